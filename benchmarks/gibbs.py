@@ -20,14 +20,8 @@ def gibbs(
 ) -> Result:
     """Time one sweep over all chains, for our sampler and the samplers of other packages.
 
-    All samplers use the same weights and the same initial scenes.
-
-    Args:
-        V: number of object classes.
-        H: number of hidden units.
-        chains: number of chains.
-        objects: mean number of objects per scene.
-        rounds: number of rounds; each round times every sampler.
+    All samplers use the same weights and the same initial scenes, with `objects` classes each. The
+    machine has V classes and H hidden units. Each of the rounds times every sampler.
     """
     machine = object_machine(MachineSpec("rbm", V=V, A=4, units=H), objects)
     generator = torch.Generator().manual_seed(1)

@@ -26,13 +26,8 @@ def log_odds(*, V: int = 417, H: int = 200, objects: int = 12, rounds: int = 31)
     """Time the closed form of a machine, and scikit-learn with one scene copy per class.
 
     Relations have no effect on objects. With binary hidden units and no couplings, the log-odds
-    therefore equal those of a plain RBM such as scikit-learn's.
-
-    Args:
-        V: number of object classes.
-        H: number of binary hidden units.
-        objects: number of objects in the scene.
-        rounds: number of rounds; each round times every method.
+    therefore equal those of a plain RBM such as scikit-learn's. The machine has V classes and H
+    hidden units. Each of the rounds times every method.
     """
     machine = object_machine(MachineSpec("rbm", V=V, A=4, units=H), objects)
     weights, rbm = weights_of(machine), scikit_learn(machine)
@@ -49,10 +44,7 @@ def log_odds(*, V: int = 417, H: int = 200, objects: int = 12, rounds: int = 31)
         return machine.object_log_odds(v)
 
     def two_copies() -> Any:
-        """For each class, compare the scene with the class and the scene without the class.
-
-        The result is valid for all classes.
-        """
+        """Compare, for each class, the scene with the class and without it."""
         present = np.repeat(v.numpy(), V, axis=0)
         absent = present.copy()
         np.fill_diagonal(present, 1)
@@ -60,10 +52,7 @@ def log_odds(*, V: int = 417, H: int = 200, objects: int = 12, rounds: int = 31)
         return rbm._free_energy(absent) - rbm._free_energy(present)
 
     def one_copy() -> Any:
-        """For each class, compare the scene with the class added and the unchanged scene.
-
-        The result is valid only for absent classes.
-        """
+        """Compare, for each absent class, the scene with the class and the unchanged scene."""
         present = np.repeat(v.numpy(), V, axis=0)
         np.fill_diagonal(present, 1)
         return rbm._free_energy(v.numpy()) - rbm._free_energy(present)

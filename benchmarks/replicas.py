@@ -8,9 +8,16 @@ so the capacity contains the cost of the client.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from statistics import median
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import httpx
@@ -18,15 +25,33 @@ import numpy as np
 import typer
 import uvloop
 
-from benchmarks.engines import plain_processes
 from benchmarks.load.questions import requests
+from benchmarks.load.servers import ServerError, free_port
 from benchmarks.load.windows import Window, at_concurrency, at_times
 from benchmarks.queueing import mean_wait
 
 SHARES = (0.3, 0.5, 0.7)
 """Offered rates as fractions of the capacity."""
 
+_ROOT = Path(__file__).resolve().parents[1]
 _ROUTE, _KIND, _MANY = "/missing", "12 labels", 32
+_PATIENCE = 180.0
+_PROXY = """
+global
+    nbthread 1
+defaults
+    mode http
+    timeout connect 5s
+    timeout client 60s
+    timeout server 60s
+    timeout http-keep-alive 20s
+    option http-no-delay
+    http-reuse always
+    balance leastconn
+listen service
+    bind 127.0.0.1:{port}
+    option httpchk GET /health/ready
+"""
 
 
 def main(
@@ -104,6 +129,52 @@ def _labels(port: int) -> list[str]:
     url = f"http://127.0.0.1:{port}/models/default/vocabulary"
     entries = httpx.get(url).raise_for_status().json()["objects"]
     return [entry["label"] for entry in entries if not entry["structure"]]
+
+
+@contextmanager
+def plain_processes(replicas: int) -> Iterator[int]:
+    """Start plain processes behind HAProxy, and yield the proxy's port."""
+    with ExitStack() as stack:
+        text = _PROXY.format(port=(port := free_port()))
+        for number in range(replicas):
+            service = free_port()
+            environment = {"SCENE_PORT": str(service)}
+            stack.enter_context(_running([sys.executable, "-m", "app"], service, environment))
+            text += f"    server replica{number} 127.0.0.1:{service} check\n"
+        config = Path(stack.enter_context(TemporaryDirectory())) / "haproxy.cfg"
+        config.write_text(text, "utf-8")
+        stack.enter_context(_running(["haproxy", "-db", "-f", str(config)], port))
+        yield port
+
+
+@contextmanager
+def _running(
+    command: list[str], port: int, variables: dict[str, str] | None = None
+) -> Iterator[None]:
+    process = subprocess.Popen(
+        command,
+        cwd=_ROOT,
+        env=os.environ | (variables or {}),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        deadline = time.monotonic() + _PATIENCE
+        while not _is_ready(port):
+            if process.poll() is not None or time.monotonic() > deadline:
+                raise ServerError(f"{command[0]} is not ready")
+            time.sleep(0.2)
+        yield
+    finally:
+        process.terminate()
+        process.wait(_PATIENCE)
+
+
+def _is_ready(port: int) -> bool:
+    try:
+        return httpx.get(f"http://127.0.0.1:{port}/health/ready").is_success
+    except httpx.TransportError:
+        return False
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
@@ -81,17 +82,13 @@ class Result:
             row = [name, duration(seconds)]
             if self.unit:
                 row.append(f"{self.work / seconds:,.0f}")
-            table.add_row(*row, *self._comparison(name))
+            if name != self.subject:
+                ratio = self.timings.ratio(self.subject, name)
+                row.append(f"{ratio.median:.3g}× ({ratio.low:.3g}–{ratio.high:.3g})")
+                row.append(f"≥ {self.targets[name]:g}×" if name in self.targets else "")
+            table.add_row(*row)
         facts = [Text(f"  {name}: {_show(value)}") for name, value in self.facts.items()]
         return Group(table, *facts)
-
-    def _comparison(self, name: str) -> tuple[str, str]:
-        if name == self.subject:
-            return "", ""
-        ratio = self.timings.ratio(self.subject, name)
-        target = self.targets.get(name)
-        text = f"{ratio.median:.3g}× ({ratio.low:.3g}–{ratio.high:.3g})"
-        return text, "" if target is None else f"≥ {target:g}×"
 
 
 def duration(seconds: float) -> str:
@@ -123,11 +120,9 @@ def describe_machine() -> dict[str, object]:
 
 def _processor() -> str:
     info = Path("/proc/cpuinfo")
-    if info.is_file():
-        for line in info.read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or "unknown"
+    text = info.read_text(encoding="utf-8") if info.is_file() else ""
+    model = re.search(r"^model name\s*: (.+)$", text, re.M)
+    return model[1].strip() if model else platform.processor() or "unknown"
 
 
 def _show(value: Fact) -> str:

@@ -14,6 +14,7 @@ import multiprocessing
 import os
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -55,35 +56,40 @@ def scaling(
 
     Args:
         classes: vocabulary sizes in increasing order. The first size is the reference.
-        units: number of hidden units.
-        states: number of states of a hidden unit.
-        K: rank of the relation weights.
-        N: number of stored samples for the generation of scenes.
+        units, states, K, N: sizes of the machine; see `MachineSpec`.
         objects: number of objects in the scene, equal for all sizes.
         rounds: number of rounds; each round times every size.
     """
-    scene = _scene(classes[0], objects)
+    drawn = random_scenes(1, classes[0], objects, torch.Generator().manual_seed(1))[0].tolist()
+    scene = Scene(tuple(SceneObject(_label(i), _label(i), i) for i in drawn))
+    sizes = {"units": units, "states": states, "K": K, "N": N}
+    sizes |= {"A": len(CANONICAL), "C": 33, "G": 8}
     with TemporaryDirectory() as folder:
         paths = {
-            V: _write(Path(folder) / str(V), _spec(V, units, states, K, N), objects)
+            V: _write(
+                Path(folder) / str(V),
+                MachineSpec("triway", V=V, T=_TRIPLES_A_CLASS * V, coupled=True, **sizes),
+                objects,
+            )
             for V in classes
         }
         memory = {V: _memory(paths[classes[0]], paths[V], scene) for V in classes}
         files = {V: sum(file.stat().st_size for file in paths[V].iterdir()) for V in classes}
         artifacts = {V: load_artifact(path) for V, path in paths.items()}
+    names = {V: f"{V:,} classes" for V in classes}
     facts: dict[str, Fact] = {}
-    for V in classes:
-        facts[f"{_name(V)}, artifact in MB"] = files[V] / _MEGABYTE
-        facts[f"{_name(V)}, loaded and asked everything, resident MB"] = memory[V] / _MEGABYTE
-        facts[f"{_name(V)}, resident kB a class"] = memory[V] / V / 1e3
+    for V, name in names.items():
+        facts[f"{name}, artifact in MB"] = files[V] / _MEGABYTE
+        facts[f"{name}, loaded and asked everything, resident MB"] = memory[V] / _MEGABYTE
+        facts[f"{name}, resident kB a class"] = memory[V] / V / 1e3
     results: list[Result] = []
-    for question, ask in _questions(scene).items():
-        calls = {_name(V): _call(ask, artifact) for V, artifact in artifacts.items()}
+    for question, ask in QUESTIONS.items():
+        calls = {names[V]: partial(ask, artifact, scene) for V, artifact in artifacts.items()}
         results.append(
             Result(
                 name=f"scaling {question}",
-                title=f"/{question}: latency relative to {_name(classes[0])}",
-                subject=_name(classes[0]),
+                title=f"/{question}: latency relative to {names[classes[0]]}",
+                subject=names[classes[0]],
                 timings=interleave(calls, rounds=rounds),
                 facts={} if results else facts,
             )
@@ -91,51 +97,17 @@ def scaling(
     return results
 
 
-def _name(V: int) -> str:
-    return f"{V:,} classes"
-
-
-Question = Callable[[Artifact], object]
-
-
-def _call(ask: Question, artifact: Artifact) -> Callable[[], object]:
-    return lambda: ask(artifact)
-
-
-def _questions(scene: Scene) -> Mapping[str, Question]:
-    return {
-        "relations": lambda artifact: questions.relations(artifact, scene),
-        "missing": lambda artifact: questions.missing(artifact, scene),
-        "outliers": lambda artifact: questions.outliers(artifact, scene),
-        "rooms": lambda artifact: questions.rooms(artifact, scene),
-        f"generate of {SCENES}": lambda artifact: questions.generate(
-            artifact, scene, count=SCENES, seed=1
-        ),
-    }
-
-
-def _scene(V: int, objects: int) -> Scene:
-    """Draw a scene of objects from the first V classes. Frequent classes are more probable."""
-    classes = random_scenes(1, V, objects, torch.Generator().manual_seed(1))[0].tolist()
-    return Scene(tuple(SceneObject(_label(i), _label(i), i) for i in classes))
+QUESTIONS: Mapping[str, Callable[[Artifact, Scene], object]] = {
+    "relations": questions.relations,
+    "missing": questions.missing,
+    "outliers": questions.outliers,
+    "rooms": questions.rooms,
+    f"generate of {SCENES}": partial(questions.generate, count=SCENES, seed=1),
+}
 
 
 def _label(number: int) -> str:
     return f"class {number}"
-
-
-def _spec(V: int, units: int, states: int, K: int, N: int) -> MachineSpec:
-    sizes = {
-        "V": V,
-        "A": len(CANONICAL),
-        "units": units,
-        "states": states,
-        "C": 33,
-        "K": K,
-        "G": 8,
-        "N": N,
-    }
-    return MachineSpec("triway", **sizes, T=_TRIPLES_A_CLASS * V, coupled=True)
 
 
 def _write(path: Path, spec: MachineSpec, objects: int) -> Path:
@@ -203,8 +175,8 @@ def _resident(first: Path, path: Path, scene: Scene) -> int:
 
 def _asked(path: Path, scene: Scene) -> Artifact:
     artifact = load_artifact(path)
-    for ask in _questions(scene).values():
-        ask(artifact)
+    for ask in QUESTIONS.values():
+        ask(artifact, scene)
     return artifact
 
 

@@ -19,13 +19,7 @@ from threadpoolctl import threadpool_limits
 
 @dataclass(frozen=True)
 class Ratio:
-    """Speed ratio of two implementations over all rounds.
-
-    Attributes:
-        median: median ratio.
-        low: first quartile of the ratios.
-        high: third quartile of the ratios.
-    """
+    """Speed ratio of two implementations over all rounds: median, first and third quartile."""
 
     median: float
     low: float
@@ -34,11 +28,7 @@ class Ratio:
 
 @dataclass(frozen=True)
 class Timings:
-    """Timings of several implementations.
-
-    Attributes:
-        seconds: seconds per call in each round, by name of the implementation.
-    """
+    """Seconds per call in each round, by name of the implementation."""
 
     seconds: Mapping[str, list[float]]
 
@@ -56,21 +46,15 @@ class Timings:
 
 
 def interleave(
-    contenders: Mapping[str, Callable[[], object]],
-    *,
-    rounds: int,
-    slice_seconds: float = 0.02,
+    contenders: Mapping[str, Callable[[], object]], *, rounds: int, slice_seconds: float = 0.02
 ) -> Timings:
     """Time every implementation in every round, on one thread and without garbage collection.
 
     Args:
         contenders: the implementations by name, as functions without arguments.
-        rounds: number of rounds, at least 1.
         slice_seconds: approximate length of a time slice. Within a slice, one implementation is
             called repeatedly.
     """
-    if rounds < 1:
-        raise ValueError(f"rounds must be at least 1, not {rounds}")
     names = list(contenders)
     seconds: dict[str, list[float]] = {name: [] for name in names}
     threads = torch.get_num_threads()

@@ -35,15 +35,8 @@ def training_step(
     """Time one step with closed-form log-odds, and one with a free energy for each class.
 
     Both steps compute the loss of random parts of scenes, its gradient, and an update by Adam. The
-    machine has couplings between classes. Persistent chains and priors are left out.
-
-    Args:
-        V: number of object classes.
-        units: number of hidden units.
-        states: number of states of a hidden unit.
-        scenes: number of scenes per step.
-        objects: number of objects per scene.
-        rounds: number of rounds; each round times both steps.
+    machine has couplings between its V classes. Persistent chains and priors are left out. Each of
+    the rounds times both steps.
     """
     generator = torch.Generator().manual_seed(0)
     v = presence(random_scenes(scenes, V, objects, generator), V)
@@ -54,11 +47,7 @@ def training_step(
         sources=("random",),
     )
     config = ObjectsConfig(
-        batch_size=scenes,
-        generative_weight=0,
-        weight_prior=0,
-        coupling_prior=0,
-        rate_prior=0,
+        batch_size=scenes, generative_weight=0, weight_prior=0, coupling_prior=0, rate_prior=0
     )
     spec = MachineSpec(
         "triway", V=V, A=1, units=units, states=states, K=1, profiles=1, coupled=True

@@ -21,10 +21,8 @@ import json
 import math
 import random
 import sys
-import time
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
@@ -165,36 +163,35 @@ class Scenes:
         """Return random values for the request fields that only the given question has."""
         rng = self.rng
         names = [o if isinstance(o, str) else o.get("id", o["label"]) for o in body["objects"]]
-        fields: dict[str, Json] = {}
-        if rng.random() < 0.5 and question != "outliers":
-            fields["top_k"] = rng.choice([1, 3, 10, 50])
-        match question:
-            case "relations":
-                if rng.random() < 0.3:
-                    fields["include_opposites"] = True
-                if rng.random() < 0.3:
-                    fields["min_probability"] = rng.choice([0.01, 0.2, 0.9])
-                if rng.random() < 0.3:
-                    fields["pairs"] = [
-                        {"subject": rng.choice(names), "object": rng.choice(names)}
-                        for _ in range(rng.choice([1, 4]))
-                    ]
-            case "missing":
-                if rng.random() < 0.4:
-                    fields["coverage"] = rng.choice([0.0, 0.25, 0.5, 0.9, 1.0])
-                if rng.random() < 0.3:
-                    fields["candidates"] = rng.sample(self.labels, 5)
-                if rng.random() < 0.4:
-                    fields["at"] = {"relation": rng.choice(RELATIONS), "object": rng.choice(names)}
-            case "outliers":
-                if rng.random() < 0.5:
-                    fields["sensitivity"] = rng.choice(["low", "medium", "high"])
-                if rng.random() < 0.2:
-                    fields["threshold"] = rng.choice([0.0, 0.3, 0.7, 1.0])
-            case "rooms":
-                if self.rooms and rng.random() < 0.4:
-                    fields["candidates"] = rng.sample(self.rooms, min(len(self.rooms), 4))
-        return fields
+        rooms = min(len(self.rooms), 4)
+
+        def drawn(**choices: list[str]) -> dict[str, str]:
+            return {name: rng.choice(values) for name, values in choices.items()}
+
+        # The chance of each field, and a function that draws its value.
+        fields: dict[str, dict[str, tuple[float, Callable[[], Json]]]] = {
+            "relations": {
+                "include_opposites": (0.3, lambda: True),
+                "min_probability": (0.3, lambda: rng.choice([0.01, 0.2, 0.9])),
+                "pairs": (
+                    0.3,
+                    lambda: [drawn(subject=names, object=names) for _ in range(rng.choice([1, 4]))],
+                ),
+            },
+            "missing": {
+                "coverage": (0.4, lambda: rng.choice([0.0, 0.25, 0.5, 0.9, 1.0])),
+                "candidates": (0.3, lambda: rng.sample(self.labels, 5)),
+                "at": (0.4, lambda: drawn(relation=[*RELATIONS], object=names)),
+            },
+            "outliers": {
+                "sensitivity": (0.5, lambda: rng.choice(["low", "medium", "high"])),
+                "threshold": (0.2, lambda: rng.choice([0.0, 0.3, 0.7, 1.0])),
+            },
+            "rooms": {"candidates": (0.4 * bool(rooms), lambda: rng.sample(self.rooms, rooms))},
+        }
+        top_k = {"top_k": (0.5, lambda: rng.choice([1, 3, 10, 50]))}
+        chosen = fields[question] | (top_k if question != "outliers" else {})
+        return {name: draw() for name, (chance, draw) in chosen.items() if rng.random() < chance}
 
 
 def post(path: str, body: Json, **headers: str) -> dict[str, Json]:
@@ -436,19 +433,16 @@ def undrawn(answer: dict[str, Json]) -> dict[str, Json]:
 def record(url: str, file: Path, key: str) -> int:
     """Send all requests, and write the requests and answers to a file. Return exit status 0."""
     rng = random.Random(SEED)
+    counts: Counter[str] = Counter()
     with httpx.Client(base_url=url, timeout=60) as client, gzip.open(file, "wt") as out:
-        counts: Counter[str] = Counter()
-
-        def keep(kind: str, request: Json, answer: Json) -> None:
-            counts[kind] += 1
-            out.write(json.dumps({"kind": kind, "request": request, "answer": answer}) + "\n")
-
         for kind, requests in (
             ("question", questions(client, rng)), ("drawn", drawn(client)), ("error", errors()),
             ("page", pages(client)),
         ):  # fmt: skip
             for request in requests:
-                keep(kind, request, ask(client, request, key))
+                answer = ask(client, request, key)
+                out.write(json.dumps({"kind": kind, "request": request, "answer": answer}) + "\n")
+                counts[kind] += 1
     sys.stdout.write(f"{sum(counts.values())} recorded: {dict(counts)}\n")
     return 0
 
@@ -460,12 +454,9 @@ def lost_model(old: Json, new: Json) -> bool:
 
 
 def compare(url: str, file: Path, key: str) -> int:
-    """Send all recorded requests again. Return exit status 1 if an answer differs, else 0.
-
-    Entries of the kind "stream" in older recordings are skipped.
-    """
+    """Send all recorded requests again. Return exit status 1 if an answer differs, else 0."""
     with gzip.open(file, "rt") as lines:
-        entries = [entry for entry in map(json.loads, lines) if entry["kind"] != "stream"]
+        entries = [json.loads(line) for line in lines]
     tests = 400 * sum(entry["kind"] == "drawn" for entry in entries)
     differing = skipped = 0
     with httpx.Client(base_url=url, timeout=60) as client:
@@ -492,21 +483,6 @@ def compare(url: str, file: Path, key: str) -> int:
     return int(differing > 0)
 
 
-def wait_until_ready(url: str) -> None:
-    """Wait until the service is ready. Its first start is slow because it compiles kernels.
-
-    Raises:
-        TimeoutError: the service is not ready within ten minutes.
-    """
-    end = time.monotonic() + 600
-    while time.monotonic() < end:
-        with suppress(httpx.TransportError):
-            if httpx.get(f"{url}/health/ready").status_code == 200:
-                return
-        time.sleep(0.5)
-    raise TimeoutError(f"{url} is not ready after ten minutes")
-
-
 def main() -> int:
     """Run the command that the command line names, and return its exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
@@ -515,7 +491,7 @@ def main() -> int:
     parser.add_argument("file", type=Path)
     parser.add_argument("--key", default="", help="admin key of the service")
     options = parser.parse_args()
-    wait_until_ready(options.url)
+    httpx.get(f"{options.url}/health/ready").raise_for_status()
     act = record if options.command == "record" else compare
     return act(options.url, options.file, options.key)
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import json
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -19,6 +18,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import httpx
 from numba.core.dispatcher import Dispatcher
 
 from app.main import create_app
@@ -33,25 +33,6 @@ SCENE = {
         for k, label in enumerate(("bed", "lamp", "chair", "desk", "pillow", "book", "sofa"))
     ]
 }
-
-
-async def ask(app: Any, path: str, body: bytes) -> int:
-    """Send one request to an application and return the status of the answer."""
-    statuses: list[int] = []
-
-    async def receive() -> dict[str, Any]:
-        return {"type": "http.request", "body": body, "more_body": False}
-
-    async def send(message: dict[str, Any]) -> None:
-        statuses.append(message.get("status", 0))
-
-    headers = [(b"host", b"localhost"), (b"content-type", b"application/json")]
-    scope = {
-        "type": "http", "method": "POST", "path": path, "raw_path": path.encode(),
-        "query_string": b"", "root_path": "", "scheme": "http", "headers": headers, "state": {},
-    }  # fmt: skip
-    await app(scope, receive, send)
-    return statuses[0]
 
 
 @contextmanager
@@ -81,7 +62,7 @@ def recorded(loop: Any, calls: set[tuple[str, str]]) -> Callable[..., Any]:
     return call
 
 
-async def called_functions(path: str, body: bytes, requests: int = 20) -> set[tuple[str, str]]:
+async def called_functions(path: str, body: Any, requests: int = 20) -> set[tuple[str, str]]:
     """Return (file, function) of all project functions that one request calls.
 
     Args:
@@ -105,13 +86,17 @@ async def called_functions(path: str, body: bytes, requests: int = 20) -> set[tu
 
     # Also profile new threads, because a thread computes the answer on a busy machine.
     threading.setprofile(record)
-    async with app.router.lifespan_context(app):
+    transport = httpx.ASGITransport(app)
+    async with (
+        app.router.lifespan_context(app),
+        httpx.AsyncClient(transport=transport, base_url="http://localhost") as client,
+    ):
         for _ in range(requests):
-            assert await ask(app, path, body) == 200
+            (await client.post(path, json=body)).raise_for_status()
         with compiled_calls(calls):
             is_counting = True
             sys.setprofile(record)
-            await ask(app, path, body)
+            await client.post(path, json=body)
             sys.setprofile(None)
     return calls
 
@@ -120,7 +105,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("path", nargs="?", default="/missing")
     path = parser.parse_args().path
-    calls = sorted(asyncio.run(called_functions(path, json.dumps(SCENE).encode())))
+    calls = sorted(asyncio.run(called_functions(path, SCENE)))
     files = sorted({file for file, _ in calls})
     for file in files:
         names = ", ".join(name for other, name in calls if other == file)

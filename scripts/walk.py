@@ -22,13 +22,12 @@ import socket
 import subprocess
 import sys
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import httpx
 from playwright.sync_api import Browser, Page, sync_playwright
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -246,18 +245,13 @@ class Walk:
         self, url: str, path: str, body: dict[str, Any], *, status: int = 200
     ) -> dict[str, Any]:
         """Send a request as curl does, and return the answer."""
-        text = json.dumps(body)
-        headers = {"Content-Type": "application/json"}
-        request = urllib.request.Request(f"{url}/{path}", text.encode(), headers)
         started = time.monotonic()
-        try:
-            with urllib.request.urlopen(request, timeout=30) as response:
-                code, content = response.status, response.read()
-        except urllib.error.HTTPError as error:
-            code, content = error.code, error.read()
-        answer: dict[str, Any] = json.loads(content)
+        response = httpx.post(f"{url}/{path}", json=body, timeout=30)
+        answer: dict[str, Any] = response.json()
         shown = json.dumps(answer, indent=1, ensure_ascii=False)
-        self._record.block(f"POST /{path} {text}", shown, time.monotonic() - started)
+        seconds = time.monotonic() - started
+        self._record.block(f"POST /{path} {json.dumps(body)}", shown, seconds)
+        code = response.status_code
         require(code == status, f"/{path} has status {code}: {shown}")
         return answer
 
@@ -308,9 +302,8 @@ def _free_port() -> int:
 
 def _is_ready(url: str) -> bool:
     try:
-        with urllib.request.urlopen(f"{url}/health/ready", timeout=5) as response:
-            return bool(response.status == 200)
-    except OSError:
+        return httpx.get(f"{url}/health/ready").is_success
+    except httpx.TransportError:
         return False
 
 

@@ -10,13 +10,10 @@ import pytest
 from benchmarks.queueing import erlang_c, mean_wait, replicas_for
 
 
-@pytest.mark.parametrize("load", [0.1, 0.5, 0.9])
-def test_one_server_is_the_textbook_formula(load: float) -> None:
-    assert erlang_c(1, load) == pytest.approx(load)
-    assert mean_wait(load, 1.0, 1) == pytest.approx(load / (1 - load))
-
-
-def test_two_servers_are_the_textbook_formula() -> None:
+def test_one_and_two_servers_are_the_textbook_formulas() -> None:
+    for load in (0.1, 0.5, 0.9):
+        assert erlang_c(1, load) == pytest.approx(load)
+        assert mean_wait(load, 1.0, 1) == pytest.approx(load / (1 - load))
     assert erlang_c(2, 1.0) == pytest.approx(1 / 3)
     assert erlang_c(2, 1.5) == pytest.approx(9 / 14)
 

@@ -26,14 +26,7 @@ import yaml
 from pytest_examples import CodeExample, EvalExample
 
 from tests.conftest import REPOSITORY
-from tests.docs.blocks import (
-    EXECUTED,
-    Block,
-    blocks,
-    check_output,
-    filled,
-    rewrite,
-)
+from tests.docs.blocks import EXECUTED, Block, blocks, check_output, filled, rewrite
 from tests.docs.conftest import Workplace
 
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
@@ -89,9 +82,7 @@ def test_the_code_of_a_page_runs(
     monkeypatch.setattr(sys, "path", [*sys.path])  # a page may add to it
     # The house's rules, but that pages print, and bind names in one block for the next.
     eval_example.set_config(
-        target_version="py310",
-        ruff_line_length=100,
-        ruff_ignore=["D", "F401", "F821", "S", "T20"],
+        target_version="py310", ruff_line_length=100, ruff_ignore=["D", "F401", "F821", "S", "T20"]
     )
     names: dict[str, object] = {}
     outputs: list[tuple[Block, str]] = []

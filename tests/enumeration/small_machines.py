@@ -88,6 +88,12 @@ def binary(units: int) -> Tensor:
     return (codes >> torch.arange(units) & 1).double()
 
 
+def code(*blocks: Tensor | np.ndarray) -> np.ndarray:
+    """One integer for each row of binary blocks, (..., units)."""
+    bits = np.concatenate(blocks, -1).astype(np.int64)
+    return (bits << np.arange(bits.shape[-1])).sum(-1)
+
+
 def unit_states(spec: MachineSpec) -> Tensor:
     """All Z^units states of h1, (Z^units, H1) float64. The first state of a unit is all 0."""
     one = torch.eye(spec.states, dtype=torch.float64)[:, 1:]
@@ -142,7 +148,7 @@ def enumerate_joint(machine: BoltzmannMachine, *rooms: int | None, source: int =
     """
     spec = machine.spec
     edges = machine.edges(torch.arange(spec.V).unsqueeze(0))
-    visible, E = binary(spec.V), edges.shape[-1]
+    visible, E = binary(spec.V), edges.valid.shape[1]
     t = torch.tensor([-1 if room is None else room for room in rooms or (-1,)])
     blocks = [visible, binary(E), unit_states(spec), binary(spec.H2)]
     index = torch.cartesian_prod(*(torch.arange(len(block)) for block in [*blocks, t]))

@@ -84,7 +84,7 @@ def test_energy_is_the_formula(name, counted):
     for _ in range(60):
         v, r, h2 = (
             torch.randint(2, (n,), generator=generator).double()
-            for n in (spec.V, edges.shape[-1], spec.H2)
+            for n in (spec.V, edges.valid.shape[1], spec.H2)
         )
         room, source = (
             int(torch.randint(-1, n, (), generator=generator)) for n in (spec.C, spec.profiles)

@@ -22,6 +22,7 @@ from tests.enumeration.small_machines import (
     SMALL,
     binary,
     check_frequencies,
+    code,
     enumerate_joint,
     random_weights,
     same,
@@ -59,12 +60,6 @@ def conditions(classes=(), relations=(), held=(), held2=(), **options):
 def one_hot(states, Z):
     """h1 (..., H1) of the states (..., units)."""
     return (states[..., None] == np.arange(1, Z)).reshape(*states.shape[:-1], -1).astype(float)
-
-
-def code(*blocks):
-    """One integer for each row of binary blocks."""
-    bits = np.concatenate(blocks, -1).astype(np.int64)
-    return (bits << np.arange(bits.shape[-1])).sum(-1)
 
 
 def at_temperature(machine, beta):

@@ -30,60 +30,48 @@ def relations(draw):
     return (torch.rand(A, n, n, generator=generator) < density).double()
 
 
-def machine_of(A=1, states=2, seed=0):
+def machine_of(A=1, states=2):
     """A Triway with every weight from N(0, 1)."""
     machine = build(MachineSpec("triway", V=V, A=A, units=3, states=states, K=2, C=2, G=2))
-    return random_weights(machine, torch.Generator().manual_seed(seed))
+    return random_weights(machine, torch.Generator().manual_seed(0))
 
 
-def in_service(machine, grid, room):
-    """Shift and apart of the service, (A, n, n), for the first n classes."""
-    n = grid.shape[1]
-    a, i, j = (index.numpy() for index in grid.nonzero(as_tuple=True))
-    observed = ObservedRelations(a, i, j, np.ones(len(a), np.float32))
+def in_service(machine, observed, n=V, room=None):
+    """The relations between the first n classes in the service, given observed relations."""
     weights, ones = weights_of(machine), np.ones(n, np.float32)
     context = context_of(weights, np.arange(n), ones, 0 * ones, room, observed)
-    between = relation_units(weights).between(context)
-    return between.shift, between.apart
+    return relation_units(weights).between(context)
 
 
 @settings(max_examples=50)
-@given(relations(), st.sampled_from([None, 0, 1]))
-def test_implications_equal_the_formula_by_hand(grid, room):
-    """The tensors and the service, which lists only relations that hold."""
+@given(relations(), st.sampled_from([-1, 0, 1]), st.sampled_from([2, 4]))
+def test_implications_equal_the_formula_by_hand(grid, room, states):
+    """The tensors and the service, which lists only relations that hold.
+
+    Also without the effects between relations of the same pair (`apart`).
+    """
     A, n, _ = grid.shape
-    machine = machine_of(A)
+    machine = machine_of(A, states)
     v = torch.zeros(1, V).double()
     v[0, :n] = 1
     padded = torch.zeros(A, V, V).double()
     padded[:, :n, :n] = grid
-    shift, _ = in_service(machine, grid, room)
+    a, i, j = (index.numpy() for index in grid.nonzero(as_tuple=True))
+    observed = ObservedRelations(a, i, j, np.ones(len(a), np.float32))
+    found = in_service(machine, observed, n, None if room < 0 else room)
     machine.double()
+    h1 = machine.state_means(machine.context(v, torch.tensor([room]))[0])
     expected = implied_by_hand(machine, v[0], padded, room)
-    x, _ = machine.context(v, None if room is None else torch.tensor([room]))
     edges = machine.edges(torch.arange(V).unsqueeze(0))
-    ours = machine.implied(edges, padded.reshape(1, -1), machine.state_means(x))
+    ours = machine.implied(edges, padded.reshape(1, -1), h1)
     torch.testing.assert_close(ours.reshape(padded.shape), expected)
+    alone = implied_by_hand(machine, v[0], padded, room, apart=True)
+    ours = implied(machine.gamma, machine.B, padded[None], h1, apart=True)[0]
+    torch.testing.assert_close(ours, alone)
     between = ~np.eye(n, dtype=bool)
-    np.testing.assert_allclose(
-        shift[:, between], expected[:, :n, :n].numpy()[:, between], rtol=1e-4, atol=1e-4
-    )
-
-
-@given(relations())
-def test_the_service_equals_the_tensors_with_more_states(grid):
-    """Also without the effects between relations of the same pair (`apart`)."""
-    A, n, _ = grid.shape
-    machine = machine_of(A, states=4)
-    found = in_service(machine, grid, 1)
-    machine.double()
-    v = torch.zeros(1, V).double()
-    v[0, :n] = 1
-    h1 = machine.state_means(machine.context(v, torch.tensor([1]))[0])
-    between = ~np.eye(n, dtype=bool)
-    for shift, apart in zip(found, (False, True), strict=True):
-        expected = implied(machine.gamma, machine.B, grid[None], h1, apart=apart)[0].numpy()
-        np.testing.assert_allclose(shift[:, between], expected[:, between], rtol=1e-4, atol=1e-4)
+    for shift, law in ((found.shift, expected), (found.apart, alone)):
+        law = law[:, :n, :n].numpy()[:, between]
+        np.testing.assert_allclose(shift[:, between], law, rtol=1e-4, atol=1e-4)
 
 
 def test_without_observed_relations_nothing_changes():
@@ -93,11 +81,9 @@ def test_without_observed_relations_nothing_changes():
     assert not machine.implied(edges, none, torch.full((1, 3), 0.3)).any()
     plain = build(replace(machine.spec, G=0))
     assert not plain.implied(edges, none + 1, torch.full((1, 3), 0.3)).any()
-    weights, ones = weights_of(machine), np.ones(V, np.float32)
     off = ObservedRelations(*(np.array([k]) for k in (0, 1, 2)), np.zeros(1, np.float32))
     for observed, shape in ((None, (0, 0, 0)), (off, (2, V, V))):
-        context = context_of(weights, np.arange(V), ones, 0 * ones, None, observed)
-        shift = relation_units(weights).between(context).shift
+        shift = in_service(machine, observed).shift
         assert shift.shape == shape
         assert not shift.any()
 

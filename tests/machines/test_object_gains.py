@@ -24,17 +24,6 @@ def uniform(shape, largest, generator):
     return (2 * torch.rand(shape, generator=generator) - 1) * largest
 
 
-def exact_gain(x, w, states):
-    """sum_m log sum_z p_m(z) exp(w[m, z]) in float64, (B, rows)."""
-
-    def log_sum(logits):
-        by_unit = logits.unflatten(-1, (-1, states - 1))
-        return torch.cat([torch.zeros_like(by_unit[..., :1]), by_unit], -1).logsumexp(-1)
-
-    x, w = x.double().unsqueeze(1), w.double()
-    return (log_sum(x + w) - log_sum(x)).sum(-1)
-
-
 @given(
     rows=st.integers(1, 40),
     units=st.integers(1, 40),
@@ -55,13 +44,15 @@ def test_gain_is_exact_to_float32_rounding(
     w, x = uniform((rows, shape), weight, generator), uniform((scenes, shape), logit, generator)
     if are_corners:
         w, x = w.sign() * weight, x.sign() * logit
+    machine = build(MachineSpec("rbm", V=1, A=1, units=units, states=states))
     for weights in (w, w.abs(), -w.abs()):
         gains = Gains(weights.numpy(), states)
         for logits in (x, x.abs(), -x.abs()):
             gain = torch.from_numpy(gains(logits.numpy())).double()
             # Each factor is good to some float32 roundings, and there are as many as units.
             close = {"rtol": 1e-5, "atol": 5e-7 * units}
-            torch.testing.assert_close(gain, exact_gain(logits, weights, states), **close)
+            exact = machine.gain(logits.double(), weights.double())
+            torch.testing.assert_close(gain, exact, **close)
 
 
 def test_many_rows_are_computed_alike():
@@ -116,12 +107,17 @@ class Case:
         context = context_of(weights, self.classes, self.presence, self.presence, room)
         self.x, self.shares = context.x, context.shares
 
-    def log_odds(self, *without):
-        """By the tensors, (V,), with the classes but those at some rows."""
+    def listed(self, *without):
+        """v of the classes but those at some rows, (1, V)."""
         v = torch.zeros(1, V).double()
         v[0, self.classes] = torch.from_numpy(self.presence).double()
         v[0, self.classes[list(without)]] = 0
+        return v
+
+    def log_odds(self, *without):
+        """By the tensors, (V,), with the classes but those at some rows."""
         room, source = torch.tensor([self.room]), torch.tensor([self.source])
+        v = self.listed(*without)
         return self.machine.object_log_odds(v, room=room, source=source)[0].numpy()
 
 
@@ -141,11 +137,9 @@ def test_log_odds_equal_the_tensors(name, seed):
     found = case.scorer.given_rest(case.x, case.shares, *scene, case.profile, room)
     rest = [case.log_odds(k)[i] + kappa[-1, i] for k, i in enumerate(case.classes)]
     close(found, rest)
-    v = torch.zeros(1, V).double()
-    v[0, case.classes] = torch.from_numpy(case.presence).double()
     if case.room < 0:
         scene = case.x[None], case.classes, case.presence[None], case.profile
-        expected = case.machine.room_log_p(v, torch.tensor([case.source]))
+        expected = case.machine.room_log_p(case.listed(), torch.tensor([case.source]))
         close(case.scorer.room_log_p(*scene)[0], expected[0])
 
 

@@ -38,9 +38,9 @@ def test_log_odds_of_normal_logits(sigma):
 SPECS = {
     "rbm": MachineSpec("rbm", V=V, A=A, units=4, states=3, T=40, C=2),
     "gbm": MachineSpec("gbm", V=V, A=A, units=6, H2=3, T=40, C=2),
-    "triway": MachineSpec("triway", V=V, A=A, units=6, K=2, T=9, C=2),
-    "triway-states": MachineSpec("triway", V=V, A=A, units=4, states=4, K=2, T=9, C=2),
-    "triway-deep": MachineSpec("triway", V=V, A=A, units=3, states=5, H2=3, K=3, T=9, C=2),
+    "triway": MachineSpec("triway", V=V, A=A, units=6, K=2, T=40, C=2),
+    "triway-states": MachineSpec("triway", V=V, A=A, units=4, states=4, K=2, T=40, C=2),
+    "triway-deep": MachineSpec("triway", V=V, A=A, units=3, states=5, H2=3, K=3, T=40, C=2),
 }
 CLASSES, LOG_COUNTS = np.array([4, 0, 3]), np.log([1, 3, 2]).astype(np.float32)
 
@@ -170,20 +170,3 @@ def test_certain_states_have_the_logits_of_the_machine():
     expected = machine.relation_logits(machine.edges(torch.arange(V)[None]), torch.ones(1, V), h1)
     np.testing.assert_allclose(mean.ravel(), expected[0], rtol=1e-4, atol=1e-4)
     assert not spread.any()
-
-
-def test_residuals_belong_to_their_triples():
-    machine = build(MachineSpec("triway", V=40, A=4, units=70, K=2, T=500)).requires_grad_(False)
-    rng = np.random.default_rng(0)
-    keys = np.sort(rng.choice(4 * 40 * 40, 500, replace=False))
-    machine.set_triples(torch.tensor(np.stack([keys // 1600, keys // 40 % 40, keys % 40], 1)))
-    machine.residual.copy_(torch.arange(1.0, 501.0))
-    expected = np.zeros(4 * 40 * 40)
-    expected[keys] = np.arange(1.0, 501.0)
-    # All other weights are zero.
-    n = np.arange(40)
-    pair = np.repeat(n, 40)[None], np.tile(n, 40)[None]
-    ends = ends_of(n, np.ones(40, np.float32), np.zeros(40, np.float32), *pair)
-    means = np.full((1, 70), 0.5, np.float32)
-    mean, _ = relation_units(weights_of(machine)).normal(means, ends)
-    np.testing.assert_array_equal(mean.ravel(), expected)

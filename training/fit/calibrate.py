@@ -22,13 +22,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from app.inference.relations import NO_UNIT
 from app.questions.placements import PLACES
 from app.questions.posterior import Posterior
 from app.registry import Artifact, Calibration, CountSlope
-from app.scene.relations import LATERAL, ON_TOP, STACKED
+from app.scene.relations import CANONICAL, LATERAL, ON_TOP, STACKED
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Rng
 from training.datasets.batches import TrainingData, subset
@@ -55,9 +54,6 @@ _SHIFTS = (0.0, -0.4, -0.8, -1.2)  # changes of the log-odds of left and front
 _ROUNDS = 3
 # Column indices of the table of examples. Column 0 is the scene.
 _RELATION, _LOGIT, _TRUTH, _SOURCE = 1, 2, 4, 5
-# The weight of an example is the number of likely examples of its source, to the power -_POWER. So
-# the rooms of one generator do not outweigh the real rooms and people's sentences.
-_POWER = 1.0
 _UNKNOWN = -1.0  # truth of an example whose data source does not annotate the relation
 # Number of objects that are removed from each scene in turn to fit placements. With one removed
 # object, the fit depends too much on chance.
@@ -78,18 +74,16 @@ def calibrate(
         *(artifact, scenes, data.train, popularity, config.served_sources, seed, chosen)
     )
     artifact = replace(artifact, calibration=objects)
-    generator = torch.Generator().manual_seed(seed)
-    pick = torch.randperm(len(scenes), generator=generator)
+    pick = torch.randperm(len(scenes), generator=torch.Generator().manual_seed(seed))
     annotated = [k for k in pick.tolist() if scenes.scenes[k].evidence.holds.any()]
     related = subset(scenes, torch.tensor(annotated[:_SCENES], dtype=torch.int64))
     if not len(related):
         return objects
     complete = [encoded for encoded in related.scenes if annotated_relations(encoded).any()]
+    relation = fit_relations(artifact, complete, seed)
     return recalibrated(
         artifact,
-        relation=with_lower_lateral(
-            artifact, fit_relations(artifact, complete, seed), related.scenes
-        ),
+        relation=with_lower_lateral(artifact, relation, related.scenes),
         placement=fit_placements(artifact, complete, seed),
         relation_given=fit_with_observed(artifact, complete, seed),
         at=fit_at(artifact, related, seed),
@@ -108,8 +102,7 @@ def fit_relations(
     rng = np.random.default_rng(seed)
     structure = artifact.vocabulary.structure
     parts = [_part_of(encoded, structure, rng) for encoded in scenes]
-    examples = _examples(_examples_of_pairs(artifact, [*scenes, *parts]))
-    return _fit_possible(examples, artifact.spec.A)
+    return _fit_possible(_examples_of_pairs(artifact, [*scenes, *parts]))
 
 
 def with_lower_lateral(
@@ -131,14 +124,13 @@ def with_lower_lateral(
         i, j = np.nonzero(stacked & ~np.eye(len(is_thing), dtype=np.bool_))
         if not len(i):
             continue
-        scene = replace(scene_of(encoded, range(len(encoded.instance_classes)), ()), room_type=None)
-        log_odds = Posterior(artifact, scene).relation_log_odds().astype(np.float64)
+        posterior = _posterior(artifact, encoded, range(len(encoded.instance_classes)))
+        log_odds = posterior.relation_log_odds().astype(np.float64)
         logs = np.log(evidence.counts)
         table = np.array([(s.intercept, s.slope, s.log_count) for s in slopes])[:, :, None, None]
         logits = table[:, 0] + table[:, 1] * log_odds + table[:, 2] * (logs[:, None] + logs)
         both = np.concatenate([logits[:, i, j], logits[:, j, i]]).T
-        holds = evidence.holds[: len(slopes)]
-        listed = np.concatenate([holds[:, i, j], holds[:, j, i]]).T
+        listed = np.concatenate([evidence.holds[:, i, j], evidence.holds[:, j, i]]).T
         is_lateral = np.isin(np.arange(both.shape[1]) % len(slopes), LATERAL)
         shifted = both + np.where(is_lateral, np.array(_SHIFTS)[:, None, None], 0.0)
         best = shifted.argmax(2)
@@ -170,31 +162,52 @@ def fit_with_observed(
 
     The fit examines the other half of the pairs.
     """
-    examples = _examples(_examples_of_pairs(artifact, scenes, np.random.default_rng(seed)))
-    return _fit_possible(examples, artifact.spec.A)
+    rng = np.random.default_rng(seed)
+    return _fit_possible(_examples_of_pairs(artifact, scenes, rng))
+
+
+def _posterior(
+    artifact: Artifact, encoded: EncodedScene, kept: Sequence[int], observed: Sequence[Triple] = ()
+) -> Posterior:
+    """Return the posterior given some instances of a scene, without its room type."""
+    return Posterior(artifact, replace(scene_of(encoded, kept, observed), room_type=None))
 
 
 def _examples_of_pairs(
     artifact: Artifact, scenes: Sequence[EncodedScene], rng: Rng | None = None
-) -> list[Floats]:
-    """Return the examples of each scene; with `rng`, of half its pairs, given the other half."""
+) -> Floats:
+    """Return the examples of all pairs of a scene; with `rng`, of half, given the other half.
+
+    The columns are: scene, relation, log-odds between the classes, log n_i + log n_j of the
+    instance counts, truth value and data source, (examples, 6). Relations without annotation are
+    examples only if their log-odds are high enough for the list of an answer.
+    """
     blocks: list[Floats] = []
     structure = artifact.vocabulary.structure
     sources = sorted({encoded.source for encoded in scenes})
     for number, encoded in enumerate(scenes):
-        pairs = np.ones((len(encoded.instance_classes),) * 2, dtype=np.bool_)
-        observed: list[Triple] = []
+        n = len(encoded.instance_classes)
+        pairs, observed = np.ones((n, n), dtype=np.bool_), list[Triple]()
         if rng is not None:
             pairs, observed = observed_pairs(encoded, structure, rng)
-            if not observed:
-                continue
-        scene = replace(scene_of(encoded, range(len(pairs)), observed), room_type=None)
-        if not scene.objects:
+        if not n or (rng is not None and not observed):
             continue
-        values = Posterior(artifact, scene).relation_log_odds()
-        source = sources.index(encoded.source)
-        blocks.append(_instance_pairs(number, source, encoded, values, structure, pairs))
-    return blocks
+        index = np.searchsorted(encoded.evidence.classes, encoded.instance_classes)
+        values = _posterior(artifact, encoded, range(n), observed).relation_log_odds()
+        log_odds = values[:, index[:, None], index]
+        is_thing = ~structure[encoded.instance_classes]
+        pairs = pairs & is_thing[:, None] & is_thing & ~np.eye(n, dtype=np.bool_)
+        annotated = annotated_relations(encoded)
+        # The smallest of the `_LISTED` largest values of each relation.
+        few = pairs.sum() <= _LISTED
+        least = [-np.inf if few else np.partition(v[pairs], -_LISTED)[-_LISTED] for v in log_odds]
+        examples = pairs & (annotated | (log_odds >= np.array(least)[:, None, None]))
+        relation, i, j = np.nonzero(examples)
+        logs = np.log(encoded.evidence.counts[index])
+        truth = np.where(annotated, encoded.instance_holds, _UNKNOWN)[examples]
+        columns = number, relation, log_odds[examples], logs[i] + logs[j], truth
+        blocks.append(_table(*columns, sources.index(encoded.source)))
+    return _examples(blocks)
 
 
 def fit_placements(
@@ -218,7 +231,7 @@ def fit_placements(
             continue
         target, kept = removal
         instance = int(rng.choice(np.flatnonzero(encoded.instance_classes == target)))
-        posterior = Posterior(artifact, replace(scene_of(encoded, kept, ()), room_type=None))
+        posterior = _posterior(artifact, encoded, kept)
         present = posterior.present
         anchors = np.flatnonzero(~structure[present.classes])
         tables = posterior.placement_log_odds(np.array([target]), anchors)
@@ -231,9 +244,13 @@ def fit_placements(
             a, anchor = map(np.ravel, np.indices(truth.shape))
             count = np.log(present.counts[anchors])[anchor]
             columns = number, a, values[0].ravel(), count, truth.ravel()
-            rows = np.broadcast_arrays(*columns, sources.index(encoded.source))
-            blocks.append(np.stack(rows, 1).astype(np.float64))
-    return _fit_listed(_examples(blocks), artifact.spec.A, PLACES)
+            blocks.append(_table(*columns, sources.index(encoded.source)))
+    return _fit_listed(_examples(blocks), PLACES)
+
+
+def _table(*columns: Any) -> Floats:
+    """Return a table, (examples, columns), of columns that are arrays or single values."""
+    return np.stack(np.broadcast_arrays(*columns), 1).astype(np.float64)
 
 
 def _examples(blocks: list[Floats]) -> Floats:
@@ -242,7 +259,7 @@ def _examples(blocks: list[Floats]) -> Floats:
     return examples[examples[:, _LOGIT] > NO_UNIT]
 
 
-def _fit_possible(examples: Floats, relations: int) -> tuple[CountSlope, ...]:
+def _fit_possible(examples: Floats) -> tuple[CountSlope, ...]:
     """Fit the slopes to the examples with log-odds of at least `_POSSIBLE`.
 
     Most pairs of objects have no relation, and their log-odds are far lower. They would determine
@@ -251,10 +268,10 @@ def _fit_possible(examples: Floats, relations: int) -> tuple[CountSlope, ...]:
     examples = examples[examples[:, _TRUTH] != _UNKNOWN]
     is_possible = examples[:, _LOGIT] >= _POSSIBLE
     weight = np.where(is_possible, 1.0, _OF_THE_REST)
-    return _fit_by_kind(examples, relations, weight * _source_weights(examples, is_possible))
+    return _fit_by_kind(examples, weight * _source_weights(examples, is_possible))
 
 
-def _fit_listed(examples: Floats, relations: int, listed: int) -> tuple[CountSlope, ...]:
+def _fit_listed(examples: Floats, listed: int) -> tuple[CountSlope, ...]:
     """Fit the slopes, mainly to the `listed` likeliest examples of each scene.
 
     An answer lists only these examples. Selection by high log-odds also selects errors, so listed
@@ -262,33 +279,31 @@ def _fit_listed(examples: Floats, relations: int, listed: int) -> tuple[CountSlo
     list have a small weight. Examples without annotation take part only in the ranking.
     """
     annotated = examples[:, _TRUTH] != _UNKNOWN
-    slopes = _fit_by_kind(examples[annotated], relations, np.ones(annotated.sum()))
+    slopes = _fit_by_kind(examples[annotated], np.ones(annotated.sum()))
     for _ in range(_ROUNDS):
         is_listed = _is_listed(examples, slopes, listed)[annotated]
         weight = np.where(is_listed, 1.0, _OF_THE_REST)
         weight *= _source_weights(examples[annotated], is_listed)
-        slopes = _fit_by_kind(examples[annotated], relations, weight)
+        slopes = _fit_by_kind(examples[annotated], weight)
     return slopes
 
 
-def _logits(examples: Floats, slopes: tuple[CountSlope, ...]) -> Floats:
-    """Return the calibrated log-odds of the examples."""
-    table = np.array([(s.slope, s.log_count, s.intercept) for s in slopes])
-    weights = table[examples[:, _RELATION].astype(np.int64)]
-    return (examples[:, _LOGIT:_TRUTH] * weights[:, :2]).sum(1) + weights[:, 2]
-
-
 def _source_weights(examples: Floats, is_listed: Flags) -> Floats:
-    """Return the weight of each example, (examples,), see `_POWER`."""
+    """Return weights that give each source the same total weight of listed examples, (examples,).
+
+    So the rooms of one generator do not outweigh the real rooms and people's sentences.
+    """
     relation, source = examples[:, [_RELATION, _SOURCE]].astype(int).T
     key = relation * (source.max(initial=0) + 1) + source
     counts = np.bincount(key[is_listed], minlength=int(key.max(initial=-1)) + 1)
-    return (np.maximum(counts, 1.0) ** -_POWER)[key]
+    return (1 / np.maximum(counts, 1.0))[key]
 
 
 def _is_listed(examples: Floats, slopes: tuple[CountSlope, ...], listed: int) -> Flags:
-    """Mark the `listed` examples of each scene with the highest log-odds, (examples,) bool."""
-    logits = _logits(examples, slopes)
+    """Mark the examples of each scene with the highest calibrated log-odds, (examples,) bool."""
+    table = np.array([(s.slope, s.log_count, s.intercept) for s in slopes])
+    weights = table[examples[:, _RELATION].astype(np.int64)]
+    logits = (examples[:, _LOGIT:_TRUTH] * weights[:, :2]).sum(1) + weights[:, 2]
     order = np.lexsort((-logits, examples[:, 0]))
     scene = examples[order, 0]
     rank = np.arange(len(order)) - np.searchsorted(scene, scene)
@@ -297,13 +312,13 @@ def _is_listed(examples: Floats, slopes: tuple[CountSlope, ...], listed: int) ->
     return is_listed
 
 
-def _fit_by_kind(examples: Floats, relations: int, weight: Floats) -> tuple[CountSlope, ...]:
+def _fit_by_kind(examples: Floats, weight: Floats) -> tuple[CountSlope, ...]:
     """Fit one slope to left and front, and one to on-top for all relations of stacked objects.
 
     Complete sources show hundreds of times more pairs with on-top than with inside, and no pairs
     with above. A kind with one truth value keeps its log-odds.
     """
-    entries = [CountSlope()] * relations
+    entries = [CountSlope()] * len(CANONICAL)
     for fitted, kind in ((LATERAL, LATERAL), ((ON_TOP,), STACKED)):
         rows = np.isin(examples[:, _RELATION], fitted)
         truth = examples[rows, _TRUTH] > 0
@@ -313,38 +328,5 @@ def _fit_by_kind(examples: Floats, relations: int, weight: Floats) -> tuple[Coun
         slope, count, intercept = logistic(features, truth, weight[rows])
         entry = CountSlope(intercept=intercept, slope=slope, log_count=count)
         for a in kind:
-            if a < relations:
-                entries[a] = entry
+            entries[a] = entry
     return tuple(entries)
-
-
-def _instance_pairs(
-    number: int,
-    source: int,
-    scene: EncodedScene,
-    values: NDArray[np.floating[Any]],
-    structure: Flags,
-    pairs: Flags,
-) -> Floats:
-    """Return the examples of a scene, (examples, 6).
-
-    The columns are: scene, relation, log-odds between the classes, log n_i + log n_j of the
-    instance counts, truth value and data source.
-    Relations without annotation are examples only if their log-odds are high enough for the list of
-    an answer.
-    """
-    evidence = scene.evidence
-    index = np.searchsorted(evidence.classes, scene.instance_classes)
-    logs = np.log(evidence.counts[index])
-    is_thing = ~structure[scene.instance_classes]
-    pairs = pairs & is_thing[:, None] & is_thing[None, :] & ~np.eye(len(index), dtype=np.bool_)
-    annotated = annotated_relations(scene)[: len(values)]
-    log_odds = values[:, index[:, None], index]
-    # The smallest of the `_LISTED` largest values of each relation.
-    few = pairs.sum() <= _LISTED
-    least = [-np.inf if few else np.partition(v[pairs], -_LISTED)[-_LISTED] for v in log_odds]
-    examples = pairs & (annotated | (log_odds >= np.array(least)[:, None, None]))
-    relation, i, j = np.nonzero(examples)
-    truth = np.where(annotated, scene.instance_holds[: len(values)], _UNKNOWN)[examples]
-    columns = number, relation, log_odds[examples], logs[i] + logs[j], truth, source
-    return np.stack(np.broadcast_arrays(*columns), 1)

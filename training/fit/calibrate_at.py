@@ -43,10 +43,9 @@ def fit_at(artifact: Artifact, scenes: SceneTensors, seed: int = 0) -> tuple[Pla
     """Return the entry of each relation. Relations without questions keep the default entry."""
     entries = [PlaceFit()] * artifact.spec.A
     for kind in (LATERAL, STACKED):
-        relations = [a for a in kind if a < artifact.spec.A]
-        weights = _fit_weights(artifact, scenes, relations, seed)
-        entry = _fit_scale(artifact, scenes.scenes, relations, weights, seed)
-        for a in relations:
+        weights = _fit_weights(artifact, scenes, kind, seed)
+        entry = _fit_scale(artifact, scenes.scenes, kind, weights, seed)
+        for a in kind:
             entries[a] = entry
     return tuple(entries)
 
@@ -73,19 +72,18 @@ def _fit_weights(
     source = scenes.source[row].numpy()
     usable = np.isin(places.relation.numpy(), relations)
     rng = np.random.default_rng(seed)
-    terms: list[tuple[Floats, ...]] = []
-    hidden: list[int] = []
+    chosen: list[int] = []
     weight: list[float] = []
     for name in np.unique(source[usable]):
         index = rng.permutation(np.flatnonzero(usable & (source == name)))[:_QUESTIONS]
-        for k in index.tolist():
-            terms.append(_masked_terms(artifact, places.rows(torch.tensor([k]))))
-            hidden.append(int(target[k]))
+        chosen += index.tolist()
         weight += [1 / len(index)] * len(index)
-    if not terms:
+    if not chosen:
         return PlaceFit()
+    terms = [_masked_terms(artifact, places.rows(torch.tensor([k]))) for k in chosen]
     presence, relation, counts = (np.stack(column) for column in zip(*terms, strict=True))
-    rows, share = np.arange(len(hidden)), np.array(weight) / sum(weight)
+    hidden, rows = target[chosen].numpy(), np.arange(len(chosen))
+    share = np.array(weight) / sum(weight)
 
     def loss(weights: Floats) -> float:
         score = presence + weights[0] * relation + weights[1] * counts

@@ -13,6 +13,7 @@ Long lists have a higher line than short ones.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
@@ -107,13 +108,10 @@ def fit_misplaced(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int 
 
 def _some(scenes: Sequence[EncodedScene], seed: int) -> list[EncodedScene]:
     """Return at most `_SCENES` random scenes of each source."""
-    rng = np.random.default_rng(seed)
-    counts: dict[str, int] = {}
-    chosen = []
-    for k in rng.permutation(len(scenes)).tolist():
-        source = scenes[k].source
-        counts[source] = counts.get(source, 0) + 1
-        if counts[source] <= _SCENES:
+    counts, chosen = Counter[str](), []
+    for k in np.random.default_rng(seed).permutation(len(scenes)).tolist():
+        counts[scenes[k].source] += 1
+        if counts[scenes[k].source] <= _SCENES:
             chosen.append(scenes[k])
     return chosen
 
@@ -127,21 +125,24 @@ def _cases(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int) -> _Ca
             entries = entries_of(artifact, Posterior(artifact, bare), bare, flipped)
             is_wrong, usable = _truth(entries, wrong)
             usable &= np.isin(entries.kind, shown)
-            if bare.poses is None and encoded.instance_positions is not None:
-                usable &= entries.kind != OVER
-            usable &= (entries.kind != OVER) | (entries.terms[:, 0] < EXPLAINED)
+            listed_of_boxes = bare.poses is None and encoded.instance_positions is not None
+            explained = listed_of_boxes | (entries.terms[:, 0] >= EXPLAINED)
+            usable &= (entries.kind != OVER) | ~explained
             size = int(usable.sum())
+            of_scene: dict[str, Any] = {
+                "scene": len(blocks),
+                "encoded": number,
+                "source": encoded.source,
+                "untouched": wrong is None,
+                "complete": STAND in shown,
+                "weight": _OF_WORDS if wrong in flipped else 1.0,
+            }
             blocks.append(
                 _Cases(
-                    scene=np.full(size, len(blocks)),
-                    encoded=np.full(size, number),
-                    source=np.full(size, encoded.source),
-                    untouched=np.full(size, wrong is None),
-                    complete=np.full(size, STAND in shown),
+                    **{name: np.full(size, value) for name, value in of_scene.items()},
                     kind=entries.kind[usable],
                     terms=entries.terms[usable],
                     wrong=is_wrong[usable],
-                    weight=np.full(size, _OF_WORDS if wrong in flipped else 1.0),
                 )
             )
     if not blocks:
@@ -185,9 +186,8 @@ def _questions(
         sizes = artifact.vocabulary.sizes
         roles = None if artifact.places is None else artifact.places.roles
         part = _part_of(untouched, scene_rng(encoded, seed + 2))
-        yield observe(untouched, typical_sizes=sizes, roles=roles), (), None
-        yield observe(part, typical_sizes=sizes, roles=roles), (), None
-        yield observe(moved[0], typical_sizes=sizes, roles=roles), (), moved[1]
+        for shown, wrong in ((untouched, None), (part, None), moved):
+            yield observe(shown, typical_sizes=sizes, roles=roles), (), wrong
 
 
 def _means_under(artifact: Artifact, encoded: EncodedScene, triple: Triple) -> bool:
@@ -214,11 +214,11 @@ def _truth(entries: Entries, wrong: Triple | int | None) -> tuple[Flags, Flags]:
 
     A moved object makes its own support wrong. Its other relations may be right or wrong.
     """
-    if isinstance(wrong, tuple):
-        is_wrong: Flags = (entries.triple == np.array(wrong)).all(1)
-        return is_wrong, np.ones(len(is_wrong), np.bool_)
+    every = np.ones(len(entries.kind), np.bool_)
     if wrong is None:
-        return np.zeros(len(entries.kind), np.bool_), np.ones(len(entries.kind), np.bool_)
+        return ~every, every
+    if isinstance(wrong, tuple):
+        return (entries.triple == np.array(wrong)).all(1), every
     about: Flags = (entries.triple[:, 1:] == wrong).any(1)
     is_wrong = (entries.mover == wrong) & (entries.kind != BESIDE)
     return is_wrong, ~about | is_wrong
@@ -244,16 +244,9 @@ def _fit_kind(cases: _Cases, budget: float) -> Judgement | None:
         used = weights < 0
     else:
         return None
-    relation, change, stand, supporter = weights.tolist()
+    terms = dict(zip(("relation", "change", "stand", "supporter"), weights.tolist(), strict=True))
     silent = AlarmLines(**dict.fromkeys(ALARMS, AlarmLine(intercept=0.0)))
-    judgement = Judgement(
-        intercept=intercept,
-        relation=relation,
-        change=change,
-        stand=stand,
-        supporter=supporter,
-        lines=silent,
-    )
+    judgement = Judgement(intercept=intercept, **terms, lines=silent)
     return judgement.model_copy(update={"lines": _alarm_lines(judgement, untouched, budget)})
 
 

@@ -21,7 +21,7 @@ Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -29,16 +29,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from app.questions.posterior import Posterior, calibrated
+from app.questions.posterior import calibrated
 from app.registry import AlarmLine, AlarmLines, Artifact, Calibration, CountSlope
 from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.cases import RIDGE, logistic
 from training.evaluation.alarms import ALARMS
-from training.evaluation.asking import of_classes
 from training.evaluation.intruders import by_popularity, by_signature, draw_intruders
 from training.evaluation.parts import Parts, draw_parts, exactly, up_to_longest
-from training.fit.calibrate_rooms import calibrate_rooms
+from training.fit.calibrate_rooms import calibrate_rooms, posterior_of
 
 COVERAGES = (0.15, 0.3, 0.45, 0.6, 0.8)
 # Tested exponents alpha of the prior of intruders.
@@ -77,11 +76,9 @@ def calibrate_objects(
     rounded = tuple(None if math.isnan(x) else round(x, 4) for x in popularity.double().tolist())
     artifact = recalibrated(artifact, popularity=rounded)
     artifact = recalibrated(artifact, **fit_missing(artifact, scenes, structure, chosen))
-    return recalibrated(
-        artifact,
-        **fit_outliers(artifact, scenes, learnt, structure, chosen),
-        **calibrate_rooms(artifact, scenes, learnt, structure),
-    ).calibration
+    entries = fit_outliers(artifact, scenes, learnt, structure, chosen)
+    entries |= calibrate_rooms(artifact, scenes, learnt, structure)
+    return recalibrated(artifact, **entries).calibration
 
 
 def recalibrated(artifact: Artifact, **entries: Any) -> Artifact:
@@ -108,20 +105,19 @@ def served_scenes(scenes: SceneTensors, served: Mapping[str, float]) -> SceneTen
     scenes. Without such a source, they are all scenes with complete object lists. At most 400
     scenes of a source take part.
     """
-    names = np.array([scenes.source_names[q] for q in scenes.source.tolist()], dtype=np.str_)
+    names, size = scenes.source_names, scenes.source.bincount(minlength=len(scenes.source_names))
     largest = max(served.values(), default=0.0)
     chosen = [
-        name
+        names.index(name)
         for name, weight in served.items()
-        if weight >= largest / 2 and (names == name).sum() >= _LEAST_SCENES
+        if weight >= largest / 2 and name in names and size[names.index(name)] >= _LEAST_SCENES
     ]
     if not chosen:
         scenes = complete_scenes(scenes)
-        names = np.array([scenes.source_names[q] for q in scenes.source.tolist()], dtype=np.str_)
-        chosen = np.unique(names).tolist()
+        chosen = scenes.source.unique().tolist()
     kept: list[int] = []
-    for name in chosen:
-        index = np.flatnonzero(names == name)
+    for source in chosen:
+        index = np.flatnonzero(scenes.source.numpy() == source)
         kept += np.random.default_rng(0).permutation(index)[:_SOURCE_SCENES].tolist()
     return subset(scenes, torch.tensor(sorted(kept), dtype=torch.int64))
 
@@ -130,34 +126,30 @@ def served_scenes(scenes: SceneTensors, served: Mapping[str, float]) -> SceneTen
 
 
 def fit_missing(
-    artifact: Artifact,
-    scenes: SceneTensors,
-    structure: Tensor,
-    chosen: Calibration | None = None,
+    artifact: Artifact, scenes: SceneTensors, structure: Tensor, chosen: Calibration | None = None
 ) -> dict[str, Any]:
     """Fit the entries `coverage` and `missing` of the calibration."""
     parts = [draw_parts(scenes, structure, exactly(n)) for n in LENGTHS]
     v, hidden = (torch.cat([getattr(part, name) for part in parts]) for name in ("v", "hidden"))
     if not len(v):
         return {}
-    candidates = (v == 0) & ~structure
     coverages = COVERAGES if chosen is None else (chosen.coverage,)
-    log_odds = {c: unlisted_log_odds(artifact, v, c) for c in coverages}
-    masks = candidates.numpy(), hidden.numpy()
-    coverage = max(coverages, key=lambda c: _mean_rank(log_odds[c], *masks))
-    examples = _first_classes(log_odds[coverage], *masks, v.sum(1).numpy())
+    log_odds = unlisted_log_odds(artifact, v, coverages)
+    masks = ((v == 0) & ~structure).numpy(), hidden.numpy()
+    best = int(np.argmax([_mean_rank(z, *masks) for z in log_odds]))
+    features, truth = _first_classes(log_odds[best], *masks, v.sum(1).numpy())
     entry = CountSlope()
-    if len(np.unique(examples[:, 2])) == 2:
-        slope, count, intercept = logistic(examples[:, :2], examples[:, 2] > 0, C=RIDGE)
+    if len(np.unique(truth)) == 2:
+        slope, count, intercept = logistic(features, truth, C=RIDGE)
         entry = CountSlope(intercept=intercept, slope=slope, log_count=count)
-    return {"coverage": coverage, "missing": entry}
+    return {"coverage": coverages[best], "missing": entry}
 
 
-def unlisted_log_odds(artifact: Artifact, v: Tensor, coverage: float) -> Floats:
-    """Return the log-odds of every class for lists v, (lists, classes)."""
-    every = np.arange(artifact.spec.V)
-    rows = [Posterior(artifact, of_classes(row.nonzero().squeeze(1).tolist())) for row in v]
-    return np.stack([posterior.absent_log_odds(every, coverage) for posterior in rows])
+def unlisted_log_odds(artifact: Artifact, v: Tensor, coverages: Sequence[float]) -> Floats:
+    """Return the log-odds of every class for lists v, (coverages, lists, classes)."""
+    every, posteriors = np.arange(artifact.spec.V), (posterior_of(artifact, row) for row in v)
+    rows = [[posterior.absent_log_odds(every, c) for c in coverages] for posterior in posteriors]
+    return np.stack(rows, 1)
 
 
 def _mean_rank(z: Floats, candidates: Flags, hidden: Flags) -> float:
@@ -170,17 +162,20 @@ def _mean_rank(z: Floats, candidates: Flags, hidden: Flags) -> float:
     return float(np.mean(ranks))
 
 
-def _first_classes(z: Floats, candidates: Flags, hidden: Flags, listed: Floats) -> Floats:
-    """Return the examples of the fit, (examples, 3): the first classes of each part.
+def _first_classes(
+    z: Floats, candidates: Flags, hidden: Flags, listed: Floats
+) -> tuple[Floats, Flags]:
+    """Return the features and the truth of the first classes of each part.
 
-    The columns are the log-odds, the log of the number of listed classes, and 1 for a hidden class.
+    The features, (examples, 2), are the log-odds and the log of the number of listed classes. The
+    truth, (examples,) bool, is True for a hidden class.
     """
     first = np.argsort(np.where(candidates, -z, np.inf), axis=1, kind="stable")[:, :_LISTED]
     rows = np.arange(len(z))[:, None]
     size = np.broadcast_to(np.log(np.maximum(listed, 1))[:, None], first.shape)
-    columns = z[rows, first], size, hidden[rows, first]
     usable = candidates[rows, first]  # a small vocabulary has fewer candidates
-    return np.stack([np.asarray(column, np.float64)[usable] for column in columns], 1)
+    features = np.stack([z[rows, first], size], -1).astype(np.float64)
+    return features[usable], hidden[rows, first][usable]
 
 
 # ----------------------------------------------------------------------------------- outliers
@@ -225,28 +220,21 @@ def fit_outliers(
     """Fit `popularity_weight`, `outlier` and `outlier_lines`, or nothing with too few scenes."""
     if len(scenes) < _LEAST_SCENES:
         return {}
+    lists = {n: draw_parts(scenes, structure, exactly(n), _SEEDS) for n in LENGTHS}
     untouched = {
-        n: score_lists(artifact, draw_parts(scenes, structure, exactly(n), _SEEDS)) for n in LENGTHS
+        n: score_lists(artifact, parts)
+        for n, parts in lists.items()
+        if len(parts.v) >= _LEAST_SCENES
     }
-    untouched = {n: scores for n, scores in untouched.items() if len(scores.size) >= _LEAST_SCENES}
-    laws = {"uniform": None, "popularity": by_popularity, "signature": by_signature}
-    altered = {}
-    for name, law in laws.items():
-        weights = None if law is None else law(scenes, train)
-        scores = score_intruders(artifact, scenes, structure, weights)
-        if len(scores.size):
-            altered[name] = scores
+    kinds = (None, by_popularity(scenes, train), by_signature(scenes, train))
+    scored = (score_intruders(artifact, scenes, structure, weights) for weights in kinds)
+    altered = [scores for scores in scored if len(scores.size)]
     if not untouched or not altered:
         return {}
-    alpha = chosen.popularity_weight if chosen else choose_alpha(untouched, altered)
-    entry = _fit_intruders(untouched, altered, alpha)
-    return {
-        "popularity_weight": alpha,
-        "outlier": entry,
-        "outlier_lines": AlarmLines(
-            **{name: fit_line(untouched, entry, alpha, share) for name, share in ALARMS.items()}
-        ),
-    }
+    alpha = chosen.popularity_weight if chosen else choose_alpha(untouched.values(), altered)
+    entry = _fit_intruders(untouched.values(), altered, alpha)
+    lines = {name: fit_line(untouched, entry, alpha, share) for name, share in ALARMS.items()}
+    return {"popularity_weight": alpha, "outlier": entry, "outlier_lines": AlarmLines(**lines)}
 
 
 def judged_classes(artifact: Artifact) -> Flags:
@@ -258,29 +246,16 @@ def judged_classes(artifact: Artifact) -> Flags:
 def score_lists(artifact: Artifact, parts: Parts, intruders: Tensor | None = None) -> ListScores:
     """Return the scores of parts of scenes, each with an intruder (parts,) if these are given."""
     popularity = np.array(artifact.calibration.popularity, dtype=np.float64)
-    rows, log_odds, classes_of, is_intruder = [], [], [], []
-    for k, v in enumerate(parts.v):
-        classes = v.nonzero().squeeze(1).numpy()
-        if intruders is not None:
-            classes = np.sort(np.append(classes, int(intruders[k])))
-        values = Posterior(artifact, of_classes(classes.tolist())).log_odds_given_rest()
-        kept = judged_classes(artifact)[classes]
-        classes, values = classes[kept], values[kept]
-        rows.append(np.full(len(classes), k))
-        log_odds.append(values)
-        classes_of.append(classes)
-        is_intruder.append(
-            np.zeros(len(classes), np.bool_) if intruders is None else classes == int(intruders[k])
-        )
-    empty: list[Floats] = [np.zeros(0)]
-    all_classes = np.concatenate(classes_of or empty).astype(np.int64)
-    return ListScores(
-        row=np.concatenate(rows or empty).astype(np.int64),
-        log_odds=np.concatenate(log_odds or empty).astype(np.float64),
-        popularity=popularity[all_classes],
-        intruder=np.concatenate(is_intruder or empty).astype(np.bool_),
-        size=parts.v.sum(1).numpy().astype(np.int64) + (intruders is not None),
-    )
+    v = parts.v.numpy() > 0
+    is_intruder = np.zeros_like(v)
+    if intruders is not None:
+        is_intruder[np.arange(len(v)), intruders.numpy()] = True
+        v = v | is_intruder
+    log_odds = np.zeros(v.shape)
+    for row, values in zip(v, log_odds, strict=True):
+        values[row] = posterior_of(artifact, torch.from_numpy(row)).log_odds_given_rest()
+    row, classes = at = np.nonzero(v & judged_classes(artifact))
+    return ListScores(row, log_odds[at], popularity[classes], is_intruder[at], v.sum(1))
 
 
 def score_intruders(
@@ -295,20 +270,15 @@ def score_intruders(
     return score_lists(artifact, parts, intruders[kept][parts.scene])
 
 
-def choose_alpha(untouched: Mapping[int, ListScores], altered: Mapping[str, ListScores]) -> float:
+def choose_alpha(untouched: Collection[ListScores], altered: Collection[ListScores]) -> float:
     """Return the alpha with the best mean of hit@1 and detected share over the intruder kinds."""
-    rates = {}
-    for alpha in ALPHAS:
-        limit = np.mean(
-            [
-                np.quantile(scores.extreme(-scores.score(alpha)), 1 - ALARMS["medium"])
-                for scores in untouched.values()
-            ]
-        )
-        rates[alpha] = float(
-            np.mean([_detection(s, alpha, float(limit)) for s in altered.values()])
-        )
-    return max(rates, key=lambda alpha: (rates[alpha], -alpha))
+
+    def rate(alpha: float) -> float:
+        worst = [scores.extreme(-scores.score(alpha)) for scores in untouched]
+        limit = float(np.mean([np.quantile(values, 1 - ALARMS["medium"]) for values in worst]))
+        return float(np.mean([_detection(scores, alpha, limit) for scores in altered]))
+
+    return max(ALPHAS, key=lambda alpha: (rate(alpha), -alpha))
 
 
 def _detection(scores: ListScores, alpha: float, limit: float) -> float:
@@ -320,11 +290,11 @@ def _detection(scores: ListScores, alpha: float, limit: float) -> float:
 
 
 def _fit_intruders(
-    untouched: Mapping[int, ListScores], altered: Mapping[str, ListScores], alpha: float
+    untouched: Collection[ListScores], altered: Collection[ListScores], alpha: float
 ) -> CountSlope:
     """Fit the log-odds of being an intruder, with half of the lists altered."""
     columns, truth, weights = [], [], []
-    for group in (list(untouched.values()), list(altered.values())):
+    for group in (untouched, altered):
         for scores in group:
             size = np.log(scores.size[scores.row])
             columns.append(np.stack([scores.score(alpha), size], 1))
@@ -344,17 +314,13 @@ def fit_line(
     The line is the least-squares line through the quantiles of all lengths. It is then raised until
     the mean share over the lengths is right.
     """
-    worst = {
-        n: scores.extreme(
-            calibrated(entry, scores.score(alpha), scores.size[scores.row]).astype(np.float64)
-        )
-        for n, scores in untouched.items()
-    }
-    quantiles = [np.quantile(values, 1 - share) for values in worst.values()]
-    slope = 0.0
-    if len(worst) > 1:
-        slope = float(np.polyfit(np.log(list(worst)), quantiles, 1)[0])
-    above = np.concatenate([values - slope * np.log(n) for n, values in worst.items()])
-    weight = np.concatenate([np.full(len(values), 1 / len(values)) for values in worst.values()])
+    sizes, worst = np.log(list(untouched)), []
+    for scores in untouched.values():
+        log_odds = calibrated(entry, scores.score(alpha), scores.size[scores.row])
+        worst.append(scores.extreme(log_odds.astype(np.float64)))
+    quantiles = [np.quantile(values, 1 - share) for values in worst]
+    slope = float(np.polyfit(sizes, quantiles, 1)[0]) if len(worst) > 1 else 0.0
+    above = np.concatenate([v - slope * n for n, v in zip(sizes, worst, strict=True)])
+    weight = np.concatenate([np.full(len(values), 1 / len(values)) for values in worst])
     limit = np.quantile(above, 1 - share, weights=weight, method="inverted_cdf")
     return AlarmLine(intercept=float(limit), log_count=slope)

@@ -18,14 +18,15 @@ from scipy.optimize import minimize
 from scipy.special import log_softmax
 from torch import Tensor
 
-from app.inference.chains import Conditions, random_stream
+from app.inference.chains import random_stream
 from app.questions.generate import STEPS, room_fit
 from app.questions.posterior import Posterior
 from app.registry import Artifact, Sharpness
-from training.datasets.array_types import Flags, Floats, Ints
+from training.datasets.array_types import Flags, Floats
 from training.datasets.batches import SceneTensors, subset
 from training.evaluation.asking import of_classes
 from training.evaluation.parts import Size, draw_parts, exactly
+from training.fit.long_chains import conditions_of
 
 _LENGTHS = (1, 2, 3, 5, 8)  # numbers of listed classes in the fit of `rooms`
 _LEAST_SCENES = 20  # validation scenes with a room type in that fit
@@ -67,26 +68,21 @@ def fit_rooms(artifact: Artifact, scenes: SceneTensors, structure: Tensor) -> Sh
     parts = [draw_parts(scenes, structure, size) for size in sizes]
     v = torch.cat([part.v for part in parts])
     room = torch.cat([scenes.room[part.scene] for part in parts]).numpy()
-    log_p = np.stack([_room_log_p(artifact, row) for row in v])
+    log_p = np.stack([posterior_of(artifact, row).room_log_p() for row in v])
     size = np.log(v.sum(1).numpy())
 
     def loss(weights: Floats) -> float:
         sharpness = np.maximum(weights[0] + weights[1] * size, 0.05)
-        return -float(_chosen(log_softmax(sharpness[:, None] * log_p, axis=1), room).mean())
+        table = log_softmax(sharpness[:, None] * log_p, axis=1)
+        return -float(table[np.arange(len(room)), room].mean())
 
     slope, log_count = minimize(loss, [1.0, 0.0], method="Nelder-Mead").x.round(4).tolist()
     return Sharpness(slope=slope, log_count=log_count)
 
 
-def _room_log_p(artifact: Artifact, v: Tensor) -> Floats:
-    posterior = Posterior(artifact, of_classes(v.nonzero().squeeze(1).tolist()))
-    log_p: Floats = posterior.room_log_p()
-    return log_p
-
-
-def _chosen(table: Floats, column: Ints) -> Floats:
-    """Return the entry of each row of the table at its column."""
-    return table[np.arange(len(column)), column]
+def posterior_of(artifact: Artifact, v: Tensor) -> Posterior:
+    """Return the posterior given the listed classes v, (classes,)."""
+    return Posterior(artifact, of_classes(v.nonzero().squeeze(1).tolist()))
 
 
 def rare_rooms(
@@ -115,9 +111,7 @@ def rare_rooms(
 
 def _samples(artifact: Artifact, room: int, seed: int) -> Flags:
     """Draw scenes of a room type as `/generate` does, without its tests, (samples, classes)."""
-    none = np.zeros(0, np.int64)
-    alone = none, np.zeros(0, np.float32), None, none.reshape(0, 2), none
-    chains = artifact.scene_chains.under(Conditions(*alone, room))
+    chains = artifact.scene_chains.under(conditions_of(room))
     samples = np.zeros((_SAMPLES, artifact.spec.V), np.bool_)
     for k, row in enumerate(samples):
         row[chains.draw(STEPS, random_stream(seed, k)).classes] = True

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -80,9 +80,9 @@ def load_checkpoint(path: Path, digest: str) -> dict[str, Any] | None:
 def write_csv(path: Path, curve: Sequence[CurvePoint]) -> None:
     """Write a CSV file with one row for each point of a curve."""
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [field.name for field in fields(CurvePoint)])
-        writer.writeheader()
-        writer.writerows(asdict(point) for point in curve)
+        writer = csv.writer(file)
+        writer.writerow([field.name for field in fields(CurvePoint)])
+        writer.writerows(map(astuple, curve))
 
 
 def write_plot(path: Path, curve: Sequence[CurvePoint], title: str) -> None:
@@ -97,9 +97,8 @@ def write_plot(path: Path, curve: Sequence[CurvePoint], title: str) -> None:
         done = [point.done for point in points]
         left.plot(done, [point.loss for point in points], marker=".", label=phase)
         right.plot(done, [point.score for point in points], marker=".", label=score)
-    left.set(xlabel="finished share of the phase", ylabel="loss", title="loss")
-    right.set(xlabel="finished share of the phase", title="validation score")
-    for axis in (left, right):
+    for axis, title in ((left, "loss"), (right, "validation score")):
+        axis.set(xlabel="finished share of the phase", title=title)
         axis.legend()
     figure.suptitle(title)
     figure.savefig(path, dpi=120)

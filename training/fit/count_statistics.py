@@ -12,10 +12,10 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.optimize import minimize
 
@@ -65,12 +65,11 @@ def folds(
 ) -> Iterator[tuple[list[EncodedScene], list[EncodedScene]]]:
     """Yield the training and the test scenes of five folds. A group is in the test of one fold."""
     groups = sorted({scene.group for scene in scenes})
-    order = np.random.default_rng(0).permutation(len(groups)).tolist()
-    fold = dict(zip(groups, order, strict=True))
+    order = np.random.default_rng(0).permutation(len(groups)) % _FOLDS
+    fold = dict(zip(groups, order.tolist(), strict=True))
     for number in range(_FOLDS):
-        test = [scene for scene in scenes if fold[scene.group] % _FOLDS == number]
-        train = [scene for scene in scenes if fold[scene.group] % _FOLDS != number]
-        yield train, test
+        test = [scene for scene in scenes if fold[scene.group] == number]
+        yield [scene for scene in scenes if fold[scene.group] != number], test
 
 
 def _fit(
@@ -92,12 +91,12 @@ def _fit(
 
 def _limit_groups(scenes: Sequence[EncodedScene]) -> list[EncodedScene]:
     """Return at most `_OF_GROUP` scenes of each group."""
-    scenes_kept, count_of = [], Counter[tuple[str, str]]()
+    kept, counts = [], Counter[tuple[str, str]]()
     for scene in scenes:
-        count_of[scene.source, scene.group] += 1
-        if count_of[scene.source, scene.group] <= _OF_GROUP:
-            scenes_kept.append(scene)
-    return scenes_kept
+        counts[scene.source, scene.group] += 1
+        if counts[scene.source, scene.group] <= _OF_GROUP:
+            kept.append(scene)
+    return kept
 
 
 def _most_listed(
@@ -109,22 +108,17 @@ def _most_listed(
     for the other classes.
     """
     scene_counts = np.zeros(len(vocabulary), dtype=np.int64)
-    largest: dict[tuple[int, str, str], int] = {}
+    largest: dict[tuple[str, str], Ints] = {}  # numbers of instances in a group, (V,)
     for scene in scenes:
         is_counted = counting[scene.source][scene.evidence.classes]
         classes, counts = scene.evidence.classes[is_counted], scene.evidence.counts[is_counted]
         scene_counts[classes] += 1
-        for index, count in zip(classes.tolist(), counts.tolist(), strict=True):
-            key = index, scene.source, scene.group
-            largest[key] = max(count, largest.get(key, 0))
-    numbers = np.array([(key[0], count) for key, count in largest.items()]).reshape(-1, 2)
-    most = np.zeros_like(scene_counts)
-    for index in np.flatnonzero(scene_counts >= _SCENES).tolist():
-        largest_counts = numbers[numbers[:, 0] == index, 1]
-        groups = np.array([(largest_counts >= number).sum() for number in range(2, MOST)])
-        if groups[0] >= _GROUPS:
-            most[index] = max(2, 1 + (groups >= _GROUPS_OF_MANY).sum())
-    return most
+        of_group = largest.setdefault((scene.source, scene.group), np.zeros_like(scene_counts))
+        of_group[classes] = np.maximum(of_group[classes], counts)
+    every = np.array([*largest.values()]).reshape(-1, len(vocabulary))
+    groups = np.stack([(every >= number).sum(0) for number in range(2, MOST)])
+    most = np.maximum(2, 1 + (groups >= _GROUPS_OF_MANY).sum(0))
+    return np.where((scene_counts >= _SCENES) & (groups[0] >= _GROUPS), most, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,24 +225,18 @@ def _is_better_than_mean(
     scenes: Sequence[EncodedScene], most: Ints, counting: dict[str, Flags], vocabulary: Vocabulary
 ) -> Flags:
     """Return the classes, (V,), whose expected number is closer than the class mean."""
-    gain = np.zeros(len(vocabulary))
+    V = len(vocabulary)
+    gain = np.zeros(V)
     for train, test in folds(scenes):
         counts = _fit(train, most, counting, vocabulary)
-        for scene in test:
-            for seed in range(_DRAWS):
-                counted = counting[scene.source]
-                part, indices = listed_cases(scene, counted, vocabulary.structure, seed)
-                classes, change = _changes(counts, part, indices, len(vocabulary))
-                gain[classes] -= change
+        for scene, seed in product(test, range(_DRAWS)):
+            counted = counting[scene.source]
+            part, indices = listed_cases(scene, counted, vocabulary.structure, seed)
+            room = part.room if part.room >= 0 else None
+            rows, p = distribution(counts, V, part.classes, part.listed, room)
+            is_asked = np.isin(rows, indices)
+            rows, expected = rows[is_asked], p[is_asked] @ np.arange(1, MOST + 1)
+            classes, number = part.classes[rows], part.number[rows]
+            mean = class_mean(counts, np.searchsorted(counts.classes, classes), part.listed[rows])
+            gain[classes] -= np.abs(expected - number) - np.abs(mean - number)
     return gain > 0
-
-
-def _changes(counts: Counts, part: Part, indices: NDArray[np.intp], V: int) -> tuple[Ints, Floats]:
-    """Return classes (k,), and error of the expected number minus error of the mean."""
-    room = part.room if part.room >= 0 else None
-    rows, p = distribution(counts, V, part.classes, part.listed, room)
-    is_asked = np.isin(rows, indices)
-    rows, expected = rows[is_asked], p[is_asked] @ np.arange(1, MOST + 1)
-    classes, number = part.classes[rows], part.number[rows]
-    mean = class_mean(counts, np.searchsorted(counts.classes, classes), part.listed[rows])
-    return classes, np.abs(expected - number) - np.abs(mean - number)

@@ -24,9 +24,7 @@ def as_stored(machine: BoltzmannMachine) -> BoltzmannMachine:
 
 
 def draft_artifact(
-    machine: BoltzmannMachine,
-    vocabulary: Vocabulary,
-    places: Places | None = None,
+    machine: BoltzmannMachine, vocabulary: Vocabulary, places: Places | None = None
 ) -> Artifact:
     """Return a model in memory, without files. Its calibration leaves log-odds as is."""
     return Artifact(
@@ -43,8 +41,5 @@ def draft_artifact(
 
 def placed_draft(machine: BoltzmannMachine, data: TrainingData) -> Artifact:
     """Return a machine in half precision, with the places of the training scenes."""
-    vocabulary = data.classes
-    places = None
-    if data.roles is not None:
-        places = fit_places(data.train.scenes, data.roles, vocabulary)
-    return draft_artifact(as_stored(machine), vocabulary, places=places)
+    places = data.roles and fit_places(data.train.scenes, data.roles, data.classes)
+    return draft_artifact(as_stored(machine), data.classes, places)

@@ -23,10 +23,6 @@ from training.fit.objects import ObjectScenes, served_weights
 RECORDED: Final = 5
 """Number of sweeps between two recorded states."""
 
-TASK: Final = "Long chains"
-SIZE: Final = "change of the number of classes"
-SHARE: Final = "largest change of a class"
-
 _CHAINS, _SWEEPS = 256, 3000
 _SETTLED = 2000  # sweeps before the first recorded state of the test
 _COMMONEST = 50
@@ -70,12 +66,12 @@ def populations(scenes: ObjectScenes, config: ObjectsConfig) -> Iterator[Populat
     """
     served = served_weights(scenes, config)
     served = served if served.any() else torch.ones_like(served)
-    by_source = served / scenes.source_sizes
-    mixed = scenes.weight * by_source[scenes.source]
     v = scenes.v.double().numpy()
     for profile in (*range(len(scenes.sources)), None):
-        weight, shows = mixed, (scenes.shows & (served > 0).unsqueeze(1)).any(0)
-        if profile is not None:
+        if profile is None:
+            weight = scenes.weight * (served / scenes.source_sizes)[scenes.source]
+            shows = scenes.shows[served > 0].any(0)
+        else:
             weight, shows = scenes.weight * (scenes.source == profile), scenes.shows[profile]
         share = weight.double().numpy() / float(weight.double().sum())
         yield Population(profile, share, scenes.room.numpy(), shows.numpy(), share @ v)
@@ -108,11 +104,9 @@ class LongChains:
 
     def run(self, sweeps: int) -> Floats:
         """Make sweeps; return how often each class is present, (chains, classes), from 0 to 1."""
-        none = np.zeros(0, np.int64)
-        alone = none, np.zeros(0, np.float32), None, none.reshape(0, 2), none
         total = np.zeros(self.on.shape)
         for room in np.unique(self._rooms).tolist():
-            conditions = Conditions(*alone, None if room < 0 else room, self._profile)
+            conditions = conditions_of(None if room < 0 else room, self._profile)
             conditioned = self._chains.under(conditions)
             for k in np.flatnonzero(self._rooms == room).tolist():
                 for _ in range(0, sweeps, RECORDED):
@@ -121,6 +115,12 @@ class LongChains:
                     total[k] += self.on[k]
         share: Floats = total / -(-sweeps // RECORDED)
         return share
+
+
+def conditions_of(room: int | None, profile: int | None = None) -> Conditions:
+    """Return the conditions of chains without listed objects."""
+    none = np.zeros(0, np.int64)
+    return Conditions(none, np.zeros(0, np.float32), None, none.reshape(0, 2), none, room, profile)
 
 
 def scene_chains(weights: Weights) -> SceneChains:
@@ -150,10 +150,13 @@ class Drift:
 
     def metrics(self) -> list[Metric]:
         """Return the metrics for the model card, with intervals of two standard errors."""
-        values = ((SIZE, self.size, self.size_error), (SHARE, self.share, self.share_error))
+        values = (
+            ("change of the number of classes", self.size, self.size_error),
+            ("largest change of a class", self.share, self.share_error),
+        )
         return [
             Metric(
-                task=TASK, source=self.source, metric=name, value=round(value, 4),
+                task="Long chains", source=self.source, metric=name, value=round(value, 4),
                 low=round(value - 2 * error, 4), high=round(value + 2 * error, 4), n=_CHAINS,
             )
             for name, value, error in values
@@ -161,25 +164,18 @@ class Drift:
 
     def objection(self) -> str | None:
         """Return why samples of the model are unlike the scenes, or None."""
+        after = f"after {_SWEEPS} sweeps,"
         if abs(self.size) - _CERTAIN * self.size_error > _SIZE_LIMIT:
-            return (
-                f"after {_SWEEPS} sweeps, generated scenes of {self.source} have {self.size:+.0%} "
-                f"classes; at most {_SIZE_LIMIT:.0%} are allowed"
-            )
+            scenes = f"generated scenes of {self.source} have {self.size:+.0%} classes"
+            return f"{after} {scenes}; at most {_SIZE_LIMIT:.0%} are allowed"
         if abs(self.share) - _CERTAIN * self.share_error > _SHARE_LIMIT:
-            return (
-                f"after {_SWEEPS} sweeps, {self.share:+.0%} generated scenes of {self.source} have "
-                f"the class {self.label}; at most {_SHARE_LIMIT:.0%} are allowed"
-            )
+            scenes = f"{self.share:+.0%} generated scenes of {self.source} have the class"
+            return f"{after} {scenes} {self.label}; at most {_SHARE_LIMIT:.0%} are allowed"
         return None
 
 
 def measure_drift(
-    weights: Weights,
-    labels: Sequence[str],
-    scenes: ObjectScenes,
-    config: ObjectsConfig,
-    seed: int = 1,
+    weights: Weights, labels: Sequence[str], scenes: ObjectScenes, config: ObjectsConfig
 ) -> list[Drift]:
     """Run 3,000 sweeps from the training scenes of each served source, and compare them.
 
@@ -195,24 +191,17 @@ def measure_drift(
         q = population.profile
         if q is None or served[q] < served.max() / 2:
             continue
-        long = LongChains(chains, scenes, population, _CHAINS, seed)
+        long = LongChains(chains, scenes, population, _CHAINS, seed=1)
         long.run(_SETTLED)
         drawn = long.run(_SWEEPS - _SETTLED)
         sizes = drawn[:, population.shows].sum(1) / population.p[population.shows].sum()
         top = np.argsort(-np.where(population.shows, population.p, 0))[:_COMMONEST]
         top = top[population.p[top] > 0]
         change = drawn[:, top] / population.p[top] - 1
-        error = change.std(0) / np.sqrt(_CHAINS)
+        share, error = change.mean(0), change.std(0) / np.sqrt(_CHAINS)
         # The class that is most certainly beyond the limit.
-        k = int(np.argmax(np.abs(change.mean(0)) - _CERTAIN * error))
-        drifts.append(
-            Drift(
-                source=scenes.sources[q],
-                size=float(sizes.mean() - 1),
-                size_error=float(sizes.std() / np.sqrt(_CHAINS)),
-                label=labels[top[k]],
-                share=float(change[:, k].mean()),
-                share_error=float(error[k]),
-            )
-        )
+        k = int(np.argmax(np.abs(share) - _CERTAIN * error))
+        size, size_error = float(sizes.mean() - 1), float(sizes.std() / np.sqrt(_CHAINS))
+        worst = labels[top[k]], float(share[k]), float(error[k])
+        drifts.append(Drift(scenes.sources[q], size, size_error, *worst))
     return drifts

@@ -30,7 +30,6 @@ Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008)
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
 
@@ -81,28 +80,25 @@ class ObjectScenes:
         Raises:
             ValueError: no scene has two classes.
         """
-        weights = torch.tensor([config.source_weights.get(q, 1.0) for q in train.source_names])
-        counts = torch.zeros(train.annotated_classes.shape)
-        counts.index_add_(0, train.source, (train.v > 0).float())
-        open_sources = [shows_everything(q, config) for q in train.source_names]
-        shows = (counts >= _SHOWN) & train.annotated_classes
-        shows |= torch.tensor(open_sources).unsqueeze(1) & ~left_out(train)
+        names, annotated = train.source_names, train.annotated_classes
+        weights = torch.tensor([config.source_weights.get(q, 1.0) for q in names])
+        counts = torch.zeros(annotated.shape).index_add_(0, train.source, (train.v > 0).float())
+        # A user's own source and one with an open vocabulary show every class, except those that a
+        # known source annotates incompletely.
+        is_open = [q not in SOURCES or SOURCES[q].open_vocabulary for q in names]
+        shows_all = [q in config.open_sources for q in names] if config.open_sources else is_open
+        partial = torch.tensor([q in SOURCES for q in names]) & torch.tensor(is_open)
+        partial = partial.unsqueeze(1) & ~annotated
+        shows = (counts >= _SHOWN) & annotated | torch.tensor(shows_all).unsqueeze(1) & ~partial
         shows &= ~structure
         v = (train.v > 0) & shows[train.source]
         weight = train.weight * weights[train.source]
         kept = ((weight > 0) & (v.sum(1) >= 2)).nonzero().squeeze(1)
         if not len(kept):
             raise ValueError("no training scene has two classes; add scenes with more objects")
-        used = train.source[kept].bincount(minlength=len(weights)) > 0
-        index = used.long().cumsum(0) - 1
-        return cls(
-            v=v[kept].float(),
-            room=train.room[kept],
-            source=index[train.source[kept]],
-            weight=weight[kept],
-            shows=shows[used],
-            sources=tuple(q for q, u in zip(train.source_names, used.tolist(), strict=True) if u),
-        )
+        used, source = train.source[kept].unique(return_inverse=True)
+        sources = tuple(names[q] for q in used.tolist())
+        return cls(v[kept].float(), train.room[kept], source, weight[kept], shows[used], sources)
 
     @property
     def size(self) -> float:
@@ -118,6 +114,15 @@ class ObjectScenes:
         """Sum of the weights of the scenes of each source, (sources,)."""
         return torch.zeros(len(self.sources)).index_add_(0, self.source, self.weight)
 
+    @property
+    def shows_rooms(self) -> Tensor:
+        """True for each source with scenes of two room types, (sources, 1) bool.
+
+        A source of bedrooms alone does not tell how common bedrooms are.
+        """
+        kinds = [self.room[self.source == q] for q in range(len(self.sources))]
+        return torch.tensor([[len(room[room >= 0].unique()) > 1] for room in kinds])
+
     def log_odds(self) -> Tensor:
         """Return the smoothed log-odds of each class in the scenes that can show it, (classes,)."""
         weight = self.weight.unsqueeze(1)
@@ -125,24 +130,6 @@ class ObjectScenes:
         total = (self.shows * self.source_sizes.unsqueeze(1)).sum(0)
         total = torch.where(total > 0, total, self.size)
         return ((count + 0.5) / (total - count + 0.5)).log()
-
-
-def shows_everything(source: str, config: ObjectsConfig) -> bool:
-    """Return True if a class that the source never lists is absent from its scenes.
-
-    A user's own source shows everything.
-    """
-    if config.open_sources:
-        return source in config.open_sources
-    return source not in SOURCES or SOURCES[source].open_vocabulary
-
-
-def left_out(train: SceneTensors) -> Tensor:
-    """Return True for classes whose annotation in a source is incomplete, (sources, classes)."""
-    has_open_words = torch.tensor(
-        [q in SOURCES and SOURCES[q].open_vocabulary for q in train.source_names]
-    )
-    return has_open_words.unsqueeze(1) & ~train.annotated_classes
 
 
 class Parts(NamedTuple):
@@ -162,8 +149,7 @@ class Parts(NamedTuple):
 def random_parts(v: Tensor, leave_one_out: float, generator: torch.Generator) -> Parts:
     """List a random part of each scene, (scenes, classes), with at least one class hidden.
 
-    Args:
-        leave_one_out: share of the scenes that hide one class.
+    A share `leave_one_out` of the scenes hides one class.
     """
     n = v.sum(1)
     hides_one = torch.rand(len(v), generator=generator) < leave_one_out
@@ -191,8 +177,11 @@ class ObjectFit:
         self.machine, self.scenes, self.config = machine, scenes, config
         self.steps, self.loss = 0, math.nan
         self._generator = torch.Generator().manual_seed(seed)
-        names = [name for name, _ in machine.named_parameters() if _is_of_objects(name)]
-        self._weights = {name: machine.get_parameter(name) for name in names}
+        self._weights = {
+            name: weight
+            for name, weight in machine.named_parameters()
+            if name.removeprefix("parametrizations.").split(".")[0] in OBJECT_WEIGHTS
+        }
         self._average = {name: w.detach().clone() for name, w in self._weights.items()}
         self._optimiser = torch.optim.Adam(self._weights.values(), lr=config.learning_rate)
         self._chains: Chains | None = None
@@ -256,7 +245,8 @@ class ObjectFit:
         weight = self.scenes.shows[source] * (1 - parts.listed)
         weight = weight * torch.where(hidden > 0, parts.weight.unsqueeze(1), 1.0)
         loss = ((softplus(log_odds) - hidden * log_odds) * weight).sum()
-        rates = base_rates(machine.a, self.scenes, self.config)
+        served = served_weights(self.scenes, self.config)
+        rates, _ = with_served_rates(machine.a, self.scenes.shows, served)
         logits = machine.f + parts.listed @ rates.T
         loss = loss + self.config.source_loss * cross_entropy(logits, source, reduction="sum")
         asked = (listed_room < 0) & (room >= 0)
@@ -277,16 +267,14 @@ class ObjectFit:
         """
         machine, generator = self.machine, self._generator
         sweep(machine, chains, generator, classes=self.config.classes_per_sweep)
-        h2 = None
-        chain_h2 = None
+        h2 = v.new_zeros(len(v), 0)
         if machine.spec.H2:
             with torch.no_grad():
                 h2 = torch.bernoulli(machine.context(v, room)[1], generator=generator)
-            chain_h2 = chains.h2
         data = self._free_energy(v, h2, room, source)
-        return data - self._free_energy(chains.v, chain_h2, chains.room, chains.source)
+        return data - self._free_energy(chains.v, chains.h2, chains.room, chains.source)
 
-    def _free_energy(self, v: Tensor, h2: Tensor | None, room: Tensor, source: Tensor) -> Tensor:
+    def _free_energy(self, v: Tensor, h2: Tensor, room: Tensor, source: Tensor) -> Tensor:
         """Return the mean free energy given the room types, which the chains do not draw."""
         free = self.machine.free_energy(v, h2, room=room, source=source)
         return (free + self.machine.room_rate(room, source)).mean()
@@ -324,16 +312,17 @@ class ObjectFit:
         """
         for name, weight in self._weights.items():
             weight.copy_(self._average[name])
-        machine = self.machine
-        mix = served_base_rates(machine.a, self.scenes, self.config)
-        machine.a.copy_(base_rates(machine.a, self.scenes, self.config) - mix)
-        machine.b.add_(mix)
-        mix = served_room_rates(machine.y, self.scenes, self.config)
-        machine.y.copy_(room_rates(machine.y, self.scenes, self.config) - mix)
-        machine.e.add_(mix)
-        served = served_weights(self.scenes, self.config).clamp(min=_UNSERVED)
-        mixed = served / served.sum()
-        machine.f.add_((mixed * self.scenes.size / self.scenes.source_sizes).log())
+        machine, scenes = self.machine, self.scenes
+        served = served_weights(scenes, self.config)
+        for rates, bias, shows in (
+            (machine.a, machine.b, scenes.shows),
+            (machine.y, machine.e, scenes.shows_rooms),
+        ):
+            complete, mix = with_served_rates(rates, shows, served)
+            rates.copy_(complete - mix)
+            bias.add_(mix)
+        served = served.clamp(min=_UNSERVED)
+        machine.f.add_((served / served.sum() * scenes.size / scenes.source_sizes).log())
         couplings = machine.couplings
         if couplings is not None:
             machine.L.copy_(couplings)
@@ -359,36 +348,20 @@ class ObjectFit:
             self._chains.v, self._chains.h2 = state["chains"]
 
 
-def served_base_rates(a: Tensor, scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
-    """Return the weighted mean of a[q] over the sources q that show each class, (classes,)."""
-    weights = served_weights(scenes, config).unsqueeze(1) * scenes.shows
-    return (weights * a).sum(0) / weights.sum(0).clamp(min=1e-9)
+def with_served_rates(rates: Tensor, shows: Tensor, served: Tensor) -> tuple[Tensor, Tensor]:
+    """Return rates a or y in which the served mean replaces the rates of what a source lacks.
 
+    The second result is the served mean, (classes,): the weighted mean over the sources that show
+    the class or the room types.
 
-def base_rates(a: Tensor, scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
-    """Return a[q], with the served base rate of the classes that q does not show; same shape."""
-    return torch.where(scenes.shows, a, served_base_rates(a, scenes, config))
-
-
-def served_room_rates(y: Tensor, scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
-    """Return the weighted mean of y[q] over the sources with room rates, (room types,)."""
-    weights = served_weights(scenes, config) * _has_room_rates(scenes)
-    return (weights / weights.sum().clamp(min=1e-9)) @ y
-
-
-def room_rates(y: Tensor, scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
-    """Return y[q], with the served rates for a source without room rates; same shape."""
-    rates = served_room_rates(y, scenes, config)
-    return torch.where(_has_room_rates(scenes).unsqueeze(1), y, rates)
-
-
-def _has_room_rates(scenes: ObjectScenes) -> Tensor:
-    """Return True for each source with scenes of two room types, (sources,) bool.
-
-    A source of bedrooms alone does not tell how common bedrooms are.
+    Args:
+        rates: a[q] or y[q] of each source q, (sources, classes).
+        shows: True where the source tells the rate, (sources, classes or 1) bool.
+        served: weight of each source in the served mix, (sources,).
     """
-    kinds = [scenes.room[scenes.source == q] for q in range(len(scenes.sources))]
-    return torch.tensor([len(room[room >= 0].unique()) > 1 for room in kinds])
+    weights = served.unsqueeze(1) * shows
+    mean = (weights * rates).sum(0) / weights.sum(0).clamp(min=1e-9)
+    return torch.where(shows, rates, mean), mean
 
 
 def served_popularity(scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
@@ -399,9 +372,9 @@ def served_popularity(scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
     count = torch.zeros(scenes.shows.shape)
     count.index_add_(0, scenes.source, scenes.v * scenes.weight.unsqueeze(1))
     share = (count + 0.5) / (scenes.source_sizes.unsqueeze(1) + 1)
-    weights = served_weights(scenes, config).unsqueeze(1) * scenes.shows
-    mean = (weights * share).sum(0) / weights.sum(0).clamp(min=1e-9)
-    rate = torch.where(weights.sum(0) > 0, mean, share.amin())
+    served = served_weights(scenes, config)
+    _, mean = with_served_rates(share, scenes.shows, served)
+    rate = torch.where(served @ scenes.shows.float() > 0, mean, share.amin())
     return torch.where(scenes.v.any(0), rate.logit(), torch.nan)
 
 
@@ -416,15 +389,3 @@ def start_objects(machine: BoltzmannMachine, scenes: ObjectScenes) -> None:
     with torch.no_grad():
         machine.f.copy_((scenes.source_sizes / scenes.size).log())
         machine.b.copy_(scenes.log_odds().clamp(min=_RARE))
-
-
-def fit_objects(fit: ObjectFit, progress: Callable[[float], None] = lambda _: None) -> None:
-    """Run all remaining steps of a fit, and set the weights to their average."""
-    while not fit.finished:
-        fit.step()
-        progress(fit.steps / fit.config.steps)
-    fit.finish()
-
-
-def _is_of_objects(name: str) -> bool:
-    return name.removeprefix("parametrizations.").split(".")[0] in OBJECT_WEIGHTS

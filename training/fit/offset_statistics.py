@@ -55,64 +55,61 @@ def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
         return None
     A = len(CANONICAL)
     relation, scenes_of = np.zeros((A, 6)), np.zeros(A, dtype=np.int32)
-    subject, other = np.zeros((A, V, 6)), np.zeros((A, V, 6))
-    pair = [np.zeros(0, dtype=np.int64)]
-    moments, counts = [np.zeros((0, 6))], [np.zeros(0, dtype=np.int32)]
+    ends = np.zeros((2, A, V, 6))
+    pair, moments, counts = [], [], []
     for a in range(A):
         offsets = observed.rows(observed.relation == a)
         if not len(offsets.offset):
             continue
         pairs = _pool_pairs(offsets)
         fit = _fit(pairs, V)
-        relation[a], subject[a], other[a] = fit.tables()
+        relation[a], ends[:, a] = fit.tables()
         mean, variance = fit.predict(pairs)
         scenes_of[a] = len(np.unique(offsets.scene))
-        pair.append((a * V + pairs.subject) * V + pairs.other)
+        pair.append((a * V + pairs.ends[0]) * V + pairs.ends[1])
         moments.append(np.concatenate([mean, np.sqrt(variance)], axis=1))
         counts.append(pairs.scenes.astype(np.int32))
+    subject, other = half_precision(ends)
     return Offsets(
-        *(half_precision(relation), scenes_of, half_precision(subject), half_precision(other)),
+        *(half_precision(relation), scenes_of, subject, other),
         *(np.concatenate(pair), half_precision(np.concatenate(moments)), np.concatenate(counts)),
     )
 
 
-class Pairs(NamedTuple):
+class _Pairs(NamedTuple):
     """Pairs of classes in one relation, with the moments of their offsets.
 
     Attributes:
-        subject, other: class indices, (pairs,), sorted by subject, then by object.
+        ends: class indices of subject and object, (2, pairs), sorted by subject, then by object.
         scenes: number of scenes with the pair, (pairs,).
         n: total weight of the offsets of the pair, (pairs, 1).
         mean: weighted mean of the offsets, (pairs, 3).
         scatter: weighted sum of squared deviations from the mean, (pairs, 3).
     """
 
-    subject: Ints
-    other: Ints
+    ends: Ints
     scenes: Ints
     n: Floats
     mean: Floats
     scatter: Floats
 
 
-def _pool_pairs(observed: ObservedOffsets) -> Pairs:
+def _pool_pairs(observed: ObservedOffsets) -> _Pairs:
     """Compute the moments of each pair of classes. Its offsets in a scene share the weight 1."""
-    classes = np.stack([observed.subject, observed.other], axis=1)
-    distinct, pair = np.unique(classes, axis=0, return_inverse=True)
-    pair = pair.reshape(-1)
+    classes = np.stack([observed.subject, observed.other])
+    ends, pair = np.unique(classes, axis=1, return_inverse=True)
     # Group the offsets by scene and pair of classes.
-    key = np.stack([pair, observed.scene])
     _, first, group, size = np.unique(
-        key, axis=1, return_index=True, return_inverse=True, return_counts=True
-    )
-    weight = source_weights(observed.source, observed.scene) / size[group.reshape(-1)]
-    P, weights = len(distinct), weight[:, None]
-    n = _sums(pair, weights, P)
-    mean = _sums(pair, weights * observed.offset, P) / n
+        np.stack([pair, observed.scene]),
+        axis=1, return_index=True, return_inverse=True, return_counts=True,
+    )  # fmt: skip
+    P, weight = ends.shape[1], source_weights(observed.source, observed.scene) / size[group]
+    weight = weight[:, None]
+    n = _sums(pair, weight, P)
+    mean = _sums(pair, weight * observed.offset, P) / n
     squares = np.square(observed.offset - mean[pair]) + _RESOLUTION**2
     scenes = np.bincount(pair[first], minlength=P)
-    subject, other = distinct.T
-    return Pairs(subject, other, scenes, n, mean, _sums(pair, weights * squares, P))
+    return _Pairs(ends, scenes, n, mean, _sums(pair, weight * squares, P))
 
 
 def _sums(group: Ints, values: Floats, groups: int) -> Floats:
@@ -138,43 +135,39 @@ class _Fit:
 
     Attributes:
         kappa, alpha, beta, mu: parameters of the prior (see the module), one for each axis, (3,).
-        u, v, doubt_u, doubt_v: effects of the class of the relation's subject (u) and object (v),
-            and their variances in units of s / kappa, (classes, 3).
+        effects, doubts: effects u and v of the classes as subject and as object of the relation,
+            and their variances in units of s / kappa, (2, classes, 3).
     """
 
     kappa: Floats
     alpha: Floats
     beta: Floats
     mu: Floats
-    u: Floats
-    v: Floats
-    doubt_u: Floats
-    doubt_v: Floats
+    effects: Floats
+    doubts: Floats
 
-    def expected(self, pairs: Pairs) -> Floats:
+    def expected(self, pairs: _Pairs) -> Floats:
         """Return the prior mean of the offset of each pair, (pairs, 3)."""
-        return self.mu + self.u[pairs.subject] + self.v[pairs.other]
+        u, v = self.effects
+        return self.mu + u[pairs.ends[0]] + v[pairs.ends[1]]
 
-    def predict(self, pairs: Pairs) -> tuple[Floats, Floats]:
+    def predict(self, pairs: _Pairs) -> tuple[Floats, Floats]:
         """Return mean and variance of a new offset of each pair, both (pairs, 3)."""
-        kappa = self.kappa / (1 + self.doubt_u[pairs.subject] + self.doubt_v[pairs.other])
+        of_u, of_v = self.doubts
+        kappa = self.kappa / (1 + of_u[pairs.ends[0]] + of_v[pairs.ends[1]])
         prior = self.expected(pairs), kappa, self.alpha, self.beta
         return posterior(prior, pairs.n, pairs.mean, pairs.scatter)
 
-    def tables(self) -> tuple[Floats, Floats, Floats]:
+    def tables(self) -> tuple[Floats, Floats]:
         """Return tables whose sum gives mean and variance of a pair without data, as `predict`.
 
         The first table, (6,), contains three means and three variances for unknown classes. The
-        others, (classes, 6), contain the contributions of the subject and of the object class.
+        other, (2, classes, 6), contains the contributions of the subject and of the object class.
         """
-        spread = self.beta / (self.alpha - 1)
-        unknown = 1 / LAMBDA
+        spread, unknown = self.beta / (self.alpha - 1), 1 / LAMBDA
         relation = np.concatenate([self.mu, spread * (1 + (1 + 2 * unknown) / self.kappa)])
-        subject, other = (
-            np.concatenate([effect, spread * (doubt - unknown) / self.kappa], axis=1)
-            for effect, doubt in ((self.u, self.doubt_u), (self.v, self.doubt_v))
-        )
-        return relation, subject, other
+        variances = spread * (self.doubts - unknown) / self.kappa
+        return relation, np.concatenate([self.effects, variances], axis=2)
 
 
 Prior = tuple[Any, Any, Any, Any]
@@ -211,12 +204,11 @@ def _updated(prior: Prior, n: Floats, mean: Floats, scatter: Floats) -> tuple[An
     return after, alpha + n / 2, rate
 
 
-def _fit(pairs: Pairs, V: int) -> _Fit:
+def _fit(pairs: _Pairs, V: int) -> _Fit:
     """Fit the parameters of one relation, by alternation between the prior and class effects."""
-    no_effect = np.zeros((V, 3))
     start = (pairs.n * pairs.mean).sum(axis=0) / pairs.n.sum()
     prior = np.ones(3), np.full(3, 2.0), np.full(3, 0.1)
-    fit = _Fit(*prior, start, *[no_effect] * 4)
+    fit = _Fit(*prior, start, *np.zeros((2, 2, V, 3)))
     for _ in range(_ROUNDS):
         expected = fit.expected(pairs)
         priors = [_fit_prior(pairs, axis, expected[:, axis]) for axis in range(3)]
@@ -225,7 +217,7 @@ def _fit(pairs: Pairs, V: int) -> _Fit:
     return fit
 
 
-def _fit_prior(pairs: Pairs, axis: int, expected: Floats) -> Floats:
+def _fit_prior(pairs: _Pairs, axis: int, expected: Floats) -> Floats:
     """Return kappa, alpha and beta of one axis, fitted by maximum likelihood."""
 
     def loss(logs: Floats) -> float:
@@ -236,20 +228,19 @@ def _fit_prior(pairs: Pairs, axis: int, expected: Floats) -> Floats:
     return np.exp(minimize(loss, np.log([1.0, 2.0, 0.1]), bounds=bounds).x)
 
 
-def _fit_effects(fit: _Fit, pairs: Pairs, V: int) -> None:
+def _fit_effects(fit: _Fit, pairs: _Pairs, V: int) -> None:
     """Fit mu and the effects u and v, shrunk towards 0, by alternation, in place."""
     # Precision of the mean offset of each pair as a measurement of u and v, in units of kappa / s.
     weight = pairs.n / (pairs.n + fit.kappa)
-
-    below_u = _sums(pairs.subject, weight, V) + LAMBDA
-    below_v = _sums(pairs.other, weight, V) + LAMBDA
+    below = np.stack([_sums(end, weight, V) for end in pairs.ends]) + LAMBDA
     for _ in range(_SWEEPS):
-        residual = pairs.mean - fit.u[pairs.subject] - fit.v[pairs.other]
+        u, v = fit.effects
+        residual = pairs.mean - u[pairs.ends[0]] - v[pairs.ends[1]]
         fit.mu = (weight * residual).sum(axis=0) / weight.sum(axis=0)
-        residual = pairs.mean - fit.mu
-        fit.u = _sums(pairs.subject, weight * (residual - fit.v[pairs.other]), V) / below_u
-        fit.v = _sums(pairs.other, weight * (residual - fit.u[pairs.subject]), V) / below_v
-    fit.doubt_u, fit.doubt_v = 1 / below_u, 1 / below_v
+        for own, other in ((0, 1), (1, 0)):
+            residual = pairs.mean - fit.mu - fit.effects[other][pairs.ends[other]]
+            fit.effects[own] = _sums(pairs.ends[own], weight * residual, V) / below[own]
+    fit.doubts = 1 / below
 
 
 def half_precision(table: Floats) -> NDArray[np.float32]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -24,21 +23,20 @@ def fit_places(
     Relations of structure, and relations between objects of one class, do not count.
     """
     V, is_thing = len(vocabulary), ~vocabulary.structure
-    held: Counter[int] = Counter()
-    listed = np.ones(V)
+    blocks, listed = [np.zeros(0, np.int64)], np.ones(V)
     for scene in scenes:
         evidence = scene.evidence
         listed[evidence.classes] += 1
         relation, subject, anchor = np.nonzero(evidence.holds)
         i, j = evidence.classes[subject], evidence.classes[anchor]
         counted = is_thing[i] & is_thing[j] & (i != j)
-        held.update(((relation * V + i) * V + j)[counted].tolist())
-    if not held:
+        blocks.append(((relation * V + i) * V + j)[counted])
+    keys, held = np.unique(np.concatenate(blocks), return_counts=True)
+    if not len(keys):
         return None
-    keys = np.array(sorted(held), np.int32)
     return Places(
-        triple=keys,
-        held=np.array([held[key] for key in keys.tolist()], np.float32),
+        triple=keys.astype(np.int32),
+        held=held.astype(np.float32),
         frequency=(listed / listed.sum()).astype(np.float32),
         role_pair=roles.pair.astype(np.int32),
         role_counts=roles.counts,

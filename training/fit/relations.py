@@ -43,8 +43,7 @@ from torch.nn.utils.parametrize import cached
 
 from training.datasets.batches import Batch, SceneTensors, relation_units, subset
 from training.fit.configuration import RelationsConfig
-from training.fit.parts import means_of_parts
-from training.fit.residuals import lower_unseen_roles, with_counted_residuals
+from training.fit.residuals import lower_unseen_roles, means_of_parts, with_counted_residuals
 from training.fit.sharing import bake_shared_weights
 from training.machines import BoltzmannMachine
 from training.machines.machine import OBJECT_WEIGHTS
@@ -55,54 +54,63 @@ _WITHOUT_PRIOR = frozenset({*OBJECT_WEIGHTS, "gamma", "B", "usual", "d"})
 _MAP_PRIOR = 0.1
 # Random change of the log of the number of classes by which scenes are sorted into batches.
 _MIXING = 0.5
-SHARED_ROWS, SHARED_COLUMNS = ("S", "O"), ("s", "o")
+# Weights that classes share; see `training.fit.sharing`.
+SHARED = ("S", "O", "s", "o")
 
 
-class RelationLikelihood(nn.Module):
-    """The negative conditional log-likelihood of annotated relations, plus priors.
+class RelationFit:
+    """The fit of the relation weights of a machine: epochs over the scenes with annotations.
 
     Attributes:
+        epochs: number of finished epochs.
         offsets: corrections of the logits for each data source, (sources, relations).
     """
 
-    def __init__(self, config: RelationsConfig, machine: BoltzmannMachine, train: SceneTensors):
-        super().__init__()
+    def __init__(
+        self, machine: BoltzmannMachine, train: SceneTensors, config: RelationsConfig, seed: int
+    ) -> None:
         self.config, self.machine = config, machine
-        self.scenes = sum(bool(scene.evidence.observed.any()) for scene in train.scenes)
+        annotated = [k for k, scene in enumerate(train.scenes) if scene.evidence.observed.any()]
+        self.train = subset(train, torch.tensor(annotated, dtype=torch.int64))
+        sizes = [len(scene.evidence.classes) for scene in self.train.scenes]
+        self._log_sizes = torch.tensor(sizes, dtype=torch.float32).clamp(min=1).log()
+        self.epochs = self._updates = 0
+        self._generator = torch.Generator().manual_seed(seed)
         self.offsets = nn.Parameter(torch.zeros(len(train.source_names), machine.spec.A))
-        weights = [config.source_weights.get(name, 1.0) for name in train.source_names]
-        self.source_weights = torch.tensor(weights)
+        self._source_weights = torch.tensor(
+            [config.source_weights.get(name, 1.0) for name in train.source_names]
+        )
+        named = machine.named_parameters()
+        self._weights = {name: weight for name, weight in named if weight.requires_grad}
+        self._weights["offsets"] = self.offsets
+        self._average = {name: w.detach().clone() for name, w in self._weights.items()}
+        self._optimiser = torch.optim.Adam(
+            self._weights.values(), lr=config.learning_rate, fused=True
+        )
 
-    def weights(self) -> dict[str, nn.Parameter]:
-        """Return the trained parameters by name: those of relations, and the offsets."""
-        named = self.machine.named_parameters()
-        return {name: p for name, p in named if p.requires_grad} | {"offsets": self.offsets}
-
-    def forward(self, batch: Batch, generator: torch.Generator) -> Tensor:
+    def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         """Return the negative log-likelihood plus the negative log prior, divided by scenes.
 
         The likelihood is divided by the scenes of the batch, and the prior by all training scenes.
         """
-        with cached():
-            return self._loss(batch, generator)
-
-    def _loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         machine = self.machine
-        batch = withhold_counts(batch, self.config.count_dropout, generator)
+        if self.config.count_dropout:
+            hidden = torch.rand(len(batch), 1, generator=generator) < self.config.count_dropout
+            batch = replace(batch, counts=batch.counts.masked_fill(hidden, 0))
         edges, r, observed = relation_units(machine, batch)
         h1 = means_of_parts(machine, batch, generator)
         offsets = self.offsets[batch.source]
-        weight = self.source_weights[batch.source].unsqueeze(1)
         logits = machine.relation_logits(edges, batch.v, h1)
         logits = logits + offsets.gather(1, edges.relation.expand(len(batch), -1))
+        weight = self._source_weights[batch.source].unsqueeze(1)
         weight = observed * machine.gate(edges, batch.v) * weight
-        nll = bernoulli_nll(logits, r, weight).sum()
+        nll = _nll(logits, r, weight)
         if machine.spec.G:
             share = torch.rand(len(r), 1, generator=generator)
             condition = r * observed * (torch.rand(r.shape, generator=generator) < share)
             shifted = logits + machine.implied(edges, condition, h1)
-            nll = nll + bernoulli_nll(shifted, r, weight * (1 - condition)).sum()
-        return nll / len(batch) + self._prior() / max(self.scenes, 1)
+            nll = nll + _nll(shifted, r, weight * (1 - condition))
+        return nll / len(batch) + self._prior() / max(len(self.train), 1)
 
     def _prior(self) -> Tensor:
         """Return the negative log prior of weights and offsets, up to a constant."""
@@ -115,66 +123,15 @@ class RelationLikelihood(nn.Module):
             total = total + share * half * (parameter**2).sum()
         return total
 
-
-def bernoulli_nll(logits: Tensor, r: Tensor, weight: Tensor) -> Tensor:
-    """Return the weighted loss -weight log p(r) of each relation unit, shaped like `logits`."""
-    return (softplus(logits) - r * logits) * weight
-
-
-def withhold_counts(batch: Batch, share: float, generator: torch.Generator) -> Batch:
-    """Return the batch with unknown instance counts (0) in a random share of its scenes."""
-    if not share:
-        return batch
-    withheld = torch.rand(len(batch), 1, generator=generator) < share
-    return replace(batch, counts=batch.counts.masked_fill(withheld, 0))
-
-
-def with_annotations(scenes: SceneTensors) -> SceneTensors:
-    """Return the scenes with an annotated relation."""
-    annotated = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.observed.any()]
-    return subset(scenes, torch.tensor(annotated, dtype=torch.int64))
-
-
-class RelationFit:
-    """The fit of the relation weights of a machine: epochs over the scenes with annotations.
-
-    Attributes:
-        epochs: number of finished epochs.
-        done: finished share of the fit, from 0 to 1.
-    """
-
-    def __init__(
-        self, machine: BoltzmannMachine, train: SceneTensors, config: RelationsConfig, seed: int
-    ) -> None:
-        self.config, self.machine = config, machine
-        self.train = with_annotations(train)
-        sizes = [len(scene.evidence.classes) for scene in self.train.scenes]
-        self._log_sizes = torch.tensor(sizes, dtype=torch.float32).clamp(min=1).log()
-        self.epochs = 0
-        self._generator = torch.Generator().manual_seed(seed)
-        self.likelihood = RelationLikelihood(config, machine, train)
-        self._weights = self.likelihood.weights()
-        self._average = {name: w.detach().clone() for name, w in self._weights.items()}
-        self._updates = 0
-        self._optimiser = torch.optim.Adam(
-            self._weights.values(), lr=self.config.learning_rate, fused=True
-        )
-
     @property
     def finished(self) -> bool:
         """True after the last epoch, and if no scene has an annotated relation."""
         return self.epochs >= self.config.epochs or not len(self.train)
 
-    @property
-    def done(self) -> float:
-        """Finished share of the fit, from 0 to 1."""
-        return self.epochs / self.config.epochs
-
     def epoch(self, progress: Callable[[float, float], None]) -> float:
         """Run one epoch, and return its mean loss.
 
-        Args:
-            progress: function that is called with the finished share of the fit and the mean loss.
+        It calls `progress` with the finished share of the fit and the mean loss.
 
         Raises:
             FloatingPointError: the loss is infinite or NaN.
@@ -205,7 +162,8 @@ class RelationFit:
         return [batches[k] for k in turn]
 
     def _update(self, index: Tensor, total: int) -> float:
-        loss = self.likelihood(self.train.batch(index), self._generator)
+        with cached():
+            loss = self.loss(self.train.batch(index), self._generator)
         for group in self._optimiser.param_groups:
             group["lr"] = self.config.learning_rate * self._schedule(total)
         self._optimiser.zero_grad()
@@ -244,17 +202,15 @@ class RelationFit:
     def finish(self, parents: Tensor) -> BoltzmannMachine:
         """Return the machine for storage, with averaged weights and counted residuals.
 
-        Args:
-            parents: (classes,) index of the parent of each class, -1 without a parent.
+        `parents` are the indices of the parents of the classes, (classes,); -1 without a parent.
         """
         self._set(self._average)
         machine = self.machine
-        bake_shared_weights(machine, (*SHARED_ROWS, *SHARED_COLUMNS))
-        if machine.has_residuals and len(self.train) and machine.residual.requires_grad:
-            likelihood = self.likelihood
-            offsets = likelihood.offsets.detach()
+        bake_shared_weights(machine, SHARED)
+        if len(self.train) and "residual" in self._weights:
             lower_unseen_roles(machine, self.train, parents)
-            return with_counted_residuals(machine, self.train, offsets, likelihood.source_weights)
+            offsets = self.offsets.detach()
+            return with_counted_residuals(machine, self.train, offsets, self._source_weights)
         return machine
 
     def state(self) -> dict[str, Any]:
@@ -262,7 +218,7 @@ class RelationFit:
         return {
             "epochs": self.epochs,
             "updates": self._updates,
-            "offsets": self.likelihood.offsets.detach(),
+            "offsets": self.offsets.detach(),
             "average": self._average,
             "optimiser": self._optimiser.state_dict(),
             "generator": self._generator.get_state(),
@@ -272,7 +228,12 @@ class RelationFit:
         """Continue from the state of a checkpoint."""
         self.epochs, self._updates = state["epochs"], state["updates"]
         with torch.no_grad():
-            self.likelihood.offsets.copy_(state["offsets"])
+            self.offsets.copy_(state["offsets"])
         self._average = state["average"]
         self._optimiser.load_state_dict(state["optimiser"])
         self._generator.set_state(state["generator"])
+
+
+def _nll(logits: Tensor, r: Tensor, weight: Tensor) -> Tensor:
+    """Return the sum of -weight log p(r) over all relation units."""
+    return ((softplus(logits) - r * logits) * weight).sum()

@@ -32,11 +32,7 @@ class Sharing(nn.Module):
 
     def __init__(self, words: Tensor, parents: Tensor, width: int, *, columns: bool) -> None:
         super().__init__()
-        self.register_buffer("words", words, persistent=False)
-        self.register_buffer("parents", parents, persistent=False)
-        self.words: Tensor
-        self.parents: Tensor
-        self.columns = columns
+        self.words, self.parents, self.columns = words, parents, columns
         self.map = nn.Parameter(torch.zeros(words.shape[1], width))
 
     def forward(self, deviation: Tensor) -> Tensor:
@@ -47,25 +43,19 @@ class Sharing(nn.Module):
 
 
 def share_weights(
-    machine: BoltzmannMachine,
-    words: Tensor,
-    parents: Tensor,
-    rows: Iterable[str],
-    columns: Iterable[str] = (),
+    machine: BoltzmannMachine, words: Tensor, parents: Tensor, names: Iterable[str]
 ) -> None:
     """Let classes share the weights of the given names. Weights that a machine lacks are skipped.
 
-    Args:
-        words, parents: see `Sharing`.
-        rows, columns: names of weights with the classes in the first or in the second dimension.
+    `Sharing` describes words and parents.
     """
     parameters = dict(machine.named_parameters())
-    for names, has_columns in ((rows, False), (columns, True)):
-        for name in names:
-            if name in parameters:
-                width = parameters[name].shape[0 if has_columns else 1]
-                sharing = Sharing(words, parents, width, columns=has_columns)
-                register_parametrization(machine, name, sharing)
+    for name in names:
+        if name in parameters:
+            columns = name in ("s", "o")
+            width = parameters[name].shape[0 if columns else 1]
+            sharing = Sharing(words, parents, width, columns=columns)
+            register_parametrization(machine, name, sharing)
 
 
 def bake_shared_weights(machine: BoltzmannMachine, names: Iterable[str]) -> None:

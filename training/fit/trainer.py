@@ -6,6 +6,7 @@ and one thread give bit-identical weights, even if a run is interrupted and resu
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
@@ -17,7 +18,10 @@ import torch
 from torch import Tensor
 
 from app.inference.variants import VARIANTS
-from training.datasets.batches import SceneTensors, TrainingData, seen_triples
+from training.datasets.batches import TrainingData, seen_triples, subset
+from training.evaluation.artifact_model import relation_score as artifact_relation_score
+from training.evaluation.parts import validation_score
+from training.evaluation.relation_tasks import rank_relations
 from training.fit.checkpoint import (
     CurvePoint,
     TrainingResult,
@@ -27,16 +31,17 @@ from training.fit.checkpoint import (
     write_plot,
 )
 from training.fit.configuration import Config
+from training.fit.draft import draft_artifact
 from training.fit.objects import ObjectFit, ObjectScenes, start_objects
-from training.fit.relations import SHARED_COLUMNS, SHARED_ROWS, RelationFit
+from training.fit.relations import SHARED, RelationFit
 from training.fit.samples import fit_scene_rates, store_samples
 from training.fit.sharing import bake_shared_weights, share_weights
-from training.fit.validation import object_score, relation_score
 from training.machines import BoltzmannMachine, MachineSpec, build
 from training.machines.edges import find_triples, triple_keys
 from training.machines.machine import OBJECT_WEIGHTS
 
 _STEPS = 100  # steps of the first phase between two checkpoints
+_SCORED = 200  # minimum number of scenes with relations of a validation score
 
 Progress = Callable[[str, float, float], None]
 """Function that is called with the phase, its finished share, and its mean loss."""
@@ -58,23 +63,21 @@ def new_machine(config: Config, data: TrainingData, scenes: ObjectScenes) -> Bol
     generator = torch.Generator().manual_seed(config.training.seed)
     machine = build(spec).set_triples(triples).initialise(generator, shape.initial_scale)
     start_objects(machine, scenes)
-    _start_relations(machine, data.train)
+    _start_relations(machine, data)
     with torch.no_grad():
         for name in shape.without:
             machine.get_parameter(name).zero_().requires_grad_(False)
     return machine
 
 
-def _start_relations(machine: BoltzmannMachine, scenes: SceneTensors) -> None:
+def _start_relations(machine: BoltzmannMachine, data: TrainingData) -> None:
     """Set the relation biases to the log-odds of relations in scenes with annotated relations."""
     A, V, T = machine.spec.A, machine.spec.V, machine.spec.T
     holding, observed, per_unit = torch.zeros(A), torch.zeros(A), torch.zeros(T)
-    logs, times, annotated = torch.zeros(V), torch.zeros(V), 0
-    for scene in scenes.scenes:
-        evidence = scene.evidence
-        if not evidence.observed.any():
-            continue
-        annotated += 1
+    logs, times = torch.zeros(V), torch.zeros(V)
+    every = [scene.evidence for scene in data.train.scenes]
+    annotated = [evidence for evidence in every if evidence.observed.any()]
+    for evidence in annotated:
         holding += torch.from_numpy(evidence.holds.sum((1, 2)))
         observed += torch.from_numpy(evidence.observed.sum((1, 2)))
         classes = torch.from_numpy(evidence.classes)
@@ -84,16 +87,12 @@ def _start_relations(machine: BoltzmannMachine, scenes: SceneTensors) -> None:
         per_unit[index[exists]] += 1
         logs[classes] += torch.from_numpy(evidence.counts).log()
         times[classes] += 1
-    machine.start_relations(
-        _log_odds(holding, observed),
-        _log_odds(per_unit, torch.full_like(per_unit, annotated)),
-        logs / times.clamp(min=1),
-    )
 
+    def log_odds(count: Tensor, total: Tensor | int) -> Tensor:
+        return ((count + 0.5) / (total - count + 0.5)).log()
 
-def _log_odds(count: Tensor, total: Tensor) -> Tensor:
-    """Return the log-odds of `count` events in `total` trials, with 1/2 added to both counts."""
-    return ((count + 0.5) / (total - count + 0.5)).log()
+    usual = logs / times.clamp(min=1)
+    machine.start_relations(log_odds(holding, observed), log_odds(per_unit, len(annotated)), usual)
 
 
 class Trainer:
@@ -110,21 +109,13 @@ class Trainer:
         torch.set_num_threads(config.training.threads)
         self.scenes = ObjectScenes.of(data.train, data.structure, config.objects)
         self.machine = new_machine(config, data, self.scenes)
-        self._share()
+        words = torch.zeros(self.machine.spec.V, 0) if data.words is None else data.words
+        for section, names in ((config.objects, ("W",)), (config.relations, SHARED)):
+            share_weights(self.machine, words * section.word_weight, data.parents, names)
         self.objects = ObjectFit(self.machine, self.scenes, config.objects, config.training.seed)
         self.curve: list[CurvePoint] = []
         self.seconds = 0.0
         self._relations: RelationFit | None = None
-
-    def _share(self) -> None:
-        """Let classes share weights with their parents and with similar words."""
-        data, V = self.data, self.machine.spec.V
-        words = torch.zeros(V, 0) if data.words is None else data.words
-        parents = data.parents
-        objects, relations = self.config.objects, self.config.relations
-        share_weights(self.machine, words * objects.word_weight, parents, ["W"])
-        words = words * relations.word_weight
-        share_weights(self.machine, words, parents, SHARED_ROWS, SHARED_COLUMNS)
 
     def resume(self) -> bool:
         """Load the checkpoint in the folder of the run. Return False if there is no checkpoint.
@@ -144,9 +135,9 @@ class Trainer:
             self.objects.load_state(state["objects"])
         else:
             self.objects.steps = self.config.objects.steps
-            self._begin_relations()
+            relations = self._begin_relations()
             self.machine.load_state_dict(state["machine"])
-            self._relation_fit.load_state(state["relations"])
+            relations.load_state(state["relations"])
         return True
 
     @property
@@ -171,10 +162,10 @@ class Trainer:
             self.curve.append(point)
             self.seconds += point.seconds
             passed(point)
-        began = time.perf_counter()
-        machine = self._relation_fit.finish(self.data.parents)
-        fit_scene_rates(machine, self.scenes, self.config.objects, self.config.training.seed)
-        store_samples(machine, self.scenes, self.config.training.seed)
+        began, seed = time.perf_counter(), self.config.training.seed
+        machine = (self._relations or self._begin_relations()).finish(self.data.parents)
+        fit_scene_rates(machine, self.scenes, self.config.objects, seed)
+        store_samples(machine, self.scenes, seed)
         self.seconds += time.perf_counter() - began
         if self.folder is not None:
             write_plot(self.folder / "curve.png", self.curve, self.config.name)
@@ -184,10 +175,9 @@ class Trainer:
         """Run the rest of both phases. Yield a point of the curve at each checkpoint."""
         while not self.objects.finished:
             yield self._train_objects(progress)
-        if self._relations is None:
-            self._begin_relations()
-        while not self._relation_fit.finished:
-            yield self._train_relations(progress)
+        fit = self._relations or self._begin_relations()
+        while not fit.finished:
+            yield self._train_relations(fit, progress)
 
     def _train_objects(self, progress: Progress) -> CurvePoint:
         """Run the next steps of the first phase."""
@@ -205,30 +195,31 @@ class Trainer:
         seconds = time.perf_counter() - began
         return CurvePoint("objects", fit.steps / total, float(np.mean(losses)), score, seconds)
 
-    def _train_relations(self, progress: Progress) -> CurvePoint:
+    def _train_relations(self, fit: RelationFit, progress: Progress) -> CurvePoint:
         """Run the next epoch of the second phase."""
-        fit, began = self._relation_fit, time.perf_counter()
+        began = time.perf_counter()
         loss = fit.epoch(partial(progress, "relations"))
         with fit.averaged():
             score = relation_score(self.machine, self.data)
-        return CurvePoint("relations", fit.done, loss, score, time.perf_counter() - began)
+        done, seconds = fit.epochs / fit.config.epochs, time.perf_counter() - began
+        return CurvePoint("relations", done, loss, score, seconds)
 
-    def _begin_relations(self) -> None:
-        """Fix the object weights, and start the second phase."""
-        with torch.no_grad():
-            bake_shared_weights(self.machine, ["W"])
-            silence(self.machine, self.data.structure)
-        for name in OBJECT_WEIGHTS:
-            if name in dict(self.machine.named_parameters()):
-                self.machine.get_parameter(name).requires_grad_(False)
-        config = self.config
-        seed = config.training.seed
-        self._relations = RelationFit(self.machine, self.data.train, config.relations, seed)
+    @torch.no_grad()
+    def _begin_relations(self) -> RelationFit:
+        """Fix the object weights, and start the second phase.
 
-    @property
-    def _relation_fit(self) -> RelationFit:
-        if self._relations is None:
-            raise RuntimeError("the second phase has not begun")
+        Weights of structure classes become 0, so that listing these classes changes nothing.
+        """
+        machine, structure = self.machine, self.data.structure
+        bake_shared_weights(machine, ["W"])
+        machine.W[structure] = 0
+        if machine.spec.coupled:
+            machine.L[structure] = machine.L[:, structure] = machine.Y[:, structure] = 0
+        for name, weight in machine.named_parameters():
+            if name in OBJECT_WEIGHTS:
+                weight.requires_grad_(False)
+        config, seed = self.config.relations, self.config.training.seed
+        self._relations = RelationFit(machine, self.data.train, config, seed)
         return self._relations
 
     @property
@@ -240,25 +231,35 @@ class Trainer:
         if self.folder is None:
             return
         relations = self._relations
-        save_checkpoint(
-            self.folder / "checkpoint.pt",
-            {
-                "digest": self._digest,
-                "machine": self.machine.state_dict(),
-                "objects": None if relations else self.objects.state(),
-                "relations": relations.state() if relations else None,
-                "curve": [asdict(point) for point in curve],
-                "seconds": seconds,
-            },
-        )
+        state = {
+            "digest": self._digest,
+            "machine": self.machine.state_dict(),
+            "objects": None if relations else self.objects.state(),
+            "relations": relations.state() if relations else None,
+            "curve": [asdict(point) for point in curve],
+            "seconds": seconds,
+        }
+        save_checkpoint(self.folder / "checkpoint.pt", state)
         write_csv(self.folder / "curve.csv", curve)
 
 
-def silence(machine: BoltzmannMachine, structure: Tensor) -> None:
-    """Set the object weights of structure classes to 0, so that listing them changes nothing."""
-    for name in ("W", "L"):
-        if name in dict(machine.named_parameters()):
-            machine.get_parameter(name)[structure] = 0
-    if machine.spec.coupled:
-        machine.L[:, structure] = 0
-        machine.Y[:, structure] = 0
+@torch.no_grad()
+def object_score(machine: BoltzmannMachine, data: TrainingData) -> float:
+    """Return the MRR of hidden classes in random parts of real scenes; NaN without such scenes."""
+
+    def log_odds(listed: Tensor, share: Tensor) -> Tensor:
+        return machine.object_log_odds(listed * ~data.structure, share=share)
+
+    return validation_score(log_odds, data.validation, data.structure)
+
+
+@torch.no_grad()
+def relation_score(machine: BoltzmannMachine, data: TrainingData) -> float:
+    """Return the R-precision of relations given the objects; NaN without annotated scenes."""
+    annotated = [k for k, s in enumerate(data.validation.scenes) if s.evidence.holds.any()]
+    if not annotated:
+        return math.nan
+    chosen = annotated[:: max(1, len(annotated) // _SCORED)]
+    score = artifact_relation_score(draft_artifact(machine, data.classes), given=False)
+    ranking = rank_relations(subset(data.validation, torch.tensor(chosen)), data.structure, score)
+    return float(ranking.hits.sum() / max(ranking.annotated.sum(), 1))

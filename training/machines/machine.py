@@ -51,8 +51,9 @@ class BoltzmannMachine(nn.Module, ABC):
     Source: Bozcan, Oymak, Alemdar, Kalkan, "What is (missing or wrong) in the scene?", ICRA 2018.
     """
 
-    # True if single triples have residual weights besides the shared weights.
-    has_residuals = False
+    triples: Tensor
+    fantasies: Tensor
+    fantasy_rooms: Tensor
 
     def __init__(self, spec: MachineSpec) -> None:
         super().__init__()
@@ -73,19 +74,16 @@ class BoltzmannMachine(nn.Module, ABC):
             self.L = nn.Parameter(torch.zeros(spec.V, spec.V))
             self.Y = nn.Parameter(torch.zeros(spec.C, spec.V))
         self.register_buffer("triples", torch.zeros(spec.T, 3, dtype=torch.int32))
-        self.triples: Tensor
         if spec.N:
             # Stored chain samples as bits, (samples, words of 32 classes), and their room types. A
             # room type of -1 is unknown.
             empty = torch.zeros(spec.N, -(-spec.V // 32), dtype=torch.int32)
             self.register_buffer("fantasies", empty)
             self.register_buffer("fantasy_rooms", torch.full((spec.N,), -1, dtype=torch.int32))
-        self.fantasies: Tensor
-        self.fantasy_rooms: Tensor
+        self.triple_keys = torch.zeros(spec.T, dtype=torch.int64)
         self.register_load_state_dict_post_hook(  # type: ignore[no-untyped-call]
             lambda module, _: module.index_triples()
         )
-        self.triple_keys = torch.zeros(spec.T, dtype=torch.int64)
 
     def index_triples(self) -> None:
         """Check the table of triples and build its search keys."""
@@ -158,9 +156,7 @@ class BoltzmannMachine(nn.Module, ABC):
 
         The room type t of a scene is its entry of `room`, (scenes,) int64. -1 means unknown.
         """
-        if room is None or not self.spec.C:
-            return self.c1.unsqueeze(0)
-        return self.c1 + self.Q[room.clamp(min=0)] * (room >= 0).unsqueeze(-1)
+        return self.c1 + _rows(self.Q, room)
 
     def second_layer_logits(self, h1: Tensor) -> Tensor:
         """Return the logits c2 + h1'J of p(h2 = 1 | h1), (..., scenes, units of h2)."""
@@ -200,8 +196,7 @@ class BoltzmannMachine(nn.Module, ABC):
         """
         if source is None or not self.spec.profiles:
             return (self.b + self.u[-1]).unsqueeze(0)
-        change = self.a[source.clamp(min=0)] * (source >= 0).unsqueeze(-1)
-        return self.b + change + self.u[source]
+        return self.b + _rows(self.a, source) + self.u[source]
 
     def source_weights(self, v: Tensor, source: Tensor | None) -> Tensor:
         """Return p(q | v, source) of each data source q, (scenes, sources).
@@ -240,9 +235,7 @@ class BoltzmannMachine(nn.Module, ABC):
 
     def room_bias(self, room: Tensor | None) -> Tensor:
         """Return the couplings Y[t] of the room type t to the classes, (scenes or 1, classes)."""
-        if room is None or not self.spec.C or not self.spec.coupled:
-            return torch.zeros(1, self.spec.V)
-        return self.Y[room.clamp(min=0)] * (room >= 0).unsqueeze(-1)
+        return _rows(self.Y, room) if self.spec.coupled else torch.zeros(1, self.spec.V)
 
     def room_rate(self, room: Tensor | None, source: Tensor | None) -> Tensor:
         """Return the bias e_t + y_qt of the room type of each scene, (scenes or 1,)."""
@@ -305,10 +298,9 @@ class BoltzmannMachine(nn.Module, ABC):
     def start_relations(self, by_relation: Tensor, by_unit: Tensor, usual: Tensor) -> None:
         """Set relation biases to log-odds of the training data.
 
-        Args:
-            by_relation: log-odds that an observed relation holds, (relations,).
-            by_unit: log-odds that a triple holds in a scene with annotated relations, (triples,).
-            usual: mean log number of instances of each class, (classes,).
+        They are the log-odds that an observed relation holds, (relations,), and that a triple holds
+        in a scene with annotated relations, (triples,). `usual` is the mean log number of instances
+        of each class, (classes,).
         """
 
     @abstractmethod
@@ -326,12 +318,8 @@ class BoltzmannMachine(nn.Module, ABC):
         """Return the relations between classes in the layout of this machine: edges, r, observed.
 
         In an RBM or GBM, the units of absent classes are 0. They count as observed if the scene has
-        any annotated relation.
-
-        Args:
-            classes, counts: class indices and numbers of instances, (scenes, n), as in `edges`.
-            holds, observed: value of each relation between the classes, and True where it is
-                observed, (scenes, relations, n, n).
+        any annotated relation. `edges` describes classes and counts. `holds` are the values of the
+        relations, and `observed` is True where they are observed, (scenes, relations, n, n).
         """
 
     @abstractmethod
@@ -349,11 +337,8 @@ class BoltzmannMachine(nn.Module, ABC):
     def implied(self, edges: Edges, observed: Tensor, h1: Tensor) -> Tensor:
         """Return the change of each relation logit due to observed relations, (scenes, units).
 
-        The change is zero in a machine without implication weights (`training.machines.triway`).
-
-        Args:
-            observed: observed relations, (scenes, units). 1 means that the relation holds.
-            h1: means of the hidden units given the objects, (scenes, H1).
+        `observed` is 1 for relations that are observed to hold, (scenes, units), and h1 are means
+        given the objects, (scenes, H1). Without implication weights, the change is zero.
         """
         del edges, h1
         return torch.zeros_like(observed)
@@ -392,3 +377,10 @@ class BoltzmannMachine(nn.Module, ABC):
 def sums(v: Tensor, weights: Tensor) -> Tensor:
     """Return v @ weights for presence v, (scenes, classes). Most classes of a scene are absent."""
     return torch.sparse.mm(v.to_sparse(), weights)
+
+
+def _rows(table: Tensor, index: Tensor | None) -> Tensor:
+    """Return the rows of a table at the indices, (scenes or 1, columns); 0 for -1 and None."""
+    if index is None or not len(table):
+        return table.new_zeros(1, table.shape[1])
+    return table[index.clamp(min=0)] * (index >= 0).unsqueeze(-1)

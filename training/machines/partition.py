@@ -44,11 +44,10 @@ class LogPartition:
 
     @classmethod
     def of_weights(cls, base: float, log_weight: Tensor, *, reverse: bool = False) -> LogPartition:
-        """Return the estimate from the log weights of forward or reverse runs.
+        """Return the estimate from the accumulated log weight of each run, (chains,).
 
         Args:
             base: exact log Z at beta = 0.
-            log_weight: accumulated log weight of each run, (chains,).
             reverse: True if the runs end at beta = 0, False if they start there.
         """
         sign, count = (-1 if reverse else 1), len(log_weight)
@@ -71,24 +70,19 @@ def ais(
     betas: Sequence[float],
     chains: int,
     generator: torch.Generator,
-    base: Tensor | None = None,
+    base: Tensor,
 ) -> LogPartition:
-    """Run forward AIS through `betas`, which increase from 0 to 1.
+    """Run forward AIS from objects with the log-odds `base`, (classes,).
 
-    Args:
-        base: log-odds of the independent objects, (classes,). The default are the biases of the
-            machine.
+    The `betas` increase from 0 to 1.
     """
-    _check(betas)
-    base = machine.scene_bias(None)[0] if base is None else base
     v = torch.bernoulli(base.sigmoid().expand(chains, -1), generator=generator)
     state = start_chains(machine, v, generator)
     # At beta = 0, the units of the second layer are on with probability 1/2.
     state.h2 = torch.bernoulli(torch.full_like(state.h2, 0.5), generator=generator)
     log_weight = torch.zeros(chains, dtype=torch.float64)
     for warm, cold in pairwise(betas):
-        change = _free_energy(machine, state, warm, base) - _free_energy(machine, state, cold, base)
-        log_weight += change.double()
+        log_weight += _change(machine, state, warm, cold, base)
         sweep(machine, state, generator, beta=cold, base=base)
     return LogPartition.of_weights(base_log_partition(machine, base), log_weight)
 
@@ -99,31 +93,27 @@ def reverse_ais(
     betas: Sequence[float],
     state: Chains,
     generator: torch.Generator,
-    base: Tensor | None = None,
+    base: Tensor,
 ) -> LogPartition:
-    """Run reverse AIS from samples of the machine, with `betas` in increasing order as in `ais`."""
-    _check(betas)
-    base = machine.scene_bias(None)[0] if base is None else base
+    """Run reverse AIS from samples of the machine; `betas` and `base` as in `ais`."""
     log_weight = torch.zeros(len(state.v), dtype=torch.float64)
     for cold, warm in pairwise(betas[::-1]):
         sweep(machine, state, generator, beta=cold, base=base)
-        change = _free_energy(machine, state, cold, base) - _free_energy(machine, state, warm, base)
-        log_weight += change.double()
-    log_base = base_log_partition(machine, base)
-    return LogPartition.of_weights(log_base, log_weight, reverse=True)
+        log_weight += _change(machine, state, cold, warm, base)
+    return LogPartition.of_weights(base_log_partition(machine, base), log_weight, reverse=True)
 
 
-def _free_energy(machine: BoltzmannMachine, state: Chains, beta: float, base: Tensor) -> Tensor:
-    """Return the free energy at beta, (chains,); see the module."""
-    x = machine.c1 + state.v @ machine.W + state.h2 @ machine.J.T
-    hidden = machine.log_states(beta * x) + beta * (state.h2 @ machine.c2)
-    couplings = machine.couplings
-    if couplings is not None:
-        hidden = hidden + 0.5 * beta * ((state.v @ couplings) * state.v).sum(-1)
-    return -(state.v @ (beta * machine.scene_bias(None)[0] + (1 - beta) * base)) - hidden
+def _change(
+    machine: BoltzmannMachine, state: Chains, before: float, after: float, base: Tensor
+) -> Tensor:
+    """Return the free energy at beta = `before` minus that at beta = `after`, (chains,)."""
 
+    def free_energy(beta: float) -> Tensor:
+        x = machine.c1 + state.v @ machine.W + state.h2 @ machine.J.T
+        hidden = machine.log_states(beta * x) + beta * (state.h2 @ machine.c2)
+        couplings = machine.couplings
+        if couplings is not None:
+            hidden = hidden + 0.5 * beta * ((state.v @ couplings) * state.v).sum(-1)
+        return -(state.v @ (beta * machine.scene_bias(None)[0] + (1 - beta) * base)) - hidden
 
-def _check(betas: Sequence[float]) -> None:
-    rising = all(x < y for x, y in pairwise(betas))
-    if len(betas) < 2 or betas[0] != 0 or betas[-1] != 1 or not rising:
-        raise ValueError("betas do not increase strictly from 0 to 1; pass such a sequence")
+    return (free_energy(before) - free_energy(after)).double()

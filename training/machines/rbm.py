@@ -44,8 +44,7 @@ class RBM(BoltzmannMachine):
         unit = position[row, slot]
         r = torch.zeros(len(classes), self.spec.T)
         r[row, unit] = holds.flatten(1)[row, slot]
-        annotated = observed.flatten(1).any(1)
-        unit_observed = annotated.unsqueeze(1).expand(-1, self.spec.T).clone()
+        unit_observed = observed.flatten(1).any(1, keepdim=True).repeat(1, self.spec.T)
         unit_observed[row, unit] = observed.flatten(1)[row, slot]
         return triple_edges(self.triples), r, unit_observed
 

@@ -49,8 +49,6 @@ _MOST = 3.0
 class Triway(BoltzmannMachine):
     """A machine whose relation units connect two present objects and the hidden units."""
 
-    has_residuals = True
-
     def __init__(self, spec: MachineSpec) -> None:
         super().__init__(spec)
         V, A, K, H1 = spec.V, spec.A, spec.K, spec.H1
@@ -80,7 +78,7 @@ class Triway(BoltzmannMachine):
             return pair_edges(classes, self.spec.A)
         usual = self.usual[classes.clamp(min=0)]
         logs = torch.where(counts > 0, counts.clamp(min=1).to(self.b.dtype).log(), usual)
-        return pair_edges(classes, self.spec.A, log_subjects=logs)
+        return pair_edges(classes, self.spec.A, logs)
 
     def lay_out(
         self, classes: Tensor, counts: Tensor, holds: Tensor, observed: Tensor
@@ -94,31 +92,22 @@ class Triway(BoltzmannMachine):
     def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
         pairs = _pairs(edges)
         shared = self.R + torch.einsum("akh,...bh->...bak", self.M, h1)
-        left = embedding(pairs.subjects, self.S).unsqueeze(-3) * shared.unsqueeze(-2)
-        product = left.flatten(-3, -2) @ embedding(pairs.objects, self.O).mT
+        left = embedding(pairs.classes, self.S).unsqueeze(-3) * shared.unsqueeze(-2)
+        product = left.flatten(-3, -2) @ embedding(pairs.classes, self.O).mT
         product = product.unflatten(-2, left.shape[-3:-1])
         bias = self.d + h1 @ self.P.T
-        subject, object_ = self._end_weights(pairs)
+        # s[a,i] + n[a,0] log n_i of the subjects i, and o[a,j] + n[a,1] log n_j of the objects j.
+        subject, object_ = (
+            weights[:, pairs.classes].transpose(0, 1) + n.unsqueeze(1) * pairs.log_counts[:, None]
+            for weights, n in zip((self.s, self.o), self.n.unbind(1), strict=True)
+        )
         ends = (subject + bias.unsqueeze(-1)).unsqueeze(-1) + object_.unsqueeze(-2)
         logits: Tensor = product + ends
-        return (logits + self._residuals(pairs) if self.spec.T else logits).flatten(-3)
-
-    def _end_weights(self, pairs: PairEdges) -> tuple[Tensor, Tensor]:
-        """Return the terms of the relation logits of only the subject or only the object class.
-
-        The terms are s[a,i] + n[a,0] log n_i, (scenes, relations, n), for subjects i, and
-        o[a,j] + n[a,1] log n_j, (scenes, relations, m), for objects j.
-        """
-        counts = self.n[:, 0, None] * pairs.log_subjects.unsqueeze(1)
-        subject = self.s[:, pairs.subjects].transpose(0, 1) + counts
-        counts = self.n[:, 1, None] * pairs.log_objects.unsqueeze(1)
-        return subject, self.o[:, pairs.objects].transpose(0, 1) + counts
-
-    def _residuals(self, pairs: PairEdges) -> Tensor:
-        """Return the weight w_e' of each unit, (scenes, relations, n, m); 0 without a triple."""
-        keys = triple_keys(pairs.relation, pairs.subject, pairs.object, self.spec.V)
-        position, exists = find_triples(self.triple_keys, keys)
-        return pairs.unflatten(self.residual[position] * exists)
+        if self.spec.T:
+            keys = triple_keys(pairs.relation, pairs.subject, pairs.object, self.spec.V)
+            position, exists = find_triples(self.triple_keys, keys)
+            logits = logits + pairs.unflatten(self.residual[position] * exists)
+        return logits.flatten(-3)
 
     def implied(self, edges: Edges, observed: Tensor, h1: Tensor) -> Tensor:
         if not self.spec.G:
@@ -145,23 +134,19 @@ def implication_features(observed: Tensor) -> Tensor:
         observed: observed relations, (scenes, relations, n, n). 1 means that the relation holds.
     """
     n = observed.shape[-1]
-    between = observed * ~torch.eye(n, dtype=torch.bool, device=observed.device)
+    between = observed * ~torch.eye(n, dtype=torch.bool)
     directed = torch.cat([between, between.mT], 1)
     kinds = directed.shape[1]
     # One batched product counts the paths of all relation pairs: (B, 2A·n, n) by (B, n, 2A·n).
     paths = directed.flatten(1, 2) @ directed.transpose(1, 2).flatten(2)
-    paths = (
-        paths.view(len(observed), kinds, n, kinds, n).transpose(2, 3).flatten(1, 2).clamp(max=1.0)
-    )
+    paths = paths.view(len(observed), kinds, n, kinds, n).transpose(2, 3).flatten(1, 2).clamp(max=1)
     outgoing = directed.sum(-1, keepdim=True) - directed
     incoming = directed.sum(-2, keepdim=True) - directed
     degrees = torch.cat([outgoing, incoming], 1).clamp(max=_MOST)
     return torch.cat([directed, paths, degrees], 1)
 
 
-def implied(
-    gamma: Tensor, B: Tensor, observed: Tensor, h1: Tensor, *, apart: bool = False
-) -> Tensor:
+def implied(gamma: Tensor, B: Tensor, observed: Tensor, h1: Tensor, apart: bool = False) -> Tensor:
     """Return the changes x of the relation logits due to observed relations.
 
     The result has the shape (scenes, relations, n, n) over pairs of n classes.
@@ -174,7 +159,7 @@ def implied(
         apart: True leaves out the effects between relations of the same pair of classes.
     """
     A = observed.shape[1]
-    itself = torch.zeros(gamma.shape[1:], dtype=torch.bool, device=gamma.device)
+    itself = torch.zeros(gamma.shape[1:], dtype=torch.bool)
     itself[:, :A].fill_diagonal_(True)
     if apart:
         # The path and degree features remain, because they depend on relations to other classes.

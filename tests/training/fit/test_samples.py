@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.training.fit.test_objects import SPECS, V, log_p, machine_of, scenes_of
+from training.fit import long_chains
 from training.fit.configuration import ObjectsConfig
 from training.fit.long_chains import LongChains, measure_drift, populations, scene_chains
 from training.fit.samples import fit_scene_rates
@@ -87,7 +88,8 @@ def test_chains_continue_from_call_to_call():
     assert share.shape == (6, V)
 
 
-def test_only_a_drift_beyond_its_limit_is_an_objection():
+def test_only_a_drift_beyond_its_limit_is_an_objection(monkeypatch):
+    monkeypatch.setattr(long_chains, "_CHAINS", 64)
     machine, scenes = fitted("coupled")
     drifts = measure_drift(weights_of(machine), LABELS, scenes, CONFIG)
     assert [drift.source for drift in drifts] == ["sunrgbd", "procthor"]
