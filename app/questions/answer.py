@@ -93,9 +93,8 @@ def reasons(
     columns, values = strongest(change, np.zeros(0, np.int64) if rows is None else rows, REASONS)
     strong = np.abs(values) >= max(least, _ROUNDING)
     entries: list[list[Fields]] = [[] for _ in change]
-    rows_of_entries, _ = np.nonzero(strong)
     numbers, changes = present.first[columns[strong]].tolist(), significant(values[strong])
-    for row, number, value in zip(rows_of_entries.tolist(), numbers, changes, strict=True):
+    for row, number, value in zip(strong.nonzero()[0].tolist(), numbers, changes, strict=True):
         entries[row].append({"object": scene.objects[number].id, "log_odds_change": value})
     return entries
 

@@ -143,32 +143,29 @@ def _ranked(
     usable = ~(artifact.vocabulary.structure | is_listed[:-1])
     if candidates is None:
         usable &= ~is_listed[artifact.vocabulary.parents]
-    absent = np.flatnonzero(usable)
-    chosen = np.ones(len(absent), np.bool_)
-    if candidates is not None:
-        chosen = _among(absent, artifact.spec.V, candidates)
-    if not chosen.any():
-        return absent[:0], np.zeros(0), np.zeros(0)
-    log_odds = posterior.absent_log_odds(absent, coverage)
+    else:
+        usable &= _among(len(usable), candidates)
+    if not usable.any():
+        return np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
+    log_odds = posterior.absent_log_odds(np.arange(len(usable)), coverage)
     if place is None:
         entry = artifact.calibration.missing
         logits = calibrated(entry, log_odds, max(1, posterior.listed))
     else:
-        logits = _logits_at(artifact, posterior, place, absent, chosen, log_odds, top_k)
-    first, probabilities = likeliest_classes(logits, chosen, top_k)
-    return absent[first], probabilities, log_odds[first]
+        logits = _logits_at(artifact, posterior, place, usable, log_odds, top_k)
+    first, probabilities = likeliest_classes(logits, usable, top_k)
+    return first, probabilities, log_odds[first]
 
 
 def _logits_at(
     artifact: Artifact,
     posterior: Posterior,
     place: Place,
-    absent: NDArray[np.int64],
-    chosen: NDArray[np.bool_],
+    usable: NDArray[np.bool_],
     log_odds: NDArray[np.floating[Any]],
     top_k: int,
 ) -> NDArray[np.floating[Any]]:
-    """Return the logits of p(present and at the place), (N,); see `PlaceFit`.
+    """Return the logits of p(present and at the place), (V,); see `PlaceFit`.
 
     The log probability of the relation is at most 0. So the other terms give an upper bound of the
     logit. The function scores candidates in blocks, in descending order of this bound. It stops
@@ -180,29 +177,31 @@ def _logits_at(
     if artifact.places is not None and entry.counts:
         anchor = int(posterior.present.classes[posterior.present.row[place.anchor]])
         ratio = artifact.places.log_ratio(place.relation, anchor, outgoing=place.outgoing)
-        bound = bound + entry.counts * ratio[absent]
+        bound = bound + entry.counts * ratio
     scores = np.full_like(bound, -np.inf)
-    order = np.flatnonzero(chosen)
+    order = np.flatnonzero(usable)
     order = order[np.argsort(-bound[order], kind="stable")]
     for start in range(0, len(order), _BLOCK):
         block = order[start : start + _BLOCK]
         largest = np.sort(scores[order[:start]])[-top_k:]
         if len(largest) == top_k and bound[block[0]] < largest[0]:
             break
-        log_p = place_log_p(posterior, absent[block], place)
+        log_p = place_log_p(posterior, block, place)
         scores[block] = bound[block] + entry.relation * log_p
     logits: NDArray[np.floating[Any]] = entry.intercept + entry.slope * scores
     return logits
 
 
-def _among(absent: NDArray[np.int64], classes: int, candidates: Sequence[int]) -> NDArray[np.bool_]:
-    """Return a bool mask (N,) of the absent classes that are candidates."""
+def _among(classes: int, candidates: Sequence[int]) -> NDArray[np.bool_]:
+    """Return a bool mask of the candidates among the classes, (V,)."""
     for index in candidates:
         if not 0 <= index < classes:
             raise ValueError(
                 f"candidate {index} is not a class index; class indices are below V = {classes}"
             )
-    return np.isin(absent, np.array(candidates, dtype=np.int64))
+    mask = np.zeros(classes, np.bool_)
+    mask[np.array(candidates, dtype=np.int64)] = True
+    return mask
 
 
 def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Options:

@@ -132,36 +132,44 @@ def _judged(
     `because` lists up to three other objects, in order of their effect on `log_odds`. For an
     outlier, these objects lower its log-odds. For other objects, they raise the log-odds.
     """
-    present = posterior.present
+    present, labels = posterior.present, artifact.vocabulary.labels
     log_odds = posterior.log_odds_given_rest()
     logits = _intruder_logits(artifact, entry, posterior, log_odds)
     p = _probability(logits)
     is_outlier = p >= threshold
-    labels = [artifact.vocabulary.labels[index] for index in present.classes.tolist()]
-    columns = labels, significant(p), significant(log_odds), is_outlier.tolist()
-    class_fields: list[Fields] = [
-        {"label": label, "probability": probability, "log_odds": value, "is_outlier": flag}
-        for label, probability, value, flag in zip(*columns, strict=True)
-    ]
     # The order follows the logits, because probabilities near 0 or 1 may round to the same number.
-    order = np.argsort(-logits[present.row], kind="stable")
+    order = (-logits[present.row]).argsort(kind="stable")
     rows = present.row[order].tolist()
+    causes: list[list[Fields]] = [[] for _ in present.classes]
+    companions: list[list[str]] = [[] for _ in present.classes]
     if details:
-        for fields in class_fields:
-            fields["because"], fields["usually_with"] = [], []
-        explained = np.array(list(dict.fromkeys(rows[:EXPLAINED])), dtype=np.int64)
-        if len(present.classes) > 1:
+        explained = np.array(list(dict.fromkeys(rows[:EXPLAINED])))
+        if len(causes) > 1:
             change = posterior.reasons(explained)
-            change = np.where(is_outlier[explained, None] == (change < 0), change, 0)
-            causes = reasons(scene, present, change, explained)
-            for row, because in zip(explained.tolist(), causes, strict=True):
-                class_fields[row]["because"] = because
+            change[is_outlier[explained, None] != (change < 0)] = 0
+            of_explained = reasons(scene, present, change, explained)
+            for row, because in zip(explained.tolist(), of_explained, strict=True):
+                causes[row] = because
         flagged = explained[is_outlier[explained]]
-        companions = _companions(artifact, present.classes, present.classes[flagged])
-        for row, companion_labels in zip(flagged.tolist(), companions, strict=True):
-            class_fields[row]["usually_with"] = companion_labels
-    pairs = zip(order.tolist(), rows, strict=True)
-    return [{"object": scene.objects[number].id} | class_fields[row] for number, row in pairs]
+        if len(flagged):
+            of_flagged = _companions(artifact, present.classes, present.classes[flagged])
+            for row, companion_labels in zip(flagged.tolist(), of_flagged, strict=True):
+                companions[row] = companion_labels
+    classes, flags = present.classes.tolist(), is_outlier.tolist()
+    probabilities, values = significant(p), significant(log_odds)
+    judged: list[Fields] = []
+    for number, row in zip(order.tolist(), rows, strict=True):
+        fields: Fields = {
+            "object": scene.objects[number].id,
+            "label": labels[classes[row]],
+            "probability": probabilities[row],
+            "log_odds": values[row],
+            "is_outlier": flags[row],
+        }
+        if details:
+            fields["because"], fields["usually_with"] = causes[row], companions[row]
+        judged.append(fields)
+    return judged
 
 
 def misplaced(
@@ -215,7 +223,7 @@ def _companions(
     """
     usable = ~artifact.vocabulary.structure
     usable[present] = False
-    if not (len(flagged) and usable.any()):
+    if not usable.any():
         return [[] for _ in flagged]
     # The rows of the arrays are outliers i, and the columns are classes j.
     weights, labels = artifact.weights, artifact.vocabulary.labels

@@ -31,9 +31,8 @@ from app.questions.reading import Reading, Triple
 from app.registry.artifact import Artifact
 from app.scene.relations import (
     CANONICAL,
-    LATERAL,
+    ON_TOP,
     OPPOSITES,
-    STACKED,
     SUPPORTS,
     canonicalise,
     opposite,
@@ -144,39 +143,25 @@ def _evidence(artifact: Artifact, posterior: Posterior, scene: Scene) -> NDArray
     The probability of an observed relation is the product of the confidences of its objects. An
     object on or in one object is not on or in another object.
     """
-    n, relations = len(scene.objects), artifact.spec.A
+    A = artifact.spec.A
     if scene.excluded is None and not relations_given(scene):
         return np.zeros((0, 0, 0), np.float32)
     holds, observed = instance_evidence(scene)
-    held = np.zeros(n, np.bool_)
-    held[held_objects(artifact, posterior, scene)] = True
-    excluded = (observed | _excluded_by(holds)) & ~holds
-    excluded[[*SUPPORTS]] |= held[:, None] & ~holds[[*SUPPORTS]]
+    # A stacked relation excludes all other relations of its two objects. Left and front exclude
+    # stacked relations.
+    lateral, stacked = holds[:ON_TOP].any(0), holds[ON_TOP:].any(0)
+    excluded = observed | stacked | stacked.T
+    excluded[ON_TOP:] |= lateral | lateral.T
+    held = held_objects(artifact, posterior, scene)
+    for a in SUPPORTS:
+        excluded[a, held] = True
     if scene.excluded is not None:
-        excluded = excluded | scene.excluded
+        excluded |= scene.excluded
+    evidence = np.where(excluded[:A], EXCLUDED, np.float32(np.nan))
     confidence = np.array([thing.confidence for thing in scene.objects], np.float32)
-    evidence = np.full((relations, n, n), np.nan, np.float32)
-    evidence[excluded[:relations]] = EXCLUDED
-    both = np.broadcast_to(confidence[:, None] * confidence, evidence.shape)
-    shown = holds[:relations]
-    evidence[shown] = both[shown]
+    units = holds[:A].nonzero()
+    evidence[units] = confidence[units[1]] * confidence[units[2]]
     return evidence
-
-
-def _excluded_by(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the relations of N objects that cannot hold beside others, (A, N, N).
-
-    A stacked relation (on-top, above, inside) excludes all other relations of its two objects. Left
-    and front exclude stacked relations.
-
-    Args:
-        holds: (A, N, N) relations that hold.
-    """
-    lateral, stacked = holds[[*LATERAL]].any(0), holds[[*STACKED]].any(0)
-    excluded = np.zeros_like(holds)
-    excluded[:] = stacked | stacked.T
-    excluded[[*STACKED]] |= lateral | lateral.T
-    return excluded
 
 
 def _judged(

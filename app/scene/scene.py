@@ -200,15 +200,13 @@ def observe(
         return scene
     objects = scene.objects if viewpoint is None else _in_viewer_frame(scene.objects, viewpoint)
     has_no_viewer = viewpoint is None and frame_id is not None and is_world_fixed(frame_id)
-    indices = [-1 if thing.class_index is None else thing.class_index for thing in objects]
-    points = np.array([thing.position or _UNKNOWN for thing in objects])
-    sizes = np.array([extent_of(thing, typical_sizes) for thing in objects])
+    points, sizes = boxes_of(objects, typical_sizes)
     poses = derive_relations(
         points,
         sizes,
-        np.array([thing.yaw for thing in objects]),
+        [thing.yaw for thing in objects],
         horizontal=not has_no_viewer,
-        classes=np.array(indices),
+        classes=np.array([-1 if one.class_index is None else one.class_index for one in objects]),
         roles=roles,
     )
     excluded = poses.observed & ~poses.holds
@@ -240,14 +238,24 @@ def _in_viewer_frame(
     return tuple(turned)
 
 
-def extent_of(thing: SceneObject, typical_sizes: NDArray[np.float64] | None) -> Sequence[float]:
-    """Return the extents of an object, else those typical of its class, else NaN."""
-    if thing.size is not None and max(thing.size) >= SMALLEST:
-        return thing.size
-    if typical_sizes is not None and thing.class_index is not None:
-        size: list[float] = typical_sizes[thing.class_index].tolist()
-        return size
-    return _UNKNOWN
+def boxes_of(
+    objects: Sequence[SceneObject], typical_sizes: NDArray[np.float64] | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the centres and the extents of n objects, (n, 3) each, NaN where unknown.
+
+    An object without a plausible size has the typical extents of its class (`Vocabulary.sizes`).
+    """
+    centres = np.array([thing.position or _UNKNOWN for thing in objects]).reshape(-1, 3)
+    indices = [-1 if thing.class_index is None else thing.class_index for thing in objects]
+    extents = np.full((len(objects), 3), math.nan)
+    if typical_sizes is not None:
+        extents = typical_sizes[indices]
+    for row, thing in enumerate(objects):
+        if thing.size is not None and max(thing.size) >= SMALLEST:
+            extents[row] = thing.size
+        elif thing.class_index is None:
+            extents[row] = math.nan
+    return centres, extents
 
 
 # -------------------------------------------------------------------------- evidence of classes

@@ -196,6 +196,13 @@ class Vocabulary:
         sizes.flags.writeable = False
         return sizes
 
+    @cached_property
+    def sorted_sizes(self) -> NDArray[np.float64]:
+        """(V, 3) typical extents of each class in ascending order, or NaN. Read-only array."""
+        sizes = np.sort(self.sizes, axis=1)
+        sizes.flags.writeable = False
+        return sizes
+
     def index(self, label: str) -> int | None:
         """Return the index of the class with this label, or None for an unknown label.
 
