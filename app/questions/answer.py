@@ -175,7 +175,7 @@ class SizeLimit:
             return size
         size += len(to_json(unknown.ignored)) + len(unknown.mapped) * _WARNING_BYTES
         size += len(reading.observed or ()) * (RELATION_BYTES + 2 * name)
-        return size + len(reading.warnings) * (_WARNING_BYTES + len(reading.ids) * name)
+        return size + len(reading.warnings) * (_WARNING_BYTES + len(reading.scene.objects) * name)
 
 
 def written(answer: Any) -> bytes:

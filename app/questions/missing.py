@@ -213,11 +213,10 @@ def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Opti
         errors.add(InvalidRequestError, ("top_k",), message)
     candidates = at = None
     if request.candidates is not None:
-        candidates = _candidates(request.candidates, reading, errors)
+        candidates = reading.unknown.resolve_all(request.candidates, "candidates", errors)
     if request.at is not None:
         at = _at(request.at, artifact, reading, errors)
-    if errors.by_class:
-        errors.raise_any()
+    errors.raise_any()
     return {
         "top_k": request.top_k,
         "candidates": candidates,
@@ -226,18 +225,6 @@ def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Opti
         "axes": _axes(request),
         "details": request.detail == "full",
     }
-
-
-def _candidates(labels: list[str], reading: Reading, errors: ErrorList) -> list[int]:
-    """Return the class indices of the labels in the request's field `candidates`."""
-    indices: dict[int, None] = {}
-    for position, label in enumerate(labels):
-        index = reading.unknown.vocabulary.index(label)
-        if index is None:
-            index = reading.unknown.resolve(label, label, ("candidates", position), errors)
-        if index is not None:
-            indices[index] = None
-    return list(indices)
 
 
 def _at(

@@ -139,7 +139,7 @@ class Unknown:
     def resolve(
         self, label: str, name: str, location: Location, errors: ErrorList, *, is_room: bool = False
     ) -> int | None:
-        """Return the class or room type that replaces an unlisted label.
+        """Return the class or room type that a label names or that replaces it.
 
         Each treatment accepts the syntax of detectors, such as "chair_12".
 
@@ -153,12 +153,16 @@ class Unknown:
         Returns:
             Index of the class or room type. None means that the label is ignored or refused.
         """
-        match = self.vocabulary.read(label, is_room=is_room)
+        vocabulary = self.vocabulary
+        index = vocabulary.room_index(label) if is_room else vocabulary.index(label)
+        if index is not None:
+            return index
+        match = vocabulary.read(label, is_room=is_room)
         if match is None and self.treatment.startswith("nearest"):
             match = self._guess(label, is_room=is_room)
         if match is not None:
             entry, similarity, rule = match
-            names = self.vocabulary.room_types if is_room else self.vocabulary.labels
+            names = vocabulary.room_types if is_room else vocabulary.labels
             mapped = Mapped(label=label, class_=names[entry], similarity=similarity, rule=rule)
             self.mapped[label, is_room] = mapped
             return entry
@@ -167,6 +171,16 @@ class Unknown:
         else:
             self._refuse(label, location, errors, is_room=is_room)
         return None
+
+    def resolve_all(
+        self, labels: Sequence[str], field: str, errors: ErrorList, *, is_room: bool = False
+    ) -> list[int]:
+        """Return the different classes or room types of the labels in a field of the request."""
+        indices = [
+            self.resolve(label, label, (field, position), errors, is_room=is_room)
+            for position, label in enumerate(labels)
+        ]
+        return list(dict.fromkeys(index for index in indices if index is not None))
 
     def _guess(self, label: str, *, is_room: bool) -> Guess | None:
         key = label, is_room

@@ -107,26 +107,14 @@ def _read(request: RoomsRequest, _: Artifact, reading: Reading) -> Options:
     candidates = None
     if request.candidates is not None:
         errors = ErrorList()
-        candidates = _candidates(request.candidates, reading, errors)
+        names = request.candidates
+        candidates = reading.unknown.resolve_all(names, "candidates", errors, is_room=True)
         errors.raise_any()
     return {
         "top_k": request.top_k,
         "candidates": candidates,
         "details": request.detail == "full",
     }
-
-
-def _candidates(names: Sequence[str], reading: Reading, errors: ErrorList) -> list[int]:
-    """Return the indices of the room types in the request's field `candidates`."""
-    indices: dict[int, None] = {}
-    for position, name in enumerate(names):
-        index = reading.unknown.vocabulary.room_index(name)
-        if index is None:
-            place = ("candidates", position)
-            index = reading.unknown.resolve(name, name, place, errors, is_room=True)
-        if index is not None:
-            indices[index] = None
-    return list(indices)
 
 
 def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:

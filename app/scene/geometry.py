@@ -59,7 +59,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from app.compiling import compiled
 from app.scene.footprints import measure
-from app.scene.relations import ABOVE, CANONICAL, FRONT, INSIDE, LEFT, ON_TOP, STACKED
+from app.scene.relations import ABOVE, CANONICAL, FRONT, INSIDE, LEFT, ON_TOP
 from app.scene.roles import IN, ON, UNDER, RoleCounts, is_smaller, likely_role, possible_roles
 
 MIN_OVERLAP: Final = 0.30  # minimum overlap as a share of the smaller footprint
@@ -186,15 +186,17 @@ def excluded_by_centres(points: Array, sizes: Array, *, horizontal: bool) -> NDA
             `UNKNOWN_REACH`.
         horizontal: whether the viewer is known, so that left and front are defined.
     """
-    dx, dy = (points[:, axis, None] - points[:, axis] for axis in (0, 1))
-    excluded = np.zeros((len(CANONICAL), len(points), len(points)), np.bool_)
+    x, y = points[:, 0], points[:, 1]
+    dx, dy = x[:, None] - x, y[:, None] - y
+    excluded = np.zeros((len(CANONICAL), len(x), len(x)), np.bool_)
     # A comparison with NaN is False.
     if horizontal:
-        excluded[LEFT] = (dy < MIN_OFFSET) | (np.abs(dy) < np.abs(dx))
-        excluded[FRONT] = (-dx < MIN_OFFSET) | (np.abs(dx) <= np.abs(dy))
+        size_x, size_y = np.abs(dx), np.abs(dy)
+        excluded[LEFT] = (dy < MIN_OFFSET) | (size_y < size_x)
+        excluded[FRONT] = (dx > -MIN_OFFSET) | (size_x <= size_y)
     radius = np.hypot(sizes[:, 0], sizes[:, 1]) / 2
     radius[np.isnan(radius)] = UNKNOWN_REACH
-    excluded[[*STACKED]] = np.hypot(dx, dy) > radius[:, None] + radius
+    excluded[ON_TOP:] = np.hypot(dx, dy) > radius[:, None] + radius  # the stacked relations
     return excluded
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from math import isfinite
 from typing import NoReturn
 
 import numpy as np
@@ -72,12 +73,17 @@ class SceneObject:
             )
         if not 0.0 < self.confidence <= 1.0:
             raise ValueError(f"confidence of {self.id!r} must be in (0, 1], not {self.confidence}")
-        if self.position is not None and not _are_finite(self.position):
+        position, size = self.position, self.size
+        if position is not None and not _are_finite(position):
             raise ValueError(f"position of {self.id!r} must be three finite numbers (metres)")
-        if self.size is not None and not (_are_finite(self.size) and min(self.size) >= 0):
+        if size is not None and not (_are_finite(size) and min(size) >= 0):
             raise ValueError(f"size of {self.id!r} must be three numbers of at least 0 (metres)")
-        if not math.isfinite(self.yaw):
+        if self.yaw and not isfinite(self.yaw):
             raise ValueError(f"yaw of {self.id!r} must be finite, not {self.yaw}")
+
+
+def _are_finite(point: Sequence[float]) -> bool:
+    return len(point) == 3 and isfinite(point[0]) and isfinite(point[1]) and isfinite(point[2])
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,12 +161,6 @@ class Scene:
             f"{self.objects[subject].id!r} has the relation {CANONICAL[relation]} to itself; a "
             "relation needs two different objects"
         )
-
-
-def _are_finite(point: Sequence[float]) -> bool:
-    # A loop would be slower. This function runs twice for every object.
-    finite = math.isfinite
-    return len(point) == 3 and finite(point[0]) and finite(point[1]) and finite(point[2])
 
 
 # ------------------------------------------------------------------------- relations from poses

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from app.scene.labels import Rule, head_of, label_key, readings
 from app.scene.nearest import Guess, Match, NameIndex
+from app.scene.scene import SceneObject
 
 Extents = tuple[float, float, float]
 
@@ -101,6 +102,7 @@ class Vocabulary:
                         f"{self.objects[first].label!r} and {entry.label!r}"
                     )
                 self._by_spelling[name] = index
+        self._bare = {name: SceneObject(name, name, k) for name, k in self._by_spelling.items()}
         self._parents = self._parent_indices()
         self._room_by_key: dict[str, int] = {}
         self._room_by_spelling: dict[str, int] = {}
@@ -202,6 +204,14 @@ class Vocabulary:
         sizes = np.sort(self.sizes, axis=1)
         sizes.flags.writeable = False
         return sizes
+
+    def bare_objects(self, labels: Sequence[str]) -> tuple[SceneObject, ...] | None:
+        """Return objects without id and pose that have these labels, or None for a new spelling.
+
+        `Vocabulary` stores these objects, because most scenes of robots are lists of labels.
+        """
+        objects = tuple(map(self._bare.get, labels))
+        return None if None in objects else objects  # type: ignore[return-value]
 
     def index(self, label: str) -> int | None:
         """Return the index of the class with this label, or None for an unknown label.
