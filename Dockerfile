@@ -50,6 +50,8 @@ COPY clients/python/scene_client ./scene_client
 COPY app ./app
 COPY deploy/ray ./deploy/ray
 COPY --chown=10001:10001 model_store ./model_store
+ENV NUMBA_CPU_NAME=generic \
+    NUMBA_CPU_FEATURES=""
 RUN NUMBA_CACHE_DIR=compiled python -m app.compile && chmod -R a+rX compiled
 ENV HOME=/tmp \
     NUMBA_CACHE_DIR=/tmp/compiled \
@@ -65,8 +67,11 @@ COPY clients/python/scene_client ./scene_client
 COPY app ./app
 # Owned by the service, which moves aliases; publishing adds versions beside those shipped.
 COPY --chown=10001:10001 model_store ./model_store
-# Compiled for the CPU that builds the image; on another kind the first start compiles anew.
+# Compiled for any CPU of the architecture, so that no start compiles. Answers take 10 to 25 % longer
+# than with loops for the own CPU, which `env -u NUMBA_CPU_NAME -u NUMBA_CPU_FEATURES` compiles.
 # The folder is private to its owner, here root; the service copies it.
+ENV NUMBA_CPU_NAME=generic \
+    NUMBA_CPU_FEATURES=""
 RUN NUMBA_CACHE_DIR=compiled python -m app.compile && chmod -R a+rX compiled
 ENV HOME=/tmp \
     NUMBA_CACHE_DIR=/tmp/compiled \

@@ -27,14 +27,12 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference import chain_kernels as kernels
+from app.inference import kernels
 from app.inference.elementary import sigmoid, softplus
-from app.inference.relation_kernels import draw_in_groups
 from app.inference.relations import (
     NEVER,
     ObservedRelations,
@@ -61,25 +59,6 @@ def random_stream(seed: int, number: int) -> np.random.Generator:
     """Return random stream ``number``, from 0, of a seed. The streams are independent."""
     sequence = np.random.SeedSequence(seed, spawn_key=(number,))
     return np.random.Generator(np.random.PCG64(sequence))
-
-
-class Arrays(NamedTuple):
-    """Weights for the compiled kernel. `weights.layout` explains the attributes not listed here.
-
-    Attributes:
-        WT: (H1, V), transpose of W.
-        JT: (H2, H1), transpose of J.
-        L: (V, V) couplings, or (0, V) for a machine without couplings.
-        b: (V,) biases of the classes.
-    """
-
-    W: Floats
-    WT: Floats
-    J: Floats
-    JT: Floats
-    L: Floats
-    b: Floats
-    c2: Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +123,7 @@ class SceneChains:
         self.machine, self._excluded = weights, list(excluded)
         self.units = units or relation_units(weights)
         W, J, spec = weights["W"], weights["J"], weights.spec
-        self.arrays = Arrays(
+        self.arrays = kernels.ChainArrays(
             W=W,
             WT=np.ascontiguousarray(W.T),
             J=J,
@@ -327,7 +306,7 @@ class ConditionedChains:
         if self._machine.spec.G:
             x, _ = self._context(classes, float(self._beta))
             weight = self._chains.units.implication_weights(x, float(self._beta))
-            draw_in_groups(weight, self._beta * logits, free, uniform, group_numbers, r)
+            kernels.draw_in_groups(weight, self._beta * logits, free, uniform, group_numbers, r)
         else:
             r |= free & (uniform < sigmoid(self._beta * logits))
         return r

@@ -28,9 +28,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from app.compiling import compiled, compiled_in_any_order
-from app.inference.elementary import exp, exponent, log, log_softmax, mantissa
-from app.inference.weights import SHARES, Weights, all_states, odds
+from app.inference import kernels
+from app.inference.elementary import log_softmax
+from app.inference.weights import SHARES, Weights
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -85,53 +85,9 @@ class Gains:
 
     def __call__(self, x: Floats) -> Floats:
         """Return the gain of each row of weights, (B, rows), at the logits x of h1, (B, H1)."""
-        p = all_states(x, self._states)
-        gain: Floats = _gains(p, self._factors, self._group, self._rows)
+        p = kernels.all_states(x, self._states)
+        gain: Floats = kernels.gains(p, self._factors, self._group, self._rows)
         return gain
-
-
-@compiled
-def _gains(p, factors, group, rows):
-    """Return the gain of each row of weights, (B, rows); see `Gains`.
-
-    After each group of sums, the function splits the product into mantissa and exponent, and adds
-    the exponent to an integer. So one log at the end is enough.
-
-    Args:
-        p: (B, units, states) probabilities of the states of h1.
-        factors: (tiles, units, states - 1, rows per tile) exponentials of the weights.
-        group: maximum number of sums in a product.
-        rows: number of rows of weights.
-    """
-    tiles, units, states, width = factors.shape
-    gain = np.empty((len(p), rows), np.float32)
-    product, exponents = np.empty(width, np.float32), np.empty(width, np.int32)
-    total = np.empty(width, np.float32)
-    for t in range(tiles):
-        for b in range(len(p)):
-            product[:], exponents[:] = _ONE, np.int32(0)
-            for m in range(units):
-                total[:] = p[b, m, 0]
-                for z in range(0, states - 1, 2):
-                    # The loop takes two states at a time. This halves the reads and writes.
-                    p1, row1 = p[b, m, z + 1], factors[t, m, z]
-                    p2, row2 = p[b, m, z + 2], factors[t, m, z + 1]
-                    for i in range(width):
-                        total[i] += p1 * row1[i] + p2 * row2[i]
-                if states % 2:
-                    p1, row1 = p[b, m, states], factors[t, m, states - 1]
-                    for i in range(width):
-                        total[i] += p1 * row1[i]
-                for i in range(width):
-                    product[i] *= total[i]
-                if (m + 1) % group == 0 or m + 1 == units:
-                    for i in range(width):
-                        exponents[i] += exponent(product[i])
-                        product[i] = mantissa(product[i])
-            gain_b = gain[b, t * width :]
-            for i in range(min(width, rows - t * width)):
-                gain_b[i] = log(product[i]) + _LN2 * np.float32(exponents[i])
-    return gain
 
 
 class ObjectScorer:
@@ -257,9 +213,9 @@ class ObjectScorer:
     def _by_source(
         self, classes: Indices, presence: Floats, rows: Indices, targets: Indices
     ) -> tuple[Floats, Floats]:
-        """See `_source_effects`."""
+        """See `kernels.source_effects`."""
         f, a = self._weights["f"], self._weights["a"]
-        return _source_effects(f, a, classes, presence, rows, targets)
+        return kernels.source_effects(f, a, classes, presence, rows, targets)
 
     def room_evidence(self, x: Floats, classes: Indices, presence: Floats) -> Doubles:
         """Return log p(v | t) of the listed classes v for each room type t, (N, C).
@@ -302,80 +258,10 @@ class ObjectScorer:
             classes: (N,) indices of the classes c.
         """
         states = self._states
-        raised, removed = odds(self._weights["W"][classes], states), odds(-shares, states)
-        gain, ratio = _changes(all_states(x, states), raised, removed)
+        raised = kernels.odds(self._weights["W"][classes], states)
+        removed = kernels.odds(-shares, states)
+        gain, ratio = kernels.gain_factors(kernels.all_states(x, states), raised, removed)
         return np.log(gain).sum(1), -np.log(ratio).sum(2)
-
-
-@compiled_in_any_order
-def _changes(p, raised, removed):
-    """Return the factors of e^gain, (N, units), and of e^-change, (N, n, units).
-
-    A factor is the effect of one hidden unit; see `ObjectScorer._changes`.
-
-    Args:
-        p: (N or 1, units, states) probabilities of the states of h1.
-        raised: (N, units, states) exponentials of the weights of the classes c.
-        removed: (n, units, states) exponentials of the contributions of classes j, negated.
-    """
-    (N, units, states), n = raised.shape, len(removed)
-    gain, ratio = np.empty((N, units), np.float32), np.empty((N, n, units), np.float32)
-    for c in range(N):
-        for m in range(units):
-            row, factors = p[min(c, len(p) - 1), m], raised[c, m]
-            with_class = np.float32(0.0)
-            for z in range(states):
-                with_class += row[z] * factors[z]
-            gain[c, m] = with_class
-            for j in range(n):
-                without, before, after = removed[j, m], np.float32(0.0), np.float32(0.0)
-                for z in range(states):
-                    product = row[z] * without[z]
-                    before += product
-                    after += product * factors[z]
-                ratio[c, j, m] = after / (before * with_class)
-    return gain, ratio
-
-
-@compiled
-def _source_effects(f, a, classes, presence, rows, targets):
-    """Return sum_q p_q a_qi of N classes i, (N,), and its change by each listed class, (N, n).
-
-    Args:
-        f, a: weights of the data sources; see `weights.layout`.
-        classes, presence: see `ObjectScorer.absent`.
-        rows: (N,) index of each class i among the listed classes. A class is not evidence for
-            itself. `rows` is empty if the classes i are not listed.
-        targets: (N,) the classes i.
-    """
-    shares = np.empty((len(classes), len(f)), np.float32)
-    logits, rest = f.copy(), np.empty(len(f), np.float32)
-    for j in range(len(classes)):
-        for q in range(len(f)):
-            shares[j, q] = a[q, classes[j]] * presence[j]
-            logits[q] += shares[j, q]
-    mean = np.empty(len(targets), np.float32)
-    change = np.empty((len(targets), len(classes)), np.float32)
-    for i in range(len(targets)):
-        values = a[:, targets[i]]
-        rest[:] = logits - shares[rows[i]] if len(rows) else logits
-        mean[i] = _mean(rest, values)
-        for j in range(len(classes)):
-            change[i, j] = mean[i] - _mean(rest - shares[j], values)
-    return mean, change
-
-
-@compiled
-def _mean(logits, values):
-    """Return the mean of values with probabilities softmax(logits), or 0 without values."""
-    top, total, weighted = np.float32(-np.inf), np.float32(0.0), np.float32(0.0)
-    for q in range(len(logits)):
-        top = max(top, logits[q])
-    for q in range(len(logits)):
-        p = exp(logits[q] - top)
-        total += p
-        weighted += p * values[q]
-    return weighted / total if len(logits) else np.float32(0.0)
 
 
 def _row_sum(rows: Floats, presence: Floats) -> Floats:

@@ -22,15 +22,14 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference import relation_kernels as kernels
+from app.inference import kernels
+from app.inference.kernels import NO_UNIT as NO_UNIT
+from app.inference.kernels import Ends, SharedArrays
 from app.inference.weights import Weights, state_means
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-
-NO_UNIT: Final = np.float32(-30.0)
-"""Lower limit of the log-odds of a relation."""
 
 NEVER: Final = np.float32(-1e4)
 """Logit of a relation for which the machine has no unit. Such a relation never holds."""
@@ -108,23 +107,6 @@ class Context:
         return ends_of(self.classes, self.presence, self.log_counts, i, j)
 
 
-class Ends(NamedTuple):
-    """Subject and object classes of some pairs. All arrays have the same shape.
-
-    Attributes:
-        i, j: class indices of the subjects and of the objects.
-        log_i, log_j: log of the number of instances of each class in i and in j.
-        p_i, p_j: probability that each class in i and in j is present.
-    """
-
-    i: Indices
-    j: Indices
-    log_i: Floats
-    log_j: Floats
-    p_i: Floats
-    p_j: Floats
-
-
 def ends_of(classes: Indices, presence: Floats, log_counts: Floats, i: Indices, j: Indices) -> Ends:
     """Return the `Ends` of pairs (i, j). i and j are indices into the other arrays."""
     n, p = log_counts, presence
@@ -148,28 +130,6 @@ class Between(NamedTuple):
     spread: Floats
     shift: Floats
     apart: Floats
-
-
-class SharedArrays(NamedTuple):
-    """Weights of a Triway's units for the compiled kernels.
-
-    Attributes:
-        S, O: (V, K + 1) factors of each class as subject and as object. The last column is 1.
-        s, o: (V, A) weights of each class as subject and as object of each relation.
-        n: (A, 2) weights of the log number of instances of subject and object class.
-        start, key: look-up table of `relation_kernels.pair_rows`.
-        residual: (pairs + 1, A) residual weight w' of each pair of classes and each relation. The
-            last row is 0.
-    """
-
-    S: Floats
-    O: Floats  # noqa: E741
-    s: Floats
-    o: Floats
-    n: Floats
-    start: NDArray[np.int32]
-    key: NDArray[np.int32]
-    residual: Floats
 
 
 class RelationUnits(ABC):
@@ -221,7 +181,7 @@ class RelationUnits(ABC):
         on = (observed.r > 0) & (observed.i != observed.j)
         ends = observed.i[on], observed.j[on]
         shifts = kernels.implication_shifts(weight, n, observed.a[on], *ends)
-        shift, apart = np.ascontiguousarray(shifts.transpose(0, 3, 1, 2))
+        shift, apart = (np.ascontiguousarray(change.transpose(2, 0, 1)) for change in shifts)
         return shift, apart
 
     def implication_weights(self, x: Floats, beta: float = 1.0) -> Floats:
@@ -404,7 +364,7 @@ class SharedUnits(RelationUnits):
         return mean[:, :, :P], spread[:, :, :P]
 
     def _covariances(self, chosen: slice, means: Floats) -> Floats:
-        """Return C of each chosen relation (see `relation_kernels.spreads`), (B, R, r (r + 1) / 2).
+        """Return C of each chosen relation (see `kernels.spreads`), (B, R, r (r + 1) / 2).
 
         cov(h1) is diag(m) - m m' within each hidden unit, and 0 between units.
         """

@@ -23,8 +23,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from app.compiling import compiled, compiled_in_any_order
-from app.inference.elementary import exp, sigmoid, softmax
+from app.inference import kernels
+from app.inference.elementary import sigmoid, softmax
 from app.inference.variants import MachineSpec
 
 SWEEPS: Final = 10
@@ -235,68 +235,8 @@ def state_means(x: NDArray[Any], states: int) -> NDArray[Any]:
 
     Each unit has `states` states. Its first state has the logit 0 and no entry in x.
     """
-    p: NDArray[Any] = all_states(x.reshape(-1, x.shape[-1]), states)
+    p: NDArray[Any] = kernels.all_states(x.reshape(-1, x.shape[-1]), states)
     return p[:, :, 1:].reshape(x.shape)
-
-
-@compiled
-def all_states(x: NDArray[Any], states: int) -> NDArray[np.float32]:
-    """Return the probabilities of all states of the hidden units, (B, units, states).
-
-    Args:
-        x: (B, H1) logits of all states but the first of each unit.
-        states: number of states of a unit.
-    """
-    p: NDArray[np.float32] = _with_first(x, states)
-    for b in range(len(p)):
-        for m in range(p.shape[1]):
-            row = p[b, m]
-            top = _largest(row)
-            # The square of e^(x/2) covers subnormal numbers.
-            for z in range(states):
-                row[z] = exp((row[z] - top) * _HALF)
-                row[z] *= row[z]
-            scale = np.float32(1.0) / _total(row)
-            for z in range(states):
-                row[z] *= scale
-    return p
-
-
-@compiled
-def odds(x: NDArray[Any], states: int) -> NDArray[np.float32]:
-    """Return e^x of all states of the hidden units, (B, units, states). See `all_states`."""
-    p: NDArray[np.float32] = _with_first(x, states)
-    flat = p.reshape(-1)
-    for k in range(len(flat)):
-        flat[k] = exp(flat[k])
-    return p
-
-
-@compiled
-def _with_first(x: NDArray[Any], states: int) -> NDArray[np.float32]:
-    """Return x (B, H1) with a 0 for the first state of each unit, (B, units, states)."""
-    p = np.zeros((len(x), x.shape[1] // (states - 1), states), np.float32)
-    for b in range(len(p)):
-        for m in range(p.shape[1]):
-            for z in range(1, states):
-                p[b, m, z] = x[b, m * (states - 1) + z - 1]
-    return p
-
-
-@compiled_in_any_order
-def _largest(row: NDArray[np.float32]) -> np.float32:
-    largest: np.float32 = row[0]
-    for z in range(1, len(row)):
-        largest = max(largest, row[z])
-    return largest
-
-
-@compiled_in_any_order
-def _total(row: NDArray[np.float32]) -> np.float32:
-    total = np.float32(0.0)
-    for z in range(len(row)):
-        total += row[z]
-    return total
 
 
 def unpack_scenes(packed: NDArray[np.int32], classes: int) -> NDArray[np.float32]:

@@ -14,19 +14,15 @@ import orjson
 from numpy.typing import NDArray
 from pydantic_core import from_json, to_json, to_jsonable_python
 
-from app.compiling import compiled
 from app.errors import AnswerTooLargeError, LocatedError
+from app.inference.kernels import DIGITS, round_to_digits, strongest
 from app.questions.posterior import Present
-from app.questions.ranking import strongest
 from app.questions.reading import Reading
 from app.scene.scene import Scene
 from scene_client.schemas import ModelReference, SceneRequest
 
 Fields: TypeAlias = dict[str, Any]
 """Fields of an answer, or of a part of an answer."""
-
-DIGITS: Final = 6
-"""Significant digits of probabilities, log-odds and metres."""
 
 REASONS: Final = 3
 """Maximum number of reasons for one entry of an answer."""
@@ -44,10 +40,6 @@ _ENVELOPE_BYTES: Final = 4096
 _WARNING_BYTES: Final = 400
 # Size in bytes of the longest id: 128 characters of at most four bytes, two quotes and a comma.
 _LONGEST_NAME: Final = 4 * 128 + 3
-
-# Doubles represent these powers of ten exactly. So an integer divided by such a power is the double
-# that is nearest to the decimal number.
-_POWERS: Final = np.array([10.0**power for power in range(23)])
 
 
 def envelope(
@@ -102,7 +94,7 @@ def reasons(
 def significant(numbers: NDArray[np.floating[Any]]) -> list[float]:
     """Round numbers (n,) to `DIGITS` significant digits."""
     values = numbers.astype(np.float64)
-    exact = _round(values)
+    exact = round_to_digits(values)
     rounded: list[float] = values.tolist()
     return rounded if exact else [rounded_number(value) for value in rounded]
 
@@ -110,27 +102,6 @@ def significant(numbers: NDArray[np.floating[Any]]) -> list[float]:
 def rounded_number(number: float) -> float:
     """Round one number to `DIGITS` significant digits. Use `significant` for many numbers."""
     return float(f"{number:.{DIGITS}g}")
-
-
-@compiled
-def _round(values: NDArray[np.float64]) -> bool:
-    """Round numbers to `DIGITS` significant digits in place.
-
-    Returns:
-        False if a number is too small or too large for exact powers of ten. Such numbers stay
-        unchanged.
-    """
-    exact = True
-    for k in range(len(values)):
-        size = np.abs(values[k])
-        if 1e-16 < size < 1e5:
-            # A number with d digits before the point keeps DIGITS - d decimal places.
-            places = DIGITS - 1 - np.int64(np.floor(np.log10(size)))
-            scale = _POWERS[places]
-            values[k] = np.rint(values[k] * scale) / scale
-        elif size != 0.0:
-            exact = False
-    return exact
 
 
 class SizeLimit:

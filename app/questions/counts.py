@@ -20,17 +20,16 @@ import math
 import sys
 from collections.abc import Collection
 from functools import lru_cache
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from app.compiling import compiled
+from app.inference.kernels import best, count_distributions, count_summaries
 from app.questions.answer import Fields, significant
 from app.questions.posterior import Present
-from app.questions.ranking import best
 from app.registry.artifact import Artifact
-from app.registry.counts import INTERCEPT, ROOM, SEVERAL, SINGLE, Counts
+from app.registry.counts import Counts
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -39,7 +38,6 @@ LIKELY: Final = 0.5
 """Minimum probability of further instances at which an answer contains a class."""
 
 _FIELDS: Final = ("label", "listed_count", "expected_count", "low", "high", "probability")
-_TAIL: Final = 0.1  # probability of a count below `low`, and of a count above `high`
 
 
 def more(
@@ -78,7 +76,7 @@ def more(
         unlisted = (1 - coverage) / (1 - usual)
     rows, p = distribution(artifact.counts, artifact.spec.V, classes, listed, room, unlisted)
     classes, listed = classes[rows], listed[rows]
-    p_more, expected, low, high = _summaries(p, listed)
+    p_more, expected, low, high = count_summaries(p, listed)
     usable = p_more >= LIKELY if candidates is None else np.isin(classes, list(candidates))
     order = best(p_more, usable, top_k)
     if not len(order):
@@ -121,83 +119,8 @@ def distribution(
     log_unlisted = math.log(max(unlisted, sys.float_info.min))
     tables = counts.classes, counts.most, counts.log_share, counts.weights
     first = counts.weights.shape[-1] - V
-    rows, p = _distributions(*tables, *scene, first, log_unlisted)
+    rows, p = count_distributions(*tables, *scene, first, log_unlisted)
     return rows, p
-
-
-@compiled
-def _distributions(
-    known: NDArray[np.integer[Any]],
-    most: NDArray[np.integer[Any]],
-    log_share: NDArray[np.float32],
-    weights: NDArray[np.float32],
-    classes: Ints,
-    listed: Ints,
-    room: int,
-    first: int,
-    log_unlisted: float,
-) -> tuple[Ints, Floats]:
-    """Return the classes and the distributions of `distribution`, (k,) and (k, M).
-
-    Args:
-        known, most, log_share, weights: see `Counts`. Column `first` of the weights is class 0.
-        classes, listed: (n,) listed classes, and numbers of listed objects.
-        room: index of the room type, or -1.
-    """
-    n, M = len(classes), log_share.shape[1]
-    p, rows, k = np.empty((n, M), np.float64), np.empty(n, np.int64), 0
-    several = (listed > 1).sum()
-    entry = np.searchsorted(known, classes)
-    for i in range(n):
-        e = entry[i]
-        if e < len(known) and known[e] == classes[i] and listed[i] <= most[e]:
-            rows[k] = i
-            k += 1
-    for row in range(k):
-        e, number = entry[rows[row]], listed[rows[row]]
-        exponents = np.zeros(2)
-        for x in range(2):
-            # The effect of a class on itself is 0, so the sum over all listed classes is correct.
-            for j in range(n):
-                exponents[x] += weights[e, x, first + classes[j]]
-            exponents[x] /= math.sqrt(max(n - 1, 1))
-            exponents[x] += weights[e, x, INTERCEPT]
-            if number == 1:
-                exponents[x] += weights[e, x, SINGLE]
-            if several > (number > 1):
-                exponents[x] += weights[e, x, SEVERAL]
-            if room >= 0:
-                exponents[x] += weights[e, x, ROOM + room]
-        p[row] = -np.inf
-        for m in range(number, M + 1):
-            log = math.log(m)
-            value = log_share[e, m - 1] + exponents[0] * log + (m - number) * log_unlisted
-            p[row, m - 1] = value + exponents[1] * log * (math.log(M) - log)
-        p[row] = np.exp(p[row] - p[row].max())
-        p[row] /= p[row].sum()
-    return rows[:k], p[:k]
-
-
-@compiled
-def _summaries(p: Floats, listed: Ints) -> tuple[Floats, Floats, Ints, Ints]:
-    """Return the columns of `more` for k classes: P(n > listed), E[n], `low` and `high`.
-
-    Args:
-        p: (k, M) probability of 1, 2, ... M instances.
-        listed: (k,) number of listed objects of each class.
-    """
-    p_more, expected = np.zeros(len(p)), np.zeros(len(p))
-    low, high = np.ones(len(p), np.int64), np.ones(len(p), np.int64)
-    for row in range(len(p)):
-        cumulative = 0.0
-        for m in range(p.shape[1]):
-            cumulative += p[row, m]
-            expected[row] += (m + 1) * p[row, m]
-            low[row] += cumulative < _TAIL
-            high[row] += cumulative < 1 - _TAIL
-            if m + 1 == listed[row]:
-                p_more[row] = 1 - cumulative
-    return p_more, expected, low, high
 
 
 @lru_cache(maxsize=8)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import InvalidRequestError
+from app.inference.kernels import best
 from app.questions.answer import (
     CAUSE_BYTES,
     EXPLAINED,
@@ -30,7 +31,6 @@ from app.questions.names import ErrorList
 from app.questions.placements import Place, place_log_p, placements
 from app.questions.posterior import LEAST_CHANGE, Posterior, calibrated
 from app.questions.question import LABELS, REFUSED, SCENES, Example, Options, Question
-from app.questions.ranking import likeliest_classes
 from app.questions.reading import Reading
 from app.registry.artifact import Artifact
 from app.scene.geometry import Axes, viewer_axes
@@ -150,11 +150,13 @@ def _ranked(
     log_odds = posterior.absent_log_odds(np.arange(len(usable)), coverage)
     if place is None:
         entry = artifact.calibration.missing
-        logits = calibrated(entry, log_odds, max(1, posterior.listed))
+        first = best(entry.slope * log_odds, usable, top_k)
+        logits = calibrated(entry, log_odds[first], max(1, posterior.listed))
     else:
         logits = _logits_at(artifact, posterior, place, usable, log_odds, top_k)
-    first, probabilities = likeliest_classes(logits, usable, top_k)
-    return first, probabilities, log_odds[first]
+        first = best(logits, usable, top_k)
+        logits = logits[first]
+    return first, 1.0 / (1.0 + np.exp(-logits.astype(np.float64))), log_odds[first]
 
 
 def _logits_at(

@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference.elementary import sigmoid
+from app.inference.kernels import best
 from app.questions.answer import (
     CAUSE_BYTES,
     EXPLAINED,
@@ -42,7 +43,6 @@ from app.questions.answer import (
 from app.questions.misplaced import misplaced_fields
 from app.questions.posterior import Posterior, calibrated
 from app.questions.question import REFUSED, SCENES, WITH_TOILET, Example, Options, Question
-from app.questions.ranking import best
 from app.questions.reading import Reading, Triple
 from app.registry.artifact import Artifact
 from app.registry.description import AlarmLine, CountSlope, Sensitivity

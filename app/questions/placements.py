@@ -6,7 +6,6 @@ called the anchor. An offset is the distance vector between the centres of both.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from itertools import repeat
 from typing import Any, Final, NamedTuple
@@ -14,19 +13,15 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from app.compiling import compiled
-from app.inference.relations import NO_UNIT
+from app.inference.kernels import NO_UNIT, UNOBSERVED, likeliest_places, rotated_offsets
 from app.questions.answer import Fields, significant
 from app.questions.posterior import Posterior
-from app.questions.ranking import likeliest_places
 from app.registry.artifact import Artifact
-from app.registry.offsets import UNOBSERVED, Offsets, look_up
+from app.registry.offsets import Offsets
 from app.scene.geometry import SMALLEST, Axes
 from app.scene.relations import (
     CANONICAL,
-    FRONT,
     INSIDE,
-    LEFT,
     ON_TOP,
     RELATIONS,
     SUPPORTS,
@@ -43,7 +38,6 @@ LEAST_LIKELY: Final = 0.05  # least probability of a placement
 _SEEN_FROM_ANCHORS: Final = tuple(map(opposite, RELATIONS))
 _TIGHT: Final = 1.2  # ratio of extents up to which a box fits into another box
 _UNTURNED: Final = np.eye(3)
-_PER_METRE: Final = 1000.0  # offsets are rounded to millimetres
 
 
 class Place(NamedTuple):
@@ -142,9 +136,9 @@ def placements(
         forward[:, ON_TOP:] += unseen[:, subjects, classes].swapaxes(0, 1)
         backward[:, ON_TOP:] += unseen[:, classes, subjects].swapaxes(0, 1)
     if A > INSIDE:
-        fits = _fits_inside(artifact, things, candidates, classes)
-        np.copyto(forward[:, INSIDE], NO_UNIT, where=~fits[0])
-        np.copyto(backward[:, INSIDE], NO_UNIT, where=~fits[1])
+        candidates_too_large, things_too_large = _too_large(artifact, things, candidates, classes)
+        forward[:, INSIDE][candidates_too_large] = NO_UNIT
+        backward[:, INSIDE][things_too_large] = NO_UNIT
     slopes, log_counts = artifact.relation_slopes.placement, present.log_counts[anchors]
     *places, p = likeliest_places(slopes, forward, backward, log_counts, PLACES, first)
     of_candidate = p.reshape(len(candidates), -1)
@@ -187,44 +181,26 @@ def held_objects(artifact: Artifact, posterior: Posterior, scene: Scene) -> list
     ]
 
 
-def _fits_inside(
+def _too_large(
     artifact: Artifact,
     things: Sequence[SceneObject],
     candidates: NDArray[np.int64],
     classes: NDArray[np.int64],
-) -> NDArray[np.bool_]:
-    """Return whether each candidate fits into each object, and each object into each candidate.
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which candidates do not fit into each object, and which objects not into candidates.
 
-    The shape is (2, N candidates, m objects). A box fits into another box if each of its extents,
+    Both arrays are (N candidates, m objects). A box fits into another box if each of its extents,
     in order of size, is at most `_TIGHT` times that of the other. Candidates, and objects of
     unknown size, have the typical size of their class. A box of unknown size fits everywhere.
     """
     sizes = artifact.vocabulary.sorted_sizes
-    outer = sizes[classes]
+    inner, outer = sizes[candidates, None], sizes[classes]
     for row, thing in enumerate(things):
         if thing.size is not None and max(thing.size) >= SMALLEST:
             outer[row] = sorted(thing.size)
-    fits: NDArray[np.bool_] = _fits(sizes[candidates], outer)
-    return fits
-
-
-@compiled
-def _fits(inner: NDArray[Any], outer: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return whether boxes with sorted extents fit into each other, (2, N, m); see `_fits_inside`.
-
-    The first table tells which inner boxes (N, 3) fit into which outer boxes (m, 3), and the second
-    one which outer boxes fit into which inner boxes.
-    """
-    fits = np.ones((2, len(inner), len(outer)), np.bool_)
-    for i in range(len(inner)):
-        for j in range(len(outer)):
-            for k in range(3):
-                # A comparison with NaN is False.
-                if inner[i, k] > _TIGHT * outer[j, k]:
-                    fits[0, i, j] = False
-                if outer[j, k] > _TIGHT * inner[i, k]:
-                    fits[1, i, j] = False
-    return fits
+    # A comparison with NaN is False.
+    too_large = inner > _TIGHT * outer, outer > _TIGHT * inner
+    return np.any(too_large[0], axis=2), np.any(too_large[1], axis=2)
 
 
 def _offset_fields(
@@ -267,51 +243,7 @@ def offsets_of(
         unknown offset.
     """
     rotation = _UNTURNED if axes is None else np.array(axes)
-    mean, std, scenes = _rotated_offsets(
+    mean, std, scenes = rotated_offsets(
         offsets.tables, relation, missing, anchor, outgoing, rotation, axes is not None
     )
-    return mean, std, scenes
-
-
-@compiled
-def _rotated_offsets(
-    tables: tuple[NDArray[Any], ...],
-    relation: NDArray[np.int64],
-    missing: NDArray[np.int64],
-    anchor: NDArray[np.int64],
-    outgoing: NDArray[np.bool_],
-    axes: NDArray[np.float64],
-    has_axes: bool,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Compute the mean (n, 3), standard deviation (n, 3) and number of scenes (n,) of n offsets.
-
-    ``has_axes`` is False if the viewing direction is unknown. For the other arguments, see
-    `offsets_of`.
-    """
-    subject, object_ = np.where(outgoing, missing, anchor), np.where(outgoing, anchor, missing)
-    offset, scenes = look_up(tables, relation, subject, object_)
-    n = len(relation)
-    mean, variance, std = np.zeros((n, 3)), np.zeros((n, 3)), np.empty((n, 3))
-    for k in range(n):
-        if has_axes:
-            for axis in range(3):
-                axis_mean, axis_variance = offset[k, axis], offset[k, 3 + axis] ** 2
-                for to in range(3):
-                    mean[k, to] += axes[axis, to] * axis_mean
-                    variance[k, to] += axes[axis, to] ** 2 * axis_variance
-        else:
-            if relation[k] == LEFT or relation[k] == FRONT:
-                scenes[k] = UNOBSERVED
-            mean[k, 2], variance[k, 2] = offset[k, 2], offset[k, 5] ** 2
-            # Any horizontal direction is equally likely, so x and y share E[x²] + E[y²] equally.
-            for axis in range(2):
-                half = (offset[k, axis] ** 2 + offset[k, 3 + axis] ** 2) / 2
-                variance[k, 0] += half
-                variance[k, 1] += half
-        for axis in range(3):
-            value = mean[k, axis] if outgoing[k] else -mean[k, axis]
-            # Adding 0.0 turns -0.0 into 0.0.
-            mean[k, axis] = np.rint(value * _PER_METRE) / _PER_METRE + 0.0
-            millimetres = np.rint(math.sqrt(variance[k, axis]) * _PER_METRE)
-            std[k, axis] = max(millimetres, 1.0) / _PER_METRE
     return mean, std, scenes

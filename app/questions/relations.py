@@ -21,12 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import InvalidRequestError, Location
+from app.inference.kernels import EXCLUDED, disagreeing, likeliest_relations, observed_pairs
 from app.questions.answer import RELATION_BYTES, Fields, SizeLimit, significant
 from app.questions.names import ErrorList
 from app.questions.placements import held_objects
 from app.questions.posterior import Posterior, Present, relations_given
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
-from app.questions.ranking import EXCLUDED, disagreeing, likeliest_relations, observed_pairs
 from app.questions.reading import Reading, Triple
 from app.registry.artifact import Artifact
 from app.scene.relations import (

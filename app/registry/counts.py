@@ -9,6 +9,10 @@ from typing import Any, ClassVar, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from app.inference.kernels import INTERCEPT as INTERCEPT
+from app.inference.kernels import ROOM as ROOM
+from app.inference.kernels import SEVERAL as SEVERAL
+from app.inference.kernels import SINGLE as SINGLE
 from app.registry.errors import ArtifactError
 from app.registry.fields import TensorGroup
 
@@ -16,10 +20,6 @@ Table = NDArray[np.float32]
 
 PREFIX: Final = "counts."
 """Prefix of the names of count tensors. They are in the same file as the machine's tensors."""
-
-INTERCEPT, SINGLE, SEVERAL, ROOM = 0, 1, 2, 3
-"""Columns of `Counts.weights`: intercept, 1 if one object is listed, 1 if another class is listed
-several times, and the first of C room types. The last V columns are those of the other classes."""
 
 EXPONENTS: Final = 2
 """Exponents of the formula: the first raises large numbers, and the second numbers between 1 and M.

@@ -7,7 +7,6 @@ The opposite relation, with both classes exchanged, has the negative offset.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,7 +15,8 @@ from typing import Any, ClassVar, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from app.compiling import compiled
+from app.inference.kernels import UNOBSERVED as UNOBSERVED
+from app.inference.kernels import look_up_offsets
 from app.registry.errors import ArtifactError
 from app.registry.fields import TensorGroup
 
@@ -25,9 +25,6 @@ Ints = NDArray[np.integer[Any]]
 
 PREFIX: Final = "offsets."
 """Prefix of the names of offset tensors. They are in the same file as the machine's tensors."""
-
-UNOBSERVED: Final = -1
-"""Number of scenes that `Offsets.find` returns if the relation never occurred in training."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +102,7 @@ class Offsets(TensorGroup):
             0. Its offset is then the sum of a term of the relation and one term of each class. If
             the relation never occurred in training, the number is `UNOBSERVED`.
         """
-        offsets, scenes = look_up(self.tables, relation, subject, other)
+        offsets, scenes = look_up_offsets(self.tables, relation, subject, other)
         return offsets, scenes
 
     @cached_property
@@ -114,24 +111,3 @@ class Offsets(TensorGroup):
         by_relation = self.relation, self.relation_scenes, self.subject, self.object
         by_pair = self.pair, self.pair_offset, self.pair_scenes
         return by_relation + by_pair
-
-
-@compiled
-def look_up(tables, relation, subject, other):
-    """See `Offsets.find`."""
-    relation_offset, relation_scenes, subjects, objects, pair, pair_offset, pair_scenes = tables
-    n, V = len(relation), subjects.shape[1]
-    offset, scenes = np.empty((n, 6)), np.empty(n, np.int64)
-    for k in range(n):
-        a, i, j = relation[k], subject[k], other[k]
-        key = (a * V + i) * V + j
-        row = np.searchsorted(pair, key)
-        if row < len(pair) and pair[row] == key:
-            offset[k], scenes[k] = pair_offset[row], pair_scenes[row]
-            continue
-        scenes[k] = 0 if relation_scenes[a] > 0 else UNOBSERVED
-        for axis in range(6):
-            value = np.float64(relation_offset[a, axis])
-            value = value + subjects[a, i, axis] + objects[a, j, axis]
-            offset[k, axis] = value if axis < 3 else math.sqrt(value)
-    return offset, scenes

@@ -20,7 +20,7 @@ from typing import Any, ClassVar, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from app.compiling import compiled
+from app.inference.kernels import triple_counts
 from app.registry.errors import ArtifactError
 from app.registry.fields import TensorGroup
 from app.scene.relations import CANONICAL, STACKED, SUPPORTS
@@ -40,27 +40,6 @@ _SHOWN: Final = 2.0  # minimum number of scenes that show a relation
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
-
-
-@compiled
-def _counts(
-    triple: NDArray[Any],
-    held: NDArray[Any],
-    V: int,
-    relation: int,
-    subject: NDArray[Any],
-    other: NDArray[Any],
-) -> Floats:
-    """Return the counts of the triples (relation, subject, other), (N, M); 0 without an entry."""
-    counts = np.zeros((len(subject), len(other)))
-    for i in range(len(subject)):
-        start = (relation * V + subject[i]) * V
-        first, last = np.searchsorted(triple, start), np.searchsorted(triple, start + V)
-        for j in range(len(other)):
-            row = first + np.searchsorted(triple[first:last], start + other[j])
-            if row < last and triple[row] == start + other[j]:
-                counts[i, j] = held[row]
-    return counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +150,7 @@ class Places(TensorGroup):
     def _held(self, relation: int, subject: Indices, other: Indices) -> Floats:
         """Return the number of training scenes with a relation between classes, (N, M)."""
         V = len(self.frequency)
-        held: Floats = _counts(self.triple, self.held, V, relation, subject, other)
+        held: Floats = triple_counts(self.triple, self.held, V, relation, subject, other)
         return held
 
     def shows(self, relation: int, subject: Indices, other: Indices) -> NDArray[np.bool_]:

@@ -57,22 +57,16 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from app.compiling import compiled
-from app.scene.footprints import measure
-from app.scene.relations import ABOVE, CANONICAL, FRONT, INSIDE, LEFT, ON_TOP
-from app.scene.roles import IN, ON, UNDER, RoleCounts, is_smaller, likely_role, possible_roles
+from app.inference import kernels
+from app.inference.kernels import CONTACT as CONTACT
+from app.inference.kernels import MIN_OFFSET
+from app.scene.relations import CANONICAL, FRONT, LEFT, ON_TOP
+from app.scene.roles import RoleCounts
 
-MIN_OVERLAP: Final = 0.30  # minimum overlap as a share of the smaller footprint
-CONTACT: Final = 0.05  # maximum distance in metres between bottom and top for *on-top*
-NEIGHBOUR_GAP: Final = 1.0  # maximum distance in metres between the footprints of neighbours
-NEIGHBOUR_DISTANCE: Final = 1.5  # maximum distance in metres between centres if a size is unknown
 UNKNOWN_REACH: Final = 1.5  # maximum reach in metres of a footprint of unknown size
-MIN_OFFSET: Final = 0.10  # minimum |dx| or |dy| in metres for *front* or *left*
 MOST_DISTANT: Final = 100.0  # longest plausible distance from the viewer in metres; detects mm
 SMALLEST: Final = 1e-3  # shortest plausible longest side of a box in metres
 LARGEST: Final = 20.0  # longest plausible side of a box in metres
-
-_NONE: Final = -1  # index for "no relation"
 
 Array = NDArray[np.float64]
 Rows = Array | Sequence[Sequence[float]]
@@ -156,7 +150,7 @@ def derive_relations(
     n = len(points)
     extents = _array("sizes", sizes, (n, 3))
     turns = np.zeros(n) if yaws is None else _array("yaws", yaws, (n,))
-    if not _are_valid(points, extents, turns):
+    if np.isinf(points).any() or np.isinf(extents).any() or not np.isfinite(turns).all():
         raise ValueError("positions, sizes and yaws must not be infinite, and yaws must not be NaN")
     if np.any(extents < 0):
         raise ValueError("sizes must not be negative")
@@ -166,7 +160,7 @@ def derive_relations(
         raise ValueError(f"classes must be {n} indices below {len(roles.anchor)}")
     holds = np.zeros((len(CANONICAL), n, n), dtype=np.bool_)
     observed = np.zeros_like(holds)
-    _relate_all(points, extents, turns, horizontal, classes, roles, holds, observed)
+    kernels.relate_all(points, extents, turns, horizontal, classes, roles, holds, observed)
     return PoseRelations(holds, observed)
 
 
@@ -198,142 +192,6 @@ def excluded_by_centres(points: Array, sizes: Array, *, horizontal: bool) -> NDA
     radius[np.isnan(radius)] = UNKNOWN_REACH
     excluded[ON_TOP:] = np.hypot(dx, dy) > radius[:, None] + radius  # the stacked relations
     return excluded
-
-
-@compiled
-def _are_valid(points, extents, turns):
-    """Return whether yaws are finite, and positions and extents are finite or NaN (unknown)."""
-    for i in range(len(points)):
-        for k in range(3):
-            if math.isinf(points[i, k]) or math.isinf(extents[i, k]):
-                return False
-        if not math.isfinite(turns[i]):
-            return False
-    return True
-
-
-@compiled
-def _relate_all(points, extents, turns, horizontal, classes, roles, holds, observed):
-    """Write the relations of all pairs of boxes to ``holds`` and ``observed``."""
-    n = len(points)
-    has_position, has_size = np.empty(n, np.bool_), np.empty(n, np.bool_)
-    radius = np.empty(n)
-    for i in range(n):
-        has_position[i], has_size[i] = _is_known(points[i]), _is_known(extents[i])
-        radius[i] = math.hypot(extents[i, 0], extents[i, 1]) / 2
-    for i in range(n):
-        for j in range(i + 1, n):
-            if not (has_position[i] and has_position[j]):
-                continue
-            distance = math.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1])
-            have_sizes, overlap = has_size[i] and has_size[j], False
-            if not have_sizes:
-                neighbours = distance <= NEIGHBOUR_DISTANCE
-            # The distance between the circles around the footprints is a fast first check, because
-            # `measure` is slower.
-            elif distance - radius[i] - radius[j] <= NEIGHBOUR_GAP:
-                share, gap = measure(
-                    points[i], extents[i], turns[i], points[j], extents[j], turns[j]
-                )
-                neighbours, overlap = gap <= NEIGHBOUR_GAP, share >= MIN_OVERLAP
-            else:
-                neighbours = False
-            # The order of relation indices is left, front, on-top, above, inside.
-            first = LEFT if neighbours and horizontal else ON_TOP
-            last = INSIDE if have_sizes else FRONT
-            for relation in range(first, last + 1):
-                observed[relation, i, j] = observed[relation, j, i] = True
-            if overlap and _stack(points, extents, i, j, classes, roles, holds, observed):
-                continue
-            if neighbours and horizontal:
-                for subject, anchor in ((i, j), (j, i)):
-                    relation = _horizontal(points, subject, anchor)
-                    if relation != _NONE:
-                        holds[relation, subject, anchor] = True
-
-
-@compiled
-def _is_known(row):
-    return not (math.isnan(row[0]) or math.isnan(row[1]) or math.isnan(row[2]))
-
-
-@compiled
-def _stack(points, extents, i, j, classes, roles, holds, observed):
-    """Set the stacked relations of two boxes by rules 1 to 3. Return whether a rule applies.
-
-    The footprints must overlap.
-    """
-    for subject, anchor in ((i, j), (j, i)):
-        relation = _vertical(points, extents, subject, anchor)
-        if relation != _NONE:
-            holds[relation, subject, anchor] = True
-            return True
-    nested = _surrounds(points, extents, i, j) or _surrounds(points, extents, j, i)
-    lowest = max(_lift(points, extents, i, j), _lift(points, extents, j, i))
-    if lowest >= -CONTACT and not nested:
-        return False  # two thin boxes at the same height
-    for smaller, larger in ((i, j), (j, i)):
-        if is_smaller(extents[smaller], extents[larger]):
-            _choose_role(points, extents, smaller, larger, classes, roles, holds, observed)
-            return True
-    for relation in (ON_TOP, INSIDE):
-        observed[relation, i, j] = observed[relation, j, i] = False
-    return True
-
-
-@compiled
-def _choose_role(points, extents, smaller, larger, classes, roles, holds, observed):
-    """Set the relation of a role by rule 3, or leave the relations of possible roles unobserved."""
-    height, larger_height = extents[smaller, 2], extents[larger, 2]
-    rise = points[smaller, 2] - height / 2 - (points[larger, 2] - larger_height / 2)
-    possible = possible_roles(rise, height, larger_height)
-    role = likely_role(roles, classes[smaller], classes[larger], possible)
-    if role == ON:
-        holds[ON_TOP, smaller, larger] = True
-    elif role == UNDER:
-        holds[ON_TOP, larger, smaller] = True
-    elif role == IN:
-        holds[INSIDE, smaller, larger] = True
-    else:
-        observed[ON_TOP, smaller, larger] = not possible[ON]
-        observed[ON_TOP, larger, smaller] = not possible[UNDER]
-        observed[INSIDE, smaller, larger] = not possible[IN]
-
-
-@compiled
-def _vertical(points, extents, i, j):
-    """Return the vertical relation of box i to box j. Their footprints must overlap."""
-    lift = _lift(points, extents, i, j)
-    if lift > CONTACT:
-        return ABOVE
-    if abs(lift) <= CONTACT and points[i, 2] > points[j, 2]:
-        return _NONE if _surrounds(points, extents, i, j) else ON_TOP
-    return _NONE
-
-
-@compiled
-def _surrounds(points, extents, i, j):
-    """Return whether box i surrounds box j; see rule 1. Their footprints must overlap."""
-    half, half_j = extents[i, 2] / 2, extents[j, 2] / 2
-    is_lower = points[i, 2] - half < points[j, 2] - half_j
-    is_higher = points[i, 2] + half > points[j, 2] + half_j
-    is_high = extents[i, 2] > 2 * CONTACT
-    return is_lower and is_higher and is_high and is_smaller(extents[j], extents[i])
-
-
-@compiled
-def _lift(points, extents, i, j):
-    """Return the height in metres of the bottom of box i above the top of box j."""
-    return (points[i, 2] - extents[i, 2] / 2) - (points[j, 2] + extents[j, 2] / 2)
-
-
-@compiled
-def _horizontal(points, i, j):
-    """Return the horizontal relation of box i to its neighbour j."""
-    to_front, to_left = points[j, 0] - points[i, 0], points[i, 1] - points[j, 1]
-    if abs(to_left) >= abs(to_front):
-        return LEFT if to_left >= MIN_OFFSET else _NONE
-    return FRONT if to_front >= MIN_OFFSET else _NONE
 
 
 def _array(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:

@@ -11,6 +11,12 @@ from collections.abc import Hashable, Iterable
 from graphlib import CycleError, TopologicalSorter
 from typing import Final, TypeVar
 
+from app.inference.kernels import ABOVE as ABOVE
+from app.inference.kernels import FRONT as FRONT
+from app.inference.kernels import INSIDE as INSIDE
+from app.inference.kernels import LEFT as LEFT
+from app.inference.kernels import ON_TOP as ON_TOP
+
 CANONICAL: Final[tuple[str, ...]] = ("left", "front", "on-top", "above", "inside")
 OPPOSITES: Final[dict[str, str]] = {
     "left": "right",
@@ -21,11 +27,6 @@ OPPOSITES: Final[dict[str, str]] = {
 }
 RELATIONS: Final[tuple[str, ...]] = CANONICAL + tuple(OPPOSITES[name] for name in CANONICAL)
 
-LEFT: Final = 0
-FRONT: Final = 1
-ON_TOP: Final = 2
-ABOVE: Final = 3
-INSIDE: Final = 4
 
 LATERAL: Final = (LEFT, FRONT)
 """Indices of the relations of neighbours that stand beside each other."""

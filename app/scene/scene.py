@@ -19,7 +19,8 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from app.compiling import compiled
+from app.inference.kernels import pool_classes as pool_classes
+from app.inference.kernels import pool_relations as pool_relations
 from app.scene.geometry import (
     SMALLEST,
     PoseRelations,
@@ -319,52 +320,6 @@ def pool_instances(
     distinct, _, row, counts, present = pool_classes(labels, np.asarray(confidence, np.float64))
     class_holds, class_observed = pool_relations(row, len(distinct), holds, observed)
     return ClassEvidence(distinct, counts, present, class_holds, class_observed, room_type)
-
-
-@compiled
-def pool_classes(
-    classes: NDArray[np.int64], confidence: NDArray[np.float64]
-) -> tuple[Indices, Indices, Indices, Indices, NDArray[np.float64]]:
-    """Return the n distinct classes of N instances.
-
-    Returns:
-        Class indices in ascending order, (n,).
-        Index of the first instance of each class, (n,).
-        For each instance, index of its class in the first array, (N,).
-        Number of instances of each class, (n,).
-        Probability that at least one instance of each class exists, (n,).
-    """
-    distinct, row = np.empty(len(classes), np.int64), np.empty(len(classes), np.int64)
-    counts, first = np.zeros(len(classes), np.int64), np.empty(len(classes), np.int64)
-    absent, n = np.ones(len(classes), np.float64), 0
-    for instance in np.argsort(classes, kind="mergesort"):
-        if n == 0 or distinct[n - 1] != classes[instance]:
-            distinct[n], first[n] = classes[instance], instance
-            n += 1
-        row[instance] = n - 1
-        counts[n - 1] += 1
-        absent[n - 1] *= 1.0 - confidence[instance]
-    return distinct[:n], first[:n], row, counts[:n], 1.0 - absent[:n]
-
-
-@compiled
-def pool_relations(
-    row: NDArray[np.int64], n: int, holds: NDArray[np.bool_], observed: NDArray[np.bool_]
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Pool the relations of instances (A, N, N) into relations of classes (A, n, n).
-
-    ``row`` (N,) is the index of each instance's class, from 0 to n - 1. The results are ``holds``
-    and ``observed`` of `ClassEvidence`.
-    """
-    size = len(row)
-    class_holds, class_observed = np.zeros((A, n, n), np.bool_), np.zeros((A, n, n), np.bool_)
-    for a in range(A):
-        for i in range(size):
-            for j in range(size):
-                if i != j and (holds[a, i, j] or observed[a, i, j]):
-                    class_observed[a, row[i], row[j]] = True
-                    class_holds[a, row[i], row[j]] |= holds[a, i, j]
-    return class_holds, class_observed
 
 
 def class_evidence(scene: Scene) -> ClassEvidence:

@@ -14,6 +14,7 @@ from typing import Literal
 
 from app import errors
 from app.compiling import check_cache, progress
+from app.inference.kernels import KERNELS
 from app.questions.reading import Limits
 from app.registry import AliasTarget, Store, StoreError, StoreState, load_model_set
 from app.serving.admission import Backlog, Threads, WorkQueue
@@ -217,7 +218,7 @@ class Runtime:
         # processes make during the load.
         self._loaded_state = self._store.state()
         models = self.models
-        with progress():
+        with progress(KERNELS):
             return prepare(load_model_set(self._store, models.store), self._new_queue, models)
 
     def _target(self, reference: str) -> AliasTarget:

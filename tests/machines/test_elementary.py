@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 from numba import njit
 
-from app.inference import elementary
+from app.inference import kernels
+from tests.conftest import run_program
 
 
 def compiled(name):
-    function = getattr(elementary, name)
+    function = getattr(kernels, name)
 
     @njit
     def apply(x, out):
@@ -61,3 +64,30 @@ def test_log():
     # Near one the value vanishes: there the error is one of the argument.
     assert (error <= 2 * np.spacing(np.abs(exact).astype(np.float32)) + 1e-8).all()
     assert compiled("log")(np.ones(1, np.float32))[0] == 0
+
+
+_GAINS = """
+import sys
+import numpy as np
+from app.inference.objects import Gains
+random = np.random.default_rng(7)
+weights, x = random.normal(size=(500, 30)), random.normal(size=(2, 30))
+gain = Gains(weights.astype("f4"), 3)(x.astype("f4"))
+np.save(sys.argv[1], gain)
+"""
+
+
+@pytest.mark.slow
+def test_loops_for_a_generic_processor_give_equal_numbers(tmp_path, monkeypatch):
+    """The image is compiled for NUMBA_CPU_NAME=generic."""
+    gains = []
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "loops"))
+    for cpu in ("own", "generic"):
+        if cpu == "generic":
+            monkeypatch.setenv("NUMBA_CPU_NAME", cpu)
+            monkeypatch.setenv("NUMBA_CPU_FEATURES", "")
+        path = tmp_path / f"{cpu}.npy"
+        run_program(sys.executable, "-c", _GAINS, path)
+        gains.append(np.load(path))
+    assert len(list(tmp_path.glob("loops/*/kernels.gains*.nbc"))) == 2
+    np.testing.assert_allclose(*gains, rtol=1e-5, atol=1e-5)

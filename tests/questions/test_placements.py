@@ -237,7 +237,8 @@ def test_a_box_fits_into_a_box_with_larger_extents_in_order_of_size():
     )
     candidates = np.array([bed, lamp, vase])
     classes = np.array([thing.class_index for thing in objects])
-    into, around = placements._fits_inside(artifact, objects, candidates, classes)
+    too_large = placements._too_large(artifact, objects, candidates, classes)
+    into, around = (~mask for mask in too_large)
     assert into.tolist() == [
         [False, False, False, True],
         [True, True, False, True],

@@ -1,0 +1,126 @@
+"""Compiled loops on disk: stored once, in a directory that only this user can change."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+PROGRAM = """
+import json, logging
+import numpy as np
+from app import compiling
+from app.inference.kernels import KERNELS, is_smaller
+logging.basicConfig(format="%(message)s", level="INFO")
+compiling.check_cache()
+with compiling.progress(KERNELS):
+    is_smaller(np.ones(3), 2 * np.ones(3))
+print(json.dumps([sum(is_smaller.stats.cache_misses.values()), is_smaller.stats.cache_path]))
+"""
+
+
+@pytest.fixture
+def package(tmp_path: Path, repository: Path) -> Path:
+    """A copy of the package `app` with the loops alone."""
+    for name in ("__init__", "compiling", "inference/__init__", "inference/kernels"):
+        copy = tmp_path / "service" / "app" / f"{name}.py"
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        text = "" if name.endswith("__init__") else (repository / f"app/{name}.py").read_text()
+        copy.write_text(text)
+    return tmp_path / "service" / "app"
+
+
+def begin(package: Path, **variables: str) -> subprocess.Popen[str]:
+    environment = {name: text for name, text in os.environ.items() if "NUMBA" not in name}
+    home = package.parent.parent / "home"
+    environment |= {"PYTHONPATH": "", "HOME": str(home), "XDG_CACHE_HOME": str(home / "cache")}
+    return subprocess.Popen(
+        [sys.executable, "-c", PROGRAM],
+        cwd=package.parent,
+        env=environment | variables,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def end(process: subprocess.Popen[str]) -> tuple[int, str | None, str]:
+    """Return the number of compilations, the directory of the loops, and the log."""
+    output, log = process.communicate(timeout=120)
+    assert process.returncode == 0, log
+    compilations, folder = json.loads(output)
+    return compilations, folder, log
+
+
+def start(package: Path, **variables: Any) -> tuple[int, str | None, str]:
+    return end(begin(package, **{name: str(value) for name, value in variables.items()}))
+
+
+def test_a_second_start_compiles_nothing(package: Path) -> None:
+    compilations, stored, log = start(package)
+    folder = package.parent / ".numba_cache"
+    assert compilations == 1
+    assert stored is not None
+    assert Path(stored).is_relative_to(folder)
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert "compiling loop 1 of" in log
+    assert start(package)[::2] == (0, "")
+    # A change of the file compiles again.
+    kernels = package / "inference" / "kernels.py"
+    kernels.write_text(kernels.read_text() + "\n")
+    assert start(package)[0] == 1
+
+
+def test_a_folder_that_others_can_change_is_refused(package: Path, tmp_path: Path) -> None:
+    root, folder = tmp_path / "root", tmp_path / "root" / "loops"
+    start(package, NUMBA_CACHE_DIR=folder)
+    folder.chmod(0o777)
+    compilations, stored, log = start(package, NUMBA_CACHE_DIR=folder)
+    assert (compilations, stored) == (1, None)
+    assert f"other users can write to {folder}" in log
+    folder.chmod(0o700)
+    root.chmod(0o770)
+    assert start(package, NUMBA_CACHE_DIR=folder)[:2] == (1, None)
+    root.chmod(0o1777)
+    assert start(package, NUMBA_CACHE_DIR=folder)[0] == 0
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a folder away")
+def test_a_folder_of_another_user_is_refused(package: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "loops"
+    folder.mkdir()
+    os.chown(folder, 10001, 10001)
+    compilations, stored, log = start(package, NUMBA_CACHE_DIR=folder)
+    assert (compilations, stored) == (1, None)
+    assert f"{folder} or its parent belongs to another user" in log
+
+
+def test_without_a_folder_beside_the_package_the_users_own_is_used(
+    package: Path, tmp_path: Path
+) -> None:
+    (package.parent / ".numba_cache").write_text("in the way")
+    _, stored, log = start(package)
+    assert stored is not None
+    assert Path(stored).is_relative_to(tmp_path / "home" / "cache" / "scene-boltzmann")
+    assert "compiled loops are stored in" in log
+
+
+@pytest.mark.slow
+def test_two_processes_that_start_together_compile_once(package: Path) -> None:
+    logs = [end(process)[2] for process in [begin(package), begin(package)]]
+    assert any("waiting until another process" in log for log in logs), logs
+    assert start(package)[0] == 0
+
+
+def test_every_loop_is_in_one_file_that_depends_on_no_other(repository: Path) -> None:
+    """numba notices no change of another file."""
+    app = repository / "app"
+    with_loops = [path for path in app.rglob("*.py") if "njit" in path.read_text()]
+    assert with_loops == [app / "inference" / "kernels.py"]
+    imports = [line for line in with_loops[0].read_text().splitlines() if " app" in line]
+    assert [line for line in imports if "import" in line] == ["from app.compiling import FOLDER"]
