@@ -30,6 +30,8 @@ from app.scene.relations import (
 )
 from app.scene.scene import Scene, SceneObject
 
+Mask = NDArray[np.bool_]
+
 PLACES: Final = 3
 """Maximum number of placements in the answer for one class."""
 
@@ -186,7 +188,7 @@ def _too_large(
     things: Sequence[SceneObject],
     candidates: NDArray[np.int64],
     classes: NDArray[np.int64],
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+) -> tuple[Mask, Mask]:
     """Return which candidates do not fit into each object, and which objects not into candidates.
 
     Both arrays are (N candidates, m objects). A box fits into another box if each of its extents,
@@ -194,13 +196,13 @@ def _too_large(
     unknown size, have the typical size of their class. A box of unknown size fits everywhere.
     """
     sizes = artifact.vocabulary.sorted_sizes
-    inner, outer = sizes[candidates, None], sizes[classes]
-    for row, thing in enumerate(things):
+    inner, outer = sizes[:, candidates, None], sizes[:, classes]
+    for column, thing in enumerate(things):
         if thing.size is not None and max(thing.size) >= SMALLEST:
-            outer[row] = sorted(thing.size)
+            outer[:, column] = sorted(thing.size)
+    outer = outer[:, None]
     # A comparison with NaN is False.
-    too_large = inner > _TIGHT * outer, outer > _TIGHT * inner
-    return np.any(too_large[0], axis=2), np.any(too_large[1], axis=2)
+    return np.any(inner > _TIGHT * outer, 0), np.any(outer > _TIGHT * inner, 0)
 
 
 def _offset_fields(

@@ -200,8 +200,8 @@ class Vocabulary:
 
     @cached_property
     def sorted_sizes(self) -> NDArray[np.float64]:
-        """(V, 3) typical extents of each class in ascending order, or NaN. Read-only array."""
-        sizes = np.sort(self.sizes, axis=1)
+        """(3, V) typical extents of each class in ascending order, or NaN. Read-only array."""
+        sizes = np.sort(self.sizes.T, axis=0)
         sizes.flags.writeable = False
         return sizes
 
