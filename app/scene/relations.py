@@ -41,6 +41,12 @@ _INDEX: Final = {name: index for index, name in enumerate(CANONICAL)}
 _FLIPPED: Final = {OPPOSITES[name]: index for index, name in enumerate(CANONICAL)}
 _OPPOSITE: Final = OPPOSITES | {opposite: name for name, opposite in OPPOSITES.items()}
 
+
+def relation_names(A: int) -> tuple[str, ...]:
+    """Return the names of the first A canonical relations, then of their opposites."""
+    return CANONICAL[:A] + RELATIONS[len(CANONICAL) : len(CANONICAL) + A]
+
+
 End = TypeVar("End", bound=Hashable)
 
 

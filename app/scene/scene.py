@@ -2,10 +2,11 @@
 
 `observe` derives the relations of a scene from the poses of its objects.
 
-Scenes contain instances (objects), but models only know classes. `class_evidence` converts a scene
-to evidence about classes. A relation is on if it holds, and off if it was observed not to hold.
-Relation a between classes x and y is on if at least one instance of x has relation a to an instance
-of y. Pairs of instances without an observed relation have no influence.
+Scenes contain instances (objects), but models only know classes. `pool_instances` converts the
+evidence about instances (`instance_evidence`) to evidence about classes. A relation is on if it
+holds, and off if it was observed not to hold. Relation a between classes x and y is on if at least
+one instance of x has relation a to an instance of y. Pairs of instances without an observed
+relation have no influence.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from math import isfinite
-from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,10 +133,7 @@ class Scene:
                 )
         elif self.poses is None:
             for triple in self.relations:
-                relation, subject, anchor = triple
-                ends_exist = 0 <= subject < n and 0 <= anchor < n
-                if subject == anchor or not (ends_exist and 0 <= relation < len(CANONICAL)):
-                    self._refuse(triple, n)
+                self._check(triple, n)
             if clash := contradiction(self.relations):
                 (relation, i, j), _ = clash
                 first, second = self.objects[i].id, self.objects[j].id
@@ -149,19 +146,18 @@ class Scene:
             if array is not None and array.shape != (A, n, n):
                 raise ValueError(f"{name} must have the shape {(A, n, n)}, not {array.shape}")
 
-    def _refuse(self, triple: tuple[int, int, int], n: int) -> NoReturn:
+    def _check(self, triple: tuple[int, int, int], n: int) -> None:
         relation, subject, anchor = triple
-        if not 0 <= relation < len(CANONICAL):
-            raise ValueError(
-                f"a relation index must be from 0 to {len(CANONICAL) - 1}, not {relation}"
-            )
+        if not 0 <= relation < A:
+            raise ValueError(f"a relation index must be from 0 to {A - 1}, not {relation}")
         for end in (subject, anchor):
             if not 0 <= end < n:
                 raise ValueError(f"the object index {end} of a relation is not from 0 to {n - 1}")
-        raise ValueError(
-            f"{self.objects[subject].id!r} has the relation {CANONICAL[relation]} to itself; a "
-            "relation needs two different objects"
-        )
+        if subject == anchor:
+            raise ValueError(
+                f"{self.objects[subject].id!r} has the relation {CANONICAL[relation]} to itself; a "
+                "relation needs two different objects"
+            )
 
 
 # ------------------------------------------------------------------------- relations from poses
@@ -224,19 +220,13 @@ def _in_viewer_frame(
     objects: tuple[SceneObject, ...], viewpoint: Viewpoint
 ) -> tuple[SceneObject, ...]:
     positions, yaws = to_viewer_frame(
-        [thing.position or _UNKNOWN for thing in objects],
-        viewpoint,
-        [thing.yaw for thing in objects],
+        [thing.position or _UNKNOWN for thing in objects], viewpoint, [one.yaw for one in objects]
     )
-    turned = [
-        thing
-        if thing.position is None
-        else SceneObject(
-            thing.id, thing.label, thing.class_index, thing.confidence, (x, y, z), thing.size, yaw
-        )
-        for thing, (x, y, z), yaw in zip(objects, positions.tolist(), yaws.tolist(), strict=True)
-    ]
-    return tuple(turned)
+    poses = zip(objects, map(tuple, positions.tolist()), yaws.tolist(), strict=True)
+    return tuple(
+        thing if thing.position is None else replace(thing, position=position, yaw=yaw)
+        for thing, position, yaw in poses
+    )
 
 
 def boxes_of(
@@ -322,28 +312,12 @@ def pool_instances(
     return ClassEvidence(distinct, counts, present, class_holds, class_observed, room_type)
 
 
-def class_evidence(scene: Scene) -> ClassEvidence:
-    """Return the evidence of a scene about its classes.
-
-    Instances whose label is outside the vocabulary are left out. If the scene has poses,
-    ``scene.poses`` defines which relations hold and which are observed. Otherwise, stated relations
-    are on. Relations that are not stated are off if ``scene.relations_complete`` is True, and
-    unobserved otherwise.
-    """
-    kept = [i for i, thing in enumerate(scene.objects) if thing.class_index is not None]
-    size = len(kept)
-    classes = np.array([scene.objects[i].class_index for i in kept], dtype=np.int64)
-    confidence = np.array([scene.objects[i].confidence for i in kept], dtype=np.float64)
-    holds, observed = instance_evidence(scene)
-    if size < len(scene.objects):
-        holds, observed = holds[:, kept][:, :, kept], observed[:, kept][:, :, kept]
-    return pool_instances(classes, confidence, holds, observed, scene.room_type)
-
-
 def instance_evidence(scene: Scene) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return which relations between the N instances of a scene hold, and which are observed.
 
-    Both bool arrays have the shape (A relations, N subjects, N objects).
+    Both bool arrays have the shape (A relations, N subjects, N objects). Poses define the values.
+    Without poses, stated relations hold, and other relations are observed only if
+    `relations_complete` is True.
     """
     if scene.poses is not None:
         return scene.poses.holds, scene.poses.observed

@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import Any, Final, Literal, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from app.scene.labels import Rule, head_of, label_key, readings
 from app.scene.nearest import Guess, Match, NameIndex
@@ -91,8 +91,8 @@ class Vocabulary:
         self.room_aliases = {room: tuple(names) for room, names in room_aliases.items()}
         if others := self.room_aliases.keys() - set(self.room_types):
             raise ValueError(f"room_aliases names unknown room types: {sorted(others)}")
-        self._by_key: dict[str, int] = {}
         self._by_spelling: dict[str, int] = {}
+        self._by_key: dict[str, int] = {}
         for index, entry in enumerate(self.objects):
             for name in (entry.label, *entry.aliases):
                 first = self._by_key.setdefault(label_key(name), index)
@@ -104,8 +104,8 @@ class Vocabulary:
                 self._by_spelling[name] = index
         self._bare = {name: SceneObject(name, name, k) for name, k in self._by_spelling.items()}
         self._parents = self._parent_indices()
-        self._room_by_key: dict[str, int] = {}
         self._room_by_spelling: dict[str, int] = {}
+        self._room_by_key: dict[str, int] = {}
         for index, room in enumerate(self.room_types):
             for name in (room, *self.room_aliases.get(room, ())):
                 if not label_key(name):
@@ -133,8 +133,7 @@ class Vocabulary:
             if (own := np.flatnonzero(ancestors == np.arange(len(ancestors)))).size:
                 raise ValueError(f"{self.objects[own[0]].label!r} is its own ancestor")
             ancestors = np.where(ancestors < 0, -1, parents[ancestors])
-        parents.flags.writeable = False
-        return parents
+        return _read_only(parents)
 
     def __len__(self) -> int:
         return len(self.objects)
@@ -165,45 +164,37 @@ class Vocabulary:
         names = [*self.labels, *self.room_types]
         return max(len(json.dumps(name, ensure_ascii=False).encode()) for name in names)
 
+    # The arrays are read-only.
+
     @cached_property
     def structure(self) -> NDArray[np.bool_]:
-        """(V,) True for structural classes, which a model never proposes. Read-only array."""
-        mask = np.array([entry.structure for entry in self.objects], dtype=np.bool_)
-        mask.flags.writeable = False
-        return mask
+        """(V,) True for structural classes, which a model never proposes."""
+        return _read_only([entry.structure for entry in self.objects])
 
     @property
     def parents(self) -> NDArray[np.int64]:
-        """(V,) index of the parent of each class, -1 without a parent. Read-only array."""
+        """(V,) index of the parent of each class, -1 without a parent."""
         return self._parents
 
     @cached_property
     def anywhere(self) -> NDArray[np.bool_]:
-        """(V,) True for classes whose objects belong in every room. Read-only array."""
-        mask = np.array([entry.anywhere for entry in self.objects], dtype=np.bool_)
-        mask.flags.writeable = False
-        return mask
+        """(V,) True for classes whose objects belong in every room."""
+        return _read_only([entry.anywhere for entry in self.objects])
 
     @cached_property
     def judged(self) -> NDArray[np.bool_]:
         """(V,) True for classes that can be intruders: neither structure nor `anywhere`."""
-        mask: NDArray[np.bool_] = ~(self.structure | self.anywhere)
-        mask.flags.writeable = False
-        return mask
+        return _read_only(~(self.structure | self.anywhere))
 
     @cached_property
     def sizes(self) -> NDArray[np.float64]:
-        """(V, 3) typical extents in metres, or NaN for classes of unknown size. Read-only array."""
-        sizes = np.array([entry.size or (math.nan,) * 3 for entry in self.objects])
-        sizes.flags.writeable = False
-        return sizes
+        """(V, 3) typical extents in metres, or NaN for classes of unknown size."""
+        return _read_only([entry.size or (math.nan,) * 3 for entry in self.objects])
 
     @cached_property
     def sorted_sizes(self) -> NDArray[np.float64]:
-        """(3, V) typical extents of each class in ascending order, or NaN. Read-only array."""
-        sizes = np.sort(self.sizes.T, axis=0)
-        sizes.flags.writeable = False
-        return sizes
+        """(3, V) typical extents of each class in ascending order, or NaN."""
+        return _read_only(np.sort(self.sizes.T, axis=0))
 
     def bare_objects(self, labels: Sequence[str]) -> tuple[SceneObject, ...] | None:
         """Return objects without id and pose that have these labels, or None for a new spelling.
@@ -330,6 +321,12 @@ class Vocabulary:
         ):
             raise ValueError("'room_aliases' must map room types to lists of strings")
         return cls([_object_class(entry) for entry in values["objects"]], rooms, aliases)
+
+
+def _read_only(values: ArrayLike) -> NDArray[Any]:
+    array = np.array(values)
+    array.flags.writeable = False
+    return array
 
 
 _FIELDS: Final = tuple(field.name for field in fields(ObjectClass))
