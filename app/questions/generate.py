@@ -343,7 +343,7 @@ def _read(request: GenerateRequest, artifact: Artifact, reading: Reading) -> Opt
     }
 
 
-def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
+def _ask_all(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
     # One Gibbs sweep compiles all kernels.
     yield generate(artifact, scenes[0], count=2, seed=0, steps=1)
 
@@ -380,7 +380,6 @@ _EXAMPLE_ANSWER: Final = {
 GENERATE: Final = Question(
     generate,
     _read,
-    _warm_up,
     GenerateRequest,
     GenerateAnswer,
     _EXAMPLES,
@@ -391,5 +390,6 @@ Sample scenes that contain the given objects and relations. Equal seeds give equ
 The request is refused if too few training scenes have its room type (`rare_room_types` of `GET
 /models/{name}/vocabulary`).
 """,
+    ask_all=_ask_all,
     samples=True,
 )

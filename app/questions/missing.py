@@ -264,7 +264,7 @@ def _size(entries: Sequence[Fields], further: Sequence[Fields]) -> tuple[int, in
     return fixed, places + causes + count
 
 
-def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
+def _ask_all(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
     related, bare, _ = scenes
     for scene in scenes:
         yield missing(artifact, scene)
@@ -335,7 +335,6 @@ _EXAMPLE_ANSWER: Final = {
 MISSING: Final = Question(
     missing,
     _read,
-    _warm_up,
     MissingRequest,
     MissingAnswer,
     _EXAMPLES,
@@ -346,4 +345,5 @@ Rank the classes that the scene does not list, most probable first, with likely 
 The list `more` contains listed classes that probably have further instances, such as a second
 nightstand. It is empty for questions about a place.
 """,
+    ask_all=_ask_all,
 )

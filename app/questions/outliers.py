@@ -238,18 +238,13 @@ def _companions(
 
 def _unjudged(artifact: Artifact, scene: Scene) -> list[SceneWarning]:
     """Return a warning for objects, and one for relations, if the model gives no judgement."""
-    parts = {
-        "objects": bool(scene.objects) and artifact.calibration.outlier is None,
-        "relations": bool(scene.relations) and not artifact.calibration.misplaced.judges_relations,
-    }
+    calibration = artifact.calibration
+    parts = ["objects"] if scene.objects and calibration.outlier is None else []
+    if scene.relations and not calibration.misplaced.judges_relations:
+        parts.append("relations")
+    message = "the model does not judge {}, because its calibration had too few scenes"
     return [
-        SceneWarning(
-            code="not-judged",
-            message=f"the model does not judge {part}, because its calibration had too few scenes",
-            objects=[],
-        )
-        for part, is_unjudged in parts.items()
-        if is_unjudged
+        SceneWarning(code="not-judged", message=message.format(part), objects=[]) for part in parts
     ]
 
 
@@ -273,7 +268,7 @@ def _read(request: OutliersRequest, _: Artifact, reading: Reading) -> Options:
     }
 
 
-def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
+def _ask_all(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
     # With threshold 0, every object is an outlier. So the function also computes `usually_with`.
     yield outliers(artifact, scenes[0], threshold=0.0)
     for scene in scenes[1:]:
@@ -336,7 +331,6 @@ _EXAMPLE_ANSWER: Final = {
 OUTLIERS: Final = Question(
     outliers,
     _read,
-    _warm_up,
     OutliersRequest,
     OutliersAnswer,
     _EXAMPLES,
@@ -347,4 +341,5 @@ Return probabilities that each object is an outlier and that each observed relat
 The list `outliers` starts with the most probable outlier. All instances of a class have the
 same probability. The list `misplaced` starts with the relation that is most probably false.
 """,
+    ask_all=_ask_all,
 )

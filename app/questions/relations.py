@@ -14,7 +14,7 @@ another chair is to the right. Then left and right both count as observed for ea
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from typing import Final
 
 import numpy as np
@@ -284,11 +284,6 @@ def _pairs(request: RelationsRequest, reading: Reading) -> list[tuple[int, int]]
     return list(pairs)
 
 
-def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
-    for scene in scenes:
-        yield relations(artifact, scene)
-
-
 _EXAMPLES: Final = {
     **SCENES,
     "instances": Example(
@@ -342,7 +337,6 @@ _EXAMPLE_ANSWER: Final = {
 RELATIONS: Final = Question(
     relations,
     _read,
-    _warm_up,
     RelationsRequest,
     RelationsAnswer,
     _EXAMPLES,

@@ -8,7 +8,7 @@ of the request. The machine's probability of a room type t (`app.inference.objec
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -117,11 +117,6 @@ def _read(request: RoomsRequest, _: Artifact, reading: Reading) -> Options:
     }
 
 
-def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
-    for scene in scenes:
-        yield rooms(artifact, scene)
-
-
 _NO_ROOM_TYPES: Final = SceneWarning(
     code="not-judged",
     message="The training scenes of this model have no room types.",
@@ -164,7 +159,6 @@ _EXAMPLE_ANSWER: Final = {
 ROOMS: Final = Question(
     rooms,
     _read,
-    _warm_up,
     RoomsRequest,
     RoomsAnswer,
     _EXAMPLES,

@@ -169,6 +169,26 @@ _NO_ROLES: Final = RoleCounts(
 )
 
 
+def overlap_and_gap(
+    centre_a: Array, size_a: Array, yaw_a: Array, centre_b: Array, size_b: Array, yaw_b: Array
+) -> tuple[Array, Array]:
+    """Compute overlap and gap of P pairs of rectangles a and b, the footprints of boxes.
+
+    Centres (P, 2) and sizes (P, 2) along the rectangle's own axes are in metres, yaws (P,) in
+    radians.
+
+    Returns:
+        Overlap of each pair, (P,): area of the intersection divided by the smaller area.
+        Gap of each pair, (P,): distance between the rectangles in metres, or 0 if they touch.
+    """
+    share, gap = np.empty(len(yaw_a)), np.empty(len(yaw_a))
+    rectangles = (centre_a, size_a, yaw_a, centre_b, size_b, yaw_b)
+    kernels.measure_pairs(
+        *(np.asarray(part, np.float64, order="C") for part in rectangles), share, gap
+    )
+    return share, gap
+
+
 def excluded_by_centres(points: Array, sizes: Array, *, horizontal: bool) -> NDArray[np.bool_]:
     """Return the relations that the centres of n boxes exclude, (A, n, n).
 

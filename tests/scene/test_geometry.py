@@ -10,8 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from app.scene.footprints import overlap_and_gap
-from app.scene.geometry import PoseRelations, Viewpoint, derive_relations, to_viewer_frame
+from app.scene.geometry import (
+    PoseRelations,
+    Viewpoint,
+    derive_relations,
+    overlap_and_gap,
+    to_viewer_frame,
+)
 from app.scene.relations import CANONICAL, FRONT, LEFT, STACKED, canonicalise
 from app.scene.roles import likely_role
 from tests.scene.pose_rules import Box, UndecidedError, relate

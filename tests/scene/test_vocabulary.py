@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import strategies as st
 
 from app.scene.vocabulary import ObjectClass, Vocabulary
 
@@ -20,14 +19,6 @@ VOCABULARY = Vocabulary(
         ObjectClass("dog", anywhere=True),
     ],
     ["bedroom", "living room"],
-)
-
-names = st.sampled_from(
-    [
-        (name, i)
-        for i, entry in enumerate(VOCABULARY.objects)
-        for name in (entry.label, *entry.aliases)
-    ]
 )
 
 
