@@ -134,8 +134,7 @@ def _judged(
     """
     present, labels = posterior.present, artifact.vocabulary.labels
     log_odds = posterior.log_odds_given_rest()
-    logits = _intruder_logits(artifact, entry, posterior, log_odds)
-    p = _probability(logits)
+    logits, p = _intruder_odds(artifact, entry, posterior, log_odds)
     is_outlier = p >= threshold
     # The order follows the logits, because probabilities near 0 or 1 may round to the same number.
     order = (-logits[present.row]).argsort(kind="stable")
@@ -188,30 +187,26 @@ def intruders(artifact: Artifact, scene: Scene) -> NDArray[np.int64]:
     classes = posterior.present.classes
     if entry is None or lines is None:
         return classes[:0]
-    logits = _intruder_logits(artifact, entry, posterior, posterior.log_odds_given_rest())
-    threshold = lines.medium.threshold(posterior.listed)
-    return classes[_probability(logits) >= threshold]
+    _, p = _intruder_odds(artifact, entry, posterior, posterior.log_odds_given_rest())
+    return classes[p >= lines.medium.threshold(posterior.listed)]
 
 
-def _intruder_logits(
+def _intruder_odds(
     artifact: Artifact,
     entry: CountSlope,
     posterior: Posterior,
     log_odds: NDArray[np.floating[Any]],
-) -> NDArray[np.float64]:
-    """Return the logit of each class's probability of being an intruder, (n,).
+) -> tuple[NDArray[np.floating[Any]], NDArray[np.floating[Any]]]:
+    """Return logit and probability that each class is an intruder, (n,) each.
 
-    The logit of a class that is not judged is -inf. `entry` is `Calibration.outlier`.
+    They are -inf and 0 for a class that is not judged. `entry` is `Calibration.outlier`.
     """
     classes = posterior.present.classes
     adjusted = log_odds - artifact.intruder_prior[classes]
-    logits = calibrated(entry, adjusted, max(1, posterior.listed)).astype(np.float64)
-    logits[~artifact.vocabulary.judged[classes]] = -np.inf
-    return logits
-
-
-def _probability(logits: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.where(np.isinf(logits), 0.0, sigmoid(logits))
+    logits = calibrated(entry, adjusted, max(1, posterior.listed))
+    p, is_excused = sigmoid(logits), ~artifact.vocabulary.judged[classes]
+    logits[is_excused], p[is_excused] = -np.inf, 0.0
+    return logits, p
 
 
 def _companions(

@@ -18,7 +18,7 @@ from app.questions.answer import Fields, significant
 from app.questions.posterior import Posterior
 from app.registry.artifact import Artifact
 from app.registry.offsets import Offsets
-from app.scene.geometry import SMALLEST, Axes
+from app.scene.geometry import Axes
 from app.scene.relations import (
     CANONICAL,
     INSIDE,
@@ -28,7 +28,8 @@ from app.scene.relations import (
     canonicalise,
     opposite,
 )
-from app.scene.scene import Scene, SceneObject
+from app.scene.scene import Scene, SceneObject, boxes_of
+from app.scene.vocabulary import do_not_fit
 
 Mask = NDArray[np.bool_]
 
@@ -38,7 +39,6 @@ PLACES: Final = 3
 LEAST_SHARE: Final = 0.75  # least probability of a placement, as a share of the first placement
 LEAST_LIKELY: Final = 0.05  # least probability of a placement
 _SEEN_FROM_ANCHORS: Final = tuple(map(opposite, RELATIONS))
-_TIGHT: Final = 1.2  # ratio of extents up to which a box fits into another box
 _UNTURNED: Final = np.eye(3)
 
 
@@ -191,18 +191,13 @@ def _too_large(
 ) -> tuple[Mask, Mask]:
     """Return which candidates do not fit into each object, and which objects not into candidates.
 
-    Both arrays are (N candidates, m objects). A box fits into another box if each of its extents,
-    in order of size, is at most `_TIGHT` times that of the other. Candidates, and objects of
-    unknown size, have the typical size of their class. A box of unknown size fits everywhere.
+    Both arrays are (N candidates, m objects). Candidates have the typical size of their class.
     """
-    sizes = artifact.vocabulary.sorted_sizes
-    inner, outer = sizes[:, candidates, None], sizes[:, classes]
-    for column, thing in enumerate(things):
-        if thing.size is not None and max(thing.size) >= SMALLEST:
-            outer[:, column] = sorted(thing.size)
-    outer = outer[:, None]
-    # A comparison with NaN is False.
-    return np.any(inner > _TIGHT * outer, 0), np.any(outer > _TIGHT * inner, 0)
+    rows, vocabulary = candidates[:, None], artifact.vocabulary
+    if all(thing.size is None for thing in things):
+        return vocabulary.too_large[rows, classes], vocabulary.too_large[classes, rows]
+    inner, (_, outer) = vocabulary.sizes[candidates], boxes_of(things, vocabulary.sizes)
+    return do_not_fit(inner, outer), do_not_fit(outer, inner).T
 
 
 def _offset_fields(

@@ -76,7 +76,7 @@ def given_relations(scene: Scene, present: Present, relations: int) -> ObservedR
     Args:
         relations: number of canonical relations that the machine knows.
     """
-    if not relations_given(scene) and scene.poses is None:
+    if not relations_given(scene):
         return None
     n = len(present.classes)
     holds, observed = pool_relations(present.row, n, *instance_evidence(scene))

@@ -27,7 +27,6 @@ from app.scene.vocabulary import Vocabulary
 from scene_client.schemas import (
     Detection,
     ObservedRelation,
-    Quaternion,
     RelationName,
     SceneRequest,
     SceneWarning,
@@ -239,21 +238,17 @@ def _scene_object(
     name: str, detection: Detection, class_index: int, *, optical: bool
 ) -> SceneObject:
     """Convert an object of a request, with its pose in body axes. ``name`` is its id."""
-    position = size = None
-    yaw = 0.0
-    if detection.size is not None:
-        size = (detection.size.x, detection.size.y, detection.size.z)
-    if detection.position is not None:
-        turn = detection.orientation
+    position, size, turn, yaw = None, None, None, 0.0
+    if (extents := detection.size) is not None:
+        size = (extents.x, extents.y, extents.z)
+    if (centre := detection.position) is not None:
         if detection.yaw is not None:
             half = detection.yaw / 2
-            turn = Quaternion(x=0.0, y=0.0, z=math.sin(half), w=math.cos(half))
-        position, size, yaw = body_pose(
-            (detection.position.x, detection.position.y, detection.position.z),
-            size,
-            None if turn is None else (turn.x, turn.y, turn.z, turn.w),
-            optical=optical,
-        )
+            turn = (0.0, 0.0, math.sin(half), math.cos(half))
+        elif (quaternion := detection.orientation) is not None:
+            turn = (quaternion.x, quaternion.y, quaternion.z, quaternion.w)
+        centre_in_frame = (centre.x, centre.y, centre.z)
+        position, size, yaw = body_pose(centre_in_frame, size, turn, optical=optical)
     return SceneObject(
         name, detection.label, class_index, detection.confidence, position, size, yaw
     )

@@ -19,6 +19,8 @@ from app.scene.scene import SceneObject
 
 Extents = tuple[float, float, float]
 
+_TIGHT: Final = 1.2  # ratio of extents up to which a box fits into another box
+
 
 @dataclass(frozen=True, slots=True)
 class ObjectClass:
@@ -91,31 +93,14 @@ class Vocabulary:
         self.room_aliases = {room: tuple(names) for room, names in room_aliases.items()}
         if others := self.room_aliases.keys() - set(self.room_types):
             raise ValueError(f"room_aliases names unknown room types: {sorted(others)}")
-        self._by_spelling: dict[str, int] = {}
-        self._by_key: dict[str, int] = {}
-        for index, entry in enumerate(self.objects):
-            for name in (entry.label, *entry.aliases):
-                first = self._by_key.setdefault(label_key(name), index)
-                if first != index:
-                    raise ValueError(
-                        f"two object classes have the name {name!r}: "
-                        f"{self.objects[first].label!r} and {entry.label!r}"
-                    )
-                self._by_spelling[name] = index
+        names = [(entry.label, *entry.aliases) for entry in self.objects]
+        clash = "two object classes have the name {name!r}: {first!r} and {second!r}"
+        self._by_spelling, self._by_key = _tables(names, "an object class", clash)
         self._bare = {name: SceneObject(name, name, k) for name, k in self._by_spelling.items()}
         self._parents = self._parent_indices()
-        self._room_by_spelling: dict[str, int] = {}
-        self._room_by_key: dict[str, int] = {}
-        for index, room in enumerate(self.room_types):
-            for name in (room, *self.room_aliases.get(room, ())):
-                if not label_key(name):
-                    raise ValueError(f"a room type has an empty name: {name!r}")
-                first = self._room_by_key.setdefault(label_key(name), index)
-                if first != index:
-                    raise ValueError(
-                        f"room types {self.room_types[first]!r} and {room!r} have the same name"
-                    )
-                self._room_by_spelling[name] = index
+        names = [(room, *self.room_aliases.get(room, ())) for room in self.room_types]
+        clash = "room types {first!r} and {second!r} have the same name"
+        self._room_by_spelling, self._room_by_key = _tables(names, "a room type", clash)
 
     def _parent_indices(self) -> NDArray[np.int64]:
         index_of = {entry.label: index for index, entry in enumerate(self.objects)}
@@ -192,9 +177,9 @@ class Vocabulary:
         return _read_only([entry.size or (math.nan,) * 3 for entry in self.objects])
 
     @cached_property
-    def sorted_sizes(self) -> NDArray[np.float64]:
-        """(3, V) typical extents of each class in ascending order, or NaN."""
-        return _read_only(np.sort(self.sizes.T, axis=0))
+    def too_large(self) -> NDArray[np.bool_]:
+        """(V, V) True if a box of the size of class i does not fit into one of class j."""
+        return _read_only(do_not_fit(self.sizes, self.sizes))
 
     def bare_objects(self, labels: Sequence[str]) -> tuple[SceneObject, ...] | None:
         """Return objects without id and pose that have these labels, or None for a new spelling.
@@ -321,6 +306,34 @@ class Vocabulary:
         ):
             raise ValueError("'room_aliases' must map room types to lists of strings")
         return cls([_object_class(entry) for entry in values["objects"]], rooms, aliases)
+
+
+def do_not_fit(inner: NDArray[np.float64], outer: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which boxes (N, 3) do not fit into which boxes (m, 3), (N, m).
+
+    A box fits into another box if each of its extents, in order of size, is at most `_TIGHT` times
+    that of the other. A box of unknown size (NaN) fits everywhere.
+    """
+    a, b = np.sort(inner, axis=1), _TIGHT * np.sort(outer, axis=1)
+    # A comparison with NaN is False.
+    return np.logical_or.reduce([a[:, None, k] > b[:, k] for k in range(3)])
+
+
+def _tables(
+    names: Sequence[tuple[str, ...]], kind: str, clash: str
+) -> tuple[dict[str, int], dict[str, int]]:
+    """Return the index of each entry by its names, and by their keys. The label comes first."""
+    by_spelling: dict[str, int] = {}
+    by_key: dict[str, int] = {}
+    for index, spellings in enumerate(names):
+        for name in spellings:
+            if not (key := label_key(name)):
+                raise ValueError(f"{kind} has an empty name: {name!r}")
+            if (first := by_key.setdefault(key, index)) != index:
+                labels = {"first": names[first][0], "second": spellings[0]}
+                raise ValueError(clash.format(name=name, **labels))
+            by_spelling[name] = index
+    return by_spelling, by_key
 
 
 def _read_only(values: ArrayLike) -> NDArray[Any]:
