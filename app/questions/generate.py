@@ -27,7 +27,14 @@ from app.inference import MachineSpec
 from app.inference.chains import ChainState, ConditionedChains, Conditions, random_stream
 from app.inference.kernels import select_consistent
 from app.inference.posterior import context_of
-from app.questions.answer import OBJECT_BYTES, RELATION_BYTES, Fields, SizeLimit, rounded_number
+from app.questions.answer import (
+    OBJECT_BYTES,
+    RELATION_BYTES,
+    Fields,
+    SizeLimit,
+    lengths,
+    rounded_number,
+)
 from app.questions.names import ErrorList
 from app.questions.outliers import intruders
 from app.questions.posterior import given_relations, present
@@ -127,7 +134,14 @@ def generate(
                 scenes.append(_scene(artifact, chains, state, is_shown, evidence))
                 break
     if size_limit is not None:
-        size_limit.check("count", *_size(scenes))
+        units = sum([len(layer) for scene in scenes for layer in scene["context"].values()])
+        size_limit.check(
+            "count",
+            (len(scenes), OBJECT_BYTES, 0),
+            (lengths(scenes, "objects"), 0, 1),
+            (lengths(scenes, "relations"), RELATION_BYTES, 2),
+            (units, _UNIT_BYTES, 0),
+        )
     return {"seed": seed, "scenes": scenes}
 
 
@@ -309,15 +323,6 @@ def room_fit(artifact: Artifact, classes: list[int], room: int) -> float:
     index = np.array(classes, dtype=np.int64)
     context = context_of(artifact.weights, index, presence, np.zeros_like(presence))
     return float(artifact.objects.room_evidence(context.x[None], index, presence[None])[0, room])
-
-
-def _size(scenes: Sequence[Fields]) -> tuple[int, int]:
-    """Return the size of the scenes in bytes without names, and the number of names."""
-    objects = sum([len(scene["objects"]) for scene in scenes])
-    relations = sum([len(scene["relations"]) for scene in scenes])
-    units = sum([len(layer) for scene in scenes for layer in scene["context"].values()])
-    fixed = len(scenes) * OBJECT_BYTES + relations * RELATION_BYTES + units * _UNIT_BYTES
-    return fixed, objects + 2 * relations
 
 
 def _read(request: GenerateRequest, artifact: Artifact, reading: Reading) -> Options:

@@ -23,6 +23,7 @@ from app.questions.answer import (
     RELATION_BYTES,
     Fields,
     SizeLimit,
+    lengths,
     reasons,
     significant,
 )
@@ -120,7 +121,12 @@ def missing(
             artifact, listing, room, top_k=top_k, candidates=candidates, coverage=coverage
         )
     if size_limit is not None:
-        size_limit.check("top_k", *_size(entries, further))
+        size_limit.check(
+            "top_k",
+            (lengths(entries, "placements"), RELATION_BYTES + _OFFSET_BYTES, 1),
+            (lengths(entries, "because"), CAUSE_BYTES, 1),
+            (len(entries) + len(further), OBJECT_BYTES, 1),
+        )
     return {"coverage": used_coverage, "missing": entries, "more": further}
 
 
@@ -144,7 +150,15 @@ def _ranked(
     if candidates is None:
         usable &= ~is_listed[artifact.vocabulary.parents]
     else:
-        usable &= _among(len(usable), candidates)
+        for index in candidates:
+            if not 0 <= index < len(usable):
+                raise ValueError(
+                    f"candidate {index} is not a class index; class indices are below V = "
+                    f"{len(usable)}"
+                )
+        chosen = np.zeros_like(usable)
+        chosen[list(candidates)] = True
+        usable &= chosen
     if not usable.any():
         return np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
     log_odds = posterior.absent_log_odds(np.arange(len(usable)), coverage)
@@ -194,18 +208,6 @@ def _logits_at(
     return logits
 
 
-def _among(classes: int, candidates: Sequence[int]) -> NDArray[np.bool_]:
-    """Return a bool mask of the candidates among the classes, (V,)."""
-    for index in candidates:
-        if not 0 <= index < classes:
-            raise ValueError(
-                f"candidate {index} is not a class index; class indices are below V = {classes}"
-            )
-    mask = np.zeros(classes, np.bool_)
-    mask[np.array(candidates, dtype=np.int64)] = True
-    return mask
-
-
 def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Options:
     """Return the arguments of `missing` for a request."""
     errors, size = ErrorList(), len(artifact.vocabulary)
@@ -251,17 +253,6 @@ def _axes(request: MissingRequest) -> Axes | None:
         return VIEWER
     view = request.viewpoint
     return viewer_axes(request.frame_id, None if view is None else view.yaw)
-
-
-def _size(entries: Sequence[Fields], further: Sequence[Fields]) -> tuple[int, int]:
-    """Return the size of the lists in bytes without names, and the number of names."""
-    places = causes = 0
-    for entry in entries:
-        places += len(entry.get("placements", ()))
-        causes += len(entry.get("because", ()))
-    count = len(entries) + len(further)
-    fixed = places * (RELATION_BYTES + _OFFSET_BYTES) + causes * CAUSE_BYTES + count * OBJECT_BYTES
-    return fixed, places + causes + count
 
 
 def _ask_all(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:

@@ -21,7 +21,7 @@ half of the largest increase are ignored.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from typing import Any, Final
 
 import numpy as np
@@ -36,6 +36,7 @@ from app.questions.answer import (
     RELATION_BYTES,
     Fields,
     SizeLimit,
+    lengths,
     reasons,
     rounded_number,
     significant,
@@ -111,7 +112,12 @@ def outliers(
         if entry is not None and threshold is not None:
             judged = _judged(artifact, entry, posterior, scene, threshold, details=details)
     if size_limit is not None:
-        size_limit.check("objects", *_size(judged, wrong))
+        size_limit.check(
+            "objects",
+            (len(judged), OBJECT_BYTES, 2),
+            (lengths(judged, "because", "usually_with"), CAUSE_BYTES, 1),
+            (len(wrong), RELATION_BYTES, 2),
+        )
     fields: Fields = {"warnings": _unjudged(artifact, scene)}
     if threshold is not None:
         fields["threshold"] = rounded_number(threshold)
@@ -241,16 +247,6 @@ def _unjudged(artifact: Artifact, scene: Scene) -> list[SceneWarning]:
     return [
         SceneWarning(code="not-judged", message=message.format(part), objects=[]) for part in parts
     ]
-
-
-def _size(judged: Sequence[Fields], wrong: Sequence[Fields]) -> tuple[int, int]:
-    """Return the size of the lists in bytes without names, and the number of names."""
-    causes = 0
-    for entry in judged:
-        causes += len(entry.get("because", ())) + len(entry.get("usually_with", ()))
-    count = len(judged)
-    fixed = count * OBJECT_BYTES + causes * CAUSE_BYTES + len(wrong) * RELATION_BYTES
-    return fixed, 2 * count + causes + 2 * len(wrong)
 
 
 def _read(request: OutliersRequest, _: Artifact, reading: Reading) -> Options:

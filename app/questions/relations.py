@@ -106,7 +106,7 @@ def relations(
     )
     if size_limit is not None:
         count = len(p) + 2 * len(disagreements)
-        size_limit.check("top_k", count * RELATION_BYTES, 2 * count)
+        size_limit.check("top_k", (count, RELATION_BYTES, 2))
     names, observed, things = relation_names(A), set(scene.relations or ()), scene.objects
     entries: list[Fields] = []
     for subject, object_, kind, probability, own in zip(*columns, expected, strict=True):

@@ -21,6 +21,7 @@ from app.questions.answer import (
     OBJECT_BYTES,
     Fields,
     SizeLimit,
+    lengths,
     reasons,
     significant,
 )
@@ -83,7 +84,8 @@ def rooms(
         for entry, because in zip(entries, causes, strict=True):
             entry["because"] = because
     if size_limit is not None:
-        size_limit.check("top_k", *_size(entries))
+        count = lengths(entries, "because")
+        size_limit.check("top_k", (len(entries), OBJECT_BYTES, 1), (count, CAUSE_BYTES, 1))
     return {"room_types": entries}
 
 
@@ -94,12 +96,6 @@ def room_probabilities(
     sharpness = entry.of(posterior.listed)
     p: NDArray[np.float64] = softmax(sharpness * posterior.room_log_p()[among])
     return p
-
-
-def _size(entries: Sequence[Fields]) -> tuple[int, int]:
-    """Return the size of the list in bytes without names, and the number of names."""
-    causes = sum([len(entry.get("because", ())) for entry in entries])
-    return causes * CAUSE_BYTES + len(entries) * OBJECT_BYTES, causes + len(entries)
 
 
 def _read(request: RoomsRequest, _: Artifact, reading: Reading) -> Options:
