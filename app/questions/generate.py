@@ -123,14 +123,14 @@ def generate(
     class_of = [thing.class_index or 0 for thing in scene.objects]
     evidence = {(a, class_of[i], class_of[j]) for a, i, j in scene.relations or ()}
     scenes: list[Fields] = []
-    plausible = Plausible(artifact, scene)
     while len(scenes) < count and not stop():
         stream = random_stream(seed, len(scenes))
         for attempt in range(ATTEMPTS):
             state = chains.draw(steps, stream)
             is_shown = shown[state.classes]
             classes = state.classes[is_shown].tolist()
-            if plausible(classes, state.room) or stop() or attempt == ATTEMPTS - 1:
+            is_last = attempt == ATTEMPTS - 1
+            if _is_plausible(artifact, scene, classes, state.room) or stop() or is_last:
                 scenes.append(_scene(artifact, chains, state, is_shown, evidence))
                 break
     if size_limit is not None:
@@ -278,38 +278,23 @@ def staying(
     return stay
 
 
-class Plausible:
-    """Test whether the drawn scenes of one request are plausible.
-
-    A scene is plausible if none of the three conditions of the module is met.
-
-    Args:
-        artifact: the model that draws the scenes.
-    """
-
-    def __init__(self, artifact: Artifact, scene: Scene) -> None:
-        self._artifact = artifact
-        self._listed = {thing.class_index for thing in scene.objects}
-        # The last entry is for scenes without a room type.
-        self._smallest = artifact.calibration.smallest or (0,)
-
-    def __call__(self, classes: list[int], room: int | None) -> bool:
-        """Return whether a drawn scene with these classes and this room type is plausible."""
-        least = self._smallest[-1 if room is None else min(room, len(self._smallest) - 1)]
-        if len(classes) < least or not self._suits_room(classes, room):
-            return False
-        if not classes:
-            return True
-        labels = self._artifact.vocabulary.labels
-        objects = [SceneObject(labels[index], labels[index], index) for index in classes]
-        drawn_scene = Scene(tuple(objects), room_type=room)
-        return self._listed.issuperset(intruders(self._artifact, drawn_scene).tolist())
-
-    def _suits_room(self, classes: list[int], room: int | None) -> bool:
-        limits = self._artifact.calibration.room_fit
-        if room is None or not limits:
-            return True
-        return room_fit(self._artifact, classes, room) >= limits[room]
+def _is_plausible(
+    artifact: Artifact, evidence: Scene, classes: list[int], room: int | None
+) -> bool:
+    """Return whether a drawn scene meets none of the three conditions of the module."""
+    calibration = artifact.calibration
+    smallest, limits = calibration.smallest or (0,), calibration.room_fit
+    # The last entry is for scenes without a room type.
+    if len(classes) < smallest[-1 if room is None else min(room, len(smallest) - 1)]:
+        return False
+    if room is not None and limits and room_fit(artifact, classes, room) < limits[room]:
+        return False
+    if not classes:
+        return True
+    labels = artifact.vocabulary.labels
+    objects = [SceneObject(labels[index], labels[index], index) for index in classes]
+    drawn = intruders(artifact, Scene(tuple(objects), room_type=room)).tolist()
+    return {thing.class_index for thing in evidence.objects}.issuperset(drawn)
 
 
 def room_fit(artifact: Artifact, classes: list[int], room: int) -> float:

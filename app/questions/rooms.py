@@ -13,7 +13,6 @@ from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from app.inference.elementary import softmax
 from app.questions.answer import (
@@ -30,7 +29,6 @@ from app.questions.posterior import LEAST_CHANGE, Posterior
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
 from app.questions.reading import Reading
 from app.registry.artifact import Artifact
-from app.registry.description import Sharpness
 from app.scene.scene import Scene
 from scene_client.schemas import RoomsAnswer, RoomsRequest, SceneWarning
 
@@ -71,7 +69,8 @@ def rooms(
     if not len(among):
         return {"warnings": [] if C else [_NO_ROOM_TYPES], "room_types": []}
     posterior = Posterior(artifact, replace(scene, room_type=None))
-    p = room_probabilities(artifact.calibration.rooms, posterior, among)
+    sharpness = artifact.calibration.rooms.of(posterior.listed)
+    p = softmax(sharpness * posterior.room_log_p()[among])
     first = np.argsort(-p, kind="stable")[:top_k]
     names = [artifact.vocabulary.room_types[t] for t in among[first].tolist()]
     entries: list[Fields] = [
@@ -87,15 +86,6 @@ def rooms(
         count = lengths(entries, "because")
         size_limit.check("top_k", (len(entries), OBJECT_BYTES, 1), (count, CAUSE_BYTES, 1))
     return {"room_types": entries}
-
-
-def room_probabilities(
-    entry: Sharpness, posterior: Posterior, among: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Return the probability of each of these room types, (N,); see the module."""
-    sharpness = entry.of(posterior.listed)
-    p: NDArray[np.float64] = softmax(sharpness * posterior.room_log_p()[among])
-    return p
 
 
 def _read(request: RoomsRequest, _: Artifact, reading: Reading) -> Options:
