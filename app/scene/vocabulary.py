@@ -297,13 +297,10 @@ class Vocabulary:
         rooms = values.get("room_types", [])
         if not isinstance(rooms, list):
             raise ValueError(f"'room_types' must be a list, not {rooms!r}")
-        if not all(isinstance(room, str) for room in rooms):
+        if not _are_strings(rooms):
             raise ValueError("'room_types' must be a list of strings")
         aliases = values.get("room_aliases", {})
-        if not isinstance(aliases, Mapping) or not all(
-            isinstance(names, list) and all(isinstance(name, str) for name in names)
-            for names in aliases.values()
-        ):
+        if not isinstance(aliases, Mapping) or not all(map(_are_strings, aliases.values())):
             raise ValueError("'room_aliases' must map room types to lists of strings")
         return cls([_object_class(entry) for entry in values["objects"]], rooms, aliases)
 
@@ -345,6 +342,10 @@ def _read_only(values: ArrayLike) -> NDArray[Any]:
 _FIELDS: Final = tuple(field.name for field in fields(ObjectClass))
 
 
+def _are_strings(values: object) -> bool:
+    return isinstance(values, list) and all(isinstance(value, str) for value in values)
+
+
 def _are_extents(size: Sequence[float]) -> bool:
     return len(size) == 3 and all(math.isfinite(side) and side > 0 for side in size)
 
@@ -358,7 +359,7 @@ def _object_class(entry: Any) -> ObjectClass:
             f"{', '.join(_FIELDS)}"
         )
     aliases, parent = entry.get("aliases", []), entry.get("parent")
-    if not isinstance(aliases, list) or not all(isinstance(name, str) for name in aliases):
+    if not _are_strings(aliases):
         raise ValueError(f"aliases of {entry['label']!r} must be a string list, not {aliases!r}")
     for name in ("structure", "anywhere"):
         if not isinstance(flag := entry.get(name, False), bool):
