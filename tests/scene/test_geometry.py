@@ -261,7 +261,7 @@ BED = standing(2.0, 0.0, 0.0, 2.1, 1.6, 1.1)  # with its headboard
     ],
     ids=lambda value: " ".join(value) if isinstance(value[0], str) else "",
 )
-def test_things_with_legs_and_in_containers(
+def test_counts_decide_the_role_of_boxes_that_reach_into_each_other(
     smaller: Thing, larger: Thing, labels: tuple[str, str], relation: str
 ) -> None:
     positions, sizes = zip(smaller, larger, strict=True)
@@ -276,7 +276,7 @@ def test_things_with_legs_and_in_containers(
     assert not found.observed[index, i, j]
 
 
-def test_a_scene_of_none_and_of_one() -> None:
+def test_scenes_of_no_and_of_one_box() -> None:
     assert derive_relations([], []).holds.shape == (len(CANONICAL), 0, 0)
     nobody = np.empty(0, np.int64)
     assert derive_relations([], [], classes=nobody, roles=COUNTS).holds.size == 0
