@@ -132,18 +132,18 @@ def entries_of(
     of_relation, changes = (
         values[relation, *pairs].tolist() for values in (alone, posterior.relation_change())
     )
-    vertical = alone[ON_TOP : ABOVE + 1, *pairs].max(0, initial=-np.inf).tolist()
     entries: list[tuple[float, ...]] = []  # relation, subject, object, kind, terms, mover
-    for (a, i, j), z, d, z_below in zip(stated, of_relation, changes, vertical, strict=True):
+    for (a, i, j), z, d in zip(stated, of_relation, changes, strict=True):
         mover = j if (a, i, j) in flipped and a != INSIDE else i
         s = q = 0.0
         if a in LATERAL:
             kind = BESIDE
         elif (a, i, j) in unders or (a == ABOVE and stands[i] == FLOOR):
-            kind, mover, z = BELOW, j, z_below
             if not moves[j]:
                 continue
+            kind, mover = BELOW, j
             s = log_p[j] if stands[j] == FLOOR else 0.0
+            z = float(alone[ON_TOP : ABOVE + 1, row[i], row[j]].max())
             if places is not None:
                 z = max(z, places.under_evidence(int(classes[i]), int(classes[j])))
         elif a == ABOVE:
