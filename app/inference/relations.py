@@ -331,7 +331,8 @@ class SharedUnits(RelationUnits):
         self._F = _columns(F).reshape(-1, self._states - 1, A * F.shape[1])
         # Products of two directions give the lower half of C. Entries off the diagonal are doubled.
         p, q = np.tril_indices(F.shape[1])
-        self._FF = _columns(F[:, p] * F[:, q] * np.where(p == q, 1, 2)[:, None])
+        twice = np.where(p == q, np.float32(1), np.float32(2))  # int64 would give float64 products
+        self._FF = _columns(F[:, p] * F[:, q] * twice[:, None])
         self._GT = _columns(self._G)
         self._B = weights["B"] if weights.spec.G else None
         if self._B is not None:

@@ -7,6 +7,7 @@ take twice the time (docs/decisions/http.md).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -85,9 +86,8 @@ def reasons(
     columns, values = strongest(change, np.zeros(0, np.int64) if rows is None else rows, REASONS)
     strong = np.abs(values) >= max(least, _ROUNDING)
     entries: list[list[Fields]] = [[] for _ in change]
-    rows_of_entries, _ = np.nonzero(strong)
     numbers, changes = present.first[columns[strong]].tolist(), significant(values[strong])
-    for row, number, value in zip(rows_of_entries.tolist(), numbers, changes, strict=True):
+    for row, number, value in zip(strong.nonzero()[0].tolist(), numbers, changes, strict=True):
         entries[row].append({"object": scene.objects[number].id, "log_odds_change": value})
     return entries
 
@@ -105,6 +105,11 @@ def rounded_number(number: float) -> float:
     return float(f"{number:.{DIGITS}g}")
 
 
+def lengths(entries: Iterable[Fields], *fields: str) -> int:
+    """Return the total length of lists in entries of an answer."""
+    return sum([len(entry.get(field, ())) for entry in entries for field in fields])
+
+
 class SizeLimit:
     """Limit on the size of the answer to one request.
 
@@ -116,17 +121,19 @@ class SizeLimit:
     def __init__(self, reading: Reading, most: int) -> None:
         self._reading, self._most = reading, most
 
-    def check(self, field: str, fixed: int, names: int) -> None:
+    def check(self, field: str, *parts: tuple[int, int, int]) -> None:
         """Check that the answer is not too large.
 
         Args:
             field: name of the request's field that the client can lower for a smaller answer.
-            fixed: size in bytes of the question's own fields, without ids and labels.
-            names: number of ids and labels in these fields.
+            parts: parts of the question's own fields: the number of such parts, the size of one
+                part in bytes without ids and labels, and the number of its ids and labels.
 
         Raises:
             RequestError: the answer is too large.
         """
+        fixed = sum(count * size for count, size, _ in parts)
+        names = sum(count * names for count, _, names in parts)
         longest = max(_LONGEST_NAME, self._reading.unknown.vocabulary.longest_label + 1)
         if self._size(fixed, names, longest) <= self._most:
             return
@@ -147,7 +154,7 @@ class SizeLimit:
             return size
         size += len(to_json(unknown.ignored)) + len(unknown.mapped) * _WARNING_BYTES
         size += len(reading.observed or ()) * (RELATION_BYTES + 2 * name)
-        return size + len(reading.warnings) * (_WARNING_BYTES + len(reading.ids) * name)
+        return size + len(reading.warnings) * (_WARNING_BYTES + len(reading.scene.objects) * name)
 
 
 def written(answer: Any) -> bytes:

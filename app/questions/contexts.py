@@ -45,14 +45,13 @@ def contexts(artifact: Artifact) -> dict[str, list[ContextUnit]]:
     table = weights["triples"]
     shown = named[table[:, 1:]].all(1)
     relations = [
-        (vocabulary.labels[i], CANONICAL[a], vocabulary.labels[j])
+        (vocabulary.labels[i], cast("RelationName", CANONICAL[a]), vocabulary.labels[j])
         for a, i, j in table[shown].tolist()
     ]
-    W, U, Q = weights["W"][named], artifact.context_rows()[shown], weights["Q"]
-    layers: dict[str, tuple[Floats, Floats, Floats]] = {"h1": (W, U, Q)}
+    rows = weights["W"][named], artifact.context_rows()[shown], weights["Q"]
+    layers: dict[str, tuple[Floats, ...]] = {"h1": rows}
     if weights.spec.H2:
-        J = weights["J"]
-        layers["h2"] = (W @ J, U @ J, Q @ J)
+        layers["h2"] = tuple(matrix @ weights["J"] for matrix in rows)
     descriptions: dict[str, list[ContextUnit]] = {}
     for layer, (to_objects, to_relations, to_rooms) in layers.items():
         deviations = to_relations - to_relations.mean(1, keepdims=True)
@@ -64,7 +63,7 @@ def contexts(artifact: Artifact) -> dict[str, list[ContextUnit]]:
         )
         others = weights.spec.states - 1 if layer == "h1" else 1
         descriptions[layer] = [
-            _description(column // others, column % others, *names)
+            _description(column // others, column % others + 1, *names)
             for column, names in enumerate(units)
         ]
     return descriptions
@@ -72,29 +71,21 @@ def contexts(artifact: Artifact) -> dict[str, list[ContextUnit]]:
 
 def _description(
     unit: int,
-    before: int,
+    state: int,
     objects: Weighted[str],
-    relations: Weighted[tuple[str, str, str]],
+    relations: Weighted[tuple[str, RelationName, str]],
     rooms: Weighted[str],
 ) -> ContextUnit:
-    """Return the description of state ``before`` + 1 of a unit.
-
-    The name has the first objects and the first relation.
-    """
+    """Return the description of a state. Its name has the first objects and the first relation."""
     parts = [", ".join(label for label, _ in objects[:_NAMED])]
     parts += [" ".join(triple) for triple, _ in relations[:1]]
     return ContextUnit(
         unit=unit,
-        state=before + 1,
-        name="; ".join(filter(None, parts)) or f"unit {unit}, state {before + 1}",
+        state=state,
+        name="; ".join(filter(None, parts)) or f"unit {unit}, state {state}",
         objects=[WeightedLabel(label=label, weight=weight) for label, weight in objects],
         relations=[
-            WeightedRelation(
-                subject=subject,
-                relation=cast("RelationName", relation),
-                object=other,
-                weight=weight,
-            )
+            WeightedRelation(subject=subject, relation=relation, object=other, weight=weight)
             for (subject, relation, other), weight in relations
         ],
         room_types=[WeightedLabel(label=room, weight=weight) for room, weight in rooms],
@@ -115,9 +106,8 @@ def _strongest(weights: Floats, names: Sequence[Named], count: int) -> list[Weig
     largest = np.argpartition(-weights.T, count - 1, axis=1)[:, :count]
     values = np.take_along_axis(weights.T, largest, axis=1)
     order = np.lexsort((largest, -values), axis=1)
-    index = np.take_along_axis(largest, order, axis=1)
-    values = np.take_along_axis(values, order, axis=1)
+    columns = (np.take_along_axis(part, order, axis=1).tolist() for part in (largest, values))
     return [
-        tuple((names[i], value) for i, value in zip(places, column, strict=True) if value > 0)
-        for places, column in zip(index.tolist(), values.tolist(), strict=True)
+        tuple((names[i], value) for i, value in zip(*pair, strict=True) if value > 0)
+        for pair in zip(*columns, strict=True)
     ]

@@ -37,6 +37,8 @@ Ints = NDArray[np.int64]
 LIKELY: Final = 0.5
 """Minimum probability of further instances at which an answer contains a class."""
 
+_FIELDS: Final = ("label", "listed_count", "expected_count", "low", "high", "probability")
+
 
 def more(
     artifact: Artifact,
@@ -77,25 +79,18 @@ def more(
     p_more, expected, low, high = count_summaries(p, listed)
     usable = p_more >= LIKELY if candidates is None else np.isin(classes, list(candidates))
     order = best(p_more, usable, top_k)
+    if not len(order):
+        return []
+    labels = artifact.vocabulary.labels
     columns = (
-        classes[order].tolist(),
+        [labels[index] for index in classes[order].tolist()],
         listed[order].tolist(),
         significant(expected[order]),
         low[order].tolist(),
         high[order].tolist(),
         significant(p_more[order]),
     )
-    return [
-        {
-            "label": artifact.vocabulary.labels[index],
-            "listed_count": count,
-            "expected_count": mean,
-            "low": least,
-            "high": most,
-            "probability": probability,
-        }
-        for index, count, mean, least, most, probability in zip(*columns, strict=True)
-    ]
+    return [dict(zip(_FIELDS, values, strict=True)) for values in zip(*columns, strict=True)]
 
 
 def distribution(

@@ -27,7 +27,14 @@ from app.inference import MachineSpec
 from app.inference.chains import ChainState, ConditionedChains, Conditions, random_stream
 from app.inference.kernels import select_consistent
 from app.inference.posterior import context_of
-from app.questions.answer import OBJECT_BYTES, RELATION_BYTES, Fields, SizeLimit, rounded_number
+from app.questions.answer import (
+    OBJECT_BYTES,
+    RELATION_BYTES,
+    Fields,
+    SizeLimit,
+    lengths,
+    rounded_number,
+)
 from app.questions.names import ErrorList
 from app.questions.outliers import intruders
 from app.questions.posterior import given_relations, present
@@ -116,18 +123,25 @@ def generate(
     class_of = [thing.class_index or 0 for thing in scene.objects]
     evidence = {(a, class_of[i], class_of[j]) for a, i, j in scene.relations or ()}
     scenes: list[Fields] = []
-    plausible = Plausible(artifact, scene)
     while len(scenes) < count and not stop():
         stream = random_stream(seed, len(scenes))
         for attempt in range(ATTEMPTS):
             state = chains.draw(steps, stream)
             is_shown = shown[state.classes]
             classes = state.classes[is_shown].tolist()
-            if plausible(classes, state.room) or stop() or attempt == ATTEMPTS - 1:
+            is_last = attempt == ATTEMPTS - 1
+            if _is_plausible(artifact, scene, classes, state.room) or stop() or is_last:
                 scenes.append(_scene(artifact, chains, state, is_shown, evidence))
                 break
     if size_limit is not None:
-        size_limit.check("count", *_size(scenes))
+        units = sum([len(layer) for scene in scenes for layer in scene["context"].values()])
+        size_limit.check(
+            "count",
+            (len(scenes), OBJECT_BYTES, 0),
+            (lengths(scenes, "objects"), 0, 1),
+            (lengths(scenes, "relations"), RELATION_BYTES, 2),
+            (units, _UNIT_BYTES, 0),
+        )
     return {"seed": seed, "scenes": scenes}
 
 
@@ -264,38 +278,23 @@ def staying(
     return stay
 
 
-class Plausible:
-    """Test whether the drawn scenes of one request are plausible.
-
-    A scene is plausible if none of the three conditions of the module is met.
-
-    Args:
-        artifact: the model that draws the scenes.
-    """
-
-    def __init__(self, artifact: Artifact, scene: Scene) -> None:
-        self._artifact = artifact
-        self._listed = {thing.class_index for thing in scene.objects}
-        # The last entry is for scenes without a room type.
-        self._smallest = artifact.calibration.smallest or (0,)
-
-    def __call__(self, classes: list[int], room: int | None) -> bool:
-        """Return whether a drawn scene with these classes and this room type is plausible."""
-        least = self._smallest[-1 if room is None else min(room, len(self._smallest) - 1)]
-        if len(classes) < least or not self._suits_room(classes, room):
-            return False
-        if not classes:
-            return True
-        labels = self._artifact.vocabulary.labels
-        objects = [SceneObject(labels[index], labels[index], index) for index in classes]
-        drawn_scene = Scene(tuple(objects), room_type=room)
-        return self._listed.issuperset(intruders(self._artifact, drawn_scene).tolist())
-
-    def _suits_room(self, classes: list[int], room: int | None) -> bool:
-        limits = self._artifact.calibration.room_fit
-        if room is None or not limits:
-            return True
-        return room_fit(self._artifact, classes, room) >= limits[room]
+def _is_plausible(
+    artifact: Artifact, evidence: Scene, classes: list[int], room: int | None
+) -> bool:
+    """Return whether a drawn scene meets none of the three conditions of the module."""
+    calibration = artifact.calibration
+    smallest, limits = calibration.smallest or (0,), calibration.room_fit
+    # The last entry is for scenes without a room type.
+    if len(classes) < smallest[-1 if room is None else min(room, len(smallest) - 1)]:
+        return False
+    if room is not None and limits and room_fit(artifact, classes, room) < limits[room]:
+        return False
+    if not classes:
+        return True
+    labels = artifact.vocabulary.labels
+    objects = [SceneObject(labels[index], labels[index], index) for index in classes]
+    drawn = intruders(artifact, Scene(tuple(objects), room_type=room)).tolist()
+    return {thing.class_index for thing in evidence.objects}.issuperset(drawn)
 
 
 def room_fit(artifact: Artifact, classes: list[int], room: int) -> float:
@@ -309,15 +308,6 @@ def room_fit(artifact: Artifact, classes: list[int], room: int) -> float:
     index = np.array(classes, dtype=np.int64)
     context = context_of(artifact.weights, index, presence, np.zeros_like(presence))
     return float(artifact.objects.room_evidence(context.x[None], index, presence[None])[0, room])
-
-
-def _size(scenes: Sequence[Fields]) -> tuple[int, int]:
-    """Return the size of the scenes in bytes without names, and the number of names."""
-    objects = sum([len(scene["objects"]) for scene in scenes])
-    relations = sum([len(scene["relations"]) for scene in scenes])
-    units = sum([len(layer) for scene in scenes for layer in scene["context"].values()])
-    fixed = len(scenes) * OBJECT_BYTES + relations * RELATION_BYTES + units * _UNIT_BYTES
-    return fixed, objects + 2 * relations
 
 
 def _read(request: GenerateRequest, artifact: Artifact, reading: Reading) -> Options:
@@ -343,7 +333,7 @@ def _read(request: GenerateRequest, artifact: Artifact, reading: Reading) -> Opt
     }
 
 
-def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
+def _ask_all(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
     # One Gibbs sweep compiles all kernels.
     yield generate(artifact, scenes[0], count=2, seed=0, steps=1)
 
@@ -380,7 +370,6 @@ _EXAMPLE_ANSWER: Final = {
 GENERATE: Final = Question(
     generate,
     _read,
-    _warm_up,
     GenerateRequest,
     GenerateAnswer,
     _EXAMPLES,
@@ -391,5 +380,6 @@ Sample scenes that contain the given objects and relations. Equal seeds give equ
 The request is refused if too few training scenes have its room type (`rare_room_types` of `GET
 /models/{name}/vocabulary`).
 """,
+    ask_all=_ask_all,
     samples=True,
 )

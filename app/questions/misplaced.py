@@ -33,8 +33,8 @@ only their supports are judged.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Iterator, Sequence
+from itertools import chain
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -47,7 +47,7 @@ from app.questions.reading import Triple
 from app.registry.artifact import Artifact
 from app.registry.description import KINDS, Judgement, Sensitivity
 from app.scene.relations import ABOVE, CANONICAL, INSIDE, LATERAL, ON_TOP, SUPPORTS, opposite
-from app.scene.scene import Scene, extent_of
+from app.scene.scene import Scene, boxes_of
 from app.scene.stands import (
     FLOOR,
     HANGS,
@@ -71,7 +71,6 @@ THE_FLOOR: Final = "floor"
 LEAST_Z: Final = -8.0  # below it, log-odds do not tell wrong relations from rare ones
 _LEAST_P: Final = 1e-6  # minimum of p(stand)
 EXPLAINED: Final = 5.0  # minimum z of an object above another object if a third object supports it
-_NOWHERE: Final = (math.nan, math.nan, math.nan)
 
 Indices = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -108,72 +107,63 @@ def entries_of(
     Args:
         flipped: relations of the scene that the request states by their opposite.
     """
-    row = posterior.present.row
+    row, A, places = posterior.present.row, artifact.spec.A, artifact.places
     classes = posterior.present.classes[row]
-    is_thing = ~artifact.vocabulary.structure[classes]
-    stated = [
-        (a, i, j)
-        for a, i, j in scene.relations or ()
-        if a < artifact.spec.A and is_thing[i] and is_thing[j]
-    ]
+    is_thing = (~artifact.vocabulary.structure[classes]).tolist()
+    stated = [t for t in scene.relations or () if t[0] < A and is_thing[t[1]] and is_thing[t[2]]]
     if not stated and scene.poses is None:
         return _NO_ENTRIES
-    heights = None if scene.poses is None else _heights(artifact, scene, classes)
-    if heights is None:
-        unders = {triple for triple in stated if triple[0] == ON_TOP and triple in flipped}
-    else:
+    heights, around = None, None
+    if scene.poses is not None:
+        heights = _heights(artifact, scene, classes)
         around = heights.around
-        unders = {(a, i, j) for a, i, j in stated if a == ON_TOP and around[i, j]}
+    unders = {
+        (a, i, j)
+        for a, i, j in stated
+        if a == ON_TOP and ((a, i, j) in flipped if around is None else around[i, j])
+    }
     supports = [(i, j) for a, i, j in stated if a in SUPPORTS and (a, i, j) not in unders]
-    stands, log_p, log_q = _stands(artifact, posterior, scene, supports, heights)
-    alone, change = posterior.alone_log_odds(), posterior.relation_change()
-    rows: list[tuple[int, int, int]] = []
-    kinds: list[int] = []
-    terms: list[tuple[float, float, float, float]] = []
-    movers: list[int] = []
-    moves = ~artifact.vocabulary.anywhere[classes]
-    for a, i, j in stated:
+    stands, log_p, log_q = (
+        values.tolist() for values in _stands(artifact, posterior, scene, supports, heights)
+    )
+    moves = (~artifact.vocabulary.anywhere[classes]).tolist()
+    relation, subject, object_ = np.fromiter(chain(*stated), np.int64).reshape(-1, 3).T
+    alone, pairs = posterior.alone_log_odds(), (row[subject], row[object_])
+    of_relation, changes = (
+        values[relation, *pairs].tolist() for values in (alone, posterior.relation_change())
+    )
+    entries: list[tuple[float, ...]] = []  # relation, subject, object, kind, terms, mover
+    for (a, i, j), z, d in zip(stated, of_relation, changes, strict=True):
         mover = j if (a, i, j) in flipped and a != INSIDE else i
-        z, d = float(alone[a, row[i], row[j]]), float(change[a, row[i], row[j]])
         s = q = 0.0
         if a in LATERAL:
             kind = BESIDE
         elif (a, i, j) in unders or (a == ABOVE and stands[i] == FLOOR):
+            if not moves[j]:
+                continue
             kind, mover = BELOW, j
+            s = log_p[j] if stands[j] == FLOOR else 0.0
+            z = float(alone[ON_TOP : ABOVE + 1, row[i], row[j]].max())
+            if places is not None:
+                z = max(z, places.under_evidence(int(classes[i]), int(classes[j])))
         elif a == ABOVE:
             kind = OVER
             if stands[i] == HANGS:
-                s = float(log_p[i])
+                s = log_p[i]
             elif stands[i] == SUPPORTED or heights is not None:
                 z = max(z, EXPLAINED)
         else:
-            kind, mover, s, q = SUPPORT, i, float(log_p[i]), float(log_q[i])
-        if kind == BELOW:
-            s = float(log_p[j]) if stands[j] == FLOOR else 0.0
-            z = max(float(alone[b, row[i], row[j]]) for b in (ON_TOP, ABOVE))
-            if artifact.places is not None:
-                z = max(z, artifact.places.under_evidence(int(classes[i]), int(classes[j])))
+            kind, mover, s, q = SUPPORT, i, log_p[i], log_q[i]
         if not moves[mover]:
-            if kind == BELOW:
-                continue
             s = q = 0.0
-        rows.append((a, i, j))
-        kinds.append(kind)
-        terms.append((max(z, LEAST_Z), d, s, q))
-        movers.append(mover)
-    if heights is not None:
-        is_free = (stands == FLOOR) | (stands == HANGS)
-        for i in np.flatnonzero(is_thing & moves & is_free).tolist():
-            rows.append((ON_TOP if stands[i] == FLOOR else ABOVE, i, -1))
-            kinds.append(STAND)
-            terms.append((0.0, 0.0, float(log_p[i]), 0.0))
-            movers.append(i)
-    return Entries(
-        np.array(rows, np.int64).reshape(-1, 3),
-        np.array(kinds, np.int64),
-        np.array(terms, np.float64).reshape(-1, TERMS),
-        np.array(movers, np.int64),
-    )
+        entries.append((a, i, j, kind, max(z, LEAST_Z), d, s, q, mover))
+    for i, stand in enumerate(stands if heights is not None else ()):
+        if is_thing[i] and moves[i] and stand in (FLOOR, HANGS):
+            held = ON_TOP if stand == FLOOR else ABOVE
+            entries.append((held, i, -1, STAND, 0.0, 0.0, log_p[i], 0.0, i))
+    table = np.fromiter(chain(*entries), np.float64).reshape(-1, 5 + TERMS)
+    numbers = table.astype(np.int64)
+    return Entries(numbers[:, :3], numbers[:, 3], table[:, 4 : 4 + TERMS], numbers[:, -1])
 
 
 def _stands(
@@ -206,9 +196,10 @@ def _stands(
         return stands, zeros, zeros
     by_class = places.supporters(classes, present.classes)
     by_class[:, artifact.vocabulary.structure[present.classes]] = 0.0
-    q = np.where(stands == SUPPORTED, 0.0, 1.0)
+    is_supported = stands == SUPPORTED
+    q = np.where(is_supported, 0.0, 1.0)
     for i, j in supports:
-        if stands[i] == SUPPORTED:
+        if is_supported[i]:
             q[i] = max(q[i], by_class[i, present.row[j]])
     log_q = np.log(np.maximum(q, _LEAST_P))
     if heights is None:
@@ -220,16 +211,14 @@ def _stands(
 
 def _heights(artifact: Artifact, scene: Scene, classes: Indices) -> Heights:
     """Return the heights of the objects. Furniture whose box is only its top reaches down."""
-    sizes, places = artifact.vocabulary.sizes, artifact.places
-    centres = np.array([thing.position or _NOWHERE for thing in scene.objects])
-    extents = np.array([extent_of(thing, sizes) for thing in scene.objects])
-    heights = Heights.of(centres, extents)
+    centres, extents = boxes_of(scene.objects, artifact.vocabulary.sizes)
+    heights, places = Heights.of(centres, extents), artifact.places
     if places is None:
         return heights
-    usual = sizes[classes, 2]
+    usual, tops = artifact.vocabulary.sizes[classes, 2], heights.tops
     is_top = (places.stands[classes, FLOOR] >= USUAL) & (extents[:, 2] < usual / 2)
-    lower = np.where(is_top, np.fmin(heights.bottoms, heights.tops - usual), heights.bottoms)
-    return heights._replace(bottoms=lower)
+    bottoms = np.where(is_top, np.fmin(heights.bottoms, tops - usual), heights.bottoms)
+    return Heights(bottoms, tops, heights.areas)
 
 
 def wrong_log_odds(judgement: Judgement, terms: Floats) -> Floats:
@@ -242,21 +231,20 @@ def wrong_log_odds(judgement: Judgement, terms: Floats) -> Floats:
 def wrong_relations(artifact: Artifact, scene: Scene) -> dict[Triple, float]:
     """Return the log-odds that each judged relation of a scene is wrong."""
     entries = entries_of(artifact, Posterior(artifact, scene), scene)
-    log_odds: dict[Triple, float] = {}
-    for _, rows, values in _judged(artifact, entries):
-        triples = entries.triple[rows].tolist()
-        log_odds |= {
-            (a, i, j): z for (a, i, j), z in zip(triples, values.tolist(), strict=True) if j >= 0
-        }
-    return log_odds
+    return {
+        (a, i, j): z
+        for _, rows, values in _judged(artifact, entries)
+        for (a, i, j), z in zip(entries.triple[rows].tolist(), values.tolist(), strict=True)
+        if j >= 0
+    }
 
 
 def _judged(artifact: Artifact, entries: Entries) -> Iterator[tuple[Judgement, Indices, Floats]]:
     """Yield the judgement of each kind, its entries, and their log-odds to be wrong."""
-    for kind, name in enumerate(KINDS):
-        judgement: Judgement | None = getattr(artifact.calibration.misplaced, name)
-        rows = np.flatnonzero(entries.kind == kind)
-        if judgement is not None and len(rows):
+    for kind in sorted({*entries.kind.tolist()}):
+        judgement: Judgement | None = getattr(artifact.calibration.misplaced, KINDS[kind])
+        if judgement is not None:
+            rows = (entries.kind == kind).nonzero()[0]
             yield judgement, rows, wrong_log_odds(judgement, entries.terms[rows])
 
 
@@ -280,37 +268,36 @@ def misplaced_fields(
     """
     entries = entries_of(artifact, posterior, scene, flipped)
     n = len(entries.kind)
-    log_odds, is_misplaced, is_listed = np.full(n, -np.inf), np.zeros(n, bool), np.zeros(n, bool)
+    if not n:
+        return []
+    log_odds, line, lowest = np.full(n, -np.inf), np.full(n, np.inf), np.full(n, np.inf)
     for judgement, rows, values in _judged(artifact, entries):
         log_odds[rows] = values
-        p = sigmoid(values)
-        is_misplaced[rows] = p >= getattr(judgement.lines, sensitivity).threshold(len(rows))
-        is_alarm = p >= judgement.lines.high.threshold(len(rows))
-        is_listed[rows] = is_alarm | (entries.kind[rows] != STAND)
-    is_listed |= is_misplaced
+        line[rows] = getattr(judgement.lines, sensitivity).threshold(len(rows))
+        lowest[rows] = judgement.lines.high.threshold(len(rows))
+    p, is_relation = sigmoid(log_odds), (entries.kind != STAND) & (log_odds > -np.inf)
     order = np.argsort(-log_odds, kind="stable")
-    order = order[is_listed[order]]
-    unders = entries.triple[entries.kind == BELOW].tolist()
-    spelled = {*flipped, *((a, i, j) for a, i, j in unders)}
-    return [
-        _spelled(scene, entries.triple[k].tolist(), spelled)
-        | {
-            "probability": probability,
-            "is_misplaced": bool(is_misplaced[k]),
-            "moved": scene.objects[entries.mover[k]].id,
-        }
-        for k, probability in zip(
-            order.tolist(), significant(sigmoid(log_odds[order])), strict=True
+    order = order[(is_relation | (p >= np.minimum(line, lowest)))[order]]
+    ids = [thing.id for thing in scene.objects]
+    columns = (
+        *(entries.triple[order].tolist(), entries.kind[order].tolist()),
+        *(significant(p[order]), (p >= line)[order].tolist(), entries.mover[order].tolist()),
+    )
+    fields: list[Fields] = []
+    for (relation, subject, object_), kind, probability, is_misplaced, mover in zip(
+        *columns, strict=True
+    ):
+        name = CANONICAL[relation]
+        if kind == BELOW or (relation, subject, object_) in flipped:
+            subject, name, object_ = object_, opposite(name), subject
+        fields.append(
+            {
+                "subject": ids[subject],
+                "relation": name,
+                "object": ids[object_] if kind != STAND else THE_FLOOR,
+                "probability": probability,
+                "is_misplaced": is_misplaced,
+                "moved": ids[mover],
+            }
         )
-    ]
-
-
-def _spelled(scene: Scene, triple: list[int], flipped: Collection[Triple]) -> Fields:
-    """Convert a canonical relation to a name, subject and object; the opposite if it is flipped."""
-    relation, subject, object_ = triple
-    name, things = CANONICAL[relation], scene.objects
-    if object_ < 0:
-        return {"subject": things[subject].id, "relation": name, "object": THE_FLOOR}
-    if (relation, subject, object_) in flipped:
-        subject, name, object_ = object_, opposite(name), subject
-    return {"subject": things[subject].id, "relation": name, "object": things[object_].id}
+    return fields

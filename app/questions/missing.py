@@ -23,6 +23,7 @@ from app.questions.answer import (
     RELATION_BYTES,
     Fields,
     SizeLimit,
+    lengths,
     reasons,
     significant,
 )
@@ -120,7 +121,12 @@ def missing(
             artifact, listing, room, top_k=top_k, candidates=candidates, coverage=coverage
         )
     if size_limit is not None:
-        size_limit.check("top_k", *_size(entries, further))
+        size_limit.check(
+            "top_k",
+            (lengths(entries, "placements"), RELATION_BYTES + _OFFSET_BYTES, 1),
+            (lengths(entries, "because"), CAUSE_BYTES, 1),
+            (len(entries) + len(further), OBJECT_BYTES, 1),
+        )
     return {"coverage": used_coverage, "missing": entries, "more": further}
 
 
@@ -143,33 +149,39 @@ def _ranked(
     usable = ~(artifact.vocabulary.structure | is_listed[:-1])
     if candidates is None:
         usable &= ~is_listed[artifact.vocabulary.parents]
-    absent = np.flatnonzero(usable)
-    chosen = np.ones(len(absent), np.bool_)
-    if candidates is not None:
-        chosen = _among(absent, artifact.spec.V, candidates)
-    if not chosen.any():
-        return absent[:0], np.zeros(0), np.zeros(0)
-    log_odds = posterior.absent_log_odds(absent, coverage)
+    else:
+        for index in candidates:
+            if not 0 <= index < len(usable):
+                raise ValueError(
+                    f"candidate {index} is not a class index; class indices are below V = "
+                    f"{len(usable)}"
+                )
+        chosen = np.zeros_like(usable)
+        chosen[list(candidates)] = True
+        usable &= chosen
+    if not usable.any():
+        return np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
+    log_odds = posterior.absent_log_odds(np.arange(len(usable)), coverage)
     if place is None:
         entry = artifact.calibration.missing
-        logits = calibrated(entry, log_odds, max(1, posterior.listed))
+        first = best(entry.slope * log_odds, usable, top_k)
+        logits = calibrated(entry, log_odds[first], max(1, posterior.listed))
     else:
-        logits = _logits_at(artifact, posterior, place, absent, chosen, log_odds, top_k)
-    first = best(logits, chosen, top_k)
-    probabilities = 1.0 / (1.0 + np.exp(-logits[first].astype(np.float64)))
-    return absent[first], probabilities, log_odds[first]
+        logits = _logits_at(artifact, posterior, place, usable, log_odds, top_k)
+        first = best(logits, usable, top_k)
+        logits = logits[first]
+    return first, 1.0 / (1.0 + np.exp(-logits.astype(np.float64))), log_odds[first]
 
 
 def _logits_at(
     artifact: Artifact,
     posterior: Posterior,
     place: Place,
-    absent: NDArray[np.int64],
-    chosen: NDArray[np.bool_],
+    usable: NDArray[np.bool_],
     log_odds: NDArray[np.floating[Any]],
     top_k: int,
 ) -> NDArray[np.floating[Any]]:
-    """Return the logits of p(present and at the place), (N,); see `PlaceFit`.
+    """Return the logits of p(present and at the place), (V,); see `PlaceFit`.
 
     The log probability of the relation is at most 0. So the other terms give an upper bound of the
     logit. The function scores candidates in blocks, in descending order of this bound. It stops
@@ -181,29 +193,19 @@ def _logits_at(
     if artifact.places is not None and entry.counts:
         anchor = int(posterior.present.classes[posterior.present.row[place.anchor]])
         ratio = artifact.places.log_ratio(place.relation, anchor, outgoing=place.outgoing)
-        bound = bound + entry.counts * ratio[absent]
+        bound = bound + entry.counts * ratio
     scores = np.full_like(bound, -np.inf)
-    order = np.flatnonzero(chosen)
+    order = np.flatnonzero(usable)
     order = order[np.argsort(-bound[order], kind="stable")]
     for start in range(0, len(order), _BLOCK):
         block = order[start : start + _BLOCK]
         largest = np.sort(scores[order[:start]])[-top_k:]
         if len(largest) == top_k and bound[block[0]] < largest[0]:
             break
-        log_p = place_log_p(posterior, absent[block], place)
+        log_p = place_log_p(posterior, block, place)
         scores[block] = bound[block] + entry.relation * log_p
     logits: NDArray[np.floating[Any]] = entry.intercept + entry.slope * scores
     return logits
-
-
-def _among(absent: NDArray[np.int64], classes: int, candidates: Sequence[int]) -> NDArray[np.bool_]:
-    """Return a bool mask (N,) of the absent classes that are candidates."""
-    for index in candidates:
-        if not 0 <= index < classes:
-            raise ValueError(
-                f"candidate {index} is not a class index; class indices are below V = {classes}"
-            )
-    return np.isin(absent, np.array(candidates, dtype=np.int64))
 
 
 def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Options:
@@ -215,11 +217,10 @@ def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Opti
         errors.add(InvalidRequestError, ("top_k",), message)
     candidates = at = None
     if request.candidates is not None:
-        candidates = _candidates(request.candidates, reading, errors)
+        candidates = reading.unknown.resolve_all(request.candidates, "candidates", errors)
     if request.at is not None:
         at = _at(request.at, artifact, reading, errors)
-    if errors.by_class:
-        errors.raise_any()
+    errors.raise_any()
     return {
         "top_k": request.top_k,
         "candidates": candidates,
@@ -228,18 +229,6 @@ def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Opti
         "axes": _axes(request),
         "details": request.detail == "full",
     }
-
-
-def _candidates(labels: list[str], reading: Reading, errors: ErrorList) -> list[int]:
-    """Return the class indices of the labels in the request's field `candidates`."""
-    indices: dict[int, None] = {}
-    for position, label in enumerate(labels):
-        index = reading.unknown.vocabulary.index(label)
-        if index is None:
-            index = reading.unknown.resolve(label, label, ("candidates", position), errors)
-        if index is not None:
-            indices[index] = None
-    return list(indices)
 
 
 def _at(
@@ -266,18 +255,7 @@ def _axes(request: MissingRequest) -> Axes | None:
     return viewer_axes(request.frame_id, None if view is None else view.yaw)
 
 
-def _size(entries: Sequence[Fields], further: Sequence[Fields]) -> tuple[int, int]:
-    """Return the size of the lists in bytes without names, and the number of names."""
-    places = causes = 0
-    for entry in entries:
-        places += len(entry.get("placements", ()))
-        causes += len(entry.get("because", ()))
-    count = len(entries) + len(further)
-    fixed = places * (RELATION_BYTES + _OFFSET_BYTES) + causes * CAUSE_BYTES + count * OBJECT_BYTES
-    return fixed, places + causes + count
-
-
-def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
+def _ask_all(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
     related, bare, _ = scenes
     for scene in scenes:
         yield missing(artifact, scene)
@@ -348,7 +326,6 @@ _EXAMPLE_ANSWER: Final = {
 MISSING: Final = Question(
     missing,
     _read,
-    _warm_up,
     MissingRequest,
     MissingAnswer,
     _EXAMPLES,
@@ -359,4 +336,5 @@ Rank the classes that the scene does not list, most probable first, with likely 
 The list `more` contains listed classes that probably have further instances, such as a second
 nightstand. It is empty for questions about a place.
 """,
+    ask_all=_ask_all,
 )

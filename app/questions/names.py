@@ -75,6 +75,11 @@ class ErrorList:
                 raise kind(self.by_class[kind])
 
 
+# id() of a vocabulary, label, and whether it is a room type. The id is unique, because the request
+# keeps its models in memory.
+_Key = tuple[int, str, bool]
+
+
 @dataclass(slots=True)
 class LookUps:
     """Searches for classes similar to unknown labels, shared by all scenes of one request.
@@ -88,10 +93,8 @@ class LookUps:
     """
 
     suggestions: int = 0
-    _guesses: dict[tuple[int, str, bool], Guess | None] = field(default_factory=dict)
-    _similar: dict[tuple[int, str, bool], tuple[Match, ...]] = field(default_factory=dict)
-
-    # id() of a vocabulary stays unique, because the request keeps its models in memory.
+    _guesses: dict[_Key, Guess | None] = field(default_factory=dict)
+    _similar: dict[_Key, tuple[Match, ...]] = field(default_factory=dict)
 
     def guess(self, vocabulary: Vocabulary, label: str, *, is_room: bool) -> Guess | None:
         """Return what an unknown label probably stands for.
@@ -100,20 +103,18 @@ class LookUps:
             OverflowError: the request has had `MAX_MAPPED` guesses.
         """
         key = id(vocabulary), label, is_room
+        if key not in self._guesses and len(self._guesses) >= MAX_MAPPED:
+            raise OverflowError
         if key not in self._guesses:
-            if len(self._guesses) >= MAX_MAPPED:
-                raise OverflowError
             self._guesses[key] = vocabulary.guess(label, is_room=is_room)
         return self._guesses[key]
 
     def similar(self, vocabulary: Vocabulary, label: str, *, is_room: bool) -> tuple[Match, ...]:
         """Return the names most similar to a label, or none after `MAX_SUGGESTED` searches."""
         key = id(vocabulary), label, is_room
-        if key not in self._similar:
-            if len(self._similar) >= MAX_SUGGESTED:
-                return ()
+        if key not in self._similar and len(self._similar) < MAX_SUGGESTED:
             self._similar[key] = vocabulary.nearest(label, is_room=is_room)
-        return self._similar[key]
+        return self._similar.get(key, ())
 
 
 @dataclass(slots=True)
@@ -139,7 +140,7 @@ class Unknown:
     def resolve(
         self, label: str, name: str, location: Location, errors: ErrorList, *, is_room: bool = False
     ) -> int | None:
-        """Return the class or room type that replaces an unlisted label.
+        """Return the class or room type that a label names or that replaces it.
 
         Each treatment accepts the syntax of detectors, such as "chair_12".
 
@@ -153,12 +154,16 @@ class Unknown:
         Returns:
             Index of the class or room type. None means that the label is ignored or refused.
         """
-        match = self.vocabulary.read(label, is_room=is_room)
+        vocabulary = self.vocabulary
+        index = vocabulary.room_index(label) if is_room else vocabulary.index(label)
+        if index is not None:
+            return index
+        match = vocabulary.read(label, is_room=is_room)
         if match is None and self.treatment.startswith("nearest"):
             match = self._guess(label, is_room=is_room)
         if match is not None:
             entry, similarity, rule = match
-            names = self.vocabulary.room_types if is_room else self.vocabulary.labels
+            names = vocabulary.room_types if is_room else vocabulary.labels
             mapped = Mapped(label=label, class_=names[entry], similarity=similarity, rule=rule)
             self.mapped[label, is_room] = mapped
             return entry
@@ -167,6 +172,16 @@ class Unknown:
         else:
             self._refuse(label, location, errors, is_room=is_room)
         return None
+
+    def resolve_all(
+        self, labels: Sequence[str], field: str, errors: ErrorList, *, is_room: bool = False
+    ) -> list[int]:
+        """Return the different classes or room types of the labels in a field of the request."""
+        indices = [
+            self.resolve(label, label, (field, position), errors, is_room=is_room)
+            for position, label in enumerate(labels)
+        ]
+        return list(dict.fromkeys(index for index in indices if index is not None))
 
     def _guess(self, label: str, *, is_room: bool) -> Guess | None:
         key = label, is_room
@@ -221,18 +236,12 @@ class Names:
         return {thing.id: index for index, thing in enumerate(self._objects)}
 
     @cached_property
-    def _by_label(self) -> dict[str, list[int]]:
-        indices: dict[str, list[int]] = {}
+    def _by_name(self) -> dict[str | int | None, list[int]]:
+        """The objects with each label and of each class."""
+        indices: dict[str | int | None, list[int]] = {}
         for index, thing in enumerate(self._objects):
             indices.setdefault(thing.label, []).append(index)
-        return indices
-
-    @cached_property
-    def _by_class(self) -> dict[int, list[int]]:
-        indices: dict[int, list[int]] = {}
-        for index, thing in enumerate(self._objects):
-            if thing.class_index is not None:
-                indices.setdefault(thing.class_index, []).append(index)
+            indices.setdefault(thing.class_index, []).append(index)
         return indices
 
     @cached_property
@@ -248,10 +257,10 @@ class Names:
         """
         if (index := self._by_id.get(name)) is not None:
             return index
-        indices = self._by_label.get(name)
+        indices = self._by_name.get(name)
         if indices is None:
             of_class = self._unknown.vocabulary.index(name)
-            indices = [] if of_class is None else self._by_class.get(of_class, [])
+            indices = [] if of_class is None else self._by_name.get(of_class, [])
         if len(indices) == 1:
             return indices[0]
         if indices:

@@ -21,7 +21,7 @@ half of the largest increase are ignored.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from typing import Any, Final
 
 import numpy as np
@@ -36,6 +36,7 @@ from app.questions.answer import (
     RELATION_BYTES,
     Fields,
     SizeLimit,
+    lengths,
     reasons,
     rounded_number,
     significant,
@@ -111,7 +112,12 @@ def outliers(
         if entry is not None and threshold is not None:
             judged = _judged(artifact, entry, posterior, scene, threshold, details=details)
     if size_limit is not None:
-        size_limit.check("objects", *_size(judged, wrong))
+        size_limit.check(
+            "objects",
+            (len(judged), OBJECT_BYTES, 2),
+            (lengths(judged, "because", "usually_with"), CAUSE_BYTES, 1),
+            (len(wrong), RELATION_BYTES, 2),
+        )
     fields: Fields = {"warnings": _unjudged(artifact, scene)}
     if threshold is not None:
         fields["threshold"] = rounded_number(threshold)
@@ -132,36 +138,43 @@ def _judged(
     `because` lists up to three other objects, in order of their effect on `log_odds`. For an
     outlier, these objects lower its log-odds. For other objects, they raise the log-odds.
     """
-    present = posterior.present
+    present, labels = posterior.present, artifact.vocabulary.labels
     log_odds = posterior.log_odds_given_rest()
-    logits = _intruder_logits(artifact, entry, posterior, log_odds)
-    p = _probability(logits)
+    logits, p = _intruder_odds(artifact, entry, posterior, log_odds)
     is_outlier = p >= threshold
-    labels = [artifact.vocabulary.labels[index] for index in present.classes.tolist()]
-    columns = labels, significant(p), significant(log_odds), is_outlier.tolist()
-    class_fields: list[Fields] = [
-        {"label": label, "probability": probability, "log_odds": value, "is_outlier": flag}
-        for label, probability, value, flag in zip(*columns, strict=True)
-    ]
     # The order follows the logits, because probabilities near 0 or 1 may round to the same number.
-    order = np.argsort(-logits[present.row], kind="stable")
+    order = (-logits[present.row]).argsort(kind="stable")
     rows = present.row[order].tolist()
+    causes: list[list[Fields]] = [[] for _ in present.classes]
+    companions: list[list[str]] = [[] for _ in present.classes]
     if details:
-        for fields in class_fields:
-            fields["because"], fields["usually_with"] = [], []
-        explained = np.array(list(dict.fromkeys(rows[:EXPLAINED])), dtype=np.int64)
-        if len(present.classes) > 1:
+        explained = np.array(list(dict.fromkeys(rows[:EXPLAINED])))
+        if len(causes) > 1:
             change = posterior.reasons(explained)
-            change = np.where(is_outlier[explained, None] == (change < 0), change, 0)
-            causes = reasons(scene, present, change, explained)
-            for row, because in zip(explained.tolist(), causes, strict=True):
-                class_fields[row]["because"] = because
+            change[is_outlier[explained, None] != (change < 0)] = 0
+            of_explained = reasons(scene, present, change, explained)
+            for row, because in zip(explained.tolist(), of_explained, strict=True):
+                causes[row] = because
         flagged = explained[is_outlier[explained]]
-        companions = _companions(artifact, present.classes, present.classes[flagged])
-        for row, companion_labels in zip(flagged.tolist(), companions, strict=True):
-            class_fields[row]["usually_with"] = companion_labels
-    pairs = zip(order.tolist(), rows, strict=True)
-    return [{"object": scene.objects[number].id} | class_fields[row] for number, row in pairs]
+        if len(flagged):
+            of_flagged = _companions(artifact, present.classes, present.classes[flagged])
+            for row, companion_labels in zip(flagged.tolist(), of_flagged, strict=True):
+                companions[row] = companion_labels
+    classes, flags = present.classes.tolist(), is_outlier.tolist()
+    probabilities, values = significant(p), significant(log_odds)
+    judged: list[Fields] = []
+    for number, row in zip(order.tolist(), rows, strict=True):
+        fields: Fields = {
+            "object": scene.objects[number].id,
+            "label": labels[classes[row]],
+            "probability": probabilities[row],
+            "log_odds": values[row],
+            "is_outlier": flags[row],
+        }
+        if details:
+            fields["because"], fields["usually_with"] = causes[row], companions[row]
+        judged.append(fields)
+    return judged
 
 
 def misplaced(
@@ -180,30 +193,26 @@ def intruders(artifact: Artifact, scene: Scene) -> NDArray[np.int64]:
     classes = posterior.present.classes
     if entry is None or lines is None:
         return classes[:0]
-    logits = _intruder_logits(artifact, entry, posterior, posterior.log_odds_given_rest())
-    threshold = lines.medium.threshold(posterior.listed)
-    return classes[_probability(logits) >= threshold]
+    _, p = _intruder_odds(artifact, entry, posterior, posterior.log_odds_given_rest())
+    return classes[p >= lines.medium.threshold(posterior.listed)]
 
 
-def _intruder_logits(
+def _intruder_odds(
     artifact: Artifact,
     entry: CountSlope,
     posterior: Posterior,
     log_odds: NDArray[np.floating[Any]],
-) -> NDArray[np.float64]:
-    """Return the logit of each class's probability of being an intruder, (n,).
+) -> tuple[NDArray[np.floating[Any]], NDArray[np.floating[Any]]]:
+    """Return logit and probability that each class is an intruder, (n,) each.
 
-    The logit of a class that is not judged is -inf. `entry` is `Calibration.outlier`.
+    They are -inf and 0 for a class that is not judged. `entry` is `Calibration.outlier`.
     """
     classes = posterior.present.classes
     adjusted = log_odds - artifact.intruder_prior[classes]
-    logits = calibrated(entry, adjusted, max(1, posterior.listed)).astype(np.float64)
-    logits[~artifact.vocabulary.judged[classes]] = -np.inf
-    return logits
-
-
-def _probability(logits: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.where(np.isinf(logits), 0.0, sigmoid(logits))
+    logits = calibrated(entry, adjusted, max(1, posterior.listed))
+    p, is_excused = sigmoid(logits), ~artifact.vocabulary.judged[classes]
+    logits[is_excused], p[is_excused] = -np.inf, 0.0
+    return logits, p
 
 
 def _companions(
@@ -215,7 +224,7 @@ def _companions(
     """
     usable = ~artifact.vocabulary.structure
     usable[present] = False
-    if not (len(flagged) and usable.any()):
+    if not usable.any():
         return [[] for _ in flagged]
     # The rows of the arrays are outliers i, and the columns are classes j.
     weights, labels = artifact.weights, artifact.vocabulary.labels
@@ -230,29 +239,14 @@ def _companions(
 
 def _unjudged(artifact: Artifact, scene: Scene) -> list[SceneWarning]:
     """Return a warning for objects, and one for relations, if the model gives no judgement."""
-    parts = {
-        "objects": bool(scene.objects) and artifact.calibration.outlier is None,
-        "relations": bool(scene.relations) and not artifact.calibration.misplaced.judges_relations,
-    }
+    calibration = artifact.calibration
+    parts = ["objects"] if scene.objects and calibration.outlier is None else []
+    if scene.relations and not calibration.misplaced.judges_relations:
+        parts.append("relations")
+    message = "the model does not judge {}, because its calibration had too few scenes"
     return [
-        SceneWarning(
-            code="not-judged",
-            message=f"the model does not judge {part}, because its calibration had too few scenes",
-            objects=[],
-        )
-        for part, is_unjudged in parts.items()
-        if is_unjudged
+        SceneWarning(code="not-judged", message=message.format(part), objects=[]) for part in parts
     ]
-
-
-def _size(judged: Sequence[Fields], wrong: Sequence[Fields]) -> tuple[int, int]:
-    """Return the size of the lists in bytes without names, and the number of names."""
-    causes = 0
-    for entry in judged:
-        causes += len(entry.get("because", ())) + len(entry.get("usually_with", ()))
-    count = len(judged)
-    fixed = count * OBJECT_BYTES + causes * CAUSE_BYTES + len(wrong) * RELATION_BYTES
-    return fixed, 2 * count + causes + 2 * len(wrong)
 
 
 def _read(request: OutliersRequest, _: Artifact, reading: Reading) -> Options:
@@ -265,7 +259,7 @@ def _read(request: OutliersRequest, _: Artifact, reading: Reading) -> Options:
     }
 
 
-def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
+def _ask_all(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
     # With threshold 0, every object is an outlier. So the function also computes `usually_with`.
     yield outliers(artifact, scenes[0], threshold=0.0)
     for scene in scenes[1:]:
@@ -328,7 +322,6 @@ _EXAMPLE_ANSWER: Final = {
 OUTLIERS: Final = Question(
     outliers,
     _read,
-    _warm_up,
     OutliersRequest,
     OutliersAnswer,
     _EXAMPLES,
@@ -339,4 +332,5 @@ Return probabilities that each object is an outlier and that each observed relat
 The list `outliers` starts with the most probable outlier. All instances of a class have the
 same probability. The list `misplaced` starts with the relation that is most probably false.
 """,
+    ask_all=_ask_all,
 )

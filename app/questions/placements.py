@@ -6,7 +6,8 @@ called the anchor. An offset is the distance vector between the centres of both.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from itertools import repeat
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -19,7 +20,6 @@ from app.registry.artifact import Artifact
 from app.registry.offsets import Offsets
 from app.scene.geometry import Axes
 from app.scene.relations import (
-    ABOVE,
     CANONICAL,
     INSIDE,
     ON_TOP,
@@ -28,8 +28,10 @@ from app.scene.relations import (
     canonicalise,
     opposite,
 )
-from app.scene.scene import Scene, extent_of
-from app.scene.stands import HANGS, SUPPORTED, USUAL
+from app.scene.scene import Scene, SceneObject, boxes_of
+from app.scene.vocabulary import do_not_fit
+
+Mask = NDArray[np.bool_]
 
 PLACES: Final = 3
 """Maximum number of placements in the answer for one class."""
@@ -37,8 +39,6 @@ PLACES: Final = 3
 LEAST_SHARE: Final = 0.75  # least probability of a placement, as a share of the first placement
 LEAST_LIKELY: Final = 0.05  # least probability of a placement
 _SEEN_FROM_ANCHORS: Final = tuple(map(opposite, RELATIONS))
-_LEAST_STAND: Final = 0.005  # least share of a stand
-_TIGHT: Final = 1.2  # ratio of extents up to which a box fits into another box
 _UNTURNED: Final = np.eye(3)
 
 
@@ -115,53 +115,51 @@ def placements(
         For each candidate, the fields of `scene_client.schemas.Placement`.
     """
     present = posterior.present
-    anchors = np.flatnonzero(~artifact.vocabulary.structure[present.classes])
+    anchors = (~artifact.vocabulary.structure[present.classes]).nonzero()[0]
     if not len(anchors):
         return [[] for _ in candidates]
     forward, backward = posterior.placement_log_odds(candidates, anchors)
-    A, objects = forward.shape[1], present.first[anchors]
+    A, classes, objects = forward.shape[1], present.classes[anchors], present.first[anchors]
     first = -1  # number of the requested place in `likeliest_places`; -1 without a request
     if A > ON_TOP and scene.relations:
-        columns = np.flatnonzero(np.isin(objects, held_objects(artifact, posterior, scene)))
+        held = held_objects(artifact, posterior, scene)
+        columns = [k for k, number in enumerate(objects.tolist()) if number in held]
         for a in SUPPORTS:
             if a < A:
                 backward[:, a, columns] = NO_UNIT
     if at is not None:
         # If the anchor is structural, no column matches it.
-        for column in np.flatnonzero(anchors == present.row[at.anchor]).tolist():
+        for column in (anchors == present.row[at.anchor]).nonzero()[0].tolist():
             first = ((0 if at.outgoing else A) + at.relation) * len(anchors) + column
             objects[column] = at.anchor
-    _lower_unseen(artifact, candidates, present.classes[anchors], forward, backward)
+    things = [scene.objects[number] for number in objects.tolist()]
+    if A > ON_TOP and artifact.places is not None:
+        unseen, subjects = artifact.places.unseen[: A - ON_TOP], candidates[:, None]
+        forward[:, ON_TOP:] += unseen[:, subjects, classes].swapaxes(0, 1)
+        backward[:, ON_TOP:] += unseen[:, classes, subjects].swapaxes(0, 1)
     if A > INSIDE:
-        fits = _fits_inside(artifact, scene, candidates, objects)
-        forward[:, INSIDE][~fits[0]] = NO_UNIT
-        backward[:, INSIDE][~fits[1]] = NO_UNIT
+        candidates_too_large, things_too_large = _too_large(artifact, things, candidates, classes)
+        forward[:, INSIDE][candidates_too_large] = NO_UNIT
+        backward[:, INSIDE][things_too_large] = NO_UNIT
     slopes, log_counts = artifact.relation_slopes.placement, present.log_counts[anchors]
-    rows, relations, outgoing, columns, p = likeliest_places(
-        slopes, forward, backward, log_counts, PLACES, first
-    )
-    places = len(rows) // len(candidates)  # the same number for each candidate
-    is_likely = (p >= LEAST_SHARE * np.repeat(p[::places], places)) & (p >= LEAST_LIKELY)
-    if first >= 0:
-        is_likely[::places] = True
-    likely = np.flatnonzero(is_likely)
-    rows, relations, outgoing = rows[likely], relations[likely], outgoing[likely]
-    columns = columns[likely]
-    numbers = objects[columns].tolist()
-    offsets: Iterator[Fields | None] = iter([None] * len(likely))
-    if artifact.offsets is not None and any(
-        scene.objects[number].position is not None for number in numbers
-    ):
-        missing, anchor = candidates[rows], present.classes[anchors[columns]]
+    *places, p = likeliest_places(slopes, forward, backward, log_counts, PLACES, first)
+    of_candidate = p.reshape(len(candidates), -1)
+    is_likely = of_candidate >= np.maximum(LEAST_SHARE * of_candidate[:, :1], LEAST_LIKELY)
+    is_likely[:, 0] |= first >= 0
+    likely = is_likely.reshape(-1).nonzero()[0]
+    rows, relations, outgoing, columns = (values[likely] for values in places)
+    offsets: Iterator[Fields | None] = repeat(None)
+    if artifact.offsets is not None and any(thing.position is not None for thing in things):
+        missing, anchor = candidates[rows], classes[columns]
         offsets = _offset_fields(
             *offsets_of(artifact.offsets, relations, missing, anchor, outgoing, axes)
         )
     entries: list[list[Fields]] = [[] for _ in candidates]
-    arrays = rows.tolist(), relations.tolist(), outgoing.tolist(), numbers
-    for row, relation, is_subject, number, probability, offset in zip(
-        *arrays, significant(p[likely]), offsets, strict=True
+    arrays = rows.tolist(), relations.tolist(), outgoing.tolist(), columns.tolist()
+    for row, relation, is_subject, column, probability, offset in zip(
+        *arrays, significant(p[likely]), offsets, strict=False
     ):
-        thing = scene.objects[number]
+        thing = things[column]
         name = (RELATIONS if is_subject else _SEEN_FROM_ANCHORS)[relation]
         entry: Fields = {"relation": name, "object": thing.id, "probability": probability}
         if offset is not None and thing.position is not None:
@@ -185,54 +183,21 @@ def held_objects(artifact: Artifact, posterior: Posterior, scene: Scene) -> list
     ]
 
 
-def _lower_unseen(
+def _too_large(
     artifact: Artifact,
+    things: Sequence[SceneObject],
     candidates: NDArray[np.int64],
-    anchors: NDArray[np.int64],
-    forward: NDArray[np.floating[Any]],
-    backward: NDArray[np.floating[Any]],
-) -> None:
-    """Lower the log-odds of stacked relations that training never shows, in place.
+    classes: NDArray[np.int64],
+) -> tuple[Mask, Mask]:
+    """Return which candidates do not fit into each object, and which objects not into candidates.
 
-    The share of a stand is that of the subject's class: objects on a wall for the relation above,
-    and supported objects for on-top and inside. A share below `USUAL` lowers the odds in
-    proportion. So a blackboard does not stand on a chair.
-
-    Args:
-        candidates, anchors: class indices, (N,) and (m,).
-        forward, backward: log-odds with the candidate and with the anchor as subject, (N, A, m).
+    Both arrays are (N candidates, m objects). Candidates have the typical size of their class.
     """
-    places = artifact.places
-    if places is None:
-        return
-    of_missing, of_listed = (
-        np.log(np.minimum(np.maximum(places.stands[classes], _LEAST_STAND) / USUAL, 1.0))
-        for classes in (candidates, anchors)
-    )
-    for relation, stand in ((ON_TOP, SUPPORTED), (ABOVE, HANGS), (INSIDE, SUPPORTED)):
-        if relation < forward.shape[1]:
-            shown = places.shows(relation, candidates, anchors)
-            forward[:, relation] += np.where(shown, 0.0, of_missing[:, stand, None])
-            shown = places.shows(relation, anchors, candidates).T
-            backward[:, relation] += np.where(shown, 0.0, of_listed[:, stand])
-
-
-def _fits_inside(
-    artifact: Artifact, scene: Scene, candidates: NDArray[np.int64], objects: NDArray[np.int64]
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return whether each candidate fits into each object, and each object into each candidate.
-
-    Both arrays are (N candidates, m objects). A box fits into another box if each of its extents,
-    in order of size, is at most `_TIGHT` times that of the other. Candidates have the typical size
-    of their class. A box of unknown size fits everywhere.
-    """
-    sizes = artifact.vocabulary.sizes
-    inner = np.sort(sizes[candidates], axis=1)
-    outer = np.sort([extent_of(scene.objects[k], sizes) for k in objects.tolist()], axis=1)
-    # A comparison with NaN is False.
-    inner_fits = np.logical_not(inner[:, None] > _TIGHT * outer).all(2)
-    outer_fits = np.logical_not(outer > _TIGHT * inner[:, None]).all(2)
-    return np.asarray(inner_fits), np.asarray(outer_fits)
+    rows, vocabulary = candidates[:, None], artifact.vocabulary
+    if all(thing.size is None for thing in things):
+        return vocabulary.too_large[rows, classes], vocabulary.too_large[classes, rows]
+    inner, (_, outer) = vocabulary.sizes[candidates], boxes_of(things, vocabulary.sizes)
+    return do_not_fit(inner, outer), do_not_fit(outer, inner).T
 
 
 def _offset_fields(

@@ -50,11 +50,12 @@ def present(scene: Scene, spec: MachineSpec) -> Present:
     Raises:
         ValueError: the machine does not know the class of an object, the room type or the profile.
     """
-    V, indices = spec.V, [thing.class_index for thing in scene.objects]
-    for number, index in enumerate(indices):
-        if index is None or index >= V:
-            name = scene.objects[number].id
-            raise ValueError(f"class_index of {name!r} is {index}, but must be below V = {V}")
+    indices = [thing.class_index for thing in scene.objects]
+    for thing, index in zip(scene.objects, indices, strict=True):
+        if index is None or index >= spec.V:
+            raise ValueError(
+                f"class_index of {thing.id!r} is {index}, but must be below V = {spec.V}"
+            )
     if scene.room_type is not None and spec.C and not 0 <= scene.room_type < spec.C:
         raise ValueError(f"room_type is {scene.room_type}, but must be from 0 to {spec.C - 1}")
     if scene.profile is not None and not 0 <= scene.profile < spec.profiles:
@@ -75,12 +76,14 @@ def given_relations(scene: Scene, present: Present, relations: int) -> ObservedR
     Args:
         relations: number of canonical relations that the machine knows.
     """
-    if not relations_given(scene) and scene.poses is None:
+    if not relations_given(scene):
         return None
-    holds, observed = pool_relations(present.row, len(present.classes), *instance_evidence(scene))
-    # np.stack() makes contiguous arrays. For another layout, numba would compile the loops again.
-    a, i, j = np.stack(np.nonzero(observed[:relations]))
-    return ObservedRelations(a, i, j, r=holds[a, i, j].astype(np.float32))
+    n = len(present.classes)
+    holds, observed = pool_relations(present.row, n, *instance_evidence(scene))
+    # The arrays are contiguous. For another layout, numba would compile the loops again.
+    units = observed[:relations].reshape(-1).nonzero()[0]
+    a, pair = np.divmod(units, n * n)
+    return ObservedRelations(a, *np.divmod(pair, n), holds.reshape(-1)[units].astype(np.float32))
 
 
 def relations_given(scene: Scene) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from inspect import cleandoc, getdoc
 from typing import Any, Final, Generic, TypeAlias, TypeVar
@@ -45,13 +45,13 @@ class Question(Generic[RequestT]):
             question. If the answer could be too large, the argument ``size_limit`` raises an error.
         read: function that returns the keyword arguments of ``answer`` for a request. It raises
             `RequestError` if a field of the request is wrong.
-        warm_up: function that asks a model about scenes and yields the answers. The function must
-            call every compiled kernel of the question, because the first call compiles the kernel.
         request, response: schemas of the request and of the answer.
         examples: dictionary from names to example requests. The default model knows all labels of
             the examples.
         example_answer: an answer with illustrative figures, without the common fields of answers.
         description: description of the route, for the API documentation.
+        ask_all: function that asks a model about scenes with all options that need kernels of
+            their own, and yields the answers. None: the question has no such options.
         samples: whether the question samples scenes. Then the scene of a request may be empty, the
             request has a field ``count``, and ``answer`` has an argument ``stop``, a function that
             returns True after the end of the request. There is no route for batches.
@@ -59,18 +59,24 @@ class Question(Generic[RequestT]):
 
     answer: Callable[..., Fields]
     read: Callable[[RequestT, Artifact, Reading], Options]
-    warm_up: Callable[[Artifact, tuple[Scene, ...]], Iterator[Fields]]
     request: type[RequestT]
     response: type[schemas.Answer]
     examples: Mapping[str, Example]
     example_answer: Fields
     description: str
+    ask_all: Callable[[Artifact, tuple[Scene, ...]], Iterable[Fields]] | None = None
     samples: bool = False
 
     def __post_init__(self) -> None:
         self.name = self.answer.__name__
         self.summary = getdoc(self.request) or ""
         self.description = cleandoc(self.description)
+
+    def warm_up(self, artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterable[Fields]:
+        """Ask a model about scenes, and return the answers. The first call compiles the kernels."""
+        if self.ask_all is not None:
+            return self.ask_all(artifact, scenes)
+        return (self.answer(artifact, scene) for scene in scenes)
 
 
 LABELS: Final[dict[str, Any]] = {"objects": ["bed", "nightstand", "lamp"]}

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import cached_property
+from itertools import compress, count
 
 from pydantic_core import to_json
 
@@ -26,7 +27,6 @@ from app.scene.vocabulary import Vocabulary
 from scene_client.schemas import (
     Detection,
     ObservedRelation,
-    Quaternion,
     RelationName,
     SceneRequest,
     SceneWarning,
@@ -56,7 +56,6 @@ class Reading:
 
     Attributes:
         scene: objects of known classes, their relations and the room type.
-        ids: ids of the objects in `scene`.
         unknown: unknown labels of the request and their treatment.
         left_out: pairs (id, label) of the ignored objects.
         observed: relations that the service has derived from poses, or None without poses.
@@ -66,9 +65,8 @@ class Reading:
     """
 
     scene: Scene
-    ids: list[str]
     unknown: Unknown
-    left_out: list[tuple[str, str]] = field(default_factory=list)
+    left_out: list[tuple[str, str]]
     observed: list[ObservedRelation] | None = None
     flipped: frozenset[Triple] = frozenset()
     warnings: list[SceneWarning] = field(default_factory=list)
@@ -80,11 +78,7 @@ class Reading:
 
     def longest_name(self) -> int:
         """Return the maximum size in bytes of an id or label in the JSON text of the answer."""
-        text = "".join(self.ids)
-        if text.isascii() and '"' not in text and "\\" not in text:
-            longest = max(map(len, self.ids), default=0) + 2
-        else:
-            longest = max(len(to_json(name)) for name in self.ids)
+        longest = max((len(to_json(thing.id)) for thing in self.scene.objects), default=0)
         return max(longest, self.unknown.vocabulary.longest_label) + 1
 
 
@@ -114,61 +108,79 @@ def read_scene(
     """
     errors = ErrorList()
     _check_fields(request, limits, errors)
-    ids = _ids(request.objects, errors)
     unknown = Unknown(vocabulary, request.unknown_labels, look_ups or LookUps())
-    reading = Reading(Scene(()), ids, unknown)
-    objects: list[SceneObject] = []
-    optical = request.frame_id is not None and is_optical(request.frame_id)
+    ids, left_out = _ids(request.objects, errors), list[tuple[str, str]]()
     detections: dict[int, Detection] = {}
-    for number, entry in enumerate(request.objects):
-        label = entry if isinstance(entry, str) else entry.label
-        index = vocabulary.index(label)
-        if index is None:
-            location: Location = ("objects", number)
-            if not isinstance(entry, str):
-                location = (*location, "label")
-            index = unknown.resolve(label, ids[number], location, errors)
-            if errors.by_class and errors.are_many:
-                break
-        if index is None:
-            reading.left_out.append((ids[number], label))
-        elif isinstance(entry, str):
-            objects.append(SceneObject(ids[number], label, index))
-        else:
-            detections[len(objects)] = entry
-            objects.append(_scene_object(ids[number], entry, index, optical=optical))
-    room, room_name = None, request.room_type
-    if room_name is not None:
-        room = vocabulary.room_index(room_name)
-        if room is None:
-            room = unknown.resolve(room_name, room_name, ("room_type",), errors, is_room=True)
-    profile = None if request.profile is None else _profile(request.profile, profiles, errors)
+    objects = vocabulary.bare_objects(ids) if ids == request.objects else None
+    if objects is None:
+        objects, detections = _objects(request, ids, unknown, left_out, errors)
+    room, profile = None, None
+    if (name := request.room_type) is not None:
+        room = unknown.resolve(name, name, ("room_type",), errors, is_room=True)
+    if request.profile is not None:
+        profile = _profile(request.profile, profiles, errors)
     if not objects and not may_be_empty and not errors.by_class:
-        errors.add(
-            InvalidRequestError, ("objects",), "the model does not know any of these objects"
-        )
-    if errors.by_class:
-        errors.raise_any()
+        message = "the model does not know any of these objects"
+        errors.add(InvalidRequestError, ("objects",), message)
+    errors.raise_any()
 
-    reading.scene = Scene(tuple(objects), None, False, room, profile)
-    if reading.left_out:
-        left_out = {name for name, _ in reading.left_out}
-        reading.ids = [name for name in ids if name not in left_out]
-    stated = _stated(request, ids)
+    reading = Reading(Scene(objects, None, False, room, profile), unknown, left_out)
+    stated = _stated(request, ids) if detections or request.relations is not None else None
     if stated is not None:
         triples, reading.flipped = _triples(stated, reading, errors)
-        if errors.by_class:
-            errors.raise_any()
-        complete = request.relations_complete
-        reading.scene = Scene(reading.scene.objects, triples, complete, room, profile)
+        errors.raise_any()
+        reading.scene = Scene(objects, triples, request.relations_complete, room, profile)
     if detections:
-        in_frame = reading.scene
-        _derive(request, reading, vocabulary, roles)
+        in_frame, view = reading.scene, request.viewpoint
+        reading.scene = observe(
+            in_frame,
+            frame_id=request.frame_id,
+            viewpoint=None if view is None else Viewpoint(view.x, view.y, view.yaw),
+            typical_sizes=vocabulary.sizes,
+            roles=roles,
+        )
+        if reading.scene.poses is not None:
+            reading.observed = [
+                ObservedRelation(objects[i].id, CANONICAL[a], objects[j].id)  # type: ignore[arg-type]
+                for a, i, j in reading.scene.relations or ()
+            ]
         derived = reading.observed is not None
         reading.warnings = scene_warnings(
             in_frame, detections, vocabulary, request, derived=derived
         )
     return reading
+
+
+def _objects(
+    request: SceneRequest,
+    ids: Sequence[str],
+    unknown: Unknown,
+    left_out: list[tuple[str, str]],
+    errors: ErrorList,
+) -> tuple[tuple[SceneObject, ...], dict[int, Detection]]:
+    """Return the objects of known classes, and the detection of those that are not bare labels.
+
+    The function adds the ignored objects to ``left_out``.
+    """
+    optical = request.frame_id is not None and is_optical(request.frame_id)
+    objects: list[SceneObject] = []
+    detections: dict[int, Detection] = {}
+    for number, (name, entry) in enumerate(zip(ids, request.objects, strict=True)):
+        location: Location = ("objects", number)
+        if isinstance(entry, str):
+            index = unknown.resolve(entry, name, location, errors)
+            if index is not None:
+                objects.append(SceneObject(name, entry, index))
+        else:
+            index = unknown.resolve(entry.label, name, (*location, "label"), errors)
+            if index is not None:
+                detections[len(objects)] = entry
+                objects.append(_scene_object(name, entry, index, optical=optical))
+        if index is None:
+            left_out.append((name, entry if isinstance(entry, str) else entry.label))
+            if errors.by_class and errors.are_many:
+                break
+    return tuple(objects), detections
 
 
 def _profile(name: str, profiles: Sequence[str], errors: ErrorList) -> int | None:
@@ -188,28 +200,7 @@ def _check_fields(request: SceneRequest, limits: Limits, errors: ErrorList) -> N
     if request.relations is None and request.relations_complete:
         message = "`relations_complete` requires the field `relations`"
         errors.add(InvalidRequestError, ("relations_complete",), message)
-    if errors.by_class:
-        errors.raise_any()
-
-
-def _derive(
-    request: SceneRequest, reading: Reading, vocabulary: Vocabulary, roles: RoleCounts | None
-) -> None:
-    """Add to ``reading`` the relations that follow from the poses of the objects."""
-    view = request.viewpoint
-    reading.scene = observe(
-        reading.scene,
-        frame_id=request.frame_id,
-        viewpoint=None if view is None else Viewpoint(view.x, view.y, view.yaw),
-        typical_sizes=vocabulary.sizes,
-        roles=roles,
-    )
-    if reading.scene.poses is not None:
-        ids = reading.ids
-        reading.observed = [
-            ObservedRelation(ids[i], CANONICAL[a], ids[j])  # type: ignore[arg-type]
-            for a, i, j in reading.scene.relations or ()
-        ]
+    errors.raise_any()
 
 
 def _ids(entries: Sequence[str | Detection], errors: ErrorList) -> list[str]:
@@ -218,62 +209,46 @@ def _ids(entries: Sequence[str | Detection], errors: ErrorList) -> list[str]:
     An object without an id has its label as id. If several objects have this label, a number at the
     end makes the id unique.
     """
-    labels: list[str] = [entry for entry in entries if isinstance(entry, str)]
-    if len(set(labels)) == len(entries):
-        return labels
-    stated_ids: dict[str, None] = {}  # an ordered set
-    labels = []
-    for index, entry in enumerate(entries):
-        if isinstance(entry, str):
-            labels.append(entry)
-        elif entry.id is None:
-            labels.append(entry.label)
-        else:
-            if entry.id in stated_ids:
-                errors.add(
-                    InvalidRequestError, ("objects", index, "id"), "another object has this id"
-                )
-            stated_ids[entry.id] = None
-    if len(stated_ids) == len(entries):
-        return list(stated_ids)
-    if not stated_ids and len(set(labels)) == len(labels):
-        return labels
-    repeats = Counter(labels)
-    last_number: Counter[str] = Counter()
-    ids = []
-    for entry in entries:
-        if isinstance(entry, Detection) and entry.id is not None:
-            ids.append(entry.id)
+    names = [
+        entry if isinstance(entry, str) else entry.label if entry.id is None else entry.id
+        for entry in entries
+    ]
+    if len(set(names)) == len(names):
+        return names
+    is_stated = [not isinstance(entry, str) and entry.id is not None for entry in entries]
+    used: set[str] = set()
+    for index in compress(count(), is_stated):
+        if names[index] in used:
+            errors.add(InvalidRequestError, ("objects", index, "id"), "another object has this id")
+        used.add(names[index])
+    labels = Counter(name for name, has_id in zip(names, is_stated, strict=True) if not has_id)
+    numbers = {label: count(1) for label in labels}
+    for index, label in enumerate(names):
+        if is_stated[index]:
             continue
-        label = name = entry if isinstance(entry, str) else entry.label
-        if repeats[name] > 1 or name in stated_ids:
-            while name == label or name in stated_ids:
-                last_number[label] += 1
-                name = f"{label}_{last_number[label]}"
-        stated_ids[name] = None
-        ids.append(name)
-    return ids
+        if labels[label] > 1 or label in used:
+            names[index] = next(
+                name for k in numbers[label] if (name := f"{label}_{k}") not in used
+            )
+        used.add(names[index])
+    return names
 
 
 def _scene_object(
     name: str, detection: Detection, class_index: int, *, optical: bool
 ) -> SceneObject:
     """Convert an object of a request, with its pose in body axes. ``name`` is its id."""
-    position = size = None
-    yaw = 0.0
-    if detection.size is not None:
-        size = (detection.size.x, detection.size.y, detection.size.z)
-    if detection.position is not None:
-        turn = detection.orientation
+    position, size, turn, yaw = None, None, None, 0.0
+    if (extents := detection.size) is not None:
+        size = (extents.x, extents.y, extents.z)
+    if (centre := detection.position) is not None:
         if detection.yaw is not None:
             half = detection.yaw / 2
-            turn = Quaternion(x=0.0, y=0.0, z=math.sin(half), w=math.cos(half))
-        position, size, yaw = body_pose(
-            (detection.position.x, detection.position.y, detection.position.z),
-            size,
-            None if turn is None else (turn.x, turn.y, turn.z, turn.w),
-            optical=optical,
-        )
+            turn = (0.0, 0.0, math.sin(half), math.cos(half))
+        elif (quaternion := detection.orientation) is not None:
+            turn = (quaternion.x, quaternion.y, quaternion.z, quaternion.w)
+        centre_in_frame = (centre.x, centre.y, centre.z)
+        position, size, yaw = body_pose(centre_in_frame, size, turn, optical=optical)
     return SceneObject(
         name, detection.label, class_index, detection.confidence, position, size, yaw
     )

@@ -14,7 +14,7 @@ another chair is to the right. Then left and right both count as observed for ea
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from typing import Final
 
 import numpy as np
@@ -29,15 +29,7 @@ from app.questions.posterior import Posterior, Present, relations_given
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
 from app.questions.reading import Reading, Triple
 from app.registry.artifact import Artifact
-from app.scene.relations import (
-    CANONICAL,
-    LATERAL,
-    OPPOSITES,
-    STACKED,
-    SUPPORTS,
-    canonicalise,
-    opposite,
-)
+from app.scene.relations import ON_TOP, SUPPORTS, canonicalise, opposite, relation_names
 from app.scene.scene import Scene, instance_evidence
 from scene_client.schemas import RelationsAnswer, RelationsRequest
 
@@ -95,7 +87,7 @@ def relations(
         raise ValueError(f"min_probability must be in [0, 1], not {min_probability}")
     if not scene.objects:
         return {"relations": [], "disagreements": []}
-    posterior = Posterior(artifact, scene)
+    posterior, A = Posterior(artifact, scene), artifact.spec.A
     present, slopes = posterior.present, artifact.relation_slopes
     judged = _judged(artifact, present, pairs)
     # This limit is slightly lower than the requested minimum, because the final comparison uses
@@ -114,20 +106,17 @@ def relations(
     )
     if size_limit is not None:
         count = len(p) + 2 * len(disagreements)
-        size_limit.check("top_k", count * RELATION_BYTES, 2 * count)
-    # Relation A + a is the opposite of relation a.
-    names = CANONICAL[: artifact.spec.A]
-    names += tuple([OPPOSITES[name] for name in names])
-    observed, things = set(scene.relations or ()), scene.objects
+        size_limit.check("top_k", (count, RELATION_BYTES, 2))
+    names, observed, things = relation_names(A), set(scene.relations or ()), scene.objects
     entries: list[Fields] = []
     for subject, object_, kind, probability, own in zip(*columns, expected, strict=True):
         if probability < min_probability:
             continue
-        name = names[kind]
-        is_observed = bool(observed) and canonicalise(subject, name, object_) in observed
+        ends = (subject, object_) if kind < A else (object_, subject)
+        is_observed = (kind % A, *ends) in observed
         entry: Fields = {
             "subject": things[subject].id,
-            "relation": name,
+            "relation": names[kind],
             "object": things[object_].id,
             "probability": probability,
             "observed": is_observed,
@@ -144,39 +133,25 @@ def _evidence(artifact: Artifact, posterior: Posterior, scene: Scene) -> NDArray
     The probability of an observed relation is the product of the confidences of its objects. An
     object on or in one object is not on or in another object.
     """
-    n, relations = len(scene.objects), artifact.spec.A
+    A = artifact.spec.A
     if scene.excluded is None and not relations_given(scene):
         return np.zeros((0, 0, 0), np.float32)
     holds, observed = instance_evidence(scene)
-    held = np.zeros(n, np.bool_)
-    held[held_objects(artifact, posterior, scene)] = True
-    excluded = (observed | _excluded_by(holds)) & ~holds
-    excluded[[*SUPPORTS]] |= held[:, None] & ~holds[[*SUPPORTS]]
+    # A stacked relation excludes all other relations of its two objects. Left and front exclude
+    # stacked relations.
+    lateral, stacked = holds[:ON_TOP].any(0), holds[ON_TOP:].any(0)
+    excluded = observed | stacked | stacked.T
+    excluded[ON_TOP:] |= lateral | lateral.T
+    held = held_objects(artifact, posterior, scene)
+    for a in SUPPORTS:
+        excluded[a, held] = True
     if scene.excluded is not None:
-        excluded = excluded | scene.excluded
+        excluded |= scene.excluded
+    evidence = np.where(excluded[:A], EXCLUDED, np.float32(np.nan))
     confidence = np.array([thing.confidence for thing in scene.objects], np.float32)
-    evidence = np.full((relations, n, n), np.nan, np.float32)
-    evidence[excluded[:relations]] = EXCLUDED
-    both = np.broadcast_to(confidence[:, None] * confidence, evidence.shape)
-    shown = holds[:relations]
-    evidence[shown] = both[shown]
+    units = holds[:A].nonzero()
+    evidence[units] = confidence[units[1]] * confidence[units[2]]
     return evidence
-
-
-def _excluded_by(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the relations of N objects that cannot hold beside others, (A, N, N).
-
-    A stacked relation (on-top, above, inside) excludes all other relations of its two objects. Left
-    and front exclude stacked relations.
-
-    Args:
-        holds: (A, N, N) relations that hold.
-    """
-    lateral, stacked = holds[[*LATERAL]].any(0), holds[[*STACKED]].any(0)
-    excluded = np.zeros_like(holds)
-    excluded[:] = stacked | stacked.T
-    excluded[[*STACKED]] |= lateral | lateral.T
-    return excluded
 
 
 def _judged(
@@ -220,53 +195,54 @@ def _disagreements(
     if not stated:
         return []
     present = posterior.present
-    subjects, objects, holds, of_classes = observed_pairs(
-        np.array(stated), present.row, judged, len(present.classes), A
-    )
+    pairs = observed_pairs(np.array(stated), present.row, judged, len(present.classes), A)
+    subjects, objects, holds, of_classes = pairs
     if not len(subjects):
         return []
     i, j = present.row[subjects], present.row[objects]
-    table = artifact.relation_slopes.relation_given
-    forward, backward = posterior.log_odds_apart(i, j)
-    log_counts, least = present.log_counts[i] + present.log_counts[j], max(least, EXPECTED)
-    pairs, expected, p, observed_p = disagreeing(
-        table, forward, backward, log_counts, holds, of_classes, least, top_k
+    table, least = artifact.relation_slopes.relation_given, max(least, EXPECTED)
+    log_odds, log_counts = posterior.log_odds_apart(i, j), present.log_counts
+    chosen, expected, p, observed_p = disagreeing(
+        table, *log_odds, log_counts[i] + log_counts[j], holds, of_classes, least, top_k
     )
-    columns = subjects[pairs], objects[pairs], holds[pairs], expected
-    disagreements = [
-        _disagreement(scene, A, flipped, [subject, object_], bits, kind)
-        for subject, object_, bits, kind in zip(*(c.tolist() for c in columns), strict=True)
-    ]
-    probabilities = zip(disagreements, significant(p), significant(observed_p), strict=True)
+    columns = *(part[chosen].tolist() for part in (subjects, objects, holds)), expected.tolist()
     return [
-        names | {"probability": probability, "observed_probability": observed_probability}
-        for names, probability, observed_probability in probabilities
+        {
+            **_names(scene, A, flipped, subject, object_, bits, kind),
+            "probability": probability,
+            "observed_probability": observed_probability,
+        }
+        for subject, object_, bits, kind, probability, observed_probability in zip(
+            *columns, significant(p), significant(observed_p), strict=True
+        )
     ]
 
 
-def _disagreement(
-    scene: Scene, A: int, flipped: Collection[Triple], pair: list[int], holds: int, expected: int
+def _names(
+    scene: Scene,
+    A: int,
+    flipped: Collection[Triple],
+    subject: int,
+    object_: int,
+    holds: int,
+    expected: int,
 ) -> Fields:
     """Return the names of a disagreement, from the subject of the relation in the request.
 
     Args:
         A: number of canonical relations that the machine knows.
         flipped: relations that the request states by their opposite.
-        pair: indices of subject and object.
         holds: bit set of the observed relations; see `observed_pairs`.
         expected: number of the expected relation.
     """
-    names = CANONICAL[:A] + tuple(OPPOSITES[name] for name in CANONICAL[:A])
+    names = relation_names(A)
     observed = [name for bit, name in enumerate(names) if holds >> bit & 1]
-    subject, object_ = pair
-    if flipped:
-        triples = {canonicalise(subject, relation, object_) for relation in observed}
-        # A relation comes from this subject if the request states it with this subject, or if the
-        # request states its opposite with the other object as subject.
-        if all((triple[1] == subject) == (triple in flipped) for triple in triples):
-            subject, object_ = object_, subject
-            names = tuple(map(opposite, names))
-            observed = list(map(opposite, observed))
+    triples = {canonicalise(subject, relation, object_) for relation in observed}
+    # A relation comes from this subject if the request states it with this subject, or if the
+    # request states its opposite with the other object as subject.
+    if all((triple[1] == subject) == (triple in flipped) for triple in triples):
+        subject, object_ = object_, subject
+        names, observed = tuple(map(opposite, names)), list(map(opposite, observed))
     return {
         "subject": scene.objects[subject].id,
         "object": scene.objects[object_].id,
@@ -306,11 +282,6 @@ def _pairs(request: RelationsRequest, reading: Reading) -> list[tuple[int, int]]
         pairs[subject, other] = None
     errors.raise_any()
     return list(pairs)
-
-
-def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
-    for scene in scenes:
-        yield relations(artifact, scene)
 
 
 _EXAMPLES: Final = {
@@ -366,7 +337,6 @@ _EXAMPLE_ANSWER: Final = {
 RELATIONS: Final = Question(
     relations,
     _read,
-    _warm_up,
     RelationsRequest,
     RelationsAnswer,
     _EXAMPLES,

@@ -8,12 +8,11 @@ of the request. The machine's probability of a room type t (`app.inference.objec
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from app.inference.elementary import softmax
 from app.questions.answer import (
@@ -21,6 +20,7 @@ from app.questions.answer import (
     OBJECT_BYTES,
     Fields,
     SizeLimit,
+    lengths,
     reasons,
     significant,
 )
@@ -29,7 +29,6 @@ from app.questions.posterior import LEAST_CHANGE, Posterior
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
 from app.questions.reading import Reading
 from app.registry.artifact import Artifact
-from app.registry.description import Sharpness
 from app.scene.scene import Scene
 from scene_client.schemas import RoomsAnswer, RoomsRequest, SceneWarning
 
@@ -70,7 +69,8 @@ def rooms(
     if not len(among):
         return {"warnings": [] if C else [_NO_ROOM_TYPES], "room_types": []}
     posterior = Posterior(artifact, replace(scene, room_type=None))
-    p = room_probabilities(artifact.calibration.rooms, posterior, among)
+    sharpness = artifact.calibration.rooms.of(posterior.listed)
+    p = softmax(sharpness * posterior.room_log_p()[among])
     first = np.argsort(-p, kind="stable")[:top_k]
     names = [artifact.vocabulary.room_types[t] for t in among[first].tolist()]
     entries: list[Fields] = [
@@ -83,23 +83,9 @@ def rooms(
         for entry, because in zip(entries, causes, strict=True):
             entry["because"] = because
     if size_limit is not None:
-        size_limit.check("top_k", *_size(entries))
+        count = lengths(entries, "because")
+        size_limit.check("top_k", (len(entries), OBJECT_BYTES, 1), (count, CAUSE_BYTES, 1))
     return {"room_types": entries}
-
-
-def room_probabilities(
-    entry: Sharpness, posterior: Posterior, among: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Return the probability of each of these room types, (N,); see the module."""
-    sharpness = entry.of(posterior.listed)
-    p: NDArray[np.float64] = softmax(sharpness * posterior.room_log_p()[among])
-    return p
-
-
-def _size(entries: Sequence[Fields]) -> tuple[int, int]:
-    """Return the size of the list in bytes without names, and the number of names."""
-    causes = sum([len(entry.get("because", ())) for entry in entries])
-    return causes * CAUSE_BYTES + len(entries) * OBJECT_BYTES, causes + len(entries)
 
 
 def _read(request: RoomsRequest, _: Artifact, reading: Reading) -> Options:
@@ -107,31 +93,14 @@ def _read(request: RoomsRequest, _: Artifact, reading: Reading) -> Options:
     candidates = None
     if request.candidates is not None:
         errors = ErrorList()
-        candidates = _candidates(request.candidates, reading, errors)
+        names = request.candidates
+        candidates = reading.unknown.resolve_all(names, "candidates", errors, is_room=True)
         errors.raise_any()
     return {
         "top_k": request.top_k,
         "candidates": candidates,
         "details": request.detail == "full",
     }
-
-
-def _candidates(names: Sequence[str], reading: Reading, errors: ErrorList) -> list[int]:
-    """Return the indices of the room types in the request's field `candidates`."""
-    indices: dict[int, None] = {}
-    for position, name in enumerate(names):
-        index = reading.unknown.vocabulary.room_index(name)
-        if index is None:
-            place = ("candidates", position)
-            index = reading.unknown.resolve(name, name, place, errors, is_room=True)
-        if index is not None:
-            indices[index] = None
-    return list(indices)
-
-
-def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
-    for scene in scenes:
-        yield rooms(artifact, scene)
 
 
 _NO_ROOM_TYPES: Final = SceneWarning(
@@ -176,7 +145,6 @@ _EXAMPLE_ANSWER: Final = {
 ROOMS: Final = Question(
     rooms,
     _read,
-    _warm_up,
     RoomsRequest,
     RoomsAnswer,
     _EXAMPLES,

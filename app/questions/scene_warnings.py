@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import compress
 from statistics import median
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal
 
 from app.scene.geometry import LARGEST, MOST_DISTANT, SMALLEST, is_optical, is_world_fixed
 from app.scene.scene import Point, Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
 from scene_client.schemas import Detection, SceneRequest, SceneWarning
 
+_ORIGIN: Final[Point] = (0.0, 0.0, 0.0)
 _SAME_DEPTH: Final = 1e-3  # maximum difference in m of depths that count as equal
 _LEAST: Final = 3  # minimum number of objects for warnings about all objects of a scene
 _FURNITURE: Final = 0.5  # minimum longest side of furniture in m; smaller objects may lie or stand
@@ -83,22 +85,23 @@ def scene_warnings(
     sized = _sized(scene, detections, vocabulary)
     factor, scaled = _scaled(sized)
     fits = _fits(sized)
-    odd = [one for one in scene.objects if not _is_plausible(one.size) and one not in scaled]
+    odd = [
+        one
+        for one in scene.objects
+        if one.size is not None and not SMALLEST <= max(one.size) <= LARGEST and one not in scaled
+    ]
     rolled = _rolled(fits, detections)
     optical = request.frame_id is not None and is_optical(request.frame_id)
-    y_up = () if optical else _y_up([fit for fit in fits if fit.thing not in rolled])
+    y_up = () if optical else _y_up([fit for fit in fits if fit[0] not in rolled])
+    unsized = _unsized(placed, vocabulary) if derived and len(placed) > 1 else ()
     kinds: list[tuple[Code, str, Sequence[SceneObject]]] = [
-        ("implausible-position", _TOO_FAR, _distant(scene, request) if placed else ()),
+        ("implausible-position", _TOO_FAR, _distant(placed, request)),
         ("implausible-size", _ODD_SIZE, odd),
         ("implausible-scale", _SCALED.format(factor), scaled),
         ("y-axis-up", _Y_UP, y_up),
         ("rolled-objects", _ROLLED, rolled),
         ("flat-scene", _FLAT, placed if optical and _is_flat(placed) else ()),
-        (
-            "unknown-sizes",
-            _UNSIZED,
-            _unsized(placed, vocabulary) if derived and len(placed) > 1 else (),
-        ),
+        ("unknown-sizes", _UNSIZED, unsized),
     ]
     return [
         SceneWarning(code=code, message=message, objects=[thing.id for thing in objects])
@@ -107,24 +110,21 @@ def scene_warnings(
     ]
 
 
-def _distant(scene: Scene, request: SceneRequest) -> list[SceneObject]:
+def _distant(placed: Sequence[SceneObject], request: SceneRequest) -> list[SceneObject]:
     """Return the objects that are too far from the viewer.
 
     In a world-fixed frame without a viewpoint, the position of the viewer is unknown. The median
     position of the objects then replaces the position of the viewer.
     """
-    placed = [(thing, thing.position) for thing in scene.objects if thing.position is not None]
-    centre: Point = (0.0, 0.0, 0.0)
+    positions = [thing.position or _ORIGIN for thing in placed]
+    centre = _ORIGIN
     if request.viewpoint is not None:
         centre = (request.viewpoint.x, request.viewpoint.y, 0.0)
-    elif request.frame_id is not None and is_world_fixed(request.frame_id):
-        xs, ys, zs = zip(*[position for _, position in placed], strict=True)
-        centre = (median(xs), median(ys), median(zs))
-    return [thing for thing, position in placed if math.dist(position, centre) > MOST_DISTANT]
-
-
-def _is_plausible(size: Point | None) -> bool:
-    return size is None or SMALLEST <= max(size) <= LARGEST
+    elif placed and request.frame_id is not None and is_world_fixed(request.frame_id):
+        x, y, z = map(median, zip(*positions, strict=True))
+        centre = (x, y, z)
+    far = [math.dist(position, centre) > MOST_DISTANT for position in positions]
+    return list(compress(placed, far))
 
 
 def _is_flat(placed: Sequence[SceneObject]) -> bool:
@@ -134,56 +134,38 @@ def _is_flat(placed: Sequence[SceneObject]) -> bool:
 
 
 def _unsized(placed: Sequence[SceneObject], vocabulary: Vocabulary) -> list[SceneObject]:
-    sizes = vocabulary.sizes
+    classes = vocabulary.objects
     return [
         thing
         for thing in placed
         if thing.size is None
-        and (thing.class_index is None or math.isnan(sizes[thing.class_index, 0]))
+        and (thing.class_index is None or classes[thing.class_index].size is None)
     ]
 
 
 # ---------------------------------------------------------------- comparison with typical sizes
 
+# An object of known size, its detection, its size and the typical extents of its class in metres.
+_Sized = tuple[SceneObject, Detection, Point, Point]
 
-class _Sized(NamedTuple):
-    """An object of known size, and the typical extents of its class in metres."""
-
-    thing: SceneObject
-    detection: Detection
-    size: Point
-    typical: Point
-
-
-class _Fit(NamedTuple):
-    """Comparison of a piece of furniture with the typical proportion of its class.
-
-    The proportion of a box is its height, divided by the geometric mean of the two other sides. A
-    misfit is the absolute log ratio of two proportions, so it does not depend on the unit.
-
-    Attributes:
-        thing: the piece of furniture.
-        by_z, by_y: misfit if the extent along z or y of the scene is the height.
-        by_own_z: misfit if the extent along the z axis of the box is the height.
-    """
-
-    thing: SceneObject
-    by_z: float
-    by_y: float
-    by_own_z: float
+# A piece of furniture, and three misfits. The proportion of a box is its height, divided by the
+# geometric mean of the two other sides. A misfit is the absolute log ratio of the proportion to the
+# typical proportion, so it does not depend on the unit. The height is the extent along z of the
+# scene, along y of the scene, and along the z axis of the box.
+_Fit = tuple[SceneObject, float, float, float]
 
 
 def _sized(
     scene: Scene, detections: Mapping[int, Detection], vocabulary: Vocabulary
 ) -> list[_Sized]:
     """Return the objects whose size and typical size are known, without thin objects."""
-    classes, sized = vocabulary.objects, []
+    sized = []
     for number, detection in detections.items():
         thing = scene.objects[number]
         if thing.size is not None and thing.class_index is not None:
-            typical = classes[thing.class_index].size
+            typical = vocabulary.objects[thing.class_index].size
             if typical is not None and min(thing.size) >= SMALLEST:
-                sized.append(_Sized(thing, detection, thing.size, typical))
+                sized.append((thing, detection, thing.size, typical))
     return sized
 
 
@@ -195,12 +177,12 @@ def _scaled(sized: Sequence[_Sized]) -> tuple[float, list[SceneObject]]:
     if len(sized) < _LEAST:
         return 1.0, []
     # The mean log ratio of the three sides of each object.
-    scales = [math.log(math.prod(one.size) / math.prod(one.typical)) / 3 for one in sized]
+    scales = [math.log(math.prod(size) / math.prod(typical)) / 3 for _, _, size, typical in sized]
     centre = median(scales)
     if abs(centre) < _UNIT:
         return 1.0, []
     agreeing = [
-        one.thing for one, scale in zip(sized, scales, strict=True) if abs(scale - centre) <= _TWICE
+        one[0] for one, scale in zip(sized, scales, strict=True) if abs(scale - centre) <= _TWICE
     ]
     agree = len(agreeing) >= max(_LEAST, _MOST * len(sized))
     return math.exp(centre), agreeing if agree else []
@@ -216,11 +198,10 @@ def _fits(sized: Sequence[_Sized]) -> list[_Fit]:
         # The yaw decides which side of the box is nearer to the y axis.
         if abs(math.sin(thing.yaw)) > abs(math.cos(thing.yaw)):
             x, y = y, x
-        height = _proportion(typical[2], typical[0], typical[1])
-        by_z = abs(_proportion(z, x, y) - height)
-        by_y = abs(_proportion(y, x, z) - height)
-        by_own_z = abs(_proportion(own.z, own.x, own.y) - height)
-        fits.append(_Fit(thing, by_z, by_y, by_own_z))
+        usual = _proportion(typical[2], typical[0], typical[1])
+        by_z, by_y = _proportion(z, x, y), _proportion(y, x, z)
+        by_own_z = _proportion(own.z, own.x, own.y)
+        fits.append((thing, abs(by_z - usual), abs(by_y - usual), abs(by_own_z - usual)))
     return fits
 
 
@@ -234,9 +215,7 @@ def _rolled(fits: Sequence[_Fit], detections: Mapping[int, Detection]) -> list[S
     One object may really have fallen over. So the list is empty, unless it has several objects, or
     all quaternions of the scene are turns about the vertical if w is read first.
     """
-    rolled = [
-        fit.thing for fit in fits if fit.by_own_z <= _TWICE and fit.by_z >= fit.by_own_z + _TWICE
-    ]
+    rolled = [thing for thing, by_z, _, by_own_z in fits if by_own_z <= _TWICE <= by_z - by_own_z]
     if not rolled or len(rolled) >= _LEAST:
         return rolled
     turns = [one.orientation for one in detections.values() if one.orientation is not None]
@@ -246,9 +225,9 @@ def _rolled(fits: Sequence[_Fit], detections: Mapping[int, Detection]) -> list[S
 
 def _y_up(fits: Sequence[_Fit]) -> list[SceneObject]:
     """Return the furniture that fits its class better if y points up, if most furniture does."""
-    gains = [(fit.by_z - fit.by_y, fit.thing) for fit in fits]
-    total = sum(gain for gain, _ in gains)
-    agree = total >= _MOST * sum(abs(gain) for gain, _ in gains)
+    gains = [by_z - by_y for _, by_z, by_y, _ in fits]
+    total = sum(gains)
+    agree = total >= _MOST * sum(map(abs, gains))
     if len(gains) < _LEAST or not agree or total < _BETTER * len(gains):
         return []
-    return [thing for gain, thing in gains if gain > 0]
+    return [fit[0] for fit, gain in zip(fits, gains, strict=True) if gain > 0]

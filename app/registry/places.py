@@ -22,14 +22,16 @@ from numpy.typing import NDArray
 
 from app.inference.kernels import triple_counts
 from app.registry.fields import TensorGroup
-from app.scene.relations import CANONICAL, SUPPORTS
+from app.scene.relations import CANONICAL, STACKED, SUPPORTS
 from app.scene.roles import IN, ON, UNDER, RoleCounts, role_counts
+from app.scene.stands import HANGS, SUPPORTED, USUAL
 
 _PLACE: Final = 10.0  # smoothing s, in scenes
 _RELATION: Final = 3.0  # smoothing m, in scenes
 _SUPPORTER: Final = 10.0  # smoothing of the supporters of a class, in scenes
 _SEEN: Final = 0.5  # smoothing of the counts of supporters
 _OTHER_ROLES: Final = 0.5  # smoothing of the counts of other roles
+_LEAST_STAND: Final = 0.005  # minimum share of a stand
 _SHOWN: Final = 2.0  # minimum number of scenes that show a relation
 
 Floats = NDArray[np.float64]
@@ -120,25 +122,45 @@ class Places(TensorGroup):
         A supporter is an object on or in which the subject is. The class indices are (N,) and (M,).
         The counts of a subject are smoothed by `_SUPPORTER` supporters of all classes.
         """
-        total, share = self._supporters
-        held = sum(self._held(relation, subject, other) for relation in SUPPORTS)
-        return (held + _SUPPORTER * share[other]) / (total[subject, None] + _SUPPORTER)
+        total, share, held = self._supporters
+        of_pairs = held[subject[:, None], other] + _SUPPORTER * share[other]
+        shares: Floats = of_pairs / (total[subject, None] + _SUPPORTER)
+        return shares
 
     @cached_property
-    def _supporters(self) -> tuple[Floats, Floats]:
-        """Number of supporters of each class, and its share among all supporters, (V,) each."""
+    def _supporters(self) -> tuple[Floats, Floats, NDArray[np.float32]]:
+        """Number of supporters of each class, its share among all supporters, and by pair.
+
+        The shapes are (V,), (V,) and (V supported classes, V supporters).
+        """
         V = len(self.frequency)
         is_support = np.isin(self.triple // (V * V), SUPPORTS)
-        keys, held = self.triple[is_support], self.held[is_support]
-        total: Floats = np.bincount(keys // V % V, held, V).astype(np.float64)
-        count = np.bincount(keys % V, held, V) + _SEEN
-        return total, count / count.sum()
+        keys, held = self.triple[is_support] % (V * V), self.held[is_support]
+        by_pair = np.bincount(keys, held, V * V).reshape(V, V)
+        count = by_pair.sum(0) + _SEEN
+        return by_pair.sum(1), count / count.sum(), by_pair.astype(np.float32)
 
     def _held(self, relation: int, subject: Indices, other: Indices) -> Floats:
         """Return the number of training scenes with a relation between classes, (N, M)."""
         V = len(self.frequency)
         held: Floats = triple_counts(self.triple, self.held, V, relation, subject, other)
         return held
+
+    @cached_property
+    def unseen(self) -> NDArray[np.float32]:
+        """Change of the log-odds of stacked relations that training never shows, (3, V, V).
+
+        The axes are the relations of `STACKED`, subject class and object class. The change is the
+        log share of the subject's stand: on a wall for above, on or in an object for on-top and
+        inside. So a blackboard does not stand on a chair. Shares of at least `USUAL` do not change
+        the log-odds.
+        """
+        shares = np.log(np.minimum(np.maximum(self.stands, _LEAST_STAND) / USUAL, 1.0))
+        every = np.arange(len(shares))
+        changes = np.zeros((len(STACKED), len(every), len(every)), np.float32)
+        for change, a, stand in zip(changes, STACKED, (SUPPORTED, HANGS, SUPPORTED), strict=True):
+            change[:] = np.where(self.shows(a, every, every), 0.0, shares[:, stand, None])
+        return changes
 
     def under_evidence(self, upper: int, lower: int) -> float:
         """Return log(n · n / m), with n scenes that show the lower class under the upper.

@@ -60,7 +60,7 @@ from numpy.typing import ArrayLike, NDArray
 from app.inference import kernels
 from app.inference.kernels import CONTACT as CONTACT
 from app.inference.kernels import MIN_OFFSET
-from app.scene.relations import CANONICAL, FRONT, LEFT, STACKED
+from app.scene.relations import CANONICAL, FRONT, LEFT, ON_TOP
 from app.scene.roles import RoleCounts
 
 UNKNOWN_REACH: Final = 1.5  # maximum reach in metres of a footprint of unknown size
@@ -169,6 +169,26 @@ _NO_ROLES: Final = RoleCounts(
 )
 
 
+def overlap_and_gap(
+    centre_a: Array, size_a: Array, yaw_a: Array, centre_b: Array, size_b: Array, yaw_b: Array
+) -> tuple[Array, Array]:
+    """Compute overlap and gap of P pairs of rectangles a and b, the footprints of boxes.
+
+    Centres (P, 2) and sizes (P, 2) along the rectangle's own axes are in metres, yaws (P,) in
+    radians.
+
+    Returns:
+        Overlap of each pair, (P,): area of the intersection divided by the smaller area.
+        Gap of each pair, (P,): distance between the rectangles in metres, or 0 if they touch.
+    """
+    share, gap = np.empty(len(yaw_a)), np.empty(len(yaw_a))
+    rectangles = (centre_a, size_a, yaw_a, centre_b, size_b, yaw_b)
+    kernels.measure_pairs(
+        *(np.asarray(part, np.float64, order="C") for part in rectangles), share, gap
+    )
+    return share, gap
+
+
 def excluded_by_centres(points: Array, sizes: Array, *, horizontal: bool) -> NDArray[np.bool_]:
     """Return the relations that the centres of n boxes exclude, (A, n, n).
 
@@ -180,15 +200,17 @@ def excluded_by_centres(points: Array, sizes: Array, *, horizontal: bool) -> NDA
             `UNKNOWN_REACH`.
         horizontal: whether the viewer is known, so that left and front are defined.
     """
-    dx, dy = (points[:, axis, None] - points[:, axis] for axis in (0, 1))
-    excluded = np.zeros((len(CANONICAL), len(points), len(points)), np.bool_)
+    x, y = points[:, 0], points[:, 1]
+    dx, dy = x[:, None] - x, y[:, None] - y
+    excluded = np.zeros((len(CANONICAL), len(x), len(x)), np.bool_)
     # A comparison with NaN is False.
     if horizontal:
-        excluded[LEFT] = (dy < MIN_OFFSET) | (np.abs(dy) < np.abs(dx))
-        excluded[FRONT] = (-dx < MIN_OFFSET) | (np.abs(dx) <= np.abs(dy))
+        size_x, size_y = np.abs(dx), np.abs(dy)
+        excluded[LEFT] = (dy < MIN_OFFSET) | (size_y < size_x)
+        excluded[FRONT] = (dx > -MIN_OFFSET) | (size_x <= size_y)
     radius = np.hypot(sizes[:, 0], sizes[:, 1]) / 2
     radius[np.isnan(radius)] = UNKNOWN_REACH
-    excluded[[*STACKED]] = np.hypot(dx, dy) > radius[:, None] + radius
+    excluded[ON_TOP:] = np.hypot(dx, dy) > radius[:, None] + radius  # the stacked relations
     return excluded
 
 

@@ -37,15 +37,24 @@ SUPPORTS: Final = (ON_TOP, INSIDE)
 STACKED: Final = (ON_TOP, ABOVE, INSIDE)
 """Indices of the relations of two objects with overlapping footprints."""
 
-_INDEX: Final = {name: index for index, name in enumerate(CANONICAL)}
-_FLIPPED: Final = {OPPOSITES[name]: index for index, name in enumerate(CANONICAL)}
-_OPPOSITE: Final = OPPOSITES | {opposite: name for name, opposite in OPPOSITES.items()}
+_NUMBER: Final = {name: number for number, name in enumerate(RELATIONS)}
+
+
+def relation_names(A: int) -> tuple[str, ...]:
+    """Return the names of the first A canonical relations, then of their opposites."""
+    return CANONICAL[:A] + RELATIONS[len(CANONICAL) : len(CANONICAL) + A]
+
 
 End = TypeVar("End", bound=Hashable)
 
 
-def _unknown(relation: str) -> ValueError:
-    return ValueError(f"unknown relation {relation!r}; it must be one of {', '.join(RELATIONS)}")
+def _number(relation: str) -> int:
+    """Return the index in `RELATIONS`."""
+    try:
+        return _NUMBER[relation]
+    except KeyError:
+        names = ", ".join(RELATIONS)
+        raise ValueError(f"unknown relation {relation!r}; it must be one of {names}") from None
 
 
 def opposite(relation: str) -> str:
@@ -54,10 +63,7 @@ def opposite(relation: str) -> str:
     Raises:
         ValueError: the relation is not one of the ten `RELATIONS`.
     """
-    try:
-        return _OPPOSITE[relation]
-    except KeyError:
-        raise _unknown(relation) from None
+    return RELATIONS[(_number(relation) + len(CANONICAL)) % len(RELATIONS)]
 
 
 def canonicalise(subject: End, relation: str, anchor: End) -> tuple[int, End, End]:
@@ -69,11 +75,10 @@ def canonicalise(subject: End, relation: str, anchor: End) -> tuple[int, End, En
     Raises:
         ValueError: the relation is not one of the ten `RELATIONS`.
     """
-    if (index := _INDEX.get(relation)) is not None:
-        return index, subject, anchor
-    if (index := _FLIPPED.get(relation)) is not None:
-        return index, anchor, subject
-    raise _unknown(relation)
+    number = _number(relation)
+    if number < len(CANONICAL):
+        return number, subject, anchor
+    return number - len(CANONICAL), anchor, subject
 
 
 def contradiction(

@@ -37,7 +37,7 @@ class RoleCounts(NamedTuple):
 def role_counts(roles: RoleCounts, i: int, j: int) -> NDArray[np.float32]:
     """Return the counts of the roles of a smaller class i at a larger class j, (3,)."""
     key = i * len(roles.anchor) + j
-    row = int(np.searchsorted(roles.pair, key))
+    row = int(roles.pair.searchsorted(key))
     if row < len(roles.pair) and roles.pair[row] == key:
         counts: NDArray[np.float32] = roles.counts[row]
         return counts

@@ -2,10 +2,11 @@
 
 `observe` derives the relations of a scene from the poses of its objects.
 
-Scenes contain instances (objects), but models only know classes. `class_evidence` converts a scene
-to evidence about classes. A relation is on if it holds, and off if it was observed not to hold.
-Relation a between classes x and y is on if at least one instance of x has relation a to an instance
-of y. Pairs of instances without an observed relation have no influence.
+Scenes contain instances (objects), but models only know classes. `pool_instances` converts the
+evidence about instances (`instance_evidence`) to evidence about classes. A relation is on if it
+holds, and off if it was observed not to hold. Relation a between classes x and y is on if at least
+one instance of x has relation a to an instance of y. Pairs of instances without an observed
+relation have no influence.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NoReturn
+from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,12 +74,17 @@ class SceneObject:
             )
         if not 0.0 < self.confidence <= 1.0:
             raise ValueError(f"confidence of {self.id!r} must be in (0, 1], not {self.confidence}")
-        if self.position is not None and not _are_finite(self.position):
+        position, size = self.position, self.size
+        if position is not None and not _are_finite(position):
             raise ValueError(f"position of {self.id!r} must be three finite numbers (metres)")
-        if self.size is not None and not (_are_finite(self.size) and min(self.size) >= 0):
+        if size is not None and not (_are_finite(size) and min(size) >= 0):
             raise ValueError(f"size of {self.id!r} must be three numbers of at least 0 (metres)")
-        if not math.isfinite(self.yaw):
+        if self.yaw and not isfinite(self.yaw):
             raise ValueError(f"yaw of {self.id!r} must be finite, not {self.yaw}")
+
+
+def _are_finite(point: Sequence[float]) -> bool:
+    return len(point) == 3 and isfinite(point[0]) and isfinite(point[1]) and isfinite(point[2])
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,10 +133,7 @@ class Scene:
                 )
         elif self.poses is None:
             for triple in self.relations:
-                relation, subject, anchor = triple
-                ends_exist = 0 <= subject < n and 0 <= anchor < n
-                if subject == anchor or not (ends_exist and 0 <= relation < len(CANONICAL)):
-                    self._refuse(triple, n)
+                self._check(triple, n)
             if clash := contradiction(self.relations):
                 (relation, i, j), _ = clash
                 first, second = self.objects[i].id, self.objects[j].id
@@ -143,25 +146,18 @@ class Scene:
             if array is not None and array.shape != (A, n, n):
                 raise ValueError(f"{name} must have the shape {(A, n, n)}, not {array.shape}")
 
-    def _refuse(self, triple: tuple[int, int, int], n: int) -> NoReturn:
+    def _check(self, triple: tuple[int, int, int], n: int) -> None:
         relation, subject, anchor = triple
-        if not 0 <= relation < len(CANONICAL):
-            raise ValueError(
-                f"a relation index must be from 0 to {len(CANONICAL) - 1}, not {relation}"
-            )
+        if not 0 <= relation < A:
+            raise ValueError(f"a relation index must be from 0 to {A - 1}, not {relation}")
         for end in (subject, anchor):
             if not 0 <= end < n:
                 raise ValueError(f"the object index {end} of a relation is not from 0 to {n - 1}")
-        raise ValueError(
-            f"{self.objects[subject].id!r} has the relation {CANONICAL[relation]} to itself; a "
-            "relation needs two different objects"
-        )
-
-
-def _are_finite(point: Sequence[float]) -> bool:
-    # A loop would be slower. This function runs twice for every object.
-    finite = math.isfinite
-    return len(point) == 3 and finite(point[0]) and finite(point[1]) and finite(point[2])
+        if subject == anchor:
+            raise ValueError(
+                f"{self.objects[subject].id!r} has the relation {CANONICAL[relation]} to itself; a "
+                "relation needs two different objects"
+            )
 
 
 # ------------------------------------------------------------------------- relations from poses
@@ -201,15 +197,13 @@ def observe(
         return scene
     objects = scene.objects if viewpoint is None else _in_viewer_frame(scene.objects, viewpoint)
     has_no_viewer = viewpoint is None and frame_id is not None and is_world_fixed(frame_id)
-    indices = [-1 if thing.class_index is None else thing.class_index for thing in objects]
-    points = np.array([thing.position or _UNKNOWN for thing in objects])
-    sizes = np.array([extent_of(thing, typical_sizes) for thing in objects])
+    points, sizes = boxes_of(objects, typical_sizes)
     poses = derive_relations(
         points,
         sizes,
-        np.array([thing.yaw for thing in objects]),
+        [thing.yaw for thing in objects],
         horizontal=not has_no_viewer,
-        classes=np.array(indices),
+        classes=np.array([-1 if one.class_index is None else one.class_index for one in objects]),
         roles=roles,
     )
     excluded = poses.observed & ~poses.holds
@@ -226,29 +220,33 @@ def _in_viewer_frame(
     objects: tuple[SceneObject, ...], viewpoint: Viewpoint
 ) -> tuple[SceneObject, ...]:
     positions, yaws = to_viewer_frame(
-        [thing.position or _UNKNOWN for thing in objects],
-        viewpoint,
-        [thing.yaw for thing in objects],
+        [thing.position or _UNKNOWN for thing in objects], viewpoint, [one.yaw for one in objects]
     )
-    turned = [
-        thing
-        if thing.position is None
-        else SceneObject(
-            thing.id, thing.label, thing.class_index, thing.confidence, (x, y, z), thing.size, yaw
-        )
-        for thing, (x, y, z), yaw in zip(objects, positions.tolist(), yaws.tolist(), strict=True)
-    ]
-    return tuple(turned)
+    poses = zip(objects, map(tuple, positions.tolist()), yaws.tolist(), strict=True)
+    return tuple(
+        thing if thing.position is None else replace(thing, position=position, yaw=yaw)
+        for thing, position, yaw in poses
+    )
 
 
-def extent_of(thing: SceneObject, typical_sizes: NDArray[np.float64] | None) -> Sequence[float]:
-    """Return the extents of an object, else those typical of its class, else NaN."""
-    if thing.size is not None and max(thing.size) >= SMALLEST:
-        return thing.size
-    if typical_sizes is not None and thing.class_index is not None:
-        size: list[float] = typical_sizes[thing.class_index].tolist()
-        return size
-    return _UNKNOWN
+def boxes_of(
+    objects: Sequence[SceneObject], typical_sizes: NDArray[np.float64] | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the centres and the extents of n objects, (n, 3) each, NaN where unknown.
+
+    An object without a plausible size has the typical extents of its class (`Vocabulary.sizes`).
+    """
+    centres = np.array([thing.position or _UNKNOWN for thing in objects]).reshape(-1, 3)
+    indices = [-1 if thing.class_index is None else thing.class_index for thing in objects]
+    extents = np.full((len(objects), 3), math.nan)
+    if typical_sizes is not None:
+        extents = typical_sizes[indices]
+    for row, thing in enumerate(objects):
+        if thing.size is not None and max(thing.size) >= SMALLEST:
+            extents[row] = thing.size
+        elif thing.class_index is None:
+            extents[row] = math.nan
+    return centres, extents
 
 
 # -------------------------------------------------------------------------- evidence of classes
@@ -314,28 +312,12 @@ def pool_instances(
     return ClassEvidence(distinct, counts, present, class_holds, class_observed, room_type)
 
 
-def class_evidence(scene: Scene) -> ClassEvidence:
-    """Return the evidence of a scene about its classes.
-
-    Instances whose label is outside the vocabulary are left out. If the scene has poses,
-    ``scene.poses`` defines which relations hold and which are observed. Otherwise, stated relations
-    are on. Relations that are not stated are off if ``scene.relations_complete`` is True, and
-    unobserved otherwise.
-    """
-    kept = [i for i, thing in enumerate(scene.objects) if thing.class_index is not None]
-    size = len(kept)
-    classes = np.array([scene.objects[i].class_index for i in kept], dtype=np.int64)
-    confidence = np.array([scene.objects[i].confidence for i in kept], dtype=np.float64)
-    holds, observed = instance_evidence(scene)
-    if size < len(scene.objects):
-        holds, observed = holds[:, kept][:, :, kept], observed[:, kept][:, :, kept]
-    return pool_instances(classes, confidence, holds, observed, scene.room_type)
-
-
 def instance_evidence(scene: Scene) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return which relations between the N instances of a scene hold, and which are observed.
 
-    Both bool arrays have the shape (A relations, N subjects, N objects).
+    Both bool arrays have the shape (A relations, N subjects, N objects). Poses define the values.
+    Without poses, stated relations hold, and other relations are observed only if
+    `relations_complete` is True.
     """
     if scene.poses is not None:
         return scene.poses.holds, scene.poses.observed

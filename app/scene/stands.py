@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.scene.geometry import CONTACT
-from app.scene.relations import ABOVE, INSIDE, ON_TOP, SUPPORTS
+from app.scene.relations import ABOVE, INSIDE, ON_TOP
 
 UNKNOWN, FLOOR, HANGS, SUPPORTED = -1, 0, 1, 2
 """An object stands on the floor, hangs on a wall or from the ceiling, or is on or in an object."""
@@ -33,15 +36,16 @@ def floor_level(bottoms: Floats, weights: Floats) -> float:
         weights: (n,) shares of the objects of each class that stand on the floor.
     """
     usable = np.isfinite(bottoms) & (weights >= USUAL)
-    if not usable.any():
-        return float("nan")
     bottoms, weights = bottoms[usable], weights[usable]
-    order = np.argsort(bottoms, kind="stable")
-    total = np.cumsum(weights[order])
-    return float(bottoms[order][np.searchsorted(total, total[-1] / 3)])
+    if not len(bottoms):
+        return math.nan
+    order = bottoms.argsort(kind="stable")
+    total = weights[order].cumsum()
+    return float(bottoms[order[total.searchsorted(total[-1] / 3)]])
 
 
-class Heights(NamedTuple):
+@dataclass(frozen=True)
+class Heights:
     """Bottoms, tops and footprint areas of n boxes, in metres and square metres; NaN: unknown."""
 
     bottoms: Floats
@@ -54,7 +58,7 @@ class Heights(NamedTuple):
         half = sizes[:, 2] / 2
         return cls(centres[:, 2] - half, centres[:, 2] + half, sizes[:, 0] * sizes[:, 1])
 
-    @property
+    @cached_property
     def around(self) -> Flags:
         """Whether box i reaches below a smaller box j, or far below its top, (n, n).
 
@@ -76,15 +80,15 @@ def stands_of(holds: Flags, observed: Flags, heights: Heights, floor: float) -> 
         holds, observed: (A, n, n) relations between the boxes; see `PoseRelations`.
         floor: height of the floor in metres, or NaN.
     """
-    bottoms, tops, _ = heights
+    bottoms, tops, has_floor = heights.bottoms, heights.tops, not math.isnan(floor)
     is_known = np.isfinite(bottoms)
-    other = ~np.eye(len(bottoms), dtype=np.bool_)
     is_close = (holds[ABOVE] & (bottoms[:, None] - tops <= CLOSE)).any(1)
-    is_open = (~observed[[*SUPPORTS]] & is_known & other).any((0, 2))
+    is_closed = observed[ON_TOP] & observed[INSIDE]
+    np.fill_diagonal(is_closed, True)
     carried = holds[ON_TOP] & ~heights.around & ~(tops <= floor + CLEARANCE)
     stands = np.where(is_close, UNKNOWN, HANGS)
     stands[bottoms <= floor + CLEARANCE] = FLOOR
-    stands[is_open] = UNKNOWN
+    stands[(~is_closed & is_known).any(1)] = UNKNOWN
     stands[(carried | holds[INSIDE]).any(1)] = SUPPORTED
-    stands[~is_known | (np.isnan(floor) & (stands != SUPPORTED))] = UNKNOWN
+    stands[~is_known if has_floor else ~is_known | (stands != SUPPORTED)] = UNKNOWN
     return stands

@@ -11,12 +11,15 @@ from types import MappingProxyType
 from typing import Any, Final, Literal, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from app.scene.labels import Rule, head_of, label_key, readings
 from app.scene.nearest import Guess, Match, NameIndex
+from app.scene.scene import SceneObject
 
 Extents = tuple[float, float, float]
+
+_TIGHT: Final = 1.2  # ratio of extents up to which a box fits into another box
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,30 +93,14 @@ class Vocabulary:
         self.room_aliases = {room: tuple(names) for room, names in room_aliases.items()}
         if others := self.room_aliases.keys() - set(self.room_types):
             raise ValueError(f"room_aliases names unknown room types: {sorted(others)}")
-        self._by_key: dict[str, int] = {}
-        self._by_spelling: dict[str, int] = {}
-        for index, entry in enumerate(self.objects):
-            for name in (entry.label, *entry.aliases):
-                first = self._by_key.setdefault(label_key(name), index)
-                if first != index:
-                    raise ValueError(
-                        f"two object classes have the name {name!r}: "
-                        f"{self.objects[first].label!r} and {entry.label!r}"
-                    )
-                self._by_spelling[name] = index
+        names = [(entry.label, *entry.aliases) for entry in self.objects]
+        clash = "two object classes have the name {name!r}: {first!r} and {second!r}"
+        self._by_spelling, self._by_key = _tables(names, "an object class", clash)
+        self._bare = {name: SceneObject(name, name, k) for name, k in self._by_spelling.items()}
         self._parents = self._parent_indices()
-        self._room_by_key: dict[str, int] = {}
-        self._room_by_spelling: dict[str, int] = {}
-        for index, room in enumerate(self.room_types):
-            for name in (room, *self.room_aliases.get(room, ())):
-                if not label_key(name):
-                    raise ValueError(f"a room type has an empty name: {name!r}")
-                first = self._room_by_key.setdefault(label_key(name), index)
-                if first != index:
-                    raise ValueError(
-                        f"room types {self.room_types[first]!r} and {room!r} have the same name"
-                    )
-                self._room_by_spelling[name] = index
+        names = [(room, *self.room_aliases.get(room, ())) for room in self.room_types]
+        clash = "room types {first!r} and {second!r} have the same name"
+        self._room_by_spelling, self._room_by_key = _tables(names, "a room type", clash)
 
     def _parent_indices(self) -> NDArray[np.int64]:
         index_of = {entry.label: index for index, entry in enumerate(self.objects)}
@@ -131,8 +118,7 @@ class Vocabulary:
             if (own := np.flatnonzero(ancestors == np.arange(len(ancestors)))).size:
                 raise ValueError(f"{self.objects[own[0]].label!r} is its own ancestor")
             ancestors = np.where(ancestors < 0, -1, parents[ancestors])
-        parents.flags.writeable = False
-        return parents
+        return _read_only(parents)
 
     def __len__(self) -> int:
         return len(self.objects)
@@ -163,38 +149,45 @@ class Vocabulary:
         names = [*self.labels, *self.room_types]
         return max(len(json.dumps(name, ensure_ascii=False).encode()) for name in names)
 
+    # The arrays are read-only.
+
     @cached_property
     def structure(self) -> NDArray[np.bool_]:
-        """(V,) True for structural classes, which a model never proposes. Read-only array."""
-        mask = np.array([entry.structure for entry in self.objects], dtype=np.bool_)
-        mask.flags.writeable = False
-        return mask
+        """(V,) True for structural classes, which a model never proposes."""
+        return _read_only([entry.structure for entry in self.objects])
 
     @property
     def parents(self) -> NDArray[np.int64]:
-        """(V,) index of the parent of each class, -1 without a parent. Read-only array."""
+        """(V,) index of the parent of each class, -1 without a parent."""
         return self._parents
 
     @cached_property
     def anywhere(self) -> NDArray[np.bool_]:
-        """(V,) True for classes whose objects belong in every room. Read-only array."""
-        mask = np.array([entry.anywhere for entry in self.objects], dtype=np.bool_)
-        mask.flags.writeable = False
-        return mask
+        """(V,) True for classes whose objects belong in every room."""
+        return _read_only([entry.anywhere for entry in self.objects])
 
     @cached_property
     def judged(self) -> NDArray[np.bool_]:
         """(V,) True for classes that can be intruders: neither structure nor `anywhere`."""
-        mask: NDArray[np.bool_] = ~(self.structure | self.anywhere)
-        mask.flags.writeable = False
-        return mask
+        return _read_only(~(self.structure | self.anywhere))
 
     @cached_property
     def sizes(self) -> NDArray[np.float64]:
-        """(V, 3) typical extents in metres, or NaN for classes of unknown size. Read-only array."""
-        sizes = np.array([entry.size or (math.nan,) * 3 for entry in self.objects])
-        sizes.flags.writeable = False
-        return sizes
+        """(V, 3) typical extents in metres, or NaN for classes of unknown size."""
+        return _read_only([entry.size or (math.nan,) * 3 for entry in self.objects])
+
+    @cached_property
+    def too_large(self) -> NDArray[np.bool_]:
+        """(V, V) True if a box of the size of class i does not fit into one of class j."""
+        return _read_only(do_not_fit(self.sizes, self.sizes))
+
+    def bare_objects(self, labels: Sequence[str]) -> tuple[SceneObject, ...] | None:
+        """Return objects without id and pose that have these labels, or None for a new spelling.
+
+        `Vocabulary` stores these objects, because most scenes of robots are lists of labels.
+        """
+        objects = tuple(map(self._bare.get, labels))
+        return None if None in objects else objects  # type: ignore[return-value]
 
     def index(self, label: str) -> int | None:
         """Return the index of the class with this label, or None for an unknown label.
@@ -304,18 +297,53 @@ class Vocabulary:
         rooms = values.get("room_types", [])
         if not isinstance(rooms, list):
             raise ValueError(f"'room_types' must be a list, not {rooms!r}")
-        if not all(isinstance(room, str) for room in rooms):
+        if not _are_strings(rooms):
             raise ValueError("'room_types' must be a list of strings")
         aliases = values.get("room_aliases", {})
-        if not isinstance(aliases, Mapping) or not all(
-            isinstance(names, list) and all(isinstance(name, str) for name in names)
-            for names in aliases.values()
-        ):
+        if not isinstance(aliases, Mapping) or not all(map(_are_strings, aliases.values())):
             raise ValueError("'room_aliases' must map room types to lists of strings")
         return cls([_object_class(entry) for entry in values["objects"]], rooms, aliases)
 
 
+def do_not_fit(inner: NDArray[np.float64], outer: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which boxes (N, 3) do not fit into which boxes (m, 3), (N, m).
+
+    A box fits into another box if each of its extents, in order of size, is at most `_TIGHT` times
+    that of the other. A box of unknown size (NaN) fits everywhere.
+    """
+    a, b = np.sort(inner, axis=1), _TIGHT * np.sort(outer, axis=1)
+    # A comparison with NaN is False.
+    return np.logical_or.reduce([a[:, None, k] > b[:, k] for k in range(3)])
+
+
+def _tables(
+    names: Sequence[tuple[str, ...]], kind: str, clash: str
+) -> tuple[dict[str, int], dict[str, int]]:
+    """Return the index of each entry by its names, and by their keys. The label comes first."""
+    by_spelling: dict[str, int] = {}
+    by_key: dict[str, int] = {}
+    for index, spellings in enumerate(names):
+        for name in spellings:
+            if not (key := label_key(name)):
+                raise ValueError(f"{kind} has an empty name: {name!r}")
+            if (first := by_key.setdefault(key, index)) != index:
+                labels = {"first": names[first][0], "second": spellings[0]}
+                raise ValueError(clash.format(name=name, **labels))
+            by_spelling[name] = index
+    return by_spelling, by_key
+
+
+def _read_only(values: ArrayLike) -> NDArray[Any]:
+    array = np.array(values)
+    array.flags.writeable = False
+    return array
+
+
 _FIELDS: Final = tuple(field.name for field in fields(ObjectClass))
+
+
+def _are_strings(values: object) -> bool:
+    return isinstance(values, list) and all(isinstance(value, str) for value in values)
 
 
 def _are_extents(size: Sequence[float]) -> bool:
@@ -331,7 +359,7 @@ def _object_class(entry: Any) -> ObjectClass:
             f"{', '.join(_FIELDS)}"
         )
     aliases, parent = entry.get("aliases", []), entry.get("parent")
-    if not isinstance(aliases, list) or not all(isinstance(name, str) for name in aliases):
+    if not _are_strings(aliases):
         raise ValueError(f"aliases of {entry['label']!r} must be a string list, not {aliases!r}")
     for name in ("structure", "anywhere"):
         if not isinstance(flag := entry.get(name, False), bool):

@@ -11,8 +11,7 @@ import httpx
 import numpy as np
 import pytest
 
-from app.scene.footprints import overlap_and_gap
-from app.scene.geometry import Viewpoint, derive_relations, to_viewer_frame
+from app.scene.geometry import Viewpoint, derive_relations, overlap_and_gap, to_viewer_frame
 from app.scene.relations import CANONICAL, OPPOSITES
 from tests.browser.driving import Board, OpenBoard
 

@@ -142,7 +142,7 @@ def close(value):
     return pytest.approx(value, rel=1e-4, abs=1e-4)
 
 
-@pytest.mark.parametrize("coverage", [None, 0.0, 0.45, 0.7, 1.0])
+@pytest.mark.parametrize("coverage", [None, 0.0, 0.3, 0.45, 0.7, 0.95, 1.0])
 @pytest.mark.parametrize(("name", "room", "profile"), CASES)
 def test_missing(name, room, profile, coverage):
     """Stated relations change no class. The default coverage of these artifacts is 1/2."""

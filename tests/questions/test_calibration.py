@@ -6,10 +6,9 @@ import math
 
 import pytest
 
-from app.questions import rooms
-from app.registry.description import CountSlope, Judgement, Sharpness
-from tests.questions.answers import misplaced, missing, relations, without_minimums
-from tests.questions.artifacts import NO_ALARM, judging, larger_artifact, scene_of
+from app.registry.description import CountSlope
+from tests.questions.answers import missing, relations, without_minimums
+from tests.questions.artifacts import larger_artifact, scene_of
 
 
 def sigmoid(x: float) -> float:
@@ -54,34 +53,6 @@ def test_instances_count_in_relations():
     assert p[0, 1] == pytest.approx(sigmoid(-2 - 0.5 * math.log(9)), rel=1e-5)
 
 
-def test_room_types_are_as_sharp_as_their_entry():
-    """Four listed classes; two chairs are one class."""
-    scene = scene_of([3, 3, 1, 0, 2])
-    plain, sharp = (
-        [one["probability"] for one in rooms(larger_artifact("triway", **own), scene)["room_types"]]
-        for own in ({}, {"rooms": Sharpness(slope=0.75, log_count=-0.25)})
-    )
-    powers = [p ** (0.75 - 0.25 * math.log(4)) for p in plain]
-    assert sharp == pytest.approx([power / sum(powers) for power in powers], rel=1e-4)
-    assert sharp != pytest.approx(plain, rel=1e-2)
-
-
-def test_false_relations():
-    """Every kind has an entry of its own. The machine has no implications."""
-    scene = scene_of([0, 1, 2], [(2, 1, 0), (0, 1, 2)])
-    plain = misplaced(larger_artifact("triway"), scene)
-    entry = Judgement(
-        intercept=0.4, relation=-0.5, change=0.0, stand=0.0, supporter=0.0, lines=NO_ALARM
-    )
-    scaled = misplaced(larger_artifact("triway", misplaced=judging(lateral=entry)), scene)
-    assert len(plain) == len(scaled) == 2
-    for one in plain:
-        (other,) = (entry for entry in scaled if entry[:3] == one[:3])
-        z = math.log(one.probability / (1 - one.probability))
-        expected = sigmoid(0.4 + 0.5 * z) if one.relation == "left" else one.probability
-        assert other.probability == pytest.approx(expected, rel=1e-4)
-
-
 @pytest.mark.parametrize(
     ("classes", "listed"), [([0, 1, 1, 8], 2), ([0, 1, 2], 3), ([8], 1), ([], 1)]
 )
@@ -92,3 +63,10 @@ def test_missing_classes_by_log_odds_and_number_of_listed_classes(classes, liste
     for entry in missing(artifact, scene_of(classes), top_k=9):
         z = 0.4 + 0.6 * entry.log_odds - 0.5 * math.log(listed)
         assert entry.probability == pytest.approx(sigmoid(z), rel=1e-5)
+
+
+def test_the_default_coverage_is_that_of_the_model():
+    artifact, scene = larger_artifact("triway", coverage=0.25), scene_of([0, 1])
+    default = missing(artifact, scene)
+    assert default == missing(artifact, scene, coverage=0.25)
+    assert default != missing(artifact, scene, coverage=0.5)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.scene import OPPOSITES, Scene, SceneObject, observe
+from app.scene import Scene, SceneObject, observe
 from app.scene.relations import ABOVE, CANONICAL, INSIDE, LEFT, ON_TOP
 from tests.questions.answers import relations
 from tests.questions.artifacts import LABELS, larger_artifact, scene_of
@@ -17,10 +17,10 @@ A = len(CANONICAL)
 SIZE = (0.5, 0.5, 0.5)
 
 
-def boxes(*bottoms, confidence=1.0, stated=None):
+def boxes(*bottoms, stated=None):
     """Boxes of 50 cm, of a class each."""
     objects = tuple(
-        SceneObject(LABELS[k], LABELS[k], k, confidence, (x, y, z + 0.25), SIZE)
+        SceneObject(LABELS[k], LABELS[k], k, 1.0, (x, y, z + 0.25), SIZE)
         for k, (x, y, z) in enumerate(bottoms)
     )
     return Scene(objects, stated)
@@ -119,19 +119,6 @@ def test_unknown_positions_exclude_nothing():
     scene = observe(scene_of([0, 1]))
     assert scene.excluded is None
     assert entries(scene) == entries(scene_of([0, 1]))
-
-
-def test_opposites_have_the_evidence_of_their_relation():
-    scene = observe(boxes((0, 0, 0), (0, 0, 0.5), (0.7, 0, 0), confidence=0.8))
-    both, plain = entries(scene, include_opposites=True), entries(scene)
-    assert any(entry.observed for entry in plain.values())
-    assert len(both) == 2 * len(plain)
-    for (name, i, j), entry in plain.items():
-        other = both[OPPOSITES[name], j, i]
-        assert other[3:] == entry[3:] == both[name, i, j][3:]
-    on = both["under", 0, 1]
-    assert on.observed
-    assert on.probability == pytest.approx(0.64)
 
 
 def test_least_probabilities_count_the_evidence():

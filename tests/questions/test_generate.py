@@ -8,6 +8,7 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -181,6 +182,7 @@ DRAWN: dict[str, MachineSpec] = {
 }
 
 
+@cache
 def with_joint(name, room=None, profile=None, evidence=()):
     """An artifact, and the joint of its machine under a room type and a profile.
 
@@ -218,7 +220,8 @@ def test_objects_have_the_distribution_of_the_model(name, evidence, clamped):
     profile = 1 if clamped and spec.profiles else None
     state = spec.states - 1
     context = {"h1": [(1, state)]} if clamped else None
-    artifact, joint = with_joint(name, room, profile, evidence)
+    # The mean base rates depend on the evidence only if the machine has data sources.
+    artifact, joint = with_joint(name, room, profile, tuple(evidence) if spec.profiles else ())
     scene = scene_of(evidence, room=room, profile=profile)
     drawn = label_sets(generate(artifact, scene, count=512, seed=0, steps=40, context=context))
     condition = (joint.v[:, evidence] > 0).all(1)

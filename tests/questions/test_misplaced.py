@@ -181,7 +181,7 @@ def test_the_stand_of_classes_that_belong_everywhere_is_not_judged():
     assert [mover for _, _, mover in alone.values()] == [1]
 
 
-def test_a_supported_object_above_another_is_no_sign_of_a_fault():
+def test_a_supported_object_above_another_is_not_misplaced():
     over = (ABOVE, 1, 2)
     alone = entries(stated([DESK, MONITOR, RUG], [over]))
     assert alone[over] == (OVER, [LEAST_Z, 0.0, 0.0, 0.0], 1)
@@ -349,7 +349,7 @@ def test_a_kind_without_judgement_is_left_out():
     assert not fields_of(on_floor, judgements=WITHOUT_STAND)
 
 
-def test_generation_uses_the_same_log_odds():
+def test_wrong_relations_have_the_log_odds_of_the_answer():
     artifact = larger_artifact("triway")
     scene = scene_of([0, 1, 2, 3], [(ON_TOP, 1, 2), (LEFT, 0, 3), (ABOVE, 1, 0)])
     log_odds = wrong_relations(artifact, scene)

@@ -60,10 +60,10 @@ def triples_of(entries):
 
 
 @few
-@given(artifacts, scenes())
-def test_missing(artifact, scene):
+@given(artifacts, scenes(), st.none() | st.floats(0, 1))
+def test_missing(artifact, scene, coverage):
     """All unlisted classes, with their best placements and strongest reasons."""
-    entries = missing(artifact, scene, top_k=len(LABELS))
+    entries = missing(artifact, scene, top_k=len(LABELS), coverage=coverage)
     first = {thing.label: k for k, thing in reversed(list(enumerate(scene.objects)))}
     assert {entry.label for entry in entries} == set(LABELS) - first.keys() - STRUCTURE
     assert all(0 <= entry.probability <= 1 for entry in entries)
@@ -90,22 +90,6 @@ def test_candidates_and_top_k_select_entries_without_changing_them(
     some = missing(artifact, scene, top_k=top_k, candidates=sorted(candidates))
     chosen = [entry for entry in every if LABELS.index(entry.label) in candidates][:top_k]
     assert [entry[:3] for entry in some] == [entry[:3] for entry in chosen]
-
-
-@few
-@given(st.sampled_from([ARTIFACTS[name] for name in ("rbm", "triway-states")]), scenes())
-def test_a_reason_is_the_difference_to_the_scene_without_the_class(artifact, scene):
-    """Without relations."""
-    without = {}
-    for entry in missing(artifact, Scene(scene.objects)):
-        for object_, change in entry.because:
-            label = scene.objects[object_].label
-            if label not in without:
-                rest = tuple(thing for thing in scene.objects if thing.label != label)
-                others = missing(artifact, Scene(rest), top_k=len(LABELS))
-                without[label] = {other.label: other.log_odds for other in others}
-            expected = entry.log_odds - without[label][entry.label]
-            assert change == pytest.approx(expected, abs=1e-4, rel=1e-4)
 
 
 @few
@@ -193,12 +177,12 @@ def test_a_relation_of_one_instance_explains_the_others():
 
 @few
 @given(artifacts, scenes(minimum=2))
-def test_opposites_have_the_same_probability(artifact, scene):
+def test_opposites_have_the_same_probability_and_evidence(artifact, scene):
     plain = relations(artifact, scene, top_k=ALL)
     both = relations(artifact, scene, top_k=ALL, include_opposites=True)
-    expected = {(e.subject, e.relation, e.object, e.probability) for e in plain}
-    expected |= {(e.object, OPPOSITES[e.relation], e.subject, e.probability) for e in plain}
-    assert {entry[:4] for entry in both} == expected
+    expected = {(*e,) for e in plain}
+    expected |= {(e.object, OPPOSITES[e.relation], e.subject, *e[3:]) for e in plain}
+    assert {(*entry,) for entry in both} == expected
     assert len(both) == len(expected)
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.scene.footprints import overlap_and_gap
+from app.scene.geometry import overlap_and_gap
 from tests.scene.pose_rules import Box, common_area, distance_of
 
 Rectangle = tuple[float, float, float, float, float]

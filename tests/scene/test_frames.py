@@ -94,7 +94,7 @@ def test_quaternions_must_have_length_one(quaternion: tuple[float, float, float,
 
 
 @given(st.floats(-7, 7), st.booleans(), st.tuples(*[st.floats(-5, 5)] * 3))
-def test_viewer_axes_undo_the_way_to_the_viewer(
+def test_viewer_axes_invert_the_conversion_to_the_viewer(
     yaw: float, optical: bool, point: tuple[float, float, float]
 ) -> None:
     """A point read into body axes, seen by the viewer, and told in the frame again."""

@@ -77,7 +77,7 @@ def test_a_name_is_guessed_by_its_spelling_or_its_last_words(
         " ".join(["refrigeratr", "nigthstand", "wodden", "chairr"] * 2),
     ],
 )
-def test_a_name_that_can_be_several_things_has_no_guess(label: str) -> None:
+def test_an_ambiguous_name_has_no_guess(label: str) -> None:
     assert VOCABULARY.guess(label) is None
 
 
@@ -133,7 +133,7 @@ def test_only_plausible_names_are_suggested_best_first() -> None:
     assert all(0 <= similarity <= 1 for similarity in similarities)
 
 
-def test_room_types_have_neighbours_too() -> None:
+def test_similar_room_types_are_found() -> None:
     assert [match.entry for match in VOCABULARY.nearest("bedrom", is_room=True)] == [0]
     assert VOCABULARY.nearest("garage", is_room=True) == ()
     found = VOCABULARY.guess("bedrom", is_room=True)

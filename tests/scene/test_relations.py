@@ -27,7 +27,7 @@ def test_the_ten_relations() -> None:
     assert {name: opposite(name) for name in CANONICAL} == OPPOSITES
 
 
-def test_requests_speak_of_the_same_relations() -> None:
+def test_the_schema_has_the_same_relations() -> None:
     assert set(get_args(RelationName)) == set(RELATIONS)
 
 
@@ -40,7 +40,7 @@ def test_a_relation_and_its_opposite_are_one_statement(relation: str, i: int, j:
 
 
 @pytest.mark.parametrize("name", ["", "Left", "on top", "near", "on_top"])
-def test_other_names_are_refused_by_name(name: str) -> None:
+def test_unknown_relations_are_refused(name: str) -> None:
     with pytest.raises(ValueError, match=rf"unknown relation '{name}'.*on-top"):
         canonicalise(0, name, 1)
     with pytest.raises(ValueError, match=rf"unknown relation '{name}'"):
@@ -52,7 +52,7 @@ def test_contradictions() -> None:
     assert contradiction([(0, 1, 2), (3, 0, 1), (0, 2, 1)]) == ((0, 1, 2), (0, 2, 1))
 
 
-def test_objects_that_hold_each_other_in_a_circle() -> None:
+def test_supports_in_a_circle_are_found() -> None:
     """Only on-top (2) and inside (4) hold an object."""
     tower = [(2, "box", "book"), (4, "book", "bag"), (2, "bag", "desk")]
     assert support_cycle(tower) is None

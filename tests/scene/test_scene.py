@@ -94,7 +94,7 @@ def test_counts_decide_between_the_roles_of_boxes_that_reach_into_each_other() -
     assert observe(Scene((desk, replace(bin_, class_index=None))), roles=roles).relations == ()
 
 
-def test_stated_relations_are_not_overruled_but_poses_exclude_others() -> None:
+def test_stated_relations_stay_and_poses_exclude_others() -> None:
     """The monitor stands on the desk, 20 cm to the left, and the sofa is far away."""
     sofa = SceneObject("sofa", "sofa", 3, position=(6.0, 0.0, 0.4), size=(0.9, 2.0, 0.8))
     objects = (DESK, MONITOR, sofa)
@@ -138,7 +138,7 @@ def test_scenes_without_poses_stay_as_they_are() -> None:
         assert observe(bare) is bare
 
 
-def test_things_without_a_position_stay_unobserved() -> None:
+def test_objects_without_a_position_have_no_observed_relations() -> None:
     seen = observe(Scene((DESK, SceneObject("cup", "cup", 1))), viewpoint=Viewpoint(0, 0, 1.0))
     assert seen.relations == ()
     assert seen.poses is not None

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from app.scene import ObjectClass, Vocabulary
-from app.scene.footprints import overlap_and_gap
+from app.scene.geometry import overlap_and_gap
 from app.scene.relations import FRONT, INSIDE, LEFT, ON_TOP
 from training.datasets import AnnotatedObject, AnnotatedScene, encode
 from training.datasets.moved import (
