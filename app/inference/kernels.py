@@ -302,6 +302,64 @@ def gain_factors(p, raised, removed):
 
 
 @compiled
+def source_weights(f, a, classes, presence):
+    """Return softmax(f + a v) of the data sources in N scenes, (N, profiles).
+
+    The sums have float64 digits, so that listed structure, whose terms are 0, changes none. See
+    `weights.Weights.source_weights` for the arguments.
+    """
+    p = np.empty((len(presence), len(f)), np.float64)
+    for s in range(len(presence)):
+        top, total = -np.inf, 0.0
+        for q in range(len(f)):
+            p[s, q] = f[q]
+            for j in range(len(classes)):
+                p[s, q] += np.float64(a[q, classes[j]]) * presence[s, j]
+            top = max(top, p[s, q])
+        for q in range(len(f)):
+            p[s, q] = math.exp(p[s, q] - top)
+            total += p[s, q]
+        for q in range(len(f)):
+            p[s, q] /= total
+    return p
+
+
+@compiled
+def class_log_odds(gain, bias, p, a, L, classes, presence):
+    """Return gain + bias + sum_q p_q a_q + sum_j presence_j L_j, (V,).
+
+    Args:
+        gain, bias: (V,) terms of the classes.
+        p, a: (profiles,) probabilities of the data sources, and (profiles, V) their base rates.
+        L: (V, V) couplings, or (0, V) without couplings.
+        classes, presence: (n,) listed classes j, and the probabilities that they are present.
+    """
+    log_odds = np.empty(len(gain), np.float32)
+    for i in range(len(gain)):
+        log_odds[i] = gain[i] + bias[i]
+    for q in range(len(p)):
+        weight, row = np.float32(p[q]), a[q]
+        for i in range(len(gain)):
+            log_odds[i] += weight * row[i]
+    for j in range(len(classes) if len(L) else 0):
+        weight, row = presence[j], L[classes[j]]
+        for i in range(len(gain)):
+            log_odds[i] += weight * row[i]
+    return log_odds
+
+
+@compiled
+def log_sums(x):
+    """Return the sum of ln x over the last axis, (N,), for positive x (N, units)."""
+    total = np.zeros(len(x), np.float32)
+    for i in range(len(x)):
+        row = x[i]
+        for m in range(len(row)):
+            total[i] += log(row[m])
+    return total
+
+
+@compiled
 def source_effects(f, a, classes, presence, rows, targets):
     """Return sum_q p_q a_qi of N classes i, (N,), and its change by each listed class, (N, n).
 
@@ -427,6 +485,28 @@ def pair_rows(start, keys, pairs):
             if keys[row] == pair:
                 rows[e] = row
     return rows
+
+
+@compiled
+def placement_ends(candidates, classes, log_counts, presence):
+    """Return the `Ends` of N candidate classes and m anchor classes, (N, 2 m) each.
+
+    In the first m columns, the candidate is the subject. In the others, the anchor is. Candidates
+    are present, with one instance.
+    """
+    N, m = len(candidates), len(classes)
+    i, j = np.empty((N, 2 * m), np.int64), np.empty((N, 2 * m), np.int64)
+    log_i, log_j = np.empty((N, 2 * m), np.float32), np.empty((N, 2 * m), np.float32)
+    p_i, p_j = np.empty((N, 2 * m), np.float32), np.empty((N, 2 * m), np.float32)
+    for c in range(N):
+        for k in range(m):
+            i[c, k] = j[c, m + k] = candidates[c]
+            j[c, k] = i[c, m + k] = classes[k]
+            log_i[c, k] = log_j[c, m + k] = np.float32(0.0)
+            log_j[c, k] = log_i[c, m + k] = log_counts[k]
+            p_i[c, k] = p_j[c, m + k] = np.float32(1.0)
+            p_j[c, k] = p_i[c, m + k] = presence[k]
+    return Ends(i, j, log_i, log_j, p_i, p_j)
 
 
 @compiled

@@ -51,6 +51,9 @@ _LANES: Final = 16
 _LN2 = np.float32(0.6931471805599453)
 _ONE = np.float32(1.0)
 _SMALLEST: Final = 1e-300  # least probability of a room type
+# Maximum number of biases that a scorer keeps, of 4 bytes for each class.
+_KEPT_BIASES: Final = 64
+_NO_COUPLINGS: Final[Floats] = np.zeros((0, 0), np.float32)
 # Listed share in the middle of each bin of kappa. The last bin lists all classes but one.
 _MIDDLES: Final = (0.15, 0.45, 0.8, 1.0)
 
@@ -102,6 +105,7 @@ class ObjectScorer:
 
     def __init__(self, weights: Weights) -> None:
         self._weights, self._states = weights, weights.spec.states
+        self._biases: dict[tuple[float, int | None], Floats] = {}  # by coverage and room type
         self.gains = Gains(weights["W"], self._states)
         self.room_gains = Gains(weights["Q"], self._states)
 
@@ -126,12 +130,15 @@ class ObjectScorer:
             coverage: listed share of the scene. 1 means that all classes but one are listed.
             room: index of the room type, or None if unknown.
         """
-        bias = self._weights.class_bias(classes, presence, profile)
-        bias = bias + self._weights.room_couplings(room)
-        log_odds: Floats = bias + self.gains(x[None])[0] + self.kappa(coverage)
-        if self._weights.spec.coupled:
-            log_odds += _row_sum(self._weights["L"][classes], presence)
-        return log_odds
+        weights, gain = self._weights, self.gains(x[None])[0]
+        bias = self._biases.get((coverage, room))
+        if bias is None:
+            bias = weights["b"] + weights.room_couplings(room) + self.kappa(coverage)
+            if len(self._biases) < _KEPT_BIASES:
+                self._biases[coverage, room] = bias
+        p = weights.source_weights(classes, presence[None], profile)[0]
+        couplings = weights["L"] if weights.spec.coupled else _NO_COUPLINGS
+        return kernels.class_log_odds(gain, bias, p, weights["a"], couplings, classes, presence)
 
     def kappa(self, coverage: float) -> Floats:
         """Return the bias of each class for a listed share, interpolated between the bins, (V,)."""
@@ -261,7 +268,8 @@ class ObjectScorer:
         raised = kernels.odds(self._weights["W"][classes], states)
         removed = kernels.odds(-shares, states)
         gain, ratio = kernels.gain_factors(kernels.all_states(x, states), raised, removed)
-        return np.log(gain).sum(1), -np.log(ratio).sum(2)
+        flat = ratio.reshape(-1, ratio.shape[2])
+        return kernels.log_sums(gain), -kernels.log_sums(flat).reshape(ratio.shape[:2])
 
 
 def _row_sum(rows: Floats, presence: Floats) -> Floats:

@@ -220,17 +220,8 @@ class RelationUnits(ABC):
             Log-odds (N, R, m) with the candidate as subject, and log-odds (N, R, m) with the
             anchor as subject.
         """
-        m = len(anchors)
-        # In the first m columns, the candidate is the subject. In the others, the anchor is.
-        shape = len(candidates), 2 * m
-        i, j = np.empty(shape, np.int64), np.empty(shape, np.int64)
-        log_i, log_j = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-        p_i, p_j = np.ones(shape, np.float32), np.ones(shape, np.float32)
-        i[:, :m] = j[:, m:] = candidates[:, None]
-        j[:, :m] = i[:, m:] = context.classes[anchors]
-        log_j[:, :m] = log_i[:, m:] = context.log_counts[anchors]
-        p_j[:, :m] = p_i[:, m:] = context.presence[anchors]
-        ends = Ends(i, j, log_i, log_j, p_i, p_j)
+        m, scene = len(anchors), (context.classes, context.log_counts, context.presence)
+        ends = kernels.placement_ends(candidates, *(part[anchors] for part in scene))
         means = state_means(context.x + self._W[candidates], self._states)
         log_odds = to_log_odds(*self.normal(means, ends, only))
         return log_odds[:, :, :m], log_odds[:, :, m:]

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference import kernels
-from app.inference.elementary import sigmoid, softmax
+from app.inference.elementary import sigmoid
 from app.inference.variants import MachineSpec
 
 SWEEPS: Final = 10
@@ -162,10 +162,7 @@ class Weights:
             one = np.zeros((len(presence), self.spec.profiles))
             one[:, profile] = 1.0
             return one
-        # The sum has float64 digits, so that listed structure, whose terms are 0, changes none.
-        evidence = presence.astype(np.float64) @ self["a"][:, classes].astype(np.float64).T
-        weights: NDArray[np.float64] = softmax(self["f"] + evidence)
-        return weights
+        return kernels.source_weights(self["f"], self["a"], classes, presence)
 
     def class_bias(
         self, classes: NDArray[Any], presence: NDArray[Any], profile: int | None
