@@ -216,11 +216,7 @@ def write(folder: Path, values: Mapping[str, Any], text: str) -> None:
     write_whole(folder / "results.json", json.dumps(values, indent=1) + "\n")
 
 
-def summarise(
-    reports: Reports,
-    ours: str,
-    parameters: Mapping[str, int] | None = None,
-) -> Results:
+def summarise(reports: Reports, ours: str, parameters: Mapping[str, int] | None = None) -> Results:
     """Compute the metrics of every row, and the paired differences from the reference row.
 
     Metrics over the scenes of a single group are left out, because they have no interval.
@@ -249,10 +245,7 @@ def summarise(
         for (row, source, task, name), mean in means.items()
     )
     differences = tuple(
-        Difference(
-            *(row, task, source, name),
-            paired_difference(mine, mean),
-        )
+        Difference(*(row, task, source, name), paired_difference(mine, mean))
         for (row, source, task, name), mean in means.items()
         if row != ours
         and (mine := means.get((ours, source, task, name))) is not None

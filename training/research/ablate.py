@@ -117,11 +117,7 @@ def ablate(
 
 
 def _configs(
-    reference: str,
-    path: Path | None,
-    names: Sequence[str] | None,
-    limit: int | None,
-    length: float,
+    reference: str, path: Path | None, names: Sequence[str] | None, limit: int | None, length: float
 ) -> list[Config]:
     """Return the configurations of the full model and of the selected ablations."""
     full = load_config(reference)

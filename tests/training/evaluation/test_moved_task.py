@@ -133,9 +133,7 @@ def test_the_service_sees_the_poses_of_a_request():
     terms = {"intercept": 0.0, "relation": -1.0, "change": -1.0, "stand": 0.0, "supporter": 0.0}
     unlikely = Judgement(**terms, lines=lines(0.9, 0.8, 0.7))
     judging = artifact.calibration.model_copy(
-        update={
-            "misplaced": Misplaced(lateral=unlikely, support=unlikely),
-        }
+        update={"misplaced": Misplaced(lateral=unlikely, support=unlikely)}
     )
     artifact = replace(artifact, calibration=judging)
     case = moved_cases(POSED, STRUCTURE)[0]

@@ -10,30 +10,15 @@ import pytest
 import torch
 
 from tests.questions.artifacts import LARGER, larger_artifact, lines
-from tests.training.evaluation.scenes import (
-    flat,
-    knowing,
-    random_scenes,
-    scene,
-    tensors,
-)
+from tests.training.evaluation.scenes import flat, knowing, random_scenes, scene, tensors
 from training.datasets.batches import seen_triples
 from training.datasets.cases import some_scenes
-from training.evaluation.artifact_model import (
-    artifact_model,
-    floor_model,
-    independent_model,
-)
+from training.evaluation.artifact_model import artifact_model, floor_model, independent_model
 from training.evaluation.calibration_task import QUESTIONS
 from training.evaluation.density_task import DensitySettings
 from training.evaluation.generation_task import held_out_halves
 from training.evaluation.model import Model
-from training.evaluation.report import (
-    evaluate,
-    measure,
-    pooled,
-    settings_by_source,
-)
+from training.evaluation.report import evaluate, measure, pooled, settings_by_source
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import EVERY_TASK, TASKS, WHOLE_SET
 

@@ -144,10 +144,7 @@ def test_an_interrupted_ablation_goes_on(finished, tmp_path, monkeypatch):
 def test_bad_requests_are_named(finished, tmp_path):
     _, config, *_ = arguments(tmp_path)
     for request, message in (
-        (
-            (*arguments(tmp_path), "--row", "nobody"),
-            "unknown rows ['nobody']: choose from wide",
-        ),
+        ((*arguments(tmp_path), "--row", "nobody"), "unknown rows ['nobody']: choose from wide"),
         ((*arguments(tmp_path), "--rows", "nowhere.toml"), "nowhere.toml does not exist"),
         (("ablate", config), "no shipped ablations"),
         ((*arguments(finished), "--limit", "20"), "another configuration of rooms-triway"),

@@ -13,12 +13,7 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, embedding_bag, normalize, softplus
 
 from training.datasets.batches import SceneTensors
-from training.evaluation.baselines.classes import (
-    LinearScore,
-    Lists,
-    frequency,
-    training_lists,
-)
+from training.evaluation.baselines.classes import LinearScore, Lists, frequency, training_lists
 from training.evaluation.baselines.fitting import TRIALS, Proposals, drawn_settings, halving
 from training.evaluation.density_task import DensitySettings, ising_density
 from training.evaluation.model import ObjectDensity, ObjectScore, Parameters
