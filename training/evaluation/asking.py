@@ -118,10 +118,7 @@ def index_of_ids(scene: Scene) -> dict[str, int]:
 def canonical_triple(scene: Scene, entry: Mapping[str, Any]) -> tuple[int, int, int]:
     """Return (canonical relation, subject, object) of a relation in an answer about a scene."""
     index = index_of_ids(scene)
-    relation, subject, other = canonicalise(
-        index[entry["subject"]], entry["relation"], index[entry["object"]]
-    )
-    return relation, subject, other
+    return canonicalise(index[entry["subject"]], entry["relation"], index[entry["object"]])
 
 
 def missing_probabilities(
@@ -139,15 +136,13 @@ def missing_probabilities(
             missing object has this relation. None means the whole scene.
         candidates: classes to rank. None means all classes.
     """
-    vocabulary = artifact.vocabulary
-    size = len(vocabulary)
-    probabilities = np.full(size, -np.inf)
+    p = np.full(len(artifact.vocabulary), -np.inf)
     answer = questions.missing(
-        artifact, scene, top_k=size, candidates=candidates, at=at, details=False
+        artifact, scene, top_k=len(p), candidates=candidates, at=at, details=False
     )
     for entry in answer["missing"]:
-        probabilities[vocabulary.index(entry["label"])] = entry["probability"]
-    return probabilities
+        p[artifact.vocabulary.index(entry["label"])] = entry["probability"]
+    return p
 
 
 def judge(artifact: Artifact, scene: Scene, sensitivity: Sensitivity = "medium") -> Floats:
@@ -157,20 +152,24 @@ def judge(artifact: Artifact, scene: Scene, sensitivity: Sensitivity = "medium")
     the rest of the scene, and 1 if the service reports the object as an outlier.
     """
     columns = np.zeros((len(scene.objects), 3))
-    answer = questions.outliers(artifact, scene, sensitivity=sensitivity, details=False)
     index = index_of_ids(scene)
+    answer = questions.outliers(artifact, scene, sensitivity=sensitivity, details=False)
     for entry in answer["outliers"]:
-        values = entry["probability"], entry["log_odds"], entry["is_outlier"]
-        columns[index[entry["object"]]] = values
+        fields = ("probability", "log_odds", "is_outlier")
+        columns[index[entry["object"]]] = [entry[field] for field in fields]
     return columns
+
+
+def log_of(p: Floats) -> Tensor:
+    """Return the log of probabilities; a finite value for 0 and for -inf."""
+    return torch.from_numpy(np.log(np.maximum(p, np.finfo(np.float64).tiny)))
 
 
 def missing_score(artifact: Artifact) -> Callable[[Tensor], Tensor]:
     """Return a function from lists (B, V) to the log-probabilities of `/missing`, (B, V)."""
 
     def score(v: Tensor) -> Tensor:
-        p = np.stack([missing_probabilities(artifact, scene) for scene in _scenes(v)])
-        return torch.from_numpy(np.log(np.maximum(p, np.finfo(np.float64).tiny)))
+        return log_of(np.stack([missing_probabilities(artifact, scene) for scene in _scenes(v)]))
 
     return score
 
@@ -192,7 +191,7 @@ def room_score(artifact: Artifact, profiles: Sequence[str]) -> RoomScore | None:
             answer = questions.rooms(artifact, scene, top_k=types, details=False)
             for entry in answer["room_types"]:
                 row[names.index(entry["room_type"])] = entry["probability"]
-        return torch.from_numpy(np.log(np.maximum(p, np.finfo(np.float64).tiny)))
+        return log_of(p)
 
     return score
 
@@ -248,9 +247,8 @@ def relation_probabilities(
     The value is 0 outside `pairs`, ordered pairs of object indices. None means all pairs.
     """
     n = len(scene.objects)
-    probabilities = np.zeros((len(CANONICAL), n, n))
-    most = max(1, len(CANONICAL) * n * n)
-    answer = questions.relations(artifact, scene, top_k=most, pairs=pairs)
+    p = np.zeros((len(CANONICAL), n, n))
+    answer = questions.relations(artifact, scene, top_k=max(1, p.size), pairs=pairs)
     for entry in answer["relations"]:
-        probabilities[canonical_triple(scene, entry)] = entry["probability"]
-    return probabilities
+        p[canonical_triple(scene, entry)] = entry["probability"]
+    return p

@@ -28,7 +28,6 @@ from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.cases import MOST, counted_classes, listed_cases
 from training.evaluation.asking import of_classes
 from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.model import Model
 from training.evaluation.setting import Outcome, Setting
 
 METRICS: Final = (
@@ -41,13 +40,13 @@ METRICS: Final = (
 )
 
 
-def counts_task(model: Model, setting: Setting) -> Outcome | None:
+def counts_task(artifact: Artifact, setting: Setting) -> Outcome | None:
     """Measure the errors, the share of counts in the interval and the precision of proposals.
 
     Return None if the model has no counts, or if the data source does not count instances.
     """
-    artifact, train = model.artifact, setting.train
-    if artifact is None or artifact.counts is None or train is None:
+    train = setting.train
+    if artifact.counts is None or train is None:
         return None
     counting = counted_classes(train.scenes, artifact.vocabulary)
     is_counted = torch.tensor([scene.source in counting for scene in setting.scenes.scenes])

@@ -31,7 +31,7 @@ from training.datasets.cases import scene_rng, some_scenes
 from training.datasets.moved import moved_scene, untouched_scene
 from training.evaluation.asking import ask_every
 from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.model import MisplacedScore, Model
+from training.evaluation.model import MisplacedScore
 from training.evaluation.setting import Outcome, Setting
 
 ALARMS: Final = 0.05
@@ -113,15 +113,13 @@ def flagged(suspicion: Floats, untouched: Floats, source: Ints) -> Flags:
     return is_flagged
 
 
-def moved_task(model: Model, setting: Setting) -> Outcome | None:
+def moved_task(score: MisplacedScore, setting: Setting) -> Outcome | None:
     """Measure T3c."""
-    if model.misplaced is None:
-        return None
     scenes = some_scenes(setting.some(related=True), _SCENES, setting.seed)
     cases = moved_cases(scenes, setting.structure, setting.seed)
     if not cases:
         return None
-    first, suspicion, untouched = ask_moved(model.misplaced, cases).T
+    first, suspicion, untouched = ask_moved(score, cases).T
     place = np.array([case.place for case in cases])
     is_flagged = flagged(suspicion, untouched, scenes.source.numpy()[place])
     values = first, is_flagged.astype(np.float64)

@@ -84,11 +84,9 @@ def ablate(
             for seed in range(seeds)
         ]
         with shown(console, "ablation", len(entries) * len(plan.settings)) as progress:
+            diverged = (FloatingPointError,)
             measured, failures = measure_entries(
-                *(plan, entries, progress),
-                workers=workers,
-                fresh=fresh,
-                failures=(FloatingPointError,),
+                plan, entries, progress, workers=workers, fresh=fresh, failures=diverged
             )
     if configs[0].name in failures:
         console.print(f"[red]error:[/red] {configs[0].name}: {failures[configs[0].name]}")
@@ -148,9 +146,7 @@ def _settings(scenes: TrainingData, limit: int) -> dict[str, Setting]:
 def _with_pools(reports: Mapping[str, SourceReport]) -> dict[str, SourceReport]:
     """Return the `PRIMARY` metrics, first of the pooled validation and test parts."""
     pools = {
-        f"{part} pooled": pooled(
-            [report for name, report in reports.items() if name.startswith(part)], f"{part} pooled"
-        )
+        f"{part} pooled": pooled([r for name, r in reports.items() if name.startswith(part)])
         for part in ("validation", "test")
     }
     return {name: only(report, PRIMARY) for name, report in {**pools, **reports}.items()}
@@ -189,8 +185,7 @@ class _File(BaseModel):
 def load_rows(path: Path, full: Config) -> list[Config]:
     """Read the ablations in a TOML file: one configuration for each `[[row]]` of the file.
 
-    All ablations use the scenes of the full model. The description of an ablation states how it
-    differs from the full model.
+    All ablations use the scenes of the full model.
 
     Raises:
         ConfigError: the file is missing or not TOML, a setting is unknown or invalid, two ablations

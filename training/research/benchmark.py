@@ -47,10 +47,9 @@ After training on shuffled scenes, no other model should exceed this baseline.
 """
 
 _RELATION_TASKS = ("T1a relations", "T1 pairs")
-# Tasks that a quick run leaves out. The annealing that estimates log Z (the log of the partition
-# function) is slow even for a few scenes.
+# A quick run leaves out tasks that are slow even for a few scenes.
 _SLOW_TASKS = ("Density",)
-# Settings of a quick run. A quick run only tests the command, so its results are meaningless.
+# A quick run only tests the command, so its results are meaningless.
 _QUICK_SCENES = 150
 _QUICK = 0.1  # share of the training
 _QUICK_LIMIT = 30
@@ -172,8 +171,7 @@ def read_domains(references: Sequence[str]) -> list[Domain]:
     """Read configurations, and group them by data section into domains.
 
     Raises:
-        ConfigError: a configuration cannot be read, or two configurations or two domains have the
-            same name.
+        ConfigError: a configuration cannot be read, or a name occurs twice.
     """
     groups: dict[DataConfig, list[Config]] = {}
     for reference in references:
@@ -273,23 +271,23 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> None:
             )
         plan = replace(plan, tasks=tasks)
     entries = [machine_entry(config, calibrated=False) for config in options.configs(domain, 0)]
+    yardsticks = {YARDSTICKS[task][0] for task in tasks}
+    chosen = BASELINES if options.baselines is None else yardsticks | set(options.baselines)
     # A baseline that supports several of the tasks is fitted once.
     names = [
-        name for name, baseline in BASELINES.items() if baseline.scores in (("missing",), RELATIONS)
+        name
+        for name, baseline in BASELINES.items()
+        if baseline.scores in (("missing",), RELATIONS) and name in chosen
     ]
-    if options.baselines is not None:
-        yardsticks = {YARDSTICKS[task][0] for task in tasks}
-        names = [name for name in names if name in yardsticks | set(options.baselines)]
-    entries += baseline_entries(
-        *(0, names),
-        related=plan.data.related, whole=False, learning=domain.configs[0].objects,
-    )  # fmt: skip
+    learning = domain.configs[0].objects
+    entries += baseline_entries(0, names, related=plan.data.related, whole=False, learning=learning)
     reports = _measure_all(plan, entries, options, f"{domain.name}, shuffled")
     weights = plan.parameters(entries)
     for task in tasks:
         yardstick, metric = YARDSTICKS[task]
+        shown_metrics = {task: (metric,)}
         task_reports: Reports = {
-            row: {source: only(report, {task: (metric,)}) for source, report in by_source.items()}
+            row: {source: only(report, shown_metrics) for source, report in by_source.items()}
             for row, by_source in reports.items()
         }
         # A task without metrics needs data that these scenes lack, for example room types.
@@ -298,7 +296,7 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> None:
             results = summarise(task_reports, yardstick, weights)
             text = shuffled_text(task, results)
             _write(folder / slug(task), scenes, results.to_dict(), text)
-            console.print("trained on shuffled scenes:", *results.tables({task: (metric,)}))
+            console.print("trained on shuffled scenes:", *results.tables(shown_metrics))
 
 
 def _plan(
@@ -314,8 +312,7 @@ def _plan(
     """
     data = scenes.complete_data()
     train = data.train if asked_by is None else asked_by.training_data().train
-    seen = seen_triples(data.train.scenes, data.train.v.shape[1])
-    limit = options.limit
+    seen, limit = seen_triples(data.train.scenes, data.train.v.shape[1]), options.limit
     settings = dict(settings_by_source(data.test, data.structure, train, seen, limit=limit))
     facts = EVERYDAY if facts_file() else None
     settings[POOLED] = Setting(data.test, data.structure, train, seen, limit, everyday=facts)
@@ -323,11 +320,9 @@ def _plan(
 
 
 def _measure_all(plan: Plan, entries: Sequence[Entry], options: Options, title: str) -> Reports:
+    workers, fresh = options.workers, options.fresh
     with shown(console, title, len(entries) * len(plan.settings)) as progress:
-        reports, _ = measure_entries(
-            *(plan, entries, progress), workers=options.workers, fresh=options.fresh
-        )
-    return reports
+        return measure_entries(plan, entries, progress, workers=workers, fresh=fresh)[0]
 
 
 def _write(folder: Path, scenes: SplitScenes, values: dict[str, Any], text: str) -> None:

@@ -140,3 +140,15 @@ def test_tables_for_terminals_name_tasks_in_words_and_fit_80_columns():
     assert shown.count("0.500 [0.500, 0.500]") == 8
     assert shown.count("*") == 1
     assert "…" not in shown
+
+
+def test_a_summary_needs_our_row_and_pairs_equal_scenes():
+    """A metric that one row has on two sources, and another row on one of them."""
+    with pytest.raises(ValueError, match="no metric of the reference row ours"):
+        summarise({}, "ours")
+    both, one = Ratio.of_scenes(np.ones(4)), Ratio.of_scenes(np.ones(2))
+    reports = {
+        (name, 0): {"pooled": SourceReport("pooled", "", {"T2": Outcome({"MRR": metric}, 4, 0)})}
+        for name, metric in (("ours", both), ("other", one))
+    }
+    assert summarise(reports, "ours").differences == ()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import torch
@@ -17,14 +18,11 @@ from training.evaluation.model import ObjectScore, PlacedScore, Places, Relation
 
 @dataclass(frozen=True, eq=False)
 class TripleCounts:
-    """Numbers of scenes with each triple (relation a, subject class i, object class j).
-
-    Structure classes, and triples with i = j, have the count 0.
+    """Numbers of scenes with annotated relations; 0 for structure, and for equal classes.
 
     Attributes:
-        held: number of scenes in which the relation holds, (relations, classes, classes).
-        together: number of scenes with annotated relations that contain both classes, (classes,
-            classes).
+        held: number of scenes in which a relation holds, (relations, subjects, objects).
+        together: number of scenes that contain both classes, (classes, classes).
     """
 
     held: Tensor
@@ -68,22 +66,15 @@ def count_triples(scenes: SceneTensors, structure: Tensor) -> TripleCounts:
 class TripleTable:
     """The relation score log_odds[a, i, j] + g · log(n_i n_j) of relation a from class i to j.
 
-    n_i and n_j are the instance counts of the classes. The score ignores observed relations.
-
-    Attributes:
-        log_odds: table over relation, subject class and object class, (relations, classes,
-            classes).
-        multiplicity: weight g of the instance counts. 0 ignores the counts.
+    n_i and n_j are the instance counts of the classes, and g is `multiplicity`. The score ignores
+    observed relations.
     """
 
     log_odds: Tensor
     multiplicity: float = 0.0
 
     def __call__(self, batch: Batch) -> Tensor:
-        """Return the log-odds of the relations of a batch, (scenes, relations, n, n).
-
-        n is the number of classes in `batch.classes`. The log-odds of padding are arbitrary.
-        """
+        """Return the log-odds of the relations of a batch, (B, A, n, n); arbitrary for padding."""
         index = batch.classes.clamp(min=0)
         values = self.log_odds[:, index[:, :, None], index[:, None, :]].movedim(0, 1)
         if self.multiplicity:
@@ -107,9 +98,7 @@ def smoothed_log_odds(counts: TripleCounts, pair: float, end: float) -> Tensor:
         p(r | i, j) = (held + s · [p(r | i as subject) + p(r | j as object)] / 2) / (together + s)
         p(r | i)    = (held with i + m · p(r)) / (pairs with i + m), likewise p(r | j)
 
-    Args:
-        pair: smoothing s of a pair of classes, above 0: number of added cases.
-        end: smoothing m of a single class, above 0: number of added cases.
+    s (`pair`) and m (`end`) are numbers of added cases, above 0.
     """
     overall = counts.overall()[:, None]
     subject = (counts.held.sum(2) + end * overall) / (counts.together.sum(1) + end)
@@ -121,12 +110,10 @@ def smoothed_log_odds(counts: TripleCounts, pair: float, end: float) -> Tensor:
 def frequency_table(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[RelationScore]:
     """Yield a score for each smoothing of pairs and of classes, and each weight of the counts."""
     counts = count_triples(train, structure)
-    for pair in _PAIR:
-        for end in _END:
-            table = smoothed_log_odds(counts, pair, end)
-            for weight in _MULTIPLICITY:
-                parameters = {"pair": pair, "end": end, "multiplicity": weight}
-                yield parameters, TripleTable(table, weight)
+    for pair, end in product(_PAIR, _END):
+        table = smoothed_log_odds(counts, pair, end)
+        for weight in _MULTIPLICITY:
+            yield {"pair": pair, "end": end, "multiplicity": weight}, TripleTable(table, weight)
 
 
 _PLACE = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
@@ -139,9 +126,7 @@ _CORRECTIONS = (0.0, 0.25, 0.5, 1.0)
 class PlacedTable:
     """The score log p(i | a, j) of class i at the place (a, j), from a frequency table.
 
-    Attributes:
-        log_p: table over direction, relation, class j of the place and class i, (2, relations,
-            classes, classes). The direction is `Places.outgoing`.
+    `log_p` is a table over `Places.outgoing`, relation a, class j and class i, (2, A, V, V).
     """
 
     log_p: Tensor
@@ -177,12 +162,8 @@ def smoothed_log_p(
 
         p(i | a, j) = (scenes with a(i, j) + s · p(i | a)) / (scenes with a of any class to j + s)
 
-    p(i | a) is smoothed in the same way towards p(i), with m in place of s.
-
-    Args:
-        popularity: frequency of each class, (classes,). The function normalises the sum to 1.
-        place: smoothing s of a place (a, j), above 0: number of added cases.
-        relation: smoothing m of a relation a, above 0: number of added cases.
+    p(i | a) is smoothed in the same way towards p(i), with m in place of s. p(i) is proportional to
+    the popularity, (classes,). s (`place`) and m (`relation`) are numbers of added cases.
     """
     # In the second table, the removed class is the subject of the relation. The transpose puts the
     # class j of the place first.
@@ -198,10 +179,9 @@ def smoothed_log_p(
 def placed_table(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[PlacedScore]:
     """Yield a score for each smoothing s of places and each smoothing m of relations."""
     counts = count_triples(train, structure)
-    for place in _PLACE:
-        for relation in _RELATION:
-            log_p = smoothed_log_p(counts, frequency(train.v), place, relation)
-            yield {"place": place, "relation": relation}, PlacedTable(log_p)
+    for place, relation in product(_PLACE, _RELATION):
+        log_p = smoothed_log_p(counts, frequency(train.v), place, relation)
+        yield {"place": place, "relation": relation}, PlacedTable(log_p)
 
 
 def times(
@@ -217,9 +197,8 @@ def times(
 
     def placed_table(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[PlacedScore]:
         log_popularity = frequency(train.v, train.weight).log()
-        for weight in _WEIGHTS:
-            for correction in _CORRECTIONS:
-                score = PlacedProduct(objects, table, log_popularity, weight, correction)
-                yield {"weight": weight, "correction": correction}, score
+        for weight, correction in product(_WEIGHTS, _CORRECTIONS):
+            score = PlacedProduct(objects, table, log_popularity, weight, correction)
+            yield {"weight": weight, "correction": correction}, score
 
     return placed_table

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -91,24 +92,20 @@ def complex_embedding(
 ) -> Proposals[RelationScore]:
     """Yield a ComplEx score for each rank, penalty and weight of the instance counts."""
     counts = count_triples(train, structure)
-    for rank in _RANKS:
-        for penalty in _PENALTIES:
-            table = fit_complex(counts, rank=rank, penalty=penalty, seed=seed)
-            for weight in _COMPLEX_MULTIPLICITY:
-                parameters = {"rank": rank, "penalty": penalty, "multiplicity": weight}
-                yield parameters, TripleTable(table, weight)
+    for rank, penalty in product(_RANKS, _PENALTIES):
+        table = fit_complex(counts, rank=rank, penalty=penalty, seed=seed)
+        for weight in _COMPLEX_MULTIPLICITY:
+            parameters = {"rank": rank, "penalty": penalty, "multiplicity": weight}
+            yield parameters, TripleTable(table, weight)
 
 
 # Frequency table with logical rules: the log-odds change by consequences of observed relations.
 #
-# The score adds a bonus to a relation a(i, k) that follows by transitivity from observed a(i, j)
-# and a(j, k). The score subtracts a penalty from the reverse a(k, i) of each observed or implied
-# relation. Canonical relations represent right as left with exchanged subject and object. Bonus and
-# penalty are finite, because classes can have several instances, and because annotated on-top is
-# not always transitive.
+# A relation a(i, k) is implied by transitivity from observed a(i, j) and a(j, k). Its reverse is
+# a(k, i). Bonus and penalty are finite, because classes can have several instances, and because
+# annotated on-top is not always transitive.
 #
-# In the batches of task T1b, only the given relations of a scene are marked as observed. This score
-# needs such batches.
+# The score needs batches in which only the given relations are observed, as in task T1b.
 
 _CLOSURE_PAIR = (3.0, 10.0, 30.0)
 _CLOSURE_END = 30.0
@@ -119,12 +116,10 @@ _PENALTY = (0.0, 1.0, 3.0)
 
 @dataclass(frozen=True, eq=False)
 class ClosureScore:
-    """The score of a frequency table, changed by logical rules.
+    """The score of a table, changed by logical rules.
 
-    Attributes:
-        table: score without observed relations.
-        bonus: added log-odds of an implied relation, at least 0.
-        penalty: subtracted log-odds of the reverse of an observed or implied relation, at least 0.
+    The log-odds of implied relations get the bonus. Those of the reverse of observed or implied
+    relations lose the penalty.
     """
 
     table: TripleTable
@@ -146,9 +141,6 @@ def frequency_table_with_closure(
     counts = count_triples(train, structure)
     for pair in _CLOSURE_PAIR:
         log_odds = smoothed_log_odds(counts, pair, _CLOSURE_END)
-        for weight in _CLOSURE_MULTIPLICITY:
-            table = TripleTable(log_odds, weight)
-            for bonus in _BONUS:
-                for penalty in _PENALTY:
-                    parameters = {"pair": pair, "multiplicity": weight, "bonus": bonus}
-                    yield parameters | {"penalty": penalty}, ClosureScore(table, bonus, penalty)
+        for weight, bonus, penalty in product(_CLOSURE_MULTIPLICITY, _BONUS, _PENALTY):
+            parameters = {"pair": pair, "multiplicity": weight, "bonus": bonus, "penalty": penalty}
+            yield parameters, ClosureScore(TripleTable(log_odds, weight), bonus, penalty)
