@@ -47,8 +47,7 @@ def artifact_model(
 ) -> Model:
     """Return the answers of a trained model; only a `calibrated` model judges outliers.
 
-    Args:
-        profiles: names of the profiles that requests about rooms may name.
+    Requests about rooms may name the `profiles`.
     """
     machine = machine_of(artifact.weights)
     completion = relation_score(artifact, given=True)

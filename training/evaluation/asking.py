@@ -54,10 +54,7 @@ def ask_every(ask: Callable[[Case], Floats], cases: Sequence[Case]) -> list[Floa
 
 @torch.no_grad()
 def ask_rows(score: Callable[..., Tensor], *columns: Tensor, block: int = 256) -> Tensor:
-    """Return the scores (N, ...) of N cases. The scores are computed in blocks of cases.
-
-    Args:
-        score: function of a block of each column. Entry k of each column belongs to case k.
+    """Return the scores (N, ...) of N cases, computed in blocks of the rows of each column.
 
     Raises:
         LeakError: a case gets another score when it is queried in another block.
@@ -132,8 +129,7 @@ def missing_probabilities(
     The value is -inf for classes that `/missing` cannot propose.
 
     Args:
-        at: place of the missing object: a relation, and the index of the object to which the
-            missing object has this relation. None means the whole scene.
+        at: place of the missing object: its relation to the object with an index.
         candidates: classes to rank. None means all classes.
     """
     p = np.full(len(artifact.vocabulary), -np.inf)
@@ -177,7 +173,7 @@ def missing_score(artifact: Artifact) -> Callable[[Tensor], Tensor]:
 def room_score(artifact: Artifact, profiles: Sequence[str]) -> RoomScore | None:
     """Return a function for the log-probabilities of `/rooms`, or None without room types.
 
-    A profile that is not in `profiles`, the names of the model's profiles, is not named.
+    Requests name only the profiles of the model, `profiles`.
     """
     types, names = artifact.spec.C, artifact.vocabulary.room_types
     if not types:
@@ -197,10 +193,7 @@ def room_score(artifact: Artifact, profiles: Sequence[str]) -> RoomScore | None:
 
 
 def suspicion_score(artifact: Artifact) -> Callable[[Tensor], Tensor]:
-    """Return a function from lists (B, V) to the probabilities of `/outliers`, (B, V).
-
-    The value is -inf for unlisted classes.
-    """
+    """Return a function from lists (B, V) to the probabilities of `/outliers`, or -inf, (B, V)."""
     return lambda v: _judged(artifact, v, 0, "medium", -torch.inf)
 
 

@@ -178,8 +178,8 @@ class PlaceQuestion(NamedTuple):
 
     Attributes:
         placed: (V,) bool, the hidden classes at the place.
-        usable: (V,) bool, the classes without structure that may be asked: neither listed, nor
-            hidden with an unknown relation to the anchor.
+        usable: (V,) bool, the classes that may be asked: neither structure, nor listed, nor hidden
+            with an unknown relation to the anchor.
     """
 
     scene: Scene
@@ -216,10 +216,7 @@ def place_question(
 
 
 def ask_placed(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
-    """Ask for the hidden classes at one place, which is a relation to an object.
-
-    A class is left out if it is unknown whether the class has this relation to the object.
-    """
+    """Ask for the hidden classes at one place, without those of an unknown relation."""
     question = place_question(artifact.vocabulary, encoded, rng, range(artifact.spec.A))
     if question is None:
         return None
@@ -239,9 +236,7 @@ def ask_outliers(
 ) -> Answered | None:
     """Ask for the outliers of a random part. Half of the parts contain an intruder.
 
-    Args:
-        intruders: maps (source, scene id) to the classes from which the intruder is drawn, see
-            `draw_intruder_choices`. None means any absent class.
+    The intruder is drawn from `draw_intruder_choices`. Without these, it is any absent class.
     """
     structure = artifact.vocabulary.structure
     classes = encoded.evidence.classes
@@ -294,10 +289,7 @@ NAMES = (*QUESTIONS, *(f"missing, {listed} classes" for listed in LISTED))
 
 
 def calibration_task(artifact: Artifact, setting: Setting) -> Outcome | None:
-    """Measure the calibration of the answers to all questions, published and uncalibrated.
-
-    Questions about objects use scenes with complete object lists, the others scenes with relations.
-    """
+    """Measure the calibration of the answers to all questions, published and uncalibrated."""
     related = setting.some(related=True, share=3)
     complete = setting.complete.some(share=3)
     train, seed = setting.complete.train, setting.seed

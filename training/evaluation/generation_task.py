@@ -66,11 +66,8 @@ def independent_sampler(train: SceneTensors) -> Sampler:
 def scene_sampler(scenes: SceneTensors) -> Sampler:
     """Return a sampler that returns real scenes, to estimate the best possible value of a metric.
 
-    Without given classes, the sample with index k is scene k if its room type fits. Otherwise the
-    sample is a random scene with the given classes and room type.
-
-    Raises:
-        ValueError: no scene has the given classes and room type (raised by the sampler).
+    Without given classes, sample k is scene k if its room type fits. Otherwise it is a random scene
+    with the given classes and room type. Without such a scene, the sampler raises a ValueError.
     """
     counts = drawn_of(scenes).contradictions
 
@@ -124,10 +121,9 @@ def machine_sampler(artifact: Artifact, *, steps: int = STEPS) -> Sampler:
 
 
 def held_out_halves(setting: Setting) -> tuple[SceneTensors, SceneTensors]:
-    """Split held-out scenes into two halves: reference scenes, and scenes of an ideal sampler.
+    """Split held-out scenes into reference scenes and scenes of an ideal sampler, by groups.
 
-    A group of near-duplicate scenes stays in one half. The limit of the setting applies to each
-    half.
+    The limit of the setting applies to each half.
     """
     scenes = setting.scenes
     is_odd = torch.from_numpy(scenes.group_ids % 2 > 0)
@@ -187,10 +183,7 @@ def marginal_error(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]
 
 
 def pair_correlation(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]:
-    """Return Pearson r of the class covariances as a function of the weights of held-out scenes.
-
-    The covariances are those of the most common held-out classes.
-    """
+    """Return Pearson r of the covariances of common classes, by weights of held-out scenes."""
     common = np.argsort(-held_out.sum(0), kind="stable")[:_COMMON_CLASSES]
     common = common[held_out[:, common].any(0)]
     x, y = drawn[:, common], held_out[:, common]
@@ -261,12 +254,10 @@ def generation_metrics(
 def generation_task(sampler_of: SamplerOf, setting: Setting) -> Outcome | None:
     """Measure T4: compare generated scenes with the first half of the held-out scenes.
 
-    The number of generated scenes is the number of scenes in the second half. The scenes are
-    generated under three conditions: without evidence, with the room types of the second half, and
-    with one given class. The given classes are drawn from all (scene, class) pairs of the second
-    half, so scenes with many classes are drawn more often. With a given class, each scene of the
-    first half is therefore weighted by its number of classes. A perfect sampler then has no
-    discrepancy.
+    As many scenes as the second half has are generated under three conditions: without evidence,
+    with the room types of the second half, and with one given class. The given classes are drawn
+    from all (scene, class) pairs of the second half. With a given class, each scene of the first
+    half is therefore weighted by its number of classes. A perfect sampler then has no discrepancy.
     """
     sampler = sampler_of(setting)
     if sampler is None or setting.train is None:

@@ -30,6 +30,9 @@ from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import scene_rng
 
+LAWS = ("uniform", "by popularity", "signature")
+"""Distributions of intruders."""
+
 SIGNATURE = 10
 """Maximum number of signature classes of a room type."""
 
@@ -101,6 +104,14 @@ def by_signature(scenes: SceneTensors, train: SceneTensors) -> Tensor:
     return torch.from_numpy(weights)
 
 
+def intruder_weights(scenes: SceneTensors, train: SceneTensors | None) -> dict[str, Tensor | None]:
+    """Return the sampling weights of each law, (scenes, classes); only uniform without `train`."""
+    if train is None:
+        return {"uniform": None}
+    weights = (None, by_popularity(scenes, train), by_signature(scenes, train))
+    return dict(zip(LAWS, weights, strict=True))
+
+
 def draw_intruder_choices(
     scenes: SceneTensors, structure: Tensor, train: SceneTensors | None, seed: int = 0
 ) -> dict[tuple[str, str], Ints]:
@@ -108,9 +119,7 @@ def draw_intruder_choices(
 
     They are a uniform, a popular and a signature intruder; without `train`, only a uniform one.
     """
-    weights: list[Tensor | None] = [None]
-    if train is not None:
-        weights += [by_popularity(scenes, train), by_signature(scenes, train)]
+    weights = intruder_weights(scenes, train).values()
     # `ask_outliers` uses `seed` itself. Another seed keeps the draws independent.
     columns = [draw_intruders(scenes, structure, weight, seed + 1) for weight in weights]
     rows = torch.stack(columns, 1).numpy()

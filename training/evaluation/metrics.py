@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm, t
 
 from training.datasets.array_types import Flags, Floats, Ints
-from training.evaluation.item_statistics import STATISTICS
+from training.evaluation.item_statistics import STATISTICS, by_score, reliability
 
 RESAMPLES = 1000
 
@@ -263,12 +263,17 @@ class Scored(Metric):
         return len(self.unit)
 
     @cached_property
-    def _prepared(self) -> Callable[[Floats], float]:
-        """The statistic as a function of item weights; items are sorted once for all resamples."""
-        return STATISTICS[self.statistic](self.score, self.truth)
+    def _by_score(self) -> tuple[Floats, Callable[[Floats], tuple[Floats, Floats]]]:
+        return by_score(self.score, self.truth)  # sorts the items once for all resamples
 
     def at(self, weight: Floats) -> float:
-        return self._prepared(weight[self.unit])
+        scores, count = self._by_score
+        return STATISTICS[self.statistic](scores, *count(weight[self.unit]))
+
+    def reliability(self) -> tuple[Floats, Floats]:
+        """Return the mean score and the share of true items of each bin of the ECE."""
+        scores, count = self._by_score
+        return reliability(scores, *count(np.ones(self.n)))
 
     @cached_property
     def draws(self) -> Floats:  # type: ignore[override]

@@ -44,11 +44,9 @@ _SCENES: Final = 300  # maximum number of scenes of a source
 
 @dataclass(frozen=True, eq=False)
 class MovedCase:
-    """A scene with a moved object, and the same scene without the move.
+    """A scene with the moved object `object`, and the same scene without the move.
 
-    Attributes:
-        place: index of the scene in its set.
-        object: id of the moved object.
+    `place` is the index of the scene in its set.
     """
 
     place: int
@@ -97,12 +95,10 @@ def _highest(entries: Sequence[Mapping[str, Any]], object_: str | None = None) -
 
 
 def flagged(suspicion: Floats, untouched: Floats, source: Ints) -> Flags:
-    """Return whether each suspicion exceeds the threshold of its source, (N,).
+    """Return whether each suspicion exceeds the threshold of its source, all (N,).
 
-    Args:
-        suspicion: (N,) highest probability about the moved object.
-        untouched: (N,) highest probability in the untouched scene.
-        source: (N,) index of the data source.
+    `suspicion` is the highest probability about the moved object, `untouched` that in the untouched
+    scene.
     """
     is_flagged = np.zeros(len(source), dtype=np.bool_)
     for name in np.unique(source):

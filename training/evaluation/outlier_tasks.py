@@ -19,7 +19,7 @@ from torch import Tensor
 from training.datasets.array_types import Floats
 from training.datasets.batches import SceneTensors
 from training.evaluation.asking import SENSITIVITIES, ask_rows
-from training.evaluation.intruders import by_popularity, by_signature, draw_intruders
+from training.evaluation.intruders import draw_intruders, intruder_weights
 from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.missing_tasks import SEEDS
 from training.evaluation.model import Flagged, Model, ObjectScore
@@ -28,17 +28,6 @@ from training.evaluation.setting import Outcome, Setting
 
 LENGTHS: Final = (1, 2, 3, 5, 8)
 """Numbers of listed classes in which alarms are measured."""
-
-LAWS: Final = ("uniform", "by popularity", "signature")
-"""Distributions of intruders, see `training.evaluation.intruders`."""
-
-
-def intruder_weights(scenes: SceneTensors, train: SceneTensors | None) -> dict[str, Tensor | None]:
-    """Return the sampling weights of each law, (scenes, classes); only uniform without `train`."""
-    if train is None:
-        return {"uniform": None}
-    weights = (None, by_popularity(scenes, train), by_signature(scenes, train))
-    return dict(zip(LAWS, weights, strict=True))
 
 
 def with_intruders(

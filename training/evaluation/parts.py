@@ -8,7 +8,7 @@ scene depend only on the seed and the id of the scene.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
@@ -177,6 +177,13 @@ def rank_hidden(parts: Parts, structure: Tensor, values: Tensor) -> Ranking:
     return Ranking.of(parts.scene[row], target, competing, parts.scenes, parts.skipped)
 
 
+def real_sources(scenes: SceneTensors) -> Iterator[tuple[str, SceneTensors]]:
+    """Generate `REAL_SOURCES` by name, with their scenes; all sources if there are no real ones."""
+    names = np.array([scene.source for scene in scenes.scenes], dtype=np.str_)
+    for name in [x for x in REAL_SOURCES if x in names] or np.unique(names).tolist():
+        yield name, subset(scenes, torch.from_numpy(np.flatnonzero(names == name)))
+
+
 @torch.no_grad()
 def validation_score(
     score_function: ListScore, scenes: SceneTensors, structure: Tensor, seed: int = 0
@@ -191,13 +198,10 @@ def validation_score(
     Raises:
         FloatingPointError: a score is NaN.
     """
-    names = np.array([scene.source for scene in scenes.scenes], dtype=np.str_)
-    usable = scenes.complete.numpy() if bool(scenes.complete.any()) else ~scenes.complete.numpy()
-    sources = [name for name in REAL_SOURCES if (usable & (names == name)).any()]
     values = []
-    for source in sources or np.unique(names[usable]).tolist():
-        index = torch.from_numpy(np.flatnonzero(usable & (names == source)))
-        sample = some_scenes(subset(scenes, index), _SCENES, seed)
+    some = scenes.complete if bool(scenes.complete.any()) else ~scenes.complete
+    for _, own in real_sources(subset(scenes, some.nonzero().squeeze(1))):
+        sample = some_scenes(own, _SCENES, seed)
         for size in (up_to_longest, all_but_one):
             parts = draw_parts(sample, structure, size, (seed,))
             if not len(parts.v):

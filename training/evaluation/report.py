@@ -46,8 +46,8 @@ class SourceReport:
     Attributes:
         source: name of the data source, or "pooled".
         scenes: digest of the questions, see `digest`.
-        outcomes: metrics of each task, by task name. None if the model does not support the task.
-        seconds: wall time of each task in seconds, by task name.
+        outcomes, seconds: metrics and wall time of each task, by task name. The outcome is None if
+            the model does not support the task.
     """
 
     source: str
@@ -167,11 +167,7 @@ def measure(
 
 
 def pooled(reports: Sequence[SourceReport], source: str = "pooled") -> SourceReport:
-    """Pool the reports on several data sources into one report.
-
-    Metrics of a whole set of scenes (task T4, generated scenes) cannot be pooled and are left out.
-    Use `measure` on the union of the scenes for these metrics.
-    """
+    """Pool the reports on several data sources, without metrics of a whole set of scenes (T4)."""
     together = sha256("\n".join(report.scenes for report in reports).encode()).hexdigest()
     joined = SourceReport(source, together)
     for task in dict.fromkeys(task for report in reports for task in report.outcomes):
@@ -203,9 +199,8 @@ def evaluate(
     Generated scenes are compared with the scenes of all data sources together.
 
     Args:
-        train: training scenes. They show which generated scenes are copies, and which classes are
-            typical of a room type.
-        limit: maximum number of scenes per data source in slow tasks; see `Setting`.
+        train: training scenes, see `Setting`.
+        limit: maximum number of scenes per data source in slow tasks, see `Setting`.
         tasks: names of the tasks to measure. None means all tasks of a model card.
     """
     model = artifact_model(artifact, train)

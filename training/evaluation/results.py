@@ -121,13 +121,9 @@ class Results:
     def markdown(self, shown: Shown = SHOWN, *, changes: bool = False) -> str:
         """Return one Markdown table per metric, and remarks on each task.
 
-        A table has one line per row and one column per data source. A star marks a row that is
-        worse than the reference row: the whole interval of the paired difference agrees.
-
-        Args:
-            shown: names of the metrics by task.
-            changes: True replaces the intervals of the metrics by intervals of the differences. A
-                difference is the row minus the reference row.
+        A star marks a row that is worse than the reference row: the whole interval of the paired
+        difference agrees. With `changes`, the intervals are those of the differences, the row minus
+        the reference row.
         """
         parts: list[str] = []
         for task, metrics in shown.items():
@@ -137,10 +133,7 @@ class Results:
         return "\n\n".join(parts) + "\n"
 
     def tables(self, shown: Shown = SHOWN) -> Iterator[Table]:
-        """Generate one table per task for the terminal, of the pooled sources if there are any.
-
-        A star has the meaning of `markdown`.
-        """
+        """Generate one table per task for the terminal, of the pooled sources if there are any."""
         sources = list(dict.fromkeys(cell.source for cell in self.cells))
         columns = [source for source in sources if "pooled" in source] or sources
         for task, metrics in shown.items():

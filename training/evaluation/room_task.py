@@ -29,7 +29,15 @@ from training.evaluation.asking import ask_rows
 from training.evaluation.metrics import Items, Metric, Ratio
 from training.evaluation.missing_tasks import SEEDS
 from training.evaluation.model import RoomScore
-from training.evaluation.parts import REAL_SOURCES, Parts, Ranking, Size, draw_parts, exactly
+from training.evaluation.parts import (
+    REAL_SOURCES,
+    Parts,
+    Ranking,
+    Size,
+    draw_parts,
+    exactly,
+    real_sources,
+)
 from training.evaluation.setting import Outcome, Setting
 
 LEAST: Final = 1e-4
@@ -105,16 +113,13 @@ def mean_log_p(scenes: SceneTensors, structure: Tensor, score: RoomScore) -> flo
     Raises:
         ValueError: no scene has a room type.
     """
-    scenes = with_room_type(scenes)
-    names = np.array([scene.source for scene in scenes.scenes], dtype=np.str_)
     values = []
-    for source in [name for name in REAL_SOURCES if (names == name).any()] or np.unique(names):
-        sample = subset(scenes, torch.from_numpy(np.flatnonzero(names == source)))
+    for source, sample in real_sources(with_room_type(scenes)):
         for size, seeds in LISTS.values():
             parts = draw_parts(sample, structure, size, seeds)
             values += [
                 -room_figures(sample, parts, score, profile)["log-loss"].value
-                for profile in ("", str(source))
+                for profile in ("", source)
                 if len(parts.v)
             ]
     if not values:

@@ -17,10 +17,11 @@ from training.evaluation.calibration_task import NAMES, calibration_task
 from training.evaluation.density_task import density_task
 from training.evaluation.everyday_task import LINES, everyday_task
 from training.evaluation.generation_task import generation_task
+from training.evaluation.intruders import LAWS
 from training.evaluation.missing_tasks import SIZES, missing_task, placed_task, structure_task
 from training.evaluation.model import Model
 from training.evaluation.moved_task import METRICS, moved_task
-from training.evaluation.outlier_tasks import LAWS, LENGTHS, alarms_task, outliers_task
+from training.evaluation.outlier_tasks import LENGTHS, alarms_task, outliers_task
 from training.evaluation.pair_task import pairs_task
 from training.evaluation.relation_tasks import completion_task, placement_task, relations_task
 from training.evaluation.room_task import FIGURES, LISTS, rooms_task

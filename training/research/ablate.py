@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 from rich.console import Console
 
 from training.datasets.batches import TrainingData, seen_triples
@@ -121,25 +121,22 @@ def _configs(
     full = load_config(reference)
     if limit is not None:
         full = with_settings(full, {"data.limit": limit})
-    rows = {
-        row.name: row for row in load_rows(own_or_shipped(path, full, "ablations", "--rows"), full)
-    }
-    if unknown := sorted(set(names or ()) - set(rows)):
-        raise ConfigError(f"unknown rows {unknown}: choose from {', '.join(rows)}")
-    configs = [full, *(row for name, row in rows.items() if not names or name in names)]
+    rows = load_rows(own_or_shipped(path, full, "ablations", "--rows"), full)
+    known = [row.name for row in rows]
+    if unknown := sorted(set(names or ()) - set(known)):
+        raise ConfigError(f"unknown rows {unknown}: choose from {', '.join(known)}")
+    configs = [full, *(row for row in rows if not names or row.name in names)]
     return [shortened(config, length) for config in configs]
 
 
 def _settings(scenes: TrainingData, limit: int) -> dict[str, Setting]:
     """Return the evaluation settings of the validation and test part of each data source."""
     seen = seen_triples(scenes.train.scenes, scenes.train.v.shape[1])
-    parts = {"validation": scenes.validation, "test": scenes.test}
+    common = scenes.structure, scenes.train, seen
     return {
         f"{part} {source}": setting
-        for part, part_scenes in parts.items()
-        for source, setting in settings_by_source(
-            part_scenes, scenes.structure, scenes.train, seen, limit=limit
-        )
+        for part, own in (("validation", scenes.validation), ("test", scenes.test))
+        for source, setting in settings_by_source(own, *common, limit=limit)
     }
 
 
@@ -167,18 +164,14 @@ def _costs(plan: Plan, entries: Sequence[Entry]) -> tuple[dict[str, int], dict[s
     return weights, seconds
 
 
-class _Change(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
+class _Change(BaseModel, extra="forbid", frozen=True):
     name: str
     what: str
     start: str | None = Field(default=None, alias="from")
     changes: dict[str, Any] = Field(default_factory=dict)
 
 
-class _File(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
+class _File(BaseModel, extra="forbid", frozen=True):
     row: tuple[_Change, ...] = Field(min_length=1)
 
 
@@ -195,12 +188,12 @@ def load_rows(path: Path, full: Config) -> list[Config]:
         file = _File.model_validate(read_toml(path))
     except ValidationError as error:
         raise ConfigError(f"{path.name}: {first_error(error)}") from error
-    configs: dict[str, Config] = {}
+    configs = [full]
     for row in file.row:
-        if row.name in configs or row.name == full.name:
+        if any(row.name == config.name for config in configs):
             raise ConfigError(f"{path.name}: the name {row.name} occurs twice: rename one row")
-        configs[row.name] = _config(row, full, path.name)
-    return list(configs.values())
+        configs.append(_config(row, full, path.name))
+    return configs[1:]
 
 
 def _config(row: _Change, full: Config, file: str) -> Config:

@@ -41,10 +41,7 @@ YARDSTICKS = {
     "T2 missing": ("popularity", "MRR, one removed"),
     "T3 outliers": ("popularity", "hit@1, signature"),
 }
-"""Reference baseline and metric of each task, for training on shuffled scenes.
-
-After training on shuffled scenes, no other model should exceed this baseline.
-"""
+"""Baseline of each task that no model should exceed after training on shuffled scenes; metric."""
 
 _RELATION_TASKS = ("T1a relations", "T1 pairs")
 # A quick run leaves out tasks that are slow even for a few scenes.
@@ -66,10 +63,7 @@ console = Console()
 
 @dataclass(frozen=True)
 class Domain:
-    """Configurations with the same data section. The first one is the reference of differences.
-
-    The name is that of the first configuration without its last word: "indoor".
-    """
+    """Configurations with the same data section. The first one is the reference of differences."""
 
     name: str
     configs: tuple[Config, ...]
@@ -181,6 +175,7 @@ def read_domains(references: Sequence[str]) -> list[Domain]:
         groups.setdefault(config.data, []).append(config)
     domains: dict[str, Domain] = {}
     for configs in groups.values():
+        # The first name without its last word: "indoor".
         name = configs[0].name.rpartition("-")[0] or configs[0].name
         if name in domains:
             raise ConfigError(
@@ -192,9 +187,7 @@ def read_domains(references: Sequence[str]) -> list[Domain]:
 
 
 def chosen_tasks(names: Sequence[str] | None, quick: bool) -> tuple[str, ...]:
-    """Return the tasks with these names or prefixes; without `names`, all tasks.
-
-    With `quick`, slow tasks are left out, unless they are named.
+    """Return the tasks with these names or prefixes; by default all, without slow ones if `quick`.
 
     Raises:
         ValueError: a name matches no task.
@@ -224,12 +217,7 @@ def shuffled_tasks(tasks: Sequence[str]) -> tuple[str, ...]:
 
 
 def compare_domain(domain: Domain, folder: Path, options: Options) -> None:
-    """Measure the machines and baselines of a domain on its test scenes; write tables and plots.
-
-    Raises:
-        ConfigError: the scene files are missing.
-        ValueError: a baseline in `options` is unknown.
-    """
+    """Measure the machines and baselines of a domain on its test scenes; write tables and plots."""
     scenes = options.scenes(domain)
     plan = _plan(folder, scenes, options, options.tasks)
     entries: list[Entry] = []
@@ -255,8 +243,7 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> None:
     are always measured.
 
     Raises:
-        ValueError: no task is supported (see `shuffled_tasks`), or all supported tasks need
-            relations and the scenes contain none.
+        ValueError: no task is supported, see `shuffled_tasks`, or relations are needed.
     """
     real = options.scenes(domain)
     scenes = real.shuffled(seed=0)

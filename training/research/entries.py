@@ -20,8 +20,9 @@ from training.evaluation.asking import ask_rows
 from training.evaluation.baselines import PLACED, placed_product
 from training.evaluation.baselines.classes import frequency
 from training.evaluation.baselines.fitting import TRIALS, Baseline
+from training.evaluation.intruders import intruder_weights
 from training.evaluation.model import Model, ObjectScore, suspicion_of
-from training.evaluation.outlier_tasks import first_shares, intruder_weights, with_intruders
+from training.evaluation.outlier_tasks import first_shares, with_intruders
 from training.evaluation.report import Progress, write_whole
 from training.fit.calibrate import calibrate
 from training.fit.checkpoint import RunError

@@ -87,7 +87,6 @@ class Plan:
 
     Attributes:
         folder: folder of the reports.
-        data: scenes for training, validation and test.
         settings: evaluation setting by data source. The key `POOLED` is the union of all sources.
         tasks: names of the tasks to measure, which are keys of `EVERY_TASK`.
     """
@@ -108,11 +107,7 @@ class Plan:
         return [task for task in self.tasks if task not in ONCE]
 
     def claim(self, entry: Entry) -> None:
-        """Reserve the folder of an entry, or check that it belongs to this entry and these scenes.
-
-        Raises:
-            BenchmarkError: the folder belongs to an entry with other settings or other scenes.
-        """
+        """Reserve the folder of an entry. Another entry or other scenes are a BenchmarkError."""
         path = self.folder_of(entry) / "row.json"
         row = {"name": entry.name, "seed": entry.seed, "identity": entry.identity}
         row["material"] = self.data.digest
@@ -205,9 +200,6 @@ def measure_entries(
 
     Returns:
         The reports by (name, seed), and the error messages of failed entries by name.
-
-    Raises:
-        BrokenProcessPool: a worker process died.
     """
     if fresh:
         for entry in entries:

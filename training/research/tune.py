@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 import typer
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ValidationError
 from rich.console import Console
 from rich.table import Table
 
@@ -83,9 +83,7 @@ _WARM_UP = 33
 console = Console()
 
 
-class _Interval(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
-
+class _Interval(BaseModel, extra="forbid", frozen=True, strict=True):
     low: int | float
     high: int | float
     log: bool = False
@@ -194,11 +192,7 @@ class Search:
     journal: Path
 
     def open(self, scenes: str, seed: int, *, prune: bool) -> Study:
-        """Open the optuna study in the folder, or create it.
-
-        Raises:
-            ConfigError: the folder holds a search with another configuration, scenes or metric.
-        """
+        """Open the optuna study, or create it. A study of another search is a ConfigError."""
         import optuna
         from optuna.storages.journal import JournalFileBackend
 
@@ -270,8 +264,7 @@ class Search:
     def value_of(self, trial: Trial, settings: Mapping[str, Any]) -> float:
         """Train the machine of one trial, and return its metric on validation scenes.
 
-        Raises:
-            optuna.TrialPruned: the best score is below the median of earlier trials.
+        If its best score is below the median of earlier trials, optuna.TrialPruned is raised.
         """
         import optuna
 
@@ -304,13 +297,12 @@ class Search:
         return sum(metrics[name].value for name in _BY[self.by] if name in metrics)
 
     def _measure(self, machine: BoltzmannMachine, folder: Path) -> dict[str, Metric]:
-        artifact = draft_artifact(machine, self.data.classes)
+        data, artifact = self.data, draft_artifact(machine, self.data.classes)
         relations = relation_score(artifact, given=False)
         model = Model(missing=missing_score(artifact), relations=relations)
         tasks = [task for task, _ in FIGURES.values()]
-        for source, setting in settings_by_source(
-            self.data.validation, self.data.structure, self.data.train, seen=None
-        ):
+        settings = settings_by_source(data.validation, data.structure, data.train, seen=None)
+        for source, setting in settings:
             measure(model, setting, source, tasks=tasks, path=folder / f"{source}.json")
         return self.metrics(folder)
 
@@ -336,15 +328,11 @@ def shown(settings: Mapping[str, Any]) -> str:
 
 def _counted_trials(study: Study) -> list[FrozenTrial]:
     """Return the trials that ended by themselves or that still run."""
-    return [
-        trial
-        for trial in study.trials
-        if "settings" in trial.user_attrs or trial.state.name == "RUNNING"
-    ]
+    return [t for t in study.trials if "settings" in t.user_attrs or t.state.name == "RUNNING"]
 
 
 def _folder(trial: Trial | FrozenTrial) -> str:
-    """Return the name of a trial's folder, which a trial that is queued again keeps."""
+    """Return the name of a trial's folder, which it keeps if it is queued again."""
     return str(trial.user_attrs.get("folder", f"trial-{trial.number}"))
 
 

@@ -8,13 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from training.evaluation.item_statistics import (
-    BINS,
-    STATISTICS,
-    brier_skill,
-    calibration_error,
-    reliability,
-)
+from training.evaluation.item_statistics import BINS, STATISTICS
 from training.evaluation.metrics import (
     Figure,
     Ratio,
@@ -110,38 +104,43 @@ RNG = np.random.default_rng(0)
 SCORE = RNG.normal(size=60)
 P = 1 / (1 + np.exp(-SCORE))
 TRUTH = RNG.random(60) < 0.3
-ONE = np.ones(60)
 
 
-@pytest.mark.parametrize("statistic", STATISTICS.values(), ids=STATISTICS)
+def scored(statistic, p, truth):
+    """The statistic of items that have a group each."""
+    groups = np.arange(len(p))
+    return Scored(statistic, groups, np.asarray(p, dtype=float), np.asarray(truth), groups)
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
 def test_weights_are_copies(statistic):
     weight = RNG.integers(0, 3, size=60)
-    copied = statistic(np.repeat(P, weight), np.repeat(TRUTH, weight))(np.ones(weight.sum()))
-    assert statistic(P, TRUTH)(weight.astype(float)) == pytest.approx(copied)
+    copied = scored(statistic, np.repeat(P, weight), np.repeat(TRUTH, weight))
+    assert scored(statistic, P, TRUTH).at(weight.astype(float)) == pytest.approx(copied.value)
 
 
 def test_calibration_error_by_hand():
     """Ten bins of one item each: |p - y| of each."""
     p = np.linspace(0.05, 0.95, BINS)
     y = p > 0.5
-    assert calibration_error(p, y)(np.ones(BINS)) == pytest.approx(np.abs(p - y).mean())
+    assert scored("ECE", p, y).value == pytest.approx(np.abs(p - y).mean())
     # 20 items in two levels: .2 with 3 of 10 true, .9 with 8 of 10 true.
     y = np.concatenate([np.arange(10) < 3, np.arange(10) < 8])
-    assert calibration_error(np.repeat([0.2, 0.9], 10), y)(np.ones(20)) == pytest.approx(0.1)
+    assert scored("ECE", np.repeat([0.2, 0.9], 10), y).value == pytest.approx(0.1)
     # A constant at the base rate is calibrated, in whatever order the items come.
-    y, flat, one = np.arange(30) < 6, np.full(30, 0.2), np.ones(30)
-    assert calibration_error(flat, y)(one) == pytest.approx(0.0, abs=1e-12)
-    assert brier_skill(flat, y)(one) == pytest.approx(0.0)
-    assert brier_skill(y.astype(float), y)(one) == pytest.approx(1.0)
-    assert np.isnan(brier_skill(P, np.zeros(60, bool))(ONE))
+    y, flat = np.arange(30) < 6, np.full(30, 0.2)
+    assert scored("ECE", flat, y).value == pytest.approx(0.0, abs=1e-12)
+    assert scored("Brier skill", flat, y).value == pytest.approx(0.0)
+    assert scored("Brier skill", y, y).value == pytest.approx(1.0)
+    assert np.isnan(scored("Brier skill", P, np.zeros(60, bool)).value)
 
 
 def test_reliability_is_what_the_error_is_made_of():
-    probability, frequency = reliability(P, TRUTH)
+    error = scored("ECE", P, TRUTH)
+    probability, frequency = error.reliability()
     assert len(probability) == BINS
     assert (probability.mean(), frequency.mean()) == pytest.approx((P.mean(), TRUTH.mean()))
-    gap = np.abs(probability - frequency).mean()
-    assert gap == pytest.approx(calibration_error(P, TRUTH)(ONE))
+    assert np.abs(probability - frequency).mean() == pytest.approx(error.value)
 
 
 # ------------------------------------------------------------------------------------- intervals

@@ -13,11 +13,16 @@ from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
 from training.evaluation import asking
 from training.evaluation.artifact_model import artifact_model
 from training.evaluation.asking import SENSITIVITIES, LeakError, ask_every, judge, of_classes
-from training.evaluation.intruders import by_popularity, by_signature, draw_intruders, signatures
+from training.evaluation.intruders import (
+    LAWS,
+    by_popularity,
+    by_signature,
+    draw_intruders,
+    signatures,
+)
 from training.evaluation.missing_tasks import SEEDS
 from training.evaluation.model import Model, suspicion_of
 from training.evaluation.outlier_tasks import (
-    LAWS,
     alarms_task,
     first_shares,
     hit_at_1,

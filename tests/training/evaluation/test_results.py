@@ -18,17 +18,10 @@ def figure(value):
     return Figure(value, value, value, 1)
 
 
-@pytest.mark.parametrize(
-    ("task", "metric", "said"),
-    [
-        ("T1a relations", "R-precision, distinct classes", True),
-        ("T1b completion", "R-precision", True),
-        ("T2 missing", "MRR, one removed", False),
-    ],
-)
-def test_precision_of_relations_says_what_counts_as_wrong(task, metric, said):
-    text = Results("a", (Cell("a", task, "x", metric, figure(0.5), (0.5,)),), ()).markdown()
-    assert ("An unlisted relation counts as wrong" in text) is said
+def test_precision_of_relations_says_what_counts_as_wrong():
+    for task, metric in (("T1b completion", "R-precision"), ("T2 missing", "MRR, one removed")):
+        text = Results("a", (Cell("a", task, "x", metric, figure(0.5), (0.5,)),), ()).markdown()
+        assert ("An unlisted relation counts as wrong" in text) is task.startswith("T1")
 
 
 @pytest.mark.parametrize(

@@ -48,10 +48,8 @@ def test_short_lists_are_shorter_and_need_more_classes():
         return by_first(v, profile)
 
     metrics = rooms_task(listening, SETTING).metrics
-    assert set(torch.cat(lengths).tolist()) == {
-        4.0,
-        2.0,
-    }  # a scene of four classes has no part of 4
+    # A scene of four classes has no part of 4.
+    assert set(torch.cat(lengths).tolist()) == {4.0, 2.0}
     assert {name.split(", ")[1] for name in metrics} == {"all classes", "2 classes"}
     assert metrics["top-1, 2 classes"].n == 3 * 30
 

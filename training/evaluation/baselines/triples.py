@@ -62,25 +62,22 @@ def count_triples(scenes: SceneTensors, structure: Tensor) -> TripleCounts:
     return TripleCounts(torch.from_numpy(holds * pair), torch.from_numpy(together * pair))
 
 
-@dataclass(frozen=True, eq=False)
-class TripleTable:
-    """The relation score log_odds[a, i, j] + g · log(n_i n_j) of relation a from class i to j.
+def table_score(log_odds: Tensor, multiplicity: float = 0.0) -> RelationScore:
+    """Return the relation score log_odds[a, i, j] + g · log(n_i n_j), from a table (A, V, V).
 
     n_i and n_j are the instance counts of the classes, and g is `multiplicity`. The score ignores
-    observed relations.
+    observed relations. It is arbitrary for padding.
     """
 
-    log_odds: Tensor
-    multiplicity: float = 0.0
-
-    def __call__(self, batch: Batch) -> Tensor:
-        """Return the log-odds of the relations of a batch, (B, A, n, n); arbitrary for padding."""
+    def score(batch: Batch) -> Tensor:
         index = batch.classes.clamp(min=0)
-        values = self.log_odds[:, index[:, :, None], index[:, None, :]].movedim(0, 1)
-        if self.multiplicity:
+        values = log_odds[:, index[:, :, None], index[:, None, :]].movedim(0, 1)
+        if multiplicity:
             logs = batch.counts.clamp(min=1).to(values.dtype).log()
-            values = values + self.multiplicity * (logs[:, None, :, None] + logs[:, None, None, :])
+            values = values + multiplicity * (logs[:, None, :, None] + logs[:, None, None, :])
         return values
+
+    return score
 
 
 _PAIR = (1.0, 3.0, 10.0, 30.0, 100.0)
@@ -113,7 +110,7 @@ def frequency_table(train: SceneTensors, structure: Tensor, _seed: int) -> Propo
     for pair, end in product(_PAIR, _END):
         table = smoothed_log_odds(counts, pair, end)
         for weight in _MULTIPLICITY:
-            yield {"pair": pair, "end": end, "multiplicity": weight}, TripleTable(table, weight)
+            yield {"pair": pair, "end": end, "multiplicity": weight}, table_score(table, weight)
 
 
 _PLACE = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
@@ -122,43 +119,18 @@ _WEIGHTS = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5)
 _CORRECTIONS = (0.0, 0.25, 0.5, 1.0)
 
 
-@dataclass(frozen=True, eq=False)
-class PlacedTable:
-    """The score log p(i | a, j) of class i at the place (a, j), from a frequency table.
+def place_score(log_p: Tensor) -> PlacedScore:
+    """Return the score log p(i | a, j) of class i at the place (a, j).
 
     `log_p` is a table over `Places.outgoing`, relation a, class j and class i, (2, A, V, V).
     """
-
-    log_p: Tensor
-
-    def __call__(self, places: Places) -> Tensor:
-        """Return log p(i | a, j) of each class i at each place, (places, classes)."""
-        return self.log_p[places.outgoing.long(), places.relation, places.anchor]
-
-
-@dataclass(frozen=True, eq=False)
-class PlacedProduct:
-    """The score objects(v) + weight · table - correction · log popularity of a class at a place.
-
-    Both factors depend on the class frequency. The last term corrects for this.
-    """
-
-    objects: ObjectScore
-    table: PlacedScore
-    log_popularity: Tensor
-    weight: float
-    correction: float
-
-    def __call__(self, places: Places) -> Tensor:
-        """Return the score of each class at each place, (places, classes)."""
-        added = self.weight * self.table(places) - self.correction * self.log_popularity
-        return self.objects(places.v) + added
+    return lambda places: log_p[places.outgoing.long(), places.relation, places.anchor]
 
 
 def smoothed_log_p(
     counts: TripleCounts, popularity: Tensor, place: float, relation: float
 ) -> Tensor:
-    """Return log p(i | a, j) in the layout of `PlacedTable.log_p`.
+    """Return log p(i | a, j) in the layout of `place_score`.
 
         p(i | a, j) = (scenes with a(i, j) + s · p(i | a)) / (scenes with a of any class to j + s)
 
@@ -181,13 +153,13 @@ def placed_table(train: SceneTensors, structure: Tensor, _seed: int) -> Proposal
     counts = count_triples(train, structure)
     for place, relation in product(_PLACE, _RELATION):
         log_p = smoothed_log_p(counts, frequency(train.v), place, relation)
-        yield {"place": place, "relation": relation}, PlacedTable(log_p)
+        yield {"place": place, "relation": relation}, place_score(log_p)
 
 
 def times(
     objects: ObjectScore | None, table: PlacedScore | None
 ) -> Callable[[SceneTensors, Tensor, int], Proposals[PlacedScore]]:
-    """Return a generator function for the product of a fitted object score and a fitted table.
+    """Return a generator function for objects(v) + weight · table - correction · log popularity.
 
     Raises:
         ValueError: a score is missing.
@@ -195,10 +167,18 @@ def times(
     if objects is None or table is None:
         raise ValueError("the product needs an object score and a table of places")
 
-    def placed_table(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[PlacedScore]:
+    def product_score(weight: float, correction: float, log_popularity: Tensor) -> PlacedScore:
+        # Both factors depend on the class frequency. The last term corrects for this.
+        def score(places: Places) -> Tensor:
+            added = weight * table(places) - correction * log_popularity
+            return objects(places.v) + added
+
+        return score
+
+    def propose(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[PlacedScore]:
         log_popularity = frequency(train.v, train.weight).log()
         for weight, correction in product(_WEIGHTS, _CORRECTIONS):
-            score = PlacedProduct(objects, table, log_popularity, weight, correction)
+            score = product_score(weight, correction, log_popularity)
             yield {"weight": weight, "correction": correction}, score
 
-    return placed_table
+    return propose

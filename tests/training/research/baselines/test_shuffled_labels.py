@@ -29,7 +29,7 @@ from training.evaluation.relation_tasks import rank, score_scenes
 from training.fit.configuration import Config
 from training.fit.draft import draft_artifact
 from training.fit.trainer import Trainer
-from training.research.baselines import BASELINES
+from training.research.baselines import BASELINES, networks
 
 pytestmark = pytest.mark.slow
 
@@ -37,6 +37,13 @@ TOLERANCE = 0.1
 POPULARITY, *OBJECTS = (b for b in BASELINES.values() if b.scores == ("missing",))
 RELATION_POPULARITY, *OF_RELATIONS = (b for b in BASELINES.values() if b.scores == RELATIONS)
 HELD_OUT = furnished(100, seed=3)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _longer_courses():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(networks, "_STEPS", 100)
+        yield
 
 
 @cache
