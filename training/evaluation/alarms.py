@@ -39,10 +39,9 @@ _GROUPS = 30  # minimum number of groups of a source with its own count of alarm
 
 @dataclass(frozen=True)
 class Alarms:
-    """The number of scenes of a source (at most one of each group), and of those with an alarm.
+    """The scenes of a source, one of each group, and those with an alarm about `about`.
 
-    Attributes:
-        about: "objects" or "relations".
+    `about` is "objects" or "relations".
     """
 
     source: str

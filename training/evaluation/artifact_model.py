@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache, partial
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,6 +16,7 @@ from app.scene import CANONICAL, OPPOSITES, Scene
 from training.datasets.batches import Batch, SceneTensors
 from training.evaluation.asking import (
     instances_of,
+    log_of,
     misplaced_score,
     missing_probabilities,
     missing_score,
@@ -31,14 +31,7 @@ from training.evaluation.generation_task import (
     machine_sampler,
     scene_sampler,
 )
-from training.evaluation.model import (
-    Model,
-    ObjectDensity,
-    PlacedScore,
-    Places,
-    RelationScore,
-    Sampler,
-)
+from training.evaluation.model import Model, PlacedScore, Places, RelationScore, Sampler
 from training.evaluation.setting import Setting
 from training.machines.arrays import machine_of
 
@@ -54,8 +47,7 @@ def artifact_model(
 ) -> Model:
     """Return the answers of a trained model; only a `calibrated` model judges outliers.
 
-    Args:
-        profiles: names of the profiles that requests about rooms may name.
+    Requests about rooms may name the `profiles`.
     """
     machine = machine_of(artifact.weights)
     completion = relation_score(artifact, given=True)
@@ -87,12 +79,10 @@ def relation_score(artifact: Artifact, *, given: bool) -> RelationScore:
 
     def score(batch: Batch) -> Tensor:
         log_odds = torch.full(batch.holds.shape, -torch.inf)
-        evidence = batch.holds * batch.observed * given
-        for row, classes in enumerate(batch.classes):
-            n = int((classes >= 0).sum())
-            scene, _ = _with_relations(classes[:n], batch.counts[row, :n], evidence[row])
+        for row, (scene, _) in enumerate(_scenes(batch, given)):
             values = Posterior(artifact, scene).relation_log_odds()
-            log_odds[row, : len(values), :n, :n] = torch.from_numpy(values)
+            a, n, _ = values.shape
+            log_odds[row, :a, :n, :n] = torch.from_numpy(values)
         return log_odds
 
     return score
@@ -106,10 +96,7 @@ def false_relation_score(artifact: Artifact) -> RelationScore:
 
     def score(batch: Batch) -> Tensor:
         log_odds = torch.full(batch.holds.shape, -torch.inf)
-        evidence = batch.holds * batch.observed
-        for row, classes in enumerate(batch.classes):
-            n = int((classes >= 0).sum())
-            scene, triples = _with_relations(classes[:n], batch.counts[row, :n], evidence[row])
+        for row, (scene, triples) in enumerate(_scenes(batch)):
             wrong = wrong_relations(artifact, scene)
             for pair, stated in triples.items():
                 log_odds[(row, *pair)] = -wrong.get(stated, 0.0)
@@ -118,23 +105,25 @@ def false_relation_score(artifact: Artifact) -> RelationScore:
     return score
 
 
-def _with_relations(
-    classes: Tensor, counts: Tensor, evidence: Tensor
-) -> tuple[Scene, dict[Triple, Triple]]:
-    """Return a scene with instances of the classes, and with relations between classes.
+def _scenes(batch: Batch, given: bool = True) -> Iterator[tuple[Scene, dict[Triple, Triple]]]:
+    """Generate the scenes of a batch, with instances of its classes.
 
-    The relations are those above 0 in `evidence`, (A, n, n). a(x, y) and a(y, x) can both hold
+    With `given`, a scene has the observed relations that hold. a(x, y) and a(y, x) can both hold
     between classes, but for different instances. The second result maps the relations of classes to
     those of instances.
     """
-    scene, first = instances_of(classes, counts)
-    observed = set(map(tuple, evidence.nonzero().tolist()))
-    last = first + counts.clamp(min=1) - 1
-    triples: dict[Triple, Triple] = {}
-    for a, x, y in sorted(observed):
-        index = last if (a, y, x) in observed and x > y else first
-        triples[a, x, y] = (a, int(index[x]), int(index[y]))
-    return Scene(scene.objects, tuple(triples.values()) or None), triples
+    evidence = batch.holds * batch.observed * given
+    for classes, counts, holds in zip(batch.classes, batch.counts, evidence, strict=True):
+        is_class = classes >= 0
+        counts = counts[is_class]
+        scene, first = instances_of(classes[is_class], counts)
+        observed = set(map(tuple, holds.nonzero().tolist()))
+        last = first + counts.clamp(min=1) - 1
+        triples: dict[Triple, Triple] = {}
+        for a, x, y in sorted(observed):
+            index = last if (a, y, x) in observed and x > y else first
+            triples[a, x, y] = (a, int(index[x]), int(index[y]))
+        yield Scene(scene.objects, tuple(triples.values()) or None), triples
 
 
 def placed_score(artifact: Artifact) -> PlacedScore:
@@ -155,9 +144,8 @@ def placed_score(artifact: Artifact) -> PlacedScore:
             # A model without this relation cannot use the place.
             at = (name, anchor) if places.relation[row] < artifact.spec.A else None
             p = missing_probabilities(artifact, scene, at=at)
-            tiny = np.finfo(np.float64).tiny
-            rows.append(np.where(p >= 0, np.log(np.maximum(p, tiny)), -np.inf))
-        return torch.from_numpy(np.stack(rows)).to(places.v.dtype)
+            rows.append(log_of(p).masked_fill(torch.from_numpy(p < 0), -torch.inf))
+        return torch.stack(rows).to(places.v.dtype)
 
     return score
 
@@ -174,11 +162,8 @@ def floor_model() -> Model:
 
 def independent_model(classes: int) -> Model:
     """Return a model that samples classes independently at their training frequencies."""
-
-    def sampler(setting: Setting) -> Sampler | None:
-        return None if setting.train is None else independent_sampler(setting.train)
-
-    def density(setting: Setting) -> ObjectDensity | None:
-        return None if setting.train is None else independent_density(setting.train)
-
-    return Model(generate=sampler, density=density, parameters=classes)
+    return Model(
+        generate=lambda s: None if s.train is None else independent_sampler(s.train),
+        density=lambda s: None if s.train is None else independent_density(s.train),
+        parameters=classes,
+    )

@@ -54,10 +54,7 @@ def ask_every(ask: Callable[[Case], Floats], cases: Sequence[Case]) -> list[Floa
 
 @torch.no_grad()
 def ask_rows(score: Callable[..., Tensor], *columns: Tensor, block: int = 256) -> Tensor:
-    """Return the scores (N, ...) of N cases. The scores are computed in blocks of cases.
-
-    Args:
-        score: function of a block of each column. Entry k of each column belongs to case k.
+    """Return the scores (N, ...) of N cases, computed in blocks of the rows of each column.
 
     Raises:
         LeakError: a case gets another score when it is queried in another block.
@@ -118,10 +115,7 @@ def index_of_ids(scene: Scene) -> dict[str, int]:
 def canonical_triple(scene: Scene, entry: Mapping[str, Any]) -> tuple[int, int, int]:
     """Return (canonical relation, subject, object) of a relation in an answer about a scene."""
     index = index_of_ids(scene)
-    relation, subject, other = canonicalise(
-        index[entry["subject"]], entry["relation"], index[entry["object"]]
-    )
-    return relation, subject, other
+    return canonicalise(index[entry["subject"]], entry["relation"], index[entry["object"]])
 
 
 def missing_probabilities(
@@ -135,19 +129,16 @@ def missing_probabilities(
     The value is -inf for classes that `/missing` cannot propose.
 
     Args:
-        at: place of the missing object: a relation, and the index of the object to which the
-            missing object has this relation. None means the whole scene.
+        at: place of the missing object: its relation to the object with an index.
         candidates: classes to rank. None means all classes.
     """
-    vocabulary = artifact.vocabulary
-    size = len(vocabulary)
-    probabilities = np.full(size, -np.inf)
+    p = np.full(len(artifact.vocabulary), -np.inf)
     answer = questions.missing(
-        artifact, scene, top_k=size, candidates=candidates, at=at, details=False
+        artifact, scene, top_k=len(p), candidates=candidates, at=at, details=False
     )
     for entry in answer["missing"]:
-        probabilities[vocabulary.index(entry["label"])] = entry["probability"]
-    return probabilities
+        p[artifact.vocabulary.index(entry["label"])] = entry["probability"]
+    return p
 
 
 def judge(artifact: Artifact, scene: Scene, sensitivity: Sensitivity = "medium") -> Floats:
@@ -157,20 +148,24 @@ def judge(artifact: Artifact, scene: Scene, sensitivity: Sensitivity = "medium")
     the rest of the scene, and 1 if the service reports the object as an outlier.
     """
     columns = np.zeros((len(scene.objects), 3))
-    answer = questions.outliers(artifact, scene, sensitivity=sensitivity, details=False)
     index = index_of_ids(scene)
+    answer = questions.outliers(artifact, scene, sensitivity=sensitivity, details=False)
     for entry in answer["outliers"]:
-        values = entry["probability"], entry["log_odds"], entry["is_outlier"]
-        columns[index[entry["object"]]] = values
+        fields = ("probability", "log_odds", "is_outlier")
+        columns[index[entry["object"]]] = [entry[field] for field in fields]
     return columns
+
+
+def log_of(p: Floats) -> Tensor:
+    """Return the log of probabilities; a finite value for 0 and for -inf."""
+    return torch.from_numpy(np.log(np.maximum(p, np.finfo(np.float64).tiny)))
 
 
 def missing_score(artifact: Artifact) -> Callable[[Tensor], Tensor]:
     """Return a function from lists (B, V) to the log-probabilities of `/missing`, (B, V)."""
 
     def score(v: Tensor) -> Tensor:
-        p = np.stack([missing_probabilities(artifact, scene) for scene in _scenes(v)])
-        return torch.from_numpy(np.log(np.maximum(p, np.finfo(np.float64).tiny)))
+        return log_of(np.stack([missing_probabilities(artifact, scene) for scene in _scenes(v)]))
 
     return score
 
@@ -178,7 +173,7 @@ def missing_score(artifact: Artifact) -> Callable[[Tensor], Tensor]:
 def room_score(artifact: Artifact, profiles: Sequence[str]) -> RoomScore | None:
     """Return a function for the log-probabilities of `/rooms`, or None without room types.
 
-    A profile that is not in `profiles`, the names of the model's profiles, is not named.
+    Requests name only the profiles of the model, `profiles`.
     """
     types, names = artifact.spec.C, artifact.vocabulary.room_types
     if not types:
@@ -192,16 +187,13 @@ def room_score(artifact: Artifact, profiles: Sequence[str]) -> RoomScore | None:
             answer = questions.rooms(artifact, scene, top_k=types, details=False)
             for entry in answer["room_types"]:
                 row[names.index(entry["room_type"])] = entry["probability"]
-        return torch.from_numpy(np.log(np.maximum(p, np.finfo(np.float64).tiny)))
+        return log_of(p)
 
     return score
 
 
 def suspicion_score(artifact: Artifact) -> Callable[[Tensor], Tensor]:
-    """Return a function from lists (B, V) to the probabilities of `/outliers`, (B, V).
-
-    The value is -inf for unlisted classes.
-    """
+    """Return a function from lists (B, V) to the probabilities of `/outliers`, or -inf, (B, V)."""
     return lambda v: _judged(artifact, v, 0, "medium", -torch.inf)
 
 
@@ -248,9 +240,8 @@ def relation_probabilities(
     The value is 0 outside `pairs`, ordered pairs of object indices. None means all pairs.
     """
     n = len(scene.objects)
-    probabilities = np.zeros((len(CANONICAL), n, n))
-    most = max(1, len(CANONICAL) * n * n)
-    answer = questions.relations(artifact, scene, top_k=most, pairs=pairs)
+    p = np.zeros((len(CANONICAL), n, n))
+    answer = questions.relations(artifact, scene, top_k=max(1, p.size), pairs=pairs)
     for entry in answer["relations"]:
-        probabilities[canonical_triple(scene, entry)] = entry["probability"]
-    return probabilities
+        p[canonical_triple(scene, entry)] = entry["probability"]
+    return p

@@ -24,7 +24,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from functools import partial
-from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -64,13 +63,11 @@ from training.evaluation.asking import (
 )
 from training.evaluation.intruders import draw_intruder_choices
 from training.evaluation.metrics import Items, Metric
-from training.evaluation.model import Model
 from training.evaluation.parts import Size, draw_parts, exactly, up_to_longest
 from training.evaluation.setting import Outcome, Setting
 
-# Number of removed objects per scene in `ask_placements`. A removed object gives only 3 answers,
-# while a scene has about 20 relations. With one removed object per scene, chance alone gives an
-# expected calibration error (ECE) of .02 to .03.
+# Number of removed objects per scene in `ask_placements`. A removed object gives only 3 answers.
+# With one per scene, chance alone gives a calibration error (ECE) of .02 to .03.
 _REMOVALS = 4
 _NO_ALARM = AlarmLine(intercept=1e3)
 # (probability, truth) of each answer about one scene.
@@ -81,8 +78,7 @@ Ask = Callable[[Artifact, EncodedScene, Rng], Answered | None]
 def uncalibrated(artifact: Artifact) -> Artifact:
     """Return the artifact with raw log-odds in place of calibrated log-odds.
 
-    Calibration multiplies log-odds by a slope. The slope -1 turns the log-odds of an object or
-    relation into the log-odds that the object or relation is wrong.
+    The slope -1 turns the log-odds of an object or relation into those that it is wrong.
     """
     lines = AlarmLines(low=_NO_ALARM, medium=_NO_ALARM, high=_NO_ALARM)
     plain = Judgement(
@@ -121,8 +117,6 @@ def ask_relations(
 ) -> Answered | None:
     """Ask for all relations of a scene. The request contains only the labels of the objects."""
     is_known = annotated_relations(encoded)
-    if not is_known.any():
-        return None
     return _answers_on(artifact, encoded, labels_alone(encoded), is_known) or None
 
 
@@ -145,30 +139,23 @@ def _answers_on(artifact: Artifact, encoded: EncodedScene, scene: Scene, mask: F
 
 
 def ask_placements(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
-    """Ask where a removed object belongs. Up to `_REMOVALS` objects are removed one at a time."""
-    if not annotated_relations(encoded).any():
-        return None
-    answers = (_ask_one_placement(artifact, encoded, rng) for _ in range(_REMOVALS))
-    return list(chain.from_iterable(answers)) or None
-
-
-def _ask_one_placement(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered:
-    """Remove a class, and ask for the places of one of its instances in the remaining scene."""
-    removal = removed_class(encoded, artifact.vocabulary.structure, rng)
-    if removal is None:
-        return []
-    target, kept = removal
-    removed = int(rng.choice(np.flatnonzero(encoded.instance_classes == target)))
+    """Ask where an instance of a removed class belongs, for up to `_REMOVALS` removals."""
     is_known = annotated_relations(encoded)
     answers: Answered = []
-    scene = labels_alone(encoded, kept)
-    index = index_of_ids(scene)
-    for entry in missing(artifact, scene, candidates=[target])["missing"]:
-        for place in entry["placements"]:
-            triple = canonicalise(removed, place["relation"], kept[index[place["object"]]])
-            if is_known[triple]:
-                answers.append((place["probability"], bool(encoded.instance_holds[triple])))
-    return answers
+    for _ in range(_REMOVALS if is_known.any() else 0):
+        removal = removed_class(encoded, artifact.vocabulary.structure, rng)
+        if removal is None:
+            continue
+        target, kept = removal
+        removed = int(rng.choice(np.flatnonzero(encoded.instance_classes == target)))
+        scene = labels_alone(encoded, kept)
+        index = index_of_ids(scene)
+        for entry in missing(artifact, scene, candidates=[target])["missing"]:
+            for place in entry["placements"]:
+                triple = canonicalise(removed, place["relation"], kept[index[place["object"]]])
+                if is_known[triple]:
+                    answers.append((place["probability"], bool(encoded.instance_holds[triple])))
+    return answers or None
 
 
 def collect_missing(artifact: Artifact, scenes: SceneTensors, size: Size, seed: int = 0) -> Items:
@@ -191,8 +178,8 @@ class PlaceQuestion(NamedTuple):
 
     Attributes:
         placed: (V,) bool, the hidden classes at the place.
-        usable: (V,) bool, the classes without structure that may be asked: neither listed, nor
-            hidden with an unknown relation to the anchor.
+        usable: (V,) bool, the classes that may be asked: neither structure, nor listed, nor hidden
+            with an unknown relation to the anchor.
     """
 
     scene: Scene
@@ -206,9 +193,12 @@ def place_question(
 ) -> PlaceQuestion | None:
     """Draw a part of a scene and a place at one of its objects; None if there is none."""
     structure = vocabulary.structure
-    hidden = _draw_hidden(structure, encoded, rng)
-    if hidden is None:
+    classes = encoded.evidence.classes
+    order: Ints = rng.permutation(classes[~structure[classes]])
+    listed = up_to_longest(len(order), rng) if encoded.complete else 0
+    if not listed:
         return None
+    hidden = order[listed:]
     is_hidden = np.isin(encoded.instance_classes, hidden)
     place = occupied_place(encoded, structure, ~is_hidden, rng, relations)
     if place is None:
@@ -226,10 +216,7 @@ def place_question(
 
 
 def ask_placed(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
-    """Ask for the hidden classes at one place, which is a relation to an object.
-
-    A class is left out if it is unknown whether the class has this relation to the object.
-    """
+    """Ask for the hidden classes at one place, without those of an unknown relation."""
     question = place_question(artifact.vocabulary, encoded, rng, range(artifact.spec.A))
     if question is None:
         return None
@@ -241,14 +228,6 @@ def ask_placed(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered 
     return [(p, bool(placed[index])) for p, index in answers if usable[index]]
 
 
-def _draw_hidden(structure: Flags, encoded: EncodedScene, rng: Rng) -> Ints | None:
-    """Draw the classes that a random part of a scene hides; None if the scene has no part."""
-    classes = encoded.evidence.classes
-    order: Ints = rng.permutation(classes[~structure[classes]])
-    listed = up_to_longest(len(order), rng) if encoded.complete else 0
-    return order[listed:] if listed else None
-
-
 def ask_outliers(
     artifact: Artifact,
     encoded: EncodedScene,
@@ -257,16 +236,15 @@ def ask_outliers(
 ) -> Answered | None:
     """Ask for the outliers of a random part. Half of the parts contain an intruder.
 
-    Args:
-        intruders: maps (source, scene id) to the classes from which the intruder is drawn, see
-            `draw_intruder_choices`. None means any absent class.
+    The intruder is drawn from `draw_intruder_choices`. Without these, it is any absent class.
     """
     structure = artifact.vocabulary.structure
     classes = encoded.evidence.classes
     if not encoded.complete or (~structure[classes]).sum() < 3:
         return None
-    candidates = np.setdiff1d(np.flatnonzero(~structure), classes)
-    if intruders is not None:
+    if intruders is None:
+        candidates = np.setdiff1d(np.flatnonzero(~structure), classes)
+    else:
         candidates = intruders[encoded.source, encoded.scene_id]
     if not len(candidates):
         return None
@@ -295,8 +273,7 @@ def ask_misplaced(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answer
     ] or None
 
 
-LISTED = (2, 4, 8)
-"""Numbers of listed classes in questions about missing classes."""
+LISTED = (2, 4, 8)  # listed classes in questions about missing classes
 
 QUESTIONS: dict[str, Ask] = {
     "relations": ask_relations,
@@ -307,44 +284,37 @@ QUESTIONS: dict[str, Ask] = {
     "misplaced": ask_misplaced,
 }
 
-
 NAMES = (*QUESTIONS, *(f"missing, {listed} classes" for listed in LISTED))
 """Names of all questions in the metrics of the task."""
 
 
-def calibration_task(model: Model, setting: Setting) -> Outcome | None:
-    """Measure the calibration of the answers to all questions, published and uncalibrated.
-
-    Questions about objects use scenes with complete object lists, the others scenes with relations.
-    """
-    if model.artifact is None:
-        return None
+def calibration_task(artifact: Artifact, setting: Setting) -> Outcome | None:
+    """Measure the calibration of the answers to all questions, published and uncalibrated."""
     related = setting.some(related=True, share=3)
     complete = setting.complete.some(share=3)
-    at_place = setting.complete.some(related=True, share=3)
-    scenes_of = {"outliers": complete, "missing at a place": at_place}
-    metrics: dict[str, Metric] = {}
-    skipped = 0
-    train = setting.complete.train
-    intruders = draw_intruder_choices(complete, setting.structure, train, setting.seed)
-    asks = QUESTIONS | {"outliers": partial(ask_outliers, intruders=intruders)}
+    train, seed = setting.complete.train, setting.seed
+    intruders = draw_intruder_choices(complete, setting.structure, train, seed)
     collects: dict[str, tuple[SceneTensors, Callable[..., Items]]] = {
-        name: (scenes_of.get(name, related), partial(collect, ask=ask))
-        for name, ask in asks.items()
+        name: (related, partial(collect, ask=ask)) for name, ask in QUESTIONS.items()
     }
+    at_place = setting.complete.some(related=True, share=3)
+    collects["missing at a place"] = at_place, partial(collect, ask=ask_placed)
+    ask = partial(ask_outliers, intruders=intruders)
+    collects["outliers"] = complete, partial(collect, ask=ask)
     for n in LISTED:
         ask_parts = partial(collect_missing, size=exactly(n))
-        collects[f"missing, {n} classes"] = (setting.complete.some(), ask_parts)
+        collects[f"missing, {n} classes"] = setting.complete.some(), ask_parts
+    metrics: dict[str, Metric] = {}
+    skipped = 0
     for name, (scenes, ask_all) in collects.items():
-        answers = ask_all(model.artifact, scenes, seed=setting.seed)
-        skipped += answers.skipped
-        if len(answers.scene):
-            raw_answers = ask_all(uncalibrated(model.artifact), scenes, seed=setting.seed)
+        for suffix, model in (("", artifact), (", uncalibrated", uncalibrated(artifact))):
+            answers = ask_all(model, scenes, seed=seed)
+            skipped += 0 if suffix else answers.skipped
+            if not len(answers.scene):
+                break
             for figure in ("ECE", "Brier skill"):
-                metrics[f"{figure}, {name}"] = answers.metric(figure).by(scenes.group_ids)
-                if len(raw_answers.scene):
-                    raw = raw_answers.metric(figure).by(scenes.group_ids)
-                    metrics[f"{figure}, {name}, uncalibrated"] = raw
+                metric = answers.metric(figure).by(scenes.group_ids)
+                metrics[f"{figure}, {name}{suffix}"] = metric
     # Brier skill is undefined if all answers are true or all answers are false.
     metrics = {name: metric for name, metric in metrics.items() if np.isfinite(metric.value)}
     return Outcome(metrics, max(len(related), len(complete)), skipped) if metrics else None

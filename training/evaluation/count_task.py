@@ -28,7 +28,6 @@ from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.cases import MOST, counted_classes, listed_cases
 from training.evaluation.asking import of_classes
 from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.model import Model
 from training.evaluation.setting import Outcome, Setting
 
 METRICS: Final = (
@@ -41,13 +40,10 @@ METRICS: Final = (
 )
 
 
-def counts_task(model: Model, setting: Setting) -> Outcome | None:
-    """Measure the errors, the share of counts in the interval and the precision of proposals.
-
-    Return None if the model has no counts, or if the data source does not count instances.
-    """
-    artifact, train = model.artifact, setting.train
-    if artifact is None or artifact.counts is None or train is None:
+def counts_task(artifact: Artifact, setting: Setting) -> Outcome | None:
+    """Measure the errors, the share of counts in the interval and the precision of proposals."""
+    train = setting.train
+    if artifact.counts is None or train is None:
         return None
     counting = counted_classes(train.scenes, artifact.vocabulary)
     is_counted = torch.tensor([scene.source in counting for scene in setting.scenes.scenes])
@@ -74,8 +70,8 @@ def counts_task(model: Model, setting: Setting) -> Outcome | None:
         "error of the class mean": mean_error,
         "change of error, class mean": ours - mean_error,
         "change of error, mean of the source": ours - of_source,
+        "count in the interval": Ratio.of_items(scene_index, is_inside, len(scenes)),
     }
-    metrics["count in the interval"] = Ratio.of_items(scene_index, is_inside, len(scenes))
     if (is_likely := p >= LIKELY).any():
         is_right = (number > listed)[is_likely].astype(np.float64)
         hits = Ratio.of_items(scene_index[is_likely], is_right, len(scenes))
@@ -86,11 +82,7 @@ def counts_task(model: Model, setting: Setting) -> Outcome | None:
 def _ask_counts(
     artifact: Artifact, scene: EncodedScene, counted: Flags, seed: int
 ) -> list[tuple[float, ...]]:
-    """Return the answers about a partly listed scene.
-
-    An answer is (class, number in the scene, listed number, expected number, low, high,
-    probability).
-    """
+    """Return (class, number, listed, expected, low, high, probability) of each listed class."""
     part, asked = listed_cases(scene, counted, artifact.vocabulary.structure, seed)
     room = part.room if part.room >= 0 else None
     scene_part = of_classes(np.repeat(part.classes, part.listed).tolist())
@@ -117,9 +109,7 @@ def _mean_counts(scenes: Sequence[EncodedScene], artifact: Artifact) -> Floats:
 def class_mean(counts: Counts, row: Ints, listed: Ints) -> Floats:
     """Return the mean number in training scenes with at least the listed number, (k,).
 
-    Args:
-        row: (k,) rows of the classes in `counts`.
-        listed: (k,) number of listed instances of each class.
+    `row` (k,) are the rows of the classes in `counts`.
     """
     numbers = np.arange(1, counts.log_share.shape[1] + 1)
     p = np.exp(counts.log_share[row].astype(np.float64)) * (numbers >= listed[:, None])

@@ -10,34 +10,24 @@ machine with one hidden layer,
 is exact up to log Z. The upper estimate of log Z lowers the log-likelihood. The reported
 log-likelihood is therefore conservative. Machines with two hidden layers are left out.
 
-The pairwise model is the fully visible Boltzmann machine (Ising model) of classes:
-p(v) = exp(b·v + v'Wv / 2) / Z with symmetric W and zero diagonal. The annealing path starts at
-beta = 0 with independent classes of log-odds a, where log Z has a closed form. The path ends at
-beta = 1 with the model. At any other beta, the biases are (1 - beta) a + beta b, and the pairwise
-weights are beta W. One Gibbs sweep updates each class once.
-
 Source: Neal, "Annealed importance sampling" (2001), run in both directions as in
 `training.machines.partition`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import torch
-from scipy.special import expit
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
-from training.datasets.array_types import Floats, Rng
 from training.datasets.batches import SceneTensors
 from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.model import Model, ObjectDensity
+from training.evaluation.model import DensityOf, ObjectDensity
 from training.evaluation.setting import Outcome, Setting
-from training.machines import BoltzmannMachine
+from training.machines import BoltzmannMachine, MachineSpec, build
 from training.machines.gibbs import start_chains, sweep
 from training.machines.partition import LogPartition, ais, reverse_ais
 
@@ -71,22 +61,17 @@ def independent_density(train: SceneTensors) -> ObjectDensity:
     return ObjectDensity(log_p, 0.0, 0.0)
 
 
-def ising_density(
-    b: Tensor,
-    W: Tensor,
-    train: SceneTensors,
-    settings: DensitySettings = DensitySettings(),
-    seed: int = 0,
-) -> ObjectDensity:
-    """Return the density of a pairwise model with biases b (V,) and pairwise weights W (V, V)."""
-    model = Ising(b.double().numpy(), W.double().numpy())
-    generator = torch.Generator().manual_seed(seed)
-    start = torch.randint(len(train), (settings.chains,), generator=generator)
-    base = _class_log_odds(train).double().numpy()
-    below, above = model.log_partition(
-        base, train.v[start], settings.betas(), settings.burn_in, seed
-    )
-    return _density(model.log_unnormalised, below, above)
+@torch.no_grad()
+def ising_machine(b: Tensor, W: Tensor) -> BoltzmannMachine:
+    """Return the pairwise model p(v) = exp(b·v + v'Wv / 2) / Z, with b (V,) and W (V, V).
+
+    It is a machine with couplings whose hidden unit has no weights. W is symmetric and has a zero
+    diagonal.
+    """
+    machine = build(MachineSpec("rbm", V=len(b), A=1, units=1, coupled=True))
+    machine.b.copy_(b)
+    machine.L.copy_(W)
+    return machine.requires_grad_(False)
 
 
 def machine_density(
@@ -103,12 +88,6 @@ def machine_density(
     if machine.spec.H2:
         return None
     below, above = log_partition(machine, train, settings, seed)
-    return _density(lambda v: -machine.free_energy(v), below, above)
-
-
-def _density(
-    log_unnormalised: Callable[[Tensor], Tensor], below: LogPartition, above: LogPartition
-) -> ObjectDensity:
     notes = {
         "log Z, AIS": below.log_z,
         "standard error, AIS": below.standard_error,
@@ -116,7 +95,7 @@ def _density(
         "standard error, reverse AIS": above.standard_error,
     }
     # The mean log weights are bounds of log Z in expectation for any spread of the weights.
-    return ObjectDensity(log_unnormalised, below.bound, above.bound, notes)
+    return ObjectDensity(lambda v: -machine.free_energy(v), below.bound, above.bound, notes)
 
 
 @torch.no_grad()
@@ -140,104 +119,20 @@ def _class_log_odds(train: SceneTensors) -> Tensor:
     return ((count + 0.5) / (len(train) - count + 0.5)).log()
 
 
-def density_task(model: Model, setting: Setting) -> Outcome | None:
+def density_task(density_of: DensityOf, setting: Setting) -> Outcome | None:
     """Measure the log-likelihood of the objects in nats, with the lower and upper log Z."""
-    density = model.density(setting) if model.density else None
+    density = density_of(setting)
     if density is None or setting.train is None:
         return None
     scenes = setting.some()
     log_sum = density.log_unnormalised(scenes.v).double().numpy()
     base = independent_density(setting.train).log_unnormalised(scenes.v).double().numpy()
-    metrics: dict[str, Metric] = {
-        "log-likelihood, upper log Z": Ratio.of_scenes(log_sum - density.upper),
-        "log-likelihood, lower log Z": Ratio.of_scenes(log_sum - density.lower),
-        "log-likelihood, independent classes": Ratio.of_scenes(base),
-        "gain over independent classes, upper log Z": Ratio.of_scenes(
-            log_sum - density.upper - base
-        ),
+    values = {
+        "log-likelihood, upper log Z": log_sum - density.upper,
+        "log-likelihood, lower log Z": log_sum - density.lower,
+        "log-likelihood, independent classes": base,
+        "gain over independent classes, upper log Z": log_sum - density.upper - base,
     }
+    metrics: dict[str, Metric] = {name: Ratio.of_scenes(value) for name, value in values.items()}
     notes = {"log Z, upper": density.upper, "log Z, lower": density.lower} | density.notes
     return Outcome.over(scenes, metrics, 0, notes)
-
-
-@dataclass(frozen=True, eq=False)
-class Ising:
-    """A fully visible Boltzmann machine with biases b (V,) and pairwise weights W (V, V).
-
-    Raises:
-        ValueError: the shapes of b and W disagree, or W is not symmetric with a zero diagonal.
-    """
-
-    b: Floats
-    W: Floats
-
-    def __post_init__(self) -> None:
-        V = len(self.b)
-        if self.W.shape != (V, V):
-            raise ValueError(f"W must be ({V}, {V}), not {self.W.shape}")
-        if np.diagonal(self.W).any() or not np.allclose(self.W, self.W.T):
-            raise ValueError("W must be symmetric with a zero diagonal")
-
-    def log_unnormalised(self, v: Tensor) -> Tensor:
-        """Return b·v + v'Wv / 2, (B,), for presence (B, V)."""
-        x = v.double()
-        W = torch.from_numpy(self.W)
-        return x @ torch.from_numpy(self.b) + ((x @ W) * x).sum(1) / 2
-
-    def log_partition(
-        self, a: Floats, start: Tensor, betas: Sequence[float], burn_in: int, seed: int
-    ) -> tuple[LogPartition, LogPartition]:
-        """Run forward and reverse annealing with one chain per row of `start`.
-
-        Args:
-            a: (V,) log-odds of the independent classes at beta = 0.
-            start: (chains, V) initial presence of the reverse chains.
-            betas: inverse temperatures, increasing from 0 to 1.
-            burn_in: number of sweeps of the reverse chains at beta = 1 before annealing.
-        """
-        rng = np.random.default_rng(seed)
-        log_base = float(np.logaddexp(0, a).sum())
-        chains = len(start)
-        state = State(self, (rng.random((len(a), chains)) < expit(a)[:, None]).astype(float))
-        weight = np.zeros(chains)
-        for warm, cold in pairwise(betas):
-            weight += (cold - warm) * state.gain(a)
-            state.sweep(a, cold, rng)
-        below = LogPartition.of_weights(log_base, torch.from_numpy(weight))
-        state = State(self, start.double().numpy().T.copy())
-        for _ in range(burn_in):
-            state.sweep(a, 1.0, rng)
-        weight = np.zeros(chains)
-        for warm, cold in zip(betas[-2::-1], betas[:0:-1], strict=True):
-            state.sweep(a, cold, rng)
-            weight -= (cold - warm) * state.gain(a)
-        return below, LogPartition.of_weights(log_base, torch.from_numpy(weight), reverse=True)
-
-
-class State:
-    """The states of all Gibbs chains, (classes, chains).
-
-    The class axis comes first, so that the values of one class are contiguous in memory.
-    """
-
-    def __init__(self, model: Ising, v: Floats) -> None:
-        self.model = model
-        self.v = v
-        self.field = model.W @ v
-
-    def gain(self, a: Floats) -> Floats:
-        """Return the log ratio of the pairwise model to independent classes, (chains,)."""
-        linear = (self.model.b - a) @ self.v
-        return np.asarray(linear + (self.field * self.v).sum(0) / 2)
-
-    def sweep(self, a: Floats, beta: float, rng: Rng) -> None:
-        """Sample each class once given the other classes, at the inverse temperature `beta`."""
-        uniform = rng.random(self.v.shape)
-        logits = np.log(uniform) - np.log1p(-uniform)
-        bias = (1 - beta) * a + beta * self.model.b
-        for i, (logit, old) in enumerate(zip(logits, self.v, strict=True)):
-            new = logit < bias[i] + beta * self.field[i]
-            changed = np.flatnonzero(new != old)
-            if len(changed):
-                self.field[:, changed] += np.outer(self.model.W[i], new[changed] - old[changed])
-                self.v[i] = new

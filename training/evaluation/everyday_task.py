@@ -22,7 +22,6 @@ from app.registry import Artifact
 from app.scene import Scene, SceneObject, opposite
 from training.datasets.files import DATA
 from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.model import Model
 from training.evaluation.setting import Outcome, Setting
 
 EVERYDAY = DATA.parent / "everyday"
@@ -46,10 +45,10 @@ LINES = (
 )
 """Names of the eleven counts of the report.
 
-Lower is better for the alarms in plain scenes (scenes without intruder) and for the last two names.
+Lower is better for the alarms in plain scenes (without intruder) and for the last two names.
 """
 
-_VERTICAL = ("on-top", "under", "above", "below")
+_VERTICAL = {"on-top", "under", "above", "below"}
 _NEWER = ("inside", "contains")
 _RELATIONS = 50
 _LISTED = 5
@@ -72,10 +71,10 @@ def facts_digest(folder: Path) -> str:
     return "" if path is None else sha256(path.read_bytes()).hexdigest()
 
 
-def everyday_task(model: Model, setting: Setting) -> Outcome | None:
+def everyday_task(artifact: Artifact, setting: Setting) -> Outcome | None:
     """Measure the everyday facts. Each fact counts as one scene. `setting.scenes` is not used."""
-    artifact, folder = model.artifact, setting.everyday
-    if artifact is None or folder is None or facts_file(folder) is None:
+    folder = setting.everyday
+    if folder is None or facts_file(folder) is None:
         return None
     metrics: dict[str, Metric] = {}
     count = 0
@@ -125,12 +124,10 @@ def _relations(artifact: Artifact, facts: list[dict[str, str]]) -> Lines:
     rows = []
     for fact in facts:
         p = _relation_probabilities(artifact, fact["subject"], fact["object"])
-        vertical = {name: value for name, value in p.items() if name in _VERTICAL}
-        relation = fact["relation"]
         likeliest = max(p, key=p.__getitem__, default="")
-        likeliest_vertical = max(vertical, key=vertical.__getitem__, default="")
-        is_likely = p.get(relation, 0.0) >= 0.5
-        rows.append((likeliest == relation, likeliest_vertical == relation, is_likely))
+        vertical = max(_VERTICAL & p.keys(), key=p.__getitem__, default="")
+        relation = fact["relation"]
+        rows.append((likeliest == relation, vertical == relation, p.get(relation, 0.0) >= 0.5))
     return _count_hits(LINES[:3], rows)
 
 
@@ -149,25 +146,23 @@ def _relation_probabilities(artifact: Artifact, subject: str, other: str) -> dic
     p: dict[str, float] = {}
     for entry in answer["relations"]:
         name = entry["relation"]
-        if name in _NEWER:
-            continue
-        name = name if entry["subject"] == subject else opposite(name)
-        p[name] = max(p.get(name, 0.0), entry["probability"])
+        if name not in _NEWER:
+            name = name if entry["subject"] == subject else opposite(name)
+            p[name] = max(p.get(name, 0.0), entry["probability"])
     return p
 
 
 def _missing(artifact: Artifact, name: str, facts: list[dict[str, Any]]) -> Lines:
-    hits = []
-    for fact in facts:
-        labels = {entry["label"] for entry in _first_missing(artifact, fact)}
-        hits.append([bool(labels & set(fact["expected"]))])
+    hits = [
+        [any(entry["label"] in fact["expected"] for entry in _first_missing(artifact, fact))]
+        for fact in facts
+    ]
     return _count_hits([f"{name}: an expected object is among five"], hits)
 
 
 def _first_missing(artifact: Artifact, fact: dict[str, Any]) -> list[Fields]:
     """Return the first five answers, or an empty list if the service would reject the request."""
-    scene = _scene(artifact, fact["objects"])
-    at = None
+    scene, at = _scene(artifact, fact["objects"]), None
     if "at" in fact:
         if (anchor := _object_index(artifact, scene, fact["at"]["object"])) is None:
             return []
@@ -189,22 +184,18 @@ def _object_index(artifact: Artifact, scene: Scene, name: str) -> int | None:
 def _outliers(
     artifact: Artifact, intruders: list[dict[str, Any]], plain: list[dict[str, Any]]
 ) -> Lines:
+    def ask(labels: Sequence[str]) -> tuple[list[str], set[str]]:
+        """Return the labels, the most suspicious first, and the labels of reported outliers."""
+        entries = questions.outliers(artifact, _scene(artifact, labels))["outliers"]
+        flagged = {entry["label"] for entry in entries if entry["is_outlier"]}
+        return [entry["label"] for entry in entries], flagged
+
     rows = []
     for fact in intruders:
-        answers = _outlier_entries(artifact, [*fact["objects"], fact["intruder"]])
-        is_first = bool(answers) and answers[0]["label"] == fact["intruder"]
-        flagged = {answer["label"] for answer in answers if answer["is_outlier"]}
-        rows.append((is_first, fact["intruder"] in flagged))
-    alarms = [
-        [any(answer["is_outlier"] for answer in _outlier_entries(artifact, fact["objects"]))]
-        for fact in plain
-    ]
+        ranked, flagged = ask([*fact["objects"], fact["intruder"]])
+        rows.append((ranked[:1] == [fact["intruder"]], fact["intruder"] in flagged))
+    alarms = [[bool(ask(fact["objects"])[1])] for fact in plain]
     return _count_hits(LINES[5:7], rows) | _count_hits(LINES[7:8], alarms)
-
-
-def _outlier_entries(artifact: Artifact, labels: Sequence[str]) -> list[Fields]:
-    entries: list[Fields] = questions.outliers(artifact, _scene(artifact, labels))["outliers"]
-    return entries
 
 
 def _scenes(artifact: Artifact, rooms: list[dict[str, Any]], seeds: list[int]) -> Lines:

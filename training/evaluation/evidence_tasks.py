@@ -39,7 +39,6 @@ from training.evaluation.asking import (
 )
 from training.evaluation.intruders import draw_intruders
 from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.model import Model
 from training.evaluation.relation_tasks import expected_hits
 from training.evaluation.setting import Outcome, Setting
 
@@ -74,19 +73,17 @@ class Case:
 
 
 def with_relations(encoded: EncodedScene, kind: str, between: Flags) -> tuple[Scene, Scene] | None:
-    """Return a scene with labels only, and with evidence; None if the scene lacks this evidence.
+    """Return a scene with labels only, and with evidence about the pairs `between`, (n, n).
 
-    `between` (instances, instances) are the pairs of instances with evidence.
+    Return None if the scene lacks this evidence.
     """
     bare = replace(scene_of(encoded, range(len(between)), ()), room_type=None)
     holds = encoded.instance_holds & between
     triples = tuple((int(a), int(i), int(j)) for a, i, j in np.argwhere(holds))
     if not triples or (kind == "poses" and encoded.instance_positions is None):
         return None
-    poses = None
-    if kind == "poses":
-        poses = PoseRelations(holds, encoded.instance_observed & between)
-    return bare, replace(bare, relations=triples, poses=poses)
+    poses = PoseRelations(holds, encoded.instance_observed & between)
+    return bare, replace(bare, relations=triples, poses=poses if kind == "poses" else None)
 
 
 def with_room(encoded: EncodedScene, kept: list[int]) -> tuple[Scene, Scene] | None:
@@ -145,84 +142,71 @@ def reciprocal_rank(artifact: Artifact, scene: Scene, target: int) -> float:
     return float((1.0 / np.arange(above + 1, above + ties + 1)).mean())
 
 
-def missing_evidence_task(model: Model, setting: Setting) -> Outcome | None:
+def missing_evidence_task(artifact: Artifact, setting: Setting) -> Outcome | None:
     """Measure T2 (missing objects) with labels only and with additional evidence."""
     structure = setting.structure.numpy()
     return _changes(
         "MRR",
-        model,
         setting,
-        lambda _, scenes, __: removals(scenes, structure, setting.seed),
-        lambda artifact, scene, case: reciprocal_rank(artifact, scene, case.target),
+        lambda scenes, _: removals(scenes, structure, setting.seed),
+        lambda scene, case: reciprocal_rank(artifact, scene, case.target),
         OF_OBJECTS,
     )
 
 
-def outliers_evidence_task(model: Model, setting: Setting) -> Outcome | None:
+def outliers_evidence_task(artifact: Artifact, setting: Setting) -> Outcome | None:
     """Measure T3 (outliers) with labels only and with additional evidence."""
-    structure = setting.structure.numpy()
 
-    def cases(artifact: Artifact, scenes: SceneTensors, _: str) -> Iterator[Case]:
+    def cases(scenes: SceneTensors, _: str) -> Iterator[Case]:
         intruders = draw_intruders(scenes, setting.structure, seed=setting.seed).numpy()
-        return intrusions(artifact, scenes, structure, intruders)
+        return intrusions(artifact, scenes, setting.structure.numpy(), intruders)
 
-    def value(artifact: Artifact, scene: Scene, case: Case) -> float:
+    def value(scene: Scene, case: Case) -> float:
         p = judge(artifact, scene)[:, 0]
-        is_highest = p == p.max()
-        return float(is_highest[case.target] / is_highest.sum())
+        return expected_hits(p, np.arange(len(p)) == case.target, 1)
 
-    return _changes("hit@1", model, setting, cases, value, OF_OBJECTS)
+    return _changes("hit@1", setting, cases, value, OF_OBJECTS)
 
 
-def relations_evidence_task(model: Model, setting: Setting) -> Outcome | None:
+def relations_evidence_task(artifact: Artifact, setting: Setting) -> Outcome | None:
     """Measure T1 (relations) with labels only and with additional evidence."""
 
-    def value(artifact: Artifact, scene: Scene, case: Case) -> float:
+    def cases(scenes: SceneTensors, kind: str) -> Iterator[Case]:
+        return halves(scenes, setting.structure.numpy(), kind, setting.seed)
+
+    def value(scene: Scene, case: Case) -> float:
         p, truth = relation_probabilities(artifact, scene)[case.queried], case.truth[case.queried]
         return expected_hits(p, truth, case.items)
 
-    return _changes(
-        "R-precision",
-        model,
-        setting,
-        lambda _, scenes, kind: halves(scenes, setting.structure.numpy(), kind, setting.seed),
-        value,
-        OF_RELATIONS,
-    )
+    return _changes("R-precision", setting, cases, value, OF_RELATIONS)
 
 
 def _changes(
     metric: str,
-    model: Model,
     setting: Setting,
-    cases_of: Callable[[Artifact, SceneTensors, str], Iterator[Case]],
-    value: Callable[[Artifact, Scene, Case], float],
+    cases_of: Callable[[SceneTensors, str], Iterator[Case]],
+    value: Callable[[Scene, Case], float],
     kinds: tuple[str, ...],
 ) -> Outcome | None:
     """Return the metric without and with each kind of evidence, and the change of the metric.
 
     Args:
-        cases_of: function that takes a model, scenes and a kind of evidence, and yields questions.
-        value: function that takes a model, one of the two scenes of a question, and the question.
-            It returns the metric of the answer, summed over the items of the question.
+        cases_of: function that yields the questions about scenes for a kind of evidence.
+        value: function of one of the two scenes of a question, and the question. It returns the
+            metric of the answer, summed over the items of the question.
     """
-    artifact = model.artifact
-    if artifact is None:
-        return None
     scenes = setting.some(related=kinds == OF_RELATIONS)
     metrics: dict[str, Metric] = {}
     skipped: list[int] = []
     for kind in kinds:
-        cases = list(cases_of(artifact, scenes, kind))
+        cases = list(cases_of(scenes, kind))
         if not cases:
             continue
-        values = np.array(
-            ask_every(lambda case: np.array([value(artifact, s, case) for s in case.scenes]), cases)
-        )
+        values = ask_every(lambda case: np.array([value(s, case) for s in case.scenes]), cases)
         index = [case.scene_index for case in cases]
         without, informed, items = (
             np.bincount(index, weights=column, minlength=len(scenes)).astype(np.float64)
-            for column in (*values.T, [case.items for case in cases])
+            for column in (*np.array(values).T, [case.items for case in cases])
         )
         metrics |= {
             f"change of {metric}, {kind}": Ratio(informed - without, items),
@@ -230,4 +214,4 @@ def _changes(
             f"{metric}, {kind} withheld": Ratio(without, items),
         }
         skipped.append(int((items == 0).sum()))
-    return Outcome.over(scenes, metrics, skipped[0]) if metrics else None
+    return Outcome.over(scenes, metrics, skipped[0] if skipped else 0)

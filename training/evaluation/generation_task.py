@@ -35,7 +35,7 @@ from training.datasets.batches import SceneTensors, subset
 from training.datasets.cases import some_scenes
 from training.evaluation.contradictions import contradiction_metrics, count_contradictions
 from training.evaluation.metrics import Metric, Ratio, Resampled
-from training.evaluation.model import Drawn, Model, Sampler
+from training.evaluation.model import Drawn, Sampler, SamplerOf
 from training.evaluation.setting import Outcome, Setting
 
 _RESAMPLES = 200
@@ -66,11 +66,8 @@ def independent_sampler(train: SceneTensors) -> Sampler:
 def scene_sampler(scenes: SceneTensors) -> Sampler:
     """Return a sampler that returns real scenes, to estimate the best possible value of a metric.
 
-    Without given classes, the sample with index k is scene k if its room type fits. Otherwise the
-    sample is a random scene with the given classes and room type.
-
-    Raises:
-        ValueError: no scene has the given classes and room type (raised by the sampler).
+    Without given classes, sample k is scene k if its room type fits. Otherwise it is a random scene
+    with the given classes and room type. Without such a scene, the sampler raises a ValueError.
     """
     counts = drawn_of(scenes).contradictions
 
@@ -124,18 +121,15 @@ def machine_sampler(artifact: Artifact, *, steps: int = STEPS) -> Sampler:
 
 
 def held_out_halves(setting: Setting) -> tuple[SceneTensors, SceneTensors]:
-    """Split held-out scenes into two halves: reference scenes, and scenes of an ideal sampler.
+    """Split held-out scenes into reference scenes and scenes of an ideal sampler, by groups.
 
-    A group of near-duplicate scenes stays in one half. The limit of the setting applies to each
-    half.
+    The limit of the setting applies to each half.
     """
     scenes = setting.scenes
     is_odd = torch.from_numpy(scenes.group_ids % 2 > 0)
     first, second = (subset(scenes, mask.nonzero().squeeze(1)) for mask in (~is_odd, is_odd))
-    return (
-        some_scenes(first, setting.limit, setting.seed),
-        some_scenes(second, setting.limit, setting.seed),
-    )
+    limit, seed = setting.limit, setting.seed
+    return some_scenes(first, limit, seed), some_scenes(second, limit, seed)
 
 
 def hamming(x: Tensor, y: Tensor) -> Tensor:
@@ -189,10 +183,7 @@ def marginal_error(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]
 
 
 def pair_correlation(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]:
-    """Return Pearson r of the class covariances as a function of the weights of held-out scenes.
-
-    The covariances are those of the most common held-out classes.
-    """
+    """Return Pearson r of the covariances of common classes, by weights of held-out scenes."""
     common = np.argsort(-held_out.sum(0), kind="stable")[:_COMMON_CLASSES]
     common = common[held_out[:, common].any(0)]
     x, y = drawn[:, common], held_out[:, common]
@@ -232,12 +223,10 @@ def generation_metrics(
     bandwidth: float,
     emphasis: Tensor | None = None,
 ) -> dict[str, Metric]:
-    """Compute all metrics of T4.
+    """Compute all metrics of T4 over the classes in `mask`, (classes,), of two or more scenes.
 
     Args:
-        drawn: at least two generated scenes.
         groups: (held-out scenes,) group of each held-out scene.
-        mask: (classes,) bool, the classes that the metrics use.
         bandwidth: bandwidth of the MMD kernel, as a Hamming distance.
         emphasis: (held-out scenes,) weights of the held-out scenes. None means equal weights.
     """
@@ -262,17 +251,15 @@ def generation_metrics(
     return metrics
 
 
-def generation_task(model: Model, setting: Setting) -> Outcome | None:
+def generation_task(sampler_of: SamplerOf, setting: Setting) -> Outcome | None:
     """Measure T4: compare generated scenes with the first half of the held-out scenes.
 
-    The number of generated scenes is the number of scenes in the second half. The scenes are
-    generated under three conditions: without evidence, with the room types of the second half, and
-    with one given class. The given classes are drawn from all (scene, class) pairs of the second
-    half, so scenes with many classes are drawn more often. With a given class, each scene of the
-    first half is therefore weighted by its number of classes. A perfect sampler then has no
-    discrepancy.
+    As many scenes as the second half has are generated under three conditions: without evidence,
+    with the room types of the second half, and with one given class. The given classes are drawn
+    from all (scene, class) pairs of the second half. With a given class, each scene of the first
+    half is therefore weighted by its number of classes. A perfect sampler then has no discrepancy.
     """
-    sampler = model.generate(setting) if model.generate else None
+    sampler = sampler_of(setting)
     if sampler is None or setting.train is None:
         return None
     first, second = held_out_halves(setting)
@@ -281,8 +268,7 @@ def generation_task(model: Model, setting: Setting) -> Outcome | None:
     if min(len(first), len(second), len(mentions)) < 2 or not first.v[:, mask].any():
         return None
     bandwidth = median_distance(first.v[:, mask])
-    no_classes = torch.zeros_like(second.v, dtype=torch.bool)
-    no_rooms = torch.full_like(second.room, -1)
+    no_classes, no_rooms = torch.zeros_like(second.v).bool(), torch.full_like(second.room, -1)
     order = np.random.default_rng(setting.seed).permutation(len(mentions))[: len(second)]
     classes = mentions[torch.from_numpy(order), 1]
     one_class = no_classes[: len(classes)].scatter(1, classes.unsqueeze(1), True)
@@ -293,10 +279,9 @@ def generation_task(model: Model, setting: Setting) -> Outcome | None:
         "given one class": (one_class, no_rooms[: len(one_class)], class_counts),
     }
     metrics: dict[str, Metric] = {}
+    truth = first.v, first.group_ids, setting.train.v, mask, bandwidth
     for name, (given, room, emphasis) in conditions.items():
-        drawn = sampler(given, room, setting.seed)
-        truth = first.v, first.group_ids
-        values = generation_metrics(drawn, *truth, setting.train.v, mask, bandwidth, emphasis)
+        values = generation_metrics(sampler(given, room, setting.seed), *truth, emphasis)
         metrics |= {f"{metric}, {name}": value for metric, value in values.items()}
     notes = {"bandwidth": bandwidth, "held-out scenes": len(first), "drawn scenes": len(second)}
     return Outcome(metrics, len(first), 0, notes)

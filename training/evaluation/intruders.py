@@ -22,8 +22,6 @@ of these classes. Both draws are uniform.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -32,6 +30,9 @@ from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import scene_rng
 
+LAWS = ("uniform", "by popularity", "signature")
+"""Distributions of intruders."""
+
 SIGNATURE = 10
 """Maximum number of signature classes of a room type."""
 
@@ -39,9 +40,6 @@ _SCENES = 20
 _LIFT = 5.0
 _OFTEN = 0.2
 _FOREIGN = 0.01
-
-# Function that takes scenes and training scenes, and returns sampling weights (scenes, classes).
-Law = Callable[[SceneTensors, SceneTensors], Tensor]
 
 
 def by_popularity(scenes: SceneTensors, train: SceneTensors) -> Tensor:
@@ -79,17 +77,12 @@ def signatures(train: SceneTensors) -> tuple[Flags, Floats]:
     """
     has_room = (train.room >= 0).numpy()
     v, room = train.v.numpy()[has_room] > 0, train.room.numpy()[has_room]
-    rooms = int(room.max(initial=-1)) + 1
-    share = np.full((rooms, v.shape[1]), np.nan)
+    share = np.full((int(room.max(initial=-1)) + 1, v.shape[1]), np.nan)
     typical = np.zeros(share.shape, dtype=np.bool_)
-    popularity = v.mean(0) if len(v) else np.zeros(v.shape[1])
-    for r in range(rooms):
-        room_scenes = v[room == r]
-        if len(room_scenes) < _SCENES:
-            continue
-        share[r] = room_scenes.mean(0)
+    for r in np.flatnonzero(np.bincount(room) >= _SCENES):
+        share[r] = v[room == r].mean(0)
         is_frequent = share[r] >= _OFTEN
-        lift = np.divide(share[r], popularity, where=is_frequent, out=np.zeros(v.shape[1]))
+        lift = np.divide(share[r], v.mean(0), where=is_frequent, out=np.zeros(v.shape[1]))
         ranked = np.argsort(-lift, kind="stable")[:SIGNATURE]
         typical[r, ranked[lift[ranked] >= _LIFT]] = True
     return typical, share
@@ -111,6 +104,14 @@ def by_signature(scenes: SceneTensors, train: SceneTensors) -> Tensor:
     return torch.from_numpy(weights)
 
 
+def intruder_weights(scenes: SceneTensors, train: SceneTensors | None) -> dict[str, Tensor | None]:
+    """Return the sampling weights of each law, (scenes, classes); only uniform without `train`."""
+    if train is None:
+        return {"uniform": None}
+    weights = (None, by_popularity(scenes, train), by_signature(scenes, train))
+    return dict(zip(LAWS, weights, strict=True))
+
+
 def draw_intruder_choices(
     scenes: SceneTensors, structure: Tensor, train: SceneTensors | None, seed: int = 0
 ) -> dict[tuple[str, str], Ints]:
@@ -118,9 +119,7 @@ def draw_intruder_choices(
 
     They are a uniform, a popular and a signature intruder; without `train`, only a uniform one.
     """
-    weights: list[Tensor | None] = [None]
-    if train is not None:
-        weights += [by_popularity(scenes, train), by_signature(scenes, train)]
+    weights = intruder_weights(scenes, train).values()
     # `ask_outliers` uses `seed` itself. Another seed keeps the draws independent.
     columns = [draw_intruders(scenes, structure, weight, seed + 1) for weight in weights]
     rows = torch.stack(columns, 1).numpy()

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm, t
 
 from training.datasets.array_types import Flags, Floats, Ints
-from training.evaluation.item_statistics import STATISTICS
+from training.evaluation.item_statistics import STATISTICS, by_score, reliability
 
 RESAMPLES = 1000
 
@@ -35,12 +35,9 @@ better in all of five groups with a probability of 1/32, which is more than 2.5 
 
 @dataclass(frozen=True)
 class Figure:
-    """A metric with its 95 % interval.
+    """A metric over `n` scored items, and its 95 % interval.
 
-    Attributes:
-        value: the metric over all scenes.
-        low, high: percentiles 2.5 and 97.5 over resampled groups, widened by `_widening`.
-        n: number of scored items (removed objects, relations, scenes).
+    The interval has the percentiles 2.5 and 97.5 over resampled groups, widened by `_widening`.
     """
 
     value: float
@@ -71,10 +68,12 @@ class Metric(ABC):
         groups: (G,) int64 ids of the groups of scenes, with groups that could not be scored. A
             metric per scene has one group for each scene.
         n: number of scored items.
+        draws: (resamples,) the metric over resampled groups; NaN where undefined.
     """
 
     groups: Ints
     n: int
+    draws: Floats
 
     @abstractmethod
     def at(self, weight: Floats) -> float:
@@ -93,11 +92,6 @@ class Metric(ABC):
     def value(self) -> float:
         """The metric over all scenes."""
         return self.at(np.ones(len(self.groups)))
-
-    @cached_property
-    def draws(self) -> Floats:
-        """The metric over resampled groups, (resamples,); NaN where undefined."""
-        return resample(self.at, len(self.groups))
 
     def figure(self) -> Figure:
         """Return the value with its interval."""
@@ -134,10 +128,8 @@ def _widening(groups: int) -> float:
 @lru_cache(maxsize=4)  # many metrics resample the same groups one after the other
 def group_weights(groups: int, resamples: int = RESAMPLES) -> Floats:
     """Return how often each resample draws each group, (resamples, groups); read-only."""
-    rng = np.random.default_rng(0)
-    weights = np.empty((resamples, groups))
-    for row in weights:
-        row[:] = np.bincount(rng.integers(groups, size=groups), minlength=groups)
+    draws = np.random.default_rng(0).integers(groups, size=(resamples, groups))
+    weights = np.array([np.bincount(row, minlength=groups) for row in draws], dtype=np.float64)
     weights.flags.writeable = False
     return weights
 
@@ -156,12 +148,9 @@ def _centred(drawn: Floats, value: float) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Ratio(Metric):
-    """Micro-average: sum(numerators) / sum(denominators) over scenes.
+    """Micro-average: sum(numerators) / sum(denominators) over scenes, all arrays (G,).
 
-    All arrays have the shape (G,). A skipped scene has denominator 0.
-
-    Raises:
-        ValueError: all denominators are 0.
+    A skipped scene has denominator 0. If all denominators are 0, a ValueError is raised.
     """
 
     numerators: Floats
@@ -202,7 +191,7 @@ class Ratio(Metric):
         return Ratio(top, below, ids)
 
     @cached_property
-    def draws(self) -> Floats:
+    def draws(self) -> Floats:  # type: ignore[override]
         # Two matrix products compute all resamples.
         weights = group_weights(len(self.groups))
         top, below = weights @ self.numerators, weights @ self.denominators
@@ -211,8 +200,7 @@ class Ratio(Metric):
     def mean_over_scenes(self) -> Ratio:
         """Return the metric with equal weight for every scored scene."""
         is_scored = self.denominators > 0
-        share = np.zeros(len(self.groups))
-        np.divide(self.numerators, self.denominators, where=is_scored, out=share)
+        share = self.numerators / np.where(is_scored, self.denominators, np.inf)
         return Ratio.of_scenes(share, is_scored)
 
     def __sub__(self, other: Ratio) -> Ratio:
@@ -227,19 +215,16 @@ class Ratio(Metric):
 
     @classmethod
     def join(cls, parts: Sequence[Self]) -> Ratio:
-        whole = cls(
-            np.concatenate([part.numerators for part in parts]),
-            np.concatenate([part.denominators for part in parts]),
-        )
-        return whole.by(np.concatenate([part.groups for part in parts]))
+        names = ("numerators", "denominators", "groups")
+        top, below, groups = (np.concatenate([getattr(p, name) for p in parts]) for name in names)
+        return cls(top, below).by(groups)
 
 
 @dataclass(frozen=True, eq=False)
 class Scored(Metric):
-    """A statistic of the scores of N items that belong to scenes, such as the calibration error.
+    """One of `STATISTICS` of the scores of N items that belong to scenes.
 
     Attributes:
-        statistic: name in `STATISTICS`.
         unit: (N,) position of the scene or group of each item in `groups`.
         score, truth: (N,) score and truth value of each item.
 
@@ -268,30 +253,30 @@ class Scored(Metric):
     @classmethod
     def join(cls, parts: Sequence[Self]) -> Scored:
         groups = np.concatenate([part.groups for part in parts])
-        starts = np.cumsum([0, *(len(part.groups) for part in parts)]).tolist()
-        shifted = [part.unit + start for part, start in zip(parts, starts[:-1], strict=True)]
-        return cls(
-            parts[0].statistic,
-            np.concatenate(shifted).astype(np.int64),
-            np.concatenate([part.score for part in parts]),
-            np.concatenate([part.truth for part in parts]),
-            groups,
-        ).by(groups)
+        starts = np.cumsum([0, *(len(part.groups) for part in parts)])[:-1]
+        unit = np.concatenate([p.unit + start for p, start in zip(parts, starts, strict=True)])
+        score, truth = (np.concatenate([getattr(p, x) for p in parts]) for x in ("score", "truth"))
+        return cls(parts[0].statistic, unit, score, truth, groups).by(groups)
 
     @property
     def n(self) -> int:  # type: ignore[override]
         return len(self.unit)
 
     @cached_property
-    def _prepared(self) -> Callable[[Floats], float]:
-        """The statistic as a function of item weights; items are sorted once for all resamples."""
-        return STATISTICS[self.statistic](self.score, self.truth)
+    def _by_score(self) -> tuple[Floats, Callable[[Floats], tuple[Floats, Floats]]]:
+        return by_score(self.score, self.truth)  # sorts the items once for all resamples
 
     def at(self, weight: Floats) -> float:
-        return self._prepared(weight[self.unit])
+        scores, count = self._by_score
+        return STATISTICS[self.statistic](scores, *count(weight[self.unit]))
+
+    def reliability(self) -> tuple[Floats, Floats]:
+        """Return the mean score and the share of true items of each bin of the ECE."""
+        scores, count = self._by_score
+        return reliability(scores, *count(np.ones(self.n)))
 
     @cached_property
-    def draws(self) -> Floats:
+    def draws(self) -> Floats:  # type: ignore[override]
         values = resample(self.at, len(self.groups))
         # Resampling inflates calibration errors, so these resamples are centred on the value.
         return _centred(values, self.value) if self.statistic == "ECE" else values
@@ -299,13 +284,9 @@ class Scored(Metric):
 
 @dataclass(frozen=True, eq=False)
 class Items:
-    """N scored items of some scenes, such as answers with their probabilities.
+    """N scored items of some scenes, such as answers: scene, score and truth value, all (N,).
 
-    Attributes:
-        scene: (N,) scene of each item.
-        score: (N,) score of each item.
-        truth: (N,) bool, the item is true.
-        skipped: number of scenes that could not be scored.
+    `skipped` is the number of scenes that could not be scored.
     """
 
     scene: Ints
@@ -330,11 +311,11 @@ class Items:
 
 @dataclass(frozen=True, eq=False)
 class Resampled(Metric):
-    """A metric of whole sets; only its value and its resamples are kept.
+    """A metric of which only its value and its resamples are kept, such as one of whole sets.
 
     Attributes:
         drawn: (resamples,) from `resample`.
-        items: number of scenes in the other set of the comparison.
+        items: number of scored items, such as scenes in the other set of a comparison.
     """
 
     point: float
@@ -364,34 +345,26 @@ class Resampled(Metric):
     def value(self) -> float:
         return self.point
 
-    def at(self, weight: Floats) -> float:
-        raise NotImplementedError("a metric of whole sets cannot be computed for weights")
-
-    @cached_property
-    def draws(self) -> Floats:
+    @property
+    def draws(self) -> Floats:  # type: ignore[override]
         return self.drawn
 
-
-class MeanOverSeeds(Metric):
-    """The mean of a metric over training seeds; all seeds use the same resamples."""
-
-    def __init__(self, members: Sequence[Metric]) -> None:
-        if not members:
-            raise ValueError("a mean over seeds needs at least one metric")
-        if not all(np.array_equal(member.groups, members[0].groups) for member in members):
-            raise ValueError("all seeds must have results on the same groups of scenes")
-        self.members = tuple(members)
-        self.groups, self.n = members[0].groups, members[0].n
-
-    @property
-    def value(self) -> float:
-        return float(np.mean([member.value for member in self.members]))
-
     def at(self, weight: Floats) -> float:
-        return float(np.mean([member.at(weight) for member in self.members]))
+        raise NotImplementedError("a resampled metric cannot be computed for weights")
 
-    @cached_property
-    def draws(self) -> Floats:
-        shortest = min(len(member.draws) for member in self.members)
-        mean: Floats = np.mean([member.draws[:shortest] for member in self.members], axis=0)
-        return mean
+
+def mean_over_seeds(members: Sequence[Metric]) -> Resampled:
+    """Return the mean of a metric over training seeds; all seeds use the same resamples.
+
+    Raises:
+        ValueError: there is no metric, or the metrics have different groups.
+    """
+    if not members:
+        raise ValueError("a mean over seeds needs at least one metric")
+    groups = members[0].groups
+    if not all(np.array_equal(member.groups, groups) for member in members):
+        raise ValueError("all seeds must have results on the same groups of scenes")
+    shortest = min(len(member.draws) for member in members)
+    drawn: Floats = np.mean([member.draws[:shortest] for member in members], axis=0)
+    value = float(np.mean([member.value for member in members]))
+    return Resampled(value, drawn, groups, members[0].n)

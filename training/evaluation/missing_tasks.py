@@ -22,13 +22,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from app.registry import Artifact
 from app.scene import CANONICAL
 from training.datasets.array_types import Ints
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import scene_rng
 from training.evaluation.asking import ask_every, ask_rows, missing_probabilities, of_classes
 from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.model import Model, ObjectScore, PlacedScore, Places
+from training.evaluation.model import ObjectScore, PlacedScore, Places
 from training.evaluation.parts import (
     Ranking,
     Size,
@@ -67,15 +68,13 @@ def rank_missing(
     return rank_hidden(parts, structure, ask_rows(score, v))
 
 
-def missing_task(model: Model, setting: Setting) -> Outcome | None:
+def missing_task(score: ObjectScore, setting: Setting) -> Outcome | None:
     """Measure T2, without structure and with the structure of the scene."""
-    if model.missing is None:
-        return None
     scenes, structure = setting.some(), setting.structure
     metrics: dict[str, Metric] = {}
     skipped = 0
     for name, size in SIZES.items():
-        ranking = rank_missing(scenes, structure, model.missing, size)
+        ranking = rank_missing(scenes, structure, score, size)
         if not len(ranking.target):
             return None
         skipped = ranking.skipped
@@ -83,23 +82,20 @@ def missing_task(model: Model, setting: Setting) -> Outcome | None:
         if size is all_but_one:
             metrics |= {f"top-{k}": ranking.top(k) for k in TOP}
             metrics["MRR, unknown labels score 0"] = _with_unknown(ranking.mrr(), scenes, structure)
-        listed = rank_missing(scenes, structure, model.missing, size, structure_listed=True)
+        listed = rank_missing(scenes, structure, score, size, structure_listed=True)
         metrics[f"MRR, {name}, structure listed"] = listed.mrr()
     return Outcome.over(scenes, metrics, skipped)
 
 
 def _with_unknown(mrr: Ratio, scenes: SceneTensors, structure: Tensor) -> Ratio:
-    """Return the MRR if the removed class is drawn from the unknown labels too, which score 0."""
+    """Return the MRR if unknown labels are removed too, which score 0."""
     known = ((scenes.v > 0) & ~structure).sum(1).clamp(min=1).double().numpy()
     unknown = np.array([len(scene.unknown) for scene in scenes.scenes])
     return Ratio(mrr.numerators, mrr.denominators * (1 + unknown / known))
 
 
-def structure_task(model: Model, setting: Setting) -> Outcome | None:
+def structure_task(artifact: Artifact, setting: Setting) -> Outcome | None:
     """Measure the mean change of the first ten probabilities if the request lists structure."""
-    artifact = model.artifact
-    if artifact is None:
-        return None
     scenes = setting.some()
     parts = draw_parts(scenes, setting.structure, up_to_longest, (setting.seed,))
     labels = (artifact.vocabulary.index(label) for label in _STRUCTURE)
@@ -124,12 +120,9 @@ def removed_places(
 ) -> tuple[Tensor, Tensor, Places]:
     """Return the indices of the scenes (N,), the removed classes (N,), and the places."""
     removals: list[tuple[int, int, int, int, bool]] = []
-    not_structure = ~structure.numpy()
     for k, scene in enumerate(scenes.scenes):
         evidence = scene.evidence
-        is_thing = not_structure[evidence.classes]
-        if is_thing.sum() < 2:
-            continue
+        is_thing = ~structure.numpy()[evidence.classes]
         pair = is_thing[:, None] & is_thing & ~np.eye(len(is_thing), dtype=np.bool_)
         triples = np.argwhere(evidence.holds & pair)
         rng = scene_rng(scene, seed)
@@ -143,9 +136,9 @@ def removed_places(
     row, target, relation, anchor, outgoing = table.unbind(1)
     v = (scenes.v[row] * ~structure).scatter(1, target.unsqueeze(1), 0.0)
     counts = torch.zeros_like(v)
-    for question, k in enumerate(row.tolist()):
+    for own, k in zip(counts, row.tolist(), strict=True):
         evidence = scenes.scenes[k].evidence
-        counts[question, torch.from_numpy(evidence.classes)] = torch.tensor(evidence.counts).float()
+        own[torch.from_numpy(evidence.classes)] = torch.tensor(evidence.counts).float()
     return row, target, Places(v, counts * v, relation, anchor, outgoing.bool())
 
 
@@ -154,25 +147,18 @@ def leave_one_out_at(
 ) -> tuple[Ranking, Ints]:
     """Return the rank of every removed class among the absent classes, and its relation (N,)."""
     row, target, places = removed_places(scenes, structure, seed)
-    values = places.v
-    if len(row):
-        index = torch.arange(len(row))
-        values = ask_rows(lambda index: score(places.rows(index)), index, block=16)
+    values = ask_rows(lambda *columns: score(Places(*columns)), *vars(places).values(), block=16)
     values = values.masked_fill((places.v > 0) | structure, -torch.inf)
     skipped = len(scenes) - len(row.unique())
     return Ranking.of(row, target, values, len(scenes), skipped), places.relation.numpy()
 
 
-def placed_task(model: Model, setting: Setting) -> Outcome | None:
+def placed_task(score: PlacedScore, setting: Setting) -> Outcome | None:
     """Measure T2-at."""
-    if model.at_place is None:
-        return None
     scenes, structure = setting.some(related=True, share=3), setting.structure
-    ranking, relation = leave_one_out_at(scenes, structure, model.at_place, seed=setting.seed)
+    ranking, relation = leave_one_out_at(scenes, structure, score, seed=setting.seed)
     if not len(relation):
         return None
     metrics: dict[str, Metric] = {"MRR": ranking.mrr()}
-    for a, name in enumerate(CANONICAL):
-        if (relation == a).any():
-            metrics[f"MRR, {name}"] = ranking.mrr(relation == a)
+    metrics |= {f"MRR, {CANONICAL[a]}": ranking.mrr(relation == a) for a in np.unique(relation)}
     return Outcome.over(scenes, metrics, ranking.skipped)

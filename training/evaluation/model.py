@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor
@@ -17,13 +17,8 @@ from training.evaluation.setting import Setting
 # Function that takes presence (scenes, classes) and returns log-odds (scenes, classes).
 ObjectScore = Callable[[Tensor], Tensor]
 
-
-class RoomScore(Protocol):
-    """Function from lists (B, V) and the name of a profile, or "", to log p (B, room types)."""
-
-    def __call__(self, v: Tensor, profile: str) -> Tensor: ...
-
-
+# Function from lists (B, V) and the name of a profile, or "", to log p (B, room types).
+RoomScore = Callable[[Tensor, str], Tensor]
 # Function that takes lists (B, V) and a sensitivity, and returns the reported outliers (B, V) bool.
 Flagged = Callable[[Tensor, Sensitivity], Tensor]
 
@@ -33,10 +28,8 @@ class Places:
     """B scenes with a removed class, and the place of the removed class.
 
     Attributes:
-        v: (B, V) presence of the remaining classes.
-        counts: (B, V) instances of the remaining classes, 0 elsewhere.
-        relation: (B,) int64 canonical relation.
-        anchor: (B,) int64 class at the other end of the relation.
+        v, counts: (B, V) presence and instances of the remaining classes.
+        relation, anchor: (B,) int64 canonical relation, and class at its other end.
         outgoing: (B,) bool, the removed class is the subject of the relation.
     """
 
@@ -48,7 +41,7 @@ class Places:
 
     def rows(self, index: Tensor) -> Places:
         """Select the scenes at the given indices."""
-        return Places(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+        return Places(*(column[index] for column in vars(self).values()))
 
 
 # Function that returns scores (B, V): higher means more likely missing from the place.
@@ -65,9 +58,8 @@ class ObjectDensity:
     """A probability distribution over presence vectors, which list the classes of a scene.
 
     Attributes:
-        log_unnormalised: function that takes presence vectors (B, V) and returns their
-            log-likelihood + log Z, (B,).
-        upper: upper estimate of log Z. It equals `lower` if log Z is exact.
+        log_unnormalised: function from presence (B, V) to its log-likelihood + log Z, (B,).
+        lower, upper: estimates of log Z; equal if log Z is exact.
         notes: estimates of log Z and their standard errors, by name.
     """
 
@@ -79,27 +71,18 @@ class ObjectDensity:
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """Generated scenes.
-
-    Attributes:
-        contradictions: (scenes, 4) from `count_contradictions`. None if the sampler generates no
-            relations.
-    """
+    """Generated scenes, (scenes, V), and `count_contradictions` of their relations, if any."""
 
     v: Tensor
     contradictions: Tensor | None = None
 
 
-class Sampler(Protocol):
-    """Function that generates scenes, one for each row of `given`.
-
-    Args:
-        given: (scenes, classes) bool, the classes that each scene must contain.
-        room: (scenes,) int64 room type of each scene; -1 if the room type is free.
-    """
-
-    def __call__(self, given: Tensor, room: Tensor, seed: int) -> Drawn: ...
-
+# Function that generates scenes from the classes that each scene must contain, (scenes, classes)
+# bool, the room type of each scene, (scenes,) int64 or -1 for any, and a seed.
+Sampler = Callable[[Tensor, Tensor, int], Drawn]
+# Functions of the setting; None if its scenes allow no answer.
+SamplerOf = Callable[[Setting], Sampler | None]
+DensityOf = Callable[[Setting], ObjectDensity | None]
 
 Parameters: TypeAlias = Mapping[str, float | int | str]
 
@@ -108,9 +91,7 @@ Parameters: TypeAlias = Mapping[str, float | int | str]
 class Trial:
     """The result of one point of a hyperparameter grid.
 
-    Attributes:
-        seconds: wall time of fit and evaluation in seconds. Work that was already done for earlier
-            grid points is not included.
+    `seconds` is the wall time of fit and evaluation, without work done for earlier grid points.
     """
 
     parameters: Parameters
@@ -125,18 +106,15 @@ class Model:
     Each attribute answers the questions of one task. It is None if the model does not answer them.
 
     Attributes:
-        missing: score of T2, missing objects.
-        at_place: score of T2-at, missing objects at a place.
+        missing, at_place: scores of T2 and T2-at, missing objects in a scene and at a place.
         suspicion: score of T3, intruders: it takes lists (B, V) and returns the suspicion of each
             listed class (B, V), -inf for other classes. By default `suspicion_of(missing)`.
         flags: outliers that a published model reports.
-        relations: score of T1a, relations of a scene.
-        completion: score of T1b; the batch observes the given triples.
-        false_relations: score of T3b; the batch observes all triples, one of them false.
+        relations, completion, false_relations: scores of T1a, T1b and T3b. The batch observes no
+            relation, the given triples, or all triples with one false triple.
         misplaced: score of T3c, moved objects.
         rooms: log-probabilities of the room types.
-        generate: function that takes the setting and returns the sampler of T4, or None.
-        density: function that takes the setting and returns the density of objects, or None.
+        generate, density: sampler of T4 and density of objects for a setting.
         artifact: model for Calibration and for all questions to the service.
         parameters: number of trained weights, or None if this number is not meaningful.
         trials: all settings that the tuning of a baseline tried, in order.
@@ -151,8 +129,8 @@ class Model:
     false_relations: RelationScore | None = None
     misplaced: MisplacedScore | None = None
     rooms: RoomScore | None = None
-    generate: Callable[[Setting], Sampler | None] | None = None
-    density: Callable[[Setting], ObjectDensity | None] | None = None
+    generate: SamplerOf | None = None
+    density: DensityOf | None = None
     artifact: Artifact | None = None
     parameters: int | None = None
     trials: tuple[Trial, ...] = ()

@@ -31,7 +31,7 @@ from training.datasets.cases import scene_rng, some_scenes
 from training.datasets.moved import moved_scene, untouched_scene
 from training.evaluation.asking import ask_every
 from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.model import MisplacedScore, Model
+from training.evaluation.model import MisplacedScore
 from training.evaluation.setting import Outcome, Setting
 
 ALARMS: Final = 0.05
@@ -44,11 +44,9 @@ _SCENES: Final = 300  # maximum number of scenes of a source
 
 @dataclass(frozen=True, eq=False)
 class MovedCase:
-    """A scene with a moved object, and the same scene without the move.
+    """A scene with the moved object `object`, and the same scene without the move.
 
-    Attributes:
-        place: index of the scene in its set.
-        object: id of the moved object.
+    `place` is the index of the scene in its set.
     """
 
     place: int
@@ -97,12 +95,10 @@ def _highest(entries: Sequence[Mapping[str, Any]], object_: str | None = None) -
 
 
 def flagged(suspicion: Floats, untouched: Floats, source: Ints) -> Flags:
-    """Return whether each suspicion exceeds the threshold of its source, (N,).
+    """Return whether each suspicion exceeds the threshold of its source, all (N,).
 
-    Args:
-        suspicion: (N,) highest probability about the moved object.
-        untouched: (N,) highest probability in the untouched scene.
-        source: (N,) index of the data source.
+    `suspicion` is the highest probability about the moved object, `untouched` that in the untouched
+    scene.
     """
     is_flagged = np.zeros(len(source), dtype=np.bool_)
     for name in np.unique(source):
@@ -113,15 +109,13 @@ def flagged(suspicion: Floats, untouched: Floats, source: Ints) -> Flags:
     return is_flagged
 
 
-def moved_task(model: Model, setting: Setting) -> Outcome | None:
+def moved_task(score: MisplacedScore, setting: Setting) -> Outcome | None:
     """Measure T3c."""
-    if model.misplaced is None:
-        return None
     scenes = some_scenes(setting.some(related=True), _SCENES, setting.seed)
     cases = moved_cases(scenes, setting.structure, setting.seed)
     if not cases:
         return None
-    first, suspicion, untouched = ask_moved(model.misplaced, cases).T
+    first, suspicion, untouched = ask_moved(score, cases).T
     place = np.array([case.place for case in cases])
     is_flagged = flagged(suspicion, untouched, scenes.source.numpy()[place])
     values = first, is_flagged.astype(np.float64)

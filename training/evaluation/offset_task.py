@@ -15,10 +15,10 @@ from typing import Final
 import numpy as np
 from scipy.stats import chi2
 
+from app.registry import Artifact
 from app.scene import CANONICAL
 from training.datasets.offsets import observed_offsets
 from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.model import Model
 from training.evaluation.setting import Outcome, Setting
 
 SHARE: Final = 0.8
@@ -34,12 +34,12 @@ METRICS: Final = (
 )
 
 
-def offsets_task(model: Model, setting: Setting) -> Outcome | None:
+def offsets_task(artifact: Artifact, setting: Setting) -> Outcome | None:
     """Measure the share of covered offsets for each relation, and the distances for all relations.
 
     Return None if the model has no offsets, or if no scene has related objects with poses.
     """
-    if model.artifact is None or (offsets := model.artifact.offsets) is None:
+    if (offsets := artifact.offsets) is None:
         return None
     scenes = setting.scenes.scenes
     all_offsets = observed_offsets(scenes)

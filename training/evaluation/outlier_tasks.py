@@ -19,26 +19,15 @@ from torch import Tensor
 from training.datasets.array_types import Floats
 from training.datasets.batches import SceneTensors
 from training.evaluation.asking import SENSITIVITIES, ask_rows
-from training.evaluation.intruders import by_popularity, by_signature, draw_intruders
+from training.evaluation.intruders import draw_intruders, intruder_weights
 from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.missing_tasks import SEEDS
-from training.evaluation.model import Model, ObjectScore
+from training.evaluation.model import Flagged, Model, ObjectScore
 from training.evaluation.parts import draw_parts, exactly
 from training.evaluation.setting import Outcome, Setting
 
 LENGTHS: Final = (1, 2, 3, 5, 8)
 """Numbers of listed classes in which alarms are measured."""
-
-LAWS: Final = ("uniform", "by popularity", "signature")
-"""Distributions of intruders, see `training.evaluation.intruders`."""
-
-
-def intruder_weights(scenes: SceneTensors, train: SceneTensors | None) -> dict[str, Tensor | None]:
-    """Return the sampling weights of each law, (scenes, classes); only uniform without `train`."""
-    if train is None:
-        return {"uniform": None}
-    weights = (None, by_popularity(scenes, train), by_signature(scenes, train))
-    return dict(zip(LAWS, weights, strict=True))
 
 
 def with_intruders(
@@ -90,14 +79,11 @@ def outliers_task(model: Model, setting: Setting) -> Outcome | None:
             flagged = ask_rows(lambda v: flags(v, "medium").float(), v)
             caught = flagged.gather(1, intruder.unsqueeze(1)).squeeze(1).numpy()
             metrics[f"flagged, {law}"] = Ratio.of_items(scene.numpy(), caught, len(scenes))
-    return Outcome.over(scenes, metrics, skipped) if metrics else None
+    return Outcome.over(scenes, metrics, skipped)
 
 
-def alarms_task(model: Model, setting: Setting) -> Outcome | None:
+def alarms_task(flags: Flagged, setting: Setting) -> Outcome | None:
     """Measure the share of untouched random parts with an alarm, by sensitivity and length."""
-    flags = model.flags
-    if flags is None:
-        return None
     scenes = setting.some()
     metrics: dict[str, Metric] = {}
     skipped = len(scenes)
@@ -110,4 +96,4 @@ def alarms_task(model: Model, setting: Setting) -> Outcome | None:
             alarm = ask_rows(lambda v: flags(v, name).any(1).float(), parts.v).numpy()  # noqa: B023
             metric = Ratio.of_items(parts.scene.numpy(), alarm, len(scenes))
             metrics[f"alarms, {name}, {length} classes"] = metric
-    return Outcome.over(scenes, metrics, skipped) if metrics else None
+    return Outcome.over(scenes, metrics, skipped)

@@ -9,11 +9,10 @@ Intervals come from resampled groups: groups of scenes, or objects of one class.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 
 import torch
 
@@ -31,9 +30,8 @@ from training.datasets.batches import scene_tensors
 from training.datasets.readers import guess_format
 from training.datasets.records import digest_of
 from training.evaluation.artifact_model import artifact_model
-from training.evaluation.metrics import Metric
 from training.evaluation.placing_task import TASK, Room, placing_metrics, rooms_of
-from training.evaluation.report import Progress, measure, silent
+from training.evaluation.report import Progress, card_figures, card_rows, measure, silent
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import TASKS, WHOLE_SET
 
@@ -41,22 +39,6 @@ ROOM_TASKS: Final = tuple(name for name in TASKS if name not in (*WHOLE_SET, "De
 """Tasks that a room list is asked. The others compare the answers with training scenes."""
 
 _TABLES: Final = (".tsv", ".tsv.gz")
-
-
-class OutsideTest(ABC):
-    """The questions of one file."""
-
-    @abstractmethod
-    def measure(self, artifact: Artifact, progress: Progress = silent) -> list[CardMetric]:
-        """Ask a model. Return the figures of each source."""
-
-    @abstractmethod
-    def trained(self, artifact: Artifact) -> list[str]:
-        """Return the sources of the file that are training data of the model."""
-
-    @abstractmethod
-    def remark(self, artifact: Artifact) -> str:
-        """Return a remark on labels that the model does not know, or an empty string."""
 
 
 def read_test(path: Path) -> OutsideTest:
@@ -83,7 +65,7 @@ def read_test(path: Path) -> OutsideTest:
 
 
 @dataclass(frozen=True, eq=False)
-class PlacingTable(OutsideTest):
+class PlacingTable:
     """The rooms of a placing table by source."""
 
     rooms: Mapping[str, list[Room]]
@@ -93,7 +75,7 @@ class PlacingTable(OutsideTest):
         figures: list[CardMetric] = []
         for source, rooms in self.rooms.items():
             progress(f"{source}: {TASK}")
-            figures += _figures(TASK, source, placing_metrics(artifact, rooms))
+            figures += card_rows(TASK, source, placing_metrics(artifact, rooms))
         return figures
 
     def trained(self, artifact: Artifact) -> list[str]:
@@ -107,7 +89,7 @@ class PlacingTable(OutsideTest):
 
 
 @dataclass(frozen=True, eq=False)
-class RoomList(OutsideTest):
+class RoomList:
     """The scenes of a file, with the name of the file as source."""
 
     source: str
@@ -128,13 +110,9 @@ class RoomList(OutsideTest):
         structure = torch.from_numpy(vocabulary.structure.copy())
         setting = Setting(scenes, structure, train=scenes, limit=None)
         model = artifact_model(artifact, scenes)
-        report = measure(model, setting, self.source, tasks=ROOM_TASKS, progress=progress)
-        figures: list[CardMetric] = []
-        for task, outcome in report.outcomes.items():
-            metrics = {} if outcome is None else outcome.metrics
-            shown = {name: metrics[name] for name in TASKS[task].card if name in metrics}
-            figures += _figures(task, self.source, shown)
-        return figures
+        return card_figures(
+            measure(model, setting, self.source, tasks=ROOM_TASKS, progress=progress)
+        )
 
     def trained(self, artifact: Artifact) -> list[str]:
         """Return the source if the model learnt from exactly these scenes."""
@@ -150,15 +128,9 @@ class RoomList(OutsideTest):
         """Return the number of objects with unknown labels."""
         labels = [thing.label for scene in self.scenes for thing in scene.objects]
         unknown = sum(artifact.vocabulary.index(label) is None for label in labels)
-        if not unknown:
-            return ""
-        return (
-            f"{unknown:,} of {len(labels):,} objects are left out, because their labels are unknown"
-        )
+        reason = "objects are left out, because their labels are unknown"
+        return f"{unknown:,} of {len(labels):,} {reason}" if unknown else ""
 
 
-def _figures(task: str, source: str, metrics: Mapping[str, Metric]) -> Iterator[CardMetric]:
-    """Generate the figures of a task with an interval, which needs two groups."""
-    for name, metric in metrics.items():
-        if len(metric.groups) > 1:
-            yield CardMetric(task=task, source=source, metric=name, **asdict(metric.figure()))
+OutsideTest: TypeAlias = PlacingTable | RoomList
+"""The questions of one file."""

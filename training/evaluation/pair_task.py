@@ -59,6 +59,11 @@ class ScenePairs:
     ends: Ints
     listed: Flags
 
+    @property
+    def classes(self) -> Ints:
+        """Class indices of each pair, (P, 2)."""
+        return self.scene.evidence.classes[self.ends]
+
 
 # Function that returns probabilities (P, 2 A) for the pairs of a scene.
 PairScore = Callable[[ScenePairs], Floats]
@@ -75,11 +80,8 @@ def listed_pairs(
         related = holds[[a for a in relations if a < len(holds)]].any(0)
         is_thing = not_structure[scene.evidence.classes]
         pair = np.triu(related | related.T, 1) & is_thing[:, None] & is_thing
-        ends = np.argwhere(pair)
-        if len(ends):
-            x, y = ends.T
-            listed = np.concatenate([holds[:, x, y], holds[:, y, x]]).T
-            pairs.append(ScenePairs(index, scene, ends, listed))
+        if len(ends := np.argwhere(pair)):
+            pairs.append(ScenePairs(index, scene, ends, _both_ways(holds, ends)))
     return pairs
 
 
@@ -88,12 +90,10 @@ def service_score(artifact: Artifact) -> PairScore:
 
     def score(question: ScenePairs) -> Floats:
         scene, classes = question.scene, question.scene.evidence.classes
-        first = [int(np.flatnonzero(scene.instance_classes == c)[0]) for c in classes]
-        ends = [(first[x], first[y]) for x, y in question.ends.tolist()]
-        pairs = ends + [(y, x) for x, y in ends]
-        p = relation_probabilities(artifact, labels_alone(scene), pairs)
-        x, y = np.array(ends).T
-        return np.concatenate([p[:, x, y], p[:, y, x]]).T
+        first = np.array([np.flatnonzero(scene.instance_classes == c)[0] for c in classes])
+        ends = first[question.ends]
+        pairs = [tuple(pair) for pair in np.concatenate([ends, ends[:, ::-1]]).tolist()]
+        return _both_ways(relation_probabilities(artifact, labels_alone(scene), pairs), ends)
 
     return score
 
@@ -104,11 +104,15 @@ def baseline_score(scenes: SceneTensors, relations: RelationScore) -> PairScore:
     @torch.no_grad()
     def score(question: ScenePairs) -> Floats:
         batch = scenes.batch(torch.tensor([question.place]))
-        p = relations(telling(batch))[0].double().sigmoid().numpy()
-        x, y = question.ends.T
-        return np.concatenate([p[:, x, y], p[:, y, x]]).T
+        return _both_ways(relations(telling(batch))[0].double().sigmoid().numpy(), question.ends)
 
     return score
+
+
+def _both_ways(table: NDArray[Any], ends: NDArray[Any]) -> NDArray[Any]:
+    """Return the entries of a table (A, n, n) for pairs (P, 2) in both directions, (P, 2 A)."""
+    x, y = ends.T
+    return np.concatenate([table[:, x, y], table[:, y, x]]).T
 
 
 def accuracy(p: Floats, listed: Flags) -> Floats:
@@ -192,7 +196,7 @@ def _ask(model: Model, setting: Setting, relations: Sequence[int]) -> _Answers |
     return _Answers(
         scenes,
         np.repeat([q.place for q in questions], [len(q.ends) for q in questions]),
-        np.concatenate([q.scene.evidence.classes[q.ends] for q in questions]),
+        np.concatenate([q.classes for q in questions]),
         np.concatenate(ask_every(score, questions)),
         np.concatenate([q.listed for q in questions]),
     )

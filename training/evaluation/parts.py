@@ -8,7 +8,7 @@ scene depend only on the seed and the id of the scene.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
@@ -47,8 +47,7 @@ class Parts:
 
     Attributes:
         scene: (N,) int64, index of the scene.
-        v: (N, V) 1 for listed classes.
-        hidden: (N, V) bool, True for hidden classes.
+        v, hidden: (N, V) 1 for listed classes; True for hidden classes.
         scenes: number of scenes of the set, with the scenes without a part.
     """
 
@@ -120,10 +119,8 @@ class Ranking:
     """Ranks of all hidden classes of a set of scenes.
 
     Attributes:
-        scene: (N,) index of the scene in the set.
-        target: (N,) the hidden class.
-        above: (N,) number of candidates with a higher score.
-        ties: (N,) number of other candidates with the same score.
+        scene, target: (N,) index of the scene in the set, and the hidden class.
+        above, ties: (N,) number of candidates with a higher score, and of others with the same.
         skipped: number of scenes with too few classes.
     """
 
@@ -180,6 +177,13 @@ def rank_hidden(parts: Parts, structure: Tensor, values: Tensor) -> Ranking:
     return Ranking.of(parts.scene[row], target, competing, parts.scenes, parts.skipped)
 
 
+def real_sources(scenes: SceneTensors) -> Iterator[tuple[str, SceneTensors]]:
+    """Generate `REAL_SOURCES` by name, with their scenes; all sources if there are no real ones."""
+    names = np.array([scene.source for scene in scenes.scenes], dtype=np.str_)
+    for name in [x for x in REAL_SOURCES if x in names] or np.unique(names).tolist():
+        yield name, subset(scenes, torch.from_numpy(np.flatnonzero(names == name)))
+
+
 @torch.no_grad()
 def validation_score(
     score_function: ListScore, scenes: SceneTensors, structure: Tensor, seed: int = 0
@@ -187,36 +191,24 @@ def validation_score(
     """Return the mean over real sources of the MRR of hidden classes; NaN without hidden classes.
 
     The MRR of a source is the mean of two MRRs: of random parts of 1 to `LONGEST` classes, and of
-    parts of all classes but one. At most 400 scenes of each source take part. If the scenes
-    contain no source of `REAL_SOURCES`, all sources count.
-
-    Args:
-        score_function: function of lists (B, V) of zeros and ones, and their share bins (B,), see
-            `share_bin`. It returns scores (B, V). Higher scores mean likelier classes.
-        scenes: validation scenes. Scenes with incomplete object lists are left out, unless all
-            lists are incomplete.
-        structure: (V,) bool, True for structure classes.
+    parts of all classes but one. At most 400 scenes of each source take part. Scenes with
+    incomplete object lists are left out, unless all lists are incomplete. If the scenes contain no
+    source of `REAL_SOURCES`, all sources count.
 
     Raises:
         FloatingPointError: a score is NaN.
     """
-    names = np.array([scene.source for scene in scenes.scenes], dtype=np.str_)
-    usable = scenes.complete.numpy() if bool(scenes.complete.any()) else ~scenes.complete.numpy()
-    sources = [name for name in REAL_SOURCES if (usable & (names == name)).any()]
     values = []
-    for source in sources or np.unique(names[usable]).tolist():
-        index = torch.from_numpy(np.flatnonzero(usable & (names == source)))
-        sample = some_scenes(subset(scenes, index), _SCENES, seed)
+    some = scenes.complete if bool(scenes.complete.any()) else ~scenes.complete
+    for _, own in real_sources(subset(scenes, some.nonzero().squeeze(1))):
+        sample = some_scenes(own, _SCENES, seed)
         for size in (up_to_longest, all_but_one):
             parts = draw_parts(sample, structure, size, (seed,))
-            if len(parts.v):
-                values.append(_mrr(score_function, parts, structure))
+            if not len(parts.v):
+                continue
+            listed = parts.v.sum(1)
+            bins = share_bin(listed, listed + parts.hidden.sum(1))
+            blocks = zip(parts.v.split(_BLOCK), bins.split(_BLOCK), strict=True)
+            scores = torch.cat([score_function(v, block) for v, block in blocks])
+            values.append(rank_hidden(parts, structure, scores).mrr().value)
     return float(np.mean(values)) if values else float("nan")
-
-
-def _mrr(score_function: ListScore, parts: Parts, structure: Tensor) -> float:
-    listed = parts.v.sum(1)
-    bins = share_bin(listed, listed + parts.hidden.sum(1))
-    blocks = zip(parts.v.split(_BLOCK), bins.split(_BLOCK), strict=True)
-    scores = torch.cat([score_function(v, block) for v, block in blocks])
-    return rank_hidden(parts, structure, scores).mrr().value

@@ -38,13 +38,7 @@ TASK: Final = "Placing"
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """A room of a source, with n objects and m receptacles.
-
-    Attributes:
-        name: name of the room type.
-        objects, receptacles: their labels.
-        votes: (n, m) number of votes or observations.
-    """
+    """A room type of a source: the labels of n objects and m receptacles, and votes (n, m)."""
 
     name: str
     objects: tuple[str, ...]
@@ -58,8 +52,7 @@ class _Answer(NamedTuple):
     Attributes:
         group: class of the object; its label if the model does not know the object.
         precision: average precision of each ranking by name, 0 if the question is left out.
-        unknown: number of receptacles that the model does not know.
-        receptacles: number of receptacles.
+        unknown, receptacles: number of receptacles that the model does not know, and of all.
         reason: reason for which the question is left out, or an empty string.
     """
 
@@ -77,20 +70,18 @@ _RIVALS: Final = ("popularity", "random order")
 
 def rooms_of(placings: Iterable[Placing]) -> list[Room]:
     """Return the rooms of one source, sorted by name."""
-    votes: dict[str, dict[tuple[str, str], int]] = {}
+    by_room: dict[str, list[Placing]] = {}
     for row in placings:
-        pairs = votes.setdefault(row.room, {})
-        pair = row.subject, row.receptacle
-        pairs[pair] = pairs.get(pair, 0) + row.votes
+        by_room.setdefault(row.room, []).append(row)
     rooms = []
-    for name, pairs in sorted(votes.items()):
-        objects, receptacles = (tuple(sorted({pair[end] for pair in pairs})) for end in (0, 1))
-        table = np.zeros((len(objects), len(receptacles)))
-        for (subject, receptacle), count in pairs.items():
-            table[objects.index(subject), receptacles.index(receptacle)] = count
-        voted = table.any(1)
-        objects = tuple(np.array(objects)[voted].tolist())
-        rooms.append(Room(name, objects, receptacles, table[voted]))
+    for name, rows in sorted(by_room.items()):
+        objects = sorted({row.subject for row in rows if row.votes})
+        receptacles = sorted({row.receptacle for row in rows})
+        votes = np.zeros((len(objects), len(receptacles)))
+        for row in rows:
+            if row.votes:
+                votes[objects.index(row.subject), receptacles.index(row.receptacle)] += row.votes
+        rooms.append(Room(name, tuple(objects), tuple(receptacles), votes))
     return rooms
 
 
@@ -152,25 +143,21 @@ def placing_metrics(artifact: Artifact, rooms: list[Room]) -> dict[str, Metric]:
     answers. If all objects have one class, intervals are over the questions.
     """
     answers = [answer for room in rooms for answer in _answer(artifact, room)]
-    scored = [answer for answer in answers if not answer.reason]
     is_scored = np.array([not answer.reason for answer in answers])
     metrics: dict[str, Metric] = {}
 
     def mean(name: str) -> Ratio:
-        values = [answer.precision[name] for answer in answers]
-        return Ratio.of_scenes(np.array(values), is_scored)
+        return Ratio.of_scenes(np.array([a.precision[name] for a in answers]), is_scored)
 
-    if scored:
+    if is_scored.any():
         ours = mean("model")
         metrics = {"mAP": ours, "mAP, room type listed": mean("model, room type listed")}
         metrics |= {f"mAP of {name}": mean(name) for name in _RIVALS}
         metrics |= {f"mAP minus {name}": ours - mean(name) for name in _RIVALS}
-        unknown = np.array([answer.unknown for answer in answers]) * is_scored
-        receptacles = np.array([answer.receptacles for answer in answers]) * is_scored
-        metrics["unknown receptacles"] = Ratio(unknown.astype(float), receptacles.astype(float))
+        counts = np.array([(answer.unknown, answer.receptacles) for answer in answers], float)
+        metrics["unknown receptacles"] = Ratio(*(counts.T * is_scored))
     for reason in (_UNKNOWN, _TRIVIAL):
-        is_left_out = np.array([answer.reason == reason for answer in answers])
-        metrics[reason] = Ratio.of_scenes(is_left_out)
+        metrics[reason] = Ratio.of_scenes(np.array([answer.reason == reason for answer in answers]))
     names, groups = np.unique([answer.group for answer in answers], return_inverse=True)
     if len(names) < 2:
         return metrics

@@ -33,7 +33,7 @@ from training.datasets.array_types import Flags, Floats, Ints, Rng
 from training.datasets.batches import Batch, SceneTensors
 from training.datasets.cases import Triple, scene_rng
 from training.evaluation.metrics import Items, Metric, Ratio
-from training.evaluation.model import Model, RelationScore
+from training.evaluation.model import RelationScore
 from training.evaluation.setting import Outcome, Setting
 from training.machines.edges import triple_keys
 
@@ -50,7 +50,7 @@ class Candidates:
     Attributes:
         scene: index of the scene among the scored scenes.
         relation: (k,) int64, index of the canonical relation.
-        key: (k,) int64, number of the triple (relation, class, class), see `triple_keys`.
+        key: (k,) int64, number of the triple, see `triple_keys`.
         score: (k,) score of each triple. A higher score means more likely true.
         truth: (k,) bool, the triple is annotated.
     """
@@ -63,9 +63,8 @@ class Candidates:
 
     def where(self, mask: Flags) -> Candidates:
         """Select the triples with a True value in `mask` (k,)."""
-        return Candidates(
-            self.scene, self.relation[mask], self.key[mask], self.score[mask], self.truth[mask]
-        )
+        scene, *columns = vars(self).values()
+        return Candidates(scene, *(column[mask] for column in columns))
 
 
 def scorable(batch: Batch, structure: Tensor) -> Tensor:
@@ -83,14 +82,11 @@ def telling(batch: Batch, given: Tensor | None = None) -> Batch:
     return replace(batch, holds=given.to(batch.holds.dtype), observed=given)
 
 
-def _batches(
-    scenes: SceneTensors, triples: int, block: int = 16
-) -> Iterator[tuple[list[int], Batch]]:
+def _batches(scenes: SceneTensors, triples: int) -> Iterator[tuple[list[int], Batch]]:
     """Yield (indices, batch) of the scenes with at least `triples` annotated triples."""
     related = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.holds.sum() >= triples]
-    for start in range(0, len(related), block):
-        index = related[start : start + block]
-        yield index, scenes.batch(torch.tensor(index, dtype=torch.int64))
+    for index in torch.tensor(related, dtype=torch.int64).split(16) if related else ():
+        yield index.tolist(), scenes.batch(index)
 
 
 def _candidates(batches: Iterable[tuple[Batch, Tensor, Tensor]]) -> list[Candidates]:
@@ -115,7 +111,7 @@ def score_scenes(
     """Score the T1a candidates of annotated scenes. Without `counts`, all counts are 0, unknown."""
 
     def scored() -> Iterator[tuple[Batch, Tensor, Tensor]]:
-        for _, batch in _batches(scenes, 1, block=32):
+        for _, batch in _batches(scenes, 1):
             question = telling(batch)
             if not counts:
                 question = replace(question, counts=torch.zeros_like(batch.counts))
@@ -161,7 +157,7 @@ class RelationRanking:
 
     @property
     def skipped(self) -> int:
-        """Number of scenes without annotated triples among the candidates."""
+        """Number of scenes without annotated triples."""
         return int((self.annotated == 0).sum())
 
     def pooled(self) -> Ratio:
@@ -215,16 +211,13 @@ def alter(holds: Flags, allowed: Flags, rng: Rng) -> tuple[Triple, Triple] | Non
     A, n, _ = holds.shape
     a, x, y = triples[rng.integers(len(triples))].tolist()
     for _ in range(_TRIES):
-        kind, replacement = rng.random(), int(rng.integers(n))
+        kind, other = rng.random(), int(rng.integers(n))
         if kind < 0.5:
-            false = (int(rng.integers(A)), x, y)
-        elif kind < 0.75:
-            false = (a, x, replacement)
+            b, i, j = int(rng.integers(A)), x, y
         else:
-            false = (a, replacement, y)
-        b, i, j = false
-        if allowed[false] and not holds[b, i, j] and not holds[b, j, i]:
-            return (a, x, y), false
+            b, i, j = (a, x, other) if kind < 0.75 else (a, other, y)
+        if allowed[b, i, j] and not holds[b, i, j] and not holds[b, j, i]:
+            return (a, x, y), (b, i, j)
     return None
 
 
@@ -232,10 +225,10 @@ def alter(holds: Flags, allowed: Flags, rng: Rng) -> tuple[Triple, Triple] | Non
 def placement_scores(
     scenes: SceneTensors, structure: Tensor, score: RelationScore, *, seed: int = 0
 ) -> Items:
-    """Score all triples of scenes in which one triple is false.
+    """Return the suspicion that each triple is false, in scenes with one false triple.
 
-    The score of an item is the suspicion that its triple is false. Its truth is True for the false
-    triple. `score` must judge each observed triple without using that triple.
+    The truth of an item is True for the false triple. `score` must judge each observed triple
+    without using that triple.
     """
     parts: list[Tensor] = [torch.zeros(0, 3, dtype=torch.float64)]
     for index, batch in _batches(scenes, 2):
@@ -244,8 +237,7 @@ def placement_scores(
         observed, is_false = torch.zeros_like(truth), torch.zeros_like(truth)
         for row, k in enumerate(index):
             rng = scene_rng(scenes.scenes[k], seed)
-            case = alter(batch.holds[row].numpy() > 0, mask[row].numpy(), rng)
-            if case is not None:
+            if case := alter(batch.holds[row].numpy() > 0, mask[row].numpy(), rng):
                 true_triple, false_triple = case
                 observed[row] = truth[row]
                 observed[row][true_triple] = False
@@ -258,11 +250,9 @@ def placement_scores(
     return Items(scene.astype(np.int64), suspicion, false > 0, len(scenes), skipped)
 
 
-def relations_task(model: Model, setting: Setting) -> Outcome | None:
+def relations_task(score: RelationScore, setting: Setting) -> Outcome | None:
     """Measure T1a."""
-    if model.relations is None:
-        return None
-    scenes, structure, score = setting.scenes, setting.structure, model.relations
+    scenes, structure = setting.scenes, setting.structure
     with_counts = score_scenes(scenes, structure, score)
     uncounted = score_scenes(scenes, structure, score, counts=False)
     if not _any_true(uncounted):
@@ -278,12 +268,10 @@ def relations_task(model: Model, setting: Setting) -> Outcome | None:
     return Outcome.over(scenes, metrics, ranking.skipped)
 
 
-def completion_task(model: Model, setting: Setting) -> Outcome | None:
+def completion_task(score: RelationScore, setting: Setting) -> Outcome | None:
     """Measure T1b."""
-    if model.completion is None:
-        return None
-    scenes, structure, seed = setting.scenes, setting.structure, setting.seed
-    candidates = complete_scenes(scenes, structure, model.completion, seed=seed)
+    scenes = setting.scenes
+    candidates = complete_scenes(scenes, setting.structure, score, seed=setting.seed)
     if not _any_true(candidates):
         return None
     ranking = rank(candidates, len(scenes))
@@ -316,12 +304,9 @@ def _details(scored: list[Candidates], setting: Setting, first: Sequence[int]) -
     return metrics
 
 
-def placement_task(model: Model, setting: Setting) -> Outcome | None:
+def placement_task(score: RelationScore, setting: Setting) -> Outcome | None:
     """Measure T3b."""
-    if model.false_relations is None:
-        return None
     scenes = setting.some(related=True)
-    scores = placement_scores(scenes, setting.structure, model.false_relations, seed=setting.seed)
-    if not len(scores.scene):
-        return None
-    return Outcome.over(scenes, {"hit@1": scores.hit_at_1()}, scores.skipped)
+    scores = placement_scores(scenes, setting.structure, score, seed=setting.seed)
+    metrics = {"hit@1": scores.hit_at_1()} if len(scores.scene) else {}
+    return Outcome.over(scenes, metrics, scores.skipped)

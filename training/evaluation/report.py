@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from hashlib import sha256
 from pathlib import Path
@@ -30,10 +30,7 @@ from training.evaluation.model import Model
 from training.evaluation.setting import Outcome, Setting
 from training.evaluation.tasks import EVERY_TASK, ONCE, TASKS, WHOLE_SET
 
-# Maximum number of scenes per data source in slow tasks. The second limit is for machines that
-# compute their answers by sampling.
-_LIMIT = 200
-_LIMIT_OF_DRAWS = 20
+_LIMIT = 200  # maximum number of scenes per data source in slow tasks
 
 Progress = Callable[[str], None]
 
@@ -49,8 +46,8 @@ class SourceReport:
     Attributes:
         source: name of the data source, or "pooled".
         scenes: digest of the questions, see `digest`.
-        outcomes: metrics of each task, by task name. None if the model does not support the task.
-        seconds: wall time of each task in seconds, by task name.
+        outcomes, seconds: metrics and wall time of each task, by task name. The outcome is None if
+            the model does not support the task.
     """
 
     source: str
@@ -64,7 +61,12 @@ class SourceReport:
             "source": self.source,
             "scenes": self.scenes,
             "tasks": {
-                task: {"seconds": self.seconds.get(task, 0.0), "outcome": _to_dict(outcome)}
+                task: {
+                    "seconds": self.seconds.get(task, 0.0),
+                    "outcome": outcome
+                    and vars(outcome)
+                    | {"metrics": {k: metric_to_dict(m) for k, m in outcome.metrics.items()}},
+                }
                 for task, outcome in self.outcomes.items()
             },
         }
@@ -82,13 +84,14 @@ class SourceReport:
                 f"the report {path} belongs to other scenes or tasks: use --fresh, use another "
                 "folder, or delete it"
             )
-        tasks = values["tasks"].items()
-        return cls(
-            values["source"],
-            values["scenes"],
-            {task: _from_dict(entry["outcome"]) for task, entry in tasks},
-            {task: float(entry["seconds"]) for task, entry in tasks},
-        )
+        report = cls(values["source"], values["scenes"])
+        for task, entry in values["tasks"].items():
+            report.seconds[task] = float(entry["seconds"])
+            report.outcomes[task] = None
+            if outcome := entry["outcome"]:
+                metrics = {k: metric_from_dict(m) for k, m in outcome["metrics"].items()}
+                report.outcomes[task] = Outcome(**outcome | {"metrics": metrics})
+        return report
 
 
 def write_whole(path: Path, text: str) -> None:
@@ -164,26 +167,19 @@ def measure(
 
 
 def pooled(reports: Sequence[SourceReport], source: str = "pooled") -> SourceReport:
-    """Pool the reports on several data sources into one report.
-
-    Metrics of a whole set of scenes (task T4, generated scenes) cannot be pooled and are left out.
-    Use `measure` on the union of the scenes for these metrics.
-    """
+    """Pool the reports on several data sources, without metrics of a whole set of scenes (T4)."""
     together = sha256("\n".join(report.scenes for report in reports).encode()).hexdigest()
     joined = SourceReport(source, together)
     for task in dict.fromkeys(task for report in reports for task in report.outcomes):
         parts = [outcome for report in reports if (outcome := report.outcomes.get(task))]
-        names = dict.fromkeys(name for part in parts for name in part.metrics)
         metrics = {
             name: metric
-            for name in names
+            for name in dict.fromkeys(name for part in parts for name in part.metrics)
             if (metric := pool([part.metrics[name] for part in parts if name in part.metrics]))
         }
+        counts = sum(part.scenes for part in parts), sum(part.skipped for part in parts)
         joined.seconds[task] = sum(report.seconds.get(task, 0.0) for report in reports)
-        joined.outcomes[task] = None
-        if metrics:
-            skipped = sum(part.skipped for part in parts)
-            joined.outcomes[task] = Outcome(metrics, sum(part.scenes for part in parts), skipped)
+        joined.outcomes[task] = Outcome(metrics, *counts) if metrics else None
     return joined
 
 
@@ -203,62 +199,48 @@ def evaluate(
     Generated scenes are compared with the scenes of all data sources together.
 
     Args:
-        train: training scenes. They show which generated scenes are copies, and which classes are
-            typical of a room type.
-        limit: maximum number of scenes per data source in slow tasks; see `Setting`.
+        train: training scenes, see `Setting`.
+        limit: maximum number of scenes per data source in slow tasks, see `Setting`.
         tasks: names of the tasks to measure. None means all tasks of a model card.
     """
     model = artifact_model(artifact, train)
     selected = [
         name for name, task in EVERY_TASK.items() if task.card and (tasks is None or name in tasks)
     ]
-    rows: list[CardMetric] = []
-
-    def add(setting: Setting, source: str, tasks: list[str]) -> None:
-        report = measure(model, setting, source, tasks=tasks, progress=progress)
-        rows.extend(
-            CardMetric(task=task, source=source, metric=name, **asdict(metric.figure()))
-            for task, outcome in report.outcomes.items()
-            if outcome is not None
-            for name in EVERY_TASK[task].card
-            # A metric is missing if the data source lacks data for it, such as listed relations.
-            if (metric := outcome.metrics.get(name)) is not None
-            # The scenes of a single group give no interval.
-            and len(metric.groups) > 1
-        )
-
     settings = dict(settings_by_source(scenes, structure, train, None, limit=limit))
-    for source, setting in settings.items():
-        add(setting, source, [task for task in selected if task not in WHOLE_SET])
     together = next(iter(settings)) if len(settings) == 1 else "pooled"
+    questions = [
+        (setting, source, [task for task in selected if task not in WHOLE_SET])
+        for source, setting in settings.items()
+    ]
     whole = [task for task in selected if task in WHOLE_SET and task not in ONCE]
-    add(Setting(scenes, structure, train, limit=limit), together, whole)
-    setting = Setting(scenes, structure, limit=limit, everyday=everyday)
-    add(setting, SOURCE, [task for task in selected if task in ONCE])
+    questions.append((Setting(scenes, structure, train, limit=limit), together, whole))
+    once = [task for task in selected if task in ONCE]
+    questions.append((Setting(scenes, structure, limit=limit, everyday=everyday), SOURCE, once))
+    return [
+        row
+        for setting, source, names in questions
+        for row in card_figures(measure(model, setting, source, tasks=names, progress=progress))
+    ]
+
+
+def card_figures(report: SourceReport) -> list[CardMetric]:
+    """Return the figures of a model card. A data source may lack data for some of them."""
+    rows: list[CardMetric] = []
+    for task, outcome in report.outcomes.items():
+        metrics = outcome.metrics if outcome else {}
+        shown = {name: metrics[name] for name in EVERY_TASK[task].card if name in metrics}
+        rows += card_rows(task, report.source, shown)
     return rows
 
 
-def _to_dict(outcome: Outcome | None) -> dict[str, Any] | None:
-    if outcome is None:
-        return None
-    return {
-        "scenes": outcome.scenes,
-        "skipped": outcome.skipped,
-        "notes": outcome.notes,
-        "metrics": {name: metric_to_dict(metric) for name, metric in outcome.metrics.items()},
-    }
-
-
-def _from_dict(values: dict[str, Any] | None) -> Outcome | None:
-    if values is None:
-        return None
-    metrics = values["metrics"].items()
-    return Outcome(
-        {name: metric_from_dict(entry) for name, entry in metrics},
-        values["scenes"],
-        values["skipped"],
-        values["notes"],
-    )
+def card_rows(task: str, source: str, metrics: Mapping[str, Metric]) -> list[CardMetric]:
+    """Return the metrics of a task with an interval, which needs two groups."""
+    return [
+        CardMetric(task=task, source=source, metric=name, **asdict(metric.figure()))
+        for name, metric in metrics.items()
+        if len(metric.groups) > 1
+    ]
 
 
 def pool(parts: Sequence[Metric]) -> Metric | None:
@@ -290,20 +272,18 @@ def metric_from_dict(values: dict[str, Any]) -> Metric:
     Raises:
         ValueError: the kind of metric is unknown.
     """
-    entries = dict(values)
-    kind = entries.pop("kind", None)
+    kind = values.get("kind")
     if kind not in _KINDS:
         raise ValueError(f"metric kind must be one of {sorted(_KINDS)}, not {kind!r}")
-    metric: Metric = _KINDS[kind](**{name: _array(name, value) for name, value in entries.items()})
+    # JSON has no NaN, so null marks a resample in which the metric is undefined. numpy reads None
+    # as NaN.
+    entries = {
+        name: np.array(value, _TYPES.get(name, np.float64)) if isinstance(value, list) else value
+        for name, value in values.items()
+        if name != "kind"
+    }
+    metric: Metric = _KINDS[kind](**entries)
     return metric
-
-
-def _array(name: str, value: Any) -> Any:
-    if not isinstance(value, list):
-        return value
-    # JSON has no NaN, so null marks a resample in which the metric is undefined.
-    values = [float("nan") if x is None else x for x in value]
-    return np.array(values, dtype=_TYPES.get(name, np.float64))
 
 
 def _plain(value: Any) -> Any:

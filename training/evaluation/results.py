@@ -15,7 +15,7 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
-from training.evaluation.metrics import Figure, MeanOverSeeds, Metric, paired_difference
+from training.evaluation.metrics import Figure, Metric, mean_over_seeds, paired_difference
 from training.evaluation.report import SourceReport, write_whole
 from training.evaluation.tasks import TASKS, in_words
 
@@ -49,12 +49,7 @@ _LOWER_IS_BETTER = (
 
 @dataclass(frozen=True)
 class Cell:
-    """One metric of one row on one data source.
-
-    Attributes:
-        figure: mean over training seeds, with the bootstrap interval over groups.
-        seeds: value of the metric for each training seed.
-    """
+    """One metric of one row on one data source: its mean over training seeds, and their values."""
 
     row: str
     task: str
@@ -98,12 +93,11 @@ class Asked:
 
 @dataclass(frozen=True)
 class Results:
-    """The results of an experiment.
+    """The results of an experiment, sorted by row, data source and task.
 
     Attributes:
         ours: name of the reference row of all comparisons.
-        cells: metrics of all rows, sorted by row, data source and task.
-        differences: paired differences from the reference row, sorted by row, data source and task.
+        differences: paired differences from the reference row.
         parameters: number of trained weights by row name, for rows with weights.
         asked: number of scenes of each task.
     """
@@ -127,13 +121,9 @@ class Results:
     def markdown(self, shown: Shown = SHOWN, *, changes: bool = False) -> str:
         """Return one Markdown table per metric, and remarks on each task.
 
-        A table has one line per row and one column per data source. A star marks a row that is
-        worse than the reference row: the whole interval of the paired difference agrees.
-
-        Args:
-            shown: names of the metrics by task.
-            changes: True replaces the intervals of the metrics by intervals of the differences. A
-                difference is the row minus the reference row.
+        A star marks a row that is worse than the reference row: the whole interval of the paired
+        difference agrees. With `changes`, the intervals are those of the differences, the row minus
+        the reference row.
         """
         parts: list[str] = []
         for task, metrics in shown.items():
@@ -143,10 +133,7 @@ class Results:
         return "\n\n".join(parts) + "\n"
 
     def tables(self, shown: Shown = SHOWN) -> Iterator[Table]:
-        """Generate one table per task for the terminal, of the pooled sources if there are any.
-
-        A star has the meaning of `markdown`.
-        """
+        """Generate one table per task for the terminal, of the pooled sources if there are any."""
         sources = list(dict.fromkeys(cell.source for cell in self.cells))
         columns = [source for source in sources if "pooled" in source] or sources
         for task, metrics in shown.items():
@@ -216,11 +203,7 @@ def write(folder: Path, values: Mapping[str, Any], text: str) -> None:
     write_whole(folder / "results.json", json.dumps(values, indent=1) + "\n")
 
 
-def summarise(
-    reports: Reports,
-    ours: str,
-    parameters: Mapping[str, int] | None = None,
-) -> Results:
+def summarise(reports: Reports, ours: str, parameters: Mapping[str, int] | None = None) -> Results:
     """Compute the metrics of every row, and the paired differences from the reference row.
 
     Metrics over the scenes of a single group are left out, because they have no interval.
@@ -229,37 +212,40 @@ def summarise(
         ValueError: the reports lack the reference row.
     """
     members: dict[tuple[str, str, str, str], list[Metric]] = {}
-    rows = list(dict.fromkeys(row for row, _ in reports))
-    for row, seed in sorted(reports, key=lambda key: rows.index(key[0])):
-        for source, report in reports[row, seed].items():
+    asked: list[Asked] = []
+    for (row, seed), by_source in reports.items():
+        for source, report in by_source.items():
             for task, outcome in report.outcomes.items():
-                for name, metric in (outcome.metrics if outcome else {}).items():
+                if outcome is None:
+                    continue
+                counts = outcome.scenes, outcome.skipped
+                asked.append(Asked(row, seed, task, source, *counts, outcome.notes))
+                for name, metric in outcome.metrics.items():
                     members.setdefault((row, source, task, name), []).append(metric)
+    rows = [row for row, _ in reports]
     # A pooled metric is left out if its data sources differ between seeds. For example, the Brier
     # skill of a seed is undefined on a source where all queried relations hold.
     means = {
-        key: MeanOverSeeds(metrics)
-        for key, metrics in members.items()
+        key: mean_over_seeds(metrics)
+        for key, metrics in sorted(members.items(), key=lambda item: rows.index(item[0][0]))
         if len(metrics[0].groups) > 1 and all(_same_groups(m, metrics[0]) for m in metrics)
     }
     if not any(key[0] == ours for key in means):
         raise ValueError(f"the reports contain no metric of the reference row {ours}")
     cells = tuple(
-        Cell(row, task, source, name, mean.figure(), tuple(m.value for m in mean.members))
-        for (row, source, task, name), mean in means.items()
+        Cell(row, task, source, name, mean.figure(), tuple(m.value for m in members[key]))
+        for key, mean in means.items()
+        for row, source, task, name in [key]
     )
     differences = tuple(
-        Difference(
-            *(row, task, source, name),
-            paired_difference(mine, mean),
-        )
+        Difference(*(row, task, source, name), paired_difference(mine, mean))
         for (row, source, task, name), mean in means.items()
         if row != ours
         and (mine := means.get((ours, source, task, name))) is not None
         # A row may lack a pooled metric on some data sources. Its scenes then cannot be paired.
         and _same_groups(mine, mean)
     )
-    return Results(ours, cells, differences, parameters or {}, tuple(_scene_counts(reports)))
+    return Results(ours, cells, differences, parameters or {}, tuple(asked))
 
 
 def _same_groups(a: Metric, b: Metric) -> bool:
@@ -281,23 +267,13 @@ def only(report: SourceReport, wanted: Mapping[str, Sequence[str]]) -> SourceRep
     return replace(report, outcomes=outcomes)
 
 
-def _scene_counts(reports: Reports) -> Iterator[Asked]:
-    for (row, seed), by_source in reports.items():
-        for source, report in by_source.items():
-            for task, outcome in report.outcomes.items():
-                if outcome is not None:
-                    counts = outcome.scenes, outcome.skipped
-                    yield Asked(row, seed, task, source, *counts, outcome.notes)
-
-
 def remarks(asked: Sequence[Asked]) -> list[str]:
     """Return remarks on one task: the number of skipped scenes, and a table of the notes."""
     skipped = []
     for source in dict.fromkeys(entry.source for entry in asked):
         entries = [entry for entry in asked if entry.source == source]
-        count = _range(entry.skipped for entry in entries)
-        scenes = _range(entry.scenes for entry in entries)
-        if count != "0":
+        if any(entry.skipped for entry in entries):
+            count, scenes = (_range(getattr(e, x) for e in entries) for x in ("skipped", "scenes"))
             skipped.append(f"{source} {count} of {scenes}")
     parts = [f"Scenes that could not be scored: {', '.join(skipped)}."] if skipped else []
     with_notes = [entry for entry in asked if entry.notes]

@@ -17,7 +17,6 @@ rooms" are those of the sources of real rooms alone.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Final
 
 import numpy as np
@@ -29,8 +28,16 @@ from training.datasets.batches import SceneTensors, subset
 from training.evaluation.asking import ask_rows
 from training.evaluation.metrics import Items, Metric, Ratio
 from training.evaluation.missing_tasks import SEEDS
-from training.evaluation.model import Model, RoomScore
-from training.evaluation.parts import REAL_SOURCES, Parts, Ranking, Size, draw_parts, exactly
+from training.evaluation.model import RoomScore
+from training.evaluation.parts import (
+    REAL_SOURCES,
+    Parts,
+    Ranking,
+    Size,
+    draw_parts,
+    exactly,
+    real_sources,
+)
 from training.evaluation.setting import Outcome, Setting
 
 LEAST: Final = 1e-4
@@ -61,7 +68,7 @@ def room_figures(
 ) -> dict[str, Metric]:
     """Return `FIGURES` for lists of scenes with a room type."""
     scene, target, count = parts.scene.numpy(), scenes.room[parts.scene], len(scenes)
-    log_p = ask_rows(partial(score, profile=profile), parts.v)
+    log_p = ask_rows(lambda v: score(v, profile), parts.v)
     # At least three other types rank before a type that the model cannot name.
     is_named = (target < log_p.shape[1]).unsqueeze(1)
     lowest, added = torch.finfo(log_p.dtype).min, int(target.max()) + 4
@@ -79,12 +86,10 @@ def room_figures(
     }
 
 
-def rooms_task(model: Model, setting: Setting) -> Outcome | None:
+def rooms_task(score: RoomScore, setting: Setting) -> Outcome | None:
     """Measure the likeliest room types, without and with the named profile."""
     scenes = with_room_type(setting.some())
     sources = {scene.source for scene in scenes.scenes}
-    if model.rooms is None or not len(scenes):
-        return None
     metrics: dict[str, Metric] = {}
     for name, (size, seeds) in LISTS.items():
         parts = draw_parts(scenes, setting.structure, size, seeds)
@@ -92,11 +97,11 @@ def rooms_task(model: Model, setting: Setting) -> Outcome | None:
             continue
         kinds = {name: ""} | ({f"{name}, profile named": min(sources)} if len(sources) == 1 else {})
         for kind, profile in kinds.items():
-            figures = room_figures(scenes, parts, model.rooms, profile)
+            figures = room_figures(scenes, parts, score, profile)
             metrics |= {f"{figure}, {kind}": metric for figure, metric in figures.items()}
     if sources <= set(REAL_SOURCES):
         metrics |= {f"{name}, real rooms": metric for name, metric in metrics.items()}
-    return Outcome.over(scenes, metrics, 0) if metrics else None
+    return Outcome.over(scenes, metrics, 0)
 
 
 def mean_log_p(scenes: SceneTensors, structure: Tensor, score: RoomScore) -> float:
@@ -108,16 +113,13 @@ def mean_log_p(scenes: SceneTensors, structure: Tensor, score: RoomScore) -> flo
     Raises:
         ValueError: no scene has a room type.
     """
-    scenes = with_room_type(scenes)
-    names = np.array([scene.source for scene in scenes.scenes], dtype=np.str_)
     values = []
-    for source in [name for name in REAL_SOURCES if (names == name).any()] or np.unique(names):
-        sample = subset(scenes, torch.from_numpy(np.flatnonzero(names == source)))
+    for source, sample in real_sources(with_room_type(scenes)):
         for size, seeds in LISTS.values():
             parts = draw_parts(sample, structure, size, seeds)
             values += [
                 -room_figures(sample, parts, score, profile)["log-loss"].value
-                for profile in ("", str(source))
+                for profile in ("", source)
                 if len(parts.v)
             ]
     if not values:

@@ -86,8 +86,10 @@ class Outcome:
         metrics: Mapping[str, Metric],
         skipped: int,
         notes: Mapping[str, float] | None = None,
-    ) -> Outcome:
-        """Return an outcome whose metrics per scene are summed by group of near-duplicates."""
+    ) -> Outcome | None:
+        """Return the metrics per scene, summed by group of near-duplicates; None without any."""
+        if not metrics:
+            return None
         groups = scenes.group_ids
         by_group = {name: metric.by(groups) for name, metric in metrics.items()}
         return cls(by_group, len(scenes), skipped, dict(notes or {}))

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 from rich.console import Console
 
 from training.datasets.batches import TrainingData, seen_triples
@@ -84,11 +84,9 @@ def ablate(
             for seed in range(seeds)
         ]
         with shown(console, "ablation", len(entries) * len(plan.settings)) as progress:
+            diverged = (FloatingPointError,)
             measured, failures = measure_entries(
-                *(plan, entries, progress),
-                workers=workers,
-                fresh=fresh,
-                failures=(FloatingPointError,),
+                plan, entries, progress, workers=workers, fresh=fresh, failures=diverged
             )
     if configs[0].name in failures:
         console.print(f"[red]error:[/red] {configs[0].name}: {failures[configs[0].name]}")
@@ -117,44 +115,35 @@ def ablate(
 
 
 def _configs(
-    reference: str,
-    path: Path | None,
-    names: Sequence[str] | None,
-    limit: int | None,
-    length: float,
+    reference: str, path: Path | None, names: Sequence[str] | None, limit: int | None, length: float
 ) -> list[Config]:
     """Return the configurations of the full model and of the selected ablations."""
     full = load_config(reference)
     if limit is not None:
         full = with_settings(full, {"data.limit": limit})
-    rows = {
-        row.name: row for row in load_rows(own_or_shipped(path, full, "ablations", "--rows"), full)
-    }
-    if unknown := sorted(set(names or ()) - set(rows)):
-        raise ConfigError(f"unknown rows {unknown}: choose from {', '.join(rows)}")
-    configs = [full, *(row for name, row in rows.items() if not names or name in names)]
+    rows = load_rows(own_or_shipped(path, full, "ablations", "--rows"), full)
+    known = [row.name for row in rows]
+    if unknown := sorted(set(names or ()) - set(known)):
+        raise ConfigError(f"unknown rows {unknown}: choose from {', '.join(known)}")
+    configs = [full, *(row for row in rows if not names or row.name in names)]
     return [shortened(config, length) for config in configs]
 
 
 def _settings(scenes: TrainingData, limit: int) -> dict[str, Setting]:
     """Return the evaluation settings of the validation and test part of each data source."""
     seen = seen_triples(scenes.train.scenes, scenes.train.v.shape[1])
-    parts = {"validation": scenes.validation, "test": scenes.test}
+    common = scenes.structure, scenes.train, seen
     return {
         f"{part} {source}": setting
-        for part, part_scenes in parts.items()
-        for source, setting in settings_by_source(
-            part_scenes, scenes.structure, scenes.train, seen, limit=limit
-        )
+        for part, own in (("validation", scenes.validation), ("test", scenes.test))
+        for source, setting in settings_by_source(own, *common, limit=limit)
     }
 
 
 def _with_pools(reports: Mapping[str, SourceReport]) -> dict[str, SourceReport]:
     """Return the `PRIMARY` metrics, first of the pooled validation and test parts."""
     pools = {
-        f"{part} pooled": pooled(
-            [report for name, report in reports.items() if name.startswith(part)], f"{part} pooled"
-        )
+        f"{part} pooled": pooled([r for name, r in reports.items() if name.startswith(part)])
         for part in ("validation", "test")
     }
     return {name: only(report, PRIMARY) for name, report in {**pools, **reports}.items()}
@@ -175,26 +164,21 @@ def _costs(plan: Plan, entries: Sequence[Entry]) -> tuple[dict[str, int], dict[s
     return weights, seconds
 
 
-class _Change(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
+class _Change(BaseModel, extra="forbid", frozen=True):
     name: str
     what: str
     start: str | None = Field(default=None, alias="from")
     changes: dict[str, Any] = Field(default_factory=dict)
 
 
-class _File(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
+class _File(BaseModel, extra="forbid", frozen=True):
     row: tuple[_Change, ...] = Field(min_length=1)
 
 
 def load_rows(path: Path, full: Config) -> list[Config]:
     """Read the ablations in a TOML file: one configuration for each `[[row]]` of the file.
 
-    All ablations use the scenes of the full model. The description of an ablation states how it
-    differs from the full model.
+    All ablations use the scenes of the full model.
 
     Raises:
         ConfigError: the file is missing or not TOML, a setting is unknown or invalid, two ablations
@@ -204,12 +188,12 @@ def load_rows(path: Path, full: Config) -> list[Config]:
         file = _File.model_validate(read_toml(path))
     except ValidationError as error:
         raise ConfigError(f"{path.name}: {first_error(error)}") from error
-    configs: dict[str, Config] = {}
+    configs = [full]
     for row in file.row:
-        if row.name in configs or row.name == full.name:
+        if any(row.name == config.name for config in configs):
             raise ConfigError(f"{path.name}: the name {row.name} occurs twice: rename one row")
-        configs[row.name] = _config(row, full, path.name)
-    return list(configs.values())
+        configs.append(_config(row, full, path.name))
+    return configs[1:]
 
 
 def _config(row: _Change, full: Config, file: str) -> Config:

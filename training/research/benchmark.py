@@ -41,16 +41,12 @@ YARDSTICKS = {
     "T2 missing": ("popularity", "MRR, one removed"),
     "T3 outliers": ("popularity", "hit@1, signature"),
 }
-"""Reference baseline and metric of each task, for training on shuffled scenes.
-
-After training on shuffled scenes, no other model should exceed this baseline.
-"""
+"""Baseline of each task that no model should exceed after training on shuffled scenes; metric."""
 
 _RELATION_TASKS = ("T1a relations", "T1 pairs")
-# Tasks that a quick run leaves out. The annealing that estimates log Z (the log of the partition
-# function) is slow even for a few scenes.
+# A quick run leaves out tasks that are slow even for a few scenes.
 _SLOW_TASKS = ("Density",)
-# Settings of a quick run. A quick run only tests the command, so its results are meaningless.
+# A quick run only tests the command, so its results are meaningless.
 _QUICK_SCENES = 150
 _QUICK = 0.1  # share of the training
 _QUICK_LIMIT = 30
@@ -67,10 +63,7 @@ console = Console()
 
 @dataclass(frozen=True)
 class Domain:
-    """Configurations with the same data section. The first one is the reference of differences.
-
-    The name is that of the first configuration without its last word: "indoor".
-    """
+    """Configurations with the same data section. The first one is the reference of differences."""
 
     name: str
     configs: tuple[Config, ...]
@@ -172,8 +165,7 @@ def read_domains(references: Sequence[str]) -> list[Domain]:
     """Read configurations, and group them by data section into domains.
 
     Raises:
-        ConfigError: a configuration cannot be read, or two configurations or two domains have the
-            same name.
+        ConfigError: a configuration cannot be read, or a name occurs twice.
     """
     groups: dict[DataConfig, list[Config]] = {}
     for reference in references:
@@ -183,6 +175,7 @@ def read_domains(references: Sequence[str]) -> list[Domain]:
         groups.setdefault(config.data, []).append(config)
     domains: dict[str, Domain] = {}
     for configs in groups.values():
+        # The first name without its last word: "indoor".
         name = configs[0].name.rpartition("-")[0] or configs[0].name
         if name in domains:
             raise ConfigError(
@@ -194,9 +187,7 @@ def read_domains(references: Sequence[str]) -> list[Domain]:
 
 
 def chosen_tasks(names: Sequence[str] | None, quick: bool) -> tuple[str, ...]:
-    """Return the tasks with these names or prefixes; without `names`, all tasks.
-
-    With `quick`, slow tasks are left out, unless they are named.
+    """Return the tasks with these names or prefixes; by default all, without slow ones if `quick`.
 
     Raises:
         ValueError: a name matches no task.
@@ -226,12 +217,7 @@ def shuffled_tasks(tasks: Sequence[str]) -> tuple[str, ...]:
 
 
 def compare_domain(domain: Domain, folder: Path, options: Options) -> None:
-    """Measure the machines and baselines of a domain on its test scenes; write tables and plots.
-
-    Raises:
-        ConfigError: the scene files are missing.
-        ValueError: a baseline in `options` is unknown.
-    """
+    """Measure the machines and baselines of a domain on its test scenes; write tables and plots."""
     scenes = options.scenes(domain)
     plan = _plan(folder, scenes, options, options.tasks)
     entries: list[Entry] = []
@@ -257,8 +243,7 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> None:
     are always measured.
 
     Raises:
-        ValueError: no task is supported (see `shuffled_tasks`), or all supported tasks need
-            relations and the scenes contain none.
+        ValueError: no task is supported, see `shuffled_tasks`, or relations are needed.
     """
     real = options.scenes(domain)
     scenes = real.shuffled(seed=0)
@@ -273,23 +258,23 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> None:
             )
         plan = replace(plan, tasks=tasks)
     entries = [machine_entry(config, calibrated=False) for config in options.configs(domain, 0)]
+    yardsticks = {YARDSTICKS[task][0] for task in tasks}
+    chosen = BASELINES if options.baselines is None else yardsticks | set(options.baselines)
     # A baseline that supports several of the tasks is fitted once.
     names = [
-        name for name, baseline in BASELINES.items() if baseline.scores in (("missing",), RELATIONS)
+        name
+        for name, baseline in BASELINES.items()
+        if baseline.scores in (("missing",), RELATIONS) and name in chosen
     ]
-    if options.baselines is not None:
-        yardsticks = {YARDSTICKS[task][0] for task in tasks}
-        names = [name for name in names if name in yardsticks | set(options.baselines)]
-    entries += baseline_entries(
-        *(0, names),
-        related=plan.data.related, whole=False, learning=domain.configs[0].objects,
-    )  # fmt: skip
+    learning = domain.configs[0].objects
+    entries += baseline_entries(0, names, related=plan.data.related, whole=False, learning=learning)
     reports = _measure_all(plan, entries, options, f"{domain.name}, shuffled")
     weights = plan.parameters(entries)
     for task in tasks:
         yardstick, metric = YARDSTICKS[task]
+        shown_metrics = {task: (metric,)}
         task_reports: Reports = {
-            row: {source: only(report, {task: (metric,)}) for source, report in by_source.items()}
+            row: {source: only(report, shown_metrics) for source, report in by_source.items()}
             for row, by_source in reports.items()
         }
         # A task without metrics needs data that these scenes lack, for example room types.
@@ -298,7 +283,7 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> None:
             results = summarise(task_reports, yardstick, weights)
             text = shuffled_text(task, results)
             _write(folder / slug(task), scenes, results.to_dict(), text)
-            console.print("trained on shuffled scenes:", *results.tables({task: (metric,)}))
+            console.print("trained on shuffled scenes:", *results.tables(shown_metrics))
 
 
 def _plan(
@@ -314,8 +299,7 @@ def _plan(
     """
     data = scenes.complete_data()
     train = data.train if asked_by is None else asked_by.training_data().train
-    seen = seen_triples(data.train.scenes, data.train.v.shape[1])
-    limit = options.limit
+    seen, limit = seen_triples(data.train.scenes, data.train.v.shape[1]), options.limit
     settings = dict(settings_by_source(data.test, data.structure, train, seen, limit=limit))
     facts = EVERYDAY if facts_file() else None
     settings[POOLED] = Setting(data.test, data.structure, train, seen, limit, everyday=facts)
@@ -323,11 +307,9 @@ def _plan(
 
 
 def _measure_all(plan: Plan, entries: Sequence[Entry], options: Options, title: str) -> Reports:
+    workers, fresh = options.workers, options.fresh
     with shown(console, title, len(entries) * len(plan.settings)) as progress:
-        reports, _ = measure_entries(
-            *(plan, entries, progress), workers=options.workers, fresh=options.fresh
-        )
-    return reports
+        return measure_entries(plan, entries, progress, workers=workers, fresh=fresh)[0]
 
 
 def _write(folder: Path, scenes: SplitScenes, values: dict[str, Any], text: str) -> None:

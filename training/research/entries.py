@@ -20,8 +20,9 @@ from training.evaluation.asking import ask_rows
 from training.evaluation.baselines import PLACED, placed_product
 from training.evaluation.baselines.classes import frequency
 from training.evaluation.baselines.fitting import TRIALS, Baseline
+from training.evaluation.intruders import intruder_weights
 from training.evaluation.model import Model, ObjectScore, suspicion_of
-from training.evaluation.outlier_tasks import first_shares, intruder_weights, with_intruders
+from training.evaluation.outlier_tasks import first_shares, with_intruders
 from training.evaluation.report import Progress, write_whole
 from training.fit.calibrate import calibrate
 from training.fit.checkpoint import RunError
@@ -33,14 +34,10 @@ from training.machines import BoltzmannMachine
 from training.research.baselines import BASELINES
 from training.runs.folder import load_run, save_run
 
-CALIBRATION = "calibration.json"
-"""File name of a machine's calibration, in the folder of its run."""
-
-
-# Weights of log popularity in the ranking of intruders, and the scenes that choose one. The scores
-# of baselines have different scales.
+CALIBRATION = "calibration.json"  # in the folder of the run of a machine
+# Weights of log popularity in the ranking of intruders: scores of baselines have different scales.
 _WEIGHTS = (0.0, *np.geomspace(0.005, 2.0, TRIALS - 1).tolist())
-_SCENES = 300
+_SCENES = 300  # maximum scenes that choose a weight
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +45,6 @@ class Entry:
     """One model of an experiment, with one training seed.
 
     Attributes:
-        name: name of the model. It does not depend on the training seed.
         identity: text with all settings that affect the results. Reports on disk with another
             identity are rejected.
         make: function that trains the model, or reads the trained model from its folder.
@@ -75,21 +71,21 @@ def baseline_entries(
     Args:
         related: False leaves out relation baselines.
         whole: True adds place scores to object baselines.
-        learning: settings of the machines for objects. Baselines for objects and rooms learn from
-            the scenes of the machines, with their weights and masks.
+        learning: settings of the machines for objects, see `object_scenes`.
 
     Raises:
         ValueError: a name is not in `BASELINES`.
     """
     if unknown := sorted(set(names or ()) - set(BASELINES)):
         raise ValueError(f"unknown baselines {unknown}: choose from {list(BASELINES)}")
+    config = learning or ObjectsConfig()
+    decisive = config.model_dump(include={"source_weights", "open_sources"})
     for name, baseline in BASELINES.items():
         is_usable = related or not baseline.learns_relations
         is_selected = names is None or name in names
         if is_usable and is_selected and (baseline.stochastic or seed == 0):
-            config = learning or ObjectsConfig()
             make = partial(_baseline_model, baseline, seed, whole, config)
-            yield Entry(name, seed, f"{name}, seed {seed}, {_decisive(config)}", make)
+            yield Entry(name, seed, f"{name}, seed {seed}, {decisive}", make)
 
 
 def reference_entries() -> Iterator[Entry]:
@@ -119,10 +115,10 @@ def _baseline_model(
     folder: Path,
     say: Progress,
 ) -> Model:
-    """Fit a baseline; a baseline for objects or rooms to the scenes, weights and masks of machines.
+    """Fit a baseline; one for objects or rooms to `object_scenes`.
 
-    An object baseline ranks intruders with a prior of popularity, as `/outliers` does. It also
-    supports T2-at (missing object at a place): its score is multiplied by a frequency table.
+    An object baseline ranks intruders with a prior of popularity, as `/outliers` does. For T2-at
+    (missing object at a place), its score is multiplied by a frequency table.
     """
     if baseline.scores not in (("missing",), ("rooms",)):
         return _fit(baseline, data, seed, folder, say)
@@ -136,10 +132,6 @@ def _baseline_model(
     table = _fit(PLACED, data, seed, folder, say)
     product = _fit(placed_product(baseline.name, model, table), objects, seed, folder, say)
     return replace(model, at_place=product.at_place)
-
-
-def _decisive(config: ObjectsConfig) -> str:
-    return str(config.model_dump(include={"source_weights", "open_sources"}))
 
 
 def object_scenes(train: SceneTensors, structure: Tensor, config: ObjectsConfig) -> SceneTensors:

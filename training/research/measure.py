@@ -49,8 +49,6 @@ from training.research.entries import Entry
 
 # A progress function receives the row, the source, and a note on the current step.
 Progress: TypeAlias = Callable[[str, str, str], None]
-# Measures an entry, and returns the error of an entry that failed.
-Work: TypeAlias = Callable[[Entry, Progress], Exception | None]
 
 # Seconds between two checks for messages of the processes.
 _TICK = 0.2
@@ -70,15 +68,9 @@ class BenchmarkError(RuntimeError):
 
 @contextmanager
 def resumable(console: Console, *others: type[Exception]) -> Iterator[None]:
-    """Print expected errors and exit; after Ctrl-C, print how to continue.
-
-    Args:
-        others: further exception types that are printed without a traceback.
-    """
-    expected: tuple[type[Exception], ...] = (
-        *(ConfigError, DatasetError, BenchmarkError, RunError, BrokenProcessPool),
-        *others,
-    )
+    """Print expected errors, and those of the types `others`; after Ctrl-C, how to continue."""
+    ours = (ConfigError, DatasetError, BenchmarkError, RunError, BrokenProcessPool)
+    expected: tuple[type[Exception], ...] = (*ours, *others)
     try:
         yield
     except expected as error:
@@ -95,7 +87,6 @@ class Plan:
 
     Attributes:
         folder: folder of the reports.
-        data: scenes for training, validation and test.
         settings: evaluation setting by data source. The key `POOLED` is the union of all sources.
         tasks: names of the tasks to measure, which are keys of `EVERY_TASK`.
     """
@@ -116,28 +107,22 @@ class Plan:
         return [task for task in self.tasks if task not in ONCE]
 
     def claim(self, entry: Entry) -> None:
-        """Reserve the folder of an entry, or check that it belongs to this entry and these scenes.
-
-        Raises:
-            BenchmarkError: the folder belongs to an entry with other settings or other scenes.
-        """
+        """Reserve the folder of an entry. Another entry or other scenes are a BenchmarkError."""
         path = self.folder_of(entry) / "row.json"
-        values = {"name": entry.name, "seed": entry.seed, "identity": entry.identity}
+        row = {"name": entry.name, "seed": entry.seed, "identity": entry.identity}
+        row["material"] = self.data.digest
         if not path.exists():
-            write_whole(path, json.dumps(values | {"material": self.data.digest}))
-            return
-        row = _read_row(path)
-        if row["identity"] != entry.identity:
-            raise BenchmarkError(
-                f"{path.parent} holds reports of another configuration of {entry.name}: use "
-                "--fresh or another folder"
-            )
-        if row.get("material") != self.data.digest:
-            raise BenchmarkError(
+            write_whole(path, json.dumps(row))
+        stored, reason = _read_row(path), ""
+        if stored["identity"] != entry.identity:
+            reason = f"{path.parent} holds reports of another configuration of {entry.name}"
+        elif stored.get("material") != self.data.digest:
+            reason = (
                 f"the reports in {path.parent} belong to other training scenes, or do not record "
-                "their scenes (files, sources, limit, split and vocabulary must be equal): use "
-                "--fresh or another folder"
+                "their scenes (files, sources, limit, split and vocabulary must be equal)"
             )
+        if reason:
+            raise BenchmarkError(f"{reason}: use --fresh or another folder")
 
     def parameters(self, entries: Sequence[Entry]) -> dict[str, int]:
         """Return the number of trained weights by name, for entries that record this number."""
@@ -148,8 +133,7 @@ class Plan:
         """Return the finished reports of an entry, by data source.
 
         Raises:
-            BenchmarkError: the folder holds reports of other test scenes, other training scenes, or
-                another configuration of the entry.
+            BenchmarkError: the folder belongs to other scenes or another entry.
         """
         self.claim(entry)
         reports = {}
@@ -169,7 +153,7 @@ class Plan:
     def measure(self, entry: Entry, progress: Progress) -> None:
         """Measure an entry on every data source that lacks a finished report.
 
-        The model is trained only if a report is missing. Results of finished tasks are on disk.
+        The model is trained only if a report is missing.
         """
         reports, folder = self.finished(entry), self.folder_of(entry)
         model: Model | None = None
@@ -184,12 +168,8 @@ class Plan:
                 if model.parameters is not None:
                     row = _read_row(folder / "row.json") | {"parameters": model.parameters}
                     write_whole(folder / "row.json", json.dumps(row))
-            measure(
-                *(model, setting, source),
-                tasks=self.tasks_on(source),
-                path=folder / f"{source}.json",
-                progress=say,
-            )
+            path = folder / f"{source}.json"
+            measure(model, setting, source, tasks=self.tasks_on(source), path=path, progress=say)
             say(DONE)
 
     def report(self, entry: Entry) -> dict[str, SourceReport]:
@@ -220,33 +200,31 @@ def measure_entries(
 
     Returns:
         The reports by (name, seed), and the error messages of failed entries by name.
-
-    Raises:
-        BrokenProcessPool: a worker process died.
     """
     if fresh:
         for entry in entries:
             shutil.rmtree(plan.folder_of(entry), ignore_errors=True)
-    failed: dict[tuple[str, int], Exception] = {}
     missing = [entry for entry in entries if len(plan.finished(entry)) < len(plan.settings)]
     for entry in entries:
         if entry not in missing:
             plan.measure(entry, progress)
-    work = partial(_measure_or_error, plan, failures)
     if missing and workers > 1:
-        failed = _measure_in_processes(work, missing, progress, min(workers, len(missing)))
+        failed = _in_processes(plan, failures, missing, progress, min(workers, len(missing)))
     else:
-        for entry in missing:
-            if error := work(entry, progress):
-                failed[entry.name, entry.seed] = error
-    reasons = {name: f"seed {seed}: {error}" for (name, seed), error in failed.items()}
+        failed = [_measure(plan, failures, entry, progress) for entry in missing]
+    reasons = {
+        entry.name: f"seed {entry.seed}: {error}"
+        for entry, error in zip(missing, failed, strict=True)
+        if error
+    }
     measured = [entry for entry in entries if entry.name not in reasons]
     return {(entry.name, entry.seed): plan.report(entry) for entry in measured}, reasons
 
 
-def _measure_or_error(
+def _measure(
     plan: Plan, failures: tuple[type[Exception], ...], entry: Entry, progress: Progress
 ) -> Exception | None:
+    """Measure an entry; return its error if it failed."""
     try:
         plan.measure(entry, progress)
     except failures as error:
@@ -254,27 +232,30 @@ def _measure_or_error(
     return None
 
 
-def _measure_in_processes(
-    work: Work, entries: Sequence[Entry], progress: Progress, workers: int
-) -> dict[tuple[str, int], Exception]:
-    """Measure entries in processes; return the errors of failed entries by (name, seed)."""
+def _in_processes(
+    plan: Plan,
+    failures: tuple[type[Exception], ...],
+    entries: Sequence[Entry],
+    progress: Progress,
+    workers: int,
+) -> list[Exception | None]:
+    """Measure entries in processes; return the error of each entry that failed, else None."""
     context = multiprocessing.get_context("spawn")
     # SimpleQueue has no sending thread, so the queue has all messages of a finished entry.
     messages: SimpleQueue[tuple[str, str, str]] = context.SimpleQueue()
     # Pickling avoids the shared memory of torch, which is small in containers.
-    begin = (pickle.dumps(work), messages)
+    begin = (pickle.dumps(partial(_measure, plan, failures)), messages)
     with _one_thread(), ProcessPoolExecutor(workers, context, _start_worker, begin) as pool:
         try:
-            futures = {
-                pool.submit(_measure_here, entry): (entry.name, entry.seed) for entry in entries
-            }
+            futures = [pool.submit(_measure_here, entry) for entry in entries]
             while True:
                 done, waiting = wait(futures, _TICK, FIRST_EXCEPTION)
                 while not messages.empty():
                     progress(*messages.get())
-                failed = {futures[future]: error for future in done if (error := future.result())}
+                for future in done:
+                    future.result()  # raises an unexpected error at once
                 if not waiting:
-                    return failed
+                    return [future.result() for future in futures]
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             for process in multiprocessing.active_children():
@@ -297,7 +278,7 @@ def _one_thread() -> Iterator[None]:
                 os.environ[name] = value
 
 
-_work: Work
+_work: Callable[[Entry, Progress], Exception | None]
 _progress: Progress
 
 

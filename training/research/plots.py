@@ -7,13 +7,11 @@ recall.png          recall among the first k predictions, for relations and for 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
 
 from training.evaluation.calibration_task import NAMES
-from training.evaluation.item_statistics import reliability
 from training.evaluation.metrics import Scored
 from training.evaluation.results import Reports, Results
 from training.evaluation.setting import Outcome
@@ -26,14 +24,10 @@ _RECALL = {
 }
 
 
-def write_plots(
-    plan: Plan, machines: Sequence[Entry], reports: Reports, results: Results
-) -> list[Path]:
-    """Write all plots that have data, and return the paths of the files.
+def write_plots(plan: Plan, machines: Sequence[Entry], reports: Reports, results: Results) -> None:
+    """Write all plots that have data.
 
-    Args:
-        machines: trained and calibrated machines, one per training seed. The reliability plots use
-            the seed of the first machine.
+    The reliability plots use the calibrated machines with the training seed of the first.
     """
     figures = {"recall": recall_curves(results, POOLED)}
     for entry in machines:
@@ -41,19 +35,14 @@ def write_plots(
         if outcome is not None and entry.seed == machines[0].seed:
             title = f"{entry.name}, {POOLED}"
             figures[f"reliability-{slug(entry.name)}"] = reliability_diagrams(outcome, title)
-    paths = []
     for name, figure in figures.items():
-        path = plan.folder / f"{name}.png"
-        figure.savefig(path, dpi=110)
-        paths.append(path)
-    return paths
+        figure.savefig(plan.folder / f"{name}.png", dpi=110)
 
 
 def reliability_diagrams(outcome: Outcome, title: str) -> Figure:
     """Plot reliability diagrams, one per question, with and without calibration.
 
-    Each bin holds the same number of answers. The axes are logarithmic because most probabilities
-    are small.
+    The axes are logarithmic because most probabilities are small.
     """
     questions = [name for name in NAMES if f"ECE, {name}" in outcome.metrics]
     figure = Figure(figsize=(3.2 * max(len(questions), 1), 3.6), layout="constrained")
@@ -64,7 +53,7 @@ def reliability_diagrams(outcome: Outcome, title: str) -> Figure:
             metric = outcome.metrics[f"ECE, {name}{suffix}"]
             if not isinstance(metric, Scored):
                 raise TypeError(f"the metric ECE of {name} does not store its answers")
-            probability, frequency = reliability(metric.score, metric.truth)
+            probability, frequency = metric.reliability()
             label = f"{suffix[2:] or 'as published'}, ECE {metric.value:.3f}"
             axis.plot(probability, frequency, marker=marker, linewidth=1, label=label)
         axis.set_xscale("symlog", linthresh=1e-3)

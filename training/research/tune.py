@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 import typer
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ValidationError
 from rich.console import Console
 from rich.table import Table
 
@@ -74,19 +74,16 @@ _BY: dict[By, tuple[str, ...]] = {
     "r-precision": ("R-precision",),
     "both": tuple(FIGURES),
 }
-# Settings that cannot be searched: trials are comparable only with the same scenes and seed.
+# Trials are comparable only with the same scenes and seed.
 _FIXED = ("data.", "training.seed", "training.threads")
-# Pruning stops a trial whose metric is below the median of earlier trials. It needs this number of
-# finished trials, and it starts after this percentage of the first phase of a trial.
+# Pruning needs this number of finished trials, and starts after this percentage of the first phase.
 _RIVALS = 4
 _WARM_UP = 33
 
 console = Console()
 
 
-class _Interval(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
-
+class _Interval(BaseModel, extra="forbid", frozen=True, strict=True):
     low: int | float
     high: int | float
     log: bool = False
@@ -144,10 +141,7 @@ def tune(
 
 
 def load_space(path: Path, config: Config) -> dict[str, BaseDistribution]:
-    """Read a search space, and check its values in the configuration.
-
-    Returns:
-        The distribution of each searched setting, by setting name.
+    """Return the distribution of each setting in a search space.
 
     Raises:
         ConfigError: the file is missing or not TOML, an entry is neither a list of choices nor an
@@ -198,11 +192,7 @@ class Search:
     journal: Path
 
     def open(self, scenes: str, seed: int, *, prune: bool) -> Study:
-        """Open the optuna study in the folder, or create it.
-
-        Raises:
-            ConfigError: the folder holds a search with another configuration, scenes or metric.
-        """
+        """Open the optuna study, or create it. A study of another search is a ConfigError."""
         import optuna
         from optuna.storages.journal import JournalFileBackend
 
@@ -210,14 +200,13 @@ class Search:
         self.folder.mkdir(parents=True, exist_ok=True)
         self.journal.parent.mkdir(parents=True, exist_ok=True)
         backend = JournalFileBackend(str(self.journal))
+        pruners = optuna.pruners
         study = optuna.create_study(
             storage=optuna.storages.JournalStorage(backend),
             study_name=self.config.name,
             direction="maximize",
             load_if_exists=True,
-            pruner=optuna.pruners.MedianPruner(_RIVALS, _WARM_UP)
-            if prune
-            else optuna.pruners.NopPruner(),
+            pruner=pruners.MedianPruner(_RIVALS, _WARM_UP) if prune else pruners.NopPruner(),
         )
         identity = {"config": self.config.digest, "scenes": scenes, "by": self.by}
         if study.user_attrs.setdefault("identity", identity) != identity:
@@ -242,22 +231,18 @@ class Search:
             trial.set_user_attr("process", _process())
             # With one seed for all, each process would draw the same settings.
             study.sampler = optuna.samplers.TPESampler(seed=seed + trial.number)
-            is_original = trial.user_attrs.get("as it is", trial.number == 0)
-            self._run(study, trial, {} if is_original else _suggest_settings(trial, self.space))
+            settings = {} if _is_original(trial) else _suggest_settings(trial, self.space)
+            self._run(study, trial, settings)
 
     def _requeue(self, study: Study) -> None:
         """Queue the trials of ended processes again; the new trials resume from the checkpoints."""
         from optuna.trial import TrialState
 
         for trial in study.get_trials(states=(TrialState.RUNNING,)):
-            if _is_running(trial.user_attrs.get("process", "")):
-                continue
-            attributes = {
-                "as it is": trial.user_attrs.get("as it is", trial.number == 0),
-                "folder": _folder(trial),
-            }
-            study.enqueue_trial(trial.params, user_attrs=attributes)
-            study.tell(trial.number, state=TrialState.FAIL)
+            if not _is_running(trial.user_attrs.get("process", "")):
+                attributes = {"as it is": _is_original(trial), "folder": _folder(trial)}
+                study.enqueue_trial(trial.params, user_attrs=attributes)
+                study.tell(trial.number, state=TrialState.FAIL)
 
     def _run(self, study: Study, trial: Trial, settings: Mapping[str, Any]) -> None:
         """Run one trial, and store its settings, its value or the reason of its end."""
@@ -279,8 +264,7 @@ class Search:
     def value_of(self, trial: Trial, settings: Mapping[str, Any]) -> float:
         """Train the machine of one trial, and return its metric on validation scenes.
 
-        Raises:
-            optuna.TrialPruned: the best score is below the median of earlier trials.
+        If its best score is below the median of earlier trials, optuna.TrialPruned is raised.
         """
         import optuna
 
@@ -313,13 +297,12 @@ class Search:
         return sum(metrics[name].value for name in _BY[self.by] if name in metrics)
 
     def _measure(self, machine: BoltzmannMachine, folder: Path) -> dict[str, Metric]:
-        artifact = draft_artifact(machine, self.data.classes)
+        data, artifact = self.data, draft_artifact(machine, self.data.classes)
         relations = relation_score(artifact, given=False)
         model = Model(missing=missing_score(artifact), relations=relations)
         tasks = [task for task, _ in FIGURES.values()]
-        for source, setting in settings_by_source(
-            self.data.validation, self.data.structure, self.data.train, seen=None
-        ):
+        settings = settings_by_source(data.validation, data.structure, data.train, seen=None)
+        for source, setting in settings:
             measure(model, setting, source, tasks=tasks, path=folder / f"{source}.json")
         return self.metrics(folder)
 
@@ -345,16 +328,17 @@ def shown(settings: Mapping[str, Any]) -> str:
 
 def _counted_trials(study: Study) -> list[FrozenTrial]:
     """Return the trials that ended by themselves or that still run."""
-    return [
-        trial
-        for trial in study.trials
-        if "settings" in trial.user_attrs or trial.state.name == "RUNNING"
-    ]
+    return [t for t in study.trials if "settings" in t.user_attrs or t.state.name == "RUNNING"]
 
 
 def _folder(trial: Trial | FrozenTrial) -> str:
-    """Return the name of a trial's folder, which a trial that is queued again keeps."""
+    """Return the name of a trial's folder, which it keeps if it is queued again."""
     return str(trial.user_attrs.get("folder", f"trial-{trial.number}"))
+
+
+def _is_original(trial: Trial | FrozenTrial) -> bool:
+    """Return whether a trial uses the unchanged configuration."""
+    return bool(trial.user_attrs.get("as it is", trial.number == 0))
 
 
 def _process() -> str:
@@ -374,23 +358,20 @@ def _is_running(process: str) -> bool:
 
 
 def _finished(study: Study) -> list[FrozenTrial]:
-    from optuna.trial import TrialState
-
-    return study.get_trials(states=(TrialState.COMPLETE,))
+    return [trial for trial in study.trials if trial.state.name == "COMPLETE"]
 
 
 def _suggest_settings(trial: Trial, space: Mapping[str, BaseDistribution]) -> dict[str, Any]:
     from optuna.distributions import FloatDistribution, IntDistribution
 
-    settings: dict[str, Any] = {}
     for name, entry in space.items():
         if isinstance(entry, IntDistribution):
-            settings[name] = trial.suggest_int(name, entry.low, entry.high, log=entry.log)
+            trial.suggest_int(name, entry.low, entry.high, log=entry.log)
         elif isinstance(entry, FloatDistribution):
-            settings[name] = trial.suggest_float(name, entry.low, entry.high, log=entry.log)
+            trial.suggest_float(name, entry.low, entry.high, log=entry.log)
         else:
-            settings[name] = trial.suggest_categorical(name, entry.choices)  # type: ignore[attr-defined]
-    return settings
+            trial.suggest_categorical(name, entry.choices)  # type: ignore[attr-defined]
+    return trial.params
 
 
 def _table(study: Study, title: str) -> Table:
@@ -399,11 +380,10 @@ def _table(study: Study, title: str) -> Table:
     table = Table(*headings, "state", "settings", title=title)
     trials = [trial for trial in study.trials if "settings" in trial.user_attrs]
     for trial in sorted(trials, key=lambda t: math.inf if t.value is None else -t.value):
-        figures = trial.user_attrs.get("figures", {})
-        reason = trial.user_attrs.get("reason", "")
-        state = f"{trial.state.name.lower()}: {reason}" if reason else trial.state.name.lower()
-        settings = shown(trial.user_attrs["settings"])
-        table.add_row(*(figures.get(name, "") for name in FIGURES), state, settings)
+        attributes = trial.user_attrs
+        figures = (attributes.get("figures", {}).get(name, "") for name in FIGURES)
+        state = ": ".join(filter(None, (trial.state.name.lower(), attributes.get("reason"))))
+        table.add_row(*figures, state, shown(attributes["settings"]))
     return table
 
 

@@ -98,11 +98,7 @@ def _train_all(
     settings: Mapping[str, float],
     workers: int,
 ) -> dict[str, dict[str, list[Run]]]:
-    """Train and measure each machine without a file, in worker processes of one thread.
-
-    Returns:
-        The runs by split and variant.
-    """
+    """Return the runs by split and variant, from files or worker processes of one thread."""
     runs: dict[str, dict[str, list[Run]]] = {split: {} for split in materials}
     jobs = list(product(materials, VARIANTS, range(seeds)))
     one = partial(_run, folder=folder, materials=dict(materials), settings=dict(settings))
@@ -134,12 +130,11 @@ def _run(
 ) -> Run:
     """Return the run in a file, or train and measure a machine and write the file.
 
-    Args:
-        job: split, variant and training seed.
+    A job is a split, a variant and a training seed.
 
     Raises:
         FolderError: the file contains a run with other scenes or settings.
-        FloatingPointError: training has diverged. The message names the machine.
+        FloatingPointError: training has diverged.
     """
     split, name, number = job
     path = folder / split / f"{name}-seed-{number}.json"

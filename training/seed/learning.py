@@ -40,17 +40,12 @@ LARGEST_WEIGHT: Final = 50.0
 RUNAWAY: Final = 4.0, 10
 """Training has diverged if E stays above this multiple of the error of units that are always off,
 for this number of epochs, and does not fall."""
-
-
 KINDS: Final = ("objects", "relations")
 
 
 @dataclass(frozen=True)
 class Epoch:
-    """Errors E of objects and relations, for the training and the validation scenes.
-
-    Without annotated scenes, the errors of relations are 0.
-    """
+    """Errors E of objects and relations, which are 0 without annotated scenes."""
 
     objects: float
     relations: float
@@ -65,21 +60,19 @@ def phases(
     """Run the positive phase and `steps` sweeps of the negative phase.
 
     Returns:
-        The states at the end of the positive and of the negative phase, where the mean of h1 given
-        all other units replaces h1; the error E of the objects, (B,), and of the relations, (B,).
+        The states at the end of both phases, with the mean of h1 given all other units in place of
+        h1; the error E of the objects, (B,), and of the relations, (B,).
     """
-    v, r, annotated = scenes.v, scenes.r, scenes.annotated.unsqueeze(1)
-    h1, h2 = machine.hidden(v, r, generator)
-    free = Free(torch.ones_like(v, dtype=torch.bool), annotated.expand(r.shape))
-    state = State(v, r, h1, h2)
+    v, r, free = scenes.v, scenes.r, Free.of(scenes.v, scenes.annotated, scenes.r)
+    start = state = State(v, r, *machine.hidden(v, r, generator))
     object_p, relation_p = v, r
     for _ in range(steps):
         state, object_p, relation_p = machine.sweep(state, free, 1.0, generator)
-    draws = [torch.rand(h.shape, generator=generator, dtype=h.dtype) for h in (h1, h2)]
-    positive = _with_context(machine, State(v, r, h1, h2), draws)
-    negative = _with_context(machine, state, draws)
+    hidden = (start.h1, start.h2)
+    draws = [torch.rand(h.shape, generator=generator, dtype=h.dtype) for h in hidden]
+    positive, negative = (_with_context(machine, end, draws) for end in (start, state))
     object_error = (v - object_p).square().sum(1)
-    relation_error = ((r - relation_p) * annotated).square().sum(1)
+    relation_error = ((r - relation_p) * free.r).square().sum(1)
     return positive, negative, object_error, relation_error
 
 
@@ -101,8 +94,7 @@ def train(
     """Train a machine in place, and return the errors of each epoch.
 
     Raises:
-        FloatingPointError: training has diverged. The message names the weight, the errors and the
-            learning rate.
+        FloatingPointError: training has diverged.
     """
     history: list[Epoch] = []
     best, best_epoch, weights = math.inf, 0, machine.state_dict()

@@ -53,6 +53,11 @@ class Free:
     v: Tensor
     r: Tensor
 
+    @classmethod
+    def of(cls, v: Tensor, annotated: Tensor, r: Tensor) -> Free:
+        """Return all objects, and the relations of the `annotated` scenes, (B,)."""
+        return cls(torch.ones_like(v).bool(), annotated.unsqueeze(1).expand(r.shape))
+
 
 def bernoulli(p: Tensor, generator: torch.Generator) -> Tensor:
     """Sample units that are on with probability p, in the shape of p."""
@@ -148,8 +153,7 @@ class Machine(nn.Module):
     ) -> tuple[State, Tensor, Tensor]:
         """Sample h2, h1, the free objects and the free relations once, in this order.
 
-        Returns:
-            The new state, and the probabilities of objects (B, V) and relations (B, T) to be on.
+        Return the new state, and the probabilities of objects (B, V) and relations (B, T) to be on.
         """
         h2 = bernoulli((self.h2_logits(state.h1) / temperature).sigmoid(), generator)
         logits = self.h1_logits(state.v, state.r, h2)

@@ -89,10 +89,8 @@ def measure(answer: Answer, triples: Tensor, test: Scenes, seed: int) -> dict[st
     generator = torch.Generator().manual_seed(seed)
     figures = relations_on(answer, test, generator)
     for name, left in (("relations left", True), ("relations deleted", False)):
-        figures |= {
-            f"T2 {metric}, {name}": value
-            for metric, value in removed_on(answer, triples, test, left, generator).items()
-        }
+        values = removed_on(answer, triples, test, left, generator)
+        figures |= {f"T2 {metric}, {name}": value for metric, value in values.items()}
     return figures | extra_errors(answer, test, generator)
 
 
@@ -102,9 +100,7 @@ def relations_on(answer: Answer, test: Scenes, generator: torch.Generator) -> di
     if not len(scenes):
         return {}
     off = torch.zeros_like(scenes.r)
-    free = Free(
-        torch.zeros_like(scenes.v, dtype=torch.bool), torch.ones_like(off, dtype=torch.bool)
-    )
+    free = Free(torch.zeros_like(scenes.v).bool(), torch.ones_like(off).bool())
     _, r = answer(scenes.v, off, free, generator)
     hits, on, labelled = float((r * scenes.r).sum()), float(r.sum()), float(scenes.labelled.sum())
     return {
@@ -120,9 +116,8 @@ def removed_on(
 ) -> dict[str, float]:
     """Measure T2 over the scenes of two or more classes.
 
-    The remaining classes and the relations among them stay as they are. The absent classes and
-    their relations are free. With `left`, the relations between the removed class and the others
-    also stay as they are.
+    The absent classes and their relations are free. With `left`, the relations of the removed class
+    stay as they are.
     """
     scenes = test.rows(test.v.sum(1) >= 2)
     removed = torch.multinomial(scenes.v, 1, generator=generator)
@@ -141,9 +136,7 @@ def extra_errors(answer: Answer, test: Scenes, generator: torch.Generator) -> di
     """Measure T3. All units are free, and sampling starts at the scene with the added class."""
     added = torch.multinomial(1 - test.v, 1, generator=generator)
     altered = test.v.scatter(1, added, 1.0)
-    free_r = test.annotated.unsqueeze(1).expand(test.r.shape)
-    free = Free(torch.ones_like(altered, dtype=torch.bool), free_r)
-    v, _ = answer(altered, test.r, free, generator)
+    v, _ = answer(altered, test.r, Free.of(altered, test.annotated, test.r), generator)
     wrong = float((v - test.v).abs().sum())
     return {
         "T3 error / V": wrong / test.v.numel(),
@@ -174,23 +167,21 @@ def generate(
         h1[range(len(units)), units] = 1.0
         v = _objects_given(machine, h1.repeat_interleave(_DRAWN, 0), generator)
         pairs = torch.einsum("bi,bj->ij", v, v).fill_diagonal_(0)
+        share = (pairs * seen).sum() / pairs.sum().clamp(min=1)
         figures[f"T4 objects a scene, others {name}"] = float(v.sum(1).mean())
-        figures[f"T4 pairs seen, others {name}"] = float(
-            (pairs * seen).sum() / pairs.sum().clamp(min=1)
-        )
+        figures[f"T4 pairs seen, others {name}"] = float(share)
         for unit, drawn in zip(units.tolist(), v.split(_DRAWN), strict=True):
             top = drawn.mean(0).topk(min(_SHOWN, v.shape[1])).indices.tolist()
-            labels = [vocabulary.objects[i].label for i in top]
-            classes[f"unit {unit}, others {name}"] = labels
+            classes[f"unit {unit}, others {name}"] = [vocabulary.objects[i].label for i in top]
     return figures, classes
 
 
 def _objects_given(machine: Machine, h1: Tensor, generator: torch.Generator) -> Tensor:
     """Sample objects given h1, (B, V), by ten alternations with relations."""
-    v, r = h1.new_zeros(len(h1), len(machine.b)), h1.new_zeros(len(h1), len(machine.d))
-    free = Free(torch.ones_like(v, dtype=torch.bool), torch.ones_like(r, dtype=torch.bool))
+    v, r, h2 = (h1.new_zeros(len(h1), len(bias)) for bias in (machine.b, machine.d, machine.c2))
+    free = Free(torch.ones_like(v).bool(), torch.ones_like(r).bool())
     for _ in range(10):
-        state = State(v, r, h1, h1.new_zeros(len(h1), len(machine.c2)))
+        state = State(v, r, h1, h2)
         v, _ = machine.sample_objects(state, free, 1.0, generator)
         r = bernoulli(machine.relation_logits(v, h1).sigmoid() * machine.gate(v), generator)
     return v

@@ -35,8 +35,7 @@ class Scenes:
     """N scenes. In an annotated scene, an unlisted relation is false.
 
     Attributes:
-        v: (N, V) presence of each class.
-        r: (N, T) listed triples, among the T triples of the training scenes.
+        v, r: (N, V) presence of each class; (N, T) listed triples among those of training.
         labelled: (N,) number of listed triples, those without a unit included.
         annotated: (N,) bool, False for a scene without annotation of relations.
     """
@@ -108,39 +107,29 @@ def _material(
 ) -> Material:
     parts = split(scenes, seed=0, protocol=protocol)
     V = len(vocabulary)
-    keys = {
-        part: [_keys(encoded[scene.scene_id], V) for scene in members]
-        for part, members in parts.items()
-    }
-    units = np.unique(np.concatenate([*keys["train"], np.zeros(0, np.int64)]))
-    tensors = {
-        part: _scenes([encoded[scene.scene_id] for scene in members], keys[part], units, V)
-        for part, members in parts.items()
-    }
+    members = {part: [encoded[x.scene_id] for x in own] for part, own in parts.items()}
+    train = [_keys(scene, V) for scene in members["train"]]
+    units = np.unique(np.concatenate([*train, np.zeros(0, np.int64)]))
+    tensors = {part: _scenes(own, units, V) for part, own in members.items()}
     sha = hashlib.sha256(repr([entry.label for entry in vocabulary.objects]).encode())
-    for part, members in parts.items():
-        sha.update(repr((part, members)).encode())
+    for entry in parts.items():
+        sha.update(repr(entry).encode())
     triples = np.stack([units // V // V, units // V % V, units % V], axis=1)
     return Material(vocabulary, torch.from_numpy(triples), **tensors, digest=sha.hexdigest())
 
 
 def _keys(scene: EncodedScene, V: int) -> np.ndarray:
-    """Return the listed triples of a scene as sorted integers (relation * V + i) * V + j."""
+    """Return the listed triples of a scene as integers (relation * V + i) * V + j."""
     relation, subject, object_ = scene.evidence.holds[:RELATIONS].nonzero()
     classes = scene.evidence.classes
-    return np.sort((relation * V + classes[subject]) * V + classes[object_])
+    return np.asarray((relation * V + classes[subject]) * V + classes[object_])
 
 
-def _scenes(
-    scenes: Sequence[EncodedScene], keys: Sequence[np.ndarray], units: np.ndarray, V: int
-) -> Scenes:
+def _scenes(scenes: Sequence[EncodedScene], units: np.ndarray, V: int) -> Scenes:
     v, r = torch.zeros(len(scenes), V), torch.zeros(len(scenes), len(units))
+    keys = [_keys(scene, V) for scene in scenes]
     for row, (scene, own) in enumerate(zip(scenes, keys, strict=True)):
         v[row, torch.from_numpy(scene.evidence.classes)] = 1.0
-        r[row, torch.from_numpy(np.flatnonzero(np.isin(units, own)))] = 1.0
-    return Scenes(
-        v,
-        r,
-        torch.tensor([len(own) for own in keys]),
-        torch.tensor([bool(scene.evidence.observed[:RELATIONS].any()) for scene in scenes]),
-    )
+        r[row, torch.from_numpy(np.isin(units, own))] = 1.0
+    annotated = [bool(scene.evidence.observed[:RELATIONS].any()) for scene in scenes]
+    return Scenes(v, r, torch.tensor([len(own) for own in keys]), torch.tensor(annotated))

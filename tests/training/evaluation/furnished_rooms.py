@@ -36,10 +36,7 @@ def room_model() -> Artifact:
         for parameter in machine.parameters():
             parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.5)
     calibration = Calibration.neutral(A).model_copy(
-        update={
-            "outlier": CountSlope(slope=-1.0),
-            "outlier_lines": lines(0.0, 0.0, 0.0),
-        }
+        update={"outlier": CountSlope(slope=-1.0), "outlier_lines": lines(0.0, 0.0, 0.0)}
     )
     draft = draft_artifact(machine.eval().requires_grad_(False), VOCABULARY)
     return replace(draft, calibration=calibration)

@@ -128,19 +128,16 @@ def test_a_fact_and_its_mirror_image_are_the_same_fact(tmp_path):
 
 def test_the_task_has_a_metric_for_each_line(folder):
     setting = Setting(rooms(5, 1), STRUCTURE, everyday=folder)
-    model = Model(artifact=room_model())
-    outcome = everyday_task(model, setting)
+    outcome = everyday_task(room_model(), setting)
     assert tuple(outcome.metrics) == LINES
     for line, (hits, asked) in ask_everyday(room_model(), folder).items():
         assert outcome.metrics[line].value == pytest.approx(hits / asked)
         assert outcome.metrics[line].n == asked
-    assert everyday_task(Model(), setting) is None
 
 
 def test_an_absent_folder_leaves_the_task_out(tmp_path):
-    model = Model(artifact=room_model())
     for place in (None, tmp_path / "nowhere"):
-        assert everyday_task(model, Setting(rooms(5, 1), STRUCTURE, everyday=place)) is None
+        assert everyday_task(room_model(), Setting(rooms(5, 1), STRUCTURE, everyday=place)) is None
     with pytest.raises(FileNotFoundError, match=r"no facts\.json"):
         ask_everyday(room_model(), tmp_path)
     assert facts_digest(tmp_path) == ""
@@ -161,13 +158,13 @@ def test_a_card_has_the_lines_once(folder):
     found = [(row.source, row.metric) for row in rows if row.task == "Everyday"]
     # A single fact has no interval.
     setting = Setting(rooms(5, 1), STRUCTURE, everyday=folder)
-    metrics = everyday_task(Model(artifact=room_model()), setting).metrics
+    metrics = everyday_task(room_model(), setting).metrics
     assert found == [("facts", line) for line in LINES if len(metrics[line].groups) > 1]
     assert len(found) > 5
 
 
-def test_no_other_module_reads_the_facts():
-    """Neither the file nor its folder is named elsewhere."""
+def test_no_training_or_tuning_asks_the_facts():
+    """Modules that import the task publish or compare finished models; none names the file."""
     named = re.compile(r"facts\.json|shared/everyday|/\s*[\"']everyday\b|[\"']\S*/everyday\b")
     own = REPOSITORY / "training/evaluation/everyday_task.py"
     sources = [*(REPOSITORY / "training").rglob("*"), *(REPOSITORY / "app").rglob("*.py")]
@@ -175,28 +172,17 @@ def test_no_other_module_reads_the_facts():
         if path.suffix in (".py", ".toml", ".json") and path != own:
             text = path.read_text(encoding="utf-8")
             assert not named.search(text), f"{path} names the everyday facts"
-
-
-def test_no_training_or_tuning_asks_the_facts():
-    """What imports the module publishes or compares finished models."""
     used = re.compile(r"evaluation(?:\.everyday| import everyday)|ask_everyday")
     users = {
         str(path.relative_to(REPOSITORY))
         for path in (REPOSITORY / "training").rglob("*.py")
         if used.search(path.read_text(encoding="utf-8"))
     }
-    users.discard("training/evaluation/everyday_task.py")
     assert users == {
         "training/domain/evaluate_command.py",
+        "training/evaluation/everyday_task.py",
         "training/evaluation/report.py",
         "training/evaluation/tasks.py",
         "training/research/benchmark.py",
         "training/runs/publish.py",
     }
-
-
-def test_publishing_asks_after_everything_is_fitted():
-    """The facts are opened by `evaluate` alone, which takes a calibrated model."""
-    text = (REPOSITORY / "training/runs/publish.py").read_text(encoding="utf-8")
-    assert text.count("EVERYDAY") == 2
-    assert text.index("everyday=EVERYDAY") > text.index("judge(calibrated)")

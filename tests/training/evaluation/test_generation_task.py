@@ -52,31 +52,15 @@ def test_discrepancy_and_marginal_error_by_hand():
     assert marginal(np.ones(3)) == pytest.approx((2 / 3 + 1 / 6 + 2 / 3) / (4 / 3))
 
 
-def test_discrepancy_of_one_distribution_is_zero_on_average():
-    """300 pairs of samples from the same law; the mean is within 5 standard errors of zero."""
-    rng = torch.Generator().manual_seed(0)
-    p = torch.tensor([0.1, 0.5, 0.3, 0.8])
-    values = []
-    for _ in range(300):
-        x, y = (torch.rand(20, 4, generator=rng) < p for _ in range(2))
-        values.append(discrepancy(x.float(), y.float(), 2.0)(np.ones(20)))
-    assert abs(np.mean(values)) < 5 * np.std(values) / np.sqrt(300)
-    other = (torch.rand(20, 4, generator=rng) < 1 - p).float()
-    assert discrepancy(x.float(), other, 2.0)(np.ones(20)) > 0.1
-
-
 def test_pair_correlation_by_hand():
     """Covariances of (0,1), (0,2), (1,2) against those of another sample."""
     rng = np.random.default_rng(0)
-    x, y = (rng.random((30, 3)) < 0.5 for _ in range(2))
+    x, y = ((rng.random((30, 3)) < 0.5).astype(float) for _ in range(2))
     pairs = [(0, 1), (0, 2), (1, 2)]
-    cov = [[np.cov(v.T.astype(float), bias=True)[p] for p in pairs] for v in (x, y)]
+    cov = [[np.cov(v.T, bias=True)[p] for p in pairs] for v in (x, y)]
     expected = np.corrcoef(*cov)[0, 1]
-    assert pair_correlation(y.astype(float), x.astype(float))(np.ones(30)) == pytest.approx(
-        expected
-    )
-    same = pair_correlation(y.astype(float), y.astype(float))
-    assert same(np.ones(30)) == pytest.approx(1.0)
+    assert pair_correlation(y, x)(np.ones(30)) == pytest.approx(expected)
+    assert pair_correlation(y, y)(np.ones(30)) == pytest.approx(1.0)
 
 
 def test_contradictions_by_hand():
@@ -106,8 +90,7 @@ def test_halves_keep_groups_together():
     scenes = tensors([scene([0, 1], group=f"g{k // 2}") for k in range(40)])
     first, second = held_out_halves(Setting(scenes, torch.zeros(5, dtype=torch.bool)))
     assert len(first) + len(second) == 40
-    assert len(first) >= 5
-    assert len(second) >= 5
+    assert min(len(first), len(second)) >= 5
     assert not {s.group for s in first.scenes} & {s.group for s in second.scenes}
 
 

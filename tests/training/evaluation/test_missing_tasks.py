@@ -19,7 +19,7 @@ from tests.training.evaluation.scenes import (
     scene,
     tensors,
 )
-from training.evaluation import asking, missing_tasks
+from training.evaluation import missing_tasks
 from training.evaluation.artifact_model import placed_score
 from training.evaluation.asking import LeakError, missing_probabilities, missing_score, of_classes
 from training.evaluation.missing_tasks import (
@@ -30,8 +30,8 @@ from training.evaluation.missing_tasks import (
     removed_places,
     structure_task,
 )
-from training.evaluation.model import Model, Places
-from training.evaluation.parts import draw_parts, one_quarter, up_to_longest
+from training.evaluation.model import Places
+from training.evaluation.parts import all_but_one, draw_parts, one_quarter, up_to_longest
 from training.evaluation.setting import Setting
 
 DATA = tensors(random_scenes(20), WIDE)
@@ -50,7 +50,7 @@ def test_metrics_by_hand():
     unknown in a third of the cases.
     """
     data = tensors([scene([0, 1], unknown=("x",)), scene([3, 4]), scene([2], unknown=("x",) * 5)])
-    outcome = missing_task(Model(missing=in_order), Setting(data, NO_STRUCTURE))
+    outcome = missing_task(in_order, Setting(data, NO_STRUCTURE))
     values = {name: metric.value for name, metric in outcome.metrics.items()}
     assert values["MRR, one removed"] == values["MRR, 25 % shown"] == pytest.approx((1 + 1 / 4) / 2)
     assert values["MRR, one removed, structure listed"] == values["MRR, one removed"]
@@ -58,7 +58,7 @@ def test_metrics_by_hand():
     assert values["MRR, unknown labels score 0"] == pytest.approx((1 + 1 / 4) / (3 / 2 + 1))
     assert outcome.metrics["MRR, one removed"].n == 2 * len(SEEDS)
     assert (outcome.scenes, outcome.skipped) == (3, 1)
-    assert missing_task(Model(missing=in_order), Setting(tensors([scene([0])]), FLOOR)) is None
+    assert missing_task(in_order, Setting(tensors([scene([0])]), FLOOR)) is None
 
 
 def test_structure_is_listed_in_its_own_metrics_alone():
@@ -91,46 +91,14 @@ def test_the_removed_object_cannot_leak():
     assert not first[torch.arange(3), torch.from_numpy(ranking.target)].any()
 
 
-CHEATERS = {
-    "its relations dangle": lambda evidence, x, target: (
-        [target] if evidence.holds[:, x].any() or evidence.holds[:, :, x].any() else []
-    ),
-    "the whole scene": lambda evidence, x, target: evidence.classes.tolist(),
-    "the removed object": lambda evidence, x, target: [target],
-}
-
-
-@pytest.mark.parametrize("cheater", CHEATERS)
 @pytest.mark.parametrize("first", [3, 9])
-def test_a_planted_cheater_is_caught(cheater, first):
+def test_a_planted_cheater_is_caught(first):
     """A score that counts the questions, however many objects the first scene has."""
-    large = scene(range(first), [(0, 0, 1), (1, 1, 2)])
-    data = tensors([large, scene([1, 3, 4], [(2, 1, 4)]), scene([0, 10])], WIDE)
-    ranking = rank_missing(data, WIDE_STRUCTURE, torch.zeros_like)
-    hints = []
-    for k, target in zip(ranking.scene, ranking.target, strict=True):
-        evidence, row = data.scenes[k].evidence, torch.zeros(WIDE)
-        x = int(np.searchsorted(evidence.classes, target))
-        row[CHEATERS[cheater](evidence, x, target)] = 1.0
-        hints.append(row)
-    turns = iter(hints * 3)
+    data = tensors([scene(range(first)), scene([1, 3, 4]), scene([0, 10])], WIDE)
+    hidden = draw_parts(data, WIDE_STRUCTURE, all_but_one, SEEDS).hidden.float()
+    turns = iter([*hidden] * 3)
     with pytest.raises(LeakError, match="leaks information"):
         rank_missing(data, WIDE_STRUCTURE, lambda v: torch.stack([next(turns) for _ in v]))
-
-
-def test_a_model_that_knows_the_hidden_classes_is_caught(monkeypatch):
-    """Planted behind the question itself."""
-    data = rooms(30, 1)
-    turns = iter(list(draw_parts(data, STRUCTURE, one_quarter, SEEDS).hidden.numpy()) * 3)
-    honest = asking.missing_probabilities
-
-    def cheat(artifact, asked):
-        p = honest(artifact, asked)
-        return np.where(np.isfinite(p), p + next(turns), p)
-
-    monkeypatch.setattr(asking, "missing_probabilities", cheat)
-    with pytest.raises(LeakError, match="leaks information"):
-        rank_missing(data, STRUCTURE, missing_score(room_model()), one_quarter)
 
 
 def test_the_score_is_the_ranking_of_the_service():
@@ -152,9 +120,9 @@ def test_the_score_is_the_ranking_of_the_service():
 def test_the_change_by_structure_by_hand(monkeypatch):
     """The first ten probabilities of one part, with and without another class as structure."""
     setting = Setting(rooms(30, 1), STRUCTURE, limit=8)
-    assert structure_task(Model(artifact=room_model()), setting) is None
+    assert structure_task(room_model(), setting) is None
     monkeypatch.setattr(missing_tasks, "_STRUCTURE", ("floor", VOCABULARY.labels[3]))
-    outcome = structure_task(Model(artifact=room_model()), setting)
+    outcome = structure_task(room_model(), setting)
     parts = draw_parts(setting.some(), STRUCTURE, up_to_longest)
     listed = parts.v[0].nonzero().squeeze(1).tolist()
     assert 3 not in listed
@@ -165,7 +133,6 @@ def test_the_change_by_structure_by_hand(monkeypatch):
     group = np.flatnonzero(metric.groups == setting.some().group_ids[parts.scene[0]])
     assert metric.numerators[group] == pytest.approx(np.abs(p[first] - q[first]).mean())
     assert metric.value > 0
-    assert structure_task(Model(missing=in_order), setting) is None
 
 
 # ------------------------------------------------------------------------------------------ T2-at
@@ -192,9 +159,9 @@ def test_the_class_at_a_place_cannot_leak():
     assert torch.equal(places.v.sum(1), DATA.v[row].sum(1) - 1)
     for n, k in enumerate(row.tolist()):
         evidence = DATA.scenes[k].evidence
-        x, y = np.searchsorted(evidence.classes, [target[n], places.anchor[n]])
-        a = places.relation[n]
-        assert evidence.holds[a, x, y] if places.outgoing[n] else evidence.holds[a, y, x]
+        ends = np.searchsorted(evidence.classes, [target[n], places.anchor[n]])
+        x, y = ends if places.outgoing[n] else ends[::-1]
+        assert evidence.holds[places.relation[n], x, y]
 
 
 def test_ranks_at_a_place_by_hand():

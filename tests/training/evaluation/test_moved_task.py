@@ -14,11 +14,8 @@ from app.scene import observe
 from tests.questions.artifacts import lines
 from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, room_model, rooms
 from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
-from training.datasets.moved import has_boxes
 from training.evaluation import moved_task as module
-from training.evaluation.artifact_model import artifact_model
 from training.evaluation.asking import LeakError, misplaced_score
-from training.evaluation.model import Model
 from training.evaluation.moved_task import flagged, moved_cases, moved_task
 from training.evaluation.setting import Setting
 
@@ -49,7 +46,7 @@ def oracle(scenes, structure, *, names=("moved", "subject")):
         right = dict.fromkeys(names, moved[keyed(request)])
         return [{"subject": "", "probability": 0.9} | right, {"subject": "0", "probability": 0.95}]
 
-    return Model(misplaced=score)
+    return score
 
 
 @pytest.mark.parametrize(("scenes", "structure"), BOTH)
@@ -57,20 +54,12 @@ def test_each_scene_is_asked_twice(scenes, structure):
     cases = moved_cases(scenes, structure)
     assert len(cases) == (len(POSED) if scenes is POSED else 8)
     for case in cases:
-        encoded = scenes.scenes[case.place]
+        assert case.moved.room_type is case.untouched.room_type is None
         index = int(case.object)
-        for request in (case.moved, case.untouched):
-            assert request.room_type is None
-            assert [thing.class_index for thing in request.objects] == (
-                encoded.instance_classes.tolist()
-            )
-        if has_boxes(encoded):
+        if scenes is POSED:
             assert case.moved.relations is case.untouched.relations is None
             assert case.moved.objects[index] != case.untouched.objects[index]
         else:
-            assert set(case.untouched.relations) == set(
-                map(tuple, np.argwhere(encoded.instance_holds).tolist())
-            )
             (new,) = set(case.moved.relations) - set(case.untouched.relations)
             assert new[:2] == (ON, index)
 
@@ -101,18 +90,14 @@ def test_the_threshold_alarms_in_at_most_one_of_twenty_scenes_of_the_source():
     # Two of 40 scenes exceed 37 / 40. Ten scenes allow no alarm.
     expected = np.repeat([False, True, False], [20, 20, 10])
     assert flagged(suspicion, untouched, source).tolist() == expected.tolist()
-    for k in (0, 1):
-        mine = source == k
-        alarms = flagged(untouched[mine], untouched[mine], source[mine])
-        assert alarms.mean() == (0.05 if k == 0 else 0.0)
+    assert flagged(untouched, untouched, source)[:40].mean() == 0.05
 
 
 def test_a_model_without_entries_names_and_flags_nothing():
-    outcome = moved_task(Model(misplaced=lambda _: []), Setting(LISTED, NO_STRUCTURE))
+    outcome = moved_task(lambda _: [], Setting(LISTED, NO_STRUCTURE))
     assert [metric.value for metric in outcome.metrics.values()] == [0, 0]
-    assert moved_task(Model(), Setting(LISTED, NO_STRUCTURE)) is None
     silent = tensors([scene([0, 1], [(LEFT, 1, 0)])])
-    assert moved_task(Model(misplaced=lambda _: []), Setting(silent, NO_STRUCTURE)) is None
+    assert moved_task(lambda _: [], Setting(silent, NO_STRUCTURE)) is None
 
 
 def test_at_most_so_many_scenes_are_asked(monkeypatch):
@@ -122,7 +107,7 @@ def test_at_most_so_many_scenes_are_asked(monkeypatch):
 
 def test_a_score_that_follows_the_order_is_caught():
     turn = count()
-    leaking = Model(misplaced=lambda _: [{"subject": "0", "probability": next(turn) / 1e4}])
+    leaking = lambda _: [{"subject": "0", "probability": next(turn) / 1e4}]  # noqa: E731
     with pytest.raises(LeakError):
         moved_task(leaking, Setting(LISTED, NO_STRUCTURE))
 
@@ -133,9 +118,7 @@ def test_the_service_sees_the_poses_of_a_request():
     terms = {"intercept": 0.0, "relation": -1.0, "change": -1.0, "stand": 0.0, "supporter": 0.0}
     unlikely = Judgement(**terms, lines=lines(0.9, 0.8, 0.7))
     judging = artifact.calibration.model_copy(
-        update={
-            "misplaced": Misplaced(lateral=unlikely, support=unlikely),
-        }
+        update={"misplaced": Misplaced(lateral=unlikely, support=unlikely)}
     )
     artifact = replace(artifact, calibration=judging)
     case = moved_cases(POSED, STRUCTURE)[0]
@@ -144,6 +127,3 @@ def test_the_service_sees_the_poses_of_a_request():
         artifact, observe(case.moved, typical_sizes=VOCABULARY.sizes)
     )
     assert entries
-    setting = Setting(POSED, STRUCTURE, limit=4)
-    values = moved_task(artifact_model(artifact, POSED), setting).metrics.values()
-    assert all(0 <= metric.value <= 1 for metric in values)

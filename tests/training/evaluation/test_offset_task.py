@@ -10,10 +10,9 @@ import torch
 
 from app.scene.relations import INSIDE, LEFT, ON_TOP
 from tests.questions.artifacts import LARGER, larger_artifact
+from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, rooms
 from tests.training.evaluation.scenes import scene, tensors
 from tests.training.fit.test_offset_statistics import MEAN, STD, apart, draws
-from training.datasets import encode, generate_rooms, rooms_vocabulary
-from training.evaluation.model import Model
 from training.evaluation.offset_task import METRICS, offsets_task
 from training.evaluation.report import evaluate
 from training.evaluation.setting import Setting
@@ -23,13 +22,12 @@ V = LARGER["triway"].V
 NO_STRUCTURE = torch.zeros(V, dtype=torch.bool)
 
 
-def model(train):
-    artifact = larger_artifact("triway")
-    return Model(artifact=replace(artifact, offsets=fit_offsets(train, V)))
+def artifact_of(train, classes=V):
+    return replace(larger_artifact("triway"), offsets=fit_offsets(train, classes))
 
 
 def outcome(train, test):
-    return offsets_task(model(train), Setting(tensors(test, V), NO_STRUCTURE))
+    return offsets_task(artifact_of(train), Setting(tensors(test, V), NO_STRUCTURE))
 
 
 def values(found):
@@ -40,17 +38,13 @@ def test_draws_of_a_known_normal_are_covered_as_promised():
     """2,000 scenes: .8 within .05 is 5.6 standard errors of .009, and 400 draws are learnt from,
     which moves the share by less than .02; the seeds are fixed, and others would fail with
     probability below 1e-3."""
-    found = outcome(draws(MEAN, STD, 400, 0), draws(MEAN, STD, 2000, 1))
+    test = draws(MEAN, STD, 2000, 1)
+    found = outcome(draws(MEAN, STD, 400, 0), test)
     share = values(found)
     assert share["in the ellipse, left"] == pytest.approx(0.8, abs=0.05)
     assert share["in the ellipsoid, left"] == pytest.approx(0.8, abs=0.05)
-    assert "in the ellipse, front" not in share
     assert found.metrics["in the ellipse, left"].n == 2000
-
-
-def test_a_spread_that_is_too_small_is_told():
-    narrow = outcome(draws(MEAN, STD / 2, 400, 0), draws(MEAN, STD, 2000, 1))
-    wide = outcome(draws(MEAN, STD * 2, 400, 0), draws(MEAN, STD, 2000, 1))
+    narrow, wide = (outcome(draws(MEAN, STD * k, 400, 0), test) for k in (0.5, 2))
     assert values(narrow)["in the ellipse, left"] < 0.5
     assert values(wide)["in the ellipse, left"] > 0.95
 
@@ -68,12 +62,8 @@ def test_relations_never_seen_in_training_are_not_judged():
     assert outcome(train, draws(MEAN, STD, 5, 1, relation=ON_TOP)) is None
     both = outcome(train, draws(MEAN, STD, 5, 1, relation=ON_TOP) + draws(MEAN, STD, 5, 2))
     assert both.skipped == 5
-    assert set(values(both)) == {
-        "in the ellipse, left",
-        "in the ellipsoid, left",
-        "distance (m)",
-        "distance (m), relation alone",
-    }
+    regions = {"in the ellipse, left", "in the ellipsoid, left"}
+    assert set(values(both)) == {*regions, "distance (m)", "distance (m), relation alone"}
 
 
 def test_relations_that_a_model_lacks_are_not_judged():
@@ -82,7 +72,7 @@ def test_relations_that_a_model_lacks_are_not_judged():
     older = replace(offsets, **{name: getattr(offsets, name)[:INSIDE] for name in names})
     artifact = replace(larger_artifact("triway"), offsets=older)
     test = draws(MEAN, STD, 5, 1, relation=INSIDE) + draws(MEAN, STD, 5, 2)
-    found = offsets_task(Model(artifact=artifact), Setting(tensors(test, V), NO_STRUCTURE))
+    found = offsets_task(artifact, Setting(tensors(test, V), NO_STRUCTURE))
     assert found.metrics["distance (m)"].n == found.skipped == 5
 
 
@@ -90,33 +80,22 @@ def test_models_and_sources_without_poses_have_no_figures():
     plain = [scene([0, 1], [(LEFT, 0, 1)])]
     assert outcome(draws(MEAN, STD, 20, 0), plain) is None
     assert outcome(plain, draws(MEAN, STD, 5, 1)) is None
-    assert offsets_task(Model(), Setting(tensors(plain, V), NO_STRUCTURE)) is None
 
 
-def test_the_card_s_figures_are_those_of_each_source():
+def test_regions_of_generated_rooms_hold_the_held_out_offsets():
     """In generated rooms, held out: every ellipse that is drawn for 80 % holds 70 to 95 %."""
-    vocabulary = rooms_vocabulary()
-    assert len(vocabulary) > V
-    scenes = encode(generate_rooms(400, seed=0), vocabulary)
-    train, test = scenes[:300], scenes[300:]
-    artifact = larger_artifact("triway")
-    known = replace(artifact, offsets=fit_offsets(train, len(vocabulary)))
-    setting = Setting(
-        tensors([replace(one, source="rooms") for one in test], len(vocabulary)),
-        torch.from_numpy(vocabulary.structure.copy()),
-    )
-    found = offsets_task(Model(artifact=known), setting)
-    assert set(found.metrics) <= set(METRICS)
-    shares = {name: value for name, value in values(found).items() if name.startswith("in the")}
+    known = artifact_of(rooms(300, 0).scenes, len(VOCABULARY))
+    near = values(offsets_task(known, Setting(rooms(100, 1), STRUCTURE)))
+    assert set(near) <= set(METRICS)
+    shares = [value for name, value in near.items() if name.startswith("in the")]
     assert len(shares) == 8
-    assert all(0.7 <= share <= 0.95 for share in shares.values()), shares
-    near = values(found)
+    assert all(0.7 <= share <= 0.95 for share in shares), near
     assert near["distance (m)"] < 0.9 * near["distance (m), relation alone"]
 
 
 def test_a_published_model_has_the_offsets_of_each_source():
     train = draws(MEAN, STD, 40, 0)
-    artifact = model(train).artifact
+    artifact = artifact_of(train)
     test = draws(MEAN, STD, 6, 1, source="a") + draws(MEAN, STD, 6, 2, source="b")
     rows = evaluate(artifact, tensors(test, V), NO_STRUCTURE, tensors(train, V), limit=4)
     offsets = [(row.source, row.metric, row.n) for row in rows if row.task == "Offsets"]

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from itertools import count
+
 import numpy as np
 import pytest
 import torch
 
-from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, room_model, rooms
+from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
 from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
-from training.datasets import shuffle_objects
 from training.evaluation import asking
 from training.evaluation.artifact_model import artifact_model
 from training.evaluation.asking import SENSITIVITIES, LeakError, ask_every, judge, of_classes
-from training.evaluation.intruders import by_popularity, by_signature, draw_intruders, signatures
+from training.evaluation.intruders import (
+    LAWS,
+    by_popularity,
+    by_signature,
+    draw_intruders,
+    signatures,
+)
 from training.evaluation.missing_tasks import SEEDS
 from training.evaluation.model import Model, suspicion_of
 from training.evaluation.outlier_tasks import (
-    LAWS,
-    LENGTHS,
     alarms_task,
     first_shares,
     hit_at_1,
@@ -145,16 +150,8 @@ def test_intruders_are_typical_of_another_room_and_foreign_to_this_one():
 def test_rooms_are_drawn_alike_however_many_classes_they_have():
     weights, (_, share) = by_signature(DATA, TRAIN), signatures(TRAIN)
     assert torch.allclose(weights.sum(1), torch.ones(len(DATA)).double())
-    for room, row, present in zip(DATA.room.tolist(), weights, DATA.v, strict=True):
-        assert not (row > 0)[present > 0].any()
-        assert (share[room][(row > 0).numpy()] < 0.01).all()
-
-
-def test_shuffled_scenes_have_no_signature():
-    """So the control takes its questions from the real ones."""
-    shuffled = tensors(shuffle_objects(TRAIN.scenes, STRUCTURE.numpy(), seed=0), len(VOCABULARY))
-    assert torch.equal(shuffled.v.sum(0), TRAIN.v.sum(0))
-    assert signatures(shuffled)[0].sum() < signatures(TRAIN)[0].sum() / 4
+    assert not ((weights > 0) & (DATA.v > 0)).any()
+    assert (share[DATA.room][(weights > 0).numpy()] < 0.01).all()
 
 
 # ------------------------------------------------------------------------- asked as the service is
@@ -198,23 +195,16 @@ def test_alarms_by_hand():
     def flags(v, sensitivity):
         return (v > 0) & (torch.arange(5) == 0) & (sensitivity == "high")
 
-    outcome = alarms_task(Model(flags=flags), Setting(data, NO_STRUCTURE))
+    outcome = alarms_task(flags, Setting(data, NO_STRUCTURE))
     values = {name: metric.value for name, metric in outcome.metrics.items()}
-    assert set(values) == {f"alarms, {s}, {n} classes" for s in SENSITIVITIES for n in (1, 2, 3)}
-    for length in (1, 2, 3):
-        listed = draw_parts(data, NO_STRUCTURE, exactly(length)).v
-        share = float(listed[:, 0].mean())
-        assert values[f"alarms, high, {length} classes"] == pytest.approx(share)
-        assert values[f"alarms, medium, {length} classes"] == 0
+    expected = dict.fromkeys(
+        (f"alarms, {s}, {n} classes" for s in SENSITIVITIES for n in (1, 2, 3)), 0.0
+    )
+    for n in (1, 2, 3):
+        share = float(draw_parts(data, NO_STRUCTURE, exactly(n)).v[:, 0].mean())
+        expected[f"alarms, high, {n} classes"] = pytest.approx(share)
+    assert values == expected
     assert outcome.skipped == 1
-    assert alarms_task(Model(), Setting(data, NO_STRUCTURE)) is None
-
-
-def test_every_length_and_sensitivity_of_a_published_model_has_alarms():
-    setting = Setting(DATA, STRUCTURE, TRAIN, limit=12)
-    metrics = alarms_task(artifact_model(room_model(), TRAIN), setting).metrics
-    assert {f"alarms, medium, {n} classes" for n in LENGTHS[:3]} <= set(metrics)
-    assert all(0 <= metric.value <= 1 for metric in metrics.values())
 
 
 def test_without_room_types_and_training_scenes_there_are_fewer_laws():
@@ -227,14 +217,11 @@ def test_without_room_types_and_training_scenes_there_are_fewer_laws():
 
 
 def test_a_planted_cheater_is_caught(monkeypatch):
-    """A model that counts the scenes, and suspects the intruder of the one whose turn it is."""
-    _, _, intruder = with_intruders(DATA, STRUCTURE, None)
-    turns = iter(intruder.tolist() * 3)
+    """A model that counts the scenes."""
+    turns = count()
 
     def cheat(artifact, asked, sensitivity):
-        knows = next(turns)
-        hit = np.array([thing.class_index == knows for thing in asked.objects], dtype=float)
-        return np.column_stack([hit, -hit, hit])
+        return np.full((len(asked.objects), 3), next(turns) / 1e3)
 
     monkeypatch.setattr(asking, "judge", cheat)
     with pytest.raises(LeakError, match="leaks information"):

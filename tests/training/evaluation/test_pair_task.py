@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 import pytest
@@ -136,10 +137,7 @@ def test_inside_pairs_have_ten_candidates():
 
 def test_pairs_without_a_possible_relation_count_as_a_guess():
     data = tensors([scene([0, 1], [(ON, 1, 0)])])
-
-    def never(batch):
-        return torch.full(batch.holds.shape, -torch.inf)
-
+    never = lambda batch: torch.full(batch.holds.shape, -torch.inf)  # noqa: E731
     metrics = pairs_task(Model(relations=never), Setting(data, NO_STRUCTURE)).metrics
     assert metrics["log-loss"].value == pytest.approx(np.log(8))
     assert metrics["accuracy"].value == pytest.approx(1 / 8)
@@ -162,10 +160,10 @@ def test_rare_classes_are_those_that_training_relates_to_few():
     V = RARE + 3
     train = tensors([scene([0, k], [(ON, k, 0)]) for k in range(1, V - 1)], V)
     none = torch.zeros(V, dtype=torch.bool)
-    for classes, rare in (([0, 1], 1), ([0, V - 1], 1)):
-        data = tensors([scene(classes, [(ON, classes[1], 0)])], V)
+    for other in (1, V - 1):
+        data = tensors([scene([0, other], [(ON, other, 0)])], V)
         metrics = pairs_task(Model(relations=flat), Setting(data, none, train)).metrics
-        assert metrics["accuracy, rare classes"].n == rare
+        assert metrics["accuracy, rare classes"].n == 1
     often = [scene([a, b], [(ON, a, b)]) for a in range(V) for b in range(a)]
     train = tensors(often, V)
     metrics = pairs_task(Model(relations=flat), Setting(data, none, train)).metrics
@@ -177,24 +175,17 @@ def test_no_relation_is_shown():
 
     def spy(batch):
         shown.append(bool(batch.observed.any() or batch.holds.any()))
-        return torch.zeros(batch.holds.shape)
+        return flat(batch)
 
     pairs_task(Model(relations=spy), Setting(DATA, WIDE_STRUCTURE))
-    assert shown
-    assert not any(shown)
+    assert set(shown) == {False}
 
 
 def test_a_score_that_follows_the_order_is_caught():
-    turns = iter(listed_pairs(DATA, WIDE_STRUCTURE) * 3)
+    turns = count()
 
     def cheat(batch):
-        asked = next(turns)
-        values = torch.full(batch.holds.shape, -5.0)
-        for (x, y), listed in zip(asked.ends.tolist(), asked.listed, strict=True):
-            values[0, :, min(x, values.shape[2] - 1), min(y, values.shape[2] - 1)] = (
-                10.0 * torch.from_numpy(listed[:A].astype(np.float32))
-            )
-        return values
+        return torch.full(batch.holds.shape, next(turns) / 100)
 
     with pytest.raises(LeakError, match="leaks information"):
         pairs_task(Model(relations=cheat), Setting(DATA, WIDE_STRUCTURE))

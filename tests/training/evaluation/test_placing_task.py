@@ -12,11 +12,7 @@ from app import questions
 from app.scene import Scene, SceneObject, Vocabulary
 from tests.training.evaluation.furnished_rooms import VOCABULARY, room_model
 from training.datasets.priors import Placing
-from training.evaluation.placing_task import (
-    average_precision,
-    placing_metrics,
-    rooms_of,
-)
+from training.evaluation.placing_task import average_precision, placing_metrics, rooms_of
 
 # Votes for (object, receptacle) in a room type that the vocabulary knows.
 VOTES = {

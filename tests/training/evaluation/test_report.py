@@ -10,30 +10,16 @@ import pytest
 import torch
 
 from tests.questions.artifacts import LARGER, larger_artifact, lines
-from tests.training.evaluation.scenes import (
-    flat,
-    knowing,
-    random_scenes,
-    scene,
-    tensors,
-)
+from tests.training.evaluation.scenes import flat, knowing, random_scenes, scene, tensors
 from training.datasets.batches import seen_triples
 from training.datasets.cases import some_scenes
-from training.evaluation.artifact_model import (
-    artifact_model,
-    floor_model,
-    independent_model,
-)
+from training.evaluation.artifact_model import artifact_model, floor_model, independent_model
 from training.evaluation.calibration_task import QUESTIONS
 from training.evaluation.density_task import DensitySettings
 from training.evaluation.generation_task import held_out_halves
 from training.evaluation.model import Model
-from training.evaluation.report import (
-    evaluate,
-    measure,
-    pooled,
-    settings_by_source,
-)
+from training.evaluation.relation_tasks import completion_task
+from training.evaluation.report import evaluate, measure, pooled, settings_by_source
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import EVERY_TASK, TASKS, WHOLE_SET
 
@@ -77,9 +63,7 @@ def test_every_task_has_an_outcome():
     assert all(np.isfinite(list(values_of(report).values())))
     assert "R-precision, zero-shot" in report.outcomes["T1a relations"].metrics
     assert "flagged, uniform" in report.outcomes["T3 outliers"].metrics
-
-
-def test_the_tasks_about_objects():
+    assert set(report_of(Model(), SETTING).outcomes.values()) == {None}
     relational = {"T1a relations", "T1 pairs", "T1 with evidence", "T1b completion"}
     others = relational | {"T3b placement", "T3c moved", "Calibration", "Everyday"}
     assert set(TASKS) - OF_OBJECTS == others
@@ -98,7 +82,7 @@ def test_reports_are_stored_and_resumed(tmp_path):
     again = measure(Model(), SETTING, "toy", tasks=every, path=path)
     assert values_of(again) == pytest.approx(values_of(whole))
     assert again.outcomes["T4 generate"].notes == whole.outcomes["T4 generate"].notes
-    assert not list(path.parent.glob("*.part"))
+    assert list(path.parent.iterdir()) == [path]
     written = json.loads(path.read_text())["tasks"]["T2 missing"]["outcome"]["metrics"]
     assert written["MRR, one removed"]["kind"] == "ratio"
     for other in (replace(SETTING, seed=1), replace(SETTING, limit=3)):
@@ -111,8 +95,7 @@ def test_reports_are_stored_and_resumed(tmp_path):
 @pytest.mark.parametrize("name", LARGER)
 def test_every_machine_can_be_evaluated(name):
     """Scenes without relations, of one class: nothing is asked, nothing fails."""
-    machine = larger_artifact(name)
-    model = artifact_model(machine, TRAIN, EFFORT, calibrated=False)
+    model = artifact_model(larger_artifact(name), TRAIN, EFFORT, calibrated=False)
     some = ("T1a relations", "T1b completion", "T2 missing", "T3 outliers")
     found = values_of(report_of(model, replace(SETTING, limit=8), some))
     assert {task for task, _ in found} == set(some)
@@ -122,10 +105,6 @@ def test_every_machine_can_be_evaluated(name):
     assert set(report_of(model, silent, asked).outcomes.values()) == {None}
 
 
-def test_a_model_without_scores_has_no_outcome():
-    assert set(report_of(Model(), SETTING).outcomes.values()) == {None}
-
-
 def test_tasks_about_objects_see_scenes_with_complete_object_lists_alone():
     """Elsewhere an unlisted object may be there. Relations are asked of all annotated scenes."""
     cut = [replace(one, complete=False, source="captions") for one in random_scenes(9, V, seed=2)]
@@ -133,11 +112,11 @@ def test_tasks_about_objects_see_scenes_with_complete_object_lists_alone():
     asked = sorted(OF_OBJECTS | {"T1b completion"})
     whole, more = (report_of(MODEL, setting, asked) for setting in (SETTING, mixed))
     assert more.outcomes["T1b completion"].scenes == len(DATA) + 9
-    values = [
+    first, second = (
         {key: value for key, value in values_of(report).items() if key[0] in OF_OBJECTS}
         for report in (whole, more)
-    ]
-    assert values[1] == pytest.approx(values[0])
+    )
+    assert second == pytest.approx(first)
     # A source of such scenes is asked for relations alone.
     captions = Setting(tensors(cut, V), NO_STRUCTURE, tensors(cut, V), SEEN)
     report = report_of(MODEL, captions, [task for task in TASKS if task != "Everyday"])
@@ -205,20 +184,18 @@ def test_published_figures_are_those_of_the_calibrated_artifact():
 
 def test_completion_has_the_metrics_of_relations():
     """R@k and zero-shot R-precision, of the half that is asked for."""
-    completion = TASKS["T1b completion"]
-    knows, ignorant = Model(completion=knowing(DATA)), Model(completion=flat)
     new = replace(SETTING, seen=SEEN[:0])
-    metrics = completion(knows, new).metrics
+    metrics = completion_task(knowing(DATA), new).metrics
     assert metrics["R@100"].value == 1.0
     # Nothing was seen: every triple is new.
     assert metrics["R-precision, zero-shot"].n == metrics["R-precision"].n
-    some = completion(knows, SETTING).metrics
+    some = completion_task(knowing(DATA), SETTING).metrics
     assert 0 < some["R-precision, zero-shot"].n < some["R-precision"].n
-    recalls = [completion(ignorant, new).metrics[f"R@{k}"].value for k in (20, 50, 100)]
+    ignorant = completion_task(flat, replace(SETTING, seen=None)).metrics
+    recalls = [ignorant[f"R@{k}"].value for k in (20, 50, 100)]
     assert recalls == sorted(recalls)
     assert 0 < recalls[0] < 1
-    unknown = completion(knows, replace(SETTING, seen=None)).metrics
-    assert "R-precision, zero-shot" not in unknown
+    assert "R-precision, zero-shot" not in ignorant
 
 
 def test_a_skill_that_is_undefined_is_left_out(tmp_path, monkeypatch):

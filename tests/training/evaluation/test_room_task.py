@@ -11,9 +11,7 @@ import torch
 from app import questions
 from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, room_model, rooms
 from tests.training.evaluation.scenes import NO_STRUCTURE, V, scene, tensors
-from training.evaluation.artifact_model import artifact_model
 from training.evaluation.asking import of_classes, room_score
-from training.evaluation.model import Model
 from training.evaluation.room_task import LEAST, LISTS, mean_log_p, rooms_task
 from training.evaluation.setting import Setting
 
@@ -30,7 +28,7 @@ def by_first(v, profile):
 
 def test_figures_by_hand():
     """Scene k has the type k % 3 and the answer k % 2; the model cannot name the type 2."""
-    metrics = rooms_task(Model(rooms=by_first), SETTING).metrics
+    metrics = rooms_task(by_first, SETTING).metrics
     types, answers = np.arange(30) % 3, np.arange(30) % 2
     hit = types == answers
     assert metrics["top-1, all classes"].value == pytest.approx(hit.mean())
@@ -49,30 +47,25 @@ def test_short_lists_are_shorter_and_need_more_classes():
         lengths.append(v.sum(1))
         return by_first(v, profile)
 
-    metrics = rooms_task(Model(rooms=listening), SETTING).metrics
-    assert set(torch.cat(lengths).tolist()) == {
-        4.0,
-        2.0,
-    }  # a scene of four classes has no part of 4
+    metrics = rooms_task(listening, SETTING).metrics
+    # A scene of four classes has no part of 4.
+    assert set(torch.cat(lengths).tolist()) == {4.0, 2.0}
     assert {name.split(", ")[1] for name in metrics} == {"all classes", "2 classes"}
     assert metrics["top-1, 2 classes"].n == 3 * 30
 
 
 def test_only_scenes_with_a_room_type_take_part():
     silent = replace(DATA, room=torch.full((30,), -1))
-    assert rooms_task(Model(rooms=by_first), Setting(silent, NO_STRUCTURE)) is None
+    assert rooms_task(by_first, Setting(silent, NO_STRUCTURE)) is None
     with pytest.raises(ValueError, match="no scene has a room type"):
         mean_log_p(silent, NO_STRUCTURE, by_first)
-    assert rooms_task(Model(), SETTING) is None
 
 
 def test_real_rooms_have_their_own_rows():
     real = [replace(one, source="3dssg") for one in DATA.scenes]
-    metrics = rooms_task(Model(rooms=by_first), Setting(tensors(real, V), NO_STRUCTURE)).metrics
+    metrics = rooms_task(by_first, Setting(tensors(real, V), NO_STRUCTURE)).metrics
     assert metrics["top-1, 2 classes, real rooms"].value == metrics["top-1, 2 classes"].value
-    both = rooms_task(
-        Model(rooms=by_first), Setting(tensors([*real, *DATA.scenes], V), NO_STRUCTURE)
-    )
+    both = rooms_task(by_first, Setting(tensors([*real, *DATA.scenes], V), NO_STRUCTURE))
     assert not [name for name in both.metrics if "real" in name or "named" in name]
 
 
@@ -87,5 +80,5 @@ def test_the_service_is_asked_as_a_robot_asks():
         assert VOCABULARY.room_types[int(values.argmax())] == first["room_type"]
         assert float(values.max().exp()) == pytest.approx(first["probability"])
     assert log_p.exp().sum(1) == pytest.approx(1.0, abs=1e-3)
-    outcome = rooms_task(artifact_model(room_model(), scenes), Setting(scenes, STRUCTURE))
+    outcome = rooms_task(score, Setting(scenes, STRUCTURE))
     assert all(f"top-1, {name}" in outcome.metrics for name in LISTS)

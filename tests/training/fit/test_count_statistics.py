@@ -16,7 +16,6 @@ from tests.training.evaluation.scenes import scene
 from training.datasets.cases import MOST, counted_classes, scene_rng, some_instances
 from training.datasets.sources import SOURCES
 from training.evaluation.count_task import counts_task
-from training.evaluation.model import Model
 from training.evaluation.setting import Setting
 from training.fit.count_statistics import fit_counts, folds
 
@@ -144,8 +143,8 @@ def test_generated_rooms_beat_the_class_mean():
     """400 rooms to learn from, 200 others to test; the seeds are fixed."""
     train, test = rooms(400, 0), rooms(200, 2)
     counts = fit_counts(train.scenes, VOCABULARY)
-    model = Model(artifact=replace(room_model(), counts=counts))
-    found = counts_task(model, Setting(test, None, train)).metrics
+    artifact = replace(room_model(), counts=counts)
+    found = counts_task(artifact, Setting(test, None, train)).metrics
     change = found["change of error, class mean"].figure()
     assert change.high < 0
     error, mean = found["error of the expected count"], found["error of the class mean"]
@@ -167,3 +166,13 @@ def test_cross_validation_tests_each_room_once():
         assert len(train) + len(test) == len(scenes)
         tested += [scene.scene_id for scene in test]
     assert sorted(tested) == sorted(scene.scene_id for scene in scenes)
+
+
+def test_the_task_needs_counts_and_a_source_that_counts():
+    test, once = rooms(200, 2), [scene([0, 1]) for _ in range(20)]
+    setting = Setting(test, None, test)
+    assert counts_task(room_model(), setting) is None
+    counts = fit_counts(rooms(400, 0).scenes, VOCABULARY)
+    artifact = replace(room_model(), counts=counts)
+    bare = replace(test, scenes=once)
+    assert counts_task(artifact, Setting(bare, None, bare)) is None

@@ -93,12 +93,10 @@ def test_the_table_has_the_row_minus_the_full_model(finished):
     assert "interval of the row minus rooms-triway" in section
     header, _, *lines = section.split("\n\n")[2].splitlines()
     columns = [column.strip() for column in header.split("|")]
-    assert columns[2:-1] == [
-        "weights", "validation pooled", "test pooled", "validation rooms", "test rooms",
-    ]  # fmt: skip
-    assert [line.split(" |")[0].strip("| ") for line in lines] == [
-        "**rooms-triway**", "wide", "no-counts",
-    ]  # fmt: skip
+    parts = ["validation pooled", "test pooled", "validation rooms", "test rooms"]
+    assert columns[2:-1] == ["weights", *parts]
+    rows = [line.split(" |")[0].strip("| ") for line in lines]
+    assert rows == ["**rooms-triway**", "wide", "no-counts"]
     gap = next(
         d["figure"]
         for d in results(finished)["differences"]
@@ -144,10 +142,7 @@ def test_an_interrupted_ablation_goes_on(finished, tmp_path, monkeypatch):
 def test_bad_requests_are_named(finished, tmp_path):
     _, config, *_ = arguments(tmp_path)
     for request, message in (
-        (
-            (*arguments(tmp_path), "--row", "nobody"),
-            "unknown rows ['nobody']: choose from wide",
-        ),
+        ((*arguments(tmp_path), "--row", "nobody"), "unknown rows ['nobody']: choose from wide"),
         ((*arguments(tmp_path), "--rows", "nowhere.toml"), "nowhere.toml does not exist"),
         (("ablate", config), "no shipped ablations"),
         ((*arguments(finished), "--limit", "20"), "another configuration of rooms-triway"),

@@ -7,7 +7,7 @@ import pytest
 from tests.training.commands import small_config
 from training.fit.configuration import ConfigError
 from training.research.tune import load_space
-from training.runs.config_files import load_config, shipped_files, with_settings
+from training.runs.config_files import load_config, shipped_files
 
 CONFIG = small_config()
 
@@ -61,10 +61,3 @@ def test_bad_spaces_say_what_is_wrong(tmp_path, text, message):
 def test_a_missing_space_is_named(tmp_path):
     with pytest.raises(ConfigError, match=r"nowhere.toml does not exist"):
         load_space(tmp_path / "nowhere.toml", CONFIG)
-
-
-def test_changed_settings_leave_the_rest_alone():
-    changed = with_settings(CONFIG, {"machine.units": 5, "objects.steps": 2})
-    assert (changed.machine.units, changed.objects.steps) == (5, 2)
-    before = {"machine.units": CONFIG.machine.units, "objects.steps": CONFIG.objects.steps}
-    assert with_settings(changed, before) == CONFIG

@@ -15,12 +15,9 @@ from training.evaluation.model import ObjectScore
 
 @dataclass(frozen=True, eq=False)
 class LinearScore:
-    """The linear score bias + v · weights of each class.
+    """The linear score bias + v · weights of each class, with bias (V,) and weights (V, V).
 
-    Attributes:
-        bias: bias of each class, (classes,).
-        weights: weights from a present class (row) to the scored class (column), (classes,
-            classes). The diagonal is zero.
+    Rows of the weights are present classes, columns are scored classes.
 
     Raises:
         ValueError: the shapes of bias and weights do not match, or the diagonal is not zero.
@@ -55,8 +52,7 @@ class Lists:
     Attributes:
         v: (scenes, classes) presence, without structure classes.
         labelled: (scenes, classes) bool, False for classes that the data source cannot show.
-        weight: (scenes,) weight of each scene. The mean is 1.
-        index: (scenes,) position of each scene in the training scenes.
+        weight, index: (scenes,) weight of each scene, 1 in the mean; its index in training.
     """
 
     v: Tensor
@@ -76,8 +72,8 @@ class Lists:
 def training_lists(train: SceneTensors, structure: Tensor) -> Iterator[tuple[str, Lists]]:
     """Yield sets of training scenes with their names. A baseline chooses between the sets.
 
-    A set has all scenes, or only complete object lists. The other sources mention only some objects
-    of a scene. A class that a data source cannot show is unlabelled, or it is absent.
+    A set has all scenes, or only those with complete object lists. A class that a data source
+    cannot show is unlabelled, or it is absent.
     """
     able = train.annotated_classes[train.source] & ~structure
     v, weight = train.v * ~structure, train.weight

@@ -36,7 +36,7 @@ from training.evaluation.moved_task import ask_moved, moved_cases
 from training.evaluation.parts import validation_score
 from training.evaluation.relation_tasks import complete_scenes, rank, rank_relations
 
-_SCENES = 1000  # maximum scenes in `placed_mrr` and `named_moved`
+_SCENES = 1000
 
 Score = TypeVar("Score")
 Proposals: TypeAlias = Generator[tuple[Parameters, Score], float, None]
@@ -78,11 +78,7 @@ def halving(
 
 
 def missing_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> float:
-    """Return the `validation_score` of missing objects.
-
-    Raises:
-        ValueError: no scene has two classes.
-    """
+    """Return the `validation_score` of missing objects. Without such, raise a ValueError."""
     value = validation_score(lambda v, _: score(v), scenes, structure)
     if math.isnan(value):
         raise ValueError("no scene has two classes, so no class can be hidden")
@@ -90,10 +86,7 @@ def missing_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> 
 
 
 def placed_mrr(scenes: SceneTensors, structure: Tensor, score: PlacedScore) -> float:
-    """Return the mean reciprocal rank (MRR) of removed objects at a known place (T2-at).
-
-    At most `_SCENES` scenes take part.
-    """
+    """Return the mean reciprocal rank (MRR) of T2-at in at most `_SCENES` scenes."""
     return leave_one_out_at(some_scenes(scenes, _SCENES), structure, score)[0].mrr().value
 
 
@@ -108,9 +101,9 @@ def completion_r_precision(scenes: SceneTensors, structure: Tensor, score: Relat
 
 
 def named_moved(scenes: SceneTensors, structure: Tensor, score: MisplacedScore) -> float:
-    """Return the share of moved objects that are named first (T3c).
+    """Return the share of moved objects that are named first (T3c); 0 if no object can move.
 
-    At most `_SCENES` scenes take part. If no object can move, the value is 0.
+    At most `_SCENES` scenes take part.
 
     Raises:
         ValueError: no scene has a relation.
@@ -133,7 +126,7 @@ class Baseline:
     Attributes:
         propose: function of training scenes, structure classes and seed, see the module.
         judge: function of validation scenes, structure classes and score; higher is better.
-        scores: fields of `Model` for which the score is used.
+        scores: fields of `Model` that the score answers.
         stochastic: True if the fit depends on the seed.
     """
 
@@ -170,16 +163,14 @@ class Baseline:
         if validation.v.shape[1] != V or structure.shape != (V,):
             raise ValueError(
                 f"the numbers of classes differ: training scenes have {V} classes, validation "
-                f"scenes have {validation.v.shape[1]}, and structure has shape "
-                f"{tuple(structure.shape)}"
+                f"scenes {validation.v.shape[1]}, and structure has shape {tuple(structure.shape)}"
             )
         if not train.v.any():
             raise ValueError(
                 f"the {len(train)} training scenes contain no objects; a baseline needs objects"
             )
         trials: list[Trial] = []
-        best_scores: list[Any] = []
-        highest = -math.inf
+        best, highest = None, -math.inf
         start = time.perf_counter()
         proposals = self.propose(train, structure, seed)
         proposal = next(proposals, None)
@@ -192,7 +183,7 @@ class Baseline:
                     "this grid point out"
                 )
             if metric > highest:
-                highest, best_scores = metric, [score]
+                best, highest = score, metric
             now = time.perf_counter()
             trials.append(Trial(dict(parameters), metric, now - start))
             text = ", ".join(f"{key} {value}" for key, value in parameters.items())
@@ -202,9 +193,8 @@ class Baseline:
                 proposal = proposals.send(metric)
             except StopIteration:
                 proposal = None
-        best_score = best_scores[0]
-        answers = dict.fromkeys(self.scores, best_score)
+        answers: dict[str, Any] = dict.fromkeys(self.scores, best)
         if "density" in answers:
-            answers["density"] = lambda _: best_score
-        count = getattr(best_score, "parameter_count", None) if "missing" in answers else None
+            answers["density"] = lambda _: best
+        count = getattr(best, "parameter_count", None) if "missing" in answers else None
         return Model(**answers, parameters=count, trials=tuple(trials))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import torch
@@ -17,14 +18,11 @@ from training.evaluation.model import ObjectScore, PlacedScore, Places, Relation
 
 @dataclass(frozen=True, eq=False)
 class TripleCounts:
-    """Numbers of scenes with each triple (relation a, subject class i, object class j).
-
-    Structure classes, and triples with i = j, have the count 0.
+    """Numbers of scenes with annotated relations; 0 for structure, and for equal classes.
 
     Attributes:
-        held: number of scenes in which the relation holds, (relations, classes, classes).
-        together: number of scenes with annotated relations that contain both classes, (classes,
-            classes).
+        held: number of scenes in which a relation holds, (relations, subjects, objects).
+        together: number of scenes that contain both classes, (classes, classes).
     """
 
     held: Tensor
@@ -64,32 +62,22 @@ def count_triples(scenes: SceneTensors, structure: Tensor) -> TripleCounts:
     return TripleCounts(torch.from_numpy(holds * pair), torch.from_numpy(together * pair))
 
 
-@dataclass(frozen=True, eq=False)
-class TripleTable:
-    """The relation score log_odds[a, i, j] + g · log(n_i n_j) of relation a from class i to j.
+def table_score(log_odds: Tensor, multiplicity: float = 0.0) -> RelationScore:
+    """Return the relation score log_odds[a, i, j] + g · log(n_i n_j), from a table (A, V, V).
 
-    n_i and n_j are the instance counts of the classes. The score ignores observed relations.
-
-    Attributes:
-        log_odds: table over relation, subject class and object class, (relations, classes,
-            classes).
-        multiplicity: weight g of the instance counts. 0 ignores the counts.
+    n_i and n_j are the instance counts of the classes, and g is `multiplicity`. The score ignores
+    observed relations. It is arbitrary for padding.
     """
 
-    log_odds: Tensor
-    multiplicity: float = 0.0
-
-    def __call__(self, batch: Batch) -> Tensor:
-        """Return the log-odds of the relations of a batch, (scenes, relations, n, n).
-
-        n is the number of classes in `batch.classes`. The log-odds of padding are arbitrary.
-        """
+    def score(batch: Batch) -> Tensor:
         index = batch.classes.clamp(min=0)
-        values = self.log_odds[:, index[:, :, None], index[:, None, :]].movedim(0, 1)
-        if self.multiplicity:
+        values = log_odds[:, index[:, :, None], index[:, None, :]].movedim(0, 1)
+        if multiplicity:
             logs = batch.counts.clamp(min=1).to(values.dtype).log()
-            values = values + self.multiplicity * (logs[:, None, :, None] + logs[:, None, None, :])
+            values = values + multiplicity * (logs[:, None, :, None] + logs[:, None, None, :])
         return values
+
+    return score
 
 
 _PAIR = (1.0, 3.0, 10.0, 30.0, 100.0)
@@ -107,9 +95,7 @@ def smoothed_log_odds(counts: TripleCounts, pair: float, end: float) -> Tensor:
         p(r | i, j) = (held + s · [p(r | i as subject) + p(r | j as object)] / 2) / (together + s)
         p(r | i)    = (held with i + m · p(r)) / (pairs with i + m), likewise p(r | j)
 
-    Args:
-        pair: smoothing s of a pair of classes, above 0: number of added cases.
-        end: smoothing m of a single class, above 0: number of added cases.
+    s (`pair`) and m (`end`) are numbers of added cases, above 0.
     """
     overall = counts.overall()[:, None]
     subject = (counts.held.sum(2) + end * overall) / (counts.together.sum(1) + end)
@@ -121,12 +107,10 @@ def smoothed_log_odds(counts: TripleCounts, pair: float, end: float) -> Tensor:
 def frequency_table(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[RelationScore]:
     """Yield a score for each smoothing of pairs and of classes, and each weight of the counts."""
     counts = count_triples(train, structure)
-    for pair in _PAIR:
-        for end in _END:
-            table = smoothed_log_odds(counts, pair, end)
-            for weight in _MULTIPLICITY:
-                parameters = {"pair": pair, "end": end, "multiplicity": weight}
-                yield parameters, TripleTable(table, weight)
+    for pair, end in product(_PAIR, _END):
+        table = smoothed_log_odds(counts, pair, end)
+        for weight in _MULTIPLICITY:
+            yield {"pair": pair, "end": end, "multiplicity": weight}, table_score(table, weight)
 
 
 _PLACE = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
@@ -135,54 +119,23 @@ _WEIGHTS = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5)
 _CORRECTIONS = (0.0, 0.25, 0.5, 1.0)
 
 
-@dataclass(frozen=True, eq=False)
-class PlacedTable:
-    """The score log p(i | a, j) of class i at the place (a, j), from a frequency table.
+def place_score(log_p: Tensor) -> PlacedScore:
+    """Return the score log p(i | a, j) of class i at the place (a, j).
 
-    Attributes:
-        log_p: table over direction, relation, class j of the place and class i, (2, relations,
-            classes, classes). The direction is `Places.outgoing`.
+    `log_p` is a table over `Places.outgoing`, relation a, class j and class i, (2, A, V, V).
     """
-
-    log_p: Tensor
-
-    def __call__(self, places: Places) -> Tensor:
-        """Return log p(i | a, j) of each class i at each place, (places, classes)."""
-        return self.log_p[places.outgoing.long(), places.relation, places.anchor]
-
-
-@dataclass(frozen=True, eq=False)
-class PlacedProduct:
-    """The score objects(v) + weight · table - correction · log popularity of a class at a place.
-
-    Both factors depend on the class frequency. The last term corrects for this.
-    """
-
-    objects: ObjectScore
-    table: PlacedScore
-    log_popularity: Tensor
-    weight: float
-    correction: float
-
-    def __call__(self, places: Places) -> Tensor:
-        """Return the score of each class at each place, (places, classes)."""
-        added = self.weight * self.table(places) - self.correction * self.log_popularity
-        return self.objects(places.v) + added
+    return lambda places: log_p[places.outgoing.long(), places.relation, places.anchor]
 
 
 def smoothed_log_p(
     counts: TripleCounts, popularity: Tensor, place: float, relation: float
 ) -> Tensor:
-    """Return log p(i | a, j) in the layout of `PlacedTable.log_p`.
+    """Return log p(i | a, j) in the layout of `place_score`.
 
         p(i | a, j) = (scenes with a(i, j) + s · p(i | a)) / (scenes with a of any class to j + s)
 
-    p(i | a) is smoothed in the same way towards p(i), with m in place of s.
-
-    Args:
-        popularity: frequency of each class, (classes,). The function normalises the sum to 1.
-        place: smoothing s of a place (a, j), above 0: number of added cases.
-        relation: smoothing m of a relation a, above 0: number of added cases.
+    p(i | a) is smoothed in the same way towards p(i), with m in place of s. p(i) is proportional to
+    the popularity, (classes,). s (`place`) and m (`relation`) are numbers of added cases.
     """
     # In the second table, the removed class is the subject of the relation. The transpose puts the
     # class j of the place first.
@@ -198,16 +151,15 @@ def smoothed_log_p(
 def placed_table(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[PlacedScore]:
     """Yield a score for each smoothing s of places and each smoothing m of relations."""
     counts = count_triples(train, structure)
-    for place in _PLACE:
-        for relation in _RELATION:
-            log_p = smoothed_log_p(counts, frequency(train.v), place, relation)
-            yield {"place": place, "relation": relation}, PlacedTable(log_p)
+    for place, relation in product(_PLACE, _RELATION):
+        log_p = smoothed_log_p(counts, frequency(train.v), place, relation)
+        yield {"place": place, "relation": relation}, place_score(log_p)
 
 
 def times(
     objects: ObjectScore | None, table: PlacedScore | None
 ) -> Callable[[SceneTensors, Tensor, int], Proposals[PlacedScore]]:
-    """Return a generator function for the product of a fitted object score and a fitted table.
+    """Return a generator function for objects(v) + weight · table - correction · log popularity.
 
     Raises:
         ValueError: a score is missing.
@@ -215,11 +167,18 @@ def times(
     if objects is None or table is None:
         raise ValueError("the product needs an object score and a table of places")
 
-    def placed_table(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[PlacedScore]:
-        log_popularity = frequency(train.v, train.weight).log()
-        for weight in _WEIGHTS:
-            for correction in _CORRECTIONS:
-                score = PlacedProduct(objects, table, log_popularity, weight, correction)
-                yield {"weight": weight, "correction": correction}, score
+    def product_score(weight: float, correction: float, log_popularity: Tensor) -> PlacedScore:
+        # Both factors depend on the class frequency. The last term corrects for this.
+        def score(places: Places) -> Tensor:
+            added = weight * table(places) - correction * log_popularity
+            return objects(places.v) + added
 
-    return placed_table
+        return score
+
+    def propose(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[PlacedScore]:
+        log_popularity = frequency(train.v, train.weight).log()
+        for weight, correction in product(_WEIGHTS, _CORRECTIONS):
+            score = product_score(weight, correction, log_popularity)
+            yield {"weight": weight, "correction": correction}, score
+
+    return propose

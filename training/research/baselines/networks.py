@@ -41,13 +41,7 @@ LOSSES: Final = ("softmax", "binary")
 
 @dataclass(frozen=True)
 class Course:
-    """Settings of the training of a network.
-
-    Attributes:
-        learning_rate: maximum learning rate of the cycle.
-        loss: one of `LOSSES`.
-        offers: steps at which the network becomes a candidate, as shares of `steps`.
-    """
+    """Settings of the training of a network, a candidate at the shares `offers` of `steps`."""
 
     learning_rate: float
     weight_decay: float
@@ -59,11 +53,7 @@ class Course:
 
 @dataclass(frozen=True, eq=False)
 class NetworkScore:
-    """The score of each unlisted class: its logit, or log p under a softmax over these classes.
-
-    Attributes:
-        network: network from presence, (scenes, classes), to logits of the same shape.
-    """
+    """The score of each unlisted class: its logit, or log p under a softmax over these classes."""
 
     network: nn.Module
     structure: Tensor
@@ -76,10 +66,7 @@ class NetworkScore:
 
     @torch.no_grad()
     def __call__(self, v: Tensor) -> Tensor:
-        """Return the score of each class, (scenes, classes).
-
-        Present classes and structure classes have the score -inf.
-        """
+        """Return the score of each class, (B, V); -inf for present and structure classes."""
         listed = v * ~self.structure
         values: Tensor = self.network(listed)
         values = values.masked_fill((v > 0) | self.structure, -torch.inf)
@@ -202,10 +189,7 @@ _TRANSFORMER: Final[dict[str, Sequence[Any]]] = {
 class SetTransformer(nn.Module):
     """A transformer that predicts the removed class of a scene.
 
-    Args:
-        popularity: share of scenes with each class, (classes,). The log of this share initialises
-            the output bias.
-        width: width of the encoder. Its feed-forward part is twice as wide.
+    The log of the share of scenes with each class, (classes,), initialises the output bias.
     """
 
     def __init__(

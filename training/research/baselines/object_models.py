@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from itertools import product
+from typing import Any, Final, cast
 
 import numpy as np
 import torch
@@ -13,14 +14,9 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, embedding_bag, normalize, softplus
 
 from training.datasets.batches import SceneTensors
-from training.evaluation.baselines.classes import (
-    LinearScore,
-    Lists,
-    frequency,
-    training_lists,
-)
+from training.evaluation.baselines.classes import LinearScore, Lists, frequency, training_lists
 from training.evaluation.baselines.fitting import TRIALS, Proposals, drawn_settings, halving
-from training.evaluation.density_task import DensitySettings, ising_density
+from training.evaluation.density_task import DensitySettings, ising_machine, machine_density
 from training.evaluation.model import ObjectDensity, ObjectScore, Parameters
 
 # Co-occurrence: Bernoulli naive Bayes, with the present classes as evidence.
@@ -35,13 +31,9 @@ _EXPONENTS = (0.2, 0.3, 0.5)
 
 
 def evidence(v: Tensor, smoothing: float, weight: Tensor | None = None) -> Tensor:
-    """Return log p(j | i) / p(j | not i) for present class j and scored class i.
+    """Return log p(j | i) / p(j | not i) for present class j (row) and scored class i (column).
 
-    The result has j as row and i as column, (classes, classes). The diagonal is zero.
-
-    Args:
-        smoothing: number of average scenes that are added to the scenes with i, and to the scenes
-            without i.
+    The diagonal is zero. `smoothing` average scenes are added to the scenes with, and without, i.
     """
     w = torch.ones(len(v)) if weight is None else weight
     pair_count, count, scenes = (v * w.unsqueeze(1)).T @ v, w @ v, w.sum()
@@ -54,12 +46,10 @@ def evidence(v: Tensor, smoothing: float, weight: Tensor | None = None) -> Tenso
 def naive_bayes(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
     """Yield a score for each set of scenes, smoothing and factor t."""
     for name, lists in training_lists(train, structure):
-        v, bias = lists.filled(), lists.frequency().logit()
-        for smoothing in _SMOOTHING:
-            weights = evidence(v, smoothing, lists.weight)
-            for t in _EXPONENTS:
-                score = LinearScore(bias, t * weights)
-                yield {"scenes": name, "smoothing": smoothing, "exponent": t}, score
+        for smoothing, t in product(_SMOOTHING, _EXPONENTS):
+            weights = t * evidence(lists.filled(), smoothing, lists.weight)
+            score = LinearScore(lists.frequency().logit(), weights)
+            yield {"scenes": name, "smoothing": smoothing, "exponent": t}, score
 
 
 # kNN over scenes. The neighbours are the k training scenes that are most similar to the query.
@@ -94,10 +84,9 @@ def nearest_score(lists: Lists, *, neighbours: int, sharpness: float) -> ObjectS
 def nearest(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
     """Yield a score for each set of scenes, number of neighbours and sharpness."""
     for name, lists in training_lists(train, structure):
-        for k in _NEIGHBOURS:
-            for power in _SHARPNESS:
-                score = nearest_score(lists, neighbours=k, sharpness=power)
-                yield {"scenes": name, "neighbours": k, "sharpness": power}, score
+        for k, power in product(_NEIGHBOURS, _SHARPNESS):
+            score = nearest_score(lists, neighbours=k, sharpness=power)
+            yield {"scenes": name, "neighbours": k, "sharpness": power}, score
 
 
 # Pairwise logistic model: an Ising model of classes, fitted by pseudo-likelihood.
@@ -113,8 +102,7 @@ def nearest(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[Obj
 _PAIRWISE_L2 = (50.0, 30.0, 20.0, 10.0, 5.0, 3.0)
 _DENSITY_L2 = (30.0, 10.0, 3.0)
 _ITERATIONS = 25
-# Settings for the estimate of log Z. A Gibbs sweep of this model updates one class at a time and is
-# slow, so the number of temperatures is below the default. The error of log Z is about 0.01 nats.
+# Settings for the estimate of log Z. Its error is about 0.01 nats.
 _EFFORT = DensitySettings(chains=128, temperatures=1500, burn_in=500)
 
 
@@ -179,7 +167,9 @@ def pairwise_densities(
     lists, score = Lists(train.v, everything, weight, index), None
     for l2 in _DENSITY_L2:
         score = fit_pairwise(lists, l2, start=score)
-        yield {"l2": l2}, ising_density(score.bias, score.weights, train, _EFFORT, seed)
+        machine = ising_machine(score.bias, score.weights)
+        density = machine_density(machine, train, _EFFORT, seed)
+        yield {"l2": l2}, cast(ObjectDensity, density)  # an Ising machine has one layer
 
 
 # `BernoulliRBM` of scikit-learn, trained on objects only. Each epoch draws scenes by their weights.
@@ -227,8 +217,7 @@ def fit_annealed(
     """Train scikit-learn's `BernoulliRBM` with a learning rate that falls linearly to 0.
 
     Persistent chains are accurate only if the model changes slowly at the end. On the indoor
-    validation scenes, the MRR (mean reciprocal rank) is .411 after 40 epochs with the falling rate.
-    With a constant rate, the MRR is .377 after 10 epochs and .378 after 20 epochs.
+    validation scenes, the MRR is .411 with the falling rate and .378 with a constant one.
     """
     size, v = min(batch_size, len(lists.v)), lists.filled().numpy()
     rbm = BernoulliRBM(n_components=hidden, batch_size=size, random_state=seed)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -12,9 +12,9 @@ from training.datasets.batches import Batch, SceneTensors
 from training.evaluation.baselines.fitting import Proposals
 from training.evaluation.baselines.triples import (
     TripleCounts,
-    TripleTable,
     count_triples,
     smoothed_log_odds,
+    table_score,
 )
 from training.evaluation.contradictions import transitive_closure
 from training.evaluation.model import RelationScore
@@ -26,7 +26,7 @@ def relation_popularity(
     """Yield a single score: the log-odds of each relation over all pairs of classes."""
     counts = count_triples(train, structure)
     overall = counts.overall().logit()[:, None, None]
-    yield {}, TripleTable(overall.expand_as(counts.held))
+    yield {}, table_score(overall.expand_as(counts.held))
 
 
 # ComplEx: complex embeddings of classes. Complex numbers allow different scores for left(i, j) and
@@ -45,12 +45,10 @@ _LEARNING_RATE = 0.05
 
 
 def fit_complex(counts: TripleCounts, *, rank: int, penalty: float, seed: int) -> Tensor:
-    """Fit ComplEx, and return the logits of all triples, (relations, classes, classes).
+    """Fit ComplEx of `rank` complex dimensions; return the logits of all triples, (A, V, V).
 
-    Args:
-        rank: number of complex dimensions of an embedding.
-        penalty: weight of the penalty: for each pair of classes, the mean over the relations of the
-            sum of cubed moduli of its factors.
+    The penalty weighs, for each pair of classes, the mean over the relations of the sum of cubed
+    moduli of its factors.
     """
     generator = torch.Generator().manual_seed(seed)
     A, V, _ = counts.held.shape
@@ -91,24 +89,20 @@ def complex_embedding(
 ) -> Proposals[RelationScore]:
     """Yield a ComplEx score for each rank, penalty and weight of the instance counts."""
     counts = count_triples(train, structure)
-    for rank in _RANKS:
-        for penalty in _PENALTIES:
-            table = fit_complex(counts, rank=rank, penalty=penalty, seed=seed)
-            for weight in _COMPLEX_MULTIPLICITY:
-                parameters = {"rank": rank, "penalty": penalty, "multiplicity": weight}
-                yield parameters, TripleTable(table, weight)
+    for rank, penalty in product(_RANKS, _PENALTIES):
+        table = fit_complex(counts, rank=rank, penalty=penalty, seed=seed)
+        for weight in _COMPLEX_MULTIPLICITY:
+            parameters = {"rank": rank, "penalty": penalty, "multiplicity": weight}
+            yield parameters, table_score(table, weight)
 
 
 # Frequency table with logical rules: the log-odds change by consequences of observed relations.
 #
-# The score adds a bonus to a relation a(i, k) that follows by transitivity from observed a(i, j)
-# and a(j, k). The score subtracts a penalty from the reverse a(k, i) of each observed or implied
-# relation. Canonical relations represent right as left with exchanged subject and object. Bonus and
-# penalty are finite, because classes can have several instances, and because annotated on-top is
-# not always transitive.
+# A relation a(i, k) is implied by transitivity from observed a(i, j) and a(j, k). Its reverse is
+# a(k, i). Bonus and penalty are finite, because classes can have several instances, and because
+# annotated on-top is not always transitive.
 #
-# In the batches of task T1b, only the given relations of a scene are marked as observed. This score
-# needs such batches.
+# The score needs batches in which only the given relations are observed, as in task T1b.
 
 _CLOSURE_PAIR = (3.0, 10.0, 30.0)
 _CLOSURE_END = 30.0
@@ -117,26 +111,20 @@ _BONUS = (0.0, 1.0, 2.0, 4.0)
 _PENALTY = (0.0, 1.0, 3.0)
 
 
-@dataclass(frozen=True, eq=False)
-class ClosureScore:
-    """The score of a frequency table, changed by logical rules.
+def closure_score(table: RelationScore, bonus: float, penalty: float) -> RelationScore:
+    """Return the score of a table, changed by logical rules.
 
-    Attributes:
-        table: score without observed relations.
-        bonus: added log-odds of an implied relation, at least 0.
-        penalty: subtracted log-odds of the reverse of an observed or implied relation, at least 0.
+    The log-odds of implied relations get the bonus. Those of the reverse of observed or implied
+    relations lose the penalty.
     """
 
-    table: TripleTable
-    bonus: float
-    penalty: float
-
-    def __call__(self, batch: Batch) -> Tensor:
-        """Return log-odds given the observed relations of a batch, (scenes, relations, n, n)."""
+    def score(batch: Batch) -> Tensor:
         observed = (batch.holds > 0) & batch.observed
         closed = transitive_closure(observed)
         follows, mirror = closed & ~observed, closed.mT & ~closed
-        return self.table(batch) + self.bonus * follows - self.penalty * mirror
+        return table(batch) + bonus * follows - penalty * mirror
+
+    return score
 
 
 def frequency_table_with_closure(
@@ -146,9 +134,6 @@ def frequency_table_with_closure(
     counts = count_triples(train, structure)
     for pair in _CLOSURE_PAIR:
         log_odds = smoothed_log_odds(counts, pair, _CLOSURE_END)
-        for weight in _CLOSURE_MULTIPLICITY:
-            table = TripleTable(log_odds, weight)
-            for bonus in _BONUS:
-                for penalty in _PENALTY:
-                    parameters = {"pair": pair, "multiplicity": weight, "bonus": bonus}
-                    yield parameters | {"penalty": penalty}, ClosureScore(table, bonus, penalty)
+        for weight, bonus, penalty in product(_CLOSURE_MULTIPLICITY, _BONUS, _PENALTY):
+            parameters = {"pair": pair, "multiplicity": weight, "bonus": bonus, "penalty": penalty}
+            yield parameters, closure_score(table_score(log_odds, weight), bonus, penalty)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
 
@@ -53,16 +52,14 @@ class _Counts(NamedTuple):
         return prior + exponent * without.sum(1), exponent * (p.log() - without)
 
 
-@dataclass(frozen=True, eq=False)
-class RoomTable:
-    """A linear score of room types for each data source; "" stands for all data sources."""
+def room_table(tables: Mapping[str, tuple[Tensor, Tensor]]) -> RoomScore:
+    """Return the log p of linear scores for each data source; "" stands for all data sources."""
 
-    tables: Mapping[str, tuple[Tensor, Tensor]]
-
-    def __call__(self, v: Tensor, profile: str) -> Tensor:
-        """Return log p of each room type, (B, C)."""
-        bias, weights = self.tables.get(profile, self.tables[""])
+    def score(v: Tensor, profile: str) -> Tensor:
+        bias, weights = tables.get(profile, tables[""])
         return (bias + v @ weights.T).log_softmax(1)
+
+    return score
 
 
 def _counts(train: SceneTensors, structure: Tensor) -> Iterator[tuple[str, dict[str, _Counts]]]:
@@ -90,10 +87,10 @@ def naive_bayes(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals
                 for source, count in counts.items()
             }
             kind: Parameters = {"scenes": name, "absent": absent, "exponent": s}
-            yield {**kind, "alpha": alpha, "source_alpha": source_alpha}, RoomTable(tables)
+            yield {**kind, "alpha": alpha, "source_alpha": source_alpha}, room_table(tables)
 
 
 def most_common(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[RoomScore]:
     """Yield the frequencies of the room types for each set of scenes."""
     for name, counts in _counts(train, structure):
-        yield {"scenes": name}, RoomTable({q: c.table(1.0, 0.0, False) for q, c in counts.items()})
+        yield {"scenes": name}, room_table({q: c.table(1.0, 0.0, False) for q, c in counts.items()})

@@ -38,21 +38,16 @@ _GAMMA: Final = (0.0, 0.25, 0.5, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class SupporterTable:
-    """The suspicion of each object of a scene.
+    """The suspicion (V, V + 1) of class i with supporter s; the last column is "nothing".
 
-    Attributes:
-        suspicion: (V, V + 1) suspicion of class i with supporter s; the last column is "nothing".
-        structure: (V,) True for structure classes. Structure is neither object nor supporter.
+    Structure, (V,), is neither object nor supporter.
     """
 
     suspicion: Floats
     structure: Flags
 
     def __call__(self, scene: Scene) -> list[dict[str, Any]]:
-        """Return an entry for each object with a known supporter, the most suspicious first.
-
-        The logistic function converts a suspicion to a value in (0, 1), in place of a probability.
-        """
+        """Return an entry for each object with a known supporter, the most suspicious first."""
         things = scene.objects
         classes = np.array([-1 if t.class_index is None else t.class_index for t in things])
         entries = [
@@ -112,11 +107,7 @@ def _supporters(
 def supporter_table(
     train: SceneTensors, structure: Tensor, _seed: int
 ) -> Proposals[MisplacedScore]:
-    """Yield a score for each smoothing α and each weight γ.
-
-    Raises:
-        ValueError: the scenes contain no observed relation.
-    """
+    """Yield a score for each smoothing α and weight γ. Relations are needed, else ValueError."""
     if not any(encoded.evidence.observed.any() for encoded in train.scenes):
         raise ValueError(f"the {len(train)} training scenes contain no observed relation")
     is_structure: Flags = structure.numpy()

@@ -6,14 +6,16 @@ import pytest
 
 from tests.training.research.baselines.furnished import furnished
 from training.datasets.batches import SceneTensors
-from training.research.baselines import networks
+from training.evaluation.density_task import DensitySettings
+from training.research.baselines import networks, object_models
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _short_courses() -> Iterator[None]:
-    """A hundred steps suffice for two kinds of rooms."""
+    """A few steps suffice for two kinds of rooms."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(networks, "_STEPS", 100)
+        patch.setattr(networks, "_STEPS", 60)
+        patch.setattr(object_models, "_EFFORT", DensitySettings(64, 300, 100))
         yield
 
 

@@ -27,11 +27,11 @@ from training.evaluation.baselines.classes import (
     training_lists,
 )
 from training.evaluation.baselines.triples import (
-    PlacedTable,
-    TripleTable,
     count_triples,
+    place_score,
     smoothed_log_odds,
     smoothed_log_p,
+    table_score,
 )
 from training.evaluation.contradictions import transitive_closure
 from training.evaluation.model import Places
@@ -43,7 +43,7 @@ from training.research.baselines.object_models import (
     fit_pairwise,
     nearest_score,
 )
-from training.research.baselines.relation_models import ClosureScore, complex_logits, fit_complex
+from training.research.baselines.relation_models import closure_score, complex_logits, fit_complex
 
 
 def lists_of(v):
@@ -241,10 +241,10 @@ def test_the_frequency_table_by_hand(related):
 def test_tables_are_looked_up_for_the_classes_of_a_scene(related):
     table = torch.randn(A, V, V, generator=torch.Generator().manual_seed(0))
     batch = related.batch(torch.tensor([1, 0]))
-    values = TripleTable(table)(batch)
+    values = table_score(table)(batch)
     assert values[1, LEFT, 2, 0] == table[LEFT, 2, 0]
     assert values[0, ON_TOP, 0, 1] == table[ON_TOP, 0, 1]
-    more = TripleTable(table, multiplicity=0.5)(batch) - values
+    more = table_score(table, multiplicity=0.5)(batch) - values
     assert float(more[0, LEFT, 0, 1]) == pytest.approx(0.5 * np.log(3), abs=1e-6)
     assert float(more[0, LEFT, 1, 1]) == pytest.approx(np.log(3), abs=1e-6)
     assert not more[1].any()
@@ -262,7 +262,7 @@ def test_closure_is_warshalls():
 def test_closure_moves_what_follows_and_its_mirror_image_alone():
     batch = tensors([scene([0, 1, 2, 3], [(LEFT, 0, 1), (LEFT, 1, 2)])]).batch(torch.tensor([0]))
     given = telling(batch, batch.holds > 0)
-    moved = ClosureScore(TripleTable(torch.zeros(A, V, V)), bonus=2.0, penalty=3.0)(given)
+    moved = closure_score(table_score(torch.zeros(A, V, V)), bonus=2.0, penalty=3.0)(given)
     expected = torch.zeros(1, A, 4, 4)
     expected[0, LEFT, 0, 2] = 2.0
     for i, j in ((1, 0), (2, 1), (2, 0)):
@@ -293,15 +293,9 @@ def test_places_by_hand(related):
     assert log_p.exp().sum(-1) == pytest.approx(torch.ones(2, A, V), abs=1e-5)
     # Something on 1: 0 twice. Whatever is on something: 0 twice, and one case of 1/11 each.
     back_off = (2 + 1 / 11) / (2 + 1)
-    place = Places(
-        v=torch.zeros(1, V),
-        counts=torch.zeros(1, V),
-        relation=torch.tensor([ON_TOP]),
-        anchor=torch.tensor([1]),
-        outgoing=torch.tensor([True]),
-    )
-    value = PlacedTable(log_p)(place)[0, 0].exp()
-    assert float(value) == pytest.approx((2 + 2 * back_off) / (2 + 2), abs=1e-5)
-    # Something under 0: 1 twice.
-    turned = Places(place.v, place.counts, place.relation, torch.tensor([0]), ~place.outgoing)
-    assert PlacedTable(log_p)(turned)[0].argmax() == 1
+    # Second, something under 0: 1 twice.
+    v, relation = torch.zeros(2, V), torch.tensor([ON_TOP, ON_TOP])
+    places = Places(v, v, relation, torch.tensor([1, 0]), torch.tensor([True, False]))
+    first, second = place_score(log_p)(places)
+    assert float(first[0].exp()) == pytest.approx((2 + 2 * back_off) / (2 + 2), abs=1e-5)
+    assert second.argmax() == 1

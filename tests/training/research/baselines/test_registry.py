@@ -51,12 +51,6 @@ def fitted(baseline: Baseline):
     return baseline.fit(furnished(300, seed=1), furnished(60, seed=2), STRUCTURE, seed=0)
 
 
-def score_of(baseline: Baseline, model):
-    """The score of the fitted model."""
-    score = getattr(model, baseline.scores[0])
-    return score(None) if baseline is DENSITY else score
-
-
 def best(baseline: Baseline):
     """The best trial of `fitted`."""
     return max(fitted(baseline).trials, key=lambda trial: trial.validation)
@@ -78,28 +72,25 @@ def answers(baseline: Baseline, score, scenes):
     return score(scenes.batch(torch.arange(20)))
 
 
-@named(EVERY)
-def test_every_trial_is_recorded_and_the_best_is_chosen(baseline, validation):
-    result = fitted(baseline)
-    assert len({str(trial.parameters) for trial in result.trials}) == len(result.trials)
-    assert all(trial.seconds > 0 for trial in result.trials)
-    again = baseline.judge(validation, STRUCTURE, score_of(baseline, result))
-    assert again == pytest.approx(best(baseline).validation)
-
-
 # These have few settings, or none; the log Z of the density is slow.
 FEW = ("popularity", "most common room type", "relation popularity", "pairwise, by likelihood")
 
 
-@named([baseline for baseline in EVERY if baseline.name not in FEW])
-def test_every_baseline_has_its_trials(baseline):
+@named(EVERY)
+def test_every_trial_is_recorded_and_the_best_is_chosen(baseline, validation):
     """On scenes of one kind, a baseline has a quarter of its settings for the sets of scenes."""
+    result = fitted(baseline)
+    assert len({str(trial.parameters) for trial in result.trials}) == len(result.trials)
+    assert all(trial.seconds > 0 for trial in result.trials)
+    score = getattr(result, baseline.scores[0])
+    again = baseline.judge(validation, STRUCTURE, score(None) if baseline is DENSITY else score)
+    assert again == pytest.approx(best(baseline).validation)
     settings = [
         {key: value for key, value in trial.parameters.items() if key not in ("steps", "epochs")}
-        for trial in fitted(baseline).trials
+        for trial in result.trials
     ]
     chooses = 4 if "scenes" in settings[0] else 1
-    assert chooses * len({str(setting) for setting in settings}) >= TRIALS
+    assert baseline.name in FEW or chooses * len({str(x) for x in settings}) >= TRIALS
 
 
 def test_the_best_of_the_short_fits_are_fitted_in_full():
@@ -132,21 +123,13 @@ def test_rooms_follow_their_objects(baseline):
 
 
 @named(OBJECTS[1:])
-def test_objects_beat_popularity(baseline):
+def test_objects_belong_to_their_room(baseline):
     """Popularity cannot tell a kitchen from a bedroom: of 8 classes alike it finds 1 in 4 or so."""
     assert best(baseline).validation > best(OBJECTS[0]).validation + 0.1
-
-
-@named(OBJECTS)
-def test_objects_belong_to_their_room(baseline):
-    """Of a kitchen's last class and a bedroom's, popular alike, the kitchen's is missed in it."""
     v = torch.zeros(1, V)
     v[0, [*KITCHEN[:3], FLOOR]] = 1.0
     score = fitted(baseline).missing(v)[0]
-    if baseline is OBJECTS[0]:
-        assert (score[KITCHEN[3]] - score[BEDROOM[3]]).abs() < 0.5
-    else:
-        assert score[KITCHEN[3]] > score[BEDROOM[3]]
+    assert score[KITCHEN[3]] > score[BEDROOM[3]]
 
 
 @named(OBJECTS)
@@ -161,30 +144,18 @@ def test_object_scores_are_numbers_and_scenes_do_not_mix(baseline, validation):
     torch.testing.assert_close(alone[candidates], values[candidates], rtol=1e-4, atol=1e-4)
 
 
-REPEATED = ("masked transformer", "denoising autoencoder", "ComplEx", "scikit-learn BernoulliRBM")
-
-
-@named([BASELINES[name] for name in REPEATED])
-def test_the_same_seed_gives_the_same_fit(baseline, validation):
+@named(EVERY)
+def test_stochastic_fits_depend_on_the_seed_alone(baseline, validation):
+    """By the first setting that a baseline tries."""
     torch.manual_seed(123)
     state = torch.get_rng_state()
-    figures = [
-        [trial.validation for trial in baseline.fit(validation, validation, STRUCTURE).trials]
-        for _ in range(2)
-    ]
-    assert torch.equal(torch.get_rng_state(), state), "the global generator was disturbed"
-    assert figures[0] == figures[1]
-
-
-@pytest.mark.slow
-@named(EVERY)
-def test_stochastic_fits_depend_on_the_seed(baseline, validation):
-    ours, theirs = (
-        answers(baseline, score_of(baseline, model), validation)
-        for seed in (0, 1)
-        for model in [baseline.fit(validation, validation, STRUCTURE, seed=seed)]
+    first, again, other = (
+        answers(baseline, next(baseline.propose(validation, STRUCTURE, seed))[1], validation)
+        for seed in (0, 0, 1)
     )
-    assert torch.equal(ours, theirs) is not baseline.stochastic
+    assert torch.equal(torch.get_rng_state(), state), "the global generator was disturbed"
+    assert torch.equal(first, again)
+    assert torch.equal(first, other) is not baseline.stochastic
 
 
 @named(OF_RELATIONS[1:])
@@ -214,7 +185,7 @@ def test_closure_completes_what_the_table_cannot():
             scenes.append(scene(range(6), chain, name=str(k)))
         return tensors(scenes)
 
-    train, held_out = shuffled(100), shuffled(100)
+    train, held_out = shuffled(60), shuffled(60)
     fits = (b.fit(train, held_out, STRUCTURE) for b in COMPLETIONS)
     table, closure = (max(f.trials, key=lambda trial: trial.validation) for f in fits)
     # Half of the ordered pairs hold, so the table is right by chance alone.
