@@ -24,7 +24,7 @@ from training.domain.candidates import Candidate
 from training.domain.compare import compare, compare_command, show
 from training.domain.evaluate_command import evaluate_command
 from training.domain.gate import MARGIN, NEW, losses, measure_usefulness, served_model
-from training.domain.init_command import example, fail, init
+from training.domain.init_command import STORE, StorePath, example, fail, init
 from training.domain.labels import outside_vocabulary
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, ConfigError, is_file, source_name
@@ -70,8 +70,7 @@ StoredData = Annotated[
     ),
 ]
 Runs = Annotated[Path, typer.Option("--runs", help="folder of the training runs")]
-StorePath = Annotated[str, typer.Option("--store", help="folder of the model store")]
-_RUNS, _STORE = Path("runs"), "model_store"
+_RUNS = Path("runs")
 _ALIAS = "`python -m app.registry alias` moves an alias without a comparison"
 
 
@@ -94,7 +93,7 @@ def train(
         Path | None, typer.Option("--tensorboard", help="write TensorBoard logs to this folder")
     ] = None,
     publish: Annotated[str | None, typer.Option(help="publish the run as this version")] = None,
-    store: StorePath = _STORE,
+    store: StorePath = STORE,
 ) -> None:
     """Train a configuration. With --publish, also calibrate, evaluate and publish the model."""
     try:
@@ -111,7 +110,9 @@ def train(
             config = with_settings(config, {"data.split": "final"})
             folder = folder.with_name(f"final-{folder.name}")
         scenes = _prepare(config, root)
-        _train(config, scenes, folder, root, fresh, tensorboard)
+        for name in ("checkpoint.pt", "result.json") if fresh else ():
+            (folder / name).unlink(missing_ok=True)
+        _train(config, scenes, folder, root, tensorboard)
         if publish is None and not final:
             next_steps(folder, console)
         if publish is not None:
@@ -133,7 +134,7 @@ def publish(
     ],
     version: Annotated[str, typer.Argument(help="number of the new version, such as 1.0.0")],
     data: StoredData = None,
-    store: StorePath = _STORE,
+    store: StorePath = STORE,
     promote: Annotated[
         bool,
         typer.Option(
@@ -186,7 +187,7 @@ def publish(
             raise ConfigError(
                 f"{folder} is a final run without test scenes, so it cannot be compared; {_ALIAS}"
             )
-        root = data or (Path(run.data) if run.data else DATA)
+        root = data or run.data_folder
         scenes = _prepare(run.config, root)
         if promote:
             _promote(
@@ -208,7 +209,7 @@ def publish(
 
 
 @app.command(name="list")
-def list_command(store: StorePath = _STORE) -> None:
+def list_command(store: StorePath = STORE) -> None:
     """List the models in the store and the shipped configurations."""
     try:
         models = load_model_set(Store(store))
@@ -216,9 +217,8 @@ def list_command(store: StorePath = _STORE) -> None:
         fail(error)
     table = Table("model", "version", "variant", "state", title="Published")
     for (name, version), entry in sorted(models.entries.items()):
-        state = getattr(entry, "reason", "verified")
         variant = entry.manifest.variant if hasattr(entry, "manifest") else "?"
-        table.add_row(name, version, variant, state)
+        table.add_row(name, version, variant, getattr(entry, "reason", "verified"))
     console.print(table)
     for alias, target in models.aliases.items():
         console.print(f"{alias} → {target}")
@@ -231,11 +231,11 @@ def _prepare(config: Config, data: Path) -> SplitScenes:
     examples, reasons = known_examples(read_examples(config.examples, data), scenes.vocabulary)
     sizes = ", ".join(f"{len(part)} {name}" for name, part in scenes.parts.items())
     console.print(f"{len(scenes.vocabulary)} object classes; scenes: {sizes}")
-    file_sources = {source_name(source) for source in config.data.sources if is_file(source)}
-    for is_named in (True, False):
+    files = {source_name(source) for source in config.data.sources if is_file(source)}
+    for named in (True, False):
         all_scenes = (scene for part in scenes.parts.values() for scene in part)
-        selected = (scene for scene in all_scenes if (scene.source in file_sources) == is_named)
-        if line := outside_vocabulary(selected, named=is_named):
+        selected = (scene for scene in all_scenes if (scene.source in files) == named)
+        if line := outside_vocabulary(selected, named=named):
             console.print(line, soft_wrap=True, markup=False, highlight=False)
     for reason in reasons:
         console.print(f"[yellow]note:[/yellow] an example is left out: {reason}", soft_wrap=True)
@@ -243,16 +243,8 @@ def _prepare(config: Config, data: Path) -> SplitScenes:
 
 
 def _train(
-    config: Config,
-    scenes: SplitScenes,
-    folder: Path,
-    root: Path,
-    fresh: bool,
-    tensorboard: Path | None,
+    config: Config, scenes: SplitScenes, folder: Path, root: Path, tensorboard: Path | None
 ) -> None:
-    if fresh:
-        for name in ("checkpoint.pt", "result.json"):
-            (folder / name).unlink(missing_ok=True)
     trainer = Trainer(config, scenes.training_data(), folder)
     if trainer.resume():
         console.print(f"resuming after {trainer.position}")
@@ -339,9 +331,8 @@ def _promote(
             if served.candidate is not None and (even_if_worse or not reasons):
                 try:
                     new = Candidate(NEW, run.config, scenes.digests, artifact, root)
-                    comparison = compare(
-                        *(new, served.candidate, root), limit=limit, examples=3, say=say
-                    )
+                    sides = (new, served.candidate, root)
+                    comparison = compare(*sides, limit=limit, examples=3, say=say)
                     show(comparison, console)
                     reasons += losses(comparison, margin)
                 except ConfigError as error:

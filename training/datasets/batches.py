@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from app.scene import RoleCounts, Vocabulary
+from app.scene import CANONICAL, RoleCounts, Vocabulary
 from training.datasets import EncodedScene
 from training.machines import BoltzmannMachine
 from training.machines.edges import Edges
@@ -108,16 +108,8 @@ class SceneTensors:
 def scene_tensors(
     scenes: Sequence[EncodedScene], annotated: dict[str, np.ndarray], size: int
 ) -> SceneTensors:
-    """Return encoded scenes as tensors. `annotated` has the classes, (classes,), of each source.
-
-    Raises:
-        ValueError: `annotated` has no entry for the source of a scene.
-    """
+    """Return encoded scenes as tensors. `annotated` has the classes, (classes,), of each source."""
     names = sorted(annotated)
-    if missing := {scene.source for scene in scenes} - set(names):
-        raise ValueError(
-            f"`annotated` has no entry for the sources {sorted(missing)}; add one for each source"
-        )
     v = torch.zeros(len(scenes), size)
     for row, scene in enumerate(scenes):
         v[row, torch.from_numpy(scene.evidence.classes)] = 1.0
@@ -149,14 +141,13 @@ def relation_units(machine: BoltzmannMachine, batch: Batch) -> tuple[Edges, Tens
 
 def seen_triples(scenes: Sequence[EncodedScene], size: int, minimum: int = 1) -> Tensor:
     """Return the sorted triples (relation, subject, object) of `minimum` or more scenes, (n, 3)."""
-    keys: list[np.ndarray] = []
-    for scene in scenes:
-        relation, subject, object_ = scene.evidence.holds.nonzero()
-        classes = scene.evidence.classes
-        keys.append((relation * size + classes[subject]) * size + classes[object_])
-    values, counts = np.unique(np.concatenate([*keys, np.zeros(0, np.int64)]), return_counts=True)
-    keys_kept = values[counts >= minimum].astype(np.int64)
-    table = np.stack([keys_kept // size // size, keys_kept // size % size, keys_kept % size], 1)
+    shape, keys = (len(CANONICAL), size, size), [np.zeros(0, dtype=np.int64)]
+    for evidence in (scene.evidence for scene in scenes):
+        relation, subject, other = evidence.holds.nonzero()
+        ends = evidence.classes[subject], evidence.classes[other]
+        keys.append(np.ravel_multi_index((relation, *ends), shape))
+    values, counts = np.unique(np.concatenate(keys), return_counts=True)
+    table = np.stack(np.unravel_index(values[counts >= minimum], shape), axis=1)
     return torch.from_numpy(table).to(torch.int32)
 
 

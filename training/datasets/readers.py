@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Final
 
@@ -41,9 +42,9 @@ def read_3dssg(path: Path) -> list[AnnotatedScene]:
         else:
             if labels is None:
                 labels = _labels(path.with_name("objects.json"))
-            if name not in labels:
-                raise DatasetError(path, where, f"scan {name} is not in objects.json")
-            objects = labels[name]
+            objects = labels.get(name)
+        if objects is None:
+            raise DatasetError(path, where, f"scan {name} is not in objects.json")
         if name not in rooms:
             raise DatasetError(path, where, f"scan {name} is not in 3RScan.json")
         scene_id = f"3dssg-{name}-{scan['split']}" if "split" in scan else f"3dssg-{name}"
@@ -51,13 +52,12 @@ def read_3dssg(path: Path) -> list[AnnotatedScene]:
             raise DatasetError(path, where, f"scene {scene_id} is listed twice")
         triples = _triples(path, where, scan, list(objects))
         with located(path, where):
-            things = tuple(AnnotatedObject(key, label) for key, label in objects.items())
             scenes[scene_id] = AnnotatedScene(
                 scene_id=scene_id,
                 source="3dssg",
                 group=f"3rscan-{rooms[name]}",
                 room_type=None,
-                objects=things,
+                objects=tuple(AnnotatedObject(key, label) for key, label in objects.items()),
                 relations=relations_of("3dssg", triples),
                 supported=supported_subjects("3dssg", triples),
             )
@@ -122,12 +122,14 @@ def read_coco(path: Path) -> list[AnnotatedScene]:
     image plane. Encoding later derives the relations left and above from boxes.
     """
     content = load_json(path)
-    categories: dict[int, str] = {}
-    for where, entry in _entries(path, "", content, "categories"):
-        categories[take(path, where, entry, "id", int)] = take(path, where, entry, "name", str)
-    images: dict[int, dict[int, AnnotatedObject]] = {}
-    for where, entry in _entries(path, "", content, "images"):
-        images[take(path, where, entry, "id", int)] = {}
+    categories: dict[int, str] = {
+        take(path, where, entry, "id", int): take(path, where, entry, "name", str)
+        for where, entry in _entries(path, "", content, "categories")
+    }
+    images: dict[int, dict[int, AnnotatedObject]] = {
+        take(path, where, entry, "id", int): {}
+        for where, entry in _entries(path, "", content, "images")
+    }
     for where, entry in _entries(path, "", content, "annotations"):
         image = take(path, where, entry, "image_id", int)
         category = take(path, where, entry, "category_id", int)
@@ -143,10 +145,9 @@ def read_coco(path: Path) -> list[AnnotatedScene]:
         with located(path, where):
             box = _box(path, where, entry)
             images[image][key] = AnnotatedObject(str(key), categories[category], box2d=box)
-    names = {f"coco-{image}": tuple(objects.values()) for image, objects in images.items()}
     return [
-        AnnotatedScene(name, "coco", name, None, objects)
-        for name, objects in names.items()
+        AnnotatedScene(f"coco-{image}", "coco", f"coco-{image}", None, tuple(objects.values()))
+        for image, objects in images.items()
         if objects
     ]
 
@@ -168,27 +169,27 @@ READERS: Final[dict[str, Callable[[Path], list[AnnotatedScene]]]] = {
 }
 
 
+_PATTERNS: Final = {
+    "*.jsonl": "jsonl",
+    "*.jsonl.gz": "jsonl",
+    "*.mat": "sunrgbd-mat",
+    "relationships*.json": "3dssg",
+    "instances*.json": "coco",
+}
+
+
 def guess_format(path: Path) -> str:
     """Return the name of a file's format, derived from the file name.
 
     Raises:
         DatasetError: the name matches no known format.
     """
-    name = path.name
-    if name.endswith((".jsonl", ".jsonl.gz")):
-        return "jsonl"
-    if name.endswith(".mat"):
-        return "sunrgbd-mat"
-    if name.startswith("relationships") and name.endswith(".json"):
-        return "3dssg"
-    if name.startswith("instances") and name.endswith(".json"):
-        return "coco"
-    raise DatasetError(
-        path,
-        "",
-        "the file name fits no known format; rename the file to *.jsonl, *.jsonl.gz, *.mat, "
-        "relationships*.json or instances*.json",
-    )
+    for pattern, name in _PATTERNS.items():
+        if fnmatchcase(path.name, pattern):
+            return name
+    *patterns, last = _PATTERNS
+    problem = "the file name fits no known format; rename the file to "
+    raise DatasetError(path, "", f"{problem}{', '.join(patterns)} or {last}")
 
 
 def read_scenes(path: Path) -> list[AnnotatedScene]:

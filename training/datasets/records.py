@@ -59,9 +59,10 @@ class AnnotatedObject:
     def __post_init__(self) -> None:
         if not self.label:
             raise ValueError(f"object {self.id!r} has an empty label")
-        _check_numbers("position", self.id, self.position, 3)
-        _check_numbers("size", self.id, self.size, 3)
-        _check_numbers("box2d", self.id, self.box2d, 4)
+        for name, length in (("position", 3), ("size", 3), ("box2d", 4)):
+            x = getattr(self, name)
+            if x is not None and (len(x) != length or not all(map(math.isfinite, x))):
+                raise ValueError(f"{name} of {self.id!r} must be {length} finite numbers, not {x}")
         if self.size is not None and min(self.size) < 0:
             raise ValueError(f"size of {self.id!r} must not be negative, but is {self.size}")
         if self.box2d and (self.box2d[0] > self.box2d[2] or self.box2d[1] > self.box2d[3]):
@@ -75,9 +76,10 @@ class AnnotatedObject:
 
 @dataclass(frozen=True, slots=True)
 class AnnotatedScene:
-    """One annotated scene, whose id is distinct within its data source.
+    """One annotated scene.
 
     Attributes:
+        scene_id: id of the scene, distinct within its data source.
         group: name of a group of near-duplicate scenes, such as frames of one place.
         room_type: room type in the data set. None means unknown.
         relations, false_relations: triples (subject index, relation, object index) that hold, and
@@ -115,23 +117,12 @@ class AnnotatedScene:
         for subject, relation, anchor in (*(self.relations or ()), *self.false_relations):
             if relation not in RELATIONS:
                 raise ValueError(f"unknown relation {relation!r}")
-            for end in (subject, anchor):
-                if not 0 <= end < size:
-                    raise ValueError(
-                        f"a relation has object index {end}, but the scene has {size} objects"
-                    )
+            if unknown := [end for end in (subject, anchor) if not 0 <= end < size]:
+                raise ValueError(
+                    f"a relation has object index {unknown[0]}, but the scene has {size} objects"
+                )
 
 
 def digest_of(scenes: Sequence[AnnotatedScene]) -> str:
     """Return the sha256 of the contents of the scenes. It does not depend on the file format."""
-    sha = hashlib.sha256()
-    for scene in scenes:
-        sha.update(repr(scene).encode())
-    return sha.hexdigest()
-
-
-def _check_numbers(name: str, owner: str, values: Sequence[float] | None, length: int) -> None:
-    if values is None:
-        return
-    if len(values) != length or not all(map(math.isfinite, values)):
-        raise ValueError(f"{name} of {owner!r} must be {length} finite numbers, not {values}")
+    return hashlib.sha256("".join(map(repr, scenes)).encode()).hexdigest()

@@ -56,15 +56,12 @@ def read_sunrgbd_mat(path: Path) -> list[AnnotatedScene]:
         else:
             group = f"sunrgbd-{collection}-{frames[collection] // _BLOCK}"
         frames[collection] += 1
-        boxes = _structs(take(path, where, frame, "groundtruth3DBB", object))
-        objects = tuple(
-            _box(path, f"{where}.groundtruth3DBB({index + 1})", index, box)
-            for index, box in enumerate(boxes)
-        )
+        boxes = enumerate(_structs(take(path, where, frame, "groundtruth3DBB", object)))
+        place = f"{where}.groundtruth3DBB"
+        objects = tuple(_box(path, f"{place}({index + 1})", index, box) for index, box in boxes)
         if objects:
             note = path.parent / name / "scene.txt"
-            room = note.read_text(encoding="utf-8").strip() if note.is_file() else None
-            room = room or None
+            room = (note.read_text(encoding="utf-8").strip() if note.is_file() else "") or None
             scenes.append(AnnotatedScene(name, SOURCE, group, room, objects, viewer_frame=True))
     return scenes
 

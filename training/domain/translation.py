@@ -134,20 +134,22 @@ class Translation:
         n, A = len(model_classes), batch.holds.shape[1]
         counts = torch.zeros(n, dtype=torch.int64)
         counts.index_add_(0, index_of, batch.counts[row, columns])
-        holds, observed = torch.zeros(A, n, n), torch.zeros(A, n, n, dtype=torch.bool)
         model_pair = (slice(None), index_of[:, None], index_of[None, :])
         scene_pair = (slice(None), columns[:, None], columns[None, :])
         # Scene classes that map to one model class share their observed relations.
-        for a, i, j in batch.observed[row][scene_pair].nonzero().tolist():
-            observed[a, index_of[i], index_of[j]] = True
-            holds[a, index_of[i], index_of[j]] += batch.holds[row][scene_pair][a, i, j]
+        pair = (index_of[:, None] * n + index_of).flatten().expand(A, -1)
+
+        def pooled(relations: Tensor) -> Tensor:
+            values = relations[row][scene_pair].float().flatten(1)
+            return torch.zeros(A, n * n).scatter_reduce(1, pair, values, "amax").view(1, A, n, n)
+
         model_scene = replace(
             batch.rows(torch.tensor([row])),
             v=torch.zeros(1, self.size).index_fill(1, model_classes, 1.0),
             classes=model_classes.unsqueeze(0),
             counts=counts.unsqueeze(0),
-            holds=holds.clamp(max=1.0).unsqueeze(0),
-            observed=observed.unsqueeze(0),
+            holds=pooled(batch.holds * batch.observed),
+            observed=pooled(batch.observed).bool(),
             room=torch.tensor([-1]),
         )
         values = score(model_scene)[0].clamp(min=-BEYOND)[model_pair]

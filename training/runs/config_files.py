@@ -18,14 +18,16 @@ _TRAINING = Path(__file__).resolve().parents[1]
 
 def shipped_configs() -> dict[str, Path]:
     """Return the files of the shipped configurations by name."""
-    folder = _TRAINING / "runs" / "configs"
-    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+    return _toml_files("runs/configs")
 
 
 def shipped_files(kind: str) -> dict[str, Path]:
     """Return the shipped "ablations" or "spaces" by the name of their configuration."""
-    folder = _TRAINING / "research" / "configs" / kind
-    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+    return _toml_files(f"research/configs/{kind}")
+
+
+def _toml_files(folder: str) -> dict[str, Path]:
+    return {path.stem: path for path in sorted((_TRAINING / folder).glob("*.toml"))}
 
 
 def own_or_shipped(path: Path | None, config: Config, kind: str, option: str) -> Path:
@@ -36,9 +38,9 @@ def own_or_shipped(path: Path | None, config: Config, kind: str, option: str) ->
     """
     shipped = shipped_files(kind)
     if path is None and config.name not in shipped:
+        available = f"(available for: {', '.join(shipped)})"
         raise ConfigError(
-            f"{config.name} has no shipped {kind} (available for: {', '.join(shipped)}). Pass a "
-            f"TOML file with {option}"
+            f"{config.name} has no shipped {kind} {available}. Pass a TOML file with {option}"
         )
     return path or shipped[config.name]
 
@@ -82,17 +84,19 @@ def load_config(reference: str, *, seed: int | None = None) -> Config:
     """
     path = config_path(reference)
     if not path.is_file():
-        shipped = ", ".join(shipped_configs())
-        raise ConfigError(
-            f"there is no configuration {reference!r}: pass a TOML file or one of {shipped}"
-        )
+        choice = f"pass a TOML file or one of {', '.join(shipped_configs())}"
+        raise ConfigError(f"there is no configuration {reference!r}: {choice}")
     values = read_toml(path)
     if seed is not None:
         values.setdefault("training", {})["seed"] = seed
+    return _validated(values, f"{path.name}:")
+
+
+def _validated(values: Mapping[str, Any], title: str) -> Config:
     try:
         return Config.model_validate(values)
     except ValidationError as error:
-        raise ConfigError(f"{path.name}: {first_error(error)}") from error
+        raise ConfigError(f"{title} {first_error(error)}") from error
 
 
 def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
@@ -112,23 +116,13 @@ def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
             choice = f"{section} has {', '.join(entries)}" if entries else "name it section.entry"
             raise ConfigError(f"there is no setting {name!r}: {choice}")
         values[section][entry] = value
-    try:
-        return Config.model_validate(values)
-    except ValidationError as error:
-        raise ConfigError(
-            f"the settings {dict(settings)} are invalid: {first_error(error)}"
-        ) from error
+    return _validated(values, f"the settings {dict(settings)} are invalid:")
 
 
 def shortened(config: Config, factor: float) -> Config:
     """Return a configuration whose training has a share of the steps and epochs, at least one."""
-    return with_settings(
-        config,
-        {
-            "objects.steps": max(1, round(factor * config.objects.steps)),
-            "relations.epochs": max(1, round(factor * config.relations.epochs)),
-        },
-    )
+    full = {"objects.steps": config.objects.steps, "relations.epochs": config.relations.epochs}
+    return with_settings(config, {name: max(1, round(factor * x)) for name, x in full.items()})
 
 
 def config_toml(config: Config) -> str:

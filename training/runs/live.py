@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from statistics import fmean
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -84,10 +85,7 @@ def sparkline(values: Sequence[float], width: int = _WIDTH) -> str:
     if not finite:
         return ""
     size = max(1, math.ceil(len(finite) / width))
-    means = [
-        sum(part) / len(part)
-        for part in (finite[start : start + size] for start in range(0, len(finite), size))
-    ]
+    means = [fmean(finite[start : start + size]) for start in range(0, len(finite), size)]
     low, high = min(means), max(means)
     step = (high - low) / (len(_LEVELS) - 1)
     return "".join(_LEVELS[round((value - low) / step) if step else 0] for value in means)

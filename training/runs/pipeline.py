@@ -28,7 +28,7 @@ from training.datasets import (
     split,
     with_typical_sizes,
 )
-from training.datasets.batches import SceneTensors, TrainingData, scene_tensors
+from training.datasets.batches import TrainingData, scene_tensors
 from training.datasets.files import DATA
 from training.datasets.records import digest_of
 from training.datasets.words import class_vectors, read_word_vectors
@@ -88,14 +88,10 @@ class SplitScenes:
                 f"the training part contains no scene of the source {source!r}; add scenes, or "
                 "remove the source from data.sources"
             )
-        tensors: dict[str, SceneTensors] = {
-            part: scene_tensors(scenes, annotated, len(self.vocabulary))
-            for part, scenes in self.parts.items()
-        }
+        V = len(self.vocabulary)
+        tensors = {name: scene_tensors(part, annotated, V) for name, part in self.parts.items()}
         return TrainingData(
-            train=tensors["train"],
-            validation=tensors["validation"],
-            test=tensors["test"],
+            **tensors,
             structure=torch.from_numpy(self.vocabulary.structure.copy()),
             relations=len(CANONICAL),
             room_types=len(self.vocabulary.room_types),
@@ -120,9 +116,8 @@ class SplitScenes:
 
     def shuffled(self, seed: int) -> SplitScenes:
         """Return a copy in which objects are permuted between scenes, except in test scenes."""
-        structure = self.vocabulary.structure
         permuted = {
-            part: shuffle_objects(self.parts[part], structure, seed)
+            part: shuffle_objects(self.parts[part], self.vocabulary.structure, seed)
             for part in ("train", "validation")
         }
         return replace(self, parts=self.parts | permuted, shuffle=seed)
@@ -141,15 +136,14 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
     _require_files(data, root)
     scenes: dict[str, list[AnnotatedScene]] = {}
     for source in data.sources:
-        name = source_name(source)
+        name, path = source_name(source), _path(source, root)
         if source == "rooms":
-            source_scenes = generate_rooms(data.rooms, seed=data.split_seed)
+            own = generate_rooms(data.rooms, seed=data.split_seed)
         elif source == priors.SOURCE:
-            source_scenes = priors.read_prior_scenes(_path(source, root))
+            own = priors.read_prior_scenes(path)
         else:
-            path = _path(source, root)
-            source_scenes = [replace(scene, source=name) for scene in read_scenes(path)]
-        scenes[name] = source_scenes[: data.limit]
+            own = [replace(scene, source=name) for scene in read_scenes(path)]
+        scenes[name] = own[: data.limit]
     return scenes
 
 
@@ -170,18 +164,16 @@ def _require_files(data: DataConfig, root: Path) -> None:
     if not missing:
         return
     names = ", ".join(path.relative_to(root).as_posix() for path in missing.values())
-    text = f"{len(missing)} of {len(paths)} files of scenes are missing in {root}: {names}. "
-    if all(map(is_file, missing)):
-        advice = (
-            "The paths start at the folder of your configuration file. Pass this folder with "
-            "--data, such as --data my-lab"
-        )
-    else:
-        advice = (
-            "The repository does not contain the public data sets. docs/training.md (The "
-            "public data sets) names them and their files. Pass the folder of the files with --data"
-        )
-    raise ConfigError(text + advice)
+    advice = (
+        "The paths start at the folder of your configuration file. Pass this folder with --data, "
+        "such as --data my-lab"
+        if all(map(is_file, missing))
+        else "The repository does not contain the public data sets. docs/training.md (The public "
+        "data sets) names them and their files. Pass the folder of the files with --data"
+    )
+    raise ConfigError(
+        f"{len(missing)} of {len(paths)} files of scenes are missing in {root}: {names}. {advice}"
+    )
 
 
 def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path) -> Vocabulary:
@@ -230,7 +222,11 @@ def split_and_encode(
     all_scenes = [scene for source in scenes.values() for scene in source]
     parts = split(all_scenes, seed=data.split_seed, protocol=data.split)
     if vocabulary is None:
-        vocabulary = build_vocabulary(data, list(parts["train"]), root)
+        vocabulary = build_vocabulary(data, parts["train"], root)
+    words = None
+    if data.words:
+        vectors, _ = class_vectors(read_word_vectors(root / data.words), vocabulary)
+        words = torch.from_numpy(vectors)
     roles = count_roles(parts["train"], vocabulary)
     return SplitScenes(
         data=data,
@@ -239,16 +235,8 @@ def split_and_encode(
         parts={name: encode(part, vocabulary, roles) for name, part in parts.items()},
         counts={name: len(source) for name, source in scenes.items()},
         digests={name: digest_of(source) for name, source in scenes.items()},
-        words=_word_vectors(data, vocabulary, root),
+        words=words,
     )
-
-
-def _word_vectors(data: DataConfig, vocabulary: Vocabulary, root: Path) -> torch.Tensor | None:
-    """Return the word vectors of the classes, (classes, dimensions), or None if none are set."""
-    if not data.words:
-        return None
-    vectors, _ = class_vectors(read_word_vectors(root / data.words), vocabulary)
-    return torch.from_numpy(vectors)
 
 
 def prepare(config: Config, root: Path) -> SplitScenes:

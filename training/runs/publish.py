@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.metadata
-import json
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -29,11 +28,11 @@ from training.fit.calibrate import calibrate
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, DataConfig
 from training.fit.count_statistics import fit_counts
-from training.fit.draft import as_stored, placed_draft
+from training.fit.draft import placed_draft
 from training.fit.long_chains import measure_drift
 from training.fit.objects import ObjectScenes
 from training.fit.offset_statistics import fit_offsets
-from training.runs.config_files import load_config, shipped_configs
+from training.runs.config_files import load_config, shipped_configs, with_settings
 from training.runs.example_scenes import known_examples, read_examples
 from training.runs.folder import FinishedRun
 from training.runs.pipeline import SplitScenes, read_sources, split_and_encode
@@ -81,21 +80,16 @@ def publish_run(
         StoreError, ArtifactError: see `Store.publish`.
     """
     run.require(scenes.digest)
+    measured_run, measured_scenes = measured or (run, scenes)
+    measured_run.require(measured_scenes.digest)
     data = scenes.training_data()
-    machine = as_stored(run.machine)
+    test = data if measured is None else measured_scenes.training_data()
     progress("calibrating")
-    if measured is None:
-        calibrated = calibrated_draft(run, scenes)
-        evaluated = calibrated = with_statistics(calibrated, scenes)
-        test = data
-    else:
-        measured_run, measured_scenes = measured
-        measured_run.require(measured_scenes.digest)
-        test = measured_scenes.training_data()
-        evaluated = calibrated_draft(measured_run, measured_scenes)
-        calibrated = calibrated_draft(run, scenes, evaluated.calibration)
-        evaluated = with_statistics(evaluated, measured_scenes)
-        calibrated = with_statistics(calibrated, scenes)
+    evaluated = with_statistics(calibrated_draft(measured_run, measured_scenes), measured_scenes)
+    calibrated, training = evaluated, {}
+    if measured is not None:
+        calibrated = with_statistics(calibrated_draft(run, scenes, evaluated.calibration), scenes)
+        training = {"measured_split": measured_run.config.data.split}
     alarms = untouched_alarms(calibrated, scenes.parts["validation"])
     progress("running long chains")
     learnt = ObjectScenes.of(data.train, data.structure, run.config.objects)
@@ -110,25 +104,21 @@ def publish_run(
     rows = _measure(evaluated, test, progress)
     rows += [metric for drift in drifts for metric in drift.metrics()]
     progress("publishing")
+    sources = data_sources(scenes)
     description = Description(
         name=run.config.name,
         version=version,
         created=_now(),
-        spec=machine.spec.to_dict(),
+        spec=run.machine.spec.to_dict(),
         vocabulary=VocabularyEntry.of(
-            with_room_aliases(scenes.vocabulary),
-            machine.spec.A,
-            learnt.sources,
+            with_room_aliases(scenes.vocabulary), run.machine.spec.A, learnt.sources
         ),
         calibration=calibrated.calibration,
-        training={
-            **({} if measured is None else {"measured_split": measured[0].config.data.split}),
-            "config": json.loads(run.config.model_dump_json()),
-            "parameters": run.machine.parameter_count,
-        },
-        data=data_sources(scenes),
+        training=training
+        | {"config": run.config.model_dump(mode="json"), "parameters": run.machine.parameter_count},
+        data=sources,
         metrics=tuple(rows),
-        terms=terms(scenes),
+        terms=terms(sources),
         libraries={name: importlib.metadata.version(name) for name in _LIBRARIES},
         examples=scenes.examples,
     )
@@ -161,10 +151,9 @@ def refit(
     """
     manifest = artifact.manifest
     config = Config.model_validate(manifest.training["config"])
-    data, examples_name = config.data, config.examples
-    if manifest.name in shipped_configs():
-        examples_name = load_config(manifest.name).examples
-    examples, reasons = known_examples(read_examples(examples_name, root), artifact.vocabulary)
+    data, is_shipped = config.data, manifest.name in shipped_configs()
+    named = load_config(manifest.name).examples if is_shipped else config.examples
+    examples, reasons = known_examples(read_examples(named, root), artifact.vocabulary)
     for reason in reasons:
         progress(reason)
     progress("reading scenes")
@@ -177,27 +166,19 @@ def refit(
             f"the scenes of {', '.join(changed)} have changed"
         )
     evaluated_scenes = scenes
-    if "measured_split" in manifest.training:
-        split = {"split": manifest.training["measured_split"]}
-        evaluated_scenes = split_and_encode(
-            DataConfig.model_validate(data.model_dump() | split),
-            annotated,
-            artifact.vocabulary,
-            root,
-        )
+    if split := manifest.training.get("measured_split"):
+        other = with_settings(config, {"data.split": split}).data
+        evaluated_scenes = split_and_encode(other, annotated, artifact.vocabulary, root)
     progress("fitting statistics")
     evaluated = with_statistics(artifact, evaluated_scenes)
     rows = _measure(evaluated, evaluated_scenes.training_data(), progress, tuple(STATISTICS))
-    fields = {name: getattr(manifest, name) for name in Description.model_fields}
-    fields["metrics"] = (
-        *(metric for metric in manifest.metrics if metric.task not in STATISTICS),
-        *rows,
-    )
-    changes = {"version": version, "created": _now(), "examples": examples}
-    changes["vocabulary"] = VocabularyEntry.of(
+    kept = [metric for metric in manifest.metrics if metric.task not in STATISTICS]
+    vocabulary = VocabularyEntry.of(
         with_aliases(artifact.vocabulary), artifact.spec.A, manifest.vocabulary.profiles
     )
-    description = Description(**fields | changes)
+    fields = {name: getattr(manifest, name) for name in Description.model_fields}
+    fields |= {"version": version, "created": _now(), "examples": examples}
+    description = Description(**fields | {"metrics": (*kept, *rows), "vocabulary": vocabulary})
     return _publish_rounded(store, description, with_statistics(artifact, scenes))
 
 
@@ -254,17 +235,13 @@ def _measure(
 def data_sources(scenes: SplitScenes) -> tuple[DataSource, ...]:
     """Return the data sources with the digests of their scenes and their terms of use."""
     sources = []
-    for source, count in scenes.counts.items():
-        words, research_only = terms_of(source, scenes.data)
-        sources.append(
-            DataSource(
-                source=source,
-                scenes=count,
-                digest=scenes.digests[source],
-                terms=words,
-                research_only=research_only,
-            )
+    for name, count in scenes.counts.items():
+        words, research_only = terms_of(name, scenes.data)
+        digest = scenes.digests[name]
+        source = DataSource(
+            source=name, scenes=count, digest=digest, terms=words, research_only=research_only
         )
+        sources.append(source)
     return tuple(sources)
 
 
@@ -273,19 +250,13 @@ def terms_of(source: str, data: DataConfig) -> tuple[str, bool]:
     # A user's file may have the name of a known source. `data.sources` then contains its path.
     if source in SOURCES and source in data.sources:
         return SOURCES[source].terms, SOURCES[source].research_only
-    words = data.terms or "the user's own scenes, without stated terms of use"
-    return words, data.research_only
+    return data.terms or "the user's own scenes, without stated terms of use", data.research_only
 
 
-def terms(scenes: SplitScenes) -> str:
-    """Return a sentence about the permitted use of the trained weights."""
-    entries = {source: terms_of(source, scenes.data) for source in scenes.counts}
-    sources = [source for source, (_, research_only) in entries.items() if research_only]
-    if sources:
-        return f"Research use only: trained on {', '.join(sources)}. Not for commercial robots."
-    sentences = [
-        f"Trained on {source}: {words.rstrip('.')}."
-        for source, (words, _) in entries.items()
-        if source not in SOURCES
-    ]
+def terms(sources: Sequence[DataSource]) -> str:
+    """Return a sentence about the permitted use of weights that are trained on these sources."""
+    if research := [entry.source for entry in sources if entry.research_only]:
+        return f"Research use only: trained on {', '.join(research)}. Not for commercial robots."
+    own = [entry for entry in sources if entry.source not in SOURCES]
+    sentences = [f"Trained on {entry.source}: {entry.terms.rstrip('.')}." for entry in own]
     return " ".join(sentences) or "No restriction from the training data beyond its attribution."

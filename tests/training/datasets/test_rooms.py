@@ -9,7 +9,7 @@ import pytest
 from app.scene import CANONICAL
 from app.scene.footprints import overlap_and_gap
 from training.datasets import AnnotatedScene, encode, generate_rooms, rooms_vocabulary
-from training.datasets.rooms import DOMAINS, ROOMS, Beside, Piece
+from training.datasets.rooms import DOMAINS, ROOMS, Piece
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +94,7 @@ def test_other_tables_make_another_domain() -> None:
 def test_an_adjacent_piece_is_close_to_the_named_side(side, axis, sign) -> None:
     """In the axes of the main piece, whose front is +y; from every viewpoint of a room."""
     chair = Piece("chair", (0.3, 0.3, 0.8))
-    table = Piece("table", (0.6, 0.5, 0.7), where="centre", beside=(Beside(chair, side),))
+    table = Piece("table", (0.6, 0.5, 0.7), where="centre", beside=((chair, side),))
     for scene in generate_rooms(40, 0, {"kitchen": (table,)}):
         (main,) = (thing for thing in scene.objects if thing.label == "table")
         (other,) = (thing for thing in scene.objects if thing.label == "chair")
