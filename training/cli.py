@@ -7,10 +7,9 @@ command then continues the run.
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
@@ -26,6 +25,7 @@ from training.domain.evaluate_command import evaluate_command
 from training.domain.gate import MARGIN, NEW, losses, measure_usefulness, served_model
 from training.domain.init_command import STORE, StorePath, example, fail, init
 from training.domain.labels import outside_vocabulary
+from training.evaluation.report import Progress
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, ConfigError, is_file, source_name
 from training.fit.trainer import Trainer
@@ -116,7 +116,8 @@ def train(
         if publish is None and not final:
             next_steps(folder, console)
         if publish is not None:
-            _publish(load_run(folder), scenes, store, publish, measured)
+            artifact = _publish(load_run(folder), scenes, Store(store), publish, measured=measured)
+            _print_published(artifact, store)
     except RefusedError as error:
         _exit_refused(error)
     except (*(ConfigError, DatasetError, RegistryError, RunError), FloatingPointError) as error:
@@ -197,11 +198,9 @@ def publish(
                 limit=limit,
                 even_if_worse=even_if_worse,
             )
-            command = f"SCENE_STORE={shlex.quote(store)} SCENE_PORT=8055 python -m app"
-            console.print(f"next: {command}", soft_wrap=True, markup=False, highlight=False)
         else:
             accept = _print_accepted if even_if_worse else None
-            _publish(run, scenes, store, version, accept=accept)
+            _print_published(_publish(run, scenes, models, version, accept=accept), store)
     except RefusedError as error:
         _exit_refused(error, "; --even-if-worse publishes the version all the same")
     except (RunError, ConfigError, DatasetError, RegistryError) as error:
@@ -260,21 +259,11 @@ def _train(
 
 
 def _publish(
-    run: FinishedRun,
-    scenes: SplitScenes,
-    store: str,
-    version: str,
-    measured: tuple[FinishedRun, SplitScenes] | None = None,
-    accept: Callable[[str], None] | None = None,
-) -> None:
+    run: FinishedRun, scenes: SplitScenes, store: Store, version: str, **options: Any
+) -> Artifact:
+    """Publish a run; `publish_run` has the options."""
     with console.status("publishing") as status:
-        artifact = publish_run(
-            *(run, scenes, Store(store), version),
-            measured=measured,
-            accept=accept,
-            progress=status.update,
-        )
-    _print_published(artifact, store)
+        return publish_run(run, scenes, store, version, progress=status.update, **options)
 
 
 def _print_accepted(reason: str) -> None:
@@ -320,33 +309,27 @@ def _promote(
 ) -> None:
     """Publish the version and point the alias at it, unless the gate refuses the version."""
     served = served_model(store, alias)
-    with console.status("publishing") as status:
 
-        def judged(artifact: Artifact) -> list[str]:
-            say = status.update
-            useful = measure_usefulness(artifact, scenes.training_data(), limit=limit, say=say)
-            for line in useful.lines():
-                console.print(line, highlight=False)
-            reasons = useful.objections()
-            if served.candidate is not None and (even_if_worse or not reasons):
-                try:
-                    new = Candidate(NEW, run.config, scenes.digests, artifact, root)
-                    sides = (new, served.candidate, root)
-                    comparison = compare(*sides, limit=limit, examples=3, say=say)
-                    show(comparison, console)
-                    reasons += losses(comparison, margin)
-                except ConfigError as error:
-                    if not even_if_worse:
-                        raise
-                    console.print(f"the versions were not compared: {error}", soft_wrap=True)
-            return reasons
+    def judge(artifact: Artifact, say: Progress) -> list[str]:
+        useful = measure_usefulness(artifact, scenes.training_data(), limit=limit, say=say)
+        for line in useful.lines():
+            console.print(line, highlight=False)
+        reasons = useful.objections()
+        if served.candidate is not None and (even_if_worse or not reasons):
+            try:
+                new = Candidate(NEW, run.config, scenes.digests, artifact, root)
+                sides = (new, served.candidate, root)
+                comparison = compare(*sides, limit=limit, examples=3, say=say)
+                show(comparison, console)
+                reasons += losses(comparison, margin)
+            except ConfigError as error:
+                if not even_if_worse:
+                    raise
+                console.print(f"the versions were not compared: {error}", soft_wrap=True)
+        return reasons
 
-        artifact = publish_run(
-            *(run, scenes, store, version),
-            judge=judged,
-            accept=_print_accepted if even_if_worse else None,
-            progress=status.update,
-        )
+    accept = _print_accepted if even_if_worse else None
+    artifact = _publish(run, scenes, store, version, judge=judge, accept=accept)
     if served.note:
         console.print(served.note, soft_wrap=True)
     _print_published(artifact)
@@ -355,3 +338,5 @@ def _promote(
     store.set_alias(alias, target, expected=served.target)
     change = f", before {served.target}" if served.target is not None else ""
     console.print(f"promoted: {alias} → {target}{change}", soft_wrap=True)
+    command = f"SCENE_STORE={shlex.quote(str(store.root))} SCENE_PORT=8055 python -m app"
+    console.print(f"next: {command}", soft_wrap=True, markup=False, highlight=False)

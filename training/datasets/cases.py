@@ -123,27 +123,19 @@ def _triples(holds: Flags, encoded: EncodedScene, structure: Flags) -> list[Trip
 
 
 class Part(NamedTuple):
-    """A part of a scene that a robot could list.
+    """A part of a scene that a robot could list."""
 
-    Attributes:
-        classes: (n,) listed classes without structure, in ascending order.
-        listed: (n,) number of listed instances of each class, from 1 to `number`.
-        number: (n,) number of instances of each class in the scene, at most `MOST`.
-        room: index of the room type. -1 means that the room type is unknown.
-    """
-
-    classes: Ints
-    listed: Ints
-    number: Ints
-    room: int
+    classes: Ints  # (n,) listed classes without structure, in ascending order
+    listed: Ints  # (n,) number of listed instances of each class, from 1 to `number`
+    number: Ints  # (n,) number of instances of each class in the scene, at most `MOST`
+    room: int  # index of the room type, -1 if unknown
 
 
 def some_instances(encoded: EncodedScene, structure: Flags, rng: Rng) -> Part:
-    """Draw a part of a scene to list.
+    """Draw a part of a scene to list: 25, 50, 75 or 100 % of the classes.
 
-    The part contains 25, 50, 75 or 100 % of the classes. Half of the parts list one instance of
-    each class. The other parts list any number of instances with equal probability, from one to all
-    instances. Half of the parts state the room type.
+    Half of the parts list one instance of each class. The others list from one to all instances,
+    with equal probability. Half of the parts state the room type.
     """
     things = np.flatnonzero(~structure[encoded.evidence.classes])
     share = _LISTED[rng.integers(len(_LISTED))]
@@ -184,8 +176,7 @@ def altered_case(
 ) -> tuple[Scene, Triple | None] | None:
     """Return a scene with observed relations, and their false triple (relation, subject, object).
 
-    Half of the scenes have a false triple in place of a true triple. In the other half, all triples
-    are true, and the false triple is None.
+    In half of the scenes, all triples are true, and the false triple is None.
     """
     triples = draw_true_relations(encoded, structure, rng)
     if triples is None:

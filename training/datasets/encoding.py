@@ -47,38 +47,25 @@ _IN_THE_IMAGE: Final = [CANONICAL.index("left"), CANONICAL.index("above")]
 class EncodedScene:
     """One scene, encoded with a vocabulary.
 
-    Attributes:
-        scene_id, source, group: as in the annotated scene.
-        room_type: index of the room type. -1 means that the room type is unknown.
-        evidence: classes of the scene, and relations between classes.
-        instance_classes: class index of each object instance, (instances,) int64.
-        instance_holds, instance_observed: True where a relation between two instances holds, and
-            where its truth is known, (relations, instances, instances) bool.
-        unknown: distinct labels outside the vocabulary, sorted. Their objects are left out.
-        instance_stands: what holds each instance, (instances,); see `app.scene.stands`.
-        instance_positions, instance_sizes, instance_yaws: centres, (instances, 3), and extents
-            before the rotation, (instances, 3), in metres, and rotations about the z axis in
-            radians, (instances,), in the viewer axes from which relations were derived. NaN means
-            unknown. None means that the relations do not come from positions.
-        weight: weight of the scene in the training of objects.
-        complete: True if the object list of the scene is nearly complete; see `Meaning`.
+    The boxes are in the viewer axes from which relations were derived: NaN means unknown, and None
+    that the relations do not come from positions.
     """
 
     scene_id: str
     source: str
     group: str
-    room_type: int
-    evidence: ClassEvidence
-    instance_classes: Ints
-    instance_holds: Flags
-    instance_observed: Flags
-    unknown: tuple[str, ...]
-    instance_stands: Ints
-    instance_positions: Floats | None = None
-    instance_sizes: Floats | None = None
-    instance_yaws: Floats | None = None
-    weight: float = 1.0
-    complete: bool = True
+    room_type: int  # index, -1 if unknown
+    evidence: ClassEvidence  # classes, and relations between classes
+    instance_classes: Ints  # class index of each object instance, (instances,)
+    instance_holds: Flags  # relations that hold, (relations, instances, instances)
+    instance_observed: Flags  # relations whose truth is known, (relations, instances, instances)
+    unknown: tuple[str, ...]  # distinct labels outside the vocabulary, sorted; they are left out
+    instance_stands: Ints  # what holds each instance, (instances,); see `app.scene.stands`
+    instance_positions: Floats | None = None  # centres in metres, (instances, 3)
+    instance_sizes: Floats | None = None  # extents before the rotation in metres, (instances, 3)
+    instance_yaws: Floats | None = None  # rotations about the z axis in radians, (instances,)
+    weight: float = 1.0  # in the training of objects
+    complete: bool = True  # the object list is nearly complete; see `Meaning`
 
     def only(self, kept: Flags) -> EncodedScene:
         """Return the scene with only some of its instances, (instances,) bool."""
@@ -109,10 +96,8 @@ def encode(
     - Support links. The object is on top of its support or inside it. All other relations of the
       pair are false. If the object reaches into its support, the roles of the two classes decide.
 
-    The module `training.datasets.sources` defines for each data source which unlisted relations are
-    false, and which labels are ignored.
-
-    Relations of structure classes are unobserved.
+    `training.datasets.sources` defines which unlisted relations of a data source are false, and
+    which labels are ignored. Relations of structure classes are unobserved.
     """
     encoder, scenes = _Encoder(vocabulary, roles), list(scenes)
     groups = Counter((scene.source, scene.group) for scene in scenes)
@@ -222,10 +207,7 @@ def _stands(
 def _relations(
     scene: AnnotatedScene, meaning: Meaning, classes: Ints, roles: RoleCounts | None
 ) -> tuple[PoseRelations, Floats | None]:
-    """Derive all relations, as `encode` describes. Return them and their boxes, or None.
-
-    The columns of the boxes, (objects, 7), are the position, the size and the yaw.
-    """
+    """Return all relations, and the boxes (objects, 7) (position, size, yaw) or None."""
     n, boxes = len(scene.objects), None
     if scene.relations is not None:
         return _from_lists(scene, scene.relations, meaning), None

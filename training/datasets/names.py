@@ -15,32 +15,20 @@ NAMES_FILE = Path(__file__).resolve().parent / "vocabularies" / "names.toml"
 
 @dataclass(frozen=True)
 class Names:
-    """The content of `vocabularies/names.toml`. Each attribute is a table or list of the file.
+    """The content of `vocabularies/names.toml`."""
 
-    Attributes:
-        base, household: common classes, and rare household objects. Every indoor vocabulary
-            contains them.
-        structure: classes such as walls. The service accepts these classes in requests but never
-            proposes them.
-        not_objects: labels that never become a class.
-        surroundings, outdoor: outdoor structures such as buildings, and outdoor objects. Indoor
-            vocabularies exclude them.
-        anywhere: classes whose objects belong in every room, such as pets and bags.
-        aliases: maps each class to its other names.
-        kinds: maps each class to more specific names. If a vocabulary has a class for the specific
-            name, the broader class is its parent. Otherwise the name can become an alias.
-        rooms: maps each room type to its other names. The key "" lists names without a room type.
-    """
-
-    base: tuple[str, ...] = ()
-    household: tuple[str, ...] = ()
-    structure: tuple[str, ...] = ()
-    not_objects: tuple[str, ...] = ()
-    surroundings: tuple[str, ...] = ()
-    outdoor: tuple[str, ...] = ()
-    anywhere: tuple[str, ...] = ()
-    aliases: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    base: tuple[str, ...] = ()  # common classes, in every indoor vocabulary
+    household: tuple[str, ...] = ()  # rare household objects, in every indoor vocabulary
+    structure: tuple[str, ...] = ()  # classes such as walls, which the service never proposes
+    not_objects: tuple[str, ...] = ()  # labels that never become a class
+    surroundings: tuple[str, ...] = ()  # outdoor structures such as buildings
+    outdoor: tuple[str, ...] = ()  # outdoor objects
+    anywhere: tuple[str, ...] = ()  # classes that belong in every room, such as pets and bags
+    aliases: dict[str, tuple[str, ...]] = field(default_factory=dict)  # other names of each class
+    # More specific names of each class. If a vocabulary has a class for the specific name, the
+    # broader class is its parent. Otherwise the name can become an alias.
     kinds: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    # Other names of each room type. The key "" lists names without a room type.
     rooms: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     def canonical(self, label: str) -> str:

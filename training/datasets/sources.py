@@ -27,22 +27,16 @@ Unlisted = Literal["off", "off for neighbours", "off for supported", "unobserved
 
 @dataclass(frozen=True, slots=True)
 class Meaning:
-    """The meaning of relations and objects that the scenes of a data source do not list.
-
-    Attributes:
-        on_top, inside, above, lateral: meaning of an unlisted relation of this kind. lateral means
-            left and front.
-        complete_objects: True if object lists are nearly complete. The training of objects then
-            uses unlisted objects as absent objects.
-        scenes_per_group: maximum total weight of a group of near-duplicates in the training of
-            objects, in scenes. None means that each scene has weight 1.
-    """
+    """The meaning of relations and objects that the scenes of a data source do not list."""
 
     on_top: Unlisted = "off"
     inside: Unlisted = "off"
     above: Unlisted = "off"
-    lateral: Unlisted = "off"
+    lateral: Unlisted = "off"  # left and front
+    # Object lists are nearly complete: in the training of objects, unlisted objects are absent.
     complete_objects: bool = True
+    # Maximum total weight of a group of near-duplicates in the training of objects, in scenes. None
+    # means that each scene has weight 1.
     scenes_per_group: float | None = None
 
     @property
@@ -84,37 +78,26 @@ _VRD: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A known data source.
+    """A known data source."""
 
-    Attributes:
-        terms: origin and licence of the data, for the model card.
-        research_only: True if the licence excludes commercial use.
-        meaning: meaning of unlisted relations. None means `LISTS` for scenes with listed relations
-            and `BOXES` for other scenes.
-        predicates: maps predicates of the data source to relations of the service. Names of
-            relations are predicates of every source. The reader skips other predicates, such as
-            "next to". None means that another predicate is an error.
-        supports: predicates that state the support of their subject. They mark the objects whose
-            support is listed.
-        left_out: labels that are ignored because their annotation is too incomplete or biased.
-        coarse: classes whose objects annotators mostly call by the name of the broader class, such
-            as "table" for a coffee table. An unlisted class of this kind is unobserved.
-        open_vocabulary: True if annotators used free words, so that an unlisted class is absent.
-            Otherwise a class outside their list of labels is unobserved.
-        counts_movables: True if only movable objects are counted. Others occur once in a scene.
-        of_one_view: True if a scene is one camera frame. A frame does not show how many objects are
-            in the room, so statistics of counts do not learn from it.
-    """
-
-    terms: str
-    research_only: bool = False
+    terms: str  # origin and licence of the data, for the model card
+    research_only: bool = False  # the licence excludes commercial use
+    # None means `LISTS` for scenes with listed relations, and `BOXES` for other scenes.
     meaning: Meaning | None = None
+    # Relations of the predicates that are no names of relations. The reader skips other predicates,
+    # such as "next to". None means that another predicate is an error.
     predicates: Mapping[str, str] | None = None
-    supports: tuple[str, ...] = ()
-    left_out: tuple[str, ...] = ()
+    supports: tuple[str, ...] = ()  # predicates that state the support of their subject
+    left_out: tuple[str, ...] = ()  # labels whose annotation is too incomplete or biased
+    # Classes whose objects annotators mostly call by the name of the broader class, such as "table"
+    # for a coffee table. An unlisted class of this kind is unobserved.
     coarse: tuple[str, ...] = ()
+    # Annotators used free words, so an unlisted class is absent. Otherwise a class outside their
+    # list of labels is unobserved.
     open_vocabulary: bool = False
-    counts_movables: bool = False
+    counts_movables: bool = False  # only movable objects are counted, others occur once in a scene
+    # A scene is one camera frame, which does not show how many objects are in the room. So
+    # statistics of counts do not learn from it.
     of_one_view: bool = False
 
 

@@ -38,16 +38,10 @@ Vectors = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class WordVectors:
-    """Word vectors, stored as 8-bit integers.
+    """Word vectors. The vector of a word is its row of ``vectors`` times ``scale``."""
 
-    Attributes:
-        words: distinct words in lower case, (words,).
-        vectors, scale: (words, dimensions) int8, and a positive factor. The vector of a word is its
-            row of ``vectors`` times ``scale``.
-    """
-
-    words: tuple[str, ...]
-    vectors: NDArray[np.int8]
+    words: tuple[str, ...]  # distinct, in lower case, (words,)
+    vectors: NDArray[np.int8]  # (words, dimensions)
     scale: float
 
     @property

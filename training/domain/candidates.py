@@ -14,9 +14,10 @@ from pydantic import ValidationError
 
 from app.registry import Artifact, Store, StoreError
 from app.scene import Vocabulary
-from training.datasets import AnnotatedScene, DatasetError, split, stable_part
+from training.datasets import AnnotatedScene, DatasetError, split
 from training.datasets.batches import TrainingData, has_relations
 from training.datasets.records import digest_of
+from training.datasets.splits import stable_part
 from training.domain.translation import Translation, same_classes
 from training.evaluation.artifact_model import artifact_model
 from training.evaluation.baselines import EASE, FREQUENCY_TABLE, PLACED, placed_product

@@ -60,43 +60,31 @@ console = Console()
 
 @dataclass(frozen=True)
 class Example:
-    """An example question: a scene with one removed object, and the answers of both models.
-
-    Attributes:
-        ranks: rank that each model gives to the removed object. Objects with equal scores share the
-            best rank.
-        answers: labels of the most probable missing objects by each model.
-    """
+    """An example question: a scene with one removed object, and the answers of both models."""
 
     scene: str
     room_type: str  # "" if unknown
     shown: tuple[str, ...]
     removed: str
-    ranks: tuple[int, ...]
-    answers: tuple[tuple[str, ...], ...]
+    ranks: tuple[int, ...]  # of the removed object; objects with equal scores share the best rank
+    answers: tuple[tuple[str, ...], ...]  # most probable missing objects
 
 
 @dataclass(frozen=True)
 class Comparison:
     """Comparison of two models.
 
-    Attributes:
-        results: metrics of both models. The first model is the reference `ours`.
-        b: title of the second model.
-        scenes, groups: number of compared scenes, and of their groups of near-duplicates.
-        certain: False if a model may have learnt from some of the scenes.
-        examples: questions for which the answers of the models differ most.
-        unmeasured: relation tasks that were measured for the second model before its publication,
-            but not in this comparison. Empty if this comparison measures any relation task.
+    `unmeasured` names the relation tasks that were measured for the second model before its
+    publication, but not in this comparison. It is empty if this comparison measures any such task.
     """
 
-    results: Results
-    b: str
+    results: Results  # of both models; the first model is the reference `ours`
+    b: str  # title of the second model
     scenes: int
-    groups: int
-    certain: bool
+    groups: int  # groups of near-duplicates among the compared scenes
+    certain: bool  # False if a model may have learnt from some of the scenes
     notes: tuple[str, ...]
-    examples: tuple[Example, ...]
+    examples: tuple[Example, ...]  # questions for which the answers of the models differ most
     unmeasured: tuple[str, ...] = ()
 
     @property

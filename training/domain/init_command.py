@@ -13,10 +13,11 @@ import typer
 from rich.console import Console
 
 from app.registry import RegistryError
-from training.datasets import READERS, AnnotatedScene, DatasetError, generate_rooms, vocabulary_json
+from training.datasets import AnnotatedScene, DatasetError, generate_rooms
 from training.datasets.jsonl import scan_jsonl, write_jsonl
-from training.datasets.readers import guess_format
+from training.datasets.readers import READERS, guess_format
 from training.datasets.rooms import DOMAINS
+from training.datasets.vocabulary import vocabulary_json
 from training.domain.proposal import propose
 from training.domain.proposal_report import as_dict, show
 from training.evaluation.report import write_whole

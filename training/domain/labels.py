@@ -12,7 +12,8 @@ from rapidfuzz import process
 from rapidfuzz.distance import OSA
 
 from app.scene import label_key
-from training.datasets import AnnotatedScene, EncodedScene, Names
+from training.datasets import AnnotatedScene, EncodedScene
+from training.datasets.names import Names
 from training.datasets.vocabulary import most_frequent
 
 # Maximum number of names that are compared with each other, most frequent names first.

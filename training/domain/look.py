@@ -11,7 +11,8 @@ import numpy as np
 from app.scene import CANONICAL, canonicalise, label_key
 from app.scene.geometry import LARGEST, MOST_DISTANT
 from app.scene.relations import ABOVE, ON_TOP
-from training.datasets import AnnotatedScene, Names
+from training.datasets import AnnotatedScene
+from training.datasets.names import Names
 
 # Maximum number of examples in a finding. Further cases are only counted.
 SHOWN = 5
@@ -32,23 +33,15 @@ class Finding:
 
 @dataclass(frozen=True)
 class Facts:
-    """Statistics of a set of scenes.
-
-    Attributes:
-        groups: number of groups of near-duplicates.
-        objects_per_scene: minimum, mean and maximum number of objects in a scene.
-        rooms, relations: number of scenes of each canonical room type, and of annotated triples of
-            each relation.
-        shares: share of all scenes with each kind of annotation, such as "positions".
-    """
+    """Statistics of a set of scenes."""
 
     scenes: int
-    groups: int
+    groups: int  # of near-duplicates
     objects: int
-    objects_per_scene: tuple[int, float, int]
-    rooms: dict[str, int]
-    shares: dict[str, float]
-    relations: dict[str, int]
+    objects_per_scene: tuple[int, float, int]  # minimum, mean and maximum
+    rooms: dict[str, int]  # number of scenes of each canonical room type
+    shares: dict[str, float]  # share of scenes with each kind of annotation, such as "positions"
+    relations: dict[str, int]  # number of annotated triples of each relation
     findings: tuple[Finding, ...]
 
     @property

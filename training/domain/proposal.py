@@ -14,16 +14,10 @@ from typing import Any, Final
 
 from app.registry import Example
 from app.scene import Vocabulary, label_key
-from training.datasets import (
-    FRACTIONS,
-    AnnotatedObject,
-    AnnotatedScene,
-    Names,
-    coverage,
-    curated_names,
-    source_vocabulary,
-    split,
-)
+from training.datasets import AnnotatedObject, AnnotatedScene, source_vocabulary, split
+from training.datasets.names import Names, curated_names
+from training.datasets.splits import FRACTIONS
+from training.datasets.vocabulary import coverage
 from training.domain.labels import Label, Lookalike, count_labels, lookalikes
 from training.domain.look import Facts, look
 from training.evaluation.metrics import FEWEST_GROUPS
@@ -51,35 +45,25 @@ _MANY_SCENES: Final = 1000
 
 @dataclass(frozen=True)
 class Proposal:
-    """The files and the report that `init` writes.
-
-    Attributes:
-        covered: number of classes, and share of all objects that they cover, for each minimum.
-        vocabulary: the proposed vocabulary. Merged similar labels are aliases.
-        dropped: tuple (name, number of objects, reason) of each name that is not a class.
-        values: maps each section of the configuration to its entries.
-        reasons: maps "section.entry" to the reason for the value.
-        parts: number of scenes of each part of the split.
-        test_groups: number of groups of near-duplicates in the test part.
-    """
+    """The files and the report that `init` writes."""
 
     name: str
     facts: Facts
     labels: tuple[Label, ...]
     lookalikes: tuple[Lookalike, ...]
-    minimum: int
-    covered: dict[int, tuple[int, float]]
-    vocabulary: Vocabulary
-    dropped: tuple[tuple[str, int, str], ...]
-    values: dict[str, Any]
-    reasons: dict[str, str]
-    parts: dict[str, int]
-    test_groups: int
+    minimum: int  # number of objects of a class
+    covered: dict[int, tuple[int, float]]  # number and coverage of the classes, for each minimum
+    vocabulary: Vocabulary  # merged similar labels are aliases
+    dropped: tuple[tuple[str, int, str], ...]  # names without a class: name, objects, reason
+    values: dict[str, Any]  # sections of the configuration
+    reasons: dict[str, str]  # reason for the value of "section.entry"
+    parts: dict[str, int]  # number of scenes of each part of the split
+    test_groups: int  # number of groups of near-duplicates in the test part
     examples: tuple[Example, ...]
 
     @property
     def config(self) -> Config:
-        """Return the proposed configuration after validation."""
+        """The proposed configuration after validation."""
         return Config.model_validate(self.values)
 
     @property
@@ -161,14 +145,10 @@ def propose(
 def _choose_minimum(
     scenes: Sequence[AnnotatedScene], pairs: Sequence[Lookalike]
 ) -> tuple[int, dict[int, tuple[int, float]]]:
-    """Choose the minimum number of objects of a class.
+    """Choose the minimum number of objects of a class; return it and `Proposal.covered`.
 
     The choice is the largest minimum whose classes cover enough objects, or the smallest minimum.
     A choice that gives too many classes is raised.
-
-    Returns:
-        The choice. Then the number of classes and the share of all objects that these classes
-        cover, for each possible minimum.
     """
     covered: dict[int, tuple[int, float]] = {}
     for minimum in sorted({*_TABLE, *MINIMA}):
@@ -247,8 +227,7 @@ def _dropped(
 def _split(scenes: Sequence[AnnotatedScene]) -> tuple[int, dict[str, int], int]:
     """Return a seed of the split, the number of scenes in each part, and of test groups.
 
-    The function returns the first seed whose parts are near their target shares. If there is no
-    such seed, it returns the best of the tested seeds.
+    The seed is the first whose parts are near their target shares, or the best of the tested seeds.
     """
     best: tuple[int, dict[str, int], int] | None = None
     smallest, shares = math.inf, FRACTIONS["stable"]

@@ -30,17 +30,11 @@ def same_classes(a: Vocabulary, b: Vocabulary) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Translation:
-    """Mapping from the classes of scenes to the classes of a model.
+    """Mapping from the classes of scenes to the classes of a model."""
 
-    Attributes:
-        model_class: (V,) int64, model class of each of the V scene classes; -1 for unknown classes.
-        size: number of model classes.
-        unknown: score of unknown classes.
-    """
-
-    model_class: Tensor
-    size: int
-    unknown: float = -BEYOND
+    model_class: Tensor  # (V,) int64, model class of each of the V scene classes; -1: unknown
+    size: int  # number of model classes
+    unknown: float = -BEYOND  # score of unknown classes
 
     @classmethod
     def between(cls, scenes: Vocabulary, model: Vocabulary) -> Translation:
@@ -54,8 +48,7 @@ class Translation:
     def translate(self, model: Model) -> Model:
         """Return the model with scores that take scenes and return values in the scene classes.
 
-        In T3b (false relations), the lowest score ranks first. In other tasks, the highest score
-        ranks first. Unknown classes rank last in every task.
+        Unknown classes rank last. In T3b (false relations), the lowest score ranks first.
         """
         reverse = replace(self, unknown=BEYOND)
         wrapper_of: dict[str, Callable[[Any], Any]] = {
@@ -74,9 +67,8 @@ class Translation:
         return Model(**scores, parameters=model.parameters)
 
     def presence(self, v: Tensor) -> Tensor:
-        """Map presence or counts from the scene classes to the model's classes.
+        """Map presence or counts (scenes, scene classes) to (scenes, model classes).
 
-        `v` has the shape (scenes, scene classes); the result has the shape (scenes, model classes).
         If several scene classes map to one model class, the result is their maximum.
         """
         is_known = self.model_class >= 0

@@ -66,14 +66,8 @@ def config_path(reference: str) -> Path:
 
 
 def data_folder(reference: str, config: Config, given: Path | None = None) -> Path:
-    """Return the data folder of a configuration.
-
-    The folder is `given` if it is set. If the configuration names files, the folder is that of the
-    configuration file. Otherwise the folder is `DATA`.
-    """
-    if given is not None:
-        return given
-    return config_path(reference).parent if config.data.files else DATA
+    """Return `given`, the folder of a configuration file that names files, or `DATA`."""
+    return given or (config_path(reference).parent if config.data.files else DATA)
 
 
 def load_config(reference: str, *, seed: int | None = None) -> Config:
@@ -100,10 +94,7 @@ def _validated(values: Mapping[str, Any], title: str) -> Config:
 
 
 def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
-    """Return a configuration with changed entries.
-
-    Args:
-        settings: maps the full name of an entry, such as "relations.epochs", to its new value.
+    """Return a configuration with new values of entries, such as "relations.epochs".
 
     Raises:
         ConfigError: an entry does not exist, or a value is invalid.
@@ -133,9 +124,7 @@ def config_toml(config: Config) -> str:
 def sections_toml(values: Mapping[str, Any], reasons: Mapping[str, str] | None = None) -> str:
     """Return entries and sections as TOML text.
 
-    Args:
-        values: maps each entry to its value, and each section to a mapping of its entries.
-        reasons: maps "section.entry" to a comment for the line above the entry.
+    `reasons` maps "section.entry" to a comment for the line above the entry.
     """
     sections = {name: own for name, own in values.items() if isinstance(own, Mapping)}
     lines = [_entry(name, value) for name, value in values.items() if name not in sections]

@@ -19,8 +19,9 @@ from pydantic import TypeAdapter, ValidationError
 
 from app.registry.examples import MAX_WORD, Example, Examples
 from app.scene import Vocabulary, canonicalise
-from training.datasets import AnnotatedScene, curated_names
+from training.datasets import AnnotatedScene
 from training.datasets.encoding import room_viewpoint
+from training.datasets.names import curated_names
 from training.datasets.records import AnnotatedObject
 from training.datasets.sources import source_of
 from training.fit.configuration import ConfigError, first_error

@@ -24,18 +24,13 @@ from training.machines import BoltzmannMachine, MachineSpec, build
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A finished training run, loaded from its folder.
-
-    Attributes:
-        data: folder of the scenes on the computer that trained the run; "" if it is unknown.
-        scenes: digest of the scenes, their vocabulary and split; "" if it is unknown.
-    """
+    """A finished training run, loaded from its folder."""
 
     config: Config
     machine: BoltzmannMachine
     seconds: float
-    data: str = ""
-    scenes: str = ""
+    data: str = ""  # folder of the scenes on the computer that trained the run, if known
+    scenes: str = ""  # digest of the scenes, their vocabulary and split, if known
 
     @property
     def data_folder(self) -> Path:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -15,56 +17,41 @@ from training.datasets import (
     AnnotatedScene,
     EncodedScene,
     annotated_classes,
-    count_roles,
     encode,
     generate_rooms,
-    indoor_vocabulary,
     priors,
     read_scenes,
-    read_vocabulary,
     rooms_vocabulary,
     shuffle_objects,
     source_vocabulary,
     split,
-    with_typical_sizes,
 )
 from training.datasets.batches import TrainingData, scene_tensors
 from training.datasets.files import DATA
 from training.datasets.records import digest_of
+from training.datasets.roles import count_roles
+from training.datasets.vocabulary import indoor_vocabulary, read_vocabulary, with_typical_sizes
 from training.datasets.words import class_vectors, read_word_vectors
 from training.fit.configuration import Config, ConfigError, DataConfig, is_file, source_name
 
 
 @dataclass(frozen=True)
 class SplitScenes:
-    """The encoded scenes of the train, validation and test part, and their origin.
-
-    Attributes:
-        data: the configuration section that names the sources.
-        vocabulary: classes; the scenes use their indices.
-        roles: roles of the classes in the training scenes.
-        counts, digests: number of scenes and sha256 of their contents, by source.
-        shuffle: seed of the permutation of objects; None if the objects are not permuted.
-        words: (V, D) unit word vectors of the classes; None without word vectors.
-        examples: example scenes for the artifact.
-    """
+    """The encoded scenes of the train, validation and test part, and their origin."""
 
     data: DataConfig
-    vocabulary: Vocabulary
-    roles: RoleCounts
+    vocabulary: Vocabulary  # the scenes use the indices of its classes
+    roles: RoleCounts  # of the classes in the training scenes
     parts: dict[str, list[EncodedScene]]
-    counts: dict[str, int]
-    digests: dict[str, str]
-    shuffle: int | None = None
-    words: torch.Tensor | None = None
-    examples: tuple[Example, ...] = ()
+    counts: dict[str, int]  # number of scenes, by source
+    digests: dict[str, str]  # sha256 of the contents of the scenes, by source
+    shuffle: int | None = None  # seed of the permutation of objects, if they are permuted
+    words: torch.Tensor | None = None  # (V, D) unit word vectors of the classes
+    examples: tuple[Example, ...] = ()  # for the artifact
 
     @property
     def digest(self) -> str:
-        """The sha256 of the training input: scenes, vocabulary, split and permutation.
-
-        The sha256 depends on the contents of the files, because a corrected file keeps its name.
-        """
+        """The sha256 of the training input: scenes, vocabulary, split and permutation."""
         decisive = {
             "data": self.data.model_dump(mode="json"),
             "contents": self.digests,
@@ -124,7 +111,7 @@ class SplitScenes:
 
 
 def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]]:
-    """Read the scenes of every data source. Return a mapping from source names to scenes.
+    """Read the scenes of every data source, by source name.
 
     A data source is a file, or a name. A name means `<name>.jsonl.gz` in `root` or in `root/extra`
     (`<name>.tsv.gz` for the placing priors).
@@ -182,23 +169,23 @@ def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path)
     Raises:
         ConfigError: the vocabulary name is unknown, or the file contains no vocabulary.
     """
-    if data.vocabulary == "indoor":
-        vocabulary = indoor_vocabulary()
-    elif data.vocabulary == "source":
-        vocabulary = source_vocabulary(scenes)
-    elif data.vocabulary == "rooms":
-        vocabulary = rooms_vocabulary()
-    elif data.vocabulary.endswith(".json"):
-        path = root / data.vocabulary
-        try:
-            vocabulary = read_vocabulary(path)
-        except (OSError, ValueError) as error:
-            raise ConfigError(f"data.vocabulary: {path} cannot be used: {error}") from error
-    else:
+    name = data.vocabulary
+    makers: dict[str, Callable[[], Vocabulary]] = {
+        "indoor": indoor_vocabulary,
+        "source": partial(source_vocabulary, scenes),
+        "rooms": rooms_vocabulary,
+    }
+    if name not in makers and not name.endswith(".json"):
         raise ConfigError(
-            f"data.vocabulary is {data.vocabulary!r}; it must be indoor, source, rooms, or the "
-            "name of a .json file"
+            f"data.vocabulary is {name!r}; it must be {', '.join(makers)}, or the name of a .json "
+            "file"
         )
+    if name in makers:
+        return with_typical_sizes(makers[name](), scenes)
+    try:
+        vocabulary = read_vocabulary(root / name)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"data.vocabulary: {root / name} cannot be used: {error}") from error
     return with_typical_sizes(vocabulary, scenes)
 
 
@@ -213,8 +200,7 @@ def split_and_encode(
     The split includes all data sources at once, because sources can contain the same room.
 
     Args:
-        vocabulary: vocabulary of a published model. The default is the vocabulary of the
-            configuration.
+        vocabulary: vocabulary of a published model. The default is that of the configuration.
 
     Raises:
         ConfigError: the vocabulary is invalid; see `build_vocabulary`.

@@ -22,7 +22,7 @@ from training.datasets.sources import SOURCES
 from training.datasets.vocabulary import with_aliases, with_room_aliases
 from training.evaluation.alarms import untouched_alarms
 from training.evaluation.everyday_task import EVERYDAY
-from training.evaluation.report import evaluate
+from training.evaluation.report import Progress, evaluate, silent
 from training.evaluation.tasks import STATISTICS
 from training.fit.calibrate import calibrate
 from training.fit.checkpoint import RunError
@@ -54,22 +54,20 @@ def publish_run(
     version: str,
     *,
     measured: tuple[FinishedRun, SplitScenes] | None = None,
-    judge: Callable[[Artifact], Sequence[str]] = lambda _: (),
+    judge: Callable[[Artifact, Progress], Sequence[str]] = lambda *_: (),
     accept: Callable[[str], None] | None = None,
-    progress: Callable[[str], None] = lambda _: None,
+    progress: Progress = silent,
 ) -> Artifact:
     """Calibrate on validation scenes, fit statistics, evaluate on test scenes, and publish.
 
-    The calibrated model answers `/outliers` about untouched validation scenes. It is refused if it
-    certainly raises too many alarms; see `training.evaluation.alarms`. It is also refused if long
-    chains certainly drift away from the training scenes; see `training.fit.long_chains`.
-
-    The store keeps weights in half precision. Calibration and evaluation use the same precision.
+    The model is refused if it certainly raises too many alarms about untouched validation scenes
+    (`training.evaluation.alarms`), or if long chains certainly drift away from the training scenes
+    (`training.fit.long_chains`). The store keeps weights in half precision. Calibration and
+    evaluation use the same precision.
 
     Args:
         measured: second run of the same configuration, and its scenes, for a `run` that was trained
-            on test scenes. The second run did not use test scenes. Its test results and chosen
-            calibration values are published.
+            on test scenes. Its test results and chosen calibration values are published.
         judge: function that returns further reasons against the calibrated model.
         accept: function that is called with each reason against the model, which is published all
             the same. None refuses a model with such a reason.
@@ -96,7 +94,7 @@ def publish_run(
     labels = scenes.vocabulary.labels
     drifts = measure_drift(calibrated.weights, labels, learnt, run.config.objects)
     objections = [entry.objection() for entry in alarms] + [drift.objection() for drift in drifts]
-    reasons = [*filter(None, objections), *judge(calibrated)]
+    reasons = [*filter(None, objections), *judge(calibrated, progress)]
     for reason in reasons:
         if accept is None:
             raise RefusedError(reasons)
@@ -131,15 +129,14 @@ def refit(
     store: Store,
     version: str,
     *,
-    progress: Callable[[str], None] = lambda _: None,
+    progress: Progress = silent,
 ) -> Artifact:
     """Publish a new version of a published model with refitted statistics, without training.
 
-    The new version keeps weights, calibration and metrics. Only the statistics (offsets, counts),
-    their metrics, the example scenes and the built-in synonyms of classes are new. The examples are
-    those of the shipped configuration with the name of the model, otherwise those of its own
-    configuration. The metrics of weights that were trained on test scenes come from statistics that
-    were not fitted to test scenes.
+    Only the statistics (offsets, counts), their metrics, the example scenes and the built-in
+    synonyms of classes are new. The examples are those of the shipped configuration with the name
+    of the model, otherwise those of its own configuration. The metrics of weights that were trained
+    on test scenes come from statistics that were not fitted to test scenes.
 
     Args:
         root: folder of the training scenes.
@@ -218,7 +215,7 @@ def calibrated_draft(
 def _measure(
     artifact: Artifact,
     data: TrainingData,
-    progress: Callable[[str], None],
+    progress: Progress,
     tasks: Collection[str] | None = None,
 ) -> list[Metric]:
     """Return the metrics on test scenes, or an empty list if there are no test scenes."""

@@ -17,7 +17,6 @@ import pytest
 from scipy.io import savemat
 
 from training.datasets import (
-    READERS,
     AnnotatedObject,
     AnnotatedScene,
     DatasetError,
@@ -25,7 +24,7 @@ from training.datasets import (
     jsonl,
     read_scenes,
 )
-from training.datasets.readers import guess_format
+from training.datasets.readers import READERS, guess_format
 from training.fit.configuration import ConfigError, DataConfig
 from training.runs.pipeline import read_sources
 

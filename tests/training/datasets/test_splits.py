@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from training.datasets import FRACTIONS, AnnotatedScene, split, stable_part
-from training.datasets.splits import Protocol
+from training.datasets import AnnotatedScene, split
+from training.datasets.splits import FRACTIONS, Protocol, stable_part
 
 ROOMS = ("bedroom", "kitchen", "office", None)
 

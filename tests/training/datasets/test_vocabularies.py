@@ -10,23 +10,22 @@ from app.scene import ObjectClass, Vocabulary, label_key
 from training.datasets import (
     AnnotatedObject,
     AnnotatedScene,
-    Names,
-    build_indoor_vocabulary,
-    build_vocabulary,
-    coverage,
-    curated_names,
     encode,
-    indoor_vocabulary,
     read_scenes,
     source_vocabulary,
-    vocabulary_json,
-    with_typical_sizes,
 )
+from training.datasets.names import Names, curated_names
 from training.datasets.vocabulary import (
     INDOOR_FILE,
     INDOOR_MINIMUM_MENTIONS,
     MINIMUM_MENTIONS,
+    build_indoor_vocabulary,
+    build_vocabulary,
+    coverage,
+    indoor_vocabulary,
+    vocabulary_json,
     with_room_aliases,
+    with_typical_sizes,
 )
 
 NAMES = Names(

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from app.scene import ObjectClass, Vocabulary
-from training.datasets import DatasetError, indoor_vocabulary, words
+from training.datasets import DatasetError, words
+from training.datasets.vocabulary import indoor_vocabulary
 from training.datasets.words import class_vectors, read_word_vectors
 from training.fit.configuration import DataConfig
 from training.runs.pipeline import read_sources, split_and_encode

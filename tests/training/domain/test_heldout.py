@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from training.datasets import generate_rooms, split, stable_part
+from training.datasets import generate_rooms, split
 from training.datasets.records import digest_of
+from training.datasets.splits import stable_part
 from training.domain.candidates import BASELINES, Candidate, held_out
 from training.fit.configuration import Config, ConfigError
 
