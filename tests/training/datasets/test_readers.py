@@ -296,18 +296,17 @@ def test_3dssg_whole(tmp_path: Path) -> None:
 
 def test_3dssg_needs_its_other_files(tmp_path: Path) -> None:
     path = write_json(tmp_path / "relationships.json", WHOLE)
-    with pytest.raises(DatasetError, match=r"3RScan\.json: cannot be read"):
-        read_scenes(path)
-    write_json(tmp_path / "3RScan.json", RESCANS)
-    with pytest.raises(DatasetError, match=r"objects\.json: cannot be read"):
-        read_scenes(path)
-    write_json(tmp_path / "objects.json", {"scans": []})
-    with pytest.raises(DatasetError, match=r"scans\[0\]: scan room-2 is not in objects\.json"):
-        read_scenes(path)
-    write_json(tmp_path / "3RScan.json", RESCANS[:1])
-    write_json(tmp_path / "objects.json", OBJECTS)
-    with pytest.raises(DatasetError, match=r"scans\[0\]: scan room-2 is not in 3RScan\.json"):
-        read_scenes(path)
+    for file, content, message in (
+        ("other.json", [], r"3RScan\.json: cannot be read"),
+        ("3RScan.json", RESCANS, r"objects\.json: cannot be read"),
+        ("objects.json", {"scans": []}, r"scans\[0\]: scan room-2 is not in objects\.json"),
+        ("objects.json", OBJECTS, None),
+        ("3RScan.json", RESCANS[:1], r"scans\[0\]: scan room-2 is not in 3RScan\.json"),
+    ):
+        write_json(tmp_path / file, content)
+        if message:
+            with pytest.raises(DatasetError, match=message):
+                read_scenes(path)
 
 
 @pytest.mark.parametrize(
@@ -398,31 +397,26 @@ def test_sunrgbd_mat(tmp_path: Path) -> None:
     # 3 m away and half a metre to the right: x away, y left.
     assert bed.position == (3.0, -0.5, -0.6)
     assert stand.size == pytest.approx((0.4, 0.6, 0.5))
-    for thing, box in ((bed, BOXES[0]), (stand, BOXES[1])):
-        assert np.array(corners(thing)) == pytest.approx(np.array(expected_corners(box)))
+    assert [corners(bed), corners(stand)] == [expected_corners(box) for box in BOXES]
 
 
-def corners(thing: Any) -> list[tuple[float, float]]:
-    (x, y, _), (width, depth, _) = thing.position, thing.size
+SIGNS = np.array(list(itertools.product((-1, 1), repeat=2)))
+
+
+def corners(thing: Any) -> list[list[float]]:
     cos, sin = math.cos(thing.yaw), math.sin(thing.yaw)
-    return sorted(
-        (round(x + cos * u - sin * v, 6), round(y + sin * u + cos * v, 6))
-        for u in (-width / 2, width / 2)
-        for v in (-depth / 2, depth / 2)
-    )
+    points = SIGNS * thing.size[:2] / 2 @ [[cos, sin], [-sin, cos]] + thing.position[:2]
+    return sorted(points.round(6).tolist())
 
 
-def expected_corners(box: dict[str, Any]) -> list[tuple[float, float]]:
-    """Corners straight from the definition: centroid plus signed half extents along the basis."""
-    corners = []
-    for u, v in itertools.product((-1, 1), repeat=2):
-        x, y, _ = box["centroid"][0] + np.array([u, v, 0]) * box["coeffs"][0] @ box["basis"]
-        corners.append((round(float(y), 6), round(float(-x), 6)))
-    return sorted(corners)
+def expected_corners(box: dict[str, Any]) -> list[list[float]]:
+    """Centroid plus signed half extents along the basis; x is away from the viewer, y left."""
+    points = box["centroid"][0] + np.c_[SIGNS, np.zeros(4)] * box["coeffs"][0] @ box["basis"]
+    return sorted(np.c_[points[:, 1], -points[:, 0]].round(6).tolist())
 
 
 @pytest.mark.parametrize(
-    ("box", "message"),
+    ("change", "message"),
     [
         ({"coeffs": np.array([[1.0, 0.5]])}, r"coeffs must be finite, of shape \(3,\)"),
         ({"centroid": np.array([[1.0, math.nan, 0.0]])}, "centroid must be finite"),
@@ -431,8 +425,9 @@ def expected_corners(box: dict[str, Any]) -> list[tuple[float, float]]:
         (None, "lacks 'classname'"),
     ],
 )
-def test_malformed_sunrgbd_mat(tmp_path: Path, box: Any, message: str) -> None:
-    broken = BOXES[0] | box if box else {k: v for k, v in BOXES[0].items() if k != "classname"}
+def test_malformed_sunrgbd_mat(tmp_path: Path, change: Any, message: str) -> None:
+    named = BOXES[0] | (change or {})
+    broken = named if change else {name: x for name, x in named.items() if name != "classname"}
     path = tmp_path / "SUNRGBDMeta3DBB_v2.mat"
     savemat(path, {"SUNRGBDMeta": struct_array([frame("SUNRGBD/kv2/a/1", [broken])])})
     check_malformed(path, message, "SUNRGBDMeta(1).groundtruth3DBB(1)")
@@ -441,11 +436,9 @@ def test_malformed_sunrgbd_mat(tmp_path: Path, box: Any, message: str) -> None:
 def test_mat_files_of_other_content(tmp_path: Path) -> None:
     path = tmp_path / "other.mat"
     savemat(path, {"data": np.eye(2)})
-    with pytest.raises(DatasetError, match="lacks the variable SUNRGBDMeta"):
-        read_scenes(path)
+    check_malformed(path, "lacks the variable SUNRGBDMeta")
     savemat(path, {"SUNRGBDMeta": struct_array([{"K": np.eye(3)}])})
-    with pytest.raises(DatasetError, match=r"SUNRGBDMeta\(1\): lacks 'sequenceName'"):
-        read_scenes(path)
+    check_malformed(path, "lacks 'sequenceName'", "SUNRGBDMeta(1)")
 
 
 # ------------------------------------------------------------------------------- COCO
