@@ -1,4 +1,4 @@
-"""Counts of roles by hand."""
+"""Counts of roles in small scenes."""
 
 from __future__ import annotations
 
@@ -32,9 +32,8 @@ def stated(*triples: Triple, source: str = "nr3d", group: str = "g") -> Annotate
 
 
 def rows_of(counts: RoleCounts) -> dict[tuple[int, int], list[float]]:
-    V = len(VOCABULARY)
-    pairs = zip(counts.pair.tolist(), counts.counts.tolist(), strict=True)
-    return {divmod(pair, V): row for pair, row in pairs}
+    pairs = (divmod(pair, len(VOCABULARY)) for pair in counts.pair.tolist())
+    return dict(zip(pairs, counts.counts.tolist(), strict=True))
 
 
 @pytest.mark.parametrize(
@@ -49,8 +48,7 @@ def rows_of(counts: RoleCounts) -> dict[tuple[int, int], list[float]]:
 )
 def test_words_count_in_the_stated_direction(triple: Triple, pair: tuple[int, int], role: int):
     counts = count_roles([stated(triple)], VOCABULARY)
-    expected = [0.0, 0.0, 0.0]
-    expected[role] = 1.0
+    expected = np.eye(3)[role].tolist()
     assert rows_of(counts) == {pair: expected}
     assert counts.anchor[DESK].tolist() == expected
     assert not counts.anchor[BIN].any()
@@ -94,8 +92,7 @@ def test_on_a_container_means_in_it(listed_on: int, contains: bool):
     scenes = [stated(("lamp", "on-top", "desk"), group=f"g{k}") for k in range(listed_on)]
     scenes += [stated(("bin", "inside", "desk")), stated(("bin", "under", "desk"), group="h")]
     counts = count_roles(scenes, VOCABULARY)
-    words = np.zeros(3)
-    words[IN if contains else ON] = listed_on
+    words = listed_on * np.eye(3)[IN if contains else ON]
     assert role_counts(counts, LAMP, DESK).tolist() == words.tolist()
     assert role_counts(counts, BIN, DESK).tolist() == [0, 1, 1]
     assert counts.anchor[DESK].tolist() == np.add(words, [0, 1, 1]).tolist()

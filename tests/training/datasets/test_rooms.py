@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -17,10 +17,9 @@ def rooms() -> list[AnnotatedScene]:
     return generate_rooms(300, seed=5)
 
 
-def test_a_seed_draws_the_same_rooms(rooms: list[AnnotatedScene]) -> None:
+def test_equal_seeds_give_equal_rooms(rooms: list[AnnotatedScene]) -> None:
     assert len(rooms) == 300
-    assert generate_rooms(300, seed=5) == rooms
-    # More of them begin with the same ones.
+    # A larger number only adds scenes.
     assert generate_rooms(20, seed=5) == rooms[:20]
     assert generate_rooms(20, seed=6) != rooms[:20]
     assert generate_rooms(0, seed=5) == []
@@ -31,20 +30,15 @@ def test_a_seed_draws_the_same_rooms(rooms: list[AnnotatedScene]) -> None:
 def test_views_of_a_room_share_its_group(rooms: list[AnnotatedScene]) -> None:
     views = Counter(scene.group for scene in rooms)
     assert set(views.values()) == {1, 2, 3}
-    by_group = defaultdict(set)
-    for scene in rooms:
-        by_group[scene.group].add(scene.room_type)
-    assert all(len(types) == 1 for types in by_group.values())
+    assert len({(scene.group, scene.room_type) for scene in rooms}) == len(views)
 
 
-def test_no_two_things_take_up_the_same_space(rooms: list[AnnotatedScene]) -> None:
+def test_boxes_do_not_overlap(rooms: list[AnnotatedScene]) -> None:
     for scene in rooms[:60]:
-        boxes = [thing for thing in scene.objects if thing.position and thing.size]
-        assert len(boxes) == len(scene.objects)
-        i, j = np.triu_indices(len(boxes), 1)
-        centres = np.array([box.position for box in boxes])
-        sizes = np.array([box.size for box in boxes])
-        yaws = np.array([box.yaw for box in boxes])
+        i, j = np.triu_indices(len(scene.objects), 1)
+        names = ("position", "size", "yaw")
+        boxes = ([getattr(thing, name) for thing in scene.objects] for name in names)
+        centres, sizes, yaws = map(np.array, boxes)
         share, _ = overlap_and_gap(
             centres[i, :2], sizes[i, :2], yaws[i], centres[j, :2], sizes[j, :2], yaws[j]
         )
@@ -55,7 +49,6 @@ def test_no_two_things_take_up_the_same_space(rooms: list[AnnotatedScene]) -> No
 
 
 def test_support_links_agree_with_the_boxes(rooms: list[AnnotatedScene]) -> None:
-    """What the links say, the geometry finds by itself."""
     vocabulary = rooms_vocabulary()
     on_top = CANONICAL.index("on-top")
     bare = [
@@ -85,7 +78,6 @@ def test_other_tables_make_another_domain() -> None:
     assert {scene.room_type for scene in found} == set(DOMAINS["workplaces"])
     homes = {thing.label for scene in generate_rooms(60, 0) for thing in scene.objects}
     assert not homes & {thing.label for scene in found for thing in scene.objects}
-    assert generate_rooms(20, 0, DOMAINS["workplaces"]) == found[:20]
 
 
 @pytest.mark.parametrize(

@@ -60,8 +60,7 @@ def test_classes_have_the_mean_vector_of_label_and_aliases(tmp_path: Path) -> No
     assert not vectors[4].any()
 
 
-def test_training_reads_the_vectors_beside_the_scenes(tmp_path: Path) -> None:
-    """A relative path of the configuration starts at the folder of the data."""
+def test_training_reads_the_vectors_in_the_folder_of_the_scenes(tmp_path: Path) -> None:
     folder = tmp_path / "words"
     folder.mkdir()
     save(folder)

@@ -41,12 +41,10 @@ class Workplace:
         return output, json.loads(path.read_text())
 
     @property
-    def served(self) -> str:
-        return str(Store(self.store).aliases()["default"])
-
-    @property
-    def versions(self) -> tuple[str, ...]:
-        return Store(self.store).versions("my-lab")
+    def state(self) -> tuple[str, tuple[str, ...]]:
+        """The served version and all versions."""
+        store = Store(self.store)
+        return str(store.aliases()["default"]), store.versions("my-lab")
 
 
 @pytest.fixture(scope="module")
@@ -137,27 +135,23 @@ def test_a_worse_version_is_refused_without_even_if_worse(workplace) -> None:
     hasty.write_text(re.sub(r"steps = \d+", "steps = 1", text))
     invoke("train", hasty, "--seed", 1, *workplace.places)
     run = workplace.run.with_name("seed-1")
-    before, versions = workplace.served, workplace.versions
+    before, versions = workplace.state
 
     for alias in ("default", "new-alias"):
         output = workplace.publish(run, "2.0.0", "--promote", "--alias", alias, code=3)
         assert "refused: the new version is not clearly better than popularity" in output
         assert "the new version is worse than EASE" in output
         assert "nothing was published" in output
-        assert (workplace.served, workplace.versions) == (before, versions)
+        assert workplace.state == (before, versions)
 
     _, comparison = workplace.compare(run, before)
-    (missing,) = [
-        row["figure"]
-        for row in comparison["differences"]
-        if (row["task"], row["metric"]) == ("T2 missing", "MRR, one removed")
-    ]
-    assert missing["high"] < -0.02
+    figures = {(x["task"], x["metric"]): x["figure"] for x in comparison["differences"]}
+    assert figures["T2 missing", "MRR, one removed"]["high"] < -0.02
 
     output = workplace.publish(run, "2.0.0", "--promote", "--even-if-worse")
     assert f"accepted by --even-if-worse: the new version is worse than {before}" in output
     assert f"promoted: default → my-lab@2.0.0, before {before}" in output
-    assert workplace.served == "my-lab@2.0.0"
+    assert workplace.state[0] == "my-lab@2.0.0"
 
 
 def test_a_run_is_not_published_with_an_edited_vocabulary(workplace) -> None:
