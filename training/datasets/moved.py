@@ -165,39 +165,27 @@ class _Boxes:
     centre: Floats  # (n, 3)
     size: Floats  # extents before the rotation by `yaw`, (n, 3)
     yaw: Floats  # (n,)
+    bottom: Floats  # height, (n,)
+    top: Floats  # height, (n,)
+    area: Floats  # of the footprint, (n,)
     usable: Flags  # instances with position and size that are not structure, (n,)
+    floor: float  # lowest bottom of the usable instances
     supports: Flags  # instance i stands on or in instance j, (n, n)
     strange: Flags  # pairs of usable instances whose classes never support each other, (n, n)
 
     @classmethod
     def of(cls, encoded: EncodedScene, structure: Flags) -> _Boxes:
         centre, size, yaw = _poses(encoded)
+        bottom, top = centre[:, 2] - size[:, 2] / 2, centre[:, 2] + size[:, 2] / 2
+        area = size[:, 0] * size[:, 1]
         usable = np.isfinite(centre).all(1) & np.isfinite(size).all(1)
         usable &= ~structure[encoded.instance_classes]
-        strange = _strangers(encoded) & usable[:, None] & usable
-        boxes = cls(centre, size, yaw, usable, _supports(encoded), strange)
+        floor = float(bottom[usable].min(initial=np.inf))
         # "The bin is under the desk" is stored as "the desk is on top of the bin".
-        is_around = boxes.bottom[:, None] < boxes.top - CONTACT
-        is_larger = boxes.area[:, None] > boxes.area
-        return replace(boxes, supports=boxes.supports & ~(is_around & is_larger))
-
-    @property
-    def area(self) -> Floats:
-        area: Floats = self.size[:, 0] * self.size[:, 1]
-        return area
-
-    @property
-    def bottom(self) -> Floats:
-        return self.centre[:, 2] - self.size[:, 2] / 2
-
-    @property
-    def top(self) -> Floats:
-        return self.centre[:, 2] + self.size[:, 2] / 2
-
-    @property
-    def floor(self) -> float:
-        """Lowest bottom of the usable instances."""
-        return float(self.bottom[self.usable].min(initial=np.inf))
+        is_inverse = (bottom[:, None] < top - CONTACT) & (area[:, None] > area)
+        supports = _supports(encoded) & ~is_inverse
+        strange = _strangers(encoded) & usable[:, None] & usable
+        return cls(centre, size, yaw, bottom, top, area, usable, floor, supports, strange)
 
     def group(self, i: int) -> Flags:
         """Return instance i and all instances that stand on it, directly or not, (n,)."""

@@ -2,21 +2,18 @@
 
 The percentages are the shares of the training, test and validation part.
 
-- ``group`` (75 / 15 / 10 %) puts all scenes of a group of near-duplicates into one part. A group
-  can occur in several data sources, for example as a camera frame and as 3D boxes of the same
-  frame. The group then has the same part in all these sources.
-- ``stable`` (75 / 15 / 10 %) derives the part of a group only from the seed and the group name.
-  All groups keep their parts when a data set grows. A later model version is therefore never
-  trained on the test scenes of an earlier version. This protocol does not stratify.
-- ``final`` (90 / 0 / 10 %) is ``group`` without a test part. The shipped weights are trained on the
-  90 % and calibrated on the 10 %.
+- ``group`` (75 / 15 / 10 %) puts all scenes of a group of near-duplicates into one part, also if
+  several data sources contain the group.
+- ``stable`` (75 / 15 / 10 %) derives the part of a group only from the seed and the group name, so
+  all groups keep their parts when a data set grows. This protocol does not stratify.
+- ``final`` (90 / 0 / 10 %) is ``group`` without a test part, for shipped weights.
 - ``paper`` (60 / 30 / 10 %) is the protocol of Bozcan et al. (ICRA 2018). Each scene is assigned
   separately.
 - ``paper groups`` has the shares of ``paper`` and keeps groups together.
 
 All protocols except ``stable`` stratify by room type. Their parts depend on the seed and on the set
-of scenes, but not on the order of scenes. Data sources without a common group do not affect each
-other's parts. Data sources with common groups must be split together.
+of scenes, but not on the order of scenes. Data sources with common groups must be split together;
+others do not affect each other's parts.
 """
 
 from __future__ import annotations

@@ -211,7 +211,7 @@ def compare(
     say("reading scenes")
     sources = read_sources(a.config.data, root)
     test = held_out(a, b, sources, root)
-    data = split_and_encode(a.config.data, sources, a.vocabulary).training_data()
+    data = split_and_encode(a.config.data, sources, root, a.vocabulary).training_data()
     encoded = encode(test.scenes, a.vocabulary)
     annotated = annotated_classes(encoded, a.vocabulary)
     scenes = some_scenes(scene_tensors(encoded, annotated, len(a.vocabulary)), limit)

@@ -23,7 +23,7 @@ from training.evaluation.outside import OutsideTest, read_test
 from training.evaluation.report import Progress, evaluate
 from training.evaluation.tasks import in_words
 from training.fit.configuration import Config, ConfigError, source_name
-from training.runs.pipeline import read_sources, split_and_encode
+from training.runs.pipeline import prepare
 
 Figures = dict[str, list[Metric]]
 PARTS = ("train", "validation", "test")
@@ -108,7 +108,7 @@ def _measure(
     with console.status("reading scenes"):
         # The split must include all data sources, as in training. Otherwise the test part
         # could contain training scenes.
-        scenes = split_and_encode(config.data, read_sources(config.data, data), artifact.vocabulary)
+        scenes = prepare(config, data, artifact.vocabulary)
     if part not in PARTS:
         raise ConfigError(f"--part is {part!r}; it must be one of {', '.join(PARTS)}")
     tensors = scenes.training_data()

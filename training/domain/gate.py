@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -115,8 +116,7 @@ def measure_usefulness(
     return replace(usefulness, ours=ours.value, theirs=values, differences=gaps)
 
 
-@dataclass(frozen=True)
-class ServedModel:
+class ServedModel(NamedTuple):
     """An alias of the model store, and the model that it serves now."""
 
     target: AliasTarget | None  # None if the alias is new

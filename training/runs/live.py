@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
 
@@ -12,7 +12,6 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 
 from training.fit.checkpoint import CurvePoint, TrainingResult
-from training.fit.configuration import Config
 from training.fit.trainer import Trainer
 
 _LEVELS = "▁▂▃▄▅▆▇█"
@@ -39,7 +38,13 @@ class Display(Progress):
         )
         self._trainer = trainer
         self._task = self.add_task(trainer.config.name, total=1.0, note="")
-        self._log = None if logs is None else tensorboard(logs, trainer.config)
+        self._writer = None
+        if logs is not None:
+            # Imported only when needed, because the import takes longer than a small run.
+            from torch.utils.tensorboard import SummaryWriter
+
+            config = trainer.config
+            self._writer = SummaryWriter(str(logs / config.name / f"seed-{config.training.seed}"))
 
     def progress(self, phase: str, done: float, loss: float) -> None:
         """Show the progress after an update of the weights."""
@@ -50,8 +55,14 @@ class Display(Progress):
 
     def passed(self, point: CurvePoint) -> None:
         """Write a point of the curve to the TensorBoard log."""
-        if self._log is not None:
-            self._log(point)
+        if self._writer is None:
+            return
+        step = round(1000 * point.done)
+        for name in ("loss", "score", "seconds"):
+            if not math.isnan(value := getattr(point, name)):
+                self._writer.add_scalar(f"{point.phase}/{name}", value, step)
+        # Flush each time, so that the log of an interrupted run is complete.
+        self._writer.flush()
 
 
 def score_of(point: CurvePoint) -> str:
@@ -59,24 +70,6 @@ def score_of(point: CurvePoint) -> str:
     if math.isnan(point.score):
         return f"loss {point.loss:.3f}"
     return f"{SCORES[point.phase]} {point.score:.3f}"
-
-
-def tensorboard(folder: Path, config: Config) -> Callable[[CurvePoint], None]:
-    """Return a function of a point of the curve that writes to TensorBoard."""
-    # TensorBoard is imported only when needed, because the import takes longer than a small run.
-    from torch.utils.tensorboard import SummaryWriter
-
-    writer = SummaryWriter(str(folder / config.name / f"seed-{config.training.seed}"))
-
-    def log(point: CurvePoint) -> None:
-        step = round(1000 * point.done)
-        for name in ("loss", "score", "seconds"):
-            if not math.isnan(value := getattr(point, name)):
-                writer.add_scalar(f"{point.phase}/{name}", value, step)
-        # Flush each time, so that the log of an interrupted run is complete.
-        writer.flush()
-
-    return log
 
 
 def sparkline(values: Sequence[float], width: int = _WIDTH) -> str:

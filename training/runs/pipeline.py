@@ -27,7 +27,6 @@ from training.datasets import (
     split,
 )
 from training.datasets.batches import TrainingData, scene_tensors
-from training.datasets.files import DATA
 from training.datasets.records import digest_of
 from training.datasets.roles import count_roles
 from training.datasets.vocabulary import indoor_vocabulary, read_vocabulary, with_typical_sizes
@@ -192,14 +191,15 @@ def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path)
 def split_and_encode(
     data: DataConfig,
     scenes: dict[str, list[AnnotatedScene]],
+    root: Path,
     vocabulary: Vocabulary | None = None,
-    root: Path = DATA,
 ) -> SplitScenes:
     """Split the scenes into train, validation and test parts, and encode them.
 
     The split includes all data sources at once, because sources can contain the same room.
 
     Args:
+        root: folder of the word vectors and of the vocabulary.
         vocabulary: vocabulary of a published model. The default is that of the configuration.
 
     Raises:
@@ -225,11 +225,13 @@ def split_and_encode(
     )
 
 
-def prepare(config: Config, root: Path) -> SplitScenes:
+def prepare(config: Config, root: Path, vocabulary: Vocabulary | None = None) -> SplitScenes:
     """Read the scenes of a configuration from the folder `root`, split and encode them.
+
+    `vocabulary` is that of a published model. The default is that of the configuration.
 
     Raises:
         ConfigError: a file is missing, or the vocabulary is invalid.
         DatasetError: a file of scenes is invalid.
     """
-    return split_and_encode(config.data, read_sources(config.data, root), root=root)
+    return split_and_encode(config.data, read_sources(config.data, root), root, vocabulary)

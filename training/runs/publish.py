@@ -155,7 +155,7 @@ def refit(
         progress(reason)
     progress("reading scenes")
     annotated = read_sources(data, root)
-    scenes = split_and_encode(data, annotated, artifact.vocabulary, root)
+    scenes = split_and_encode(data, annotated, root, artifact.vocabulary)
     digests = {source.source: source.digest for source in manifest.data}
     if changed := sorted(name for name in scenes.digests if digests[name] != scenes.digests[name]):
         raise RunError(
@@ -165,7 +165,7 @@ def refit(
     evaluated_scenes = scenes
     if split := manifest.training.get("measured_split"):
         other = with_settings(config, {"data.split": split}).data
-        evaluated_scenes = split_and_encode(other, annotated, artifact.vocabulary, root)
+        evaluated_scenes = split_and_encode(other, annotated, root, artifact.vocabulary)
     progress("fitting statistics")
     evaluated = with_statistics(artifact, evaluated_scenes)
     rows = _measure(evaluated, evaluated_scenes.training_data(), progress, tuple(STATISTICS))

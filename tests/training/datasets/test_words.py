@@ -65,7 +65,7 @@ def test_training_reads_the_vectors_in_the_folder_of_the_scenes(tmp_path: Path) 
     folder.mkdir()
     save(folder)
     data = DataConfig(sources=("rooms",), vocabulary="rooms", rooms=40, words="words/vectors.npz")
-    scenes = split_and_encode(data, read_sources(data, tmp_path), root=tmp_path)
+    scenes = split_and_encode(data, read_sources(data, tmp_path), tmp_path)
     assert scenes.words is not None
     vectors = dict(zip(scenes.vocabulary.labels, scenes.words.tolist(), strict=True))
     assert vectors["sofa"] == pytest.approx([0.6, -0.8])
