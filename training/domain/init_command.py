@@ -21,7 +21,7 @@ from training.datasets.vocabulary import vocabulary_json
 from training.domain.proposal import propose
 from training.domain.proposal_report import as_dict, show
 from training.evaluation.report import write_whole
-from training.fit.configuration import Config, ConfigError, is_file, source_name
+from training.fit.configuration import ConfigError, is_file, source_name
 from training.runs.config_files import shipped_configs
 from training.runs.example_scenes import examples_json
 
@@ -71,7 +71,6 @@ def init(
         all_scenes = [scene for scenes in scenes_of.values() for scene in scenes]
         with console.status("analysing scenes"):
             proposal = propose(name, all_scenes, sources, terms=terms)
-            Config.model_validate(proposal.values)
     except (ConfigError, DatasetError, ValueError) as error:
         fail(error)
     folder.mkdir(parents=True, exist_ok=True)

@@ -25,12 +25,11 @@ from training.fit.configuration import Config, ConfigError
 from training.runs.config_files import sections_toml
 from training.runs.example_scenes import choose_examples
 
-# Possible minimum numbers of objects of a class, in order of preference. A class with few objects
-# is hardly trained. A small data set needs a small minimum, so that the vocabulary covers enough
-# objects.
-MINIMA: Final = (8, 5, 3, 2)
-COVERED: Final = 0.97
-_TABLE: Final = (2, 3, 5, 8, 16, 30)
+# Possible minimum numbers of objects of a class. A class with few objects is hardly trained. Few
+# scenes need a small minimum, so that the vocabulary covers enough objects.
+_MINIMA: Final = (2, 3, 5, 8)
+_COVERED: Final = 0.97
+_TABLE: Final = (*_MINIMA, 16, 30)
 # docs/decisions/own-scenes.md gives the measurement behind these two numbers of scenes.
 FEWEST_SCENES: Final = 20
 FEW_SCENES: Final = 80
@@ -56,15 +55,11 @@ class Proposal:
     vocabulary: Vocabulary  # merged similar labels are aliases
     dropped: tuple[tuple[str, int, str], ...]  # names without a class: name, objects, reason
     values: dict[str, Any]  # sections of the configuration
+    config: Config
     reasons: dict[str, str]  # reason for the value of "section.entry"
     parts: dict[str, int]  # number of scenes of each part of the split
     test_groups: int  # number of groups of near-duplicates in the test part
     examples: tuple[Example, ...]
-
-    @property
-    def config(self) -> Config:
-        """The proposed configuration after validation."""
-        return Config.model_validate(self.values)
 
     @property
     def warning(self) -> str:
@@ -135,6 +130,7 @@ def propose(
         vocabulary=vocabulary,
         dropped=tuple(_dropped(labels, vocabulary, names, minimum)),
         values=values,
+        config=Config.model_validate(values),
         reasons=reasons,
         parts=parts,
         test_groups=test_groups,
@@ -151,7 +147,7 @@ def _choose_minimum(
     A choice that gives too many classes is raised.
     """
     covered: dict[int, tuple[int, float]] = {}
-    for minimum in sorted({*_TABLE, *MINIMA}):
+    for minimum in _TABLE:
         try:
             vocabulary = _vocabulary(scenes, pairs, minimum)
         except ValueError:
@@ -159,7 +155,7 @@ def _choose_minimum(
         covered[minimum] = (len(vocabulary), coverage(vocabulary, scenes))
     if not covered:
         raise ConfigError("every label occurs only once: training needs labels with more objects")
-    sufficient = [m for m, (_, share) in covered.items() if share >= COVERED and m <= MINIMA[0]]
+    sufficient = [m for m, (_, share) in covered.items() if share >= _COVERED and m in _MINIMA]
     chosen = max(sufficient, default=min(covered))
     affordable = [m for m, (classes, _) in covered.items() if classes <= _MOST_CLASSES]
     return max(chosen, min(affordable, default=chosen)), covered
@@ -212,15 +208,11 @@ def _use_frequent_names(vocabulary: Vocabulary, scenes: Sequence[AnnotatedScene]
 def _dropped(
     labels: Sequence[Label], vocabulary: Vocabulary, names: Names, minimum: int
 ) -> list[tuple[str, int, str]]:
-    excluded = {label_key(name) for name in names.not_objects}
+    reasons = {label_key(name): "not an object" for name in names.not_objects}
     return [
-        (
-            label.name,
-            label.mentions,
-            "not an object" if label_key(label.name) in excluded else f"under {minimum} mentions",
-        )
-        for label in labels
-        if vocabulary.index(label.name) is None
+        (x.name, x.mentions, reasons.get(label_key(x.name), f"under {minimum} mentions"))
+        for x in labels
+        if vocabulary.index(x.name) is None
     ]
 
 
