@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from app.scene import CANONICAL, ObjectClass, Vocabulary, to_viewer_frame
 from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP
-from training.datasets import AnnotatedObject, AnnotatedScene, annotated_classes, encode
+from tests.training.scenes import encode_objects, things
+from training.datasets import AnnotatedObject, annotated_classes, encode
 from training.datasets.encoding import derive_from_boxes, room_viewpoint
 
 VOCABULARY = Vocabulary(
@@ -31,14 +32,8 @@ DESK_THING = AnnotatedObject("d", "desk", **DESK_BOX)
 MONITOR_THING = AnnotatedObject("m", "monitor", **MONITOR_BOX)
 
 
-def things(*labels: str, **fields: Any) -> tuple[AnnotatedObject, ...]:
-    return tuple(AnnotatedObject(str(i), label, **fields) for i, label in enumerate(labels))
-
-
 def encoded(objects: tuple[AnnotatedObject, ...], **fields: Any) -> Any:
-    values: dict[str, Any] = {"scene_id": "s", "source": "t", "group": "g", "room_type": None}
-    (scene,) = encode([AnnotatedScene(**values | {"objects": objects} | fields)], VOCABULARY)
-    return scene
+    return encode_objects(objects, VOCABULARY, **fields)
 
 
 def triples(scene: Any) -> set[tuple[int, int, int]]:

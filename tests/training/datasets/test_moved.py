@@ -11,7 +11,8 @@ import pytest
 from app.scene import ObjectClass, Vocabulary
 from app.scene.footprints import overlap_and_gap
 from app.scene.relations import FRONT, INSIDE, LEFT, ON_TOP
-from training.datasets import AnnotatedObject, AnnotatedScene, encode
+from tests.training.scenes import encode_objects, things
+from training.datasets import AnnotatedObject
 from training.datasets.moved import (
     has_boxes,
     moved_by_pose,
@@ -36,25 +37,20 @@ POSES = {
 SEEDS = range(400)
 
 
-def things(*labels: str) -> tuple[AnnotatedObject, ...]:
-    fields = ("position", "size", "yaw")
-    return tuple(
-        AnnotatedObject(str(k), label, **dict(zip(fields, POSES[label], strict=True)))
-        for k, label in enumerate(labels)
-    )
+def posed(*labels: str) -> tuple[AnnotatedObject, ...]:
+    poses = zip(*(POSES[label] for label in labels), strict=True)
+    return things(*labels, **dict(zip(("position", "size", "yaw"), poses, strict=True)))
 
 
 def encoded(objects: tuple[AnnotatedObject, ...], **fields: Any) -> Any:
-    values: dict[str, Any] = {"scene_id": "s", "source": "t", "group": "g", "room_type": None}
-    values |= {"objects": objects, "viewer_frame": True} | fields
-    return encode([AnnotatedScene(**values)], VOCABULARY)[0]
+    return encode_objects(objects, VOCABULARY, viewer_frame=True, **fields)
 
 
 def move(scene: Any, seed: int) -> Any:
     return moved_by_pose(scene, VOCABULARY.structure, np.random.default_rng(seed))
 
 
-ROOM = encoded(things(*LABELS, "wall"))
+ROOM = encoded(posed(*LABELS, "wall"))
 MOVES = [case for seed in SEEDS if (case := move(ROOM, seed))]
 
 
@@ -125,7 +121,7 @@ def test_only_the_object_and_those_on_it_move() -> None:
 def test_a_table_stays_if_an_object_under_it_moves() -> None:
     """The relation "under" is stored as on-top of the larger object."""
     chair = AnnotatedObject("2", "chair", position=(3.0, 0.0, 0.3), size=(0.5, 0.5, 0.6))
-    scene = encoded((*things("table", "bed"), chair))
+    scene = encoded((*posed("table", "bed"), chair))
     scene.instance_holds[:] = False
     scene.instance_holds[ON_TOP, 0, 2] = True
     before = posed_scene(scene).objects
@@ -157,11 +153,11 @@ def test_equal_seeds_give_equal_cases() -> None:
 def test_scenes_without_a_wrong_place() -> None:
     # The step from the cup to the floor would be .1 m. Structure neither moves nor carries.
     for labels in (("chair",), ("cup", "straw"), ("chair", "wall")):
-        assert move(encoded(things(*labels)), 0) is None
+        assert move(encoded(posed(*labels)), 0) is None
 
 
 def test_objects_without_a_box_stay() -> None:
-    objects = (*things("table", "cup", "chair"), AnnotatedObject("3", "bed"))
+    objects = (*posed("table", "cup", "chair"), AnnotatedObject("3", "bed"))
     scene = encoded(objects)
     for seed in range(20):
         moved, i = move(scene, seed)
@@ -171,7 +167,7 @@ def test_objects_without_a_box_stay() -> None:
 
 # ---------------------------------------------------------------------------- without poses
 
-BARE = tuple(AnnotatedObject(str(k), label) for k, label in enumerate((*LABELS, "cup", "wall")))
+BARE = things(*LABELS, "cup", "wall")
 LISTED = (
     (CUP, "on-top", TABLE),
     (STRAW, "inside", CUP),

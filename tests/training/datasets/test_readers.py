@@ -9,6 +9,7 @@ import gzip
 import itertools
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
+from tests.training.scenes import scene
 from training.datasets import (
     AnnotatedObject,
     AnnotatedScene,
@@ -102,9 +104,8 @@ def test_jsonl_accepts_the_form_of_a_request(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["again.jsonl", "again.jsonl.gz"])
 def test_jsonl_is_read_as_it_was_written(tmp_path: Path, name: str) -> None:
     """Relations of a source whose predicates a reader has translated stay as they are."""
-    things = tuple(AnnotatedObject(str(k), label) for k, label in enumerate(("cup", "table")))
     translated = [
-        AnnotatedScene("s", source, "g", None, things, relations=((0, "on-top", 1),))
+        replace(scene("s", "cup", "table", relations=[(0, "on-top", 1)]), source=source)
         for source in ("3dssg", "vrd", "nr3d")
     ]
     scenes = [*read_scenes(write_jsonl(tmp_path)), *generate_rooms(10, 0), *translated]
@@ -309,24 +310,24 @@ def test_3dssg_needs_its_other_files(tmp_path: Path) -> None:
                 read_scenes(path)
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ([], "must be an object, not list"),
-        ({}, "lacks 'scans'"),
-        ({"scans": {}}, "'scans' must be of type list"),
-        ({"scans": ["room-1"]}, r"scans\[0\]: must be an object"),
-        ({"scans": [SCAN | {"scan": 3}]}, r"scans\[0\]: 'scan' must be of type str"),
-        ({"scans": [SCAN | {"objects": []}]}, r"scans\[0\]: 'objects' must be of type dict"),
-        ({"scans": [SCAN | {"objects": {"1": ""}, "relationships": []}]}, "empty label"),
-        ({"scans": [{**SCAN, "relationships": 1}]}, "'relationships' must be of type list"),
-        ({"scans": [SCAN | {"relationships": [[7, 4]]}]}, r"relationships\[0\]: must be \[subject"),
-        ({"scans": [SCAN | {"relationships": [[9, 4, 1, "left"]]}]}, "not in the scan"),
-        ({"scans": [SCAN, SCAN]}, r"scans\[1\]: scene 3dssg-room-1b-2 is listed twice"),
-    ],
-)
-def test_malformed_3dssg(tmp_path: Path, content: Any, message: str) -> None:
-    check_malformed(write_json(write_3dssg(tmp_path), content), message)
+MALFORMED_3DSSG = [
+    ([], "must be an object, not list"),
+    ({}, "lacks 'scans'"),
+    ({"scans": {}}, "'scans' must be of type list"),
+    ({"scans": ["room-1"]}, r"scans\[0\]: must be an object"),
+    *(
+        ({"scans": [SCAN | fields]}, message)
+        for fields, message in (
+            ({"scan": 3}, r"scans\[0\]: 'scan' must be of type str"),
+            ({"objects": []}, r"scans\[0\]: 'objects' must be of type dict"),
+            ({"objects": {"1": ""}, "relationships": []}, "empty label"),
+            ({"relationships": 1}, "'relationships' must be of type list"),
+            ({"relationships": [[7, 4]]}, r"relationships\[0\]: must be \[subject"),
+            ({"relationships": [[9, 4, 1, "left"]]}, "not in the scan"),
+        )
+    ),
+    ({"scans": [SCAN, SCAN]}, r"scans\[1\]: scene 3dssg-room-1b-2 is listed twice"),
+]
 
 
 # ------------------------------------------------------------------------------- SUN RGB-D
@@ -467,28 +468,34 @@ def test_coco(tmp_path: Path) -> None:
     ]
 
 
+MALFORMED_COCO = [
+    ([], "must be an object"),
+    ({"images": [], "annotations": []}, "lacks 'categories'"),
+    (COCO | {"categories": [{"id": 62}]}, r"categories\[0\]: lacks 'name'"),
+    (COCO | {"images": []}, r"annotations\[0\]: image_id 9 is not among the images"),
+    (COCO | {"categories": []}, r"annotations\[0\]: category_id 62 is not among"),
+    *(
+        (COCO | {"annotations": [COCO["annotations"][0] | extra]}, message)
+        for extra, message in (
+            ({"bbox": [1, 2, 3]}, r"annotations\[0\]: bbox must be"),
+            ({"bbox": [1, 2, -3, 4]}, "bbox must be"),
+            ({"bbox": [1, 2, 3, "4"]}, "bbox must be"),
+            ({"id": "first"}, "'id' must be of type int"),
+        )
+    ),
+    (COCO | {"annotations": COCO["annotations"][:1] * 2}, "two annotations have the same id"),
+]
+
+
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("write", "content", "message"),
     [
-        ([], "must be an object"),
-        ({"images": [], "annotations": []}, "lacks 'categories'"),
-        (COCO | {"categories": [{"id": 62}]}, r"categories\[0\]: lacks 'name'"),
-        (COCO | {"images": []}, r"annotations\[0\]: image_id 9 is not among the images"),
-        (COCO | {"categories": []}, r"annotations\[0\]: category_id 62 is not among"),
-        *(
-            (COCO | {"annotations": [COCO["annotations"][0] | extra]}, message)
-            for extra, message in (
-                ({"bbox": [1, 2, 3]}, r"annotations\[0\]: bbox must be"),
-                ({"bbox": [1, 2, -3, 4]}, "bbox must be"),
-                ({"bbox": [1, 2, 3, "4"]}, "bbox must be"),
-                ({"id": "first"}, "'id' must be of type int"),
-            )
-        ),
-        (COCO | {"annotations": COCO["annotations"][:1] * 2}, "two annotations have the same id"),
+        *((write_3dssg, *case) for case in MALFORMED_3DSSG),
+        *((write_coco, *case) for case in MALFORMED_COCO),
     ],
 )
-def test_malformed_coco(tmp_path: Path, content: Any, message: str) -> None:
-    check_malformed(write_json(tmp_path / "instances.json", content), message)
+def test_malformed_json(tmp_path: Path, write: Any, content: Any, message: str) -> None:
+    check_malformed(write_json(write(tmp_path), content), message)
 
 
 # ------------------------------------------------------------------------------- all of them

@@ -7,6 +7,7 @@ import pytest
 
 from app.scene import ObjectClass, RoleCounts, Vocabulary
 from app.scene.roles import IN, ON, UNDER, role_counts
+from tests.training.scenes import things
 from training.datasets import AnnotatedObject, AnnotatedScene
 from training.datasets.roles import count_roles, lift_of
 
@@ -26,9 +27,8 @@ Triple = tuple[str, str, str]
 def stated(*triples: Triple, source: str = "nr3d", group: str = "g") -> AnnotatedScene:
     """A scene that lists triples of labels (subject, relation, object)."""
     labels = list(dict.fromkeys(label for i, _, j in triples for label in (i, j)))
-    things = tuple(AnnotatedObject(label, label) for label in labels)
     listed = tuple((labels.index(i), relation, labels.index(j)) for i, relation, j in triples)
-    return AnnotatedScene("s", source, group, None, things, listed)
+    return AnnotatedScene("s", source, group, None, things(*labels), listed)
 
 
 def rows_of(counts: RoleCounts) -> dict[tuple[int, int], list[float]]:
@@ -59,7 +59,7 @@ def test_other_words_structure_and_pairs_of_one_class_do_not_count():
         *(("bin", "left", "desk"), ("bin", "above", "desk")),
         *(("bin", "on-top", "wall"), ("wall", "inside", "bin"), ("bin", "on-top", "spoon")),
     )
-    twins = (AnnotatedObject("a", "bin"), AnnotatedObject("b", "bin"))
+    twins = things("bin", "bin")
     nested = AnnotatedScene("t", "nr3d", "g", None, twins, ((0, "inside", 1),))
     silent = AnnotatedScene("u", "nr3d", "g", None, twins)
     counts = count_roles([scene, nested, silent], VOCABULARY)

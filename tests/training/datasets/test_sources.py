@@ -9,6 +9,7 @@ import torch
 from app.scene import ObjectClass, RoleCounts, Vocabulary
 from app.scene.relations import ABOVE, FRONT, INSIDE, LEFT, ON_TOP, SUPPORTS
 from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN
+from tests.training.scenes import encode_objects, things
 from training.datasets import (
     AnnotatedObject,
     AnnotatedScene,
@@ -31,10 +32,8 @@ CUBE = (0.2, 0.2, 0.2)
 
 
 def encoded(source: str, *objects: AnnotatedObject, **fields: Any) -> EncodedScene:
-    things = objects or tuple(AnnotatedObject(x, x) for x in ("desk", "monitor", "pencil"))
-    scene = AnnotatedScene("s", source, "g", None, things, viewer_frame=True, **fields)
-    (found,) = encode([scene], VOCABULARY)
-    return found
+    objects = objects or things("desk", "monitor", "pencil")
+    return encode_objects(objects, VOCABULARY, source=source, viewer_frame=True, **fields)
 
 
 def off(found: EncodedScene) -> set[tuple[int, int, int]]:
@@ -83,10 +82,9 @@ def test_3dssg_shows_all_supports_of_some_objects_and_sides_of_related_pairs() -
 def test_a_listed_support_excludes_all_other_supports() -> None:
     """A monitor is attached to a wall, and the desk stands on the floor."""
     vocabulary = Vocabulary([*VOCABULARY.objects, ObjectClass("floor", structure=True)])
-    labels = ("desk", "monitor", "pencil", "floor")
-    things = tuple(AnnotatedObject(label, label) for label in labels)
-    lists = ((0, "on-top", 3), (2, "on-top", 0)), False, (), (0, 1, 2)
-    (found,) = encode([AnnotatedScene("s", "3dssg", "g", None, things, *lists)], vocabulary)
+    lists = {"relations": ((0, "on-top", 3), (2, "on-top", 0)), "supported": (0, 1, 2)}
+    objects = things("desk", "monitor", "pencil", "floor")
+    found = encode_objects(objects, vocabulary, source="3dssg", **lists)
     assert found.instance_stands.tolist() == [FLOOR, HANGS, SUPPORTED, UNKNOWN]
     apart = ~np.eye(3, dtype=bool)
     assert (found.instance_observed[[*SUPPORTS], :3, :3] == apart).all()
@@ -146,8 +144,8 @@ def test_a_link_means_on_top_in_contact_and_else_the_role_of_the_classes(
     """A link says that a fridge of 1.8 m supports an object at a height in metres."""
     fridge = AnnotatedObject("f", "fridge", (0.0, 0.0, 0.9), (0.8, 0.8, 1.8))
     milk = AnnotatedObject("t", label, (0.0, 0.0, bottom + 0.1), (0.1, 0.1, 0.2), supported_by="f")
-    scene = AnnotatedScene("s", "procthor", "g", None, (fridge, milk), viewer_frame=True)
-    (found,) = encode([scene], KITCHEN, roles)
+    fields = {"source": "procthor", "viewer_frame": True}
+    found = encode_objects((fridge, milk), KITCHEN, roles, **fields)
     stated = [] if relation is None else [[relation, 1, 0]]
     assert np.argwhere(found.instance_holds).tolist() == stated
     assert found.instance_observed[:, 0, 1].all()
@@ -238,8 +236,8 @@ def test_virtualhome_shows_all_supports_and_no_sides() -> None:
 def test_an_unlisted_class_of_a_coarse_source_is_unobserved() -> None:
     labels = ("table", "coffee table", "lamp")
     vocabulary = Vocabulary([ObjectClass(label) for label in labels])
-    things = tuple(AnnotatedObject(label, label) for label in labels[:2])
-    scenes = [AnnotatedScene("s", source, "g", None, things) for source in ("sunrgbd", "3dssg")]
+    objects = things(*labels[:2])
+    scenes = [AnnotatedScene("s", source, "g", None, objects) for source in ("sunrgbd", "3dssg")]
     found = encode(scenes, vocabulary)
     assert [scene.evidence.classes.tolist() for scene in found] == [[0, 1]] * 2
     annotated = annotated_classes(found, vocabulary)
@@ -251,9 +249,9 @@ def test_an_unlisted_class_of_a_coarse_source_is_unobserved() -> None:
 
 
 def test_a_floor_plan_counts_as_a_few_scenes() -> None:
-    things = (AnnotatedObject("0", "desk", count=4), AnnotatedObject("1", "pencil"))
-    scenes = [AnnotatedScene(f"s{k}", "alfred", f"g{k // 6}", None, things) for k in range(8)]
-    scenes += [AnnotatedScene(f"v{k}", "vsr", "g", None, things, ()) for k in range(5)]
+    objects = things("desk", "pencil", count=[4, 1])
+    scenes = [AnnotatedScene(f"s{k}", "alfred", f"g{k // 6}", None, objects) for k in range(8)]
+    scenes += [AnnotatedScene(f"v{k}", "vsr", "g", None, objects, ()) for k in range(5)]
     found = encode(scenes, VOCABULARY)
     assert [scene.weight for scene in found] == [0.5] * 6 + [1.0] * 2 + [1.0] * 5
     assert found[0].evidence.counts.tolist() == [4, 1]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from app.scene import ObjectClass, Vocabulary, label_key
+from tests.training.scenes import scene
 from training.datasets import (
     AnnotatedObject,
     AnnotatedScene,
@@ -39,8 +40,7 @@ NAMES = Names(
 
 
 def scenes(*labels: str, room: str | None = None, times: int = 1) -> list[AnnotatedScene]:
-    things = tuple(AnnotatedObject(str(i), label) for i, label in enumerate(labels))
-    return [AnnotatedScene(f"s{k}", "t", "g", room, things) for k in range(times)]
+    return [scene(f"s{k}", *labels, room=room) for k in range(times)]
 
 
 def test_labels_are_pooled_under_their_curated_names() -> None:
@@ -64,7 +64,7 @@ def test_some_labels_become_no_class() -> None:
 
 def test_rooms_have_one_spelling() -> None:
     rooms = "bed_room", "Bed Room", "toilet", "bathroom", "attic", *["room"] * 3, *[None] * 3
-    several = [scene for room in rooms for scene in scenes("chair", room=room)]
+    several = [scene(str(k), "chair", room=room) for k, room in enumerate(rooms)]
     assert build_vocabulary(several, NAMES, minimum=2).room_types == ("bathroom", "bed room")
 
 
@@ -230,10 +230,9 @@ def test_real_scenes_encode(real: dict[str, list[AnnotatedScene]]) -> None:
     photographs = encode(real["vrd"], source_vocabulary(real["vrd"]))
     on = sum(scene.evidence.holds.sum(axis=(1, 2)) for scene in photographs)
     assert on.tolist() == [502, 2693, 3873, 1076, 438]
-    for scene in encode(real["sunrgbd"], vocabulary):
-        assert wall not in scene.evidence.classes
-        assert floor not in scene.evidence.classes
-        assert not scene.evidence.observed.any()
+    for evidence in (frame.evidence for frame in encode(real["sunrgbd"], vocabulary)):
+        assert not {wall, floor} & set(evidence.classes)
+        assert not evidence.observed.any()
 
 
 def test_the_curated_synonyms_of_rooms_are_added() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.training.commands import invoke
-from tests.training.domain.scenes import scene
+from tests.training.scenes import scene
 from training.datasets import generate_rooms
 from training.datasets.jsonl import write_jsonl
 from training.datasets.rooms import DOMAINS

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from tests.training.domain.scenes import scene
 from tests.training.evaluation.scenes import scene as encoded_scene
+from tests.training.scenes import scene
 from training.datasets.names import Names
 from training.domain.labels import count_labels, lookalikes, outside_vocabulary
 

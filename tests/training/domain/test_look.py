@@ -6,7 +6,7 @@ import pytest
 from pydantic import ValidationError
 
 from scene_client.schemas import MissingRequest
-from tests.training.domain.scenes import scene
+from tests.training.scenes import scene
 from training.datasets import generate_rooms
 from training.datasets.names import Names
 from training.datasets.rooms import DOMAINS
