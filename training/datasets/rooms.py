@@ -118,13 +118,14 @@ def generate_rooms(count: int, seed: int, rooms: Rooms = ROOMS) -> list[Annotate
     """
     if count < 0:
         raise ValueError(f"count must not be negative, not {count}")
-    rng, rooms_made = np.random.default_rng(seed), itertools.count()
+    rng, number = np.random.default_rng(seed), 0
     scenes: list[AnnotatedScene] = []
     while len(scenes) < count:
         room_type = str(rng.choice(list(rooms)))
         layout = _Layout(rng, room_type, rooms[room_type])
-        group, views = f"rooms-{seed}-{next(rooms_made)}", range(int(rng.integers(1, 4)))
-        scenes += [layout.view(group, view) for view in views]
+        views = range(int(rng.integers(1, 4)))
+        scenes += [layout.view(f"rooms-{seed}-{number}", view) for view in views]
+        number += 1
     return scenes[:count]
 
 

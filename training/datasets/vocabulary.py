@@ -80,7 +80,7 @@ def build_indoor_vocabulary(scenes: Iterable[AnnotatedScene]) -> Vocabulary:
     """
     names = replace(curated_names(), surroundings=())
     minima = {"minimum": INDOOR_MINIMUM_MENTIONS, "minimum_rooms": MINIMUM_MENTIONS}
-    return with_aliases(build_vocabulary(scenes, names, outdoor=True, **minima), names)
+    return with_aliases(build_vocabulary(scenes, names, outdoor=True, **minima))
 
 
 def vocabulary_json(vocabulary: Vocabulary) -> str:
@@ -96,30 +96,27 @@ def vocabulary_json(vocabulary: Vocabulary) -> str:
     return f'{{\n"objects": [\n{lines}\n],\n"room_types": {rooms}\n}}\n'
 
 
-def with_aliases(vocabulary: Vocabulary, names: Names | None = None) -> Vocabulary:
+def with_aliases(vocabulary: Vocabulary) -> Vocabulary:
     """Return the vocabulary with the curated synonyms of its classes, and of kinds that it lacks.
 
     The parents and the flag `anywhere` of its classes are renewed too. The labels, their order and
     their sizes stay the same.
     """
-    names = names or curated_names()
-    objects = []
+    aliases, objects = curated_names().aliases, []
     for entry in vocabulary.objects:
-        synonyms = (x for x in names.aliases.get(entry.label, ()) if vocabulary.index(x) is None)
+        synonyms = (x for x in aliases.get(entry.label, ()) if vocabulary.index(x) is None)
         objects.append(replace(entry, aliases=(*entry.aliases, *synonyms)))
-    named = Vocabulary(objects, vocabulary.room_types)
-    objects = [_with_kinds(entry, named, names) for entry in named.objects]
-    return with_room_aliases(Vocabulary(objects, vocabulary.room_types), names)
+    return with_room_aliases(_with_kinds(Vocabulary(objects, vocabulary.room_types)))
 
 
-def with_room_aliases(vocabulary: Vocabulary, names: Names | None = None) -> Vocabulary:
+def with_room_aliases(vocabulary: Vocabulary) -> Vocabulary:
     """Return the vocabulary with the curated synonyms of its room types."""
-    names = names or curated_names()
+    rooms = curated_names().rooms
     keys = {label_key(room) for room in vocabulary.room_types}
     aliases = {
         room: synonyms
         for room in vocabulary.room_types
-        if (synonyms := [x for x in names.rooms.get(room, ()) if label_key(x) not in keys])
+        if (synonyms := [x for x in rooms.get(room, ()) if label_key(x) not in keys])
     }
     return Vocabulary(vocabulary.objects, vocabulary.room_types, aliases)
 
@@ -152,24 +149,24 @@ def source_vocabulary(
     spellings = dict.fromkeys((*names.base, *names.household, *names.structure), ())
     aliases = spellings | names.aliases
     mentioned_only = replace(names, base=(), household=(), outdoor=(), kinds={}, aliases=aliases)
-    vocabulary = build_vocabulary(scenes, mentioned_only, minimum=minimum, outdoor=True)
-    objects = [_with_kinds(entry, vocabulary, names) for entry in vocabulary.objects]
+    return _with_kinds(build_vocabulary(scenes, mentioned_only, minimum=minimum, outdoor=True))
+
+
+def _with_kinds(vocabulary: Vocabulary) -> Vocabulary:
+    """Set the parents of classes, and add the names of their kinds without a class as aliases."""
+    names, objects = curated_names(), []
+    for entry in vocabulary.objects:
+        parent = names.broader.get(entry.label)
+        while parent is not None and parent not in vocabulary.labels:
+            parent = names.broader.get(parent)
+        kinds, aliases = list(names.kinds.get(entry.label, ())), list(entry.aliases)
+        for kind in kinds:
+            if vocabulary.index(kind) is None:
+                aliases += [kind, *names.aliases.get(kind, ())]
+                kinds += names.kinds.get(kind, ())
+        anywhere = entry.label in names.anywhere
+        objects.append(replace(entry, aliases=tuple(aliases), parent=parent, anywhere=anywhere))
     return Vocabulary(objects, vocabulary.room_types)
-
-
-def _with_kinds(entry: ObjectClass, vocabulary: Vocabulary, names: Names) -> ObjectClass:
-    """Set the parent of a class, and add the names of its kinds without a class as aliases."""
-    parent = names.broader.get(entry.label)
-    while parent is not None and parent not in vocabulary.labels:
-        parent = names.broader.get(parent)
-    kinds = list(names.kinds.get(entry.label, ()))
-    synonyms = []
-    for kind in kinds:
-        if vocabulary.index(kind) is None:
-            synonyms += [kind, *names.aliases.get(kind, ())]
-            kinds += names.kinds.get(kind, ())
-    aliases, anywhere = (*entry.aliases, *synonyms), entry.label in names.anywhere
-    return replace(entry, aliases=aliases, parent=parent, anywhere=anywhere)
 
 
 def with_typical_sizes(vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene]) -> Vocabulary:

@@ -148,7 +148,7 @@ def show(comparison: Comparison, console: Console) -> None:
     """Print the metrics of a comparison as a table, with its notes and examples."""
     titles = (comparison.a, comparison.b)
     heading = f"{comparison.scenes} held-out scenes of {comparison.groups} groups"
-    text = "{}\nA: {}\nB: {}".format(heading, *titles)
+    text = f"{heading}\nA: {comparison.a}\nB: {comparison.b}"
     console.print(text, markup=False, highlight=False, soft_wrap=True)
     headings = "task, metric", "A", "B", "A - B, 95 % interval", "A is"
     # Without edges and padding, the table fits into 80 columns.

@@ -77,12 +77,13 @@ def count_labels(scenes: Iterable[AnnotatedScene], names: Names) -> list[Label]:
     scenes_of: Counter[str] = Counter()
     canonical = cache(names.canonical)
     for scene in scenes:
-        keys = []
+        keys = set()
         for thing in scene.objects:
-            keys.append(label_key(name := canonical(thing.label)))
-            spellings[keys[-1]][thing.label] += 1
-            names_of[keys[-1]][name] += 1
-        scenes_of.update(set(keys))
+            name = canonical(thing.label)
+            keys.add(key := label_key(name))
+            spellings[key][thing.label] += 1
+            names_of[key][name] += 1
+        scenes_of.update(keys)
     labels = []
     for key, counts in spellings.items():
         spelt = tuple(sorted(counts, key=lambda label: (-counts[label], label)))

@@ -238,6 +238,6 @@ def test_real_scenes_encode(real: dict[str, list[AnnotatedScene]]) -> None:
 def test_the_curated_synonyms_of_rooms_are_added() -> None:
     """A synonym that the vocabulary uses as a room type of its own stays a room type."""
     words = Vocabulary([ObjectClass("chair")], ["bathroom", "attic"])
-    assert with_room_aliases(words, NAMES).room_index("toilet") == 0
+    assert with_room_aliases(words).room_index("toilet") == 0
     both = Vocabulary([ObjectClass("chair")], ["bathroom", "Toilet"])
-    assert with_room_aliases(both, NAMES) == both
+    assert with_room_aliases(both) == both
