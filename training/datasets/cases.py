@@ -105,6 +105,8 @@ def removed_class(
 def observed_pairs(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[Flags, list[Triple]]:
     """Draw half of the object pairs of a scene as observed pairs, with or without relations.
 
+    If relations were drawn, pairs without an observed relation would have fewer than other pairs.
+
     Returns:
         A mask of the unobserved pairs, (instances, instances) bool, and the observed triples
         (relation, subject, object).
