@@ -83,6 +83,12 @@ def test_shares_hold_over_all_and_within_room_types(protocol: Protocol) -> None:
             assert here[room] == pytest.approx(fraction * size, abs=8)
 
 
+def test_scenes_of_rare_room_types_occur_in_all_parts() -> None:
+    scenes = [AnnotatedScene(str(k), "a", str(k), f"room {k}", ()) for k in range(40)]
+    sizes = {part: len(members) for part, members in split(scenes, seed=0).items()}
+    assert sizes == {"train": 30, "test": 6, "validation": 4}
+
+
 def test_the_split_of_the_paper_divides_groups() -> None:
     scenes = collection("a", 60)
     assert divides_groups(scenes, parts_of(scenes, seed=0, protocol="paper"))
