@@ -241,7 +241,6 @@ def _onto(boxes: _Boxes, i: int, j: int, rng: Rng) -> Floats | None:
     """Return a centre of instance i on the top of instance j, apart from the objects on it."""
     bottom, height = boxes.top[j], boxes.size[i, 2]
     obstacles = (boxes.top > bottom) & (boxes.bottom < bottom + height)
-    obstacles[j] = False
     return _free_spot(boxes, i, j, obstacles, _CENTRAL, 0.0, bottom, rng)
 
 
