@@ -31,6 +31,8 @@ def test_views_of_a_room_share_its_group(rooms: list[AnnotatedScene]) -> None:
     views = Counter(scene.group for scene in rooms)
     assert set(views.values()) == {1, 2, 3}
     assert len({(scene.group, scene.room_type) for scene in rooms}) == len(views)
+    # Views omit small objects.
+    assert len({(scene.group, len(scene.objects)) for scene in rooms}) > len(views)
 
 
 def test_boxes_do_not_overlap(rooms: list[AnnotatedScene]) -> None:

@@ -101,3 +101,7 @@ def test_two_scene_classes_of_one_model_class_have_no_relation(model) -> None:
     assert bool((values[0, :, 0, 1] == -BEYOND).all())
     assert bool((values[0, :, 0, 2] > -BEYOND).all())
     torch.testing.assert_close(values[0, :, 0, 2], values[0, :, 1, 2])
+    # Both state one relation of the model class.
+    once, twice = batch([0, 1, 2], 3, (0, 0, 2)), batch([0, 1, 2], 3, (0, 0, 2))
+    twice.holds[0, 0, 1, 2], twice.observed[0, 0, 1, 2] = 1.0, True
+    torch.testing.assert_close(asked.completion(twice), asked.completion(once))
