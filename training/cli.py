@@ -7,10 +7,9 @@ command then continues the run.
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
@@ -24,8 +23,9 @@ from training.domain.candidates import Candidate
 from training.domain.compare import compare, compare_command, show
 from training.domain.evaluate_command import evaluate_command
 from training.domain.gate import MARGIN, NEW, losses, measure_usefulness, served_model
-from training.domain.init_command import example, fail, init
+from training.domain.init_command import STORE, StorePath, example, fail, init
 from training.domain.labels import outside_vocabulary
+from training.evaluation.report import Progress
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, ConfigError, is_file, source_name
 from training.fit.trainer import Trainer
@@ -70,8 +70,7 @@ StoredData = Annotated[
     ),
 ]
 Runs = Annotated[Path, typer.Option("--runs", help="folder of the training runs")]
-StorePath = Annotated[str, typer.Option("--store", help="folder of the model store")]
-_RUNS, _STORE = Path("runs"), "model_store"
+_RUNS = Path("runs")
 _ALIAS = "`python -m app.registry alias` moves an alias without a comparison"
 
 
@@ -94,7 +93,7 @@ def train(
         Path | None, typer.Option("--tensorboard", help="write TensorBoard logs to this folder")
     ] = None,
     publish: Annotated[str | None, typer.Option(help="publish the run as this version")] = None,
-    store: StorePath = _STORE,
+    store: StorePath = STORE,
 ) -> None:
     """Train a configuration. With --publish, also calibrate, evaluate and publish the model."""
     try:
@@ -111,11 +110,14 @@ def train(
             config = with_settings(config, {"data.split": "final"})
             folder = folder.with_name(f"final-{folder.name}")
         scenes = _prepare(config, root)
-        _train(config, scenes, folder, root, fresh, tensorboard)
+        for name in ("checkpoint.pt", "result.json") if fresh else ():
+            (folder / name).unlink(missing_ok=True)
+        _train(config, scenes, folder, root, tensorboard)
         if publish is None and not final:
             next_steps(folder, console)
         if publish is not None:
-            _publish(load_run(folder), scenes, store, publish, measured)
+            artifact = _publish(load_run(folder), scenes, Store(store), publish, measured=measured)
+            _print_published(artifact, store)
     except RefusedError as error:
         _exit_refused(error)
     except (*(ConfigError, DatasetError, RegistryError, RunError), FloatingPointError) as error:
@@ -133,7 +135,7 @@ def publish(
     ],
     version: Annotated[str, typer.Argument(help="number of the new version, such as 1.0.0")],
     data: StoredData = None,
-    store: StorePath = _STORE,
+    store: StorePath = STORE,
     promote: Annotated[
         bool,
         typer.Option(
@@ -186,7 +188,7 @@ def publish(
             raise ConfigError(
                 f"{folder} is a final run without test scenes, so it cannot be compared; {_ALIAS}"
             )
-        root = data or (Path(run.data) if run.data else DATA)
+        root = data or run.data_folder
         scenes = _prepare(run.config, root)
         if promote:
             _promote(
@@ -196,11 +198,9 @@ def publish(
                 limit=limit,
                 even_if_worse=even_if_worse,
             )
-            command = f"SCENE_STORE={shlex.quote(store)} SCENE_PORT=8055 python -m app"
-            console.print(f"next: {command}", soft_wrap=True, markup=False, highlight=False)
         else:
             accept = _print_accepted if even_if_worse else None
-            _publish(run, scenes, store, version, accept=accept)
+            _print_published(_publish(run, scenes, models, version, accept=accept), store)
     except RefusedError as error:
         _exit_refused(error, "; --even-if-worse publishes the version all the same")
     except (RunError, ConfigError, DatasetError, RegistryError) as error:
@@ -208,7 +208,7 @@ def publish(
 
 
 @app.command(name="list")
-def list_command(store: StorePath = _STORE) -> None:
+def list_command(store: StorePath = STORE) -> None:
     """List the models in the store and the shipped configurations."""
     try:
         models = load_model_set(Store(store))
@@ -216,9 +216,8 @@ def list_command(store: StorePath = _STORE) -> None:
         fail(error)
     table = Table("model", "version", "variant", "state", title="Published")
     for (name, version), entry in sorted(models.entries.items()):
-        state = getattr(entry, "reason", "verified")
         variant = entry.manifest.variant if hasattr(entry, "manifest") else "?"
-        table.add_row(name, version, variant, state)
+        table.add_row(name, version, variant, getattr(entry, "reason", "verified"))
     console.print(table)
     for alias, target in models.aliases.items():
         console.print(f"{alias} → {target}")
@@ -231,11 +230,11 @@ def _prepare(config: Config, data: Path) -> SplitScenes:
     examples, reasons = known_examples(read_examples(config.examples, data), scenes.vocabulary)
     sizes = ", ".join(f"{len(part)} {name}" for name, part in scenes.parts.items())
     console.print(f"{len(scenes.vocabulary)} object classes; scenes: {sizes}")
-    file_sources = {source_name(source) for source in config.data.sources if is_file(source)}
-    for is_named in (True, False):
+    files = {source_name(source) for source in config.data.sources if is_file(source)}
+    for named in (True, False):
         all_scenes = (scene for part in scenes.parts.values() for scene in part)
-        selected = (scene for scene in all_scenes if (scene.source in file_sources) == is_named)
-        if line := outside_vocabulary(selected, named=is_named):
+        selected = (scene for scene in all_scenes if (scene.source in files) == named)
+        if line := outside_vocabulary(selected, named=named):
             console.print(line, soft_wrap=True, markup=False, highlight=False)
     for reason in reasons:
         console.print(f"[yellow]note:[/yellow] an example is left out: {reason}", soft_wrap=True)
@@ -243,16 +242,8 @@ def _prepare(config: Config, data: Path) -> SplitScenes:
 
 
 def _train(
-    config: Config,
-    scenes: SplitScenes,
-    folder: Path,
-    root: Path,
-    fresh: bool,
-    tensorboard: Path | None,
+    config: Config, scenes: SplitScenes, folder: Path, root: Path, tensorboard: Path | None
 ) -> None:
-    if fresh:
-        for name in ("checkpoint.pt", "result.json"):
-            (folder / name).unlink(missing_ok=True)
     trainer = Trainer(config, scenes.training_data(), folder)
     if trainer.resume():
         console.print(f"resuming after {trainer.position}")
@@ -268,21 +259,11 @@ def _train(
 
 
 def _publish(
-    run: FinishedRun,
-    scenes: SplitScenes,
-    store: str,
-    version: str,
-    measured: tuple[FinishedRun, SplitScenes] | None = None,
-    accept: Callable[[str], None] | None = None,
-) -> None:
+    run: FinishedRun, scenes: SplitScenes, store: Store, version: str, **options: Any
+) -> Artifact:
+    """Publish a run; `publish_run` has the options."""
     with console.status("publishing") as status:
-        artifact = publish_run(
-            *(run, scenes, Store(store), version),
-            measured=measured,
-            accept=accept,
-            progress=status.update,
-        )
-    _print_published(artifact, store)
+        return publish_run(run, scenes, store, version, progress=status.update, **options)
 
 
 def _print_accepted(reason: str) -> None:
@@ -328,34 +309,27 @@ def _promote(
 ) -> None:
     """Publish the version and point the alias at it, unless the gate refuses the version."""
     served = served_model(store, alias)
-    with console.status("publishing") as status:
 
-        def judged(artifact: Artifact) -> list[str]:
-            say = status.update
-            useful = measure_usefulness(artifact, scenes.training_data(), limit=limit, say=say)
-            for line in useful.lines():
-                console.print(line, highlight=False)
-            reasons = useful.objections()
-            if served.candidate is not None and (even_if_worse or not reasons):
-                try:
-                    new = Candidate(NEW, run.config, scenes.digests, artifact, root)
-                    comparison = compare(
-                        *(new, served.candidate, root), limit=limit, examples=3, say=say
-                    )
-                    show(comparison, console)
-                    reasons += losses(comparison, margin)
-                except ConfigError as error:
-                    if not even_if_worse:
-                        raise
-                    console.print(f"the versions were not compared: {error}", soft_wrap=True)
-            return reasons
+    def judge(artifact: Artifact, say: Progress) -> list[str]:
+        useful = measure_usefulness(artifact, scenes.training_data(), limit=limit, say=say)
+        for line in useful.lines():
+            console.print(line, highlight=False)
+        reasons = useful.objections()
+        if served.candidate is not None and (even_if_worse or not reasons):
+            try:
+                new = Candidate(NEW, run.config, scenes.digests, artifact, root)
+                sides = (new, served.candidate, root)
+                comparison = compare(*sides, limit=limit, examples=3, say=say)
+                show(comparison, console)
+                reasons += losses(comparison, margin)
+            except ConfigError as error:
+                if not even_if_worse:
+                    raise
+                console.print(f"the versions were not compared: {error}", soft_wrap=True)
+        return reasons
 
-        artifact = publish_run(
-            *(run, scenes, store, version),
-            judge=judged,
-            accept=_print_accepted if even_if_worse else None,
-            progress=status.update,
-        )
+    accept = _print_accepted if even_if_worse else None
+    artifact = _publish(run, scenes, store, version, judge=judge, accept=accept)
     if served.note:
         console.print(served.note, soft_wrap=True)
     _print_published(artifact)
@@ -364,3 +338,5 @@ def _promote(
     store.set_alias(alias, target, expected=served.target)
     change = f", before {served.target}" if served.target is not None else ""
     console.print(f"promoted: {alias} → {target}{change}", soft_wrap=True)
+    command = f"SCENE_STORE={shlex.quote(str(store.root))} SCENE_PORT=8055 python -m app"
+    console.print(f"next: {command}", soft_wrap=True, markup=False, highlight=False)

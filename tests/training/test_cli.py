@@ -28,36 +28,32 @@ from training.runs.publish import refit
 
 ROOT = Path(__file__).parents[2]
 
+SIZES = {"machine.units": 4, "machine.states": 4, "machine.K": 4}
 CONFIG = with_settings(
-    small_config(rooms=260),
-    {
-        "machine.units": 4,
-        "machine.states": 4,
-        "machine.K": 4,
-        "objects.steps": 300,
-        "relations.epochs": 3,
-    },
+    small_config(rooms=260), SIZES | {"objects.steps": 300, "relations.epochs": 3}
 )
 
 
-def same_offsets_as_training_alone_teaches(artifact, config) -> None:
-    """Scenes held out for testing have no part in them."""
-    parts = prepare(config, Path()).parts
-    scenes, V = parts["train"], len(artifact.vocabulary)
-    for name, tensor in fit_offsets(scenes, V).tensors().items():
-        assert np.array_equal(artifact.offsets.tensors()[name], tensor), name
-    leaking = fit_offsets([*scenes, *parts["test"]], V)
+def check_equal(arrays, others) -> None:
+    assert arrays.keys() == others.keys()
+    for name, array in arrays.items():
+        assert np.array_equal(others[name], array), name
+
+
+def check_offsets(artifact, config) -> None:
+    """The offsets are those of the training scenes; test scenes have no part in them."""
+    parts, V = prepare(config, Path()).parts, len(artifact.vocabulary)
+    check_equal(fit_offsets(parts["train"], V).tensors(), artifact.offsets.tensors())
+    leaking = fit_offsets([*parts["train"], *parts["test"]], V)
     assert not np.array_equal(leaking.pair_scenes, artifact.offsets.pair_scenes)
 
 
-def same_weights_with_refitted_statistics(artifact, store) -> None:
-    """`publish NAME@VERSION` changes only what is fitted to the scenes without training."""
+def check_refit(artifact, store) -> None:
+    """`publish NAME@VERSION` changes only statistics."""
     invoke("publish", "rooms-triway@1.0.0", "1.0.1", "--store", store)
     again = Store(store).load("rooms-triway", "1.0.1")
-    for name, array in artifact.weights.arrays.items():
-        assert np.array_equal(again.weights[name], array), name
-    for name, tensor in artifact.counts.tensors().items():
-        assert np.array_equal(again.counts.tensors()[name], tensor), name
+    check_equal(artifact.weights.arrays, again.weights.arrays)
+    check_equal(artifact.counts.tensors(), again.counts.tensors())
     before, after = artifact.manifest, again.manifest
     assert after.calibration == before.calibration
     assert set(after.metrics) == set(before.metrics)
@@ -67,16 +63,12 @@ def same_weights_with_refitted_statistics(artifact, store) -> None:
         refit(changed, Path(), Store(store), "1.0.2")
 
 
-def pinned(name: str) -> set[str]:
-    """The packages of a lock file."""
-    lines = (ROOT / name).read_text().splitlines()
-    return {line.split("==")[0] for line in lines if "==" in line}
-
-
 @pytest.mark.slow
 def test_training_imports_nothing_that_only_checks_need():
     """The training image has `requirements-training.lock` alone."""
-    checks = pinned("requirements-dev.lock") - pinned("requirements-training.lock")
+    files = (ROOT / f"requirements-{name}.lock" for name in ("dev", "training"))
+    pinned = (set(re.findall(r"^([^=\s]+)==", file.read_text(), re.MULTILINE)) for file in files)
+    checks = next(pinned) - next(pinned)
     modules = [
         module
         for module, names in packages_distributions().items()
@@ -110,11 +102,10 @@ def test_from_rooms_to_answers(tmp_path):
         "T1", "T1a", "T1b", "T2", "T2-at", "T3", "T3b", "T3c", "T4", "Calibration", "Offsets",
         "Counts", "Rooms",
     }  # fmt: skip
-    same_offsets_as_training_alone_teaches(artifact, load_config(str(config)))
-    same_weights_with_refitted_statistics(artifact, tmp_path / "store")
-    calibration = artifact.calibration
-    assert calibration.outlier.slope < 0  # the likelier an object, the less an intruder
-    lines = calibration.outlier_lines
+    check_offsets(artifact, load_config(str(config)))
+    check_refit(artifact, tmp_path / "store")
+    assert artifact.calibration.outlier.slope < 0  # likely objects are no intruders
+    lines = artifact.calibration.outlier_lines
     limits = [line.threshold(3) for line in (lines.low, lines.medium, lines.high)]
     assert limits == sorted(limits, reverse=True)
     assert 1 > limits[0] >= limits[2] > 0
@@ -149,7 +140,7 @@ def test_errors_are_one_clear_line(arguments, message):
     assert message in invoke(*arguments, code=1)
 
 
-def test_a_stored_model_is_asked_the_questions_of_a_file(tmp_path):
+def test_a_stored_model_is_evaluated_on_files(tmp_path):
     store = tmp_path / "store"
     learnt = {"source": "placing_priors", "scenes": 3, "digest": "0" * 64, "terms": "MIT"}
     data = [learnt | {"research_only": False}]
@@ -178,7 +169,7 @@ def test_a_stored_model_is_asked_the_questions_of_a_file(tmp_path):
     assert "--file replaces the scenes of --data and --source" in refused
 
 
-def test_a_version_is_checked_before_the_work(tmp_path):
+def test_the_version_is_checked_before_training(tmp_path):
     store = tmp_path / "store"
     Store(store).publish(description("tiny", "1.2.0"), state())
     config = write_config(tmp_path / "config.toml", CONFIG.model_copy(update={"name": "tiny"}))
@@ -196,14 +187,13 @@ def test_a_version_is_checked_before_the_work(tmp_path):
     assert not (tmp_path / "runs").exists()
 
 
-def test_missing_scenes_of_ones_own_are_looked_for_beside_the_configuration(tmp_path):
+def test_the_error_about_missing_own_scenes_names_their_folder(tmp_path):
     lost = {"data.sources": ("../lost.jsonl",)}
     config = write_config(tmp_path / "config.toml", CONFIG, lost)
     assert "Pass this folder with --data" in invoke("train", config, code=1)
 
 
 def test_labels_outside_the_vocabulary_are_named(tmp_path):
-    """Scenes of one's own, written as requests."""
     scenes = [{"objects": ["bed", "pillow"]}] * 30 + [{"objects": ["bed", "perch"]}] * 3
     (tmp_path / "own.jsonl").write_text("".join(f"{json.dumps(scene)}\n" for scene in scenes))
     own = {"data.sources": ("own.jsonl",), "objects.steps": 1}

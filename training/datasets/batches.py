@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from app.scene import RoleCounts, Vocabulary
+from app.scene import CANONICAL, RoleCounts, Vocabulary
 from training.datasets import EncodedScene
 from training.machines import BoltzmannMachine
 from training.machines.edges import Edges
@@ -19,26 +19,15 @@ from training.machines.edges import Edges
 
 @dataclass(frozen=True)
 class Batch:
-    """A batch of scenes as tensors.
+    """A batch of scenes as tensors. n is the largest number of classes of a scene."""
 
-    Attributes:
-        v: presence of each class, (scenes, classes).
-        classes: indices of the n classes present in a scene, (scenes, n) int64. Padding is -1.
-        counts: number of instances of each class in `classes`, (scenes, n) int64. 0 means that the
-            data source gives no number.
-        holds, observed: value of each relation between two classes of `classes`, and True where it
-            is annotated, (scenes, relations, n, n).
-        room: index of the room type, (scenes,) int64. -1 means unknown.
-        source: index of the data source in `SceneTensors.source_names`, (scenes,) int64.
-    """
-
-    v: Tensor
-    classes: Tensor
-    counts: Tensor
-    holds: Tensor
-    observed: Tensor
-    room: Tensor
-    source: Tensor
+    v: Tensor  # presence of each class, (scenes, classes)
+    classes: Tensor  # indices of the present classes, (scenes, n) int64; padding is -1
+    counts: Tensor  # instances of each of `classes`, (scenes, n) int64; 0: the source gives none
+    holds: Tensor  # value of each relation between two of `classes`, (scenes, relations, n, n)
+    observed: Tensor  # True where a relation is annotated, (scenes, relations, n, n)
+    room: Tensor  # index of the room type, (scenes,) int64; -1 means unknown
+    source: Tensor  # index of the source in `SceneTensors.source_names`, (scenes,) int64
 
     def __len__(self) -> int:
         return len(self.v)
@@ -54,31 +43,23 @@ class Batch:
 
 @dataclass(frozen=True)
 class SceneTensors:
-    """A set of scenes as tensors. `batch` returns some of the scenes.
-
-    Attributes:
-        v: presence of each class, (scenes, classes).
-        room: index of the room type, (scenes,). -1 means unknown.
-        source: index of the data source in annotated_classes and source_names, (scenes,) int64.
-        annotated_classes: True for classes that a data source mentions, (sources, classes) bool.
-        source_names: sorted names of the data sources.
-        weight: weight of each scene in the training of objects, (scenes,).
-        complete: True if the object list of the scene is nearly complete, (scenes,) bool.
-    """
+    """A set of scenes as tensors. `batch` returns some of the scenes."""
 
     scenes: Sequence[EncodedScene]
-    v: Tensor
-    room: Tensor
-    source: Tensor
-    annotated_classes: Tensor
-    source_names: tuple[str, ...] = ()
+    v: Tensor  # presence of each class, (scenes, classes)
+    room: Tensor  # index of the room type, (scenes,) int64; -1 means unknown
+    source: Tensor  # index in annotated_classes and source_names, (scenes,) int64
+    annotated_classes: Tensor  # classes that a data source mentions, (sources, classes) bool
+    source_names: tuple[str, ...] = ()  # sorted
 
     @cached_property
     def weight(self) -> Tensor:
+        """Weight of each scene in the training of objects, (scenes,)."""
         return torch.tensor([scene.weight for scene in self.scenes], dtype=torch.float32)
 
     @cached_property
     def complete(self) -> Tensor:
+        """True if the object list of the scene is nearly complete, (scenes,) bool."""
         return torch.tensor([scene.complete for scene in self.scenes], dtype=torch.bool)
 
     @property
@@ -108,16 +89,8 @@ class SceneTensors:
 def scene_tensors(
     scenes: Sequence[EncodedScene], annotated: dict[str, np.ndarray], size: int
 ) -> SceneTensors:
-    """Return encoded scenes as tensors. `annotated` has the classes, (classes,), of each source.
-
-    Raises:
-        ValueError: `annotated` has no entry for the source of a scene.
-    """
+    """Return encoded scenes as tensors. `annotated` has the classes, (classes,), of each source."""
     names = sorted(annotated)
-    if missing := {scene.source for scene in scenes} - set(names):
-        raise ValueError(
-            f"`annotated` has no entry for the sources {sorted(missing)}; add one for each source"
-        )
     v = torch.zeros(len(scenes), size)
     for row, scene in enumerate(scenes):
         v[row, torch.from_numpy(scene.evidence.classes)] = 1.0
@@ -149,27 +122,19 @@ def relation_units(machine: BoltzmannMachine, batch: Batch) -> tuple[Edges, Tens
 
 def seen_triples(scenes: Sequence[EncodedScene], size: int, minimum: int = 1) -> Tensor:
     """Return the sorted triples (relation, subject, object) of `minimum` or more scenes, (n, 3)."""
-    keys: list[np.ndarray] = []
-    for scene in scenes:
-        relation, subject, object_ = scene.evidence.holds.nonzero()
-        classes = scene.evidence.classes
-        keys.append((relation * size + classes[subject]) * size + classes[object_])
-    values, counts = np.unique(np.concatenate([*keys, np.zeros(0, np.int64)]), return_counts=True)
-    keys_kept = values[counts >= minimum].astype(np.int64)
-    table = np.stack([keys_kept // size // size, keys_kept // size % size, keys_kept % size], 1)
+    shape, keys = (len(CANONICAL), size, size), [np.zeros(0, dtype=np.int64)]
+    for evidence in (scene.evidence for scene in scenes):
+        relation, subject, other = evidence.holds.nonzero()
+        ends = evidence.classes[subject], evidence.classes[other]
+        keys.append(np.ravel_multi_index((relation, *ends), shape))
+    values, counts = np.unique(np.concatenate(keys), return_counts=True)
+    table = np.stack(np.unravel_index(values[counts >= minimum], shape), axis=1)
     return torch.from_numpy(table).to(torch.int32)
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Scenes of the train, validation and test part, and data for the sizes of the machine.
-
-    Attributes:
-        digest: digest of the scenes, their vocabulary and split, for the resumption of a run.
-        words: (V, D) unit word vectors of the classes, 0 where unknown; None without word vectors.
-        vocabulary: the object classes and room types; None if the classes have no names.
-        roles: roles of the classes in the training scenes; None without relations.
-    """
+    """Scenes of the train, validation and test part, and data for the sizes of the machine."""
 
     train: SceneTensors
     validation: SceneTensors
@@ -177,10 +142,10 @@ class TrainingData:
     structure: Tensor
     relations: int
     room_types: int
-    digest: str = ""
-    words: Tensor | None = None
-    vocabulary: Vocabulary | None = None
-    roles: RoleCounts | None = None
+    digest: str = ""  # of the scenes, their vocabulary and split, for the resumption of a run
+    words: Tensor | None = None  # (V, D) unit word vectors of the classes, 0 where unknown
+    vocabulary: Vocabulary | None = None  # None if the classes have no names
+    roles: RoleCounts | None = None  # of the classes in the training scenes
 
     @property
     def classes(self) -> Vocabulary:

@@ -21,7 +21,7 @@ from app.scene.relations import ABOVE, LATERAL, STACKED
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Ints, Rng
 from training.datasets.batches import SceneTensors, subset
-from training.datasets.sources import SOURCES, meaning_of
+from training.datasets.sources import meaning_of, source_of
 
 Triple: TypeAlias = tuple[int, int, int]
 
@@ -67,15 +67,12 @@ def annotated_relations(encoded: EncodedScene) -> Flags:
     """Return a mask of the relations whose truth is annotated without selection bias.
 
     The mask has the shape (relations, instances, instances). It contains a relation only if the
-    data source also shows that the relation does not hold. So people's sentences only show that
-    left and front do not hold between stacked objects. If the objects have positions, left and
-    front are annotated for all pairs, because they do not hold beyond the neighbours. Without
-    positions, an annotator selected the neighbours. A camera frame shows only neighbours. Boxes
-    show too few relations above: people say that a picture hangs above a sofa, although the two
-    boxes do not overlap.
+    data source also shows that the relation does not hold. Sentences only show this for left and
+    front between stacked objects. With positions, left and front do not hold beyond the neighbours;
+    without positions, an annotator selected the neighbours, and a camera frame shows only
+    neighbours. Boxes show too few relations above (docs/decisions/relations-hold.md).
     """
-    positions, source = encoded.instance_positions, SOURCES.get(encoded.source)
-    of_one_view = source is not None and source.of_one_view
+    positions, of_one_view = encoded.instance_positions, source_of(encoded.source).of_one_view
     annotated = encoded.instance_observed.copy()
     stacked = encoded.instance_holds[[*STACKED]].any(0)
     stacked |= stacked.T
@@ -102,14 +99,13 @@ def removed_class(
     if len(removable) < 2:
         return None
     target = int(rng.choice(removable))
-    return target, [k for k, c in enumerate(encoded.instance_classes) if c != target]
+    return target, np.flatnonzero(encoded.instance_classes != target).tolist()
 
 
 def observed_pairs(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[Flags, list[Triple]]:
-    """Draw half of the object pairs of a scene as observed pairs.
+    """Draw half of the object pairs of a scene as observed pairs, with or without relations.
 
-    The draw ignores whether a pair has relations. If relations were drawn instead of pairs, pairs
-    without an observed relation would have fewer relations than other pairs.
+    If relations were drawn, pairs without an observed relation would have fewer than other pairs.
 
     Returns:
         A mask of the unobserved pairs, (instances, instances) bool, and the observed triples
@@ -118,33 +114,30 @@ def observed_pairs(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[F
     size = len(encoded.instance_classes)
     half = np.triu(rng.random((size, size)) < 0.5, 1)
     observed = half | half.T
+    return ~observed, _triples(encoded.instance_holds & observed, encoded, structure)
+
+
+def _triples(holds: Flags, encoded: EncodedScene, structure: Flags) -> list[Triple]:
+    """Return the triples (relation, subject, object) of instances without structure."""
     is_thing = ~structure[encoded.instance_classes]
-    triples = np.argwhere(encoded.instance_holds & observed & is_thing[:, None] & is_thing)
-    return ~observed, [(a, i, j) for a, i, j in triples.tolist()]
+    triples = np.argwhere(holds & is_thing[:, None] & is_thing)
+    return [(a, i, j) for a, i, j in triples.tolist()]
 
 
 class Part(NamedTuple):
-    """A part of a scene that a robot could list.
+    """A part of a scene that a robot could list."""
 
-    Attributes:
-        classes: (n,) listed classes without structure, in ascending order.
-        listed: (n,) number of listed instances of each class, from 1 to `number`.
-        number: (n,) number of instances of each class in the scene, at most `MOST`.
-        room: index of the room type. -1 means that the room type is unknown.
-    """
-
-    classes: Ints
-    listed: Ints
-    number: Ints
-    room: int
+    classes: Ints  # (n,) listed classes without structure, in ascending order
+    listed: Ints  # (n,) number of listed instances of each class, from 1 to `number`
+    number: Ints  # (n,) number of instances of each class in the scene, at most `MOST`
+    room: int  # index of the room type, -1 if unknown
 
 
 def some_instances(encoded: EncodedScene, structure: Flags, rng: Rng) -> Part:
-    """Draw a part of a scene to list.
+    """Draw a part of a scene to list: 25, 50, 75 or 100 % of the classes.
 
-    The part contains 25, 50, 75 or 100 % of the classes. Half of the parts list one instance of
-    each class. The other parts list any number of instances with equal probability, from one to all
-    instances. Half of the parts state the room type.
+    Half of the parts list one instance of each class. The others list from one to all instances,
+    with equal probability. Half of the parts state the room type.
     """
     things = np.flatnonzero(~structure[encoded.evidence.classes])
     share = _LISTED[rng.integers(len(_LISTED))]
@@ -162,9 +155,9 @@ def occupied_place(
 ) -> tuple[int, int] | None:
     """Draw a place that is related to a shown object and contains another object.
 
-    The draw ignores whether the object at the place is shown or hidden. If only places of hidden
-    objects were drawn, a missing object would seem more likely at every place. `shown` is True for
-    shown objects, (instances,). The place has one of these canonical `relations`.
+    The object at the place may be shown or hidden: with hidden objects alone, a missing object
+    would seem more likely at every place. `shown` is True for shown objects, (instances,). The
+    place has one of these canonical `relations`.
 
     Returns:
         The canonical relation of the place, and the index of the shown object, which is the object
@@ -185,8 +178,7 @@ def altered_case(
 ) -> tuple[Scene, Triple | None] | None:
     """Return a scene with observed relations, and their false triple (relation, subject, object).
 
-    Half of the scenes have a false triple in place of a true triple. In the other half, all triples
-    are true, and the false triple is None.
+    In half of the scenes, all triples are true, and the false triple is None.
     """
     triples = draw_true_relations(encoded, structure, rng)
     if triples is None:
@@ -201,11 +193,11 @@ def draw_true_relations(encoded: EncodedScene, structure: Flags, rng: Rng) -> li
 
     The result is None if the scene has fewer than two: an altered triple needs other evidence.
     """
-    is_thing = ~structure[encoded.instance_classes]
-    triples = np.argwhere(encoded.instance_holds & is_thing[:, None] & is_thing)
+    triples = _triples(encoded.instance_holds, encoded, structure)
     if len(triples) > _MOST_TRIPLES:
-        triples = triples[np.sort(rng.choice(len(triples), _MOST_TRIPLES, replace=False))]
-    return [(a, i, j) for a, i, j in triples.tolist()] if len(triples) > 1 else None
+        drawn = np.sort(rng.choice(len(triples), _MOST_TRIPLES, replace=False))
+        triples = [triples[k] for k in drawn]
+    return triples if len(triples) > 1 else None
 
 
 def altered_scene(
@@ -260,10 +252,10 @@ def counted_classes(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> d
         several[scene.source] += int((evidence.counts[is_counted] > 1).sum())
         is_repeated = repeated.setdefault(scene.source, np.zeros(len(vocabulary), dtype=np.bool_))
         is_repeated[evidence.classes[evidence.counts > 1]] = True
-    counting = [source for source in repeated if several[source] > _COUNTING * entries[source]]
-    partly = {name for name, source in SOURCES.items() if source.counts_movables}
+    counting = [name for name in repeated if several[name] > _COUNTING * entries[name]]
     return {
-        source: things & repeated[source] if source in partly else things for source in counting
+        name: things & repeated[name] if source_of(name).counts_movables else things
+        for name in counting
     }
 
 

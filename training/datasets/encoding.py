@@ -9,10 +9,9 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from app.scene import (
     CANONICAL,
@@ -33,10 +32,10 @@ from app.scene.roles import IN, ON, likely_role
 from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN, Heights, stands_of
 from scene_client.image_plane import are_neighbours, relation_between
 from training.datasets.array_types import Flags, Floats, Ints
-from training.datasets.names import Names, curated_names
-from training.datasets.records import AnnotatedObject, AnnotatedScene
+from training.datasets.names import curated_names
+from training.datasets.records import AnnotatedObject, AnnotatedScene, Box2d
 from training.datasets.roles import lift_of
-from training.datasets.sources import SOURCES, Meaning, meaning_of
+from training.datasets.sources import Meaning, meaning_of, source_of
 
 A = len(CANONICAL)
 # Roles of an object at its support.
@@ -48,62 +47,38 @@ _IN_THE_IMAGE: Final = [CANONICAL.index("left"), CANONICAL.index("above")]
 class EncodedScene:
     """One scene, encoded with a vocabulary.
 
-    Attributes:
-        scene_id, source, group: as in the annotated scene.
-        room_type: index of the room type. -1 means that the room type is unknown.
-        evidence: classes of the scene, and relations between classes.
-        instance_classes: class index of each object instance, (instances,) int64.
-        instance_holds, instance_observed: True where a relation between two instances holds, and
-            where its truth is known, (relations, instances, instances) bool.
-        unknown: distinct labels outside the vocabulary, sorted. Their objects are left out.
-        instance_positions: centres of the instances in metres, (instances, 3), in the viewer axes
-            from which relations were derived. NaN means an unknown centre. None means that the
-            relations do not come from positions.
-        instance_sizes: extents of the instances in metres before their rotation, (instances, 3).
-            NaN means an unknown size. None as for the positions.
-        instance_yaws: rotations of the instances about the z axis in radians, (instances,), in the
-            same viewer axes. None as for the positions.
-        instance_stands: what holds each instance, (instances,); see `app.scene.stands`.
-        weight: weight of the scene in the training of objects.
-        complete: True if the object list of the scene is nearly complete; see `Meaning`.
+    The boxes are in the viewer axes from which relations were derived: NaN means unknown, and None
+    that the relations do not come from positions.
     """
 
     scene_id: str
     source: str
     group: str
-    room_type: int
-    evidence: ClassEvidence
-    instance_classes: Ints
-    instance_holds: Flags
-    instance_observed: Flags
-    unknown: tuple[str, ...]
-    instance_stands: Ints
-    instance_positions: Floats | None = None
-    instance_sizes: Floats | None = None
-    instance_yaws: Floats | None = None
-    weight: float = 1.0
-    complete: bool = True
+    room_type: int  # index, -1 if unknown
+    evidence: ClassEvidence  # classes, and relations between classes
+    instance_classes: Ints  # class index of each object instance, (instances,)
+    instance_holds: Flags  # relations that hold, (relations, instances, instances)
+    instance_observed: Flags  # relations whose truth is known, (relations, instances, instances)
+    unknown: tuple[str, ...]  # distinct labels outside the vocabulary, sorted; they are left out
+    instance_stands: Ints  # what holds each instance, (instances,); see `app.scene.stands`
+    instance_positions: Floats | None = None  # centres in metres, (instances, 3)
+    instance_sizes: Floats | None = None  # extents before the rotation in metres, (instances, 3)
+    instance_yaws: Floats | None = None  # rotations about the z axis in radians, (instances,)
+    weight: float = 1.0  # in the training of objects
+    complete: bool = True  # the object list is nearly complete; see `Meaning`
 
     def only(self, kept: Flags) -> EncodedScene:
         """Return the scene with only some of its instances, (instances,) bool."""
-        index = np.flatnonzero(kept)
-        holds = self.instance_holds[:, index][:, :, index]
-        observed = self.instance_observed[:, index][:, :, index]
-        classes = self.instance_classes[index]
-        boxes = (self.instance_positions, self.instance_sizes, self.instance_yaws)
-        positions, sizes, yaws = (None if part is None else part[index] for part in boxes)
-        room = self.evidence.room_type
-        return replace(
-            self,
-            evidence=pool_instances(classes, np.ones(len(index)), holds, observed, room),
-            instance_classes=classes,
-            instance_holds=holds,
-            instance_observed=observed,
-            instance_stands=self.instance_stands[index],
-            instance_positions=positions,
-            instance_sizes=sizes,
-            instance_yaws=yaws,
-        )
+        index, room = np.flatnonzero(kept), self.evidence.room_type
+        names = ("classes", "stands", "positions", "sizes", "yaws")
+        arrays = {f"instance_{name}": getattr(self, f"instance_{name}") for name in names}
+        arrays = {name: None if array is None else array[index] for name, array in arrays.items()}
+        tables = (self.instance_holds, self.instance_observed)
+        holds, observed = (table[:, index][:, :, index] for table in tables)
+        classes = arrays["instance_classes"]
+        evidence = pool_instances(classes, np.ones(len(index)), holds, observed, room)
+        arrays |= {"instance_holds": holds, "instance_observed": observed}
+        return replace(self, evidence=evidence, **arrays)
 
 
 def encode(
@@ -121,15 +96,12 @@ def encode(
     - Support links. The object is on top of its support or inside it. All other relations of the
       pair are false. If the object reaches into its support, the roles of the two classes decide.
 
-    The module `training.datasets.sources` defines for each data source which unlisted relations are
-    false, and which labels are ignored.
-
-    Relations of structure classes are unobserved.
+    `training.datasets.sources` defines which unlisted relations of a data source are false, and
+    which labels are ignored. Relations of structure classes are unobserved.
     """
-    encoder = _Encoder(vocabulary, curated_names(), roles)
-    scene_list = list(scenes)
-    groups = Counter((scene.source, scene.group) for scene in scene_list)
-    return [encoder(scene, groups[scene.source, scene.group]) for scene in scene_list]
+    encoder, scenes = _Encoder(vocabulary, roles), list(scenes)
+    groups = Counter((scene.source, scene.group) for scene in scenes)
+    return [encoder(scene, groups[scene.source, scene.group]) for scene in scenes]
 
 
 def annotated_classes(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> dict[str, Flags]:
@@ -137,66 +109,58 @@ def annotated_classes(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) ->
 
     If a scene does not list an annotated class, the class is absent. A data source annotates the
     classes that it mentions at least once. A source with an open vocabulary annotates all classes.
-    Labels in `Source.left_out` and `Source.coarse` are excluded. The initial bias of a class is its
-    frequency in the sources that annotate the class. The evaluation of generated scenes uses only
-    annotated classes.
+    Labels in `Source.left_out` and `Source.coarse` are excluded.
     """
     annotated: dict[str, Flags] = {}
     for scene in scenes:
         if scene.source not in annotated:
-            source = SOURCES.get(scene.source)
-            start = source is not None and source.open_vocabulary
+            start = source_of(scene.source).open_vocabulary
             annotated[scene.source] = np.full(len(vocabulary), start)
         annotated[scene.source][scene.instance_classes] = True
     for name, classes in annotated.items():
-        for kind in ("left_out", "coarse"):
-            classes[_indices_of(kind, name, vocabulary)] = False
+        source = source_of(name)
+        classes[_classes_named((*source.left_out, *source.coarse), vocabulary)] = False
     return annotated
 
 
-def _indices_of(
-    kind: Literal["left_out", "coarse"], source: str, vocabulary: Vocabulary
-) -> list[int]:
-    """Return the indices of the classes in `Source.left_out` or `Source.coarse`.
+def _classes_named(labels: Iterable[str], vocabulary: Vocabulary) -> list[int]:
+    """Return the classes with these labels.
 
     A name that is only an alias is skipped, because the class then contains other objects too.
     """
-    labels: tuple[str, ...] = getattr(SOURCES[source], kind) if source in SOURCES else ()
     return [vocabulary.labels.index(label) for label in labels if label in vocabulary.labels]
 
 
 class _Encoder:
-    def __init__(self, vocabulary: Vocabulary, names: Names, roles: RoleCounts | None) -> None:
-        self.vocabulary = vocabulary
-        self.roles = roles
-        self.names = names
+    def __init__(self, vocabulary: Vocabulary, roles: RoleCounts | None) -> None:
+        self.vocabulary, self.roles = vocabulary, roles
         self.index = cache(vocabulary.index)
 
     def __call__(self, scene: AnnotatedScene, group_size: int) -> EncodedScene:
         meaning = meaning_of(scene.source, listed=scene.relations is not None)
-        left_out = _indices_of("left_out", scene.source, self.vocabulary)
-        classes = [self.index(thing.label) for thing in scene.objects]
-        kept = [i for i, c in enumerate(classes) if c is not None and c not in left_out]
-        indices = np.array([-1 if c is None else c for c in classes], dtype=np.int64)
+        left_out = _classes_named(source_of(scene.source).left_out, self.vocabulary)
+        found = [self.index(thing.label) for thing in scene.objects]
+        kept = [i for i, c in enumerate(found) if c is not None and c not in left_out]
+        indices = np.array([-1 if c is None else c for c in found], dtype=np.int64)
         relations, boxes = _relations(scene, meaning, indices, self.roles)
-        stands = _stands(scene, relations, boxes, self._is_structure(indices))[kept]
+        structure = (indices >= 0) & self.vocabulary.structure[indices]
+        stands = _stands(scene, relations, boxes, structure)[kept]
         holds = relations.holds[:, kept][:, :, kept]
         observed = relations.observed[:, kept][:, :, kept]
-        instance_classes = np.array([classes[i] for i in kept], dtype=np.int64)
+        classes = indices[kept]
         # Relations of structure classes are uninformative: every room has walls on all sides.
-        structure = self.vocabulary.structure[instance_classes]
         for array in (holds, observed):
-            array[:, structure] = array[:, :, structure] = False
-        room = self.names.canonical_room(scene.room_type)
+            array[:, structure[kept]] = array[:, :, structure[kept]] = False
+        room = curated_names().canonical_room(scene.room_type)
         room_type = None if room is None else self.vocabulary.room_index(room)
-        evidence = pool_instances(instance_classes, np.ones(len(kept)), holds, observed, room_type)
+        evidence = pool_instances(classes, np.ones(len(kept)), holds, observed, room_type)
         if any(thing.count > 1 for thing in scene.objects):
             # One object entry can mean several instances.
-            index = np.searchsorted(evidence.classes, instance_classes)
             counts = np.zeros_like(evidence.counts)
-            np.add.at(counts, index, [scene.objects[i].count for i in kept])
+            numbers = [scene.objects[i].count for i in kept]
+            np.add.at(counts, np.searchsorted(evidence.classes, classes), numbers)
             evidence = replace(evidence, counts=counts)
-        labels = [thing.label for thing in scene.objects if self.index(thing.label) is None]
+        labels = [thing.label for thing, c in zip(scene.objects, found, strict=True) if c is None]
         share = (meaning.scenes_per_group or group_size) / group_size
         return EncodedScene(
             scene_id=scene.scene_id,
@@ -204,7 +168,7 @@ class _Encoder:
             group=scene.group,
             room_type=-1 if room_type is None else room_type,
             evidence=evidence,
-            instance_classes=instance_classes,
+            instance_classes=classes,
             instance_holds=holds,
             instance_observed=observed,
             instance_stands=stands,
@@ -217,9 +181,6 @@ class _Encoder:
             complete=meaning.complete_objects,
         )
 
-    def _is_structure(self, classes: Ints) -> Flags:
-        return (classes >= 0) & self.vocabulary.structure[np.maximum(classes, 0)]
-
 
 def _stands(
     scene: AnnotatedScene, relations: PoseRelations, boxes: Floats | None, structure: Flags
@@ -231,10 +192,8 @@ def _stands(
     if boxes is not None:
         heights = Heights.of(boxes[:, :3], boxes[:, 3:6])
         if np.isfinite(heights.bottoms).any():
-            stands = stands_of(
-                *(relations.holds, relations.observed, heights),
-                floor=float(np.nanmin(heights.bottoms)),
-            )
+            floor = float(np.nanmin(heights.bottoms))
+            stands = stands_of(relations.holds, relations.observed, heights, floor=floor)
             stands[[thing.supported_by is not None for thing in scene.objects]] = SUPPORTED
             return stands
     stands = np.full(len(scene.objects), UNKNOWN)
@@ -248,10 +207,7 @@ def _stands(
 def _relations(
     scene: AnnotatedScene, meaning: Meaning, classes: Ints, roles: RoleCounts | None
 ) -> tuple[PoseRelations, Floats | None]:
-    """Derive all relations, as `encode` describes. Return them and their boxes, or None.
-
-    The columns of the boxes, (objects, 7), are the position, the size and the yaw.
-    """
+    """Return all relations, and the boxes (objects, 7) (position, size, yaw) or None."""
     n, boxes = len(scene.objects), None
     if scene.relations is not None:
         return _from_lists(scene, scene.relations, meaning), None
@@ -352,20 +308,12 @@ def room_viewpoint(scene_id: str, positions: Floats) -> Viewpoint:
     """Return a viewpoint at the middle of one side of the room, facing inwards.
 
     The room is the bounding box of the object centres in metres, (objects, 3). Centres with NaN are
-    ignored. A hash of the scene id selects the side, so the viewpoint of a scene never changes.
-    Over many scenes, all four sides occur.
-
-    Raises:
-        ValueError: no object has a position.
+    ignored, and at least one centre must be known. A hash of the scene id selects the side, so the
+    viewpoint of a scene never changes. Over many scenes, all four sides occur.
     """
-    centres = positions[np.isfinite(positions).all(axis=1), :2]
-    if not len(centres):
-        raise ValueError(
-            f"scene {scene_id!r} has no object with a position; a viewpoint needs at least one"
-        )
-    (x0, y0), (x1, y1) = centres.min(axis=0).tolist(), centres.max(axis=0).tolist()
+    (x0, y0), (x1, y1) = np.nanmin(positions[:, :2], 0), np.nanmax(positions[:, :2], 0)
     side = hashlib.sha256(scene_id.encode()).digest()[0] % 4
-    return side_viewpoints(x0, y0, x1, y1)[side]
+    return side_viewpoints(float(x0), float(y0), float(x1), float(y1))[side]
 
 
 def side_viewpoints(x0: float, y0: float, x1: float, y1: float) -> tuple[Viewpoint, ...]:
@@ -379,24 +327,15 @@ def side_viewpoints(x0: float, y0: float, x1: float, y1: float) -> tuple[Viewpoi
     )
 
 
-def derive_from_boxes(boxes: ArrayLike) -> PoseRelations:
+def derive_from_boxes(boxes: Sequence[Box2d]) -> PoseRelations:
     """Derive the relations left and above between image boxes (`scene_client.image_plane`).
 
-    The boxes (xmin, ymin, xmax, ymax) have y downwards, (objects, 4). NaN means no box.
-
-    Raises:
-        ValueError: ``boxes`` has a wrong shape.
+    The boxes (xmin, ymin, xmax, ymax) have y downwards. NaN means no box.
     """
-    corners = np.asarray(boxes, dtype=np.float64)
-    n = len(corners)
-    if corners.shape != (n, 4) and n:
-        raise ValueError(f"boxes has shape {corners.shape}, must be {(n, 4)}")
-    rows = [tuple(row) for row in corners.tolist()]
-    holds, observed = np.zeros((2, A, n, n), dtype=np.bool_)
-    for i, j in itertools.combinations(range(n), 2):
-        if not are_neighbours(rows[i], rows[j]):
-            continue
-        observed[_IN_THE_IMAGE, i, j] = observed[_IN_THE_IMAGE, j, i] = True
-        if (relation := relation_between(rows[i], rows[j])) is not None:
-            holds[canonicalise(i, relation, j)] = True
+    holds, observed = np.zeros((2, A, len(boxes), len(boxes)), dtype=np.bool_)
+    for i, j in itertools.combinations(range(len(boxes)), 2):
+        if are_neighbours(boxes[i], boxes[j]):
+            observed[_IN_THE_IMAGE, i, j] = observed[_IN_THE_IMAGE, j, i] = True
+            if (relation := relation_between(boxes[i], boxes[j])) is not None:
+                holds[canonicalise(i, relation, j)] = True
     return PoseRelations(holds, observed)

@@ -7,6 +7,7 @@ import json
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -51,11 +52,53 @@ def check_size(path: Path, size: int, limit: int) -> None:
         raise DatasetError(path, "", f"is larger than {limit // 2**20} MiB after decompression")
 
 
-def load_json(path: Path) -> Any:
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A value in a file, and its position, such as ``scans[3].objects``."""
+
+    path: Path
+    value: Any
+    where: str = ""
+
+    def take(self, name: str, kind: type | tuple[type, ...] = object) -> Any:
+        """Return a field of a JSON object, or raise a DatasetError if its type differs."""
+        if not isinstance(self.value, dict):
+            raise self.error(f"must be an object, not {type(self.value).__name__}")
+        if name not in self.value:
+            raise self.error(f"lacks {name!r}")
+        value = self.value[name]
+        if not isinstance(value, kind) or isinstance(value, bool):
+            kinds = (kind,) if isinstance(kind, type) else kind
+            names = " or ".join(k.__name__ for k in kinds)
+            raise self.error(f"{name!r} must be of type {names}, not {value!r}")
+        return value
+
+    def entries(self, name: str) -> list[Node]:
+        """Return the entries of the list in a field of a JSON object."""
+        start = f"{self.where}.{name}" if self.where else name
+        entries = enumerate(self.take(name, list))
+        return [Node(self.path, entry, f"{start}[{number}]") for number, entry in entries]
+
+    def error(self, problem: object) -> DatasetError:
+        """Return an error that names the file and the position."""
+        return DatasetError(self.path, self.where, str(problem))
+
+    @contextmanager
+    def located(self) -> Iterator[None]:
+        """Convert a TypeError or ValueError in the `with` block to a DatasetError."""
+        try:
+            yield
+        except DatasetError:
+            raise
+        except (TypeError, ValueError) as error:
+            raise self.error(error) from error
+
+
+def load_json(path: Path) -> Node:
     """Read a JSON file of at most `MAX_BYTES`, or raise a DatasetError."""
     try:
         check_size(path, path.stat().st_size, MAX_BYTES)
-        return json.loads(path.read_text(encoding="utf-8"), parse_int=bounded_int)
+        return Node(path, json.loads(path.read_text(encoding="utf-8"), parse_int=bounded_int))
     except DatasetError:
         raise
     except (OSError, UnicodeDecodeError) as error:
@@ -71,27 +114,3 @@ def bounded_int(digits: str) -> int:
     if len(digits.lstrip("-")) > MAX_DIGITS:
         raise ValueError(f"an integer of {len(digits)} digits is too long: {digits[:10]}…")
     return int(digits)
-
-
-@contextmanager
-def located(path: Path, where: str) -> Iterator[None]:
-    """Convert a TypeError or ValueError in the `with` block to a DatasetError with its place."""
-    try:
-        yield
-    except DatasetError:
-        raise
-    except (TypeError, ValueError) as error:
-        raise DatasetError(path, where, str(error)) from error
-
-
-def take(path: Path, where: str, values: Any, name: str, kind: type | tuple[type, ...]) -> Any:
-    """Return the field ``name`` of a JSON object, or raise a DatasetError if its type differs."""
-    if not isinstance(values, dict):
-        raise DatasetError(path, where, f"must be an object, not {type(values).__name__}")
-    if name not in values:
-        raise DatasetError(path, where, f"lacks {name!r}")
-    value = values[name]
-    if not isinstance(value, kind) or isinstance(value, bool):
-        names = kind.__name__ if isinstance(kind, type) else " or ".join(k.__name__ for k in kind)
-        raise DatasetError(path, where, f"{name!r} must be of type {names}, not {value!r}")
-    return value

@@ -1,20 +1,7 @@
 """Read and write scenes as JSON lines, plain or gzipped, the native format of this project.
 
-Each line contains one scene, a JSON object with these fields ("?" marks an optional field):
-
-- ``scene_id``? (default: file name and line, such as ``scenes.jsonl:3``), ``source``?, ``group``?,
-  ``room_type``? (may be null);
-- ``objects``: [{``id``?, ``label``, ``position``?, ``size``?, ``yaw``?, ``supported_by``?,
-  ``box2d``?}], or labels. Positions and sizes are [x, y, z] or {x, y, z}. An object without id gets
-  the id that it has in a request: its label, with a number if several objects have the label;
-- ``relations``?: [[subject, predicate, object]] or [{``subject``, ``relation``, ``object``}], with
-  ids or unambiguous labels; null if relations were not annotated;
-- ``false_relations``?: relations that do not hold, in the same form;
-- ``counts``?: {label: number of instances} for labels of which all instances share one entry in
-  ``objects``;
-- ``viewer_frame``?: true if positions are in viewer axes (x away from the viewer, y left, z up).
-
-A line has at most `MAX_LINE` bytes.
+docs/training.md (The scenes) describes the fields. A scene without ``scene_id`` is named after its
+file and line, such as ``scenes.jsonl:3``. A line has at most `MAX_LINE` bytes.
 """
 
 from __future__ import annotations
@@ -34,10 +21,8 @@ from training.datasets.sources import relations_of, supported_subjects
 
 MAX_LINE: Final = 8 * 2**20
 
-_SCENE_FIELDS = {
-    *("scene_id", "source", "group", "room_type", "objects", "relations", "false_relations"),
-    *("counts", "viewer_frame"),
-}
+_NAMES = ("scene_id", "source", "group", "room_type")
+_SCENE_FIELDS = {*_NAMES, "objects", "relations", "false_relations", "counts", "viewer_frame"}
 _OBJECT_FIELDS = {"id", "label", "position", "size", "yaw", "supported_by", "box2d"}
 
 # Data sources with positions in viewer axes whose files were written before the field
@@ -61,18 +46,15 @@ def scan_jsonl(path: Path) -> Iterator[AnnotatedScene | DatasetError]:
     for number, line in enumerate(read_lines(path, MAX_LINE), 1):
         if not line.strip():
             continue
-        where = f"line {number}"
         try:
             scene = _parse_scene(json.loads(line, parse_int=bounded_int), f"{path.name}:{number}")
             first = line_of.setdefault((scene.source, scene.scene_id), number)
             if first != number:
                 raise ValueError(f"scene {scene.scene_id!r} is on line {first} already")
-        except json.JSONDecodeError as error:
-            yield DatasetError(path, where, f"the line is not JSON: {error}")
-        except (ValueError, RecursionError) as error:
-            yield DatasetError(path, where, str(error))
-        else:
             yield scene
+        except (ValueError, RecursionError) as error:
+            syntax = "the line is not JSON: " if isinstance(error, json.JSONDecodeError) else ""
+            yield DatasetError(path, f"line {number}", f"{syntax}{error}")
 
 
 def write_jsonl(scenes: Iterable[AnnotatedScene], path: Path) -> None:
@@ -86,30 +68,25 @@ def write_jsonl(scenes: Iterable[AnnotatedScene], path: Path) -> None:
 def _fields_of(scene: AnnotatedScene) -> dict[str, Any]:
     """Return the fields of a scene as JSON values. Fields with an unknown value are left out."""
     ids = [thing.id for thing in scene.objects]
-
-    def with_ids(relations: Iterable[tuple[int, str, int]]) -> list[list[str]]:
-        return [[ids[s], r, ids[o]] for s, r, o in relations]
-
-    values = {name: getattr(scene, name) for name in ("scene_id", "source", "group", "room_type")}
+    values = {name: getattr(scene, name) for name in _NAMES}
     values["objects"] = [
         {name: x for name, x in asdict(thing).items() if x is not None and name != "count"}
         for thing in scene.objects
     ]
-    values["relations"] = None if scene.relations is None else with_ids(scene.relations)
-    if scene.false_relations:
-        values["false_relations"] = with_ids(scene.false_relations)
+    values["relations"] = None
+    for name in ("relations", "false_relations"):
+        if (triples := getattr(scene, name)) or (name == "relations" and triples is not None):
+            values[name] = [[ids[s], r, ids[o]] for s, r, o in triples]
     if counts := {thing.label: thing.count for thing in scene.objects if thing.count > 1}:
         values["counts"] = counts
     return values | ({"viewer_frame": True} if scene.viewer_frame else {})
 
 
 def _parse_scene(values: Any, default_id: str) -> AnnotatedScene:
-    _check_fields("a scene", values, {"objects"}, _SCENE_FIELDS)
+    _check_fields("a scene", values, "objects", _SCENE_FIELDS)
     scene_id = _require_text("scene_id", values.get("scene_id", default_id))
     source = _require_text("source", values.get("source", "jsonl"))
-    if not isinstance(values["objects"], list):
-        raise ValueError("objects must be a list")
-    objects = _with_counts(_parse_objects(values["objects"]), values.get("counts"))
+    objects = _parse_objects(values["objects"], values.get("counts"))
     viewer_frame = values.get("viewer_frame", source in _VIEWER_SOURCES)
     if not isinstance(viewer_frame, bool):
         raise ValueError(f"viewer_frame must be true or false, not {viewer_frame!r}")
@@ -130,27 +107,12 @@ def _parse_scene(values: Any, default_id: str) -> AnnotatedScene:
     )
 
 
-def _with_counts(objects: tuple[AnnotatedObject, ...], counts: Any) -> tuple[AnnotatedObject, ...]:
-    if counts is None:
-        return objects
-    if not isinstance(counts, Mapping):
-        raise ValueError("counts must be null, or an object that maps labels to numbers")
-    listed = Counter(thing.label for thing in objects)
-    for label, count in counts.items():
-        if isinstance(count, bool) or not isinstance(count, int):
-            raise ValueError(f"the count of {label!r} must be an integer, not {count!r}")
-        if listed[label] != 1:
-            raise ValueError(
-                f"counts contains the label {label!r}, which needs exactly one object, but the "
-                f"scene has {listed[label]}"
-            )
-    return tuple(replace(thing, count=counts.get(thing.label, 1)) for thing in objects)
-
-
-def _parse_objects(entries: list[Any]) -> tuple[AnnotatedObject, ...]:
+def _parse_objects(entries: Any, counts: Any) -> tuple[AnnotatedObject, ...]:
+    if not isinstance(entries, list):
+        raise ValueError("objects must be a list")
     things = [{"label": entry} if isinstance(entry, str) else entry for entry in entries]
     for thing in things:
-        _check_fields("an object", thing, {"label"}, _OBJECT_FIELDS)
+        _check_fields("an object", thing, "label", _OBJECT_FIELDS)
     nameless = Counter(_require_text("label", t["label"]) for t in things if t.get("id") is None)
     ids = {_require_id(thing["id"]) for thing in things if thing.get("id") is not None}
     objects = []
@@ -163,25 +125,40 @@ def _parse_objects(entries: list[Any]) -> tuple[AnnotatedObject, ...]:
                 name = f"{label}_{number}"
             ids.add(name)
         objects.append(_parse_object(thing, _require_id(name)))
-    return tuple(objects)
+    count_of = _parse_counts({} if counts is None else counts, objects)
+    return tuple(replace(thing, count=count_of.get(thing.label, 1)) for thing in objects)
 
 
 def _parse_object(values: Mapping[str, Any], name: str) -> AnnotatedObject:
-    supported_by = values.get("supported_by")
-    yaw = values.get("yaw", 0.0)
+    supported_by, yaw = values.get("supported_by"), values.get("yaw", 0.0)
     if not _is_number(yaw):
         raise ValueError(f"yaw must be a number, not {yaw!r}")
-    size = _parse_vector("size", values.get("size"))
+    size = _parse_numbers("size", values.get("size"), 3)
     return AnnotatedObject(
         id=name,
         label=_require_text("label", values["label"]),
-        position=_parse_vector("position", values.get("position")),
+        position=_parse_numbers("position", values.get("position"), 3),
         # Sides that are all below 1 mm mean an unknown size, as in a request.
         size=None if size and all(abs(side) < SMALLEST for side in size) else size,
         yaw=float(yaw),
         supported_by=None if supported_by is None else _require_id(supported_by),
         box2d=_parse_numbers("box2d", values.get("box2d"), 4),
     )
+
+
+def _parse_counts(counts: Any, objects: Iterable[AnnotatedObject]) -> Mapping[str, int]:
+    if not isinstance(counts, Mapping):
+        raise ValueError("counts must be null, or an object that maps labels to numbers")
+    listed = Counter(thing.label for thing in objects)
+    for label, count in counts.items():
+        if isinstance(count, bool) or not isinstance(count, int):
+            raise ValueError(f"the count of {label!r} must be an integer, not {count!r}")
+        if listed[label] != 1:
+            raise ValueError(
+                f"counts contains the label {label!r}, which needs exactly one object, but the "
+                f"scene has {listed[label]}"
+            )
+    return counts
 
 
 def _parse_triples(
@@ -211,11 +188,11 @@ def _parse_triples(
     return triples
 
 
-def _check_fields(what: str, values: Any, needed: set[str], allowed: set[str]) -> None:
+def _check_fields(what: str, values: Any, needed: str, allowed: set[str]) -> None:
     if not isinstance(values, Mapping):
         raise ValueError(f"{what} must be a JSON object, not {type(values).__name__}")
-    if missing := sorted(needed - set(values)):
-        raise ValueError(f"{what} lacks {', '.join(missing)}")
+    if needed not in values:
+        raise ValueError(f"{what} lacks {needed}")
     if unknown := sorted(set(values) - allowed):
         raise ValueError(f"{what} has unknown fields: {', '.join(unknown)}")
 
@@ -236,15 +213,12 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def _parse_vector(name: str, values: Any) -> Any:
-    if isinstance(values, dict) and set(values) == {"x", "y", "z"}:
-        values = [values[axis] for axis in "xyz"]
-    return _parse_numbers(name, values, 3)
-
-
 def _parse_numbers(name: str, values: Any, length: int) -> Any:
+    """Return a list of numbers, or the values of an object with the keys x, y and z, as a tuple."""
     if values is None:
         return None
+    if length == 3 and isinstance(values, dict) and set(values) == {"x", "y", "z"}:
+        values = [values[axis] for axis in "xyz"]
     if not isinstance(values, list) or len(values) != length or not all(map(_is_number, values)):
         raise ValueError(f"{name} must be a list of {length} numbers, not {values!r}")
-    return tuple(float(value) for value in values)
+    return tuple(map(float, values))

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from app.scene import Scene, SceneObject
+from app.scene import Scene
 from app.scene.geometry import CONTACT, overlap_and_gap
 from app.scene.relations import ON_TOP, SUPPORTS
 from training.datasets.array_types import Flags, Floats, Rng
@@ -44,15 +44,14 @@ def posed_scene(encoded: EncodedScene) -> Scene:
     """
     centre, size, yaw = _poses(encoded)
     bare = scene_of(encoded, range(len(yaw)), ())
-    poses = zip(bare.objects, centre, size, yaw.tolist(), strict=True)
     objects = tuple(
-        SceneObject(
-            *(thing.id, thing.label, thing.class_index),
+        replace(
+            thing,
             position=_point(at) if np.isfinite(at).all() else None,
             size=_point(extents) if np.isfinite(extents).all() else None,
             yaw=turn,
         )
-        for thing, at, extents, turn in poses
+        for thing, at, extents, turn in zip(bare.objects, centre, size, yaw.tolist(), strict=True)
     )
     return replace(bare, objects=objects)
 
@@ -95,24 +94,21 @@ def moved_by_triple(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[
     strange: Flags = _strangers(encoded) & ~structure[encoded.instance_classes]
     for index in rng.permutation(len(supports)).tolist():
         i, j = supports[index]
-        anchors = np.flatnonzero(strange[i])
-        if not len(anchors):
-            continue
-        k = int(rng.choice(anchors))
-        kept = [
-            (a, x, y)
-            for a, x, y in triples
-            if {x, y} not in ({i, j}, {i, k}) and not (a in SUPPORTS and x == i)
-        ]
-        every = range(len(encoded.instance_classes))
-        return scene_of(encoded, every, [*kept, (ON_TOP, i, k)]), i
+        if len(anchors := np.flatnonzero(strange[i])):
+            k = int(rng.choice(anchors))
+            kept = [
+                (a, x, y)
+                for a, x, y in triples
+                if {x, y} not in ({i, j}, {i, k}) and not (a in SUPPORTS and x == i)
+            ]
+            every = range(len(encoded.instance_classes))
+            return scene_of(encoded, every, [*kept, (ON_TOP, i, k)]), i
     return None
 
 
 def _supports(encoded: EncodedScene) -> Flags:
     """Return which instances are on-top of or inside which instances, (instances, instances)."""
-    holds = encoded.instance_holds
-    return np.any(holds[[a for a in SUPPORTS if a < len(holds)]], axis=0)
+    return np.any(encoded.instance_holds[[*SUPPORTS]], axis=0)
 
 
 def _strangers(encoded: EncodedScene) -> Flags:
@@ -130,16 +126,11 @@ def moved_by_pose(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[Sc
 
     The scene has poses and no relations. Objects on the moved object move with it. In two thirds of
     the cases, the object stands on or in a larger object, its supporter. With equal probability, it
-    moves to one of three places:
-
-    - on another object, whose footprint is at least as large;
-    - to the floor beside its supporter, at a spot without other objects;
-    - under its supporter, if it is not higher.
-
-    In one third, an object on the floor moves onto another object. This object is at least .3 m
-    high, and its footprint has at least half of the area. Every move changes the height by at least
-    .3 m, except a move onto another object. If a place does not exist, another one is tried. The
-    result is None if the scene has none.
+    moves onto another object, whose footprint is at least as large; to a free spot of the floor
+    beside its supporter; or under its supporter, if it is not higher. The last two moves change the
+    height by at least .3 m. In one third, an object on the floor moves onto another object. This
+    object is at least .3 m high, and its footprint has at least half of the area. If a place does
+    not exist, another one is tried. The result is None if the scene has none.
 
     Raises:
         ValueError: the relations of the scene do not come from positions.
@@ -168,51 +159,32 @@ def _shifted(scene: Scene, group: Flags, step: Floats) -> Scene:
 
 @dataclass(frozen=True, eq=False)
 class _Boxes:
-    """The boxes of n instances.
+    """The boxes of n instances."""
 
-    Attributes:
-        centre, size: centres, and extents before the rotation by `yaw`, (n, 3).
-        usable: True for instances with position and size that are not structure, (n,).
-        supports: True if instance i stands on or in instance j, (n, n).
-        strange: pairs of usable instances whose classes never support each other, (n, n).
-    """
-
-    centre: Floats
-    size: Floats
-    yaw: Floats
-    usable: Flags
-    supports: Flags
-    strange: Flags
+    centre: Floats  # (n, 3)
+    size: Floats  # extents before the rotation by `yaw`, (n, 3)
+    yaw: Floats  # (n,)
+    bottom: Floats  # height, (n,)
+    top: Floats  # height, (n,)
+    area: Floats  # of the footprint, (n,)
+    usable: Flags  # instances with position and size that are not structure, (n,)
+    floor: float  # lowest bottom of the usable instances
+    supports: Flags  # instance i stands on or in instance j, (n, n)
+    strange: Flags  # pairs of usable instances whose classes never support each other, (n, n)
 
     @classmethod
     def of(cls, encoded: EncodedScene, structure: Flags) -> _Boxes:
         centre, size, yaw = _poses(encoded)
+        bottom, top = centre[:, 2] - size[:, 2] / 2, centre[:, 2] + size[:, 2] / 2
+        area = size[:, 0] * size[:, 1]
         usable = np.isfinite(centre).all(1) & np.isfinite(size).all(1)
         usable &= ~structure[encoded.instance_classes]
-        strange = _strangers(encoded) & usable[:, None] & usable
-        boxes = cls(centre, size, yaw, usable, _supports(encoded), strange)
+        floor = float(bottom[usable].min(initial=np.inf))
         # "The bin is under the desk" is stored as "the desk is on top of the bin".
-        is_around = boxes.bottom[:, None] < boxes.top - CONTACT
-        is_larger = boxes.area[:, None] > boxes.area
-        return replace(boxes, supports=boxes.supports & ~(is_around & is_larger))
-
-    @property
-    def area(self) -> Floats:
-        area: Floats = self.size[:, 0] * self.size[:, 1]
-        return area
-
-    @property
-    def bottom(self) -> Floats:
-        return self.centre[:, 2] - self.size[:, 2] / 2
-
-    @property
-    def top(self) -> Floats:
-        return self.centre[:, 2] + self.size[:, 2] / 2
-
-    @property
-    def floor(self) -> float:
-        """Lowest bottom of the usable instances."""
-        return float(self.bottom[self.usable].min(initial=np.inf))
+        is_inverse = (bottom[:, None] < top - CONTACT) & (area[:, None] > area)
+        supports = _supports(encoded) & ~is_inverse
+        strange = _strangers(encoded) & usable[:, None] & usable
+        return cls(centre, size, yaw, bottom, top, area, usable, floor, supports, strange)
 
     def group(self, i: int) -> Flags:
         """Return instance i and all instances that stand on it, directly or not, (n,)."""
@@ -266,26 +238,29 @@ def _kinds(boxes: _Boxes, rng: Rng) -> Iterator[tuple[Flags, _Place]]:
 
 def _onto(boxes: _Boxes, i: int, j: int, rng: Rng) -> Floats | None:
     """Return a centre of instance i on the top of instance j, apart from the objects on it."""
-    bottom = boxes.top[j]
-    height = boxes.size[i, 2]
-    obstacles = boxes.usable & ~boxes.group(i)
-    obstacles &= (boxes.top > bottom) & (boxes.bottom < bottom + height)
-    obstacles[j] = False
-    for _ in range(_ATTEMPTS):
-        point = boxes.beside(j, rng.uniform(-_CENTRAL, _CENTRAL, 2), 0.0)
-        if boxes.is_free(i, point, obstacles):
-            return np.array([*point, bottom + height / 2])
-    return None
+    bottom, height = boxes.top[j], boxes.size[i, 2]
+    obstacles = (boxes.top > bottom) & (boxes.bottom < bottom + height)
+    return _free_spot(boxes, i, j, obstacles, _CENTRAL, 0.0, bottom, rng)
 
 
 def _to_floor(boxes: _Boxes, i: int, j: int, rng: Rng) -> Floats | None:
     """Return a centre of instance i on the floor near instance j, apart from all objects."""
-    obstacles = boxes.usable & ~boxes.group(i)
     margin = _REACH + float(np.hypot(*boxes.size[i, :2])) / 2
+    return _free_spot(boxes, i, j, boxes.usable, 0.5, margin, boxes.floor, rng)
+
+
+def _free_spot(
+    boxes: _Boxes, i: int, j: int, obstacles: Flags, reach: float, margin: float, z: float, rng: Rng
+) -> Floats | None:
+    """Return a centre of instance i with its bottom at height z, near instance j, or None.
+
+    Its footprint touches no usable obstacle (n,), except the objects that move with instance i.
+    """
+    obstacles = obstacles & boxes.usable & ~boxes.group(i)
     for _ in range(_ATTEMPTS):
-        point = boxes.beside(j, rng.uniform(-0.5, 0.5, 2), margin)
+        point = boxes.beside(j, rng.uniform(-reach, reach, 2), margin)
         if boxes.is_free(i, point, obstacles):
-            return np.array([*point, boxes.floor + boxes.size[i, 2] / 2])
+            return np.array([*point, z + boxes.size[i, 2] / 2])
     return None
 
 

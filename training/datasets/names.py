@@ -15,54 +15,21 @@ NAMES_FILE = Path(__file__).resolve().parent / "vocabularies" / "names.toml"
 
 @dataclass(frozen=True)
 class Names:
-    """The content of `vocabularies/names.toml`. Each attribute is a table or list of the file.
+    """The content of `vocabularies/names.toml`."""
 
-    Attributes:
-        base, household: common classes, and rare household objects. Every indoor vocabulary
-            contains them.
-        structure: classes such as walls. The service accepts these classes in requests but never
-            proposes them.
-        not_objects: labels that never become a class.
-        surroundings, outdoor: outdoor structures such as buildings, and outdoor objects. Indoor
-            vocabularies exclude them.
-        anywhere: classes whose objects belong in every room, such as pets and bags.
-        aliases: maps each class to its other names.
-        kinds: maps each class to more specific names. If a vocabulary has a class for the specific
-            name, the broader class is its parent. Otherwise the name can become an alias.
-        rooms: maps each room type to its other names. The key "" lists names without a room type.
-    """
-
-    base: tuple[str, ...] = ()
-    household: tuple[str, ...] = ()
-    structure: tuple[str, ...] = ()
-    not_objects: tuple[str, ...] = ()
-    surroundings: tuple[str, ...] = ()
-    outdoor: tuple[str, ...] = ()
-    anywhere: tuple[str, ...] = ()
-    aliases: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    base: tuple[str, ...] = ()  # common classes, in every indoor vocabulary
+    household: tuple[str, ...] = ()  # rare household objects, in every indoor vocabulary
+    structure: tuple[str, ...] = ()  # classes such as walls, which the service never proposes
+    not_objects: tuple[str, ...] = ()  # labels that never become a class
+    surroundings: tuple[str, ...] = ()  # outdoor structures such as buildings
+    outdoor: tuple[str, ...] = ()  # outdoor objects
+    anywhere: tuple[str, ...] = ()  # classes that belong in every room, such as pets and bags
+    aliases: dict[str, tuple[str, ...]] = field(default_factory=dict)  # other names of each class
+    # More specific names of each class. If a vocabulary has a class for the specific name, the
+    # broader class is its parent. Otherwise the name can become an alias.
     kinds: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    # Other names of each room type. The key "" lists names without a room type.
     rooms: dict[str, tuple[str, ...]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        tables = {"aliases": self.aliases, "kinds": self.kinds, "rooms": self.rooms}
-        for title, table in tables.items():
-            owner: dict[str, str] = {}
-            for name, others in table.items():
-                # A kind can have kinds of its own.
-                for other in others if title == "kinds" else (name, *others):
-                    if other and owner.setdefault(label_key(other), name) != name:
-                        first = owner[label_key(other)]
-                        raise ValueError(f"{title}: {other!r} names both {first!r} and {name!r}")
-        for name in (*self.base, *self.household):
-            if (other := self.canonical(name)) != name:
-                raise ValueError(
-                    f"the base class {name!r} is an alias of {other!r}: remove it from `base`"
-                )
-        kinds = {"kinds": [kind for name, kinds in self.kinds.items() for kind in (name, *kinds)]}
-        for title, labels in (kinds | {"anywhere": self.anywhere}).items():
-            for label in labels:
-                if (other := self.canonical(label)) != label:
-                    raise ValueError(f"{title}: {label!r} is an alias of {other!r}")
 
     def canonical(self, label: str) -> str:
         """Return the curated name of a label, or the label in lower case with single spaces."""
@@ -86,10 +53,8 @@ class Names:
 
     @cached_property
     def _by_key(self) -> dict[str, str]:
-        keys = _by_any_name(self.aliases)
-        for name in (*self.base, *self.household, *self.structure, *self.surroundings):
-            keys.setdefault(label_key(name), name)
-        return keys
+        names = (*self.base, *self.household, *self.structure, *self.surroundings)
+        return {label_key(name): name for name in names} | _by_any_name(self.aliases)
 
     @cached_property
     def _rooms_by_key(self) -> dict[str, str]:
@@ -112,16 +77,11 @@ def _by_any_name(table: dict[str, tuple[str, ...]]) -> dict[str, str]:
 
 @cache
 def curated_names() -> Names:
-    """Read the curated names of `vocabularies/names.toml`.
+    """Read the curated names of `vocabularies/names.toml`."""
 
-    Raises:
-        ValueError: the file gives two meanings to one name.
-    """
-    values: dict[str, Any] = tomllib.loads(NAMES_FILE.read_text(encoding="utf-8"))
-    tables: dict[str, Any] = {
-        name: {key: tuple(others) for key, others in entry.items()}
-        if isinstance(entry, dict)
-        else tuple(entry)
-        for name, entry in values.items()
-    }
-    return Names(**tables)
+    def frozen(entry: Any) -> Any:
+        table = isinstance(entry, dict)
+        return {key: tuple(x) for key, x in entry.items()} if table else tuple(entry)
+
+    values = tomllib.loads(NAMES_FILE.read_text(encoding="utf-8"))
+    return Names(**{name: frozen(entry) for name, entry in values.items()})

@@ -13,22 +13,14 @@ from training.datasets.array_types import Flags, Floats, Ints
 
 @dataclass(frozen=True, eq=False)
 class ObservedOffsets:
-    """Observed offsets between related objects.
+    """Observed offsets between related objects, in metres and viewer axes."""
 
-    Attributes:
-        offset: position of the relation's subject minus position of its object, in metres and
-            viewer axes, (offsets, 3).
-        relation: index of the canonical relation, (offsets,).
-        subject, other: class indices of the relation's subject and object, (offsets,).
-        source: index of the data source of the scene, (offsets,).
-    """
-
-    offset: Floats
-    relation: Ints
-    subject: Ints
-    other: Ints
-    scene: Ints
-    source: Ints
+    offset: Floats  # position of the relation's subject minus that of its object, (offsets, 3)
+    relation: Ints  # index of the canonical relation, (offsets,)
+    subject: Ints  # class of the relation's subject, (offsets,)
+    other: Ints  # class of the relation's object, (offsets,)
+    scene: Ints  # index of the scene, (offsets,)
+    source: Ints  # index of the data source of the scene, (offsets,)
 
     def rows(self, mask: Flags) -> ObservedOffsets:
         """Return the offsets where the mask, (offsets,), is True."""

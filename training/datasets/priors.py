@@ -20,7 +20,6 @@ COLUMNS: Final = ("source", "subject", "relation", "object", "count", "room")
 MAX_LINE: Final = 4096
 MAX_ROWS: Final = 2_000_000
 
-
 SOURCE: Final = "placing_priors"
 """Source name of all scenes that the reader makes from rows of the table."""
 
@@ -37,11 +36,7 @@ _SUPPORTS: Final = frozenset({"on-top", "inside"})
 
 
 class Placing(NamedTuple):
-    """A row of the table about a room.
-
-    Attributes:
-        votes: number of votes or observations of the object on or inside the receptacle.
-    """
+    """A row about a room: the number of votes for the subject on or inside the receptacle."""
 
     source: str
     subject: str
@@ -63,14 +58,11 @@ def read_prior_scenes(path: Path) -> list[AnnotatedScene]:
         # One of the sources has prefixes, for example in "food bread" and "clothes skirt".
         ends = subject, anchor
         names = [end.removeprefix("food ").removeprefix("clothes ").strip() for end in ends]
-        if source not in TRAINED or relation not in RELATIONS:
-            continue
-        if not all(map(label_key, names)) or label_key(names[0]) == label_key(names[1]):
-            continue
-        things = tuple(AnnotatedObject(str(index), name) for index, name in enumerate(names))
-        group = " ".join(names)
-        listed = ((0, relation, 1),)
-        scenes.append(AnnotatedScene(where, SOURCE, group, None, things, listed))
+        keys = set(map(label_key, names)) - {""}
+        if source in TRAINED and relation in RELATIONS and len(keys) == 2:
+            things = tuple(AnnotatedObject(str(index), name) for index, name in enumerate(names))
+            listed = ((0, relation, 1),)
+            scenes.append(AnnotatedScene(where, SOURCE, " ".join(names), None, things, listed))
     return scenes
 
 
@@ -105,9 +97,7 @@ def _rows(path: Path) -> Iterator[tuple[str, list[str]]]:
         if number == 1:
             if tuple(values) != COLUMNS:
                 raise DatasetError(path, where, f"must name the columns {', '.join(COLUMNS)}")
-        elif len(values) != len(COLUMNS):
-            raise DatasetError(
-                path, where, f"the row has {len(values)} columns, not {len(COLUMNS)}"
-            )
+        elif (count := len(values)) != len(COLUMNS):
+            raise DatasetError(path, where, f"the row has {count} columns, not {len(COLUMNS)}")
         else:
             yield where, values

@@ -14,11 +14,13 @@ A reader raises a DatasetError if a file is missing or does not have the officia
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Callable
+from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from training.datasets.files import load_json, located, take
+from training.datasets.files import Node, load_json
 from training.datasets.jsonl import read_jsonl
 from training.datasets.records import AnnotatedObject, AnnotatedScene, Box2d, DatasetError
 from training.datasets.sources import relations_of, supported_subjects
@@ -30,88 +32,76 @@ def read_3dssg(path: Path) -> list[AnnotatedScene]:
 
     All scans of a room are in one group. The official files contain no room types and no poses.
     """
-    scans = _entries(path, "", load_json(path), "scans")
+    scans = load_json(path).entries("scans")
     rooms = _rooms(path.with_name("3RScan.json"))
-    labels: dict[str, dict[str, str]] | None = None
+    whole: dict[str, dict[str, str]] | None = None
     scenes: dict[str, AnnotatedScene] = {}
-    for where, scan in scans:
-        name = take(path, where, scan, "scan", str)
-        if "objects" in scan:
-            objects = take(path, where, scan, "objects", dict)
+    for scan in scans:
+        name = scan.take("scan", str)
+        if "objects" in scan.value:
+            labels = scan.take("objects", dict)
         else:
-            if labels is None:
-                labels = _labels(path.with_name("objects.json"))
-            if name not in labels:
-                raise DatasetError(path, where, f"scan {name} is not in objects.json")
-            objects = labels[name]
+            whole = _labels(path.with_name("objects.json")) if whole is None else whole
+            labels = whole.get(name)
+        if labels is None:
+            raise scan.error(f"scan {name} is not in objects.json")
         if name not in rooms:
-            raise DatasetError(path, where, f"scan {name} is not in 3RScan.json")
-        scene_id = f"3dssg-{name}-{scan['split']}" if "split" in scan else f"3dssg-{name}"
+            raise scan.error(f"scan {name} is not in 3RScan.json")
+        part = f"-{scan.value['split']}" if "split" in scan.value else ""
+        scene_id = f"3dssg-{name}{part}"
         if scene_id in scenes:
-            raise DatasetError(path, where, f"scene {scene_id} is listed twice")
-        triples = _triples(path, where, scan, list(objects))
-        with located(path, where):
-            things = tuple(AnnotatedObject(key, label) for key, label in objects.items())
+            raise scan.error(f"scene {scene_id} is listed twice")
+        triples = _triples(scan, list(labels))
+        with scan.located():
             scenes[scene_id] = AnnotatedScene(
                 scene_id=scene_id,
                 source="3dssg",
                 group=f"3rscan-{rooms[name]}",
                 room_type=None,
-                objects=things,
+                objects=tuple(AnnotatedObject(key, label) for key, label in labels.items()),
                 relations=relations_of("3dssg", triples),
                 supported=supported_subjects("3dssg", triples),
             )
     return list(scenes.values())
 
 
-def _entries(path: Path, where: str, values: Any, name: str) -> list[tuple[str, Any]]:
-    """Return position and value of each entry of the list ``name``."""
-    entries = take(path, where, values, name, list)
-    start = f"{where}.{name}" if where else name
-    return [(f"{start}[{number}]", entry) for number, entry in enumerate(entries)]
-
-
-def _triples(
-    path: Path, where: str, scan: dict[str, Any], ids: list[str]
-) -> list[tuple[int, str, int]]:
+def _triples(scan: Node, ids: list[str]) -> list[tuple[int, str, int]]:
     """Return the triples (subject index, predicate, object index) of a scan."""
     index_of = {key: index for index, key in enumerate(ids)}
     triples = []
-    for place, entry in _entries(path, where, scan, "relationships"):
-        if not isinstance(entry, list) or len(entry) != 4 or not isinstance(entry[3], str):
-            raise DatasetError(
-                path, place, f"must be [subject, object, predicate id, predicate], not {entry!r}"
-            )
-        subject, anchor = index_of.get(str(entry[0])), index_of.get(str(entry[1]))
+    for entry in scan.entries("relationships"):
+        values = entry.value
+        if not isinstance(values, list) or len(values) != 4 or not isinstance(values[3], str):
+            raise entry.error(f"must be [subject, object, predicate id, predicate], not {values!r}")
+        subject, anchor = index_of.get(str(values[0])), index_of.get(str(values[1]))
         if subject is None or anchor is None:
-            raise DatasetError(path, place, f"{entry!r} names an object that is not in the scan")
-        triples.append((subject, entry[3], anchor))
+            raise entry.error(f"{values!r} names an object that is not in the scan")
+        triples.append((subject, values[3], anchor))
     return triples
 
 
 def _labels(path: Path) -> dict[str, dict[str, str]]:
     """Read ``objects.json``. Return a mapping from scan id to object id to label."""
-    labels: dict[str, dict[str, str]] = {}
-    for where, scan in _entries(path, "", load_json(path), "scans"):
-        scan_labels = labels.setdefault(take(path, where, scan, "scan", str), {})
-        for place, thing in _entries(path, where, scan, "objects"):
-            key = str(take(path, place, thing, "id", (str, int)))
-            scan_labels[key] = take(path, place, thing, "label", str)
+    labels: dict[str, dict[str, str]] = defaultdict(dict)
+    for scan in load_json(path).entries("scans"):
+        labels[scan.take("scan", str)] |= {
+            str(thing.take("id", (str, int))): thing.take("label", str)
+            for thing in scan.entries("objects")
+        }
     return labels
 
 
 def _rooms(path: Path) -> dict[str, str]:
     """Read ``3RScan.json``. Map each scan id to the id of the reference scan of the same room."""
     rooms: dict[str, str] = {}
-    entries = load_json(path)
-    if not isinstance(entries, list):
-        raise DatasetError(path, "", "the file must contain a list of reference scans")
-    for number, entry in enumerate(entries):
-        where = f"[{number}]"
-        reference = take(path, where, entry, "reference", str)
-        rooms[reference] = reference
-        for place, rescan in _entries(path, where, entry, "scans"):
-            rooms[take(path, place, rescan, "reference", str)] = reference
+    content = load_json(path)
+    if not isinstance(content.value, list):
+        raise content.error("the file must contain a list of reference scans")
+    for number, entry in enumerate(content.value):
+        room = Node(path, entry, f"[{number}]")
+        reference = room.take("reference", str)
+        names = (rescan.take("reference", str) for rescan in room.entries("scans"))
+        rooms |= dict.fromkeys((reference, *names), reference)
     return rooms
 
 
@@ -122,40 +112,35 @@ def read_coco(path: Path) -> list[AnnotatedScene]:
     image plane. Encoding later derives the relations left and above from boxes.
     """
     content = load_json(path)
-    categories: dict[int, str] = {}
-    for where, entry in _entries(path, "", content, "categories"):
-        categories[take(path, where, entry, "id", int)] = take(path, where, entry, "name", str)
-    images: dict[int, dict[int, AnnotatedObject]] = {}
-    for where, entry in _entries(path, "", content, "images"):
-        images[take(path, where, entry, "id", int)] = {}
-    for where, entry in _entries(path, "", content, "annotations"):
-        image = take(path, where, entry, "image_id", int)
-        category = take(path, where, entry, "category_id", int)
+    categories = {c.take("id", int): c.take("name", str) for c in content.entries("categories")}
+    images: dict[int, dict[int, AnnotatedObject]]
+    images = {image.take("id", int): {} for image in content.entries("images")}
+    for entry in content.entries("annotations"):
+        image, category = entry.take("image_id", int), entry.take("category_id", int)
         if image not in images:
-            raise DatasetError(path, where, f"image_id {image} is not among the images of the file")
+            raise entry.error(f"image_id {image} is not among the images of the file")
         if category not in categories:
-            raise DatasetError(path, where, f"category_id {category} is not among the categories")
-        if entry.get("iscrowd"):
+            raise entry.error(f"category_id {category} is not among the categories")
+        if entry.value.get("iscrowd"):
             continue
-        key = take(path, where, entry, "id", int)
+        key = entry.take("id", int)
         if key in images[image]:
             raise DatasetError(path, f"image {image}", "two annotations have the same id")
-        with located(path, where):
-            box = _box(path, where, entry)
+        with entry.located():
+            box = _box(entry)
             images[image][key] = AnnotatedObject(str(key), categories[category], box2d=box)
-    names = {f"coco-{image}": tuple(objects.values()) for image, objects in images.items()}
     return [
-        AnnotatedScene(name, "coco", name, None, objects)
-        for name, objects in names.items()
+        AnnotatedScene(f"coco-{image}", "coco", f"coco-{image}", None, tuple(objects.values()))
+        for image, objects in images.items()
         if objects
     ]
 
 
-def _box(path: Path, where: str, entry: dict[str, Any]) -> Box2d:
-    bbox = take(path, where, entry, "bbox", list)
+def _box(entry: Node) -> Box2d:
+    bbox = entry.take("bbox", list)
     numbers = all(isinstance(v, (int, float)) and math.isfinite(v) for v in bbox)
     if len(bbox) != 4 or not numbers or min(bbox[2:]) < 0:
-        raise DatasetError(path, where, f"bbox must be [x, y, width, height], not {bbox!r}")
+        raise entry.error(f"bbox must be [x, y, width, height], not {bbox!r}")
     x, y, width, height = map(float, bbox)
     return (x, y, x + width, y + height)
 
@@ -168,27 +153,27 @@ READERS: Final[dict[str, Callable[[Path], list[AnnotatedScene]]]] = {
 }
 
 
+_PATTERNS: Final = {
+    "*.jsonl": "jsonl",
+    "*.jsonl.gz": "jsonl",
+    "*.mat": "sunrgbd-mat",
+    "relationships*.json": "3dssg",
+    "instances*.json": "coco",
+}
+
+
 def guess_format(path: Path) -> str:
     """Return the name of a file's format, derived from the file name.
 
     Raises:
         DatasetError: the name matches no known format.
     """
-    name = path.name
-    if name.endswith((".jsonl", ".jsonl.gz")):
-        return "jsonl"
-    if name.endswith(".mat"):
-        return "sunrgbd-mat"
-    if name.startswith("relationships") and name.endswith(".json"):
-        return "3dssg"
-    if name.startswith("instances") and name.endswith(".json"):
-        return "coco"
-    raise DatasetError(
-        path,
-        "",
-        "the file name fits no known format; rename the file to *.jsonl, *.jsonl.gz, *.mat, "
-        "relationships*.json or instances*.json",
-    )
+    for pattern, name in _PATTERNS.items():
+        if fnmatchcase(path.name, pattern):
+            return name
+    *patterns, last = _PATTERNS
+    problem = "the file name fits no known format; rename the file to "
+    raise DatasetError(path, "", f"{problem}{', '.join(patterns)} or {last}")
 
 
 def read_scenes(path: Path) -> list[AnnotatedScene]:

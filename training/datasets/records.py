@@ -35,33 +35,26 @@ class DatasetError(ValueError):
 class AnnotatedObject:
     """One annotated object. None means that a value is unknown.
 
-    Attributes:
-        id: id of the object, distinct within the scene.
-        position, size: centre, and extents before rotation by the yaw, (x, y, z) in metres.
-        yaw: rotation of the object about the z axis in radians.
-        supported_by: id of the object that supports this object.
-        box2d: box (xmin, ymin, xmax, ymax) in the image, with y downwards.
-        count: number of instances that this entry represents.
-
     Raises:
         ValueError: the label is empty, or a number is not finite or out of range.
     """
 
-    id: str
+    id: str  # distinct within the scene
     label: str
-    position: Point | None = None
-    size: Point | None = None
-    yaw: float = 0.0
-    supported_by: str | None = None
-    box2d: Box2d | None = None
-    count: int = 1
+    position: Point | None = None  # centre (x, y, z) in metres
+    size: Point | None = None  # extents before rotation by the yaw, (x, y, z) in metres
+    yaw: float = 0.0  # rotation about the z axis in radians
+    supported_by: str | None = None  # id of the supporting object
+    box2d: Box2d | None = None  # (xmin, ymin, xmax, ymax) in the image, with y downwards
+    count: int = 1  # number of instances that this entry represents
 
     def __post_init__(self) -> None:
         if not self.label:
             raise ValueError(f"object {self.id!r} has an empty label")
-        _check_numbers("position", self.id, self.position, 3)
-        _check_numbers("size", self.id, self.size, 3)
-        _check_numbers("box2d", self.id, self.box2d, 4)
+        for name, length in (("position", 3), ("size", 3), ("box2d", 4)):
+            x = getattr(self, name)
+            if x is not None and (len(x) != length or not all(map(math.isfinite, x))):
+                raise ValueError(f"{name} of {self.id!r} must be {length} finite numbers, not {x}")
         if self.size is not None and min(self.size) < 0:
             raise ValueError(f"size of {self.id!r} must not be negative, but is {self.size}")
         if self.box2d and (self.box2d[0] > self.box2d[2] or self.box2d[1] > self.box2d[3]):
@@ -75,30 +68,23 @@ class AnnotatedObject:
 
 @dataclass(frozen=True, slots=True)
 class AnnotatedScene:
-    """One annotated scene, whose id is distinct within its data source.
-
-    Attributes:
-        group: name of a group of near-duplicate scenes, such as frames of one place.
-        room_type: room type in the data set. None means unknown.
-        relations, false_relations: triples (subject index, relation, object index) that hold, and
-            that an annotator marked as false. Without annotated relations, `relations` is None.
-        supported: indices of the objects whose support is listed, also if it is no relation of the
-            service, such as "attached to".
-        viewer_frame: True if positions are in viewer axes. Otherwise left and front are undefined
-            until a viewpoint is chosen.
+    """One annotated scene. Relations are triples (subject index, relation, object index).
 
     Raises:
         ValueError: two objects have the same id, or a link or relation names an unknown object.
     """
 
-    scene_id: str
+    scene_id: str  # distinct within the data source
     source: str
-    group: str
-    room_type: str | None
+    group: str  # name of a group of near-duplicate scenes, such as frames of one place
+    room_type: str | None  # as in the data set; None means unknown
     objects: tuple[AnnotatedObject, ...]
-    relations: tuple[tuple[int, str, int], ...] | None = None
+    relations: tuple[tuple[int, str, int], ...] | None = None  # None: not annotated
+    # True if positions are in viewer axes. Otherwise a viewpoint must be chosen for left and front.
     viewer_frame: bool = False
-    false_relations: tuple[tuple[int, str, int], ...] = ()
+    false_relations: tuple[tuple[int, str, int], ...] = ()  # marked as false by an annotator
+    # Indices of the objects whose support is listed, also by other relations than the ten of the
+    # service, such as "attached to".
     supported: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
@@ -115,23 +101,12 @@ class AnnotatedScene:
         for subject, relation, anchor in (*(self.relations or ()), *self.false_relations):
             if relation not in RELATIONS:
                 raise ValueError(f"unknown relation {relation!r}")
-            for end in (subject, anchor):
-                if not 0 <= end < size:
-                    raise ValueError(
-                        f"a relation has object index {end}, but the scene has {size} objects"
-                    )
+            if unknown := [end for end in (subject, anchor) if not 0 <= end < size]:
+                raise ValueError(
+                    f"a relation has object index {unknown[0]}, but the scene has {size} objects"
+                )
 
 
 def digest_of(scenes: Sequence[AnnotatedScene]) -> str:
     """Return the sha256 of the contents of the scenes. It does not depend on the file format."""
-    sha = hashlib.sha256()
-    for scene in scenes:
-        sha.update(repr(scene).encode())
-    return sha.hexdigest()
-
-
-def _check_numbers(name: str, owner: str, values: Sequence[float] | None, length: int) -> None:
-    if values is None:
-        return
-    if len(values) != length or not all(map(math.isfinite, values)):
-        raise ValueError(f"{name} of {owner!r} must be {length} finite numbers, not {values}")
+    return hashlib.sha256("".join(map(repr, scenes)).encode()).hexdigest()

@@ -3,16 +3,14 @@
 The table serves pairs whose boxes reach into each other. "The bin is under the desk" counts for the
 bin. "The lamp is on the desk" does not count for the desk: its box does not reach into the lamp.
 
-Words do not tell where the object is in the box: people say "on the shelf" of a book between two
-boards. So the table reads "on" as "in" for larger objects that contain things: classes whose share
-of "in" among "on" and "in" is at least `_CONTAINS`. Fridges, shelves and bathtubs contain things.
-Beds and sofas do not: an object on them reaches into their box, because the box includes a
-headboard or a back.
+People say "on the shelf" of a book between two boards. So the table reads "on" as "in" for larger
+objects that contain things: classes whose share of "in" among "on" and "in" is at least
+`_CONTAINS`, such as fridges, shelves and bathtubs, but not beds and sofas.
 """
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable
 from functools import cache
 from typing import Final
@@ -27,7 +25,7 @@ _OF_KIN: Final = 0.5  # weight of a pair in which a class is replaced by its par
 # Share of "in" from which a class contains things. In the public data, shelf has .10 and chair .06.
 _CONTAINS: Final = 0.08
 
-_ROLES: Final = {"on-top": ON, "under": UNDER, "below": UNDER, "inside": IN}
+_ROLES: Final = {"on-top": ON, "under": UNDER, "below": UNDER, "inside": IN, "contains": IN}
 
 Role = tuple[int, int, int]
 """A role, the class in this role, and the class of the larger object."""
@@ -44,22 +42,19 @@ def count_roles(scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary) -> Rol
     for scene in scenes:
         classes = [index(thing.label) for thing in scene.objects]
         for role, i, j in _stated_roles(scene):
-            ends = classes[i], classes[j]
-            if ends[0] is None or ends[1] is None or ends[0] == ends[1]:
+            k, m = classes[i], classes[j]
+            if k is None or m is None or k == m or vocabulary.structure[[k, m]].any():
                 continue
-            if not (vocabulary.structure[ends[0]] or vocabulary.structure[ends[1]]):
-                stated.add((scene.source, scene.group, (role, ends[0], ends[1])))
-    own = Counter(role for _, _, role in stated)
-    return _table(own, vocabulary)
+            stated.add((scene.source, scene.group, (role, k, m)))
+    return _table(Counter(role for _, _, role in stated), vocabulary)
 
 
 def _stated_roles(scene: AnnotatedScene) -> Iterable[Role]:
     """Yield role, index of the object in this role and index of the larger object."""
     for subject, relation, anchor in scene.relations or ():
         if relation in _ROLES:
-            yield _ROLES[relation], subject, anchor
-        elif relation == "contains":
-            yield IN, anchor, subject
+            ends = (anchor, subject) if relation == "contains" else (subject, anchor)
+            yield _ROLES[relation], *ends
 
 
 def lift_of(thing: AnnotatedObject, support: AnnotatedObject) -> float | None:
@@ -70,22 +65,16 @@ def lift_of(thing: AnnotatedObject, support: AnnotatedObject) -> float | None:
 
 
 def _table(own: Counter[Role], vocabulary: Vocabulary) -> RoleCounts:
-    V = len(vocabulary)
-    kin = _kin(vocabulary)
-    pairs: dict[int, np.ndarray] = {}
+    V, kin = len(vocabulary), _kin(vocabulary)
+    pairs: defaultdict[int, np.ndarray] = defaultdict(lambda: np.zeros(3, np.float32))
     anchor = np.zeros((V, 3), np.float32)
     for (role, i, j), count in own.items():
-        for k in kin[i]:
-            for m in kin[j]:
-                weight = 1.0 if (k, m) == (i, j) else _OF_KIN
-                row = pairs.setdefault(k * V + m, np.zeros(3, np.float32))
-                row[role] += weight * count
         for m in kin[j]:
             anchor[m, role] += (1.0 if m == j else _OF_KIN) * count
+            for k in kin[i]:
+                pairs[k * V + m][role] += (1.0 if (k, m) == (i, j) else _OF_KIN) * count
     keys = np.array(sorted(pairs), np.int64)
-    counts = np.zeros((len(keys), 3), np.float32)
-    for number, key in enumerate(keys.tolist()):
-        counts[number] = pairs[key]
+    counts = np.array([pairs[key] for key in keys.tolist()], np.float32).reshape(-1, 3)
     contains = anchor[:, IN] >= _CONTAINS * np.maximum(anchor[:, ON] + anchor[:, IN], 1)
     for table, rows in ((anchor, contains), (counts, contains[keys % V])):
         table[rows, IN] += table[rows, ON]

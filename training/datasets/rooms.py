@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -20,7 +20,7 @@ import numpy as np
 
 from app.scene import Vocabulary, to_viewer_frame
 from app.scene.geometry import overlap_and_gap
-from training.datasets.array_types import Rng
+from training.datasets.array_types import Floats, Rng
 from training.datasets.encoding import side_viewpoints
 from training.datasets.records import AnnotatedObject, AnnotatedScene
 from training.datasets.vocabulary import source_vocabulary
@@ -36,39 +36,21 @@ _CLEARANCE = 0.02  # minimum distance in metres between pieces of furniture
 # Extents of an object in metres, in the order: along the wall, away from the wall, upwards.
 Size = tuple[float, float, float]
 Where = Literal["wall", "centre", "hung", "ceiling"]
-Candidate = Literal["left", "right", "front", "around"]
-
-
-@dataclass(frozen=True, slots=True)
-class Small:
-    """A small object on furniture, added with a probability in each of ``most`` attempts."""
-
-    label: str
-    size: Size
-    chance: float
-    most: int = 1
-
-
-@dataclass(frozen=True, slots=True)
-class Beside:
-    """A piece of furniture beside a main piece, such as a nightstand left of a bed.
-
-    The side of the main piece is seen from the wall behind it; ``around`` means all four sides. The
-    ``chance`` of the adjacent piece applies to each side.
-    """
-
-    piece: Piece
-    side: Candidate
+Side = Literal["left", "right", "front", "around"]
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A piece of furniture, added to the room with a probability in each of ``most`` attempts.
+    """A piece of furniture or a small object, added with a probability in ``most`` attempts each.
 
     Attributes:
         size: mean extents of the piece.
         where: place of the piece: at a wall, in the centre, hung on a wall, or under the ceiling.
-        carries, beside: small objects that can stand on the piece, and pieces beside it.
+            Small objects stand on the piece that carries them.
+        carries: small objects that can stand on the piece.
+        beside: pieces beside the piece, such as a nightstand left of a bed, with their sides. The
+            side is seen from the wall behind the main piece; ``around`` means all four sides. The
+            ``chance`` of the adjacent piece applies to each side.
     """
 
     label: str
@@ -76,8 +58,8 @@ class Piece:
     chance: float = 1.0
     where: Where = "wall"
     most: int = 1
-    carries: tuple[Small, ...] = ()
-    beside: tuple[Beside, ...] = ()
+    carries: tuple[Piece, ...] = ()
+    beside: tuple[tuple[Piece, Side], ...] = ()
 
 
 Rooms = Mapping[str, tuple[Piece, ...]]
@@ -87,26 +69,17 @@ Rooms = Mapping[str, tuple[Piece, ...]]
 def _read_tables(path: Path) -> dict[str, Rooms]:
     """Return the rooms of each domain. An entry is a table, or the name of an earlier table."""
     values = tomllib.loads(path.read_text(encoding="utf-8"))
-    smalls: dict[str, Small] = {}
-    pieces: dict[str, Piece] = {}
-
-    def small(entry: Any) -> Small:
-        if isinstance(entry, str):
-            return smalls[entry]
-        return Small(**entry | {"size": tuple(entry["size"])})
+    named: dict[str, Piece] = {}
 
     def piece(entry: Any) -> Piece:
         if isinstance(entry, str):
-            return pieces[entry]
-        beside = (Beside(piece(e["piece"]), e["side"]) for e in entry.get("beside", ()))
-        carries = map(small, entry.get("carries", ()))
-        parts = {"size": entry["size"], "carries": carries, "beside": beside}
-        return Piece(**entry | {name: tuple(values) for name, values in parts.items()})
+            return named[entry]
+        beside = tuple((piece(e["piece"]), e["side"]) for e in entry.get("beside", ()))
+        carries = tuple(map(piece, entry.get("carries", ())))
+        return Piece(**entry | {"size": tuple(entry["size"]), "carries": carries, "beside": beside})
 
-    for name, entry in values["small"].items():
-        smalls[name] = small(entry)
-    for name, entry in values["piece"].items():
-        pieces[name] = piece(entry)
+    for name, entry in (values["small"] | values["piece"]).items():
+        named[name] = piece(entry)
     return {
         domain: {room: tuple(map(piece, entries)) for room, entries in rooms.items()}
         for domain, rooms in values["rooms"].items()
@@ -145,15 +118,14 @@ def generate_rooms(count: int, seed: int, rooms: Rooms = ROOMS) -> list[Annotate
     """
     if count < 0:
         raise ValueError(f"count must not be negative, not {count}")
-    rng = np.random.default_rng(seed)
+    rng, number = np.random.default_rng(seed), 0
     scenes: list[AnnotatedScene] = []
-    for room in itertools.count():
-        if len(scenes) >= count:
-            break
+    while len(scenes) < count:
         room_type = str(rng.choice(list(rooms)))
         layout = _Layout(rng, room_type, rooms[room_type])
         views = range(int(rng.integers(1, 4)))
-        scenes += [layout.view(f"rooms-{seed}-{room}", view) for view in views]
+        scenes += [layout.view(f"rooms-{seed}-{number}", view) for view in views]
+        number += 1
     return scenes[:count]
 
 
@@ -166,12 +138,10 @@ def rooms_vocabulary() -> Vocabulary:
     return source_vocabulary(scenes, minimum=1)
 
 
-def _labels(pieces: tuple[Piece, ...]) -> list[str]:
-    labels = []
+def _labels(pieces: Iterable[Piece]) -> Iterator[str]:
     for piece in pieces:
-        labels += [piece.label, *(small.label for small in piece.carries)]
-        labels += _labels(tuple(beside.piece for beside in piece.beside))
-    return labels
+        yield piece.label
+        yield from _labels((*piece.carries, *(beside for beside, _ in piece.beside)))
 
 
 class _Layout:
@@ -192,24 +162,21 @@ class _Layout:
         viewpoints = side_viewpoints(0.0, 0.0, self.width, self.depth)
         viewpoint = viewpoints[int(self.rng.integers(4))]
         kept = [
-            (str(index), box)
+            (index, box)
             for index, box in enumerate(self.boxes)
             if box.support is None or self.rng.random() >= _GONE
         ]
         positions, yaws = to_viewer_frame(
             [(box.x, box.y, box.z) for _, box in kept], viewpoint, [box.yaw for _, box in kept]
         )
-        poses = zip(kept, positions.tolist(), yaws.tolist(), strict=True)
         objects = tuple(
             AnnotatedObject(
-                index,
-                box.label,
-                position=(x, y, z),
-                size=box.size,
-                yaw=yaw,
+                *(str(index), box.label, tuple(position), box.size, yaw),
                 supported_by=None if box.support is None else str(box.support),
             )
-            for (index, box), (x, y, z), yaw in poses
+            for (index, box), position, yaw in zip(
+                kept, positions.tolist(), yaws.tolist(), strict=True
+            )
         )
         scene_id = f"{group}-{number}"
         return AnnotatedScene(scene_id, SOURCE, group, self.room_type, objects, viewer_frame=True)
@@ -260,10 +227,10 @@ class _Layout:
             for _ in range(small.most):
                 if self.rng.random() < small.chance:
                     self._put_on(small, support)
-        for beside in piece.beside:
-            self._put_beside(beside, box)
+        for beside, side in piece.beside:
+            self._put_beside(beside, side, box)
 
-    def _put_on(self, small: Small, support: int) -> None:
+    def _put_on(self, small: Piece, support: int) -> None:
         base = self.boxes[support]
         size = self._random_size(small.size)
         if size[0] > base.size[0] or size[1] > base.size[1]:
@@ -277,10 +244,8 @@ class _Layout:
                 self.boxes.append(box)
                 return
 
-    def _put_beside(self, beside: Beside, anchor: _Box) -> None:
-        piece = beside.piece
-        sides = ("left", "right", "front", "back") if beside.side == "around" else (beside.side,)
-        for side in sides:
+    def _put_beside(self, piece: Piece, where: Side, anchor: _Box) -> None:
+        for side in ("left", "right", "front", "back") if where == "around" else (where,):
             if self.rng.random() >= piece.chance:
                 continue
             size = self._random_size(piece.size)
@@ -288,7 +253,7 @@ class _Layout:
             if side in ("left", "right"):
                 u = (anchor.size[0] + size[0]) / 2 + gap
                 # Unless the side is "around", the backs of both pieces touch the same wall.
-                v = 0.0 if beside.side == "around" else (size[1] - anchor.size[1]) / 2
+                v = 0.0 if where == "around" else (size[1] - anchor.size[1]) / 2
                 x, y = _point_on(anchor, -u if side == "left" else u, v)
             else:
                 v = (anchor.size[1] + size[1]) / 2 + gap
@@ -313,15 +278,16 @@ class _Layout:
         ]
         if not neighbours:
             return True
-        n = len(neighbours)
-        _, gap = overlap_and_gap(
-            np.tile([box.x, box.y], (n, 1)), np.tile(box.size[:2], (n, 1)), np.full(n, box.yaw),
-            np.array([[neighbour.x, neighbour.y] for neighbour in neighbours]),
-            np.array([neighbour.size[:2] for neighbour in neighbours]),
-            np.array([neighbour.yaw for neighbour in neighbours]),
-        )  # fmt: skip
+        footprints = (_footprints(boxes) for boxes in ([box] * len(neighbours), neighbours))
+        _, gap = overlap_and_gap(*itertools.chain.from_iterable(footprints))
         clearance = 0.0 if box.support is not None else _CLEARANCE
         return bool((gap > clearance).all())
+
+
+def _footprints(boxes: Sequence[_Box]) -> tuple[Floats, Floats, Floats]:
+    """Return the centres (n, 2), sizes (n, 2) and yaws (n,) of boxes, seen from above."""
+    rows = np.array([[box.x, box.y, *box.size[:2], box.yaw] for box in boxes])
+    return rows[:, :2], rows[:, 2:4], rows[:, 4]
 
 
 def _point_on(box: _Box, u: float, v: float) -> tuple[float, float]:

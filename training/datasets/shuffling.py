@@ -35,21 +35,11 @@ def shuffle_objects(
 
     Structure classes are exchanged only with structure classes, because their relations are
     unobserved. Room types are permuted among the scenes with a room type.
-
-    Raises:
-        ValueError: a class index of a scene exceeds the length of `structure`.
     """
-    for scene in scenes:
-        if len(scene.evidence.classes) and scene.evidence.classes[-1] >= len(structure):
-            raise ValueError(
-                f"scene {scene.scene_id} has a class index of {len(structure)} or more; pass "
-                "`structure` with one value for each class"
-            )
     rng = np.random.default_rng(seed)
     sizes = [len(scene.evidence.classes) for scene in scenes]
     owner = np.repeat(np.arange(len(scenes)), sizes)
-    empty = np.zeros(0, dtype=np.int64)
-    classes = np.concatenate([empty, *(scene.evidence.classes for scene in scenes)])
+    classes = np.concatenate([np.zeros(0, int), *(scene.evidence.classes for scene in scenes)])
     for group in (structure[classes], ~structure[classes]):
         classes[group] = _exchange(owner[group], classes[group], rng)
     rooms = np.array([scene.room_type for scene in scenes], dtype=np.int64)
@@ -85,8 +75,7 @@ def _exchange(owner: Ints, classes: Ints, rng: Rng) -> Ints:
 
 def _relabel(scene: EncodedScene, labels: Ints, room: int) -> EncodedScene:
     """Return the scene with a new class in each slot, sorted by class."""
-    before = scene.evidence
-    order = np.argsort(labels)
+    before, order = scene.evidence, np.argsort(labels)
     evidence = ClassEvidence(
         classes=labels[order],
         counts=before.counts[order],
@@ -95,7 +84,5 @@ def _relabel(scene: EncodedScene, labels: Ints, room: int) -> EncodedScene:
         observed=before.observed[:, order][:, :, order],
         room_type=None if room < 0 else room,
     )
-    slots = np.searchsorted(before.classes, scene.instance_classes)
-    return replace(
-        scene, room_type=room, evidence=evidence, instance_classes=labels[slots].astype(np.int64)
-    )
+    classes = labels[np.searchsorted(before.classes, scene.instance_classes)]
+    return replace(scene, room_type=room, evidence=evidence, instance_classes=classes)

@@ -2,16 +2,7 @@
 
 A listed relation holds. An unlisted relation is false ("off"), false only between neighbours ("off
 for neighbours"), false only if the support of its subject is listed ("off for supported"), or
-unobserved. The meaning depends on the data source and on the relation:
-
-| source | on-top | inside | above | left, front |
-|---|---|---|---|---|
-| boxes with sizes (procthor) | off | off | off | off for neighbours |
-| centres only (bedrooms) | unobserved | unobserved | unobserved | off |
-| 3dssg | off for supported | off for supported | unobserved | off for neighbours |
-| support links (virtualhome) | off | off | unobserved | unobserved |
-| pictures and sentences | unobserved | unobserved | unobserved | unobserved |
-| scenes of the user with listed relations | off | off | off | off |
+unobserved. docs/decisions/relations-hold.md gives the reason for each source.
 
 Two rules apply to every data source. First, if on-top, inside or above is listed for a pair of
 objects, all unlisted relations of the pair are false in both directions. (1 to 10 % of such pairs
@@ -19,11 +10,8 @@ also have a listed left or front.) Second, a relation that an annotator marked a
 
 With poses, two objects are neighbours if they are close by the rule of `app.scene.geometry`.
 Without poses, two objects with at least one listed relation are neighbours. 3DSSG compares heights
-only within a class, so an unlisted above is unobserved. 3DSSG lists the support of half of the
-small objects, such as 51 % of the pillows. If the support of an object is listed, other supports
-are false. Walls are also supports, and objects that the object leans against or is a part of.
-3DSSG lists left and front only between objects on the same support, so left and front of distant
-pairs are unobserved.
+only within a class, so an unlisted above is unobserved. It lists left and front only between
+objects on the same support.
 """
 
 from __future__ import annotations
@@ -39,22 +27,16 @@ Unlisted = Literal["off", "off for neighbours", "off for supported", "unobserved
 
 @dataclass(frozen=True, slots=True)
 class Meaning:
-    """The meaning of relations and objects that the scenes of a data source do not list.
-
-    Attributes:
-        on_top, inside, above, lateral: meaning of an unlisted relation of this kind. lateral means
-            left and front.
-        complete_objects: True if object lists are nearly complete. The training of objects then
-            uses unlisted objects as absent objects.
-        scenes_per_group: maximum total weight of a group of near-duplicates in the training of
-            objects, in scenes. None means that each scene has weight 1.
-    """
+    """The meaning of relations and objects that the scenes of a data source do not list."""
 
     on_top: Unlisted = "off"
     inside: Unlisted = "off"
     above: Unlisted = "off"
-    lateral: Unlisted = "off"
+    lateral: Unlisted = "off"  # left and front
+    # Object lists are nearly complete: in the training of objects, unlisted objects are absent.
     complete_objects: bool = True
+    # Maximum total weight of a group of near-duplicates in the training of objects, in scenes. None
+    # means that each scene has weight 1.
     scenes_per_group: float | None = None
 
     @property
@@ -75,33 +57,19 @@ _SELECTED: Final = replace(_CENTRES, lateral="unobserved")
 _SUPPORTS: Final = replace(_SELECTED, on_top="off", inside="off")
 _MENTIONS: Final = replace(_SELECTED, complete_objects=False)
 
-_THE_TEN: Final = {name: name for name in RELATIONS}
 # Relation of each predicate of 3DSSG. All kinds of support become on-top or inside.
 _3DSSG: Final = {
-    "left": "left",
-    "right": "right",
-    "front": "front",
-    "behind": "behind",
-    "standing on": "on-top",
-    "lying on": "on-top",
-    "supported by": "on-top",
-    "standing in": "inside",
-    "lying in": "inside",
-    "hanging in": "inside",
+    **dict.fromkeys(("standing on", "lying on", "supported by"), "on-top"),
+    **dict.fromkeys(("standing in", "lying in", "hanging in"), "inside"),
     "higher than": "above",
     "lower than": "below",
 }
 _VRD: Final = {
     "on": "on-top",
     "on the top of": "on-top",
-    "above": "above",
     "over": "above",
-    "under": "under",
     "beneath": "under",
     "in": "inside",
-    "inside": "inside",
-    "below": "below",
-    "behind": "behind",
     "in the front of": "front",
     "on the left of": "left",
     "on the right of": "right",
@@ -110,37 +78,26 @@ _VRD: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A known data source.
+    """A known data source."""
 
-    Attributes:
-        terms: origin and licence of the data, for the model card.
-        research_only: True if the licence excludes commercial use.
-        meaning: meaning of unlisted relations. None means `LISTS` for scenes with listed relations
-            and `BOXES` for other scenes.
-        predicates: maps predicates of the data source to relations of the service. The reader skips
-            other predicates, such as "next to" and "wear". None means that another predicate is an
-            error. Names of relations are predicates of every source.
-        supports: predicates that state the support of their subject. They mark the objects whose
-            support is listed.
-        left_out: labels that are ignored because their annotation is too incomplete or biased.
-        coarse: classes whose objects annotators mostly call by the name of the broader class, such
-            as "table" for a coffee table. An unlisted class of this kind is unobserved.
-        open_vocabulary: True if annotators used free words, so that an unlisted class is absent.
-            Otherwise a class outside their list of labels is unobserved.
-        counts_movables: True if only movable objects are counted. Others occur once in a scene.
-        of_one_view: True if a scene is one camera frame. A frame does not show how many objects are
-            in the room, so statistics of counts do not learn from it.
-    """
-
-    terms: str
-    research_only: bool = False
+    terms: str  # origin and licence of the data, for the model card
+    research_only: bool = False  # the licence excludes commercial use
+    # None means `LISTS` for scenes with listed relations, and `BOXES` for other scenes.
     meaning: Meaning | None = None
+    # Relations of the predicates that are no names of relations. The reader skips other predicates,
+    # such as "next to". None means that another predicate is an error.
     predicates: Mapping[str, str] | None = None
-    supports: tuple[str, ...] = ()
-    left_out: tuple[str, ...] = ()
+    supports: tuple[str, ...] = ()  # predicates that state the support of their subject
+    left_out: tuple[str, ...] = ()  # labels whose annotation is too incomplete or biased
+    # Classes whose objects annotators mostly call by the name of the broader class, such as "table"
+    # for a coffee table. An unlisted class of this kind is unobserved.
     coarse: tuple[str, ...] = ()
+    # Annotators used free words, so an unlisted class is absent. Otherwise a class outside their
+    # list of labels is unobserved.
     open_vocabulary: bool = False
-    counts_movables: bool = False
+    counts_movables: bool = False  # only movable objects are counted, others occur once in a scene
+    # A scene is one camera frame, which does not show how many objects are in the room. So
+    # statistics of counts do not learn from it.
     of_one_view: bool = False
 
 
@@ -203,7 +160,7 @@ SOURCES: Final[dict[str, Source]] = {
         "research use",
         research_only=True,
         meaning=_MENTIONS,
-        predicates=_THE_TEN,
+        predicates={},
     ),
     "coco_captions": Source(
         "COCO captions (Lin et al., ECCV 2014; COCO Consortium): triples from captions of indoor "
@@ -212,33 +169,33 @@ SOURCES: Final[dict[str, Source]] = {
         # Photographers aim at people and pets. So captions mention them far more often than rooms
         # contain them.
         left_out=("person", "cat", "dog", "bird", "animal"),
-        predicates=_THE_TEN,
+        predicates={},
     ),
     "reverie_text": Source(
         "REVERIE (Qi et al., CVPR 2020): triples from instructions for Matterport houses; "
         "non-commercial use",
         research_only=True,
         meaning=_MENTIONS,
-        predicates=_THE_TEN,
+        predicates={},
     ),
     "alfred": Source(
         "ALFRED (Shridhar et al., CVPR 2020): AI2-THOR rooms and triples from instructions; MIT",
         # Thousands of episodes show only about a hundred rooms, so all episodes of a room together
         # have the weight of three scenes.
         meaning=replace(_SELECTED, scenes_per_group=3.0),
-        predicates=_THE_TEN,
+        predicates={},
         left_out=("steps",),  # of a person: "walk two steps"
         counts_movables=True,
     ),
     "bddl_goal": Source(
         "BEHAVIOR-1K (Li et al., CoRL 2022): end states of household activities; MIT",
         meaning=_MENTIONS,
-        predicates=_THE_TEN,
+        predicates={},
     ),
     "behavior1k_rooms": Source(
         "BEHAVIOR-1K (Li et al., CoRL 2022): object lists of rooms; MIT",
         meaning=LISTS,  # its scenes list no relations
-        predicates=_THE_TEN,
+        predicates={},
     ),
     "matterport_rooms": Source(
         "Matterport3D (Chang et al., 3DV 2017): object lists of rooms, from REVERIE (Qi et al., "
@@ -250,13 +207,13 @@ SOURCES: Final[dict[str, Source]] = {
     "virtualhome": Source(
         "VirtualHome (Puig et al., CVPR 2018): rooms of designed apartments; MIT",
         meaning=_SUPPORTS,
-        predicates=_THE_TEN,
+        predicates={},
     ),
     "vsr": Source(
         "Visual Spatial Reasoning (Liu, Emerson, Collier, TACL 2023): voted relations in "
         "photographs; Apache-2.0",
         meaning=_MENTIONS,
-        predicates=_THE_TEN,
+        predicates={},
     ),
     "placing_priors": Source(
         "VirtualHome (Puig et al., CVPR 2018) and AI2-THOR (Kolve et al., 2017): where things are "
@@ -267,6 +224,14 @@ SOURCES: Final[dict[str, Source]] = {
 }
 
 
+_UNKNOWN: Final = Source("")
+
+
+def source_of(name: str) -> Source:
+    """Return the data source of this name. Unknown sources have the default attributes."""
+    return SOURCES.get(name, _UNKNOWN)
+
+
 def meaning_of(source: str, *, listed: bool = True) -> Meaning:
     """Return the meaning of relations and objects that a data source does not list.
 
@@ -274,10 +239,7 @@ def meaning_of(source: str, *, listed: bool = True) -> Meaning:
         listed: True if the scene lists relations. Only unknown sources, and sources without a fixed
             meaning, depend on this argument.
     """
-    entry = SOURCES.get(source)
-    if entry is not None and entry.meaning is not None:
-        return entry.meaning
-    return LISTS if listed else BOXES
+    return source_of(source).meaning or (LISTS if listed else BOXES)
 
 
 def relation_of(source: str, predicate: str) -> str | None:
@@ -286,12 +248,11 @@ def relation_of(source: str, predicate: str) -> str | None:
     Raises:
         ValueError: the predicate is unknown, and the data source has no table of predicates.
     """
-    entry = SOURCES.get(source)
-    if entry is not None and entry.predicates is not None and predicate not in RELATIONS:
-        return entry.predicates.get(predicate)
-    if predicate not in RELATIONS:
+    if predicate in RELATIONS:
+        return predicate
+    if (predicates := source_of(source).predicates) is None:
         raise ValueError(f"unknown relation {predicate!r}: must be one of {', '.join(RELATIONS)}")
-    return predicate
+    return predicates.get(predicate)
 
 
 def relations_of(
@@ -302,19 +263,11 @@ def relations_of(
     Predicates that are no relation of the service are skipped. Some image annotators relate an
     object to itself. Such triples are also skipped.
     """
-    relations: dict[tuple[int, str, int], None] = {}
-    for subject, predicate, anchor in triples:
-        relation = relation_of(source, predicate)
-        if relation is not None and subject != anchor:
-            relations[subject, relation, anchor] = None
-    return tuple(relations)
+    relations = [(i, relation_of(source, predicate), j) for i, predicate, j in triples]
+    return tuple(dict.fromkeys((i, name, j) for i, name, j in relations if name and i != j))
 
 
 def supported_subjects(source: str, triples: Iterable[tuple[int, str, int]]) -> tuple[int, ...]:
-    """Return the sorted subjects of triples (subject, predicate, object) that state a support.
-
-    The predicates are those of the data source. Sources without `Source.supports` return ().
-    """
-    entry = SOURCES.get(source)
-    supports = () if entry is None else entry.supports
+    """Return the sorted subjects of triples (subject, predicate, object) that state a support."""
+    supports = source_of(source).supports
     return tuple(sorted({subject for subject, predicate, _ in triples if predicate in supports}))

@@ -2,28 +2,25 @@
 
 The percentages are the shares of the training, test and validation part.
 
-- ``group`` (75 / 15 / 10 %) puts all scenes of a group of near-duplicates into one part. A group
-  can occur in several data sources, for example as a camera frame and as 3D boxes of the same
-  frame. The group then has the same part in all these sources.
-- ``stable`` (75 / 15 / 10 %) derives the part of a group only from the seed and the group name.
-  All groups keep their parts when a data set grows. A later model version is therefore never
-  trained on the test scenes of an earlier version. This protocol does not stratify.
-- ``final`` (90 / 0 / 10 %) is ``group`` without a test part. The shipped weights are trained on the
-  90 % and calibrated on the 10 %.
+- ``group`` (75 / 15 / 10 %) puts all scenes of a group of near-duplicates into one part, also if
+  several data sources contain the group.
+- ``stable`` (75 / 15 / 10 %) derives the part of a group only from the seed and the group name, so
+  all groups keep their parts when a data set grows. This protocol does not stratify.
+- ``final`` (90 / 0 / 10 %) is ``group`` without a test part, for shipped weights.
 - ``paper`` (60 / 30 / 10 %) is the protocol of Bozcan et al. (ICRA 2018). Each scene is assigned
   separately.
 - ``paper groups`` has the shares of ``paper`` and keeps groups together.
 
 All protocols except ``stable`` stratify by room type. Their parts depend on the seed and on the set
-of scenes, but not on the order of scenes. Data sources without a common group do not affect each
-other's parts. Data sources with common groups must be split together.
+of scenes, but not on the order of scenes. Data sources with common groups must be split together;
+others do not affect each other's parts.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final, Literal
 
 from training.datasets.names import curated_names
@@ -84,7 +81,7 @@ def stable_part(group: str, seed: int) -> Part:
 
 def _families(
     scenes: Sequence[AnnotatedScene], units: Sequence[str]
-) -> list[dict[str, Counter[str]]]:
+) -> Sequence[Mapping[str, Counter[str]]]:
     """Count the room types of each unit (group or scene), for each set of connected data sources.
 
     Data sources are connected if they have common units. A unit is counted only in its largest
@@ -95,30 +92,19 @@ def _families(
     for scene, unit in zip(scenes, units, strict=True):
         sources_of[unit].add(scene.source)
         sizes[scene.source] += 1
-    family_of = _component_of(sizes, sources_of.values())
-    leading = {
-        unit: max(sources, key=lambda source: (sizes[source], source))
-        for unit, sources in sources_of.items()
-    }
-    families: dict[str, dict[str, Counter[str]]] = {}
+    # The name of a component is that of its alphabetically first source.
+    family_of = {source: source for source in sizes}
+    for linked in filter(lambda sources: len(sources) > 1, sources_of.values()):
+        old = {family_of[source] for source in linked}
+        family_of = {x: min(old) if name in old else name for x, name in family_of.items()}
+    families: defaultdict[str, defaultdict[str, Counter[str]]]
+    families = defaultdict(lambda: defaultdict(Counter))
     names = curated_names()
     for scene, unit in zip(scenes, units, strict=True):
-        if scene.source == leading[unit]:
-            family = families.setdefault(family_of[scene.source], {})
+        if scene.source == max(sources_of[unit], key=lambda source: (sizes[source], source)):
             room = names.canonical_room(scene.room_type) or ""
-            family.setdefault(unit, Counter())[room] += 1
+            families[family_of[scene.source]][unit][room] += 1
     return list(families.values())
-
-
-def _component_of(sources: Iterable[str], shared: Iterable[set[str]]) -> dict[str, str]:
-    """Map each data source to the alphabetically first source of its connected component."""
-    family = {source: source for source in sources}
-    for linked in shared:
-        if len(linked) > 1:
-            old = {family[source] for source in linked}
-            new = min(old)
-            family = {source: new if name in old else name for source, name in family.items()}
-    return family
 
 
 def _assign(
@@ -127,9 +113,8 @@ def _assign(
     """Assign each unit to the part that is furthest below its target share of scenes.
 
     The stratum of a unit is its most common room type. Large strata are assigned first, and a hash
-    orders the units within a stratum. The distance from the target is the sum of two distances:
-    within the stratum and over all scenes. Otherwise, all units of small strata would become
-    training scenes.
+    orders the units within a stratum. The distance from the target is counted within the stratum
+    and over all scenes. Otherwise, all units of small strata would become training scenes.
     """
     strata: dict[str, list[str]] = defaultdict(list)
     for unit, rooms in rooms_of.items():
@@ -140,22 +125,18 @@ def _assign(
     for room in sorted(strata, key=lambda room: (-sum(weight[u] for u in strata[room]), room)):
         in_stratum: Counter[Part] = Counter()
         for unit in sorted(strata[room], key=lambda unit: _rank(seed, unit)):
-            part = max(
-                shares,
-                key=lambda p: (
-                    _lack(shares[p], in_stratum[p], in_stratum.total() + weight[unit])
-                    + _lack(shares[p], overall[p], overall.total() + weight[unit])
-                ),
-            )
-            part_of[unit] = part
+            # Number of additional scenes with which a part reaches its target share.
+            lack = {
+                part: sum(
+                    share * (counts.total() + weight[unit]) - counts[part]
+                    for counts in (in_stratum, overall)
+                )
+                for part, share in shares.items()
+            }
+            part_of[unit] = part = max(lack, key=lack.__getitem__)
             in_stratum[part] += weight[unit]
             overall[part] += weight[unit]
     return part_of
-
-
-def _lack(share: float, assigned: int, total: int) -> float:
-    """Return the number of additional scenes with which a part reaches its target share."""
-    return share * total - assigned
 
 
 def _rank(seed: int, unit: str) -> bytes:

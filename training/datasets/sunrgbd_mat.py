@@ -21,7 +21,7 @@ import numpy as np
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
-from training.datasets.files import check_size, located, take
+from training.datasets.files import Node, check_size
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
 
 SOURCE = "sunrgbd-mat"
@@ -47,24 +47,22 @@ def read_sunrgbd_mat(path: Path) -> list[AnnotatedScene]:
     """
     scenes: list[AnnotatedScene] = []
     frames: Counter[str] = Counter()
-    for number, frame in enumerate(_structs(_load(path))):
-        where = f"SUNRGBDMeta({number + 1})"
-        name = _text(path, where, frame, "sequenceName").strip("/")
+    for number, value in enumerate(_structs(_load(path)), 1):
+        frame = Node(path, value, f"SUNRGBDMeta({number})")
+        name = _text(frame, "sequenceName").strip("/")
         collection = "/".join(name.split("/")[:3])
         if "sun3ddata" in name:
             group = "sunrgbd-" + "/".join(name.split("/")[:4])
         else:
             group = f"sunrgbd-{collection}-{frames[collection] // _BLOCK}"
         frames[collection] += 1
-        boxes = _structs(take(path, where, frame, "groundtruth3DBB", object))
         objects = tuple(
-            _box(path, f"{where}.groundtruth3DBB({index + 1})", index, box)
-            for index, box in enumerate(boxes)
+            _box(Node(path, box, f"{frame.where}.groundtruth3DBB({index + 1})"), index)
+            for index, box in enumerate(_structs(frame.take("groundtruth3DBB")))
         )
         if objects:
             note = path.parent / name / "scene.txt"
-            room = note.read_text(encoding="utf-8").strip() if note.is_file() else None
-            room = room or None
+            room = (note.read_text(encoding="utf-8").strip() if note.is_file() else "") or None
             scenes.append(AnnotatedScene(name, SOURCE, group, room, objects, viewer_frame=True))
     return scenes
 
@@ -147,39 +145,39 @@ def _structs(value: Any) -> list[Any]:
     return list(value) if isinstance(value, list) else list(np.atleast_1d(value))
 
 
-def _text(path: Path, where: str, struct: Any, name: str) -> str:
-    value = take(path, where, struct, name, object)
+def _text(node: Node, name: str) -> str:
+    value = node.take(name)
     if not isinstance(value, str) or not value.strip():
-        raise DatasetError(path, where, f"{name} must be a non-empty string, not {value!r}")
+        raise node.error(f"{name} must be a non-empty string, not {value!r}")
     return value.strip()
 
 
-def _array(path: Path, where: str, struct: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
-    value = take(path, where, struct, name, object)
+def _array(node: Node, name: str, shape: tuple[int, ...]) -> np.ndarray:
+    value = node.take(name)
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise DatasetError(path, where, f"{name} is not numeric") from error
+        raise node.error(f"{name} is not numeric") from error
     if array.shape != shape or not np.isfinite(array).all():
-        raise DatasetError(path, where, f"{name} must be finite, of shape {shape}, not {value!r}")
+        raise node.error(f"{name} must be finite, of shape {shape}, not {value!r}")
     return array
 
 
-def _box(path: Path, where: str, number: int, struct: Any) -> AnnotatedObject:
+def _box(node: Node, number: int) -> AnnotatedObject:
     """Convert a box of the file. Its upright axis is the one with the largest z component."""
-    basis = _array(path, where, struct, "basis", (3, 3))
+    basis = _array(node, "basis", (3, 3))
     # Some boxes in the file have negative half extents, so use the absolute values.
-    half = np.abs(_array(path, where, struct, "coeffs", (3,)))
-    x, y, z = _array(path, where, struct, "centroid", (3,)).tolist()
+    size = 2 * np.abs(_array(node, "coeffs", (3,)))
+    x, y, z = _array(node, "centroid", (3,)).tolist()
     upright = int(np.abs(basis[:, 2]).argmax())
     ahead, aside = (upright + 1) % 3, (upright + 2) % 3
-    with located(path, where):
+    with node.located():
         return AnnotatedObject(
             id=str(number),
-            label=_text(path, where, struct, "classname"),
+            label=_text(node, "classname"),
             # In the file, x points right and y away from the camera. In viewer axes, x points away
             # from the viewer and y left.
             position=(y, -x, z),
-            size=(2 * float(half[ahead]), 2 * float(half[aside]), 2 * float(half[upright])),
+            size=(float(size[ahead]), float(size[aside]), float(size[upright])),
             yaw=math.atan2(-float(basis[ahead, 0]), float(basis[ahead, 1])),
         )

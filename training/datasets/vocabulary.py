@@ -51,27 +51,25 @@ def build_vocabulary(
         if room := names.canonical_room(scene.room_type):
             rooms[room] += 1
     # Spellings with the same key count as one label, under the most common spelling.
-    mentions = Counter(
-        {
-            min(labels, key=lambda x: (-labels[x], x)): labels.total()
-            for labels in spellings.values()
-        }
-    )
-    excluded = {label_key(name) for name in names.not_objects}
-    if not outdoor:
-        excluded |= {label_key(name) for name in (*names.outdoor, *names.surroundings)}
-    if minimum_rooms is None:
-        minimum_rooms = minimum
-    labels_kept = {*names.base, *names.household}
-    labels_kept |= {label for label, count in mentions.items() if count >= minimum}
-    structure = {label_key(name) for name in (*names.structure, *names.surroundings)}
-    key_of = {label: label_key(label) for label in labels_kept}
+    mentions = Counter({most_frequent(x): x.total() for x in spellings.values()})
+    outdoors = () if outdoor else (*names.outdoor, *names.surroundings)
+    excluded = set(map(label_key, (*names.not_objects, *outdoors)))
+    structure = set(map(label_key, (*names.structure, *names.surroundings)))
+    frequent = {label for label, count in mentions.items() if count >= minimum}
     classes = [
-        ObjectClass(label, names.aliases.get(label, ()), structure=key_of[label] in structure)
-        for label in sorted(labels_kept, key=lambda label: (-mentions[label], label))
-        if key_of[label] not in excluded
+        ObjectClass(label, names.aliases.get(label, ()), structure=label_key(label) in structure)
+        for label in sorted(
+            frequent.union(names.base, names.household), key=lambda x: (-mentions[x], x)
+        )
+        if label_key(label) not in excluded
     ]
-    return Vocabulary(classes, sorted(r for r, count in rooms.items() if count >= minimum_rooms))
+    fewest = minimum if minimum_rooms is None else minimum_rooms
+    return Vocabulary(classes, sorted(room for room, count in rooms.items() if count >= fewest))
+
+
+def most_frequent(counts: Counter[str]) -> str:
+    """Return the most frequent name; of several, the alphabetically first."""
+    return min(counts, key=lambda name: (-counts[name], name))
 
 
 def build_indoor_vocabulary(scenes: Iterable[AnnotatedScene]) -> Vocabulary:
@@ -81,9 +79,8 @@ def build_indoor_vocabulary(scenes: Iterable[AnnotatedScene]) -> Vocabulary:
     therefore ordinary classes.
     """
     names = replace(curated_names(), surroundings=())
-    minimum, rooms = INDOOR_MINIMUM_MENTIONS, MINIMUM_MENTIONS
-    vocabulary = build_vocabulary(scenes, names, minimum=minimum, minimum_rooms=rooms, outdoor=True)
-    return with_aliases(vocabulary, names)
+    minima = {"minimum": INDOOR_MINIMUM_MENTIONS, "minimum_rooms": MINIMUM_MENTIONS}
+    return with_aliases(build_vocabulary(scenes, names, outdoor=True, **minima))
 
 
 def vocabulary_json(vocabulary: Vocabulary) -> str:
@@ -99,32 +96,28 @@ def vocabulary_json(vocabulary: Vocabulary) -> str:
     return f'{{\n"objects": [\n{lines}\n],\n"room_types": {rooms}\n}}\n'
 
 
-def with_aliases(vocabulary: Vocabulary, names: Names | None = None) -> Vocabulary:
+def with_aliases(vocabulary: Vocabulary) -> Vocabulary:
     """Return the vocabulary with the curated synonyms of its classes, and of kinds that it lacks.
 
     The parents and the flag `anywhere` of its classes are renewed too. The labels, their order and
     their sizes stay the same.
     """
-    names = names or curated_names()
-    objects = []
+    aliases, objects = curated_names().aliases, []
     for entry in vocabulary.objects:
-        names_of = names.aliases.get(entry.label, ())
-        new = [name for name in names_of if vocabulary.index(name) is None]
-        objects.append(replace(entry, aliases=(*entry.aliases, *new)))
-    named = Vocabulary(objects, vocabulary.room_types)
-    objects = [_with_kinds(entry, named, names) for entry in named.objects]
-    return with_room_aliases(Vocabulary(objects, vocabulary.room_types), names)
+        synonyms = (x for x in aliases.get(entry.label, ()) if vocabulary.index(x) is None)
+        objects.append(replace(entry, aliases=(*entry.aliases, *synonyms)))
+    return with_room_aliases(_with_kinds(Vocabulary(objects, vocabulary.room_types)))
 
 
-def with_room_aliases(vocabulary: Vocabulary, names: Names | None = None) -> Vocabulary:
+def with_room_aliases(vocabulary: Vocabulary) -> Vocabulary:
     """Return the vocabulary with the curated synonyms of its room types."""
-    names = names or curated_names()
+    rooms = curated_names().rooms
     keys = {label_key(room) for room in vocabulary.room_types}
     aliases = {
-        room: [name for name in names.rooms.get(room, ()) if label_key(name) not in keys]
+        room: synonyms
         for room in vocabulary.room_types
+        if (synonyms := [x for x in rooms.get(room, ()) if label_key(x) not in keys])
     }
-    aliases = {room: synonyms for room, synonyms in aliases.items() if synonyms}
     return Vocabulary(vocabulary.objects, vocabulary.room_types, aliases)
 
 
@@ -156,28 +149,24 @@ def source_vocabulary(
     spellings = dict.fromkeys((*names.base, *names.household, *names.structure), ())
     aliases = spellings | names.aliases
     mentioned_only = replace(names, base=(), household=(), outdoor=(), kinds={}, aliases=aliases)
-    vocabulary = build_vocabulary(scenes, mentioned_only, minimum=minimum, outdoor=True)
-    objects = [_with_kinds(entry, vocabulary, names) for entry in vocabulary.objects]
+    return _with_kinds(build_vocabulary(scenes, mentioned_only, minimum=minimum, outdoor=True))
+
+
+def _with_kinds(vocabulary: Vocabulary) -> Vocabulary:
+    """Set the parents of classes, and add the names of their kinds without a class as aliases."""
+    names, objects = curated_names(), []
+    for entry in vocabulary.objects:
+        parent = names.broader.get(entry.label)
+        while parent is not None and parent not in vocabulary.labels:
+            parent = names.broader.get(parent)
+        kinds, aliases = list(names.kinds.get(entry.label, ())), list(entry.aliases)
+        for kind in kinds:
+            if vocabulary.index(kind) is None:
+                aliases += [kind, *names.aliases.get(kind, ())]
+                kinds += names.kinds.get(kind, ())
+        anywhere = entry.label in names.anywhere
+        objects.append(replace(entry, aliases=tuple(aliases), parent=parent, anywhere=anywhere))
     return Vocabulary(objects, vocabulary.room_types)
-
-
-def _with_kinds(entry: ObjectClass, vocabulary: Vocabulary, names: Names) -> ObjectClass:
-    """Set the parent of a class, and add the names of its kinds without a class as aliases."""
-    parent = names.broader.get(entry.label)
-    while parent is not None and parent not in vocabulary.labels:
-        parent = names.broader.get(parent)
-    kinds = list(names.kinds.get(entry.label, ()))
-    synonyms = []
-    for kind in kinds:
-        if vocabulary.index(kind) is None:
-            synonyms += [kind, *names.aliases.get(kind, ())]
-            kinds += names.kinds.get(kind, ())
-    return replace(
-        entry,
-        aliases=(*entry.aliases, *synonyms),
-        parent=parent,
-        anywhere=entry.label in names.anywhere,
-    )
 
 
 def with_typical_sizes(vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene]) -> Vocabulary:
@@ -202,24 +191,8 @@ def with_typical_sizes(vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene])
     return Vocabulary(classes, vocabulary.room_types)
 
 
-def coverage(
-    vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene], *, structure: bool = True
-) -> float:
-    """Return the share of the objects in scenes whose label is in a vocabulary.
-
-    Objects of structure classes such as walls count only if `structure` is True.
-
-    Raises:
-        ValueError: the scenes contain no objects.
-    """
-    covered = total = 0
+def coverage(vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene]) -> float:
+    """Return the share of the objects in scenes whose label is in a vocabulary."""
     mentions = Counter(thing.label for scene in scenes for thing in scene.objects)
-    for label, count in mentions.items():
-        index = vocabulary.index(label)
-        if index is not None and not structure and vocabulary.structure[index]:
-            continue
-        total += count
-        covered += count * (index is not None)
-    if not total:
-        raise ValueError("the scenes mention no object")
-    return covered / total
+    covered = (count for label, count in mentions.items() if vocabulary.index(label) is not None)
+    return sum(covered) / mentions.total()

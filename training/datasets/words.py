@@ -1,12 +1,10 @@
 """Word vectors for the classes of a vocabulary.
 
-The ``.npz`` file contains three arrays: ``words`` (words,) strings, ``vectors`` (words, dimensions)
-int8 and the scalar ``scale``. The vector of a word is its row of ``vectors`` times ``scale``.
+The ``.npz`` file contains the arrays of `WordVectors`.
 """
 
 from __future__ import annotations
 
-import math
 import re
 import zipfile
 import zlib
@@ -16,7 +14,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from app.scene import Vocabulary
@@ -29,7 +26,9 @@ MAX_BYTES: Final = 512 * 2**20
 _MEMBERS: Final = ("words", "vectors", "scale")
 # Errors of an unreadable archive. `zipfile` raises RuntimeError for an encrypted archive and for an
 # unknown compression.
-_UNREADABLE: Final = (OSError, EOFError, ValueError, RuntimeError, zipfile.BadZipFile, zlib.error)
+_UNREADABLE: Final = (
+    *(OSError, EOFError, ValueError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error),
+)
 _SEPARATORS: Final = re.compile(r"[\s_\-./]+")
 # Words in a label that do not describe the object. They are ignored.
 _FILLERS: Final = frozenset({"a", "an", "and", "for", "in", "no", "of", "on", "or", "the", "with"})
@@ -39,16 +38,10 @@ Vectors = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class WordVectors:
-    """Word vectors, stored as 8-bit integers.
+    """Word vectors. The vector of a word is its row of ``vectors`` times ``scale``."""
 
-    Attributes:
-        words: distinct words in lower case, (words,).
-        vectors: integer vector of each word, (words, dimensions) int8.
-        scale: positive factor. The word vectors are ``vectors`` times ``scale``.
-    """
-
-    words: tuple[str, ...]
-    vectors: NDArray[np.int8]
+    words: tuple[str, ...]  # distinct, in lower case, (words,)
+    vectors: NDArray[np.int8]  # (words, dimensions)
     scale: float
 
     @property
@@ -111,12 +104,18 @@ def read_word_vectors(path: Path) -> WordVectors:
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            arrays = {name: _member(path, archive, name) for name in _MEMBERS}
+            sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
+        for name in _MEMBERS:
+            if f"{name}.npy" not in sizes:
+                raise DatasetError(path, name, "is missing")
+            if sizes[f"{name}.npy"] > MAX_BYTES:
+                raise DatasetError(path, name, f"must be at most {MAX_BYTES // 2**20} MiB")
+        with np.load(path, allow_pickle=False) as arrays:  # a pickle could run code
+            words, vectors, scale = (arrays[name] for name in _MEMBERS)
     except DatasetError:
         raise
     except _UNREADABLE as error:
         raise DatasetError(path, "", f"cannot be read: {error}") from error
-    words, vectors, scale = (arrays[name] for name in _MEMBERS)
     if words.ndim != 1 or words.dtype.kind != "U" or not 0 < len(words) <= MAX_WORDS:
         raise DatasetError(path, "words", f"must be 1 to {MAX_WORDS} strings in one dimension")
     if vectors.dtype != np.int8 or vectors.ndim != 2 or len(vectors) != len(words):
@@ -129,25 +128,6 @@ def read_word_vectors(path: Path) -> WordVectors:
     if len(set(names)) < len(names):
         raise DatasetError(path, "words", "contains a word twice; words must be distinct")
     return WordVectors(names, vectors, float(scale))
-
-
-def _member(path: Path, archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
-    """Read one array of at most `MAX_BYTES`. Unpickling can run code, so pickles are refused."""
-    if f"{name}.npy" not in archive.namelist():
-        raise DatasetError(path, name, "is missing")
-    with archive.open(f"{name}.npy") as file:
-        version = npy.read_magic(file)
-        if version not in ((1, 0), (2, 0)):
-            raise DatasetError(path, name, f"has the unsupported .npy version {version}")
-        read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-        shape, _, dtype = read(file)
-        size = dtype.itemsize * math.prod(shape)
-        if dtype.hasobject or size > MAX_BYTES:
-            raise DatasetError(
-                path, name, f"must be a plain array of at most {MAX_BYTES // 2**20} MiB"
-            )
-    with archive.open(f"{name}.npy") as file:
-        return npy.read_array(file, allow_pickle=False)
 
 
 def _unit(vector: NDArray[Any]) -> Vectors:

@@ -8,15 +8,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from pydantic import ValidationError
 
 from app.registry import Artifact, Store, StoreError
 from app.scene import Vocabulary
-from training.datasets import AnnotatedScene, DatasetError, split, stable_part
+from training.datasets import AnnotatedScene, DatasetError, split
 from training.datasets.batches import TrainingData, has_relations
-from training.datasets.files import DATA
 from training.datasets.records import digest_of
+from training.datasets.splits import stable_part
 from training.domain.translation import Translation, same_classes
 from training.evaluation.artifact_model import artifact_model
 from training.evaluation.baselines import EASE, FREQUENCY_TABLE, PLACED, placed_product
@@ -38,20 +39,13 @@ Objects at a place are scored by the product of EASE and a frequency table of pl
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One of the two compared models.
+    """One of the two compared models."""
 
-    Attributes:
-        title: name of the model in tables.
-        learnt: digest of each data source of the training, by source name.
-        artifact: the model. None for the baselines.
-        data: folder with the scene files of a run. None if the candidate is not a run.
-    """
-
-    title: str
+    title: str  # name of the model in tables
     config: Config | None
-    learnt: dict[str, str]
-    artifact: Artifact | None
-    data: Path | None = None
+    learnt: dict[str, str]  # digest of each data source of the training, by source name
+    artifact: Artifact | None  # None for the baselines
+    data: Path | None = None  # folder with the scene files of a run
 
     @property
     def vocabulary(self) -> Vocabulary | None:
@@ -59,11 +53,7 @@ class Candidate:
         return None if self.artifact is None else self.artifact.vocabulary
 
     def model(self, scenes: Vocabulary, data: TrainingData, say: Progress) -> Model:
-        """Return the scores of this candidate, which take and return values in the scene classes.
-
-        Args:
-            scenes: vocabulary of the test scenes.
-        """
+        """Return the scores of this candidate in the classes of the test scenes, `scenes`."""
         if self.artifact is None:
             return _baselines(data, say)
         model = artifact_model(self.artifact, data.train)
@@ -83,13 +73,12 @@ def run_candidate(folder: Path, data: Path | None, say: Progress) -> Candidate:
         ConfigError, DatasetError: the scene files cannot be read.
     """
     run = load_run(folder)
-    root = data if data is not None else Path(run.data) if run.data else DATA
+    root = data or run.data_folder
     say("reading scenes")
     scenes = prepare(run.config, root)
     run.require(scenes.digest)
     say(f"calibrating {folder}")
-    artifact = calibrated_draft(run, scenes)
-    return Candidate(str(folder), run.config, scenes.digests, artifact, root)
+    return Candidate(str(folder), run.config, scenes.digests, calibrated_draft(run, scenes), root)
 
 
 def stored_candidate(reference: str, store: Store) -> Candidate:
@@ -100,12 +89,11 @@ def stored_candidate(reference: str, store: Store) -> Candidate:
     """
     name, version = store.resolve(reference)
     artifact = store.load(name, version)
-    manifest = artifact.manifest
     try:
-        config = Config.model_validate(manifest.training.get("config"))
+        config = Config.model_validate(artifact.manifest.training.get("config"))
     except ValidationError:
         config = None
-    learnt = {source.source: source.digest for source in manifest.data}
+    learnt = {source.source: source.digest for source in artifact.manifest.data}
     return Candidate(f"{name}@{version}", config, learnt, artifact)
 
 
@@ -157,16 +145,15 @@ def _baselines(data: TrainingData, say: Progress) -> Model:
 Sources = Mapping[str, Sequence[AnnotatedScene]]
 
 
-@dataclass(frozen=True)
-class HeldOut:
-    """Scenes held out from both models, and remarks on their choice.
+class HeldOut(NamedTuple):
+    """Scenes held out from models, and remarks on their choice.
 
     `certain` is False if a model may have learnt from some of the scenes.
     """
 
     scenes: list[AnnotatedScene]
-    notes: tuple[str, ...]
-    certain: bool
+    notes: tuple[str, ...] = ()
+    certain: bool = True
 
 
 def held_out(a: Candidate, b: Candidate, sources: Sources, root: Path) -> HeldOut:
@@ -193,36 +180,27 @@ def held_out(a: Candidate, b: Candidate, sources: Sources, root: Path) -> HeldOu
                 "compare the run without --final"
             )
         raise ConfigError("the test part contains no scenes: provide more scenes or more groups")
-    notes: list[str] = []
-    certain = True
-    unlearnt = test_scenes
-    for candidate in (a, b):
-        unlearnt, note, is_certain = _drop_learnt(candidate, unlearnt, sources, root)
-        notes += [note] if note else []
-        certain &= is_certain
+    first = _drop_learnt(a, test_scenes, sources, root)
+    unlearnt, notes, certain = _drop_learnt(b, first.scenes, sources, root)
     if not unlearnt:
         raise ConfigError(
             f"no scene is held out from both models: {b.title} has learnt from all test scenes of "
             f"{a.title}"
         )
     if dropped := len(test_scenes) - len(unlearnt):
-        notes.append(
+        notes += (
             f"{dropped} of {len(test_scenes)} test scenes of {a.title} are left out: {b.title} has "
-            "learnt from these scenes or from near-duplicates (same group)"
+            "learnt from these scenes or from near-duplicates (same group)",
         )
-    return HeldOut(unlearnt, tuple(notes), certain)
+    return HeldOut(unlearnt, first.notes + notes, first.certain and certain)
 
 
 def _drop_learnt(
     candidate: Candidate, scenes: list[AnnotatedScene], sources: Sources, root: Path
-) -> tuple[list[AnnotatedScene], str, bool]:
-    """Leave out the scenes that a candidate learnt from.
-
-    Returns:
-        The other scenes, a note or "", and True if the candidate learnt from none of these scenes.
-    """
+) -> HeldOut:
+    """Leave out the scenes that a candidate learnt from."""
     if candidate.artifact is None:
-        return scenes, "", True  # baselines are fitted on the training scenes of the first model
+        return HeldOut(scenes)  # baselines are fitted on the training scenes of the first model
     digests = {name: digest_of(source) for name, source in sources.items()}
     shared = {
         name
@@ -231,15 +209,15 @@ def _drop_learnt(
     }
     if not shared:
         names = ", ".join(candidate.learnt) or "unknown"
-        return scenes, f"{candidate.title} learnt from other data sources ({names})", True
+        return HeldOut(scenes, (f"{candidate.title} learnt from other data sources ({names})",))
     if candidate.config is None:
         note = f"{candidate.title} does not record its split and may have learnt from these scenes"
-        return scenes, note, False
+        return HeldOut(scenes, (note,), certain=False)
     data = candidate.config.data
     if data.split == "stable":
         seed = data.split_seed
         test = {scene.group for scene in scenes if stable_part(scene.group, seed) == "test"}
-        return [s for s in scenes if s.source not in shared or s.group in test], "", True
+        return HeldOut([s for s in scenes if s.source not in shared or s.group in test])
     all_scenes = _scenes_of(data, candidate.learnt, sources, digests, root)
     if all_scenes is None:
         note = (
@@ -247,11 +225,11 @@ def _drop_learnt(
             f"of {', '.join(sorted(shared))}, so its split cannot be reproduced. Use the "
             "stable split to avoid this"
         )
-        return scenes, note, False
+        return HeldOut(scenes, (note,), certain=False)
     parts = split(all_scenes, seed=data.split_seed, protocol=data.split)
     # Filter by group for all protocols: scenes of one group are near-duplicates.
     groups = {scene.group for part in ("train", "validation") for scene in parts[part]}
-    return [scene for scene in scenes if scene.group not in groups], "", True
+    return HeldOut([scene for scene in scenes if scene.group not in groups])
 
 
 def _scenes_of(
@@ -265,15 +243,14 @@ def _scenes_of(
     scenes: list[AnnotatedScene] = []
     for source in data.sources:
         name = source_name(source)
-        if name in digests and digests[name] == learnt.get(name):
-            scenes += sources[name]
-            continue
-        try:
-            source_data = data.model_copy(update={"sources": (source,), "words": ""})
-            (source_scenes,) = read_sources(source_data, root).values()
-        except (ConfigError, DatasetError):
-            return None
-        if digest_of(source_scenes) != learnt.get(name):
-            return None
-        scenes += source_scenes
+        own: Sequence[AnnotatedScene] = sources.get(name, ())
+        if digests.get(name) != learnt.get(name):
+            try:
+                source_data = data.model_copy(update={"sources": (source,), "words": ""})
+                (own,) = read_sources(source_data, root).values()
+            except (ConfigError, DatasetError):
+                return None
+            if digest_of(own) != learnt.get(name):
+                return None
+        scenes += own
     return scenes

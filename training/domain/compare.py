@@ -23,9 +23,10 @@ from training.datasets.batches import SceneTensors, scene_tensors
 from training.datasets.cases import some_scenes
 from training.datasets.files import DATA
 from training.domain.candidates import BASELINES, Candidate, HeldOut, find, held_out
-from training.domain.init_command import fail
+from training.domain.init_command import STORE, StorePath, fail
 from training.domain.translation import BEYOND, Translation, same_classes
 from training.evaluation.asking import ask_rows
+from training.evaluation.metrics import Figure
 from training.evaluation.model import Model, ObjectScore
 from training.evaluation.parts import all_but_one, draw_parts, rank_hidden
 from training.evaluation.report import Progress, measure, silent
@@ -59,47 +60,31 @@ console = Console()
 
 @dataclass(frozen=True)
 class Example:
-    """An example question: a scene with one removed object, and the answers of both models.
-
-    Attributes:
-        room_type: room type of the scene, or "" if unknown.
-        shown: labels of the remaining objects.
-        removed: label of the removed object.
-        ranks: rank that each model gives to the removed object, first model first. Objects with
-            equal scores share the best rank.
-        answers: labels of the most probable missing objects by each model, first model first.
-    """
+    """An example question: a scene with one removed object, and the answers of both models."""
 
     scene: str
-    room_type: str
+    room_type: str  # "" if unknown
     shown: tuple[str, ...]
     removed: str
-    ranks: tuple[int, int]
-    answers: tuple[tuple[str, ...], tuple[str, ...]]
+    ranks: tuple[int, ...]  # of the removed object; objects with equal scores share the best rank
+    answers: tuple[tuple[str, ...], ...]  # most probable missing objects
 
 
 @dataclass(frozen=True)
 class Comparison:
     """Comparison of two models.
 
-    Attributes:
-        results: metrics of both models. The first model is the reference `ours`.
-        b: title of the second model.
-        groups: number of groups of near-duplicates among the compared scenes.
-        certain: False if a model may have learnt from some of the scenes.
-        notes: remarks on the results.
-        examples: questions for which the answers of the models differ most.
-        unmeasured: relation tasks that were measured for the second model before its publication,
-            but not in this comparison. Empty if this comparison measures any relation task.
+    `unmeasured` names the relation tasks that were measured for the second model before its
+    publication, but not in this comparison. It is empty if this comparison measures any such task.
     """
 
-    results: Results
-    b: str
+    results: Results  # of both models; the first model is the reference `ours`
+    b: str  # title of the second model
     scenes: int
-    groups: int
-    certain: bool
+    groups: int  # groups of near-duplicates among the compared scenes
+    certain: bool  # False if a model may have learnt from some of the scenes
     notes: tuple[str, ...]
-    examples: tuple[Example, ...]
+    examples: tuple[Example, ...]  # questions for which the answers of the models differ most
     unmeasured: tuple[str, ...] = ()
 
     @property
@@ -109,11 +94,8 @@ class Comparison:
 
     def worse_by(self, margin: float) -> list[Difference]:
         """Return the primary metrics whose whole interval of the difference is below -margin."""
-        return [
-            row
-            for row in self.results.differences
-            if row.metric == COMPARED[row.task][0] and row.figure.high < -margin
-        ]
+        rows = self.results.differences
+        return [r for r in rows if r.metric == COMPARED[r.task][0] and r.figure.high < -margin]
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-serialisable dictionary with the results and all other attributes."""
@@ -134,9 +116,7 @@ def compare_command(
     data: Annotated[
         Path | None, typer.Option("--data", help="folder with the scenes of the first model")
     ] = None,
-    store: Annotated[
-        str, typer.Option("--store", help="folder of the model store")
-    ] = "model_store",
+    store: StorePath = STORE,
     limit: Annotated[int, typer.Option(min=2, help="maximum number of scenes")] = 300,
     examples: Annotated[int, typer.Option(min=0, help="number of example questions to show")] = 3,
     output: Annotated[Path | None, typer.Option("--json", help="write all results here")] = None,
@@ -166,13 +146,10 @@ def compare_command(
 
 def show(comparison: Comparison, console: Console) -> None:
     """Print the metrics of a comparison as a table, with its notes and examples."""
-    console.print(
-        f"{comparison.scenes} held-out scenes of {comparison.groups} groups\n"
-        f"A: {comparison.a}\nB: {comparison.b}",
-        markup=False,
-        highlight=False,
-        soft_wrap=True,
-    )
+    titles = (comparison.a, comparison.b)
+    heading = f"{comparison.scenes} held-out scenes of {comparison.groups} groups"
+    text = f"{heading}\nA: {comparison.a}\nB: {comparison.b}"
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
     headings = "task, metric", "A", "B", "A - B, 95 % interval", "A is"
     # Without edges and padding, the table fits into 80 columns.
     table = Table(*headings, box=box.SIMPLE_HEAD, show_edge=False, padding=0)
@@ -183,11 +160,11 @@ def show(comparison: Comparison, console: Console) -> None:
         if row.task != task:
             task = row.task
             table.add_row(f"[bold]{in_words(task)}[/bold]")
-        colour, figure = _COLOURS.get(row.verdict, "dim"), row.figure
+        colour = _COLOURS.get(row.verdict, "dim")
         table.add_row(
             f"  {row.metric}",
-            *(f"{values[name, row.task, row.metric]:.3f}" for name in (comparison.a, comparison.b)),
-            f"{figure.value:+.3f} [{figure.low:+.3f}, {figure.high:+.3f}]",
+            *(f"{values[name, row.task, row.metric]:.3f}" for name in titles),
+            difference_text(row.figure),
             f"[{colour}]{row.verdict}[/{colour}]",
         )
     console.print(table)
@@ -197,18 +174,21 @@ def show(comparison: Comparison, console: Console) -> None:
         notes.append(f"{comparison.a} was not measured in {names}: the scenes contain no relations")
     for note in notes:
         console.print(f"note: {note}", markup=False, soft_wrap=True)
-    if not comparison.examples:
-        return
-    console.print("Questions with the most different answers (one object removed from each scene):")
+    heading = "Questions with the most different answers (one object removed from each scene):"
+    if comparison.examples:
+        console.print(heading)
     for example in comparison.examples:
         room = f" ({example.room_type})" if example.room_type else ""
         lines = [f"  {example.scene}{room}: {', '.join(example.shown)}"]
         lines.append(f"    removed: {example.removed}")
-        for name, rank, answers in zip(
-            (comparison.a, comparison.b), example.ranks, example.answers, strict=True
-        ):
+        for name, rank, answers in zip(titles, example.ranks, example.answers, strict=True):
             lines.append(f"    {name}, rank {rank}: {', '.join(answers)}, …")
         console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+
+
+def difference_text(figure: Figure) -> str:
+    """Return a difference with its sign and its interval."""
+    return f"{figure.value:+.3f} [{figure.low:+.3f}, {figure.high:+.3f}]"
 
 
 def compare(
@@ -231,7 +211,7 @@ def compare(
     say("reading scenes")
     sources = read_sources(a.config.data, root)
     test = held_out(a, b, sources, root)
-    data = split_and_encode(a.config.data, sources, a.vocabulary).training_data()
+    data = split_and_encode(a.config.data, sources, root, a.vocabulary).training_data()
     encoded = encode(test.scenes, a.vocabulary)
     annotated = annotated_classes(encoded, a.vocabulary)
     scenes = some_scenes(scene_tensors(encoded, annotated, len(a.vocabulary)), limit)
@@ -246,20 +226,16 @@ def compare(
             f"the {len(scenes)} held-out scenes are unsuitable for all compared tasks: provide "
             "scenes with at least two object classes"
         )
-    groups = len({scene.group for scene in scenes.scenes})
     say("looking for examples")
-    first, second = (model.missing for model in models)
-    changed: list[Example] = []
-    if first is not None and second is not None:
-        changed = changed_most(first, second, scenes, data.structure, a.vocabulary, examples)
+    scores = [model.missing for model in models if model.missing is not None]
     return Comparison(
         results=results,
         b=titles[1],
         scenes=len(scenes),
-        groups=groups,
+        groups=len({scene.group for scene in scenes.scenes}),
         certain=test.certain,
         notes=tuple(_notes(a, b, test, limit)),
-        examples=tuple(changed),
+        examples=tuple(changed_most(scores, scenes, data.structure, a.vocabulary, examples)),
         unmeasured=unmeasured(results.differences, b),
     )
 
@@ -301,61 +277,53 @@ def _notes(a: Candidate, b: Candidate, test: HeldOut, limit: int | None) -> Iter
     yield from test.notes
     ours, theirs = a.vocabulary, b.vocabulary
     if ours is not None and theirs is not None and not same_classes(ours, theirs):
-        model_class = Translation.between(ours, theirs).model_class
+        is_unknown = Translation.between(ours, theirs).model_class < 0
         labels = [thing.label for scene in test.scenes for thing in scene.objects]
         mentions = [index for label in labels if (index := ours.index(label)) is not None]
-        unknown = sum(int(model_class[index]) < 0 for index in mentions)
-        if missing := int((model_class < 0).sum()):
+        if missing := int(is_unknown.sum()):
+            share = int(is_unknown[mentions].sum()) / max(len(mentions), 1)
             yield (
                 f"the questions use the {len(ours)} classes of {a.title}. {b.title} lacks "
-                f"{missing} of these classes ({unknown / max(len(mentions), 1):.0%} of the "
-                "objects in the scenes). Objects of these classes are not part of its input, and "
-                "it ranks these classes last"
+                f"{missing} of these classes ({share:.0%} of the objects in the scenes). Objects "
+                "of these classes are not part of its input, and it ranks these classes last"
             )
     if limit is not None and len(test.scenes) > limit:
         yield f"only {limit} of {len(test.scenes)} held-out scenes are compared, because of --limit"
 
 
 def changed_most(
-    a: ObjectScore,
-    b: ObjectScore,
+    scores: Sequence[ObjectScore],
     scenes: SceneTensors,
     structure: Tensor,
     vocabulary: Vocabulary,
     count: int,
-) -> list[Example]:
-    """Return the questions for which the two models' reciprocal ranks differ most.
+) -> Iterator[Example]:
+    """Generate the questions for which the reciprocal ranks of two models differ most.
 
-    Each question removes one object from a scene. The result has at most `count` examples, and at
-    most one example per group of near-duplicate scenes.
+    Each question removes one object from a scene. There are at most `count` examples, and at most
+    one per group of near-duplicate scenes; none if a model does not score missing objects.
     """
-    parts = draw_parts(scenes, structure, all_but_one)
-    first, second = (rank_hidden(parts, structure, ask_rows(score, parts.v)) for score in (a, b))
-    change = np.abs(first.reciprocal_rank() - second.reciprocal_rank())
-    question_of: dict[str, int] = {}
+    if len(scores) < 2:
+        return
+    parts, labels = draw_parts(scenes, structure, all_but_one), vocabulary.labels
+    groups: set[str] = set()
+    ranked = [rank_hidden(parts, structure, ask_rows(score, parts.v)) for score in scores]
+    change = np.abs(np.subtract(*(ranks.reciprocal_rank() for ranks in ranked)))
     for question in np.argsort(-change, kind="stable").tolist():
-        if len(question_of) == count or not change[question]:
-            break
-        question_of.setdefault(scenes.scenes[int(first.scene[question])].group, question)
-    questions = []
-    for question in question_of.values():
-        row, target = int(first.scene[question]), int(first.target[question])
-        scene, v = scenes.scenes[row], parts.v[question]
-        room = vocabulary.room_types[scene.room_type] if scene.room_type >= 0 else ""
-        questions.append(
-            Example(
-                scene=scene.scene_id,
-                room_type=room,
-                shown=tuple(vocabulary.labels[k] for k in v.nonzero().squeeze(1).tolist()),
-                removed=vocabulary.labels[target],
-                ranks=(int(first.above[question]) + 1, int(second.above[question]) + 1),
-                answers=(
-                    _answers(a, v, structure, vocabulary),
-                    _answers(b, v, structure, vocabulary),
-                ),
-            )
+        scene, v = scenes.scenes[int(ranked[0].scene[question])], parts.v[question]
+        if len(groups) == count or not change[question]:
+            return
+        if scene.group in groups:
+            continue
+        groups.add(scene.group)
+        yield Example(
+            scene=scene.scene_id,
+            room_type=vocabulary.room_types[scene.room_type] if scene.room_type >= 0 else "",
+            shown=tuple(labels[k] for k in v.nonzero().squeeze(1).tolist()),
+            removed=labels[int(ranked[0].target[question])],
+            ranks=tuple(int(ranks.above[question]) + 1 for ranks in ranked),
+            answers=tuple(_answers(score, v, structure, vocabulary) for score in scores),
         )
-    return questions
 
 
 @torch.no_grad()

@@ -16,16 +16,17 @@ from app.registry import Artifact, Metric, RegistryError, Store
 from training.datasets import DatasetError
 from training.datasets.batches import subset
 from training.datasets.files import DATA
-from training.domain.init_command import fail
+from training.domain.init_command import STORE, StorePath, fail
 from training.evaluation.everyday_task import EVERYDAY
 from training.evaluation.metrics import Figure
 from training.evaluation.outside import OutsideTest, read_test
 from training.evaluation.report import Progress, evaluate
 from training.evaluation.tasks import in_words
 from training.fit.configuration import Config, ConfigError, source_name
-from training.runs.pipeline import read_sources, split_and_encode
+from training.runs.pipeline import prepare
 
 Figures = dict[str, list[Metric]]
+PARTS = ("train", "validation", "test")
 
 console = Console()
 
@@ -48,9 +49,7 @@ def evaluate_command(
             f"folder of its configuration file; default: {DATA}",
         ),
     ] = None,
-    store: Annotated[
-        str, typer.Option("--store", help="folder of the model store")
-    ] = "model_store",
+    store: StorePath = STORE,
     source: Annotated[list[str] | None, typer.Option(help="use only these data sources")] = None,
     part: Annotated[str, typer.Option(help="scenes: train, validation or test")] = "test",
     output: Annotated[Path | None, typer.Option("--json", help="write figures to a file")] = None,
@@ -109,17 +108,17 @@ def _measure(
     with console.status("reading scenes"):
         # The split must include all data sources, as in training. Otherwise the test part
         # could contain training scenes.
-        scenes = split_and_encode(config.data, read_sources(config.data, data), artifact.vocabulary)
+        scenes = prepare(config, data, artifact.vocabulary)
+    if part not in PARTS:
+        raise ConfigError(f"--part is {part!r}; it must be one of {', '.join(PARTS)}")
     tensors = scenes.training_data()
-    parts = {"train": tensors.train, "validation": tensors.validation, "test": tensors.test}
-    if part not in parts:
-        raise ConfigError(f"--part is {part!r}; it must be one of {', '.join(parts)}")
-    index = [k for k, scene in enumerate(parts[part].scenes) if scene.source in names]
+    tested = getattr(tensors, part)
+    index = [k for k, scene in enumerate(tested.scenes) if scene.source in names]
     if not index:
         raise ConfigError(
             f"{reference}: the {part} part has no scenes of the sources {', '.join(names)}"
         )
-    test = subset(parts[part], torch.tensor(index, dtype=torch.int64))
+    test = subset(tested, torch.tensor(index, dtype=torch.int64))
     with console.status(reference) as status:
         return evaluate(
             *(artifact, test, tensors.structure, tensors.train),
@@ -129,15 +128,15 @@ def _measure(
 
 
 def _show(tables: Figures, title: str | None = None) -> None:
-    figures: dict[str, dict[tuple[str, str], dict[str, str]]] = {}
+    figures: dict[tuple[str, str, str], dict[str, str]] = {}
     for name, rows in tables.items():
         for row in rows:
-            lines = figures.setdefault(row.task, {})
-            figure = Figure(row.value, row.low, row.high, row.n)
-            lines.setdefault((row.metric, row.source), {})[name] = str(figure)
-    table = Table("task, metric", "source", *tables, box=box.SIMPLE_HEAD, title=title)
-    for task, lines in sorted(figures.items()):
-        table.add_row(f"[bold]{in_words(task)}[/bold]")
-        for (metric, source), values in lines.items():
-            table.add_row(f"  {metric}", source, *(values.get(name, "") for name in tables))
+            line = figures.setdefault((row.task, row.metric, row.source), {})
+            line[name] = str(Figure(row.value, row.low, row.high, row.n))
+    table, heading = Table("task, metric", "source", *tables, box=box.SIMPLE_HEAD, title=title), ""
+    for (task, metric, source), values in sorted(figures.items(), key=lambda item: item[0][0]):
+        if task != heading:
+            heading = task
+            table.add_row(f"[bold]{in_words(task)}[/bold]")
+        table.add_row(f"  {metric}", source, *(values.get(name, "") for name in tables))
     console.print(table)

@@ -1,19 +1,15 @@
 """Decide whether an alias may point at a new version.
 
-First, the new version must be useful. On the test scenes of its run, it must rank missing objects
-better than popularity (the class frequencies) by at least `GAIN`, and not worse than EASE (class
-co-occurrence).
-
-Then the new version is compared with the version that the alias serves, on common held-out scenes
-(see compare.py). It is refused if a primary metric is lower by more than the margin, over the whole
-interval of the paired difference. Smaller or uncertain losses are accepted. The new version is also
-refused if the served version was measured on relation tasks and the comparison contains none.
+First, the new version must be useful: `Usefulness.objections`. Then it is compared with the version
+that the alias serves, on common held-out scenes: `losses`. docs/decisions/own-scenes.md gives the
+reasons for the rules.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,7 +18,7 @@ from app.registry.references import AliasTarget
 from training.datasets.batches import TrainingData, subset
 from training.datasets.cases import some_scenes
 from training.domain.candidates import Candidate, stored_candidate
-from training.domain.compare import Comparison
+from training.domain.compare import Comparison, difference_text
 from training.evaluation.asking import missing_score
 from training.evaluation.baselines import EASE, POPULARITY
 from training.evaluation.metrics import FEWEST_GROUPS, Figure, Ratio, paired_difference
@@ -44,20 +40,13 @@ _REQUIRED = f"at least {GAIN:+.3f}, whole interval above zero"
 
 @dataclass(frozen=True)
 class Usefulness:
-    """A new version beside two baselines: MRR (mean reciprocal rank) of missing objects.
-
-    Attributes:
-        scenes, groups: number of test scenes, and of their groups of near-duplicates.
-        ours: MRR of the new version. None if no test scene can be used.
-        theirs: MRR of each baseline, by name.
-        differences: new version minus baseline, with the paired 95 % interval, by name.
-    """
+    """A new version beside two baselines: MRR (mean reciprocal rank) of missing objects."""
 
     scenes: int
-    groups: int
-    ours: float | None = None
-    theirs: Mapping[str, float] = field(default_factory=dict)
-    differences: Mapping[str, Figure] = field(default_factory=dict)
+    groups: int  # of near-duplicates among the scenes
+    ours: float | None = None  # MRR of the new version; None if too few groups can be used
+    theirs: Mapping[str, float] = field(default_factory=dict)  # MRR of each baseline, by name
+    differences: Mapping[str, Figure] = field(default_factory=dict)  # new version minus baseline
 
     def lines(self) -> Iterator[str]:
         """Generate the results as lines of at most 80 characters."""
@@ -66,7 +55,7 @@ class Usefulness:
         yield f"mean reciprocal rank of a missing object, {self._sample_text()}:"
         yield f"  {NEW:16} {self.ours:.3f}"
         for name, value in self.theirs.items():
-            yield f"  {name:16} {value:.3f}  difference {_figure_text(self.differences[name])}"
+            yield f"  {name:16} {value:.3f}  difference {difference_text(self.differences[name])}"
         yield f"  required over {POPULARITY.name}: {_REQUIRED}"
 
     def objections(self) -> list[str]:
@@ -82,22 +71,19 @@ class Usefulness:
         if not (gain.value >= GAIN and gain.low > 0):
             reasons.append(
                 f"{NEW} is not clearly better than {POPULARITY.name}, which only knows how "
-                f"frequent each class is: difference {_figure_text(gain)} (required: {_REQUIRED}), "
-                f"{self._sample_text()}. Check the labels, train longer or provide more scenes"
+                f"frequent each class is: difference {difference_text(gain)} (required: "
+                f"{_REQUIRED}), {self._sample_text()}. Check the labels, train longer or provide "
+                "more scenes"
             )
         if loss.high < 0:
             reasons.append(
                 f"{NEW} is worse than EASE, a plain model of co-occurrence: difference "
-                f"{_figure_text(loss)}, {self._sample_text()}"
+                f"{difference_text(loss)}, {self._sample_text()}"
             )
         return reasons
 
     def _sample_text(self) -> str:
         return f"{self.scenes} test scenes of {self.groups} groups"
-
-
-def _figure_text(figure: Figure) -> str:
-    return f"{figure.value:+.3f} [{figure.low:+.3f}, {figure.high:+.3f}]"
 
 
 def measure_usefulness(
@@ -122,30 +108,20 @@ def measure_usefulness(
             raise ValueError("the model has no score of missing objects")
         return rank_missing(scenes, data.structure, score).mrr().by(scenes.group_ids)
 
-    ours = mrr(missing_score(artifact))
-    theirs = {}
+    ours, values, gaps = mrr(missing_score(artifact)), {}, {}
     for baseline in (POPULARITY, EASE):
         say(f"fitting {baseline.name}")
-        model = baseline.fit(data.train, data.validation, data.structure)
-        theirs[baseline.name] = mrr(model.missing)
-    values = {name: ratio.value for name, ratio in theirs.items()}
-    gaps = {name: paired_difference(ours, ratio) for name, ratio in theirs.items()}
+        theirs = mrr(baseline.fit(data.train, data.validation, data.structure).missing)
+        values[baseline.name], gaps[baseline.name] = theirs.value, paired_difference(ours, theirs)
     return replace(usefulness, ours=ours.value, theirs=values, differences=gaps)
 
 
-@dataclass(frozen=True)
-class ServedModel:
-    """An alias of the model store, and the model that it serves now.
+class ServedModel(NamedTuple):
+    """An alias of the model store, and the model that it serves now."""
 
-    Attributes:
-        target: model version that the alias names. None if the alias is new.
-        candidate: the served model. None if the alias is new or the model cannot be read.
-        note: reason why a comparison with the served model is impossible, or "".
-    """
-
-    target: AliasTarget | None
-    candidate: Candidate | None
-    note: str
+    target: AliasTarget | None  # None if the alias is new
+    candidate: Candidate | None  # None if the alias is new or the model cannot be read
+    note: str  # reason why a comparison with the served model is impossible, or ""
 
 
 def served_model(store: Store, alias: str) -> ServedModel:

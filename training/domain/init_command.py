@@ -13,30 +13,25 @@ import typer
 from rich.console import Console
 
 from app.registry import RegistryError
-from training.datasets import READERS, AnnotatedScene, DatasetError, generate_rooms, vocabulary_json
+from training.datasets import AnnotatedScene, DatasetError, generate_rooms
 from training.datasets.jsonl import scan_jsonl, write_jsonl
-from training.datasets.readers import guess_format
+from training.datasets.readers import READERS, guess_format
 from training.datasets.rooms import DOMAINS
-from training.domain.proposal import Proposal, propose
+from training.datasets.vocabulary import vocabulary_json
+from training.domain.proposal import propose
 from training.domain.proposal_report import as_dict, show
 from training.evaluation.report import write_whole
-from training.fit.configuration import Config, ConfigError, is_file, source_name
+from training.fit.configuration import ConfigError, is_file, source_name
 from training.runs.config_files import shipped_configs
 from training.runs.example_scenes import examples_json
 
 # Maximum number of invalid lines that are printed. Further invalid lines are only counted.
 BAD_LINES = 20
 
+StorePath = Annotated[str, typer.Option("--store", help="folder of the model store")]
+STORE = "model_store"
+
 console = Console()
-
-
-class BadLinesError(ValueError):
-    """Some lines of a file are not valid scenes. `errors` contains the error of each line."""
-
-    def __init__(self, errors: list[DatasetError]) -> None:
-        n = len(errors)
-        super().__init__("1 line is not a scene" if n == 1 else f"{n} lines are not scenes")
-        self.errors = errors
 
 
 def init(
@@ -71,17 +66,11 @@ def init(
         targets = [folder / file for file in (f"{name}.toml", "vocabulary.json", "examples.json")]
         with console.status("reading scenes"):
             scenes_of = {file: _read(file, format_) for file in files}
-        for file in files:
-            if not scenes_of[file]:
-                raise DatasetError(file, "", "the file contains no scene")
         sources, copies = _sources_and_copies(folder, scenes_of)
         _require_new([*targets, *copies], force=force)
         all_scenes = [scene for scenes in scenes_of.values() for scene in scenes]
         with console.status("analysing scenes"):
             proposal = propose(name, all_scenes, sources, terms=terms)
-            Config.model_validate(proposal.values)
-    except BadLinesError as error:
-        _fail_with_lines(error)
     except (ConfigError, DatasetError, ValueError) as error:
         fail(error)
     folder.mkdir(parents=True, exist_ok=True)
@@ -93,7 +82,14 @@ def init(
     if report is not None:
         write_whole(report, json.dumps(as_dict(proposal), indent=1, ensure_ascii=False) + "\n")
     show(proposal, console)
-    _print_files(proposal, folder, targets, copies)
+    lines = [
+        f"\nwritten: {', '.join(map(str, [*targets, *copies]))}",
+        f"next: check these files, then run  python -m training train {folder}",
+    ]
+    if folder.resolve().name != name:
+        lines.append(f"      (the configuration is {targets[0]})")
+    for line in lines:
+        console.print(line, markup=False, soft_wrap=True)
 
 
 def _check_name(name: str) -> None:
@@ -107,21 +103,24 @@ def _check_name(name: str) -> None:
 
 
 def _read(path: Path, format_: str | None) -> list[AnnotatedScene]:
-    """Read the scenes of a file. Report all invalid lines of a JSONL file in one error."""
+    """Read the scenes of a file, or print all invalid lines of a JSONL file and exit."""
     if format_ is not None and format_ not in READERS:
         raise ConfigError(f"unknown format {format_!r}: use one of {', '.join(READERS)}")
-    if (format_ or guess_format(path)) != "jsonl":
-        return READERS[format_ or guess_format(path)](path)
-    scenes: list[AnnotatedScene] = []
-    errors: list[DatasetError] = []
-    for line in scan_jsonl(path):
-        if isinstance(line, DatasetError):
-            errors.append(line)
-        else:
-            scenes.append(line)
+    format_ = format_ or guess_format(path)
+    lines = list(scan_jsonl(path) if format_ == "jsonl" else READERS[format_](path))
+    errors = [line for line in lines if isinstance(line, DatasetError)]
     if errors:
-        raise BadLinesError(errors)
-    return scenes
+        n = len(errors)
+        count = "1 line is not a scene" if n == 1 else f"{n} lines are not scenes"
+        console.print(f"[red]error:[/red] {count}; no file was written", soft_wrap=True)
+        for error in errors[:BAD_LINES]:
+            console.print(f"  {path.name}, {error.where}: {error.problem}", markup=False)
+        if n > BAD_LINES:
+            console.print(f"  and {n - BAD_LINES} more")
+        raise typer.Exit(1)
+    if not lines:
+        raise DatasetError(path, "", "the file contains no scene")
+    return [line for line in lines if isinstance(line, AnnotatedScene)]
 
 
 def _sources_and_copies(
@@ -139,9 +138,8 @@ def _sources_and_copies(
             guess_format(file)
             sources.append(Path(os.path.relpath(file, folder)).as_posix())
         except DatasetError:
-            copy = f"{source_name(file.name) if is_file(file.name) else file.name}.jsonl"
-            sources.append(copy)
-            copies[folder / copy] = scenes
+            sources.append(f"{source_name(file.name) if is_file(file.name) else file.name}.jsonl")
+            copies[folder / sources[-1]] = scenes
     return sources, copies
 
 
@@ -152,29 +150,6 @@ def _require_new(paths: Sequence[Path], *, force: bool) -> None:
             f"{' and '.join(existing)} would be overwritten: use --force, or choose another folder "
             "with --output"
         )
-
-
-def _print_files(
-    proposal: Proposal, folder: Path, targets: list[Path], copies: dict[Path, list[AnnotatedScene]]
-) -> None:
-    written = ", ".join(map(str, [*targets, *copies]))
-    console.print(f"\nwritten: {written}", markup=False, soft_wrap=True)
-    console.print(
-        f"next: check these files, then run  python -m training train {folder}",
-        markup=False,
-        soft_wrap=True,
-    )
-    if folder.resolve().name != proposal.name:
-        console.print(f"      (the configuration is {targets[0]})", markup=False, soft_wrap=True)
-
-
-def _fail_with_lines(error: BadLinesError) -> NoReturn:
-    console.print(f"[red]error:[/red] {error}; no file was written", soft_wrap=True)
-    for line in error.errors[:BAD_LINES]:
-        console.print(f"  {line.path.name}, {line.where}: {line.problem}", markup=False)
-    if (more := len(error.errors) - BAD_LINES) > 0:
-        console.print(f"  and {more} more")
-    raise typer.Exit(1)
 
 
 def fail(error: Exception) -> NoReturn:

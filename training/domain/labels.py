@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
+from itertools import combinations
 
 from rapidfuzz import process
 from rapidfuzz.distance import OSA
 
 from app.scene import label_key
-from training.datasets import AnnotatedScene, EncodedScene, Names
+from training.datasets import AnnotatedScene, EncodedScene
+from training.datasets.names import Names
+from training.datasets.vocabulary import most_frequent
 
 # Maximum number of names that are compared with each other, most frequent names first.
 _COMPARED = 2000
@@ -20,43 +23,28 @@ _ONE_SLIP, _TWO_SLIPS = 5, 10
 # A name is merged into a similar name if it has at least `_MERGED_LENGTH` letters and is rare. A
 # rare name has at most two objects, or at most the share `_RARE` of the objects of the other name.
 _RARE, _MERGED_LENGTH = 0.1, 6
-
-
 # Maximum number of labels in the text of `outside_vocabulary`. Further labels are only counted.
 _SHOWN = 8
 
 
 @dataclass(frozen=True)
 class Label:
-    """One name of objects, with all its spellings.
+    """One name of objects, with all its spellings."""
 
-    Attributes:
-        name: curated name, or the most frequent spelling.
-        mentions: number of objects with this name.
-        spellings: spellings in the scenes, most frequent first.
-    """
-
-    name: str
-    mentions: int
+    name: str  # curated name, or the most frequent spelling
+    mentions: int  # number of objects with this name
     scenes: int
-    spellings: tuple[str, ...]
+    spellings: tuple[str, ...]  # most frequent first
 
 
 @dataclass(frozen=True)
 class Lookalike:
-    """Two names that differ by a likely typing error.
+    """Two names that differ by a likely typing error."""
 
-    Attributes:
-        name: the rarer name.
-        like: the more frequent name.
-        mentions: number of objects with each of the two names.
-        merged: True if the rarer name becomes an alias. If False, the user has to decide.
-    """
-
-    name: str
-    like: str
-    mentions: tuple[int, int]
-    merged: bool
+    name: str  # the rarer name
+    like: str  # the more frequent name
+    mentions: tuple[int, int]  # number of objects with each of the two names
+    merged: bool  # the rarer name becomes an alias; otherwise the user has to decide
     why: str
 
 
@@ -68,13 +56,12 @@ def outside_vocabulary(scenes: Iterable[EncodedScene], *, named: bool) -> str:
         spellings.setdefault(label_key(label), Counter())[label] += count
     if not spellings:
         return ""
-    counts = [(_most_frequent(spelt), spelt.total()) for spelt in spellings.values()]
-    ordered = sorted(counts, key=lambda entry: (-entry[1], entry[0]))
-    listed = [f'"{label}" ({_number(count, "scene")})' for label, count in ordered[:_SHOWN]]
-    listed += [f"{len(ordered) - _SHOWN:,} more"] if len(ordered) > _SHOWN else []
-    are, they = ("is", "it is") if len(ordered) == 1 else ("are", "they are")
+    counts = [(-spelt.total(), most_frequent(spelt)) for spelt in spellings.values()]
+    listed = [f'"{label}" ({_number(-count, "scene")})' for count, label in sorted(counts)[:_SHOWN]]
+    listed += [f"{len(counts) - _SHOWN:,} more"] if len(counts) > _SHOWN else []
+    are, they = ("is", "it is") if len(counts) == 1 else ("are", "they are")
     return (
-        f"{_number(len(ordered), 'label')} in {_number(len(with_labels), 'scene')} {are} not in "
+        f"{_number(len(counts), 'label')} in {_number(len(with_labels), 'scene')} {are} not in "
         f"the vocabulary{': ' + ', '.join(listed) if named else ''}; {they} left out"
     )
 
@@ -85,33 +72,23 @@ def _number(count: int, noun: str) -> str:
 
 def count_labels(scenes: Iterable[AnnotatedScene], names: Names) -> list[Label]:
     """Count all names, most frequent first. Spellings with the same key count as one name."""
-    spellings: dict[str, Counter[str]] = {}
-    names_of: dict[str, Counter[str]] = {}
+    spellings: defaultdict[str, Counter[str]] = defaultdict(Counter)
+    names_of: defaultdict[str, Counter[str]] = defaultdict(Counter)
     scenes_of: Counter[str] = Counter()
     canonical = cache(names.canonical)
     for scene in scenes:
-        scene_keys = set()
+        keys = set()
         for thing in scene.objects:
             name = canonical(thing.label)
-            key = label_key(name)
-            spellings.setdefault(key, Counter())[thing.label] += 1
-            names_of.setdefault(key, Counter())[name] += 1
-            scene_keys.add(key)
-        scenes_of.update(scene_keys)
-    labels = [
-        Label(
-            name=_most_frequent(names_of[key]),
-            mentions=counts.total(),
-            scenes=scenes_of[key],
-            spellings=tuple(sorted(counts, key=lambda label: (-counts[label], label))),
-        )
-        for key, counts in spellings.items()
-    ]
+            keys.add(key := label_key(name))
+            spellings[key][thing.label] += 1
+            names_of[key][name] += 1
+        scenes_of.update(keys)
+    labels = []
+    for key, counts in spellings.items():
+        spelt = tuple(sorted(counts, key=lambda label: (-counts[label], label)))
+        labels.append(Label(most_frequent(names_of[key]), counts.total(), scenes_of[key], spelt))
     return sorted(labels, key=lambda label: (-label.mentions, label.name))
-
-
-def _most_frequent(counts: Counter[str]) -> str:
-    return min(counts, key=lambda label: (-counts[label], label))
 
 
 def lookalikes(
@@ -127,12 +104,14 @@ def lookalikes(
     pairs = list(_similar_pairs([label_key(label.name) for label in compared]))
     paired = {compared[k].name for pair in pairs for k in pair}
     together = _pairs_in_one_scene(paired, scenes, names)
-    similar = []
+    similar: list[Lookalike] = []
+    aliases: set[str] = set()  # each name is merged at most once, and never into a merged name
     for i, j in pairs:
         # Labels are sorted by frequency, so the second name of a pair is rarer.
         like, rare = compared[i], compared[j]
         keys = label_key(like.name), label_key(rare.name)
-        if set(keys) <= curated or _digits(keys[0]) != _digits(keys[1]):
+        digits = {"".join(filter(str.isdigit, key)) for key in keys}
+        if set(keys) <= curated or len(digits) == 2:
             continue
         if frozenset((like.name, rare.name)) in together:
             merged, why = False, "both occur in one scene"
@@ -142,9 +121,12 @@ def lookalikes(
             merged, why = False, "both are frequent"
         else:
             merged, why = True, "rare, one or two letters differ, never in one scene"
+        if merged and aliases & {rare.name, like.name}:
+            merged, why = False, "similar to several names"
+        aliases |= {rare.name} if merged else set()
         mentions = (rare.mentions, like.mentions)
         similar.append(Lookalike(rare.name, like.name, mentions, merged, why))
-    return _merge_each_name_once(similar)
+    return similar
 
 
 def _similar_pairs(keys: Sequence[str]) -> Iterator[tuple[int, int]]:
@@ -156,10 +138,6 @@ def _similar_pairs(keys: Sequence[str]) -> Iterator[tuple[int, int]]:
         yield from ((i, i + 1 + offset) for _, _, offset in matches)
 
 
-def _digits(key: str) -> str:
-    return "".join(letter for letter in key if letter.isdigit())
-
-
 def _pairs_in_one_scene(
     compared: set[str], scenes: Sequence[AnnotatedScene], names: Names
 ) -> set[frozenset[str]]:
@@ -169,21 +147,5 @@ def _pairs_in_one_scene(
     together: set[frozenset[str]] = set()
     for scene in scenes:
         present = {name for thing in scene.objects if (name := name_of(thing.label)) is not None}
-        together |= {frozenset((a, b)) for a in present for b in present if a < b}
+        together |= set(map(frozenset, combinations(present, 2)))
     return together
-
-
-def _merge_each_name_once(pairs: list[Lookalike]) -> list[Lookalike]:
-    """Return the pairs such that each name is merged at most once.
-
-    A name is never merged into another merged name.
-    """
-    merged: set[str] = set()
-    checked = []
-    for pair in pairs:
-        if pair.merged and (pair.name in merged or pair.like in merged):
-            pair = replace(pair, merged=False, why="similar to several names")
-        if pair.merged:
-            merged.add(pair.name)
-        checked.append(pair)
-    return checked

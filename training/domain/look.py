@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from app.scene import CANONICAL, canonicalise, label_key
 from app.scene.geometry import LARGEST, MOST_DISTANT
-from training.datasets import AnnotatedScene, Names
-
-_ON_TOP, _ABOVE = CANONICAL.index("on-top"), CANONICAL.index("above")
+from app.scene.relations import ABOVE, ON_TOP
+from training.datasets import AnnotatedScene
+from training.datasets.names import Names
 
 # Maximum number of examples in a finding. Further cases are only counted.
 SHOWN = 5
@@ -23,42 +23,25 @@ LONGEST = 100
 
 @dataclass(frozen=True)
 class Finding:
-    """A property of the scenes that the user should check.
+    """A property of the scenes that the user should check."""
 
-    Attributes:
-        what: description of the property, in one sentence.
-        advice: recommended action of the user.
-        count: number of cases.
-        examples: the first `SHOWN` cases.
-    """
-
-    what: str
-    advice: str
-    count: int
-    examples: list[str] = field(default_factory=list)
+    what: str  # description of the property, in one sentence
+    advice: str  # recommended action of the user
+    count: int  # number of cases
+    examples: list[str]  # the first `SHOWN` cases
 
 
 @dataclass(frozen=True)
 class Facts:
-    """Statistics of a set of scenes.
-
-    Attributes:
-        scenes, groups, objects: number of scenes, of groups of near-duplicates, and of objects.
-        objects_per_scene: minimum, mean and maximum number of objects in a scene.
-        rooms: maps each canonical room type to its number of scenes.
-        shares: maps a kind of annotation, such as "positions" or "sizes", to the share of all
-            scenes with this annotation.
-        relations: maps each relation to its number of annotated triples.
-        findings: findings with at least one case.
-    """
+    """Statistics of a set of scenes."""
 
     scenes: int
-    groups: int
+    groups: int  # of near-duplicates
     objects: int
-    objects_per_scene: tuple[int, float, int]
-    rooms: dict[str, int]
-    shares: dict[str, float]
-    relations: dict[str, int]
+    objects_per_scene: tuple[int, float, int]  # minimum, mean and maximum
+    rooms: dict[str, int]  # number of scenes of each canonical room type
+    shares: dict[str, float]  # share of scenes with each kind of annotation, such as "positions"
+    relations: dict[str, int]  # number of annotated triples of each relation
     findings: tuple[Finding, ...]
 
     @property
@@ -77,36 +60,31 @@ def look(scenes: Sequence[AnnotatedScene], names: Names) -> Facts:
     if not scenes:
         raise ValueError("there are no scenes to analyse; pass at least one scene")
     sizes = [len(scene.objects) for scene in scenes]
-    rooms = Counter(
-        room for scene in scenes if (room := names.canonical_room(scene.room_type)) is not None
-    )
+    canonical = [names.canonical_room(scene.room_type) for scene in scenes]
+    rooms = Counter(room for room in canonical if room is not None)
+    relations = Counter(r for scene in scenes for _, r, _ in scene.relations or ())
+
+    def share(attribute: str) -> float:
+        return sum(any(getattr(t, attribute) for t in s.objects) for s in scenes) / len(scenes)
+
     return Facts(
         scenes=len(scenes),
         groups=len({scene.group for scene in scenes}),
         objects=sum(sizes),
         objects_per_scene=(min(sizes), sum(sizes) / len(sizes), max(sizes)),
         rooms=dict(rooms.most_common()),
-        shares=_shares(scenes, names),
-        relations=dict(
-            Counter(r for scene in scenes for _, r, _ in scene.relations or ()).most_common()
-        ),
+        shares={
+            "room type": rooms.total() / len(scenes),
+            "relations": sum(bool(scene.relations) for scene in scenes) / len(scenes),
+            "positions": share("position"),
+            "sizes": share("size"),
+            "supports": share("supported_by"),
+            "boxes in an image": share("box2d"),
+            "viewer axes": sum(scene.viewer_frame for scene in scenes) / len(scenes),
+        },
+        relations=dict(relations.most_common()),
         findings=tuple(finding for finding in _findings(scenes, rooms, names) if finding.count),
     )
-
-
-def _shares(scenes: Sequence[AnnotatedScene], names: Names) -> dict[str, float]:
-    def share(has: Iterable[bool]) -> float:
-        return sum(has) / len(scenes)
-
-    return {
-        "room type": share(names.canonical_room(scene.room_type) is not None for scene in scenes),
-        "relations": share(bool(scene.relations) for scene in scenes),
-        "positions": share(any(thing.position for thing in scene.objects) for scene in scenes),
-        "sizes": share(any(thing.size for thing in scene.objects) for scene in scenes),
-        "supports": share(any(thing.supported_by for thing in scene.objects) for scene in scenes),
-        "boxes in an image": share(any(thing.box2d for thing in scene.objects) for scene in scenes),
-        "viewer axes": share(scene.viewer_frame for scene in scenes),
-    }
 
 
 def _findings(
@@ -116,7 +94,9 @@ def _findings(
         examples = list(cases)
         return Finding(what, advice, len(examples), examples[:SHOWN])
 
-    listed = [{canonicalise(*triple) for triple in scene.relations or ()} for scene in scenes]
+    listed = [
+        (scene, {canonicalise(*triple) for triple in scene.relations or ()}) for scene in scenes
+    ]
     yield finding(
         "Scenes have fewer than two different objects, so they do not show co-occurrence.",
         "Training reads them. Questions that need more objects skip them.",
@@ -127,7 +107,7 @@ def _findings(
         "Such a relation counts as unobserved. Correct it, or check the point of view.",
         (
             f"{_describe_pair(scene, i, j)}, {CANONICAL[a]}"
-            for scene, triples in zip(scenes, listed, strict=True)
+            for scene, triples in listed
             for a, i, j in sorted(triples)
             if i < j and (a, j, i) in triples
         ),
@@ -137,9 +117,9 @@ def _findings(
         "Correct one of the two relations.",
         (
             _describe_pair(scene, i, j)
-            for scene, triples in zip(scenes, listed, strict=True)
+            for scene, triples in listed
             for a, i, j in sorted(triples)
-            if a == _ON_TOP and (_ABOVE, j, i) in triples
+            if a == ON_TOP and (ABOVE, j, i) in triples
         ),
     )
     yield finding(
@@ -147,8 +127,8 @@ def _findings(
         "Correct the cycle: an object cannot stand on an object that it supports.",
         (
             f"{scene.scene_id}: {', '.join(cycle)}"
-            for scene, triples in zip(scenes, listed, strict=True)
-            if (cycle := _support_cycle(scene, triples)) is not None
+            for scene, triples in listed
+            if (cycle := _support_cycle(scene, triples))
         ),
     )
     yield finding(
@@ -167,6 +147,7 @@ def _findings(
         "If several scenes are frames or scans of one place, put these scenes into one group. "
         "Near-duplicates in training and test scenes make the test results too good.",
         len(scenes) if one_scene_each else 0,
+        [],
     )
     yield finding(
         "Scenes have no room type.",
@@ -193,10 +174,11 @@ def _findings(
 
 
 def _beyond_metres(scene: AnnotatedScene) -> bool:
-    points = [thing.position for thing in scene.objects if thing.position] or [(0.0, 0.0, 0.0)]
+    points = np.array([thing.position for thing in scene.objects if thing.position] or [(0, 0, 0)])
     middle = np.zeros(3) if scene.viewer_frame else np.median(points, 0)
-    far = bool((np.linalg.norm(points - middle, axis=1) > MOST_DISTANT).any())
-    return far or max((max(thing.size or (0,)) for thing in scene.objects), default=0) > LARGEST
+    sides = [side for thing in scene.objects for side in thing.size or ()]
+    far = np.linalg.norm(points - middle, axis=1).max() > MOST_DISTANT
+    return bool(far or max(sides, default=0) > LARGEST)
 
 
 def _invalid_labels(scenes: Sequence[AnnotatedScene], names: Names) -> Iterator[str]:
@@ -212,25 +194,20 @@ def _describe_pair(scene: AnnotatedScene, i: int, j: int) -> str:
     return f"{scene.scene_id}: {a.label} ({a.id}) and {b.label} ({b.id})"
 
 
-def _support_cycle(scene: AnnotatedScene, triples: set[tuple[int, int, int]]) -> list[str] | None:
-    """Return the labels of objects that support each other in a cycle, or None without a cycle."""
+def _support_cycle(scene: AnnotatedScene, triples: set[tuple[int, int, int]]) -> list[str]:
+    """Return the labels of objects that support each other in a cycle, or an empty list."""
     index_of = {thing.id: index for index, thing in enumerate(scene.objects)}
-    below: dict[int, set[int]] = {}
-    for a, i, j in triples:
-        # Skip pairs of objects that are on top of each other. Another finding reports such pairs.
-        if a == _ON_TOP and (a, j, i) not in triples:
-            below.setdefault(i, set()).add(j)
-    for index, thing in enumerate(scene.objects):
-        if thing.supported_by is not None:
-            below.setdefault(index, set()).add(index_of[thing.supported_by])
-    # Repeatedly remove objects whose supports were all removed. Then only cycles remain.
-    while free := [i for i, under in below.items() if not under & set(below)]:
-        for i in free:
-            del below[i]
-    if not below:
-        return None
-    path = [min(below)]
-    while (following := min(below[path[-1]] & set(below))) not in path:
+    supports = [(i, thing.supported_by) for i, thing in enumerate(scene.objects)]
+    links = {(i, index_of[support]) for i, support in supports if support is not None}
+    # Skip pairs of objects that are on top of each other. Another finding reports such pairs.
+    links |= {(i, j) for a, i, j in triples if a == ON_TOP and (a, j, i) not in triples}
+    # Repeatedly remove objects without supports. Then only cycles remain.
+    while free := {j for _, j in links} - {i for i, _ in links}:
+        links = {(i, j) for i, j in links if j not in free}
+    if not links:
+        return []
+    path = [min(links)[0]]
+    while (following := min(j for i, j in links if i == path[-1])) not in path:
         path.append(following)
     return [scene.objects[i].label for i in path[path.index(following) :]]
 
@@ -243,9 +220,9 @@ def _duplicates(scenes: Sequence[AnnotatedScene]) -> Iterator[str]:
         things = [
             (
                 labels[thing.id],
-                None if thing.position is None else tuple(round(x, 3) for x in thing.position),
+                thing.position and tuple(round(x, 3) for x in thing.position),
                 thing.box2d,
-                None if thing.supported_by is None else labels[thing.supported_by],
+                thing.supported_by and labels[thing.supported_by],
             )
             for thing in scene.objects
         ]

@@ -7,22 +7,17 @@ command `training tune` searches for a better configuration.
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from app.registry import Example
 from app.scene import Vocabulary, label_key
-from training.datasets import (
-    FRACTIONS,
-    AnnotatedScene,
-    Names,
-    coverage,
-    curated_names,
-    source_vocabulary,
-    split,
-)
+from training.datasets import AnnotatedObject, AnnotatedScene, source_vocabulary, split
+from training.datasets.names import Names, curated_names
+from training.datasets.splits import FRACTIONS
+from training.datasets.vocabulary import coverage
 from training.domain.labels import Label, Lookalike, count_labels, lookalikes
 from training.domain.look import Facts, look
 from training.evaluation.metrics import FEWEST_GROUPS
@@ -30,12 +25,11 @@ from training.fit.configuration import Config, ConfigError
 from training.runs.config_files import sections_toml
 from training.runs.example_scenes import choose_examples
 
-# Possible minimum numbers of objects of a class, in order of preference. A class with few objects
-# is hardly trained. A small data set needs a small minimum, so that the vocabulary covers enough
-# objects.
-MINIMA: Final = (8, 5, 3, 2)
-COVERED: Final = 0.97
-_TABLE: Final = (2, 3, 5, 8, 16, 30)
+# Possible minimum numbers of objects of a class. A class with few objects is hardly trained. Few
+# scenes need a small minimum, so that the vocabulary covers enough objects.
+_MINIMA: Final = (2, 3, 5, 8)
+_COVERED: Final = 0.97
+_TABLE: Final = (*_MINIMA, 16, 30)
 # docs/decisions/own-scenes.md gives the measurement behind these two numbers of scenes.
 FEWEST_SCENES: Final = 20
 FEW_SCENES: Final = 80
@@ -50,38 +44,22 @@ _MANY_SCENES: Final = 1000
 
 @dataclass(frozen=True)
 class Proposal:
-    """The files and the report that `init` writes.
-
-    Attributes:
-        facts, labels, lookalikes: results of the analysis: statistics, labels and similar labels.
-        covered: maps each possible minimum to the number of classes and the share of all objects
-            that these classes cover.
-        vocabulary: the proposed vocabulary. Merged similar labels are aliases.
-        dropped: tuple (name, number of objects, reason) of each name that is not a class.
-        values: maps each section of the configuration to its entries.
-        reasons: maps "section.entry" to the reason for the value.
-        test_groups: number of groups of near-duplicates in the test part.
-        examples: example scenes for the visual page.
-    """
+    """The files and the report that `init` writes."""
 
     name: str
     facts: Facts
     labels: tuple[Label, ...]
     lookalikes: tuple[Lookalike, ...]
-    minimum: int
-    covered: dict[int, tuple[int, float]]
-    vocabulary: Vocabulary
-    dropped: tuple[tuple[str, int, str], ...]
-    values: dict[str, Any]
-    reasons: dict[str, str]
-    parts: dict[str, int]
-    test_groups: int
+    minimum: int  # number of objects of a class
+    covered: dict[int, tuple[int, float]]  # number and coverage of the classes, for each minimum
+    vocabulary: Vocabulary  # merged similar labels are aliases
+    dropped: tuple[tuple[str, int, str], ...]  # names without a class: name, objects, reason
+    values: dict[str, Any]  # sections of the configuration
+    config: Config
+    reasons: dict[str, str]  # reason for the value of "section.entry"
+    parts: dict[str, int]  # number of scenes of each part of the split
+    test_groups: int  # number of groups of near-duplicates in the test part
     examples: tuple[Example, ...]
-
-    @property
-    def config(self) -> Config:
-        """Return the proposed configuration after validation."""
-        return Config.model_validate(self.values)
 
     @property
     def warning(self) -> str:
@@ -137,19 +115,11 @@ def propose(
         "data.split_seed": f"{parts['train']} training scenes, {parts['validation']} validation "
         f"scenes, {parts['test']} test scenes",
     }
-    data: dict[str, Any] = {
-        "sources": list(sources),
-        "vocabulary": "vocabulary.json",
-        "split": "stable",
-        "split_seed": seed,
-    } | ({"terms": terms} if terms else {})
+    data: dict[str, Any] = {"sources": list(sources), "vocabulary": "vocabulary.json"}
+    data |= {"split": "stable", "split_seed": seed} | ({"terms": terms} if terms else {})
     variant = settings["machine"]["variant"].capitalize()
-    values = {
-        "name": name,
-        "description": f"{variant} machine over {name} scenes.",
-        "examples": "examples.json",
-        "data": data,
-    } | settings
+    values = {"name": name, "description": f"{variant} machine over {name} scenes."}
+    values |= {"examples": "examples.json", "data": data} | settings
     return Proposal(
         name=name,
         facts=facts,
@@ -160,6 +130,7 @@ def propose(
         vocabulary=vocabulary,
         dropped=tuple(_dropped(labels, vocabulary, names, minimum)),
         values=values,
+        config=Config.model_validate(values),
         reasons=reasons,
         parts=parts,
         test_groups=test_groups,
@@ -170,17 +141,13 @@ def propose(
 def _choose_minimum(
     scenes: Sequence[AnnotatedScene], pairs: Sequence[Lookalike]
 ) -> tuple[int, dict[int, tuple[int, float]]]:
-    """Choose the minimum number of objects of a class.
+    """Choose the minimum number of objects of a class; return it and `Proposal.covered`.
 
     The choice is the largest minimum whose classes cover enough objects, or the smallest minimum.
     A choice that gives too many classes is raised.
-
-    Returns:
-        The choice. Then the number of classes and the share of all objects that these classes
-        cover, for each possible minimum.
     """
     covered: dict[int, tuple[int, float]] = {}
-    for minimum in sorted({*_TABLE, *MINIMA}):
+    for minimum in _TABLE:
         try:
             vocabulary = _vocabulary(scenes, pairs, minimum)
         except ValueError:
@@ -188,7 +155,7 @@ def _choose_minimum(
         covered[minimum] = (len(vocabulary), coverage(vocabulary, scenes))
     if not covered:
         raise ConfigError("every label occurs only once: training needs labels with more objects")
-    sufficient = [m for m, (_, share) in covered.items() if share >= COVERED and m <= MINIMA[0]]
+    sufficient = [m for m, (_, share) in covered.items() if share >= _COVERED and m in _MINIMA]
     chosen = max(sufficient, default=min(covered))
     affordable = [m for m, (classes, _) in covered.items() if classes <= _MOST_CLASSES]
     return max(chosen, min(affordable, default=chosen)), covered
@@ -197,15 +164,22 @@ def _choose_minimum(
 def _vocabulary(
     scenes: Sequence[AnnotatedScene], pairs: Sequence[Lookalike], minimum: int
 ) -> Vocabulary:
-    merged = {label_key(pair.name): pair.like for pair in pairs if pair.merged}
-    renamed = [_relabel(scene, merged) for scene in scenes]
-    vocabulary = source_vocabulary(renamed, minimum=minimum)
-    aliases_of: dict[str, list[str]] = {}
-    for pair in pairs:
-        if pair.merged and vocabulary.index(pair.name) is None:
-            aliases_of.setdefault(label_key(pair.like), []).append(pair.name)
+    merged = {label_key(pair.name): pair for pair in pairs if pair.merged}
+
+    def renamed(thing: AnnotatedObject) -> AnnotatedObject:
+        pair = merged.get(label_key(thing.label))
+        return thing if pair is None else replace(thing, label=pair.like)
+
+    vocabulary = source_vocabulary(
+        [replace(scene, objects=tuple(map(renamed, scene.objects))) for scene in scenes],
+        minimum=minimum,
+    )
+    aliases: defaultdict[str, list[str]] = defaultdict(list)
+    for pair in merged.values():
+        if vocabulary.index(pair.name) is None:
+            aliases[label_key(pair.like)].append(pair.name)
     objects = [
-        replace(entry, aliases=(*entry.aliases, *aliases_of.get(label_key(entry.label), ())))
+        replace(entry, aliases=(*entry.aliases, *aliases[label_key(entry.label)]))
         for entry in vocabulary.objects
     ]
     return Vocabulary(objects, vocabulary.room_types)
@@ -217,61 +191,38 @@ def _use_frequent_names(vocabulary: Vocabulary, scenes: Sequence[AnnotatedScene]
     A class of "plastic bottle", "glass bottle" and "bottle" stays "bottle", unless one of these
     names has more than half of the objects.
     """
-    key_counts: dict[int, Counter[str]] = {}
+    key_counts: defaultdict[int | None, Counter[str]] = defaultdict(Counter)
     for thing in (thing for scene in scenes for thing in scene.objects):
-        index = vocabulary.index(thing.label)
-        if index is not None:
-            key_counts.setdefault(index, Counter())[label_key(thing.label)] += 1
-    objects = list(vocabulary.objects)
-    label_of = {entry.label: entry.label for entry in objects}
-    for index, counts in key_counts.items():
-        entry = objects[index]
-        ((frequent_key, count),) = counts.most_common(1)
-        frequent = [name for name in entry.aliases if label_key(name) == frequent_key]
-        if frequent and 2 * count > counts.total():
-            label = label_of[entry.label] = frequent[0]
-            aliases = (entry.label, *(name for name in entry.aliases if name != label))
-            objects[index] = replace(entry, label=label, aliases=aliases)
-    objects = [
-        replace(entry, parent=label_of[entry.parent]) if entry.parent else entry
-        for entry in objects
-    ]
+        key_counts[vocabulary.index(thing.label)][label_key(thing.label)] += 1
+    objects, name_of = [], {}
+    for index, entry in enumerate(vocabulary.objects):
+        half = key_counts[index].total() / 2
+        common = [x for x in entry.aliases if key_counts[index][label_key(x)] > half]
+        name_of[entry.label] = label = common[0] if common else entry.label
+        others = [x for x in (entry.label, *entry.aliases) if x != label]
+        objects.append(replace(entry, label=label, aliases=tuple(others)))
+    objects = [replace(x, parent=name_of[x.parent]) if x.parent else x for x in objects]
     return Vocabulary(objects, vocabulary.room_types)
-
-
-def _relabel(scene: AnnotatedScene, merged: Mapping[str, str]) -> AnnotatedScene:
-    """Replace the labels of a scene. `merged` maps the key of a label to another label."""
-    objects = tuple(
-        replace(thing, label=merged.get(label_key(thing.label), thing.label))
-        for thing in scene.objects
-    )
-    return replace(scene, objects=objects)
 
 
 def _dropped(
     labels: Sequence[Label], vocabulary: Vocabulary, names: Names, minimum: int
 ) -> list[tuple[str, int, str]]:
-    excluded = {label_key(name) for name in names.not_objects}
+    reasons = {label_key(name): "not an object" for name in names.not_objects}
     return [
-        (
-            label.name,
-            label.mentions,
-            "not an object" if label_key(label.name) in excluded else f"under {minimum} mentions",
-        )
-        for label in labels
-        if vocabulary.index(label.name) is None
+        (x.name, x.mentions, reasons.get(label_key(x.name), f"under {minimum} mentions"))
+        for x in labels
+        if vocabulary.index(x.name) is None
     ]
 
 
 def _split(scenes: Sequence[AnnotatedScene]) -> tuple[int, dict[str, int], int]:
     """Return a seed of the split, the number of scenes in each part, and of test groups.
 
-    The function returns the first seed whose parts are near their target shares. If there is no
-    such seed, it returns the best of the tested seeds.
+    The seed is the first whose parts are near their target shares, or the best of the tested seeds.
     """
     best: tuple[int, dict[str, int], int] | None = None
-    smallest = math.inf
-    shares = FRACTIONS["stable"]
+    smallest, shares = math.inf, FRACTIONS["stable"]
     for seed in range(_SPLIT_SEEDS):
         scenes_of = split(scenes, seed=seed, protocol="stable")
         sizes: dict[str, int] = {name: len(part) for name, part in scenes_of.items()}
@@ -302,11 +253,8 @@ def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, An
     machine |= {"units": 8, "states": 32 if is_large else 8}
     machine |= {"K": 32 if is_large else 16, "G": 8} if facts.related else {"K": 0}
     machine |= {"N": 512 if is_large else 128, "min_triple_count": 2}
-    objects = {
-        "steps": 800 if is_large else 300,
-        "batch_size": 256 if is_large else 64,
-        "chains": 256 if is_large else 64,
-    }
+    size = 256 if is_large else 64
+    objects = {"steps": 800 if is_large else 300, "batch_size": size, "chains": size}
     values: dict[str, Any] = {"machine": machine, "objects": objects}
     reasons = {
         "machine.variant": "the scenes contain relations or positions"
@@ -319,8 +267,8 @@ def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, An
         # An epoch has about eight updates or more, because validation after each epoch takes
         # longer than an update.
         batch = 64 if is_large else max(4, min(32, n // 8))
-        updates = 800 if is_large else 200
-        epochs = math.ceil(updates / math.ceil(n / batch))
+        updates = math.ceil(n / batch)
+        epochs = math.ceil((800 if is_large else 200) / updates)
         values["relations"] = {"epochs": epochs, "batch_size": batch}
-        reasons["relations.epochs"] = f"{epochs} epochs of {math.ceil(n / batch)} updates"
+        reasons["relations.epochs"] = f"{epochs} epochs of {updates} updates"
     return values, reasons

@@ -17,21 +17,16 @@ ROWS = 12
 
 def as_dict(proposal: Proposal) -> dict[str, Any]:
     """Return the analysis and the proposal as a JSON-serialisable dictionary."""
+    coverage, dropped = ("classes", "share"), ("label", "mentions", "why")
     return {
         "name": proposal.name,
         "facts": asdict(proposal.facts),
-        "labels": [asdict(label) for label in proposal.labels],
-        "lookalikes": [asdict(pair) for pair in proposal.lookalikes],
+        "labels": list(map(asdict, proposal.labels)),
+        "lookalikes": list(map(asdict, proposal.lookalikes)),
         "minimum": proposal.minimum,
-        "covered": {
-            str(minimum): {"classes": classes, "share": share}
-            for minimum, (classes, share) in proposal.covered.items()
-        },
+        "covered": {k: dict(zip(coverage, x, strict=True)) for k, x in proposal.covered.items()},
         "vocabulary": proposal.vocabulary.to_dict(),
-        "dropped": [
-            {"label": label, "mentions": mentions, "why": why}
-            for label, mentions, why in proposal.dropped
-        ],
+        "dropped": [dict(zip(dropped, label, strict=True)) for label in proposal.dropped],
         "configuration": proposal.values,
         "reasons": proposal.reasons,
         "parts": proposal.parts,
@@ -42,12 +37,8 @@ def as_dict(proposal: Proposal) -> dict[str, Any]:
 
 def show(proposal: Proposal, console: Console) -> None:
     """Print the report of a proposal as tables."""
-    _facts(proposal, console)
-    _labels(proposal, console)
-    _lookalikes(proposal, console)
-    _coverage(proposal, console)
-    _findings(proposal, console)
-    _choices(proposal, console)
+    for part in (_facts, _labels, _lookalikes, _coverage, _findings, _choices):
+        part(proposal, console)
     if proposal.warning:
         console.print(f"[yellow]warning:[/yellow] {proposal.warning}", soft_wrap=True)
 
@@ -77,28 +68,27 @@ def _labels(proposal: Proposal, console: Console) -> None:
         table.add_row(label.name, str(label.mentions), str(label.scenes), spellings)
     console.print(table)
     renamed = [label for label in labels if label_key(label.name) != label_key(label.spellings[0])]
+    varied = [label for label in labels if len(label.spellings) > 1]
     if renamed:
         console.print("joined by built-in synonyms; vocabulary.json has the classes:")
-        for label in renamed[:ROWS]:
-            console.print(f"  {label.spellings[0]} = {label.name}", markup=False)
-    varied = [label for label in labels if len(label.spellings) > 1]
+    for label in renamed[:ROWS]:
+        console.print(f"  {label.spellings[0]} = {label.name}", markup=False)
     if varied:
         console.print(f"labels with several spellings, each counted as one label: {len(varied)}")
-        for label in varied[:ROWS]:
-            console.print(f"  {' = '.join(label.spellings[:6])}", markup=False)
+    for label in varied[:ROWS]:
+        console.print(f"  {' = '.join(label.spellings[:6])}", markup=False)
 
 
 def _lookalikes(proposal: Proposal, console: Console) -> None:
-    if not proposal.lookalikes:
-        return
+    ordered = sorted(proposal.lookalikes, key=lambda pair: not pair.merged)
     table = Table("label", "like", "mentions", "proposal", "why", title_justify="left")
     table.title = "Similar labels"
-    ordered = sorted(proposal.lookalikes, key=lambda pair: not pair.merged)
     for pair in ordered[:ROWS]:
         a, b = pair.mentions
         action = "alias" if pair.merged else "two objects: check"
         table.add_row(pair.name, pair.like, f"{a}, {b}", action, pair.why)
-    console.print(table)
+    if ordered:
+        console.print(table)
     if (more := len(ordered) - ROWS) > 0:
         console.print(f"and {more} more in the JSON report")
 
@@ -116,11 +106,9 @@ def _coverage(proposal: Proposal, console: Console) -> None:
 
 
 def _findings(proposal: Proposal, console: Console) -> None:
-    if not proposal.facts.findings:
-        console.print("no contradictions found")
-        return
-    console.print("Please check:")
-    for finding in proposal.facts.findings:
+    findings = proposal.facts.findings
+    console.print("Please check:" if findings else "no contradictions found")
+    for finding in findings:
         console.print(f"  [yellow]{finding.count}[/yellow] × {finding.what}")
         console.print(f"    {finding.advice}")
         for example in finding.examples:
@@ -128,8 +116,7 @@ def _findings(proposal: Proposal, console: Console) -> None:
 
 
 def _choices(proposal: Proposal, console: Console) -> None:
-    title = "Configuration"
-    table = Table("entry", "value", "why", title=title, title_justify="left")
+    table = Table("entry", "value", "why", title="Configuration", title_justify="left")
     for name, reason in proposal.reasons.items():
         section, _, entry = name.partition(".")
         if entry in proposal.values[section]:

@@ -30,17 +30,11 @@ def same_classes(a: Vocabulary, b: Vocabulary) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Translation:
-    """Mapping from the classes of scenes to the classes of a model.
+    """Mapping from the classes of scenes to the classes of a model."""
 
-    Attributes:
-        model_class: (V,) int64, model class of each of the V scene classes; -1 for unknown classes.
-        size: number of model classes.
-        unknown: score of unknown classes.
-    """
-
-    model_class: Tensor
-    size: int
-    unknown: float = -BEYOND
+    model_class: Tensor  # (V,) int64, model class of each of the V scene classes; -1: unknown
+    size: int  # number of model classes
+    unknown: float = -BEYOND  # score of unknown classes
 
     @classmethod
     def between(cls, scenes: Vocabulary, model: Vocabulary) -> Translation:
@@ -54,8 +48,7 @@ class Translation:
     def translate(self, model: Model) -> Model:
         """Return the model with scores that take scenes and return values in the scene classes.
 
-        In T3b (false relations), the lowest score ranks first. In other tasks, the highest score
-        ranks first. Unknown classes rank last in every task.
+        Unknown classes rank last. In T3b (false relations), the lowest score ranks first.
         """
         reverse = replace(self, unknown=BEYOND)
         wrapper_of: dict[str, Callable[[Any], Any]] = {
@@ -74,9 +67,8 @@ class Translation:
         return Model(**scores, parameters=model.parameters)
 
     def presence(self, v: Tensor) -> Tensor:
-        """Map presence or counts from the scene classes to the model's classes.
+        """Map presence or counts (scenes, scene classes) to (scenes, model classes).
 
-        `v` has the shape (scenes, scene classes); the result has the shape (scenes, model classes).
         If several scene classes map to one model class, the result is their maximum.
         """
         is_known = self.model_class >= 0
@@ -134,20 +126,22 @@ class Translation:
         n, A = len(model_classes), batch.holds.shape[1]
         counts = torch.zeros(n, dtype=torch.int64)
         counts.index_add_(0, index_of, batch.counts[row, columns])
-        holds, observed = torch.zeros(A, n, n), torch.zeros(A, n, n, dtype=torch.bool)
         model_pair = (slice(None), index_of[:, None], index_of[None, :])
         scene_pair = (slice(None), columns[:, None], columns[None, :])
         # Scene classes that map to one model class share their observed relations.
-        for a, i, j in batch.observed[row][scene_pair].nonzero().tolist():
-            observed[a, index_of[i], index_of[j]] = True
-            holds[a, index_of[i], index_of[j]] += batch.holds[row][scene_pair][a, i, j]
+        pair = (index_of[:, None] * n + index_of).flatten().expand(A, -1)
+
+        def pooled(relations: Tensor) -> Tensor:
+            values = relations[row][scene_pair].float().flatten(1)
+            return torch.zeros(A, n * n).scatter_reduce(1, pair, values, "amax").view(1, A, n, n)
+
         model_scene = replace(
             batch.rows(torch.tensor([row])),
             v=torch.zeros(1, self.size).index_fill(1, model_classes, 1.0),
             classes=model_classes.unsqueeze(0),
             counts=counts.unsqueeze(0),
-            holds=holds.clamp(max=1.0).unsqueeze(0),
-            observed=observed.unsqueeze(0),
+            holds=pooled(batch.holds * batch.observed),
+            observed=pooled(batch.observed).bool(),
             room=torch.tensor([-1]),
         )
         values = score(model_scene)[0].clamp(min=-BEYOND)[model_pair]

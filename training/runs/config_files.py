@@ -18,14 +18,16 @@ _TRAINING = Path(__file__).resolve().parents[1]
 
 def shipped_configs() -> dict[str, Path]:
     """Return the files of the shipped configurations by name."""
-    folder = _TRAINING / "runs" / "configs"
-    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+    return _toml_files("runs/configs")
 
 
 def shipped_files(kind: str) -> dict[str, Path]:
     """Return the shipped "ablations" or "spaces" by the name of their configuration."""
-    folder = _TRAINING / "research" / "configs" / kind
-    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+    return _toml_files(f"research/configs/{kind}")
+
+
+def _toml_files(folder: str) -> dict[str, Path]:
+    return {path.stem: path for path in sorted((_TRAINING / folder).glob("*.toml"))}
 
 
 def own_or_shipped(path: Path | None, config: Config, kind: str, option: str) -> Path:
@@ -36,9 +38,9 @@ def own_or_shipped(path: Path | None, config: Config, kind: str, option: str) ->
     """
     shipped = shipped_files(kind)
     if path is None and config.name not in shipped:
+        available = f"(available for: {', '.join(shipped)})"
         raise ConfigError(
-            f"{config.name} has no shipped {kind} (available for: {', '.join(shipped)}). Pass a "
-            f"TOML file with {option}"
+            f"{config.name} has no shipped {kind} {available}. Pass a TOML file with {option}"
         )
     return path or shipped[config.name]
 
@@ -64,14 +66,8 @@ def config_path(reference: str) -> Path:
 
 
 def data_folder(reference: str, config: Config, given: Path | None = None) -> Path:
-    """Return the data folder of a configuration.
-
-    The folder is `given` if it is set. If the configuration names files, the folder is that of the
-    configuration file. Otherwise the folder is `DATA`.
-    """
-    if given is not None:
-        return given
-    return config_path(reference).parent if config.data.files else DATA
+    """Return `given`, the folder of a configuration file that names files, or `DATA`."""
+    return given or (config_path(reference).parent if config.data.files else DATA)
 
 
 def load_config(reference: str, *, seed: int | None = None) -> Config:
@@ -82,24 +78,23 @@ def load_config(reference: str, *, seed: int | None = None) -> Config:
     """
     path = config_path(reference)
     if not path.is_file():
-        shipped = ", ".join(shipped_configs())
-        raise ConfigError(
-            f"there is no configuration {reference!r}: pass a TOML file or one of {shipped}"
-        )
+        choice = f"pass a TOML file or one of {', '.join(shipped_configs())}"
+        raise ConfigError(f"there is no configuration {reference!r}: {choice}")
     values = read_toml(path)
     if seed is not None:
         values.setdefault("training", {})["seed"] = seed
+    return _validated(values, f"{path.name}:")
+
+
+def _validated(values: Mapping[str, Any], title: str) -> Config:
     try:
         return Config.model_validate(values)
     except ValidationError as error:
-        raise ConfigError(f"{path.name}: {first_error(error)}") from error
+        raise ConfigError(f"{title} {first_error(error)}") from error
 
 
 def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
-    """Return a configuration with changed entries.
-
-    Args:
-        settings: maps the full name of an entry, such as "relations.epochs", to its new value.
+    """Return a configuration with new values of entries, such as "relations.epochs".
 
     Raises:
         ConfigError: an entry does not exist, or a value is invalid.
@@ -112,23 +107,13 @@ def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
             choice = f"{section} has {', '.join(entries)}" if entries else "name it section.entry"
             raise ConfigError(f"there is no setting {name!r}: {choice}")
         values[section][entry] = value
-    try:
-        return Config.model_validate(values)
-    except ValidationError as error:
-        raise ConfigError(
-            f"the settings {dict(settings)} are invalid: {first_error(error)}"
-        ) from error
+    return _validated(values, f"the settings {dict(settings)} are invalid:")
 
 
 def shortened(config: Config, factor: float) -> Config:
     """Return a configuration whose training has a share of the steps and epochs, at least one."""
-    return with_settings(
-        config,
-        {
-            "objects.steps": max(1, round(factor * config.objects.steps)),
-            "relations.epochs": max(1, round(factor * config.relations.epochs)),
-        },
-    )
+    full = {"objects.steps": config.objects.steps, "relations.epochs": config.relations.epochs}
+    return with_settings(config, {name: max(1, round(factor * x)) for name, x in full.items()})
 
 
 def config_toml(config: Config) -> str:
@@ -139,9 +124,7 @@ def config_toml(config: Config) -> str:
 def sections_toml(values: Mapping[str, Any], reasons: Mapping[str, str] | None = None) -> str:
     """Return entries and sections as TOML text.
 
-    Args:
-        values: maps each entry to its value, and each section to a mapping of its entries.
-        reasons: maps "section.entry" to a comment for the line above the entry.
+    `reasons` maps "section.entry" to a comment for the line above the entry.
     """
     sections = {name: own for name, own in values.items() if isinstance(own, Mapping)}
     lines = [_entry(name, value) for name, value in values.items() if name not in sections]

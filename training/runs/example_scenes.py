@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,14 +19,15 @@ from pydantic import TypeAdapter, ValidationError
 
 from app.registry.examples import MAX_WORD, Example, Examples
 from app.scene import Vocabulary, canonicalise
-from training.datasets import AnnotatedScene, curated_names
+from training.datasets import AnnotatedScene
 from training.datasets.encoding import room_viewpoint
+from training.datasets.names import curated_names
 from training.datasets.records import AnnotatedObject
-from training.datasets.sources import SOURCES
+from training.datasets.sources import source_of
 from training.fit.configuration import ConfigError, first_error
 
 _SHIPPED: Final = Path(__file__).parent / "examples"
-_READER: Final = TypeAdapter(Examples)
+_READER: Final[TypeAdapter[tuple[Example, ...]]] = TypeAdapter(Examples)
 _CHOSEN: Final = 3
 # The page shows one object beside the other, so more objects would hide each other.
 _MOST_OBJECTS: Final = 12
@@ -45,10 +47,11 @@ def read_examples(reference: str, root: Path) -> tuple[Example, ...]:
     """
     if not reference:
         return ()
-    is_file = reference.endswith(".json")
-    path = root / reference if is_file else _SHIPPED / f"{reference}.json"
+    path = root / reference
+    if not reference.endswith(".json"):
+        path = _SHIPPED / f"{reference}.json"
     try:
-        examples: tuple[Example, ...] = _READER.validate_json(path.read_bytes())
+        return _READER.validate_json(path.read_bytes())
     except ValidationError as error:
         raise ConfigError(f"{path}, {first_error(error)}") from error
     except OSError as error:
@@ -56,7 +59,6 @@ def read_examples(reference: str, root: Path) -> tuple[Example, ...]:
             f"{path} cannot be read: {error}. Remove the entry `examples` of the configuration, or "
             "provide the file"
         ) from error
-    return examples
 
 
 def known_examples(
@@ -75,20 +77,19 @@ def known_examples(
 
 def examples_json(examples: Sequence[Example]) -> str:
     """Return examples as JSON text that people can edit, with one object or relation on a line."""
-    return "[\n" + ",\n".join(map(_example_json, examples)) + "\n]\n"
+    as_json = partial(json.dumps, ensure_ascii=False)
 
+    def field(name: str, value: Any) -> str:
+        rows = ",\n".join(f"  {as_json(row)}" for row in value) if isinstance(value, list) else ""
+        return f' "{name}": ' + (f"[\n{rows}]" if rows else as_json(value))
 
-def _example_json(example: Example) -> str:
-    scene = example.request()
-    entries = []
-    for field, value in scene.items():
-        text = json.dumps(value, ensure_ascii=False)
-        if isinstance(value, list):
-            rows = ",\n".join(f"  {json.dumps(row, ensure_ascii=False)}" for row in value)
-            text = f"[\n{rows}]"
-        entries.append(f' "{field}": {text}')
-    name = json.dumps(example.name, ensure_ascii=False)
-    return f'{{"name": {name}, "scene": {{\n' + ",\n".join(entries) + "}}"
+    entries = [
+        f'{{"name": {as_json(example.name)}, "scene": {{\n'
+        + ",\n".join(field(*entry) for entry in example.request().items())
+        + "}}"
+        for example in examples
+    ]
+    return "[\n" + ",\n".join(entries) + "\n]\n"
 
 
 def choose_examples(
@@ -103,14 +104,14 @@ def choose_examples(
     objects_of = {
         scene: _usable(scene, vocabulary)
         for scene in scenes
-        if scene.source not in SOURCES or not SOURCES[scene.source].research_only
+        if not source_of(scene.source).research_only
     }
     classes = {scene: {index for index, _ in pairs} for scene, pairs in objects_of.items()}
     frequency = Counter(index for indices in classes.values() for index in indices)
     candidates = [scene for scene in objects_of if len(classes[scene]) >= _FEWEST_CLASSES]
-    sizes: dict[str | None, list[int]] = {}
+    sizes: defaultdict[str | None, list[int]] = defaultdict(list)
     for scene in candidates:
-        sizes.setdefault(scene.room_type, []).append(len(classes[scene]))
+        sizes[scene.room_type].append(len(classes[scene]))
     median_size = {room: np.median(counts) for room, counts in sizes.items()}
     ranked = sorted(
         candidates,
@@ -133,15 +134,13 @@ def choose_examples(
 
 def _usable(scene: AnnotatedScene, vocabulary: Vocabulary) -> list[tuple[int, AnnotatedObject]]:
     """Return the objects of a scene that a request can contain, with their class indices."""
-    objects = []
-    for thing in scene.objects:
-        index = vocabulary.index(thing.label)
-        if index is None or vocabulary.structure[index]:
-            continue
-        label = vocabulary.labels[index]
-        if len(label) <= MAX_WORD and label.isprintable():
-            objects.append((index, thing))
-    return objects
+    indices = [vocabulary.index(thing.label) for thing in scene.objects]
+    return [
+        (index, thing)
+        for index, thing in zip(indices, scene.objects, strict=True)
+        if index is not None and not vocabulary.structure[index]
+        if len(label := vocabulary.labels[index]) <= MAX_WORD and label.isprintable()
+    ]
 
 
 def _make_example(
@@ -181,21 +180,18 @@ def _select_objects(
     """Return the first objects of all classes, frequent classes first, then the second ones."""
     counts: Counter[int] = Counter()
     ranks = []
-    for index, _ in objects:
-        ranks.append((counts[index], -frequency[index]))
+    for position, (index, _) in enumerate(objects):
+        ranks.append((counts[index], -frequency[index], position))
         counts[index] += 1
-    order = sorted(range(len(objects)), key=ranks.__getitem__)[:_MOST_OBJECTS]
-    return [objects[position] for position in sorted(order)]
+    return [objects[position] for position in sorted(p for *_, p in sorted(ranks)[:_MOST_OBJECTS])]
 
 
 def _viewpoint(scene: AnnotatedScene) -> dict[str, float]:
     """Return the viewpoint from which training derives the relations of a scene."""
     if scene.viewer_frame:
         return {"x": 0.0, "y": 0.0, "yaw": 0.0}
-    unknown = (math.nan,) * 3
-    view = room_viewpoint(
-        scene.scene_id, np.array([thing.position or unknown for thing in scene.objects])
-    )
+    positions = [thing.position or (math.nan,) * 3 for thing in scene.objects]
+    view = room_viewpoint(scene.scene_id, np.array(positions))
     return {"x": round(view.x, 3), "y": round(view.y, 3), "yaw": round(view.yaw, 4)}
 
 
@@ -214,20 +210,18 @@ def _pose(thing: AnnotatedObject) -> dict[str, Any]:
 def _relations(scene: AnnotatedScene, names: dict[str, str]) -> list[dict[str, str]]:
     """Return the annotated relations between named objects, without contradictions."""
     index_of = {thing.id: index for index, thing in enumerate(scene.objects)}
-    triples = list(scene.relations or ())
-    if scene.relations is None:
-        triples = [
+    triples = scene.relations
+    if triples is None:
+        triples = tuple(
             (index_of[thing.id], "on-top", index_of[thing.supported_by])
             for thing in scene.objects
             if thing.supported_by is not None
-        ]
+        )
     canonical = {canonicalise(*triple) for triple in triples}
     relations = []
     for triple in triples:
         relation, i, j = canonicalise(*triple)
-        ends = [scene.objects[end].id for end in (triple[0], triple[2])]
-        if i == j or (relation, j, i) in canonical or not names.keys() >= set(ends):
-            continue
-        subject, other = (names[end] for end in ends)
-        relations.append({"subject": subject, "relation": triple[1], "object": other})
+        subject, other = (names.get(scene.objects[end].id) for end in (triple[0], triple[2]))
+        if i != j and (relation, j, i) not in canonical and subject and other:
+            relations.append({"subject": subject, "relation": triple[1], "object": other})
     return relations[:_MOST_RELATIONS]

@@ -16,6 +16,7 @@ from pathlib import Path
 from safetensors import safe_open
 from safetensors.torch import save_file
 
+from training.datasets.files import DATA
 from training.fit.checkpoint import RunError, TrainingResult
 from training.fit.configuration import Config
 from training.machines import BoltzmannMachine, MachineSpec, build
@@ -23,19 +24,18 @@ from training.machines import BoltzmannMachine, MachineSpec, build
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A finished training run, loaded from its folder.
-
-    Attributes:
-        data: folder of the scenes on the computer that trained the run.
-        scenes: digest of the scenes, their vocabulary and split. An empty text means that the run
-            has no digest.
-    """
+    """A finished training run, loaded from its folder."""
 
     config: Config
     machine: BoltzmannMachine
     seconds: float
-    data: str = ""
-    scenes: str = ""
+    data: str = ""  # folder of the scenes on the computer that trained the run, if known
+    scenes: str = ""  # digest of the scenes, their vocabulary and split, if known
+
+    @property
+    def data_folder(self) -> Path:
+        """Folder of the scenes. The default is `DATA`."""
+        return Path(self.data or DATA)
 
     def require(self, scenes: str) -> None:
         """Raise RunError if the run was trained on scenes of another digest."""
@@ -60,11 +60,8 @@ def save_run(
     spec = json.dumps(machine.spec.to_dict())
     save_file(state, folder / "model.safetensors", metadata={"spec": spec})
     (folder / "config.json").write_text(config.model_dump_json(indent=1), encoding="utf-8")
-    outcome = {
-        "seconds": round(result.seconds, 1),
-        "data": "" if data is None else str(data.resolve()),
-        "scenes": scenes,
-    }
+    origin = {"data": "" if data is None else str(data.resolve()), "scenes": scenes}
+    outcome = {"seconds": round(result.seconds, 1)} | origin
     (folder / "result.json").write_text(json.dumps(outcome), encoding="utf-8")
 
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from statistics import fmean
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from training.fit.checkpoint import CurvePoint, TrainingResult
-from training.fit.configuration import Config
 from training.fit.trainer import Trainer
 
 _LEVELS = "▁▂▃▄▅▆▇█"
@@ -38,7 +38,13 @@ class Display(Progress):
         )
         self._trainer = trainer
         self._task = self.add_task(trainer.config.name, total=1.0, note="")
-        self._log = None if logs is None else tensorboard(logs, trainer.config)
+        self._writer = None
+        if logs is not None:
+            # Imported only when needed, because the import takes longer than a small run.
+            from torch.utils.tensorboard import SummaryWriter
+
+            config = trainer.config
+            self._writer = SummaryWriter(str(logs / config.name / f"seed-{config.training.seed}"))
 
     def progress(self, phase: str, done: float, loss: float) -> None:
         """Show the progress after an update of the weights."""
@@ -49,8 +55,14 @@ class Display(Progress):
 
     def passed(self, point: CurvePoint) -> None:
         """Write a point of the curve to the TensorBoard log."""
-        if self._log is not None:
-            self._log(point)
+        if self._writer is None:
+            return
+        step = round(1000 * point.done)
+        for name in ("loss", "score", "seconds"):
+            if not math.isnan(value := getattr(point, name)):
+                self._writer.add_scalar(f"{point.phase}/{name}", value, step)
+        # Flush each time, so that the log of an interrupted run is complete.
+        self._writer.flush()
 
 
 def score_of(point: CurvePoint) -> str:
@@ -60,34 +72,13 @@ def score_of(point: CurvePoint) -> str:
     return f"{SCORES[point.phase]} {point.score:.3f}"
 
 
-def tensorboard(folder: Path, config: Config) -> Callable[[CurvePoint], None]:
-    """Return a function of a point of the curve that writes to TensorBoard."""
-    # TensorBoard is imported only when needed, because the import takes longer than a small run.
-    from torch.utils.tensorboard import SummaryWriter
-
-    writer = SummaryWriter(str(folder / config.name / f"seed-{config.training.seed}"))
-
-    def log(point: CurvePoint) -> None:
-        step = round(1000 * point.done)
-        for name in ("loss", "score", "seconds"):
-            if not math.isnan(value := getattr(point, name)):
-                writer.add_scalar(f"{point.phase}/{name}", value, step)
-        # Flush each time, so that the log of an interrupted run is complete.
-        writer.flush()
-
-    return log
-
-
 def sparkline(values: Sequence[float], width: int = _WIDTH) -> str:
     """Return the values, or means of several, as at most `width` blocks of different heights."""
     finite = [value for value in values if math.isfinite(value)]
     if not finite:
         return ""
     size = max(1, math.ceil(len(finite) / width))
-    means = [
-        sum(part) / len(part)
-        for part in (finite[start : start + size] for start in range(0, len(finite), size))
-    ]
+    means = [fmean(finite[start : start + size]) for start in range(0, len(finite), size)]
     low, high = min(means), max(means)
     step = (high - low) / (len(_LEVELS) - 1)
     return "".join(_LEVELS[round((value - low) / step) if step else 0] for value in means)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -15,56 +17,40 @@ from training.datasets import (
     AnnotatedScene,
     EncodedScene,
     annotated_classes,
-    count_roles,
     encode,
     generate_rooms,
-    indoor_vocabulary,
     priors,
     read_scenes,
-    read_vocabulary,
     rooms_vocabulary,
     shuffle_objects,
     source_vocabulary,
     split,
-    with_typical_sizes,
 )
-from training.datasets.batches import SceneTensors, TrainingData, scene_tensors
-from training.datasets.files import DATA
+from training.datasets.batches import TrainingData, scene_tensors
 from training.datasets.records import digest_of
+from training.datasets.roles import count_roles
+from training.datasets.vocabulary import indoor_vocabulary, read_vocabulary, with_typical_sizes
 from training.datasets.words import class_vectors, read_word_vectors
 from training.fit.configuration import Config, ConfigError, DataConfig, is_file, source_name
 
 
 @dataclass(frozen=True)
 class SplitScenes:
-    """The encoded scenes of the train, validation and test part, and their origin.
-
-    Attributes:
-        data: the configuration section that names the sources.
-        vocabulary: classes; the scenes use their indices.
-        roles: roles of the classes in the training scenes.
-        counts, digests: number of scenes and sha256 of their contents, by source.
-        shuffle: seed of the permutation of objects; None if the objects are not permuted.
-        words: (V, D) unit word vectors of the classes; None without word vectors.
-        examples: example scenes for the artifact.
-    """
+    """The encoded scenes of the train, validation and test part, and their origin."""
 
     data: DataConfig
-    vocabulary: Vocabulary
-    roles: RoleCounts
+    vocabulary: Vocabulary  # the scenes use the indices of its classes
+    roles: RoleCounts  # of the classes in the training scenes
     parts: dict[str, list[EncodedScene]]
-    counts: dict[str, int]
-    digests: dict[str, str]
-    shuffle: int | None = None
-    words: torch.Tensor | None = None
-    examples: tuple[Example, ...] = ()
+    counts: dict[str, int]  # number of scenes, by source
+    digests: dict[str, str]  # sha256 of the contents of the scenes, by source
+    shuffle: int | None = None  # seed of the permutation of objects, if they are permuted
+    words: torch.Tensor | None = None  # (V, D) unit word vectors of the classes
+    examples: tuple[Example, ...] = ()  # for the artifact
 
     @property
     def digest(self) -> str:
-        """The sha256 of the training input: scenes, vocabulary, split and permutation.
-
-        The sha256 depends on the contents of the files, because a corrected file keeps its name.
-        """
+        """The sha256 of the training input: scenes, vocabulary, split and permutation."""
         decisive = {
             "data": self.data.model_dump(mode="json"),
             "contents": self.digests,
@@ -88,14 +74,10 @@ class SplitScenes:
                 f"the training part contains no scene of the source {source!r}; add scenes, or "
                 "remove the source from data.sources"
             )
-        tensors: dict[str, SceneTensors] = {
-            part: scene_tensors(scenes, annotated, len(self.vocabulary))
-            for part, scenes in self.parts.items()
-        }
+        V = len(self.vocabulary)
+        tensors = {name: scene_tensors(part, annotated, V) for name, part in self.parts.items()}
         return TrainingData(
-            train=tensors["train"],
-            validation=tensors["validation"],
-            test=tensors["test"],
+            **tensors,
             structure=torch.from_numpy(self.vocabulary.structure.copy()),
             relations=len(CANONICAL),
             room_types=len(self.vocabulary.room_types),
@@ -120,16 +102,15 @@ class SplitScenes:
 
     def shuffled(self, seed: int) -> SplitScenes:
         """Return a copy in which objects are permuted between scenes, except in test scenes."""
-        structure = self.vocabulary.structure
         permuted = {
-            part: shuffle_objects(self.parts[part], structure, seed)
+            part: shuffle_objects(self.parts[part], self.vocabulary.structure, seed)
             for part in ("train", "validation")
         }
         return replace(self, parts=self.parts | permuted, shuffle=seed)
 
 
 def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]]:
-    """Read the scenes of every data source. Return a mapping from source names to scenes.
+    """Read the scenes of every data source, by source name.
 
     A data source is a file, or a name. A name means `<name>.jsonl.gz` in `root` or in `root/extra`
     (`<name>.tsv.gz` for the placing priors).
@@ -141,15 +122,14 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
     _require_files(data, root)
     scenes: dict[str, list[AnnotatedScene]] = {}
     for source in data.sources:
-        name = source_name(source)
+        name, path = source_name(source), _path(source, root)
         if source == "rooms":
-            source_scenes = generate_rooms(data.rooms, seed=data.split_seed)
+            own = generate_rooms(data.rooms, seed=data.split_seed)
         elif source == priors.SOURCE:
-            source_scenes = priors.read_prior_scenes(_path(source, root))
+            own = priors.read_prior_scenes(path)
         else:
-            path = _path(source, root)
-            source_scenes = [replace(scene, source=name) for scene in read_scenes(path)]
-        scenes[name] = source_scenes[: data.limit]
+            own = [replace(scene, source=name) for scene in read_scenes(path)]
+        scenes[name] = own[: data.limit]
     return scenes
 
 
@@ -170,18 +150,16 @@ def _require_files(data: DataConfig, root: Path) -> None:
     if not missing:
         return
     names = ", ".join(path.relative_to(root).as_posix() for path in missing.values())
-    text = f"{len(missing)} of {len(paths)} files of scenes are missing in {root}: {names}. "
-    if all(map(is_file, missing)):
-        advice = (
-            "The paths start at the folder of your configuration file. Pass this folder with "
-            "--data, such as --data my-lab"
-        )
-    else:
-        advice = (
-            "The repository does not contain the public data sets. docs/training.md (The "
-            "public data sets) names them and their files. Pass the folder of the files with --data"
-        )
-    raise ConfigError(text + advice)
+    advice = (
+        "The paths start at the folder of your configuration file. Pass this folder with --data, "
+        "such as --data my-lab"
+        if all(map(is_file, missing))
+        else "The repository does not contain the public data sets. docs/training.md (The public "
+        "data sets) names them and their files. Pass the folder of the files with --data"
+    )
+    raise ConfigError(
+        f"{len(missing)} of {len(paths)} files of scenes are missing in {root}: {names}. {advice}"
+    )
 
 
 def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path) -> Vocabulary:
@@ -190,39 +168,39 @@ def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path)
     Raises:
         ConfigError: the vocabulary name is unknown, or the file contains no vocabulary.
     """
-    if data.vocabulary == "indoor":
-        vocabulary = indoor_vocabulary()
-    elif data.vocabulary == "source":
-        vocabulary = source_vocabulary(scenes)
-    elif data.vocabulary == "rooms":
-        vocabulary = rooms_vocabulary()
-    elif data.vocabulary.endswith(".json"):
-        path = root / data.vocabulary
-        try:
-            vocabulary = read_vocabulary(path)
-        except (OSError, ValueError) as error:
-            raise ConfigError(f"data.vocabulary: {path} cannot be used: {error}") from error
-    else:
+    name = data.vocabulary
+    makers: dict[str, Callable[[], Vocabulary]] = {
+        "indoor": indoor_vocabulary,
+        "source": partial(source_vocabulary, scenes),
+        "rooms": rooms_vocabulary,
+    }
+    if name not in makers and not name.endswith(".json"):
         raise ConfigError(
-            f"data.vocabulary is {data.vocabulary!r}; it must be indoor, source, rooms, or the "
-            "name of a .json file"
+            f"data.vocabulary is {name!r}; it must be {', '.join(makers)}, or the name of a .json "
+            "file"
         )
+    if name in makers:
+        return with_typical_sizes(makers[name](), scenes)
+    try:
+        vocabulary = read_vocabulary(root / name)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"data.vocabulary: {root / name} cannot be used: {error}") from error
     return with_typical_sizes(vocabulary, scenes)
 
 
 def split_and_encode(
     data: DataConfig,
     scenes: dict[str, list[AnnotatedScene]],
+    root: Path,
     vocabulary: Vocabulary | None = None,
-    root: Path = DATA,
 ) -> SplitScenes:
     """Split the scenes into train, validation and test parts, and encode them.
 
     The split includes all data sources at once, because sources can contain the same room.
 
     Args:
-        vocabulary: vocabulary of a published model. The default is the vocabulary of the
-            configuration.
+        root: folder of the word vectors and of the vocabulary.
+        vocabulary: vocabulary of a published model. The default is that of the configuration.
 
     Raises:
         ConfigError: the vocabulary is invalid; see `build_vocabulary`.
@@ -230,7 +208,11 @@ def split_and_encode(
     all_scenes = [scene for source in scenes.values() for scene in source]
     parts = split(all_scenes, seed=data.split_seed, protocol=data.split)
     if vocabulary is None:
-        vocabulary = build_vocabulary(data, list(parts["train"]), root)
+        vocabulary = build_vocabulary(data, parts["train"], root)
+    words = None
+    if data.words:
+        vectors, _ = class_vectors(read_word_vectors(root / data.words), vocabulary)
+        words = torch.from_numpy(vectors)
     roles = count_roles(parts["train"], vocabulary)
     return SplitScenes(
         data=data,
@@ -239,23 +221,17 @@ def split_and_encode(
         parts={name: encode(part, vocabulary, roles) for name, part in parts.items()},
         counts={name: len(source) for name, source in scenes.items()},
         digests={name: digest_of(source) for name, source in scenes.items()},
-        words=_word_vectors(data, vocabulary, root),
+        words=words,
     )
 
 
-def _word_vectors(data: DataConfig, vocabulary: Vocabulary, root: Path) -> torch.Tensor | None:
-    """Return the word vectors of the classes, (classes, dimensions), or None if none are set."""
-    if not data.words:
-        return None
-    vectors, _ = class_vectors(read_word_vectors(root / data.words), vocabulary)
-    return torch.from_numpy(vectors)
-
-
-def prepare(config: Config, root: Path) -> SplitScenes:
+def prepare(config: Config, root: Path, vocabulary: Vocabulary | None = None) -> SplitScenes:
     """Read the scenes of a configuration from the folder `root`, split and encode them.
+
+    `vocabulary` is that of a published model. The default is that of the configuration.
 
     Raises:
         ConfigError: a file is missing, or the vocabulary is invalid.
         DatasetError: a file of scenes is invalid.
     """
-    return split_and_encode(config.data, read_sources(config.data, root), root=root)
+    return split_and_encode(config.data, read_sources(config.data, root), root, vocabulary)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.metadata
-import json
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -23,17 +22,17 @@ from training.datasets.sources import SOURCES
 from training.datasets.vocabulary import with_aliases, with_room_aliases
 from training.evaluation.alarms import untouched_alarms
 from training.evaluation.everyday_task import EVERYDAY
-from training.evaluation.report import evaluate
+from training.evaluation.report import Progress, evaluate, silent
 from training.evaluation.tasks import STATISTICS
 from training.fit.calibrate import calibrate
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, DataConfig
 from training.fit.count_statistics import fit_counts
-from training.fit.draft import as_stored, placed_draft
+from training.fit.draft import placed_draft
 from training.fit.long_chains import measure_drift
 from training.fit.objects import ObjectScenes
 from training.fit.offset_statistics import fit_offsets
-from training.runs.config_files import load_config, shipped_configs
+from training.runs.config_files import load_config, shipped_configs, with_settings
 from training.runs.example_scenes import known_examples, read_examples
 from training.runs.folder import FinishedRun
 from training.runs.pipeline import SplitScenes, read_sources, split_and_encode
@@ -55,22 +54,20 @@ def publish_run(
     version: str,
     *,
     measured: tuple[FinishedRun, SplitScenes] | None = None,
-    judge: Callable[[Artifact], Sequence[str]] = lambda _: (),
+    judge: Callable[[Artifact, Progress], Sequence[str]] = lambda *_: (),
     accept: Callable[[str], None] | None = None,
-    progress: Callable[[str], None] = lambda _: None,
+    progress: Progress = silent,
 ) -> Artifact:
     """Calibrate on validation scenes, fit statistics, evaluate on test scenes, and publish.
 
-    The calibrated model answers `/outliers` about untouched validation scenes. It is refused if it
-    certainly raises too many alarms; see `training.evaluation.alarms`. It is also refused if long
-    chains certainly drift away from the training scenes; see `training.fit.long_chains`.
-
-    The store keeps weights in half precision. Calibration and evaluation use the same precision.
+    The model is refused if it certainly raises too many alarms about untouched validation scenes
+    (`training.evaluation.alarms`), or if long chains certainly drift away from the training scenes
+    (`training.fit.long_chains`). The store keeps weights in half precision. Calibration and
+    evaluation use the same precision.
 
     Args:
         measured: second run of the same configuration, and its scenes, for a `run` that was trained
-            on test scenes. The second run did not use test scenes. Its test results and chosen
-            calibration values are published.
+            on test scenes. Its test results and chosen calibration values are published.
         judge: function that returns further reasons against the calibrated model.
         accept: function that is called with each reason against the model, which is published all
             the same. None refuses a model with such a reason.
@@ -81,28 +78,23 @@ def publish_run(
         StoreError, ArtifactError: see `Store.publish`.
     """
     run.require(scenes.digest)
+    measured_run, measured_scenes = measured or (run, scenes)
+    measured_run.require(measured_scenes.digest)
     data = scenes.training_data()
-    machine = as_stored(run.machine)
+    test = data if measured is None else measured_scenes.training_data()
     progress("calibrating")
-    if measured is None:
-        calibrated = calibrated_draft(run, scenes)
-        evaluated = calibrated = with_statistics(calibrated, scenes)
-        test = data
-    else:
-        measured_run, measured_scenes = measured
-        measured_run.require(measured_scenes.digest)
-        test = measured_scenes.training_data()
-        evaluated = calibrated_draft(measured_run, measured_scenes)
-        calibrated = calibrated_draft(run, scenes, evaluated.calibration)
-        evaluated = with_statistics(evaluated, measured_scenes)
-        calibrated = with_statistics(calibrated, scenes)
+    evaluated = with_statistics(calibrated_draft(measured_run, measured_scenes), measured_scenes)
+    calibrated, training = evaluated, {}
+    if measured is not None:
+        calibrated = with_statistics(calibrated_draft(run, scenes, evaluated.calibration), scenes)
+        training = {"measured_split": measured_run.config.data.split}
     alarms = untouched_alarms(calibrated, scenes.parts["validation"])
     progress("running long chains")
     learnt = ObjectScenes.of(data.train, data.structure, run.config.objects)
     labels = scenes.vocabulary.labels
     drifts = measure_drift(calibrated.weights, labels, learnt, run.config.objects)
     objections = [entry.objection() for entry in alarms] + [drift.objection() for drift in drifts]
-    reasons = [*filter(None, objections), *judge(calibrated)]
+    reasons = [*filter(None, objections), *judge(calibrated, progress)]
     for reason in reasons:
         if accept is None:
             raise RefusedError(reasons)
@@ -110,25 +102,21 @@ def publish_run(
     rows = _measure(evaluated, test, progress)
     rows += [metric for drift in drifts for metric in drift.metrics()]
     progress("publishing")
+    sources = data_sources(scenes)
     description = Description(
         name=run.config.name,
         version=version,
         created=_now(),
-        spec=machine.spec.to_dict(),
+        spec=run.machine.spec.to_dict(),
         vocabulary=VocabularyEntry.of(
-            with_room_aliases(scenes.vocabulary),
-            machine.spec.A,
-            learnt.sources,
+            with_room_aliases(scenes.vocabulary), run.machine.spec.A, learnt.sources
         ),
         calibration=calibrated.calibration,
-        training={
-            **({} if measured is None else {"measured_split": measured[0].config.data.split}),
-            "config": json.loads(run.config.model_dump_json()),
-            "parameters": run.machine.parameter_count,
-        },
-        data=data_sources(scenes),
+        training=training
+        | {"config": run.config.model_dump(mode="json"), "parameters": run.machine.parameter_count},
+        data=sources,
         metrics=tuple(rows),
-        terms=terms(scenes),
+        terms=terms(sources),
         libraries={name: importlib.metadata.version(name) for name in _LIBRARIES},
         examples=scenes.examples,
     )
@@ -141,15 +129,14 @@ def refit(
     store: Store,
     version: str,
     *,
-    progress: Callable[[str], None] = lambda _: None,
+    progress: Progress = silent,
 ) -> Artifact:
     """Publish a new version of a published model with refitted statistics, without training.
 
-    The new version keeps weights, calibration and metrics. Only the statistics (offsets, counts),
-    their metrics, the example scenes and the built-in synonyms of classes are new. The examples are
-    those of the shipped configuration with the name of the model, otherwise those of its own
-    configuration. The metrics of weights that were trained on test scenes come from statistics that
-    were not fitted to test scenes.
+    Only the statistics (offsets, counts), their metrics, the example scenes and the built-in
+    synonyms of classes are new. The examples are those of the shipped configuration with the name
+    of the model, otherwise those of its own configuration. The metrics of weights that were trained
+    on test scenes come from statistics that were not fitted to test scenes.
 
     Args:
         root: folder of the training scenes.
@@ -161,15 +148,14 @@ def refit(
     """
     manifest = artifact.manifest
     config = Config.model_validate(manifest.training["config"])
-    data, examples_name = config.data, config.examples
-    if manifest.name in shipped_configs():
-        examples_name = load_config(manifest.name).examples
-    examples, reasons = known_examples(read_examples(examples_name, root), artifact.vocabulary)
+    data, is_shipped = config.data, manifest.name in shipped_configs()
+    named = load_config(manifest.name).examples if is_shipped else config.examples
+    examples, reasons = known_examples(read_examples(named, root), artifact.vocabulary)
     for reason in reasons:
         progress(reason)
     progress("reading scenes")
     annotated = read_sources(data, root)
-    scenes = split_and_encode(data, annotated, artifact.vocabulary, root)
+    scenes = split_and_encode(data, annotated, root, artifact.vocabulary)
     digests = {source.source: source.digest for source in manifest.data}
     if changed := sorted(name for name in scenes.digests if digests[name] != scenes.digests[name]):
         raise RunError(
@@ -177,27 +163,19 @@ def refit(
             f"the scenes of {', '.join(changed)} have changed"
         )
     evaluated_scenes = scenes
-    if "measured_split" in manifest.training:
-        split = {"split": manifest.training["measured_split"]}
-        evaluated_scenes = split_and_encode(
-            DataConfig.model_validate(data.model_dump() | split),
-            annotated,
-            artifact.vocabulary,
-            root,
-        )
+    if split := manifest.training.get("measured_split"):
+        other = with_settings(config, {"data.split": split}).data
+        evaluated_scenes = split_and_encode(other, annotated, root, artifact.vocabulary)
     progress("fitting statistics")
     evaluated = with_statistics(artifact, evaluated_scenes)
     rows = _measure(evaluated, evaluated_scenes.training_data(), progress, tuple(STATISTICS))
-    fields = {name: getattr(manifest, name) for name in Description.model_fields}
-    fields["metrics"] = (
-        *(metric for metric in manifest.metrics if metric.task not in STATISTICS),
-        *rows,
-    )
-    changes = {"version": version, "created": _now(), "examples": examples}
-    changes["vocabulary"] = VocabularyEntry.of(
+    kept = [metric for metric in manifest.metrics if metric.task not in STATISTICS]
+    vocabulary = VocabularyEntry.of(
         with_aliases(artifact.vocabulary), artifact.spec.A, manifest.vocabulary.profiles
     )
-    description = Description(**fields | changes)
+    fields = {name: getattr(manifest, name) for name in Description.model_fields}
+    fields |= {"version": version, "created": _now(), "examples": examples}
+    description = Description(**fields | {"metrics": (*kept, *rows), "vocabulary": vocabulary})
     return _publish_rounded(store, description, with_statistics(artifact, scenes))
 
 
@@ -237,7 +215,7 @@ def calibrated_draft(
 def _measure(
     artifact: Artifact,
     data: TrainingData,
-    progress: Callable[[str], None],
+    progress: Progress,
     tasks: Collection[str] | None = None,
 ) -> list[Metric]:
     """Return the metrics on test scenes, or an empty list if there are no test scenes."""
@@ -254,17 +232,13 @@ def _measure(
 def data_sources(scenes: SplitScenes) -> tuple[DataSource, ...]:
     """Return the data sources with the digests of their scenes and their terms of use."""
     sources = []
-    for source, count in scenes.counts.items():
-        words, research_only = terms_of(source, scenes.data)
-        sources.append(
-            DataSource(
-                source=source,
-                scenes=count,
-                digest=scenes.digests[source],
-                terms=words,
-                research_only=research_only,
-            )
+    for name, count in scenes.counts.items():
+        words, research_only = terms_of(name, scenes.data)
+        digest = scenes.digests[name]
+        source = DataSource(
+            source=name, scenes=count, digest=digest, terms=words, research_only=research_only
         )
+        sources.append(source)
     return tuple(sources)
 
 
@@ -273,19 +247,13 @@ def terms_of(source: str, data: DataConfig) -> tuple[str, bool]:
     # A user's file may have the name of a known source. `data.sources` then contains its path.
     if source in SOURCES and source in data.sources:
         return SOURCES[source].terms, SOURCES[source].research_only
-    words = data.terms or "the user's own scenes, without stated terms of use"
-    return words, data.research_only
+    return data.terms or "the user's own scenes, without stated terms of use", data.research_only
 
 
-def terms(scenes: SplitScenes) -> str:
-    """Return a sentence about the permitted use of the trained weights."""
-    entries = {source: terms_of(source, scenes.data) for source in scenes.counts}
-    sources = [source for source, (_, research_only) in entries.items() if research_only]
-    if sources:
-        return f"Research use only: trained on {', '.join(sources)}. Not for commercial robots."
-    sentences = [
-        f"Trained on {source}: {words.rstrip('.')}."
-        for source, (words, _) in entries.items()
-        if source not in SOURCES
-    ]
+def terms(sources: Sequence[DataSource]) -> str:
+    """Return a sentence about the permitted use of weights that are trained on these sources."""
+    if research := [entry.source for entry in sources if entry.research_only]:
+        return f"Research use only: trained on {', '.join(research)}. Not for commercial robots."
+    own = [entry for entry in sources if entry.source not in SOURCES]
+    sentences = [f"Trained on {entry.source}: {entry.terms.rstrip('.')}." for entry in own]
     return " ".join(sentences) or "No restriction from the training data beyond its attribution."

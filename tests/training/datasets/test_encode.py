@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,8 @@ from hypothesis import strategies as st
 
 from app.scene import CANONICAL, ObjectClass, Vocabulary, to_viewer_frame
 from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP
-from training.datasets import AnnotatedObject, AnnotatedScene, annotated_classes, encode
+from tests.training.scenes import encode_objects, things
+from training.datasets import AnnotatedObject, annotated_classes, encode
 from training.datasets.encoding import derive_from_boxes, room_viewpoint
 
 VOCABULARY = Vocabulary(
@@ -30,14 +32,8 @@ DESK_THING = AnnotatedObject("d", "desk", **DESK_BOX)
 MONITOR_THING = AnnotatedObject("m", "monitor", **MONITOR_BOX)
 
 
-def things(*labels: str, **fields: Any) -> tuple[AnnotatedObject, ...]:
-    return tuple(AnnotatedObject(str(i), label, **fields) for i, label in enumerate(labels))
-
-
 def encoded(objects: tuple[AnnotatedObject, ...], **fields: Any) -> Any:
-    values: dict[str, Any] = {"scene_id": "s", "source": "t", "group": "g", "room_type": None}
-    (scene,) = encode([AnnotatedScene(**values | {"objects": objects} | fields)], VOCABULARY)
-    return scene
+    return encode_objects(objects, VOCABULARY, **fields)
 
 
 def triples(scene: Any) -> set[tuple[int, int, int]]:
@@ -66,18 +62,18 @@ def test_rooms_without_a_type(room_type: str | None) -> None:
     assert scene.evidence.room_type is None
 
 
-def test_stated_relations_are_complete() -> None:
+def test_unlisted_relations_are_false_in_scenes_with_listed_relations() -> None:
     scene = encoded(
         things("desk", "monitor", "monitor", "pencil"),
         relations=((1, "on-top", 0), (0, "under", 1), (2, "behind", 1)),
     )
     assert triples(scene) == {(ON_TOP, MONITOR, DESK), (FRONT, MONITOR, MONITOR)}
     assert scene.instance_holds.sum() == 2
-    off_diagonal = ~np.eye(4, dtype=bool)
-    assert (scene.instance_observed == off_diagonal).all()
+    assert (scene.instance_observed == ~np.eye(4, dtype=bool)).all()
     # A class with one instance has no pair with itself.
     single = scene.evidence.counts == 1
     assert (scene.evidence.observed == ~np.diag(single)).all()
+    assert scene.instance_positions is scene.instance_sizes is scene.instance_yaws is None
 
 
 def test_contradictory_relations_are_unobserved() -> None:
@@ -90,7 +86,7 @@ def test_contradictory_relations_are_unobserved() -> None:
     assert unobserved.tolist() == [[FRONT, 0, 1], [FRONT, 1, 0]]
 
 
-def test_relations_of_structure_are_neither_on_nor_off() -> None:
+def test_relations_of_structure_are_unobserved() -> None:
     scene = encoded(
         things("desk", "floor", "monitor"), relations=((0, "on-top", 1), (2, "on-top", 0))
     )
@@ -102,14 +98,21 @@ def test_relations_of_structure_are_neither_on_nor_off() -> None:
     assert scene.evidence.observed[:, 0, 1].all()
 
 
-def test_labels_that_a_source_annotates_incompletely_are_left_out() -> None:
+def test_incompletely_annotated_labels_of_a_source_are_left_out() -> None:
     scene = encoded(things("wall", "desk", "floor"), source="sunrgbd")
     assert scene.evidence.classes.tolist() == [DESK]
     assert scene.unknown == ()
-    # Free words annotate every other class: what they never mention was not there.
+    # The source has an open vocabulary, so it annotates every other class.
     annotated = annotated_classes([scene], VOCABULARY)["sunrgbd"]
     assert annotated.tolist() == [True, True, True, False, False]
     assert encoded(things("wall", "desk")).evidence.classes.tolist() == [DESK, WALL]
+
+
+def test_other_sources_annotate_the_classes_that_they_mention() -> None:
+    first, second = encoded(things("desk")), encoded(things("screen", "wall"))
+    annotated = annotated_classes([first, second], VOCABULARY)
+    assert annotated["t"].tolist() == [True, True, False, True, False]
+    assert annotated_classes([], VOCABULARY) == {}
 
 
 def test_poses_in_viewer_axes() -> None:
@@ -129,29 +132,21 @@ def test_poses_in_viewer_axes() -> None:
     assert not scene.evidence.observed[:, 3].any()
 
 
-def test_without_sizes_nothing_vertical_is_observed() -> None:
-    objects = (
-        AnnotatedObject("d", "desk", position=(2.0, 0.0, 0.4)),
-        AnnotatedObject("m", "monitor", position=(2.0, 0.3, 1.0)),
+def test_without_sizes_vertical_relations_are_unobserved() -> None:
+    scene = encoded(
+        tuple(replace(x, size=None) for x in (DESK_THING, MONITOR_THING)), viewer_frame=True
     )
-    scene = encoded(objects, viewer_frame=True)
     assert triples(scene) == {(LEFT, MONITOR, DESK)}
     assert not scene.evidence.observed[[ON_TOP, ABOVE]].any()
 
 
 def test_an_object_in_a_drawer_is_on_top_of_the_desk() -> None:
-    objects = (
-        DESK_THING,
-        # Boxes alone do not tell on from in.
-        AnnotatedObject("p", "pencil", position=(2.0, 0.5, 0.3), size=(0.01, 0.1, 0.01)),
-    )
-    assert triples(encoded(objects, viewer_frame=True)) == set()
-    linked = (objects[0], AnnotatedObject("p", "pencil", objects[1].position, objects[1].size,
-                                          supported_by="d"))  # fmt: skip
-    scene = encoded(linked, viewer_frame=True)
+    # Boxes alone do not tell on from in.
+    pencil = AnnotatedObject("p", "pencil", position=(2.0, 0.5, 0.3), size=(0.01, 0.1, 0.01))
+    assert triples(encoded((DESK_THING, pencil), viewer_frame=True)) == set()
+    scene = encoded((DESK_THING, replace(pencil, supported_by="d")), viewer_frame=True)
     assert triples(scene) == {(ON_TOP, PENCIL, DESK)}
-    assert scene.evidence.observed[:, 0, 1].all()
-    assert scene.evidence.observed[:, 1, 0].all()
+    assert scene.evidence.observed[:, [0, 1], [1, 0]].all()
 
 
 def test_viewpoints_are_on_all_four_sides_of_a_room() -> None:
@@ -161,11 +156,9 @@ def test_viewpoints_are_on_all_four_sides_of_a_room() -> None:
     for side in set(sides):
         assert 60 < sides.count(side) < 140
     assert len(set(sides)) == 4
-    with pytest.raises(ValueError, match="no object with a position"):
-        room_viewpoint("s", np.full((2, 3), math.nan))
 
 
-def test_world_axes_are_left_for_the_viewpoint() -> None:
+def test_without_viewer_axes_relations_depend_on_the_chosen_viewpoint() -> None:
     objects = (
         AnnotatedObject("d", "desk", position=(0.0, 0.0, 0.4), size=(0.5, 0.5, 0.8)),
         AnnotatedObject("m", "monitor", position=(1.0, 0.0, 0.4), size=(0.5, 0.5, 0.8)),
@@ -188,54 +181,25 @@ def test_scenes_without_known_objects_are_empty() -> None:
     assert encode([], VOCABULARY) == []
 
 
-def test_annotated_classes() -> None:
-    first, second = encoded(things("desk")), encoded(things("screen", "wall"))
-    annotated = annotated_classes([first, second], VOCABULARY)
-    assert annotated["t"].tolist() == [True, True, False, True, False]
-    assert annotated_classes([], VOCABULARY) == {}
-
-
-def test_positions_are_kept_in_the_axes_that_relations_were_derived_in() -> None:
-    """Of what the vocabulary knows; without a viewer, from the viewpoint that was chosen."""
-    objects = (
-        AnnotatedObject("0", "goblet", position=(9.0, 9.0, 9.0)),
-        AnnotatedObject("1", "desk", **DESK_BOX),
-        AnnotatedObject("2", "pencil"),
-        AnnotatedObject("3", "monitor", **MONITOR_BOX),
-    )
-    seen = encoded(objects, viewer_frame=True).instance_positions
-    assert seen[[0, 2]].tolist() == [list(DESK_BOX["position"]), list(MONITOR_BOX["position"])]
-    assert np.isnan(seen[1]).all()
-    chosen = encoded(objects).instance_positions
-    viewpoint = room_viewpoint(
-        "s", np.array([thing.position or (math.nan,) * 3 for thing in objects])
-    )
-    expected, _ = to_viewer_frame([DESK_BOX["position"], MONITOR_BOX["position"]], viewpoint)
-    assert chosen[[0, 2]] == pytest.approx(expected)
-
-
-def test_boxes_are_kept_with_their_positions() -> None:
+def test_boxes_are_in_the_axes_that_relations_were_derived_in() -> None:
     objects = (
         AnnotatedObject("0", "goblet", position=(9.0, 9.0, 9.0), size=(1.0, 1.0, 1.0)),
         AnnotatedObject("1", "desk", yaw=0.2, **DESK_BOX),
-        AnnotatedObject("2", "pencil", position=(1.0, 1.0, 1.0)),
+        AnnotatedObject("2", "pencil"),
+        AnnotatedObject("3", "monitor", **MONITOR_BOX),
     )
     seen, chosen = encoded(objects, viewer_frame=True), encoded(objects)
+    positions = [DESK_BOX["position"], MONITOR_BOX["position"]]
+    assert seen.instance_positions[[0, 2]].tolist() == list(map(list, positions))
+    assert seen.instance_yaws.tolist() == [0.2, 0.0, 0.0]
     for scene in (seen, chosen):
         assert scene.instance_sizes[0].tolist() == list(DESK_BOX["size"])
-        assert np.isnan(scene.instance_sizes[1]).all()
-    assert seen.instance_yaws.tolist() == [0.2, 0.0]
-    viewpoint = room_viewpoint("s", np.array([thing.position for thing in objects]))
+        assert np.isnan([scene.instance_positions[1], scene.instance_sizes[1]]).all()
+    unknown = (math.nan,) * 3
+    viewpoint = room_viewpoint("s", np.array([thing.position or unknown for thing in objects]))
+    expected, _ = to_viewer_frame(positions, viewpoint)
+    assert chosen.instance_positions[[0, 2]] == pytest.approx(expected)
     assert chosen.instance_yaws == pytest.approx(seen.instance_yaws - viewpoint.yaw)
-
-
-def test_scenes_with_stated_relations_have_no_positions() -> None:
-    objects = (DESK_THING, MONITOR_THING)
-    for scene in (
-        encoded(objects, relations=((1, "left", 0),)),
-        encoded(things("desk", "monitor")),
-    ):
-        assert scene.instance_positions is scene.instance_sizes is scene.instance_yaws is None
 
 
 # -- boxes in an image -----------------------------------------------------------------------------
@@ -250,7 +214,7 @@ boxes = st.lists(
 
 
 @given(boxes)
-def test_no_pair_contradicts_itself(drawn: list[tuple[int, int, int, int]]) -> None:
+def test_relations_of_image_boxes_are_consistent(drawn: list[tuple[int, int, int, int]]) -> None:
     relations = derive_from_boxes(drawn)
     n = len(drawn)
     assert relations.holds.shape == (len(CANONICAL), n, n)
@@ -268,19 +232,16 @@ def test_mirrored_images_exchange_left_and_right(drawn: list[tuple[int, int, int
     assert (here.holds[ABOVE] == there.holds[ABOVE]).all()
 
 
-def test_known_boxes() -> None:
-    relations = derive_from_boxes(
-        [(0, 50, 10, 60), (14, 51, 24, 61), (1, 10, 11, 40), (500, 0, 510, 9), (math.nan,) * 4]
-    )
-    assert np.argwhere(relations.holds).tolist() == [[LEFT, 0, 1], [ABOVE, 2, 0], [ABOVE, 2, 1]]
+def test_left_and_above_in_an_image() -> None:
+    drawn = [(0, 50, 10, 60), (14, 51, 24, 61), (1, 10, 11, 40), (500, 0, 510, 9), None]
+    labels = ("desk", "monitor", "pencil", "desk", "pencil")
+    objects = tuple(replace(x, box2d=b) for x, b in zip(things(*labels), drawn, strict=True))
+    scene = encoded(objects)
+    holds, observed = scene.instance_holds, scene.instance_observed
+    assert np.argwhere(holds).tolist() == [[LEFT, 0, 1], [ABOVE, 2, 0], [ABOVE, 2, 1]]
     # One box is far from all others, one is unknown.
-    assert not relations.observed[:, 3:].any()
-    assert not relations.observed[:, :, 3:].any()
-    assert relations.observed[LEFT, 1, 0]
+    assert not observed[:, 3:].any()
+    assert not observed[:, :, 3:].any()
+    assert observed[LEFT, 1, 0]
     # Offsets of less than a tenth of the box decide nothing.
     assert not derive_from_boxes([(0, 0, 100, 100), (5, 5, 105, 105)]).holds.any()
-
-
-def test_shapes_are_checked() -> None:
-    with pytest.raises(ValueError, match=r"boxes has shape \(1, 3\), must be \(1, 4\)"):
-        derive_from_boxes([[1, 2, 3]])

@@ -11,7 +11,8 @@ import pytest
 from app.scene import ObjectClass, Vocabulary
 from app.scene.geometry import overlap_and_gap
 from app.scene.relations import FRONT, INSIDE, LEFT, ON_TOP
-from training.datasets import AnnotatedObject, AnnotatedScene, encode
+from tests.training.scenes import encode_objects, things
+from training.datasets import AnnotatedObject
 from training.datasets.moved import (
     has_boxes,
     moved_by_pose,
@@ -36,26 +37,21 @@ POSES = {
 SEEDS = range(400)
 
 
-def things(*labels: str) -> tuple[AnnotatedObject, ...]:
-    fields = ("position", "size", "yaw")
-    return tuple(
-        AnnotatedObject(str(k), label, **dict(zip(fields, POSES[label], strict=True)))
-        for k, label in enumerate(labels)
-    )
+def posed(*labels: str) -> tuple[AnnotatedObject, ...]:
+    poses = zip(*(POSES[label] for label in labels), strict=True)
+    return things(*labels, **dict(zip(("position", "size", "yaw"), poses, strict=True)))
 
 
 def encoded(objects: tuple[AnnotatedObject, ...], **fields: Any) -> Any:
-    values: dict[str, Any] = {"scene_id": "s", "source": "t", "group": "g", "room_type": None}
-    values |= {"objects": objects, "viewer_frame": True} | fields
-    return encode([AnnotatedScene(**values)], VOCABULARY)[0]
+    return encode_objects(objects, VOCABULARY, viewer_frame=True, **fields)
 
 
-ROOM = encoded(things(*LABELS, "wall"))
-MOVES = [
-    case
-    for seed in SEEDS
-    if (case := moved_by_pose(ROOM, VOCABULARY.structure, np.random.default_rng(seed)))
-]
+def move(scene: Any, seed: int) -> Any:
+    return moved_by_pose(scene, VOCABULARY.structure, np.random.default_rng(seed))
+
+
+ROOM = encoded(posed(*LABELS, "wall"))
+MOVES = [case for seed in SEEDS if (case := move(ROOM, seed))]
 
 
 def box(scene: Any, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -125,13 +121,13 @@ def test_only_the_object_and_those_on_it_move() -> None:
 def test_a_table_stays_if_an_object_under_it_moves() -> None:
     """The relation "under" is stored as on-top of the larger object."""
     chair = AnnotatedObject("2", "chair", position=(3.0, 0.0, 0.3), size=(0.5, 0.5, 0.6))
-    scene = encoded((*things("table", "bed"), chair))
+    scene = encoded((*posed("table", "bed"), chair))
     scene.instance_holds[:] = False
     scene.instance_holds[ON_TOP, 0, 2] = True
     before = posed_scene(scene).objects
     moved_objects = set()
     for seed in range(40):
-        moved, i = moved_by_pose(scene, VOCABULARY.structure, np.random.default_rng(seed))
+        moved, i = move(scene, seed)
         stay = {k for k, thing in enumerate(moved.objects) if thing == before[k]}
         assert stay == {0, 1, 2} - {i}
         moved_objects.add(i)
@@ -154,33 +150,24 @@ def test_equal_seeds_give_equal_cases() -> None:
     assert again == MOVES[-1]
 
 
-@pytest.mark.parametrize(
-    "labels",
-    [
-        ("chair",),
-        # The only other object is the supporter, and the step down would be .1 m.
-        ("cup", "straw"),
-        # Structure neither moves nor carries.
-        ("chair", "wall"),
-    ],
-)
-def test_scenes_without_a_wrong_place(labels: tuple[str, ...]) -> None:
-    scene = encoded(things(*labels))
-    assert moved_by_pose(scene, VOCABULARY.structure, np.random.default_rng(0)) is None
+def test_scenes_without_a_wrong_place() -> None:
+    # The step from the cup to the floor would be .1 m. Structure neither moves nor carries.
+    for labels in (("chair",), ("cup", "straw"), ("chair", "wall")):
+        assert move(encoded(posed(*labels)), 0) is None
 
 
 def test_objects_without_a_box_stay() -> None:
-    objects = (*things("table", "cup", "chair"), AnnotatedObject("3", "bed"))
+    objects = (*posed("table", "cup", "chair"), AnnotatedObject("3", "bed"))
     scene = encoded(objects)
     for seed in range(20):
-        moved, i = moved_by_pose(scene, VOCABULARY.structure, np.random.default_rng(seed))
+        moved, i = move(scene, seed)
         assert i != 3
         assert moved.objects[3].position is None
 
 
 # ---------------------------------------------------------------------------- without poses
 
-BARE = tuple(AnnotatedObject(str(k), label) for k, label in enumerate((*LABELS, "cup", "wall")))
+BARE = things(*LABELS, "cup", "wall")
 LISTED = (
     (CUP, "on-top", TABLE),
     (STRAW, "inside", CUP),
@@ -196,19 +183,13 @@ LISTED = (
 def test_one_support_is_replaced() -> None:
     scene = encoded(BARE, relations=LISTED)
     listed = {
-        *(
-            (ON_TOP, CUP, TABLE),
-            (INSIDE, STRAW, CUP),
-            (ON_TOP, PILLOW, BED),
-            (ON_TOP, PILLOW, CHAIR),
-        ),
-        *((LEFT, PILLOW, TABLE), (FRONT, TABLE, CHAIR), (ON_TOP, 6, BED)),
+        *((ON_TOP, CUP, TABLE), (ON_TOP, PILLOW, BED), (ON_TOP, PILLOW, CHAIR), (ON_TOP, 6, BED)),
+        *((INSIDE, STRAW, CUP), (LEFT, PILLOW, TABLE), (FRONT, TABLE, CHAIR)),
     }
     assert not has_boxes(scene)
     altered = Counter()
     for seed in SEEDS:
-        rng = np.random.default_rng(seed)
-        moved, i = moved_scene(scene, VOCABULARY.structure, rng)
+        moved, i = moved_scene(scene, VOCABULARY.structure, np.random.default_rng(seed))
         stated = set(moved.relations)
         (new,) = stated - listed
         assert new[:2] == (ON_TOP, i)
@@ -233,4 +214,4 @@ def test_scenes_without_a_support_have_no_moved_object() -> None:
         scene = encoded(BARE[:4], relations=relations)
         assert moved_by_triple(scene, VOCABULARY.structure, np.random.default_rng(0)) is None
     with pytest.raises(ValueError, match="do not come from positions"):
-        moved_by_pose(scene, VOCABULARY.structure, np.random.default_rng(0))
+        move(scene, 0)

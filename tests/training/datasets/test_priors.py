@@ -23,7 +23,7 @@ def table(folder: Path, *rows: str, head: str = HEAD) -> Path:
     return path
 
 
-def test_rows_of_placements_become_scenes_of_two_things(tmp_path: Path) -> None:
+def test_rows_become_scenes_of_two_objects(tmp_path: Path) -> None:
     path = table(
         tmp_path,
         "virtualhome_placing\tfood bread\ton-top\ttable\t1\tattic",
@@ -32,34 +32,30 @@ def test_rows_of_placements_become_scenes_of_two_things(tmp_path: Path) -> None:
         "ithor_receptacles\tcups\ton-top\tcup\t1\t",
         "ithor_receptacles\tbread\tbelow\ttable\t2\t",
     )
-    first, inside, second = read_prior_scenes(path)
-    assert [thing.label for thing in first.objects] == ["bread", "table"]
-    assert (first.source, first.group, first.relations) == (
-        SOURCE, "bread table", ((0, "on-top", 1),)
-    )  # fmt: skip
-    assert (inside.group, inside.relations) == ("cup cabinet", ((0, "inside", 1),))
-    assert (second.group, second.relations) == (first.group, ((0, "below", 1),))
-
-
-@pytest.mark.parametrize("relation", ["on-top", "inside"])
-def test_votes_of_housekeep_never_enter_training(tmp_path: Path, relation: str) -> None:
-    votes = f"housekeep_votes\tcup\t{relation}\tdesk\t5\tkitchen"
-    path = table(tmp_path, votes, "ithor_receptacles\tcup\ton-top\ttable\t1\tkitchen")
-    (scene,) = read_prior_scenes(path)
-    assert scene.group == "cup table"
-    # An outside test reads them.
-    placings = read_placings(path)
-    assert placings[0] == Placing("housekeep_votes", "cup", "desk", 5, "kitchen")
+    scenes = read_prior_scenes(path)
+    assert {scene.source for scene in scenes} == {SOURCE}
+    assert [thing.label for thing in scenes[0].objects] == ["bread", "table"]
+    assert [(scene.group, scene.relations) for scene in scenes] == [
+        ("bread table", ((0, "on-top", 1),)),
+        ("cup cabinet", ((0, "inside", 1),)),
+        ("bread table", ((0, "below", 1),)),
+    ]
 
 
 def test_placings_are_rows_of_rooms_on_or_inside_a_receptacle(tmp_path: Path) -> None:
+    """Votes of people are no training scenes."""
     path = table(
         tmp_path,
-        "my_home\tcup\tinside\tcabinet\t3\tkitchen",
-        "my_home\tcup\ton-top\ttable\t1\t",
-        "my_home\tcup\tunder\ttable\t1\tkitchen",
+        "housekeep_votes\tcup\tinside\tcabinet\t3\tkitchen",
+        "housekeep_votes\tcup\ton-top\tdesk\t5\tkitchen",
+        "housekeep_votes\tcup\ton-top\ttable\t1\t",
+        "housekeep_votes\tcup\tunder\ttable\t1\tkitchen",
     )
-    assert read_placings(path) == [Placing("my_home", "cup", "cabinet", 3, "kitchen")]
+    assert read_placings(path) == [
+        Placing("housekeep_votes", "cup", "cabinet", 3, "kitchen"),
+        Placing("housekeep_votes", "cup", "desk", 5, "kitchen"),
+    ]
+    assert read_prior_scenes(path) == []
 
 
 @pytest.mark.parametrize(
@@ -70,7 +66,7 @@ def test_placings_are_rows_of_rooms_on_or_inside_a_receptacle(tmp_path: Path) ->
         ("my_home\tcup\tinside\tcabinet\t1\t", "no row has a room and the relation on-top or"),
     ],
 )
-def test_tables_without_questions(tmp_path: Path, row: str, message: str) -> None:
+def test_tables_without_placings(tmp_path: Path, row: str, message: str) -> None:
     with pytest.raises(DatasetError, match=message):
         read_placings(table(tmp_path, row))
 

@@ -1,4 +1,4 @@
-"""Counts of roles by hand."""
+"""Counts of roles in small scenes."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import pytest
 
 from app.scene import ObjectClass, RoleCounts, Vocabulary
 from app.scene.roles import IN, ON, UNDER, role_counts
+from tests.training.scenes import things
 from training.datasets import AnnotatedObject, AnnotatedScene
 from training.datasets.roles import count_roles, lift_of
 
@@ -26,15 +27,13 @@ Triple = tuple[str, str, str]
 def stated(*triples: Triple, source: str = "nr3d", group: str = "g") -> AnnotatedScene:
     """A scene that lists triples of labels (subject, relation, object)."""
     labels = list(dict.fromkeys(label for i, _, j in triples for label in (i, j)))
-    things = tuple(AnnotatedObject(label, label) for label in labels)
     listed = tuple((labels.index(i), relation, labels.index(j)) for i, relation, j in triples)
-    return AnnotatedScene("s", source, group, None, things, listed)
+    return AnnotatedScene("s", source, group, None, things(*labels), listed)
 
 
 def rows_of(counts: RoleCounts) -> dict[tuple[int, int], list[float]]:
-    V = len(VOCABULARY)
-    pairs = zip(counts.pair.tolist(), counts.counts.tolist(), strict=True)
-    return {divmod(pair, V): row for pair, row in pairs}
+    pairs = (divmod(pair, len(VOCABULARY)) for pair in counts.pair.tolist())
+    return dict(zip(pairs, counts.counts.tolist(), strict=True))
 
 
 @pytest.mark.parametrize(
@@ -49,8 +48,7 @@ def rows_of(counts: RoleCounts) -> dict[tuple[int, int], list[float]]:
 )
 def test_words_count_in_the_stated_direction(triple: Triple, pair: tuple[int, int], role: int):
     counts = count_roles([stated(triple)], VOCABULARY)
-    expected = [0.0, 0.0, 0.0]
-    expected[role] = 1.0
+    expected = np.eye(3)[role].tolist()
     assert rows_of(counts) == {pair: expected}
     assert counts.anchor[DESK].tolist() == expected
     assert not counts.anchor[BIN].any()
@@ -61,7 +59,7 @@ def test_other_words_structure_and_pairs_of_one_class_do_not_count():
         *(("bin", "left", "desk"), ("bin", "above", "desk")),
         *(("bin", "on-top", "wall"), ("wall", "inside", "bin"), ("bin", "on-top", "spoon")),
     )
-    twins = (AnnotatedObject("a", "bin"), AnnotatedObject("b", "bin"))
+    twins = things("bin", "bin")
     nested = AnnotatedScene("t", "nr3d", "g", None, twins, ((0, "inside", 1),))
     silent = AnnotatedScene("u", "nr3d", "g", None, twins)
     counts = count_roles([scene, nested, silent], VOCABULARY)
@@ -94,8 +92,7 @@ def test_on_a_container_means_in_it(listed_on: int, contains: bool):
     scenes = [stated(("lamp", "on-top", "desk"), group=f"g{k}") for k in range(listed_on)]
     scenes += [stated(("bin", "inside", "desk")), stated(("bin", "under", "desk"), group="h")]
     counts = count_roles(scenes, VOCABULARY)
-    words = np.zeros(3)
-    words[IN if contains else ON] = listed_on
+    words = listed_on * np.eye(3)[IN if contains else ON]
     assert role_counts(counts, LAMP, DESK).tolist() == words.tolist()
     assert role_counts(counts, BIN, DESK).tolist() == [0, 1, 1]
     assert counts.anchor[DESK].tolist() == np.add(words, [0, 1, 1]).tolist()

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +9,7 @@ import pytest
 from app.scene import CANONICAL
 from app.scene.geometry import overlap_and_gap
 from training.datasets import AnnotatedScene, encode, generate_rooms, rooms_vocabulary
-from training.datasets.rooms import DOMAINS, ROOMS, Beside, Piece
+from training.datasets.rooms import DOMAINS, ROOMS, Piece
 
 
 @pytest.fixture(scope="module")
@@ -17,10 +17,9 @@ def rooms() -> list[AnnotatedScene]:
     return generate_rooms(300, seed=5)
 
 
-def test_a_seed_draws_the_same_rooms(rooms: list[AnnotatedScene]) -> None:
+def test_equal_seeds_give_equal_rooms(rooms: list[AnnotatedScene]) -> None:
     assert len(rooms) == 300
-    assert generate_rooms(300, seed=5) == rooms
-    # More of them begin with the same ones.
+    # A larger number only adds scenes.
     assert generate_rooms(20, seed=5) == rooms[:20]
     assert generate_rooms(20, seed=6) != rooms[:20]
     assert generate_rooms(0, seed=5) == []
@@ -31,20 +30,17 @@ def test_a_seed_draws_the_same_rooms(rooms: list[AnnotatedScene]) -> None:
 def test_views_of_a_room_share_its_group(rooms: list[AnnotatedScene]) -> None:
     views = Counter(scene.group for scene in rooms)
     assert set(views.values()) == {1, 2, 3}
-    by_group = defaultdict(set)
-    for scene in rooms:
-        by_group[scene.group].add(scene.room_type)
-    assert all(len(types) == 1 for types in by_group.values())
+    assert len({(scene.group, scene.room_type) for scene in rooms}) == len(views)
+    # Views omit small objects.
+    assert len({(scene.group, len(scene.objects)) for scene in rooms}) > len(views)
 
 
-def test_no_two_things_take_up_the_same_space(rooms: list[AnnotatedScene]) -> None:
+def test_boxes_do_not_overlap(rooms: list[AnnotatedScene]) -> None:
     for scene in rooms[:60]:
-        boxes = [thing for thing in scene.objects if thing.position and thing.size]
-        assert len(boxes) == len(scene.objects)
-        i, j = np.triu_indices(len(boxes), 1)
-        centres = np.array([box.position for box in boxes])
-        sizes = np.array([box.size for box in boxes])
-        yaws = np.array([box.yaw for box in boxes])
+        i, j = np.triu_indices(len(scene.objects), 1)
+        names = ("position", "size", "yaw")
+        boxes = ([getattr(thing, name) for thing in scene.objects] for name in names)
+        centres, sizes, yaws = map(np.array, boxes)
         share, _ = overlap_and_gap(
             centres[i, :2], sizes[i, :2], yaws[i], centres[j, :2], sizes[j, :2], yaws[j]
         )
@@ -55,7 +51,6 @@ def test_no_two_things_take_up_the_same_space(rooms: list[AnnotatedScene]) -> No
 
 
 def test_support_links_agree_with_the_boxes(rooms: list[AnnotatedScene]) -> None:
-    """What the links say, the geometry finds by itself."""
     vocabulary = rooms_vocabulary()
     on_top = CANONICAL.index("on-top")
     bare = [
@@ -85,7 +80,6 @@ def test_other_tables_make_another_domain() -> None:
     assert {scene.room_type for scene in found} == set(DOMAINS["workplaces"])
     homes = {thing.label for scene in generate_rooms(60, 0) for thing in scene.objects}
     assert not homes & {thing.label for scene in found for thing in scene.objects}
-    assert generate_rooms(20, 0, DOMAINS["workplaces"]) == found[:20]
 
 
 @pytest.mark.parametrize(
@@ -94,7 +88,7 @@ def test_other_tables_make_another_domain() -> None:
 def test_an_adjacent_piece_is_close_to_the_named_side(side, axis, sign) -> None:
     """In the axes of the main piece, whose front is +y; from every viewpoint of a room."""
     chair = Piece("chair", (0.3, 0.3, 0.8))
-    table = Piece("table", (0.6, 0.5, 0.7), where="centre", beside=(Beside(chair, side),))
+    table = Piece("table", (0.6, 0.5, 0.7), where="centre", beside=((chair, side),))
     for scene in generate_rooms(40, 0, {"kitchen": (table,)}):
         (main,) = (thing for thing in scene.objects if thing.label == "table")
         (other,) = (thing for thing in scene.objects if thing.label == "chair")

@@ -9,6 +9,7 @@ import torch
 from app.scene import ObjectClass, RoleCounts, Vocabulary
 from app.scene.relations import ABOVE, FRONT, INSIDE, LEFT, ON_TOP, SUPPORTS
 from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN
+from tests.training.scenes import encode_objects, things
 from training.datasets import (
     AnnotatedObject,
     AnnotatedScene,
@@ -21,7 +22,6 @@ from training.datasets.cases import annotated_relations
 from training.datasets.sources import (
     SOURCES,
     meaning_of,
-    relation_of,
     relations_of,
     supported_subjects,
 )
@@ -32,10 +32,8 @@ CUBE = (0.2, 0.2, 0.2)
 
 
 def encoded(source: str, *objects: AnnotatedObject, **fields: Any) -> EncodedScene:
-    things = objects or tuple(AnnotatedObject(x, x) for x in ("desk", "monitor", "pencil"))
-    scene = AnnotatedScene("s", source, "g", None, things, viewer_frame=True, **fields)
-    (found,) = encode([scene], VOCABULARY)
-    return found
+    objects = objects or things("desk", "monitor", "pencil")
+    return encode_objects(objects, VOCABULARY, source=source, viewer_frame=True, **fields)
 
 
 def off(found: EncodedScene) -> set[tuple[int, int, int]]:
@@ -44,7 +42,7 @@ def off(found: EncodedScene) -> set[tuple[int, int, int]]:
 
 
 @pytest.mark.parametrize("source", ["vrd", "nr3d", "coco_captions", "alfred", "bddl_goal"])
-def test_people_mention_few_of_the_relations_that_hold(source: str) -> None:
+def test_unlisted_relations_of_mentions_are_unobserved_except_of_stacked_pairs(source: str) -> None:
     found = encoded(source, relations=((1, "on-top", 0), (2, "left", 1)))
     assert np.argwhere(found.instance_holds).tolist() == [[LEFT, 2, 1], [ON_TOP, 1, 0]]
     beside = {(LEFT, 0, 1), (LEFT, 1, 0), (FRONT, 0, 1), (FRONT, 1, 0)}
@@ -52,30 +50,25 @@ def test_people_mention_few_of_the_relations_that_hold(source: str) -> None:
     assert off(found) == stacked | beside
 
 
-def test_an_object_on_a_support_may_also_be_listed_beside_it() -> None:
-    found = encoded("nr3d", relations=((1, "on-top", 0), (1, "left", 0)))
-    assert found.instance_holds[[ON_TOP, LEFT], 1, 0].all()
-    assert (LEFT, 0, 1) in off(found)
+@pytest.mark.parametrize("other", ["left", "above"])
+def test_two_listed_relations_of_one_pair_both_hold(other: str) -> None:
+    found = encoded("nr3d", relations=((1, "on-top", 0), (1, other, 0)))
+    both = [ON_TOP, LEFT if other == "left" else ABOVE]
+    assert found.instance_holds[both, 1, 0].all()
+    assert off(found) >= {(a, 0, 1) for a in both}
 
 
-def test_two_listed_vertical_relations_of_one_pair_both_hold() -> None:
-    found = encoded("nr3d", relations=((1, "on-top", 0), (1, "above", 0)))
-    assert found.instance_holds[VERTICAL, 1, 0].all()
-    assert off(found) >= {(ON_TOP, 0, 1), (ABOVE, 0, 1)}
-    assert not {(a, i, j) for a, i, j in off(found) if a in VERTICAL and (i, j) == (1, 0)}
-
-
-def test_denied_relations_are_off_and_listed_ones_of_them_unobserved() -> None:
+def test_denied_relations_are_false_and_contradicted_ones_unobserved() -> None:
     one = ((1, "on-top", 0),)
     assert not encoded("vsr", relations=one, false_relations=one).instance_observed.any()
     found = encoded("vsr", relations=(), false_relations=((1, "under", 0), (2, "right", 0)))
     assert off(found) == {(ON_TOP, 0, 1), (LEFT, 0, 2)}
     assert not found.instance_holds.any()
-    # Nobody listed relations, somebody denied one.
+    # Without listed relations, a relation can be denied too.
     assert off(encoded("robot", false_relations=((1, "on-top", 0),))) == {(ON_TOP, 1, 0)}
 
 
-def test_3dssg_annotates_all_supports_of_some_objects_and_sides_of_related_pairs() -> None:
+def test_3dssg_shows_all_supports_of_some_objects_and_sides_of_related_pairs() -> None:
     listed = ((1, "on-top", 0), (2, "left", 0))
     found = encoded("3dssg", relations=listed, supported=(1,))
     for relation in (ON_TOP, INSIDE):
@@ -86,17 +79,15 @@ def test_3dssg_annotates_all_supports_of_some_objects_and_sides_of_related_pairs
     assert np.argwhere(found.instance_observed[ABOVE]).tolist() == [[0, 1], [1, 0]]
 
 
-def test_a_listed_support_that_is_no_object_excludes_all_other_supports() -> None:
-    """A monitor is attached to something, and the desk stands on the floor."""
+def test_a_listed_support_excludes_all_other_supports() -> None:
+    """A monitor is attached to a wall, and the desk stands on the floor."""
     vocabulary = Vocabulary([*VOCABULARY.objects, ObjectClass("floor", structure=True)])
-    labels = ("desk", "monitor", "pencil", "floor")
-    things = tuple(AnnotatedObject(label, label) for label in labels)
-    lists = ((0, "on-top", 3), (2, "on-top", 0)), False, (), (0, 1, 2)
-    (found,) = encode([AnnotatedScene("s", "3dssg", "g", None, things, *lists)], vocabulary)
+    lists = {"relations": ((0, "on-top", 3), (2, "on-top", 0)), "supported": (0, 1, 2)}
+    objects = things("desk", "monitor", "pencil", "floor")
+    found = encode_objects(objects, vocabulary, source="3dssg", **lists)
     assert found.instance_stands.tolist() == [FLOOR, HANGS, SUPPORTED, UNKNOWN]
-    things_alone = np.ones((3, 3), dtype=bool) & ~np.eye(3, dtype=bool)
-    for relation in SUPPORTS:
-        assert (found.instance_observed[relation, :3, :3] == things_alone).all()
+    apart = ~np.eye(3, dtype=bool)
+    assert (found.instance_observed[[*SUPPORTS], :3, :3] == apart).all()
     assert np.argwhere(found.instance_holds).tolist() == [[ON_TOP, 2, 0]]
 
 
@@ -113,6 +104,7 @@ PHRASES = [
     ("vrd", "on", "on-top", False),
     ("vrd", "next to", None, False),
     ("procthor", "contains", "contains", False),
+    ("virtualhome", "close", None, False),
 ]
 
 
@@ -135,42 +127,31 @@ ROLES = RoleCounts(
 )
 
 
-def linked(label: str, bottom: float, *, roles: RoleCounts | None = ROLES) -> EncodedScene:
-    """A fridge of 1.8 m, and an object at a height in metres that a link says it supports."""
-    fridge = AnnotatedObject("f", "fridge", (0.0, 0.0, 0.9), (0.8, 0.8, 1.8))
-    thing = AnnotatedObject("t", label, (0.0, 0.0, bottom + 0.1), (0.1, 0.1, 0.2), supported_by="f")
-    scene = AnnotatedScene("s", "procthor", "g", None, (fridge, thing), viewer_frame=True)
-    (found,) = encode([scene], KITCHEN, roles)
-    return found
-
-
 @pytest.mark.parametrize(
-    ("label", "bottom", "relation"),
+    ("label", "bottom", "roles", "relation"),
     [
-        ("milk", 1.8, ON_TOP),
-        ("milk", 1.78, ON_TOP),
-        ("jar", 1.8, ON_TOP),
-        ("milk", 0.6, INSIDE),
-        ("jar", 0.6, None),
+        ("milk", 1.8, ROLES, ON_TOP),
+        ("milk", 1.78, ROLES, ON_TOP),
+        ("jar", 1.8, ROLES, ON_TOP),
+        ("milk", 0.6, ROLES, INSIDE),
+        ("jar", 0.6, ROLES, None),
+        ("milk", 0.6, None, ON_TOP),
     ],
 )
 def test_a_link_means_on_top_in_contact_and_else_the_role_of_the_classes(
-    label: str, bottom: float, relation: int | None
+    label: str, bottom: float, roles: RoleCounts | None, relation: int | None
 ) -> None:
-    found = linked(label, bottom)
-    thing, fridge = 1, 0
-    stated = [] if relation is None else [[relation, thing, fridge]]
+    """A link says that a fridge of 1.8 m supports an object at a height in metres."""
+    fridge = AnnotatedObject("f", "fridge", (0.0, 0.0, 0.9), (0.8, 0.8, 1.8))
+    milk = AnnotatedObject("t", label, (0.0, 0.0, bottom + 0.1), (0.1, 0.1, 0.2), supported_by="f")
+    fields = {"source": "procthor", "viewer_frame": True}
+    found = encode_objects((fridge, milk), KITCHEN, roles, **fields)
+    stated = [] if relation is None else [[relation, 1, 0]]
     assert np.argwhere(found.instance_holds).tolist() == stated
-    observed = found.instance_observed
-    assert observed[:, fridge, thing].all()
-    assert observed[[LEFT, FRONT, ABOVE], thing, fridge].all()
-    assert (observed[[*SUPPORTS], thing, fridge] == (relation is not None)).all()
+    assert found.instance_observed[:, 0, 1].all()
+    assert found.instance_observed[[LEFT, FRONT, ABOVE], 1, 0].all()
+    assert (found.instance_observed[[*SUPPORTS], 1, 0] == (relation is not None)).all()
     assert found.instance_stands.tolist() == [FLOOR, SUPPORTED]
-
-
-def test_a_link_without_counts_of_roles_means_on_top() -> None:
-    found = linked("milk", 0.6, roles=None)
-    assert np.argwhere(found.instance_holds).tolist() == [[ON_TOP, 1, 0]]
 
 
 def annotated(found: EncodedScene) -> dict[int, set[tuple[int, int]]]:
@@ -220,12 +201,15 @@ def test_boxes_annotate_sides_of_all_pairs_and_no_above() -> None:
     assert annotated(encoded("sunrgbd_bedrooms_3d", *objects[:3])) == {}
 
 
+def in_a_row(size: tuple[float, float, float] | None) -> tuple[AnnotatedObject, ...]:
+    """Two neighbours, and a distant pencil."""
+    places = (("desk", 0.0), ("monitor", 0.5), ("pencil", 9.0))
+    return tuple(AnnotatedObject(label, label, (x, 0.0, 0.5), size) for label, x in places)
+
+
 @pytest.mark.parametrize("source", ["procthor", "rooms", "robot"])
 def test_boxes_far_apart_are_not_stacked(source: str) -> None:
-    objects = tuple(
-        AnnotatedObject(str(x), label, position=(x, 0.0, 0.5), size=CUBE)
-        for label, x in (("desk", 0.0), ("monitor", 0.5), ("pencil", 9.0))
-    )
+    objects = in_a_row(CUBE)
     observed = encoded(source, *objects, AnnotatedObject("d", "pencil")).instance_observed
     located = np.array([1, 1, 1, 0], dtype=bool)
     assert (observed[VERTICAL] == (located[:, None] & located & ~np.eye(4, dtype=bool))).all()
@@ -233,32 +217,27 @@ def test_boxes_far_apart_are_not_stacked(source: str) -> None:
 
 
 @pytest.mark.parametrize("source", ["sunrgbd_bedrooms_3d", "sunrgbd-bedroom-3d"])
-def test_centres_tell_left_and_front_alone(source: str) -> None:
-    objects = tuple(
-        AnnotatedObject(str(x), label, position=(x, 0.0, 0.5))
-        for label, x in (("desk", 0.0), ("monitor", 0.5), ("pencil", 9.0))
-    )
-    found = encoded(source, *objects)
+def test_centres_show_only_left_and_front(source: str) -> None:
+    found = encoded(source, *in_a_row(None))
     assert (found.instance_observed[LATERAL] == ~np.eye(3, dtype=bool)).all()
     assert not found.instance_observed[VERTICAL].any()
     assert np.argwhere(found.instance_holds).tolist() == [[FRONT, 0, 1]]
 
 
-def test_virtualhome_lists_all_supports_and_no_sides() -> None:
+def test_virtualhome_shows_all_supports_and_no_sides() -> None:
     found = encoded("virtualhome", relations=((1, "on-top", 0),))
     pairs = ~np.eye(3, dtype=bool)
     assert np.argwhere(found.instance_holds).tolist() == [[ON_TOP, 1, 0]]
     assert (found.instance_observed[ON_TOP] == pairs).all()
     assert np.argwhere(found.instance_observed[LEFT]).tolist() == [[0, 1], [1, 0]]
     assert (found.instance_observed[INSIDE] == pairs).all()
-    assert relation_of("virtualhome", "close") is None
 
 
 def test_an_unlisted_class_of_a_coarse_source_is_unobserved() -> None:
     labels = ("table", "coffee table", "lamp")
     vocabulary = Vocabulary([ObjectClass(label) for label in labels])
-    things = tuple(AnnotatedObject(label, label) for label in labels[:2])
-    scenes = [AnnotatedScene("s", source, "g", None, things) for source in ("sunrgbd", "3dssg")]
+    objects = things(*labels[:2])
+    scenes = [AnnotatedScene("s", source, "g", None, objects) for source in ("sunrgbd", "3dssg")]
     found = encode(scenes, vocabulary)
     assert [scene.evidence.classes.tolist() for scene in found] == [[0, 1]] * 2
     annotated = annotated_classes(found, vocabulary)
@@ -270,9 +249,9 @@ def test_an_unlisted_class_of_a_coarse_source_is_unobserved() -> None:
 
 
 def test_a_floor_plan_counts_as_a_few_scenes() -> None:
-    things = (AnnotatedObject("0", "desk", count=4), AnnotatedObject("1", "pencil"))
-    scenes = [AnnotatedScene(f"s{k}", "alfred", f"g{k // 6}", None, things) for k in range(8)]
-    scenes += [AnnotatedScene(f"v{k}", "vsr", "g", None, things, ()) for k in range(5)]
+    objects = things("desk", "pencil", count=[4, 1])
+    scenes = [AnnotatedScene(f"s{k}", "alfred", f"g{k // 6}", None, objects) for k in range(8)]
+    scenes += [AnnotatedScene(f"v{k}", "vsr", "g", None, objects, ()) for k in range(5)]
     found = encode(scenes, VOCABULARY)
     assert [scene.weight for scene in found] == [0.5] * 6 + [1.0] * 2 + [1.0] * 5
     assert found[0].evidence.counts.tolist() == [4, 1]

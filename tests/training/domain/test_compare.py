@@ -9,17 +9,16 @@ from rich.console import Console
 
 from app.scene import Vocabulary
 from tests.training.research.baselines.furnished import STRUCTURE, furnished, tensors
-from training.domain.candidates import Candidate, held_out
+from training.domain.candidates import Candidate
 from training.domain.compare import COMPARED, compare, show, side_by_side
 from training.evaluation.baselines import EASE, FREQUENCY_TABLE, POPULARITY
 from training.evaluation.model import Model
 from training.evaluation.tasks import in_words
-from training.fit.configuration import Config, ConfigError
+from training.fit.configuration import Config
 from training.fit.draft import as_stored, draft_artifact
 from training.fit.objects import ObjectScenes
 from training.fit.trainer import new_machine
-from training.runs.config_files import with_settings
-from training.runs.pipeline import prepare, read_sources
+from training.runs.pipeline import prepare
 
 CONFIG = Config.model_validate(
     {
@@ -76,9 +75,3 @@ def test_a_comparison_fits_into_80_columns_and_notes_lacking_classes_alone(lacki
             line.startswith(f"{row.metric} ") and line.endswith(f"] {row.verdict}")
             for line in lines
         )
-
-
-def test_a_model_of_all_scenes_has_no_test_scenes() -> None:
-    candidate = Candidate("new", with_settings(CONFIG, {"data.split": "final"}), {}, None)
-    with pytest.raises(ConfigError, match="trained with --final"):
-        held_out(candidate, candidate, read_sources(candidate.config.data, Path()), Path())

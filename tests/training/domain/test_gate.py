@@ -1,16 +1,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
 
-from app.registry import Store
+from app.registry import Artifact, Store
 from tests.http.stores import corrupt, make_store
-from training.datasets.batches import subset
+from training.datasets.batches import TrainingData, subset
 from training.domain.candidates import Candidate
 from training.domain.compare import RELATIONAL, Comparison, unmeasured
 from training.domain.gate import Usefulness, losses, measure_usefulness, served_model
@@ -36,20 +35,16 @@ def comparison(*rows: tuple[str, str, float, float]) -> Comparison:
     ("metric", "low", "high", "margin", "worse"),
     [
         ("MRR, one removed", -0.20, -0.03, 0.02, True),
-        ("MRR, one removed", -0.20, -0.03, 0.05, False),  # within the margin
-        ("MRR, one removed", -0.20, 0.01, 0.02, False),  # may be chance
-        (
-            "MRR, one removed",
-            -0.20,
-            -0.01,
-            0.02,
-            False,
-        ),  # worse for sure, beyond the margin not for sure
-        ("top-10", -0.20, -0.10, 0.02, False),  # not the primary metric
+        ("MRR, one removed", -0.20, -0.03, 0.05, False),
+        ("MRR, one removed", -0.20, 0.01, 0.02, False),
+        ("MRR, one removed", -0.20, -0.01, 0.02, False),
         ("MRR, one removed", -0.20, -0.01, 0.0, True),
+        ("top-10", -0.20, -0.10, 0.02, False),  # not the primary metric
     ],
 )
-def test_worse_is_what_lies_beyond_the_margin_entirely(metric, low, high, margin, worse) -> None:
+def test_a_metric_is_worse_if_its_whole_interval_exceeds_the_margin(
+    metric, low, high, margin, worse
+) -> None:
     found = comparison(("T2 missing", metric, low, high), ("T2 missing", "top-1", 0.1, 0.2))
     assert [row.metric for row in found.worse_by(margin)] == (["MRR, one removed"] if worse else [])
 
@@ -72,8 +67,8 @@ def test_a_refusal_names_every_metric_that_is_worse() -> None:
     ("measured", "task", "expected"),
     [
         (("T2 missing", "T3b placement", "T1a relations"), "T2 missing", 2),
-        (("T2 missing", "T1a relations"), "T1a relations", 0),  # some scenes tell of relations
-        (("T2 missing",), "T2 missing", 0),  # nor does what is served know of any
+        (("T2 missing", "T1a relations"), "T1a relations", 0),
+        (("T2 missing",), "T2 missing", 0),
     ],
 )
 def test_a_model_without_relation_metrics_replaces_no_model_with_them(
@@ -91,9 +86,6 @@ def test_a_model_without_relation_metrics_replaces_no_model_with_them(
         assert "worse" not in text
 
 
-# ---------------------------------------------------------------------- against the baselines
-
-
 def small(**objects: float) -> Config:
     return Config.model_validate(
         {
@@ -106,31 +98,33 @@ def small(**objects: float) -> Config:
     )
 
 
-@cache
+@pytest.fixture(scope="module")
 def rooms() -> SplitScenes:
     return prepare(small(), Path())
 
 
-def usefulness(scenes: SplitScenes, config: Config) -> Usefulness:
-    """Of a model that learnt from these scenes, on the real ones."""
-    machine = as_stored(Trainer(config, scenes.training_data()).run().machine)
-    artifact = draft_artifact(machine, scenes.vocabulary)
-    return measure_usefulness(artifact, rooms().training_data(), limit=300, say=lambda _: None)
+def trained(scenes: SplitScenes, **objects: float) -> Artifact:
+    machine = Trainer(small(**objects), scenes.training_data()).run().machine
+    return draft_artifact(as_stored(machine), scenes.vocabulary)
 
 
-def test_a_trained_model_is_better_than_popularity() -> None:
-    found = usefulness(rooms(), small())
+def usefulness(artifact: Artifact, data: TrainingData) -> Usefulness:
+    return measure_usefulness(artifact, data, limit=300, say=lambda _: None)
+
+
+def test_a_trained_model_is_better_than_popularity(rooms) -> None:
+    found = usefulness(trained(rooms), rooms.training_data())
     assert found.objections() == []
     assert found.differences["popularity"].low > 0.1
     assert all(len(line) <= 80 for line in found.lines())
 
 
-@pytest.mark.parametrize("how", ["hardly trained", "labels shuffled between scenes"])
-def test_a_useless_model_is_refused_with_its_figures(how: str) -> None:
-    if how == "hardly trained":
-        found = usefulness(rooms(), small(steps=1, learning_rate=1e-6))
-    else:
-        found = usefulness(rooms().shuffled(0), small())
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_a_useless_model_is_refused_with_its_figures(rooms, shuffled) -> None:
+    """Hardly trained, or trained on labels that are shuffled between scenes."""
+    options = {} if shuffled else {"steps": 1, "learning_rate": 1e-6}
+    artifact = trained(rooms.shuffled(0) if shuffled else rooms, **options)
+    found = usefulness(artifact, rooms.training_data())
     popularity, ease = found.objections()
     assert "not clearly better than popularity" in popularity
     assert "worse than EASE" in ease
@@ -142,11 +136,11 @@ def test_a_useless_model_is_refused_with_its_figures(how: str) -> None:
     ("popularity", "reasons"),
     [
         (Figure(0.006, 0.001, 0.011, 90), 1),  # a model of shuffled labels, from few groups
-        (Figure(0.030, -0.001, 0.061, 90), 1),  # may be chance
+        (Figure(0.030, -0.001, 0.061, 90), 1),
         (Figure(0.020, 0.001, 0.039, 90), 0),
     ],
 )
-def test_a_useful_model_leads_popularity_for_sure_and_by_enough(popularity, reasons) -> None:
+def test_a_useful_model_leads_popularity_certainly_and_by_enough(popularity, reasons) -> None:
     differences = {"popularity": popularity, "EASE": Figure(0.0, -0.1, 0.1, 90)}
     found = Usefulness(30, 9, 0.417, {"popularity": 0.4, "EASE": 0.417}, differences)
     required = "at least +0.020, whole interval above zero"
@@ -154,38 +148,22 @@ def test_a_useful_model_leads_popularity_for_sure_and_by_enough(popularity, reas
     assert any(required in line for line in found.lines())
 
 
-def test_photographs_with_incomplete_lists_are_used_where_there_are_no_others() -> None:
-    data = rooms().training_data()
+def test_unusual_test_scenes(rooms) -> None:
+    """Incomplete scenes are used if there are no others. Few usable scenes are refused."""
+    data, artifact = rooms.training_data(), trained(rooms, steps=1)
     flags = [replace(scene, complete=False) for scene in data.test.scenes]
-    machine = as_stored(Trainer(small(steps=1), data).run().machine)
-    artifact = draft_artifact(machine, rooms().vocabulary)
-    incomplete = replace(data, test=replace(data.test, scenes=flags))
-    found = measure_usefulness(artifact, incomplete, limit=300, say=lambda _: None)
+    found = usefulness(artifact, replace(data, test=replace(data.test, scenes=flags)))
     assert found.ours is not None
     assert found.scenes == len(flags)
+    four_with_objects = torch.zeros_like(data.test.v)
+    four_with_objects[:4] = data.test.v[:4]
+    for few in (subset(data.test, torch.arange(4)), replace(data.test, v=four_with_objects)):
+        found = usefulness(artifact, replace(data, test=few))
+        assert list(found.lines()) == []
+        assert "at least 6 groups" in found.objections()[0]
 
 
-@pytest.mark.parametrize("which", ["few scenes", "few scenes with two classes"])
-def test_too_few_test_scenes_decide_nothing_and_are_refused(which) -> None:
-    data = rooms().training_data()
-    if which == "few scenes":
-        few = replace(data, test=subset(data.test, torch.arange(4)))
-    else:
-        v = torch.zeros_like(data.test.v)
-        v[:4] = data.test.v[:4]
-        few = replace(data, test=replace(data.test, v=v))
-    artifact = draft_artifact(
-        as_stored(Trainer(small(steps=1), data).run().machine), rooms().vocabulary
-    )
-    found = measure_usefulness(artifact, few, limit=300, say=lambda _: None)
-    assert list(found.lines()) == []
-    assert "at least 6 groups" in found.objections()[0]
-
-
-# ------------------------------------------------------------------------------- what is served
-
-
-def test_an_alias_serves_a_model_or_nothing_that_can_be_compared_with(tmp_path) -> None:
+def test_new_aliases_and_unreadable_models_are_not_compared(tmp_path) -> None:
     store = Store(make_store(tmp_path / "store"))
     found = served_model(store, "default")
     assert found.candidate is not None

@@ -1,4 +1,4 @@
-"""The walk of `scripts/walk.py`, and what a user of its own model does next.
+"""The walk of `scripts/walk.py`, and the next steps of its user.
 
 The scenes are generated: 300 of laboratories, workshops and storerooms.
 """
@@ -41,12 +41,10 @@ class Workplace:
         return output, json.loads(path.read_text())
 
     @property
-    def served(self) -> str:
-        return str(Store(self.store).aliases()["default"])
-
-    @property
-    def versions(self) -> tuple[str, ...]:
-        return Store(self.store).versions("my-lab")
+    def state(self) -> tuple[str, tuple[str, ...]]:
+        """The served version and all versions."""
+        store = Store(self.store)
+        return str(store.aliases()["default"]), store.versions("my-lab")
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +68,7 @@ def test_the_walk_is_recorded(workplace) -> None:
         assert (workplace.folder.parent / name).stat().st_size > 20_000
 
 
-def test_the_model_is_worth_having(workplace) -> None:
+def test_the_model_is_accurate(workplace) -> None:
     _, comparison = workplace.compare(workplace.run, "baselines")
     values = {
         (cell["task"], cell["metric"]): cell["figure"]["value"]
@@ -82,7 +80,7 @@ def test_the_model_is_worth_having(workplace) -> None:
     assert comparison["certain"]
 
 
-async def test_the_service_answers_with_it(workplace) -> None:
+async def test_the_service_answers_with_the_model(workplace) -> None:
     question = {"objects": BENCH, "top_k": 3}
     async with serve(workplace.store) as client:
         answer = (await client.post("/missing", json=question)).json()
@@ -97,7 +95,7 @@ async def test_the_service_answers_with_it(workplace) -> None:
         assert service.client.post("/missing", json=question).json()["missing"] == answer["missing"]
 
 
-async def test_short_lists_of_the_own_scenes_raise_few_alarms(workplace) -> None:
+async def test_short_lists_of_clean_scenes_raise_few_alarms(workplace) -> None:
     """A robot that begins to look around lists two or three objects of a clean scene."""
     rng = random.Random(5)
     lines = (workplace.folder / "scenes.jsonl").read_text().splitlines()
@@ -112,7 +110,7 @@ async def test_short_lists_of_the_own_scenes_raise_few_alarms(workplace) -> None
             assert alarms <= 0.25 * len(scenes)
 
 
-def test_the_card_has_the_terms_that_were_given(workplace) -> None:
+def test_the_card_has_the_stated_terms(workplace) -> None:
     manifest = Store(workplace.store).load("my-lab", "1.0.0").manifest
     (source,) = manifest.data
     assert source.source == "scenes"
@@ -120,7 +118,7 @@ def test_the_card_has_the_terms_that_were_given(workplace) -> None:
     assert str(workplace.folder) not in manifest.model_dump_json()
 
 
-def test_the_same_again_is_not_worse_and_may_take_its_place(workplace) -> None:
+def test_an_equal_version_is_promoted(workplace) -> None:
     output, comparison = workplace.compare(workplace.run)
     assert comparison["b"].startswith("my-lab@1.0.0")
     assert {row["verdict"] for row in comparison["differences"]} == {"undecided"}
@@ -131,36 +129,32 @@ def test_the_same_again_is_not_worse_and_may_take_its_place(workplace) -> None:
     assert output.endswith(f"next: SCENE_STORE={workplace.store} SCENE_PORT=8055 python -m app")
 
 
-def test_a_worse_version_is_refused_unless_somebody_insists(workplace) -> None:
+def test_a_worse_version_is_refused_without_even_if_worse(workplace) -> None:
     text = (workplace.folder / "my-lab" / "my-lab.toml").read_text()
     hasty = workplace.folder / "my-lab" / "hasty.toml"
     hasty.write_text(re.sub(r"steps = \d+", "steps = 1", text))
     invoke("train", hasty, "--seed", 1, *workplace.places)
     run = workplace.run.with_name("seed-1")
-    before, versions = workplace.served, workplace.versions
+    before, versions = workplace.state
 
     for alias in ("default", "new-alias"):
         output = workplace.publish(run, "2.0.0", "--promote", "--alias", alias, code=3)
         assert "refused: the new version is not clearly better than popularity" in output
         assert "the new version is worse than EASE" in output
         assert "nothing was published" in output
-        assert (workplace.served, workplace.versions) == (before, versions)
+        assert workplace.state == (before, versions)
 
     _, comparison = workplace.compare(run, before)
-    (missing,) = [
-        row["figure"]
-        for row in comparison["differences"]
-        if (row["task"], row["metric"]) == ("T2 missing", "MRR, one removed")
-    ]
-    assert missing["high"] < -0.02
+    figures = {(x["task"], x["metric"]): x["figure"] for x in comparison["differences"]}
+    assert figures["T2 missing", "MRR, one removed"]["high"] < -0.02
 
     output = workplace.publish(run, "2.0.0", "--promote", "--even-if-worse")
     assert f"accepted by --even-if-worse: the new version is worse than {before}" in output
     assert f"promoted: default → my-lab@2.0.0, before {before}" in output
-    assert workplace.served == "my-lab@2.0.0"
+    assert workplace.state[0] == "my-lab@2.0.0"
 
 
-def test_an_edited_vocabulary_is_no_longer_what_the_run_learnt(workplace) -> None:
+def test_a_run_is_not_published_with_an_edited_vocabulary(workplace) -> None:
     path = workplace.folder / "my-lab" / "vocabulary.json"
     before = path.read_text()
     values = json.loads(before)
@@ -173,8 +167,8 @@ def test_an_edited_vocabulary_is_no_longer_what_the_run_learnt(workplace) -> Non
         path.write_text(before)
 
 
-def test_a_grown_data_set_is_compared_on_what_the_older_version_never_saw(workplace) -> None:
-    """More scenes, a new vocabulary in another order: the older version is asked in its classes."""
+def test_versions_of_a_growing_data_set_are_compared_on_common_test_scenes(workplace) -> None:
+    """The new vocabulary has another order. Two steps of training are too few."""
     grown = workplace.folder / "grown"
     invoke("example", grown / "scenes.jsonl", "--scenes", 360)
     invoke("init", "my-lab", grown / "scenes.jsonl", "--output", grown / "my-lab")
@@ -185,5 +179,4 @@ def test_a_grown_data_set_is_compared_on_what_the_older_version_never_saw(workpl
     _, comparison = workplace.compare(grown / "runs" / "my-lab" / "seed-0", "my-lab@1.0.0")
     assert comparison["certain"]
     assert comparison["scenes"] > 10
-    # Two steps are no match for the older version, whoever's classes are asked in.
     assert comparison["differences"][0]["verdict"] == "worse"

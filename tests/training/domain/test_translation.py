@@ -1,4 +1,4 @@
-"""A model asked in other classes than its own."""
+"""A model answers about scenes with other classes."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_the_same_classes_in_another_order_get_the_same_answers(model) -> None:
     torch.testing.assert_close(theirs, model.at_place(here)[:, order][:, absent])
 
 
-def test_aliases_are_understood_and_the_unknown_comes_last(model) -> None:
+def test_aliases_are_matched_and_unknown_classes_rank_last(model) -> None:
     scenes = vocabulary("mug", "bed", "unicorn")
     translation = Translation.between(scenes, MODEL)
     assert translation.model_class.tolist() == [1, 0, -1]
@@ -81,15 +81,12 @@ def test_aliases_are_understood_and_the_unknown_comes_last(model) -> None:
     shown = model.missing(torch.tensor([[1.0, 0.0, 0.0, 0.0, 0.0]]))
     assert proposed[0, 0] == shown[0, 1]
     assert proposed[0, 2] == -BEYOND
-    # What it does not know it cannot suspect either.
     assert translation.translate(model).suspicion(v)[0, 2] == -BEYOND
-    assert (
-        translation.translate(model).false_relations(batch([0, 1, 2], 3, (0, 0, 2)))[0, 0, 0, 2]
-        == BEYOND
-    )
+    false = translation.translate(model).false_relations(batch([0, 1, 2], 3, (0, 0, 2)))
+    assert false[0, 0, 0, 2] == BEYOND
 
 
-def test_an_unknown_anchor_says_nothing(model) -> None:
+def test_at_an_unknown_anchor_all_classes_are_unknown(model) -> None:
     scenes = vocabulary("cup", "unicorn", "bed")
     asked = Translation.between(scenes, MODEL).translate(model)
     v = torch.tensor([[0.0, 1.0, 0.0]])
@@ -97,10 +94,14 @@ def test_an_unknown_anchor_says_nothing(model) -> None:
     assert bool((asked.at_place(places) == -BEYOND).all())
 
 
-def test_two_things_under_one_name_have_no_relation(model) -> None:
+def test_two_scene_classes_of_one_model_class_have_no_relation(model) -> None:
     scenes = vocabulary("cup", "mug", "bed")
     asked = Translation.between(scenes, MODEL).translate(model)
     values = asked.relations(batch([0, 1, 2], 3))
     assert bool((values[0, :, 0, 1] == -BEYOND).all())
     assert bool((values[0, :, 0, 2] > -BEYOND).all())
     torch.testing.assert_close(values[0, :, 0, 2], values[0, :, 1, 2])
+    # Both state one relation of the model class.
+    once, twice = batch([0, 1, 2], 3, (0, 0, 2)), batch([0, 1, 2], 3, (0, 0, 2))
+    twice.holds[0, 0, 1, 2], twice.observed[0, 0, 1, 2] = 1.0, True
+    torch.testing.assert_close(asked.completion(twice), asked.completion(once))

@@ -41,7 +41,7 @@ def rows_of(results):
 
 def material(folder, **settings):
     data = DataConfig(**{"sources": ("flats",), "vocabulary": "source"} | settings)
-    return split_and_encode(data, read_sources(data, folder))
+    return split_and_encode(data, read_sources(data, folder), folder)
 
 
 def test_all_that_decides_what_is_learnt_is_in_the_digest(tmp_path):

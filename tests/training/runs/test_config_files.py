@@ -28,16 +28,15 @@ def test_shipped_configurations_load(name: str) -> None:
 
 
 def test_the_indoor_variants_learn_from_the_same_scenes() -> None:
-    """Only then can a benchmark compare them."""
     variants = [load_config(f"indoor-{variant}") for variant in ("triway", "gbm", "rbm")]
     assert [config.machine.variant for config in variants] == ["triway", "gbm", "rbm"]
     assert len({config.data.model_dump_json() for config in variants}) == 1
 
 
-def small(variant="triway", **machine):
+def small(variant="triway", rooms=10, **machine):
     return {
         "name": "small",
-        "data": {"sources": ["rooms"], "rooms": 10},
+        "data": {"sources": ["rooms"], "rooms": rooms},
         "machine": {"variant": variant, **machine},
         "objects": {"steps": 300},
     }
@@ -50,7 +49,7 @@ def small(variant="triway", **machine):
         (small("rbm", H2=4), "machine.H2 must be 0"),
         (small("rbm", G=2), "machine.G is defined for the Triway only"),
         (small("rbm", without=["S"]), "a rbm has no weights S"),
-        (small() | {"data": {"sources": ["rooms"]}}, "data.rooms must be at least 1"),
+        (small(rooms=0), "data.rooms must be at least 1"),
     ],
 )
 def test_settings_that_exclude_each_other_are_refused(values, message) -> None:
@@ -70,8 +69,6 @@ def test_a_shortened_training_keeps_at_least_one_step() -> None:
     config = Config.model_validate(small())
     tenth = shortened(config, 0.1)
     assert (tenth.objects.steps, tenth.relations.epochs) == (30, 1)
-    changes = {"objects.steps": 300, "relations.epochs": config.relations.epochs}
-    assert with_settings(tenth, changes) == config
     assert shortened(config, 1e-6).objects.steps == 1
 
 
@@ -85,7 +82,7 @@ variant = "rbm"
 """
 
 
-def test_files_are_looked_for_beside_their_configuration(tmp_path) -> None:
+def test_files_are_read_from_the_folder_of_their_configuration(tmp_path) -> None:
     folder = tmp_path / "mine"
     folder.mkdir()
     (folder / "mine.toml").write_text(FILES.format(sources='["../day.one.jsonl.gz", "3dssg"]'))
@@ -100,27 +97,25 @@ def test_files_are_looked_for_beside_their_configuration(tmp_path) -> None:
 
 
 def test_two_sources_of_one_name_are_refused(tmp_path) -> None:
-    path = tmp_path / "mine.toml"
-    path.write_text(FILES.format(sources='["a/day.jsonl", "b/day.jsonl"]'))
+    (tmp_path / "mine.toml").write_text(FILES.format(sources='["a/day.jsonl", "b/day.jsonl"]'))
     with pytest.raises(ConfigError, match="two sources are called day"):
-        load_config(str(path))
+        load_config(str(tmp_path / "mine.toml"))
 
 
-def test_terms_change_no_digest_until_they_are_given() -> None:
+def test_stated_terms_change_the_digest() -> None:
     config = load_config("indoor-rbm")
     assert "terms" not in config.model_dump_json()
     assert with_settings(config, {"data.terms": ""}).digest == config.digest
     assert with_settings(config, {"data.terms": "ours"}).digest != config.digest
 
 
-def test_terms_of_the_users_own_files() -> None:
+def test_terms_of_shipped_sources_and_of_own_files() -> None:
     data = load_config("indoor-rbm").data
     assert terms_of("sunrgbd", data) == (SOURCES["sunrgbd"].terms, True)
     # A file of a known source's name is another source.
     own = data.model_copy(update={"sources": ("sunrgbd.jsonl",), "terms": "ours"})
     assert terms_of("sunrgbd", own) == ("ours", False)
-    words, research_only = terms_of(
-        "sunrgbd", own.model_copy(update={"research_only": True, "terms": ""})
-    )
+    unstated = own.model_copy(update={"research_only": True, "terms": ""})
+    words, research_only = terms_of("sunrgbd", unstated)
     assert research_only
     assert "without stated terms" in words

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from dataclasses import replace
 
 import numpy as np
@@ -29,7 +30,7 @@ BOTH_LEFT = [
 ]
 
 
-def test_chosen_scenes_are_requests_in_the_models_words_and_read_back(tmp_path) -> None:
+def test_chosen_scenes_are_requests_with_labels_of_the_vocabulary(tmp_path) -> None:
     chosen = choose_examples(SCENES, WORDS)
     assert len(chosen) == len({example.scene.room_type for example in chosen}) == 3
     for example in chosen:
@@ -42,24 +43,20 @@ def test_chosen_scenes_are_requests_in_the_models_words_and_read_back(tmp_path) 
 
 
 def test_a_chosen_scene_has_as_many_classes_as_the_median_of_its_room_type() -> None:
-    sizes: dict[str | None, list[int]] = {}
-    of_scene = {}
+    sizes: dict[str | None, dict[str, int]] = defaultdict(dict)
     for scene in SCENES:
         classes = {WORDS.index(thing.label) for thing in scene.objects} - {None}
-        of_scene[scene.scene_id] = sum(not WORDS.structure[index] for index in classes)
-        sizes.setdefault(scene.room_type, []).append(of_scene[scene.scene_id])
-    rooms = {scene.scene_id: scene.room_type for scene in SCENES}
+        size = sum(not WORDS.structure[index] for index in classes)
+        sizes[scene.room_type][scene.scene_id] = size
     for example in choose_examples(SCENES, WORDS):
-        own = example.name.split(", ")[1]
-        assert abs(of_scene[own] - np.median(sizes[rooms[own]])) <= 1
+        (room,) = (x for x in sizes.values() if example.name.split(", ")[1] in x)
+        assert abs(room[example.name.split(", ")[1]] - np.median([*room.values()])) <= 1
 
 
-def test_supports_become_relations_where_there_are_no_positions() -> None:
+def test_without_positions_supports_become_relations() -> None:
+    bare = {"position": None, "size": None}
     flat = [
-        replace(
-            scene,
-            objects=tuple(replace(thing, position=None, size=None) for thing in scene.objects),
-        )
+        replace(scene, objects=tuple(replace(thing, **bare) for thing in scene.objects))
         for scene in SCENES
     ]
     chosen = choose_examples(flat, WORDS)
@@ -84,7 +81,7 @@ def test_research_only_scenes_are_never_chosen() -> None:
         ),
     ],
 )
-def test_an_unusable_file_is_named_with_the_reason(tmp_path, content, reason) -> None:
+def test_an_invalid_file_is_named_with_the_reason(tmp_path, content, reason) -> None:
     if content is not None:
         text = content if isinstance(content, str) else json.dumps(content)
         (tmp_path / "mine.json").write_text(text)

@@ -1,4 +1,4 @@
-"""What a run shows of itself."""
+"""The displays of a training run."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def small(epochs: int) -> Config:
     return with_settings(small_config("live", "rbm"), {"relations.epochs": epochs})
 
 
-def test_a_line_of_blocks_rises_with_its_values() -> None:
+def test_a_sparkline_rises_with_its_values() -> None:
     assert sparkline([0, 1, 2, 3, 4, 5, 6, 7]) == "▁▂▃▄▅▆▇█"
     assert sparkline([5.0]) == sparkline([math.nan, 3.0]) == "▁"
     assert sparkline([]) == sparkline([math.nan]) == ""
@@ -37,7 +37,7 @@ def test_a_line_of_blocks_rises_with_its_values() -> None:
     assert sparkline(list(range(100)), width=10) == sparkline(list(range(10)), width=10)
 
 
-def test_a_run_shows_its_scores_and_what_to_do_next(tmp_path) -> None:
+def test_a_run_shows_its_scores_and_the_next_commands(tmp_path) -> None:
     config = small(4)
     trainer = Trainer(config, prepare(config, tmp_path).training_data(), tmp_path)
     console = Console(file=io.StringIO(), width=200, force_terminal=True)
