@@ -257,7 +257,10 @@ class Gateway:
                 **record.log_fields(),
             }
             message = f"{method} {route} {status} {seconds * 1e3:.2f} ms"
-            _access.info(message, extra={"entry": entry})
+            # `_access.info` would search the stack for its caller, which no format shows.
+            line = logging.LogRecord(_access.name, logging.INFO, "", 0, message, None, None)
+            line.entry = entry
+            _access.handle(line)
 
 
 def _with_defaults(headers: Sequence[tuple[bytes, bytes]], request_id: bytes) -> list[Any]:
