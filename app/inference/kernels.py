@@ -1818,6 +1818,27 @@ def rotated_offsets(
 
 
 @compiled
+def add_unseen(shown, change, candidates, classes, forward, backward):
+    """Add the changes of stacked relations that training never shows to log-odds, in place.
+
+    Args:
+        shown: (3, V, V) bool, whether training shows each stacked relation of two classes.
+        change: (3, V) change for each subject class.
+        candidates, classes: (N,) and (m,) classes.
+        forward, backward: (N, A, m) log-odds with the candidate and with the other class as
+            subject. The last A - 2 relations are the stacked ones.
+    """
+    for c in range(len(candidates)):
+        for a in range(forward.shape[1] - ON_TOP):
+            for k in range(len(classes)):
+                i, j = candidates[c], classes[k]
+                if not shown[a, i, j]:
+                    forward[c, ON_TOP + a, k] += change[a, i]
+                if not shown[a, j, i]:
+                    backward[c, ON_TOP + a, k] += change[a, j]
+
+
+@compiled
 def triple_counts(
     triple: NDArray[Any],
     held: NDArray[Any],

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.kernels import NO_UNIT, UNOBSERVED, likeliest_places, rotated_offsets
+from app.inference.kernels import NO_UNIT, UNOBSERVED, add_unseen, likeliest_places, rotated_offsets
 from app.questions.answer import Fields, significant
 from app.questions.posterior import Posterior
 from app.registry.artifact import Artifact
@@ -134,9 +134,7 @@ def placements(
             objects[column] = at.anchor
     things = [scene.objects[number] for number in objects.tolist()]
     if A > ON_TOP and artifact.places is not None:
-        unseen, subjects = artifact.places.unseen[: A - ON_TOP], candidates[:, None]
-        forward[:, ON_TOP:] += unseen[:, subjects, classes].swapaxes(0, 1)
-        backward[:, ON_TOP:] += unseen[:, classes, subjects].swapaxes(0, 1)
+        add_unseen(*artifact.places.unseen, candidates, classes, forward, backward)
     if A > INSIDE:
         candidates_too_large, things_too_large = _too_large(artifact, things, candidates, classes)
         forward[:, INSIDE][candidates_too_large] = NO_UNIT

@@ -147,20 +147,21 @@ class Places(TensorGroup):
         return held
 
     @cached_property
-    def unseen(self) -> NDArray[np.float32]:
-        """Change of the log-odds of stacked relations that training never shows, (3, V, V).
+    def unseen(self) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+        """Change of the log-odds of stacked relations that training never shows.
 
-        The axes are the relations of `STACKED`, subject class and object class. The change is the
-        log share of the subject's stand: on a wall for above, on or in an object for on-top and
-        inside. So a blackboard does not stand on a chair. Shares of at least `USUAL` do not change
-        the log-odds.
+        The change is the log share of the subject's stand: on a wall for above, on or in an object
+        for on-top and inside. So a blackboard does not stand on a chair. Shares of at least `USUAL`
+        do not change the log-odds.
+
+        Returns:
+            Whether training shows each relation of `STACKED`, (3, V, V), and the change for each
+            subject class, (3, V); see `kernels.add_unseen`.
         """
         shares = np.log(np.minimum(np.maximum(self.stands, _LEAST_STAND) / USUAL, 1.0))
         every = np.arange(len(shares))
-        changes = np.zeros((len(STACKED), len(every), len(every)), np.float32)
-        for change, a, stand in zip(changes, STACKED, (SUPPORTED, HANGS, SUPPORTED), strict=True):
-            change[:] = np.where(self.shows(a, every, every), 0.0, shares[:, stand, None])
-        return changes
+        shown = np.stack([self.shows(a, every, every) for a in STACKED])
+        return shown, shares.T[[SUPPORTED, HANGS, SUPPORTED]].astype(np.float32)
 
     def under_evidence(self, upper: int, lower: int) -> float:
         """Return log(n · n / m), with n scenes that show the lower class under the upper.
