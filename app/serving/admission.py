@@ -33,6 +33,7 @@ from time import monotonic
 from typing import Final, TypeVar
 
 from app.errors import DeadlinePassedError, DisconnectedError, QueueFullError
+from scene_client.schemas.generate import MAX_SWEEPS
 
 T = TypeVar("T")
 
@@ -42,9 +43,6 @@ SHARE: Final = 4
 QUICK_SLOTS: Final = 8
 SLOW_SLOTS: Final = 2
 """Number of requests of a lane that run at a time."""
-
-MAX_DRAWS: Final = 32_000
-"""Maximum weight of one `/generate`: number of scenes x sweeps."""
 
 # Time in seconds between two checks of the client's connection during a computation in a thread.
 _LOOK: Final = 0.25
@@ -196,7 +194,7 @@ class Admission:
     def __init__(self, requests: int, rows: int) -> None:
         self.quick = Lane(QUICK_SLOTS, requests)
         self.slow = Lane(SLOW_SLOTS, rows)
-        self.draws = Lane(1, SHARE * MAX_DRAWS)
+        self.draws = Lane(1, SHARE * MAX_SWEEPS)
         self.workers = ThreadPoolExecutor(SLOW_SLOTS, "slow", _lower_priority)
         self.drawing = ThreadPoolExecutor(1, "drawing", _lower_priority)
 

@@ -7,13 +7,12 @@ from functools import partial
 from time import monotonic, perf_counter
 from typing import Final, TypeVar
 
-from app.errors import InvalidRequestError, LocatedError
 from app.questions.answer import Fields, SizeLimit, envelope
 from app.questions.generate import STEPS
 from app.questions.names import LookUps
 from app.questions.question import Question
 from app.questions.reading import Limits, Reading, read_scene
-from app.serving.admission import MAX_DRAWS, Admission, Ticket, in_thread
+from app.serving.admission import Admission, Ticket, in_thread
 from app.serving.metrics import Metrics
 from app.serving.models import Key, ServedModel, ServedModels
 from scene_client.schemas import SceneRequest
@@ -131,7 +130,8 @@ class Request:
         rows = 1
         if question.samples:
             reading, ask = read()
-            rows, weight = _weight_of_draws(ask)
+            rows = ask.keywords["count"]
+            weight = rows * (ask.keywords["steps"] or STEPS)
             # The models of a client take turns, too.
             await ticket.enter(admission.draws, weight, line=(ticket.client, model.key))
             fields, seconds = await in_thread(
@@ -177,16 +177,3 @@ def is_quick(scene: SceneRequest) -> bool:
     if len(scene.objects) > QUICK_OBJECTS or len(scene.relations or ()) > QUICK_ENTRIES:
         return False
     return getattr(scene, "top_k", 0) <= QUICK_ENTRIES
-
-
-def _weight_of_draws(ask: partial[Fields]) -> tuple[int, int]:
-    """Return the number of scenes to draw, and their weight in the lane `draws`.
-
-    Raises:
-        InvalidRequestError: the request draws too much.
-    """
-    count, steps = ask.keywords["count"], ask.keywords["steps"] or STEPS
-    if count * steps > MAX_DRAWS:
-        message = f"`count` x `steps` must be at most {MAX_DRAWS}, not {count * steps}"
-        raise InvalidRequestError([LocatedError(("steps",), message)])
-    return count, count * steps

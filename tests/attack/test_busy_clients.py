@@ -37,7 +37,7 @@ def request(path: str, body: Any) -> bytes:
 
 SINGLE = request("missing", SCENE)
 BATCHES = [request("missing/batch", {"scenes": [{"objects": LABELS[:3]}] * 256})]
-DRAWS = [request("generate", {**SCENE, "count": 16, "steps": 2000})]
+DRAWS = [request("generate", {**SCENE, "count": 16, "steps": 500})]
 GARBAGE = [
     request("missing", b'{"objects":[' + b"{}," * 60_000 + b"{}]}"),
     request("missing", b'{"objects":["bed",'),

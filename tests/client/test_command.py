@@ -291,7 +291,7 @@ FILES = {
         ("missing bed --model nonsuch", 1, []),
         # Port 9 is "discard": nothing listens there, and connecting fails at once.
         ("missing bed --url http://127.0.0.1:9", 3, []),
-        ("generate --count 64 --steps 2000 --timeout 0.01", 4, []),
+        ("generate --count 64 --steps 500 --timeout 0.01", 4, []),
     ],
 )
 def test_the_exit_status_and_the_reason_of_a_failure(

@@ -26,7 +26,7 @@ FORMS: dict[str, type[BaseModel]] = {
 }
 UNKNOWN_HEADER = "x-schemathesis-unknown-property"
 # Types of validation errors for constraints that JSON Schema cannot express.
-BEYOND_SCHEMAS = {"plain_text", "unit_quaternion"}
+BEYOND_SCHEMAS = {"plain_text", "unit_quaternion", "too_many_sweeps"}
 
 POSITIVE = ["2xx", "3xx", "401", "403", "404", "409", "429", "5xx"]
 NEGATIVE = ["400", "401", "404", "405", "413", "415", "422"]
@@ -116,7 +116,7 @@ def call(service: LiveService) -> Iterator[Any]:
 
 # Batches differ only in their scenes, which have the forms of single requests.
 quick = documented(5).exclude(path=["/relations/batch", "/outliers/batch", "/rooms/batch"])
-full = documented(60)
+full = documented(15)
 
 
 @quick.parametrize()

@@ -108,7 +108,8 @@ def moved_by_triple(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[
 
 def _supports(encoded: EncodedScene) -> Flags:
     """Return which instances are on-top of or inside which instances, (instances, instances)."""
-    return np.any(encoded.instance_holds[[*SUPPORTS]], axis=0)
+    holds = encoded.instance_holds
+    return np.any(holds[[a for a in SUPPORTS if a < len(holds)]], axis=0)
 
 
 def _strangers(encoded: EncodedScene) -> Flags:

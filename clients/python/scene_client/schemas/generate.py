@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, Final, Self
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from scene_client.schemas.answers import Answer, Reply
@@ -31,6 +31,10 @@ UnitState = Annotated[tuple[UnitNumber, UnitNumber], BeforeValidator(_as_pair)]
 """A hidden unit and its state."""
 
 
+MAX_SWEEPS: Final = 32_000
+"""Maximum number of Gibbs sweeps of one request: number of scenes times sweeps."""
+
+
 class GenerateRequest(SceneRequest):
     """What would a scene like this look like?"""
 
@@ -39,7 +43,7 @@ class GenerateRequest(SceneRequest):
     count: Annotated[int, Field(ge=1, le=64)] = 1
     """number of scenes to sample"""
     steps: Annotated[int | None, Field(ge=1, le=2000)] = None
-    """number of Gibbs sweeps; default: the model's value"""
+    """number of Gibbs sweeps; default: the model's value; `count` times `steps` is at most 32000"""
     # At 2, a scene has 70 objects and 1,000 relations, and 64 scenes take up to 46 s.
     temperature: Annotated[float, Field(ge=0.05, le=1.5, allow_inf_nan=False)] = 1.0
     """sampling temperature, from 0.05 to 1.5; values above 1 give more varied scenes"""
@@ -47,6 +51,13 @@ class GenerateRequest(SceneRequest):
         dict[Name, Annotated[list[UnitState], Field(max_length=4096)]] | None, Field(max_length=8)
     ] = None
     """states that hidden units keep: maps the name of each layer to pairs [unit, state]"""
+
+    @model_validator(mode="after")
+    def _has_a_limit(self) -> Self:
+        if self.count * (self.steps or 1) > MAX_SWEEPS:
+            message = f"`count` times `steps` must be at most {MAX_SWEEPS}"
+            raise PydanticCustomError("too_many_sweeps", "{message}", {"message": message})
+        return self
 
 
 class GeneratedRelation(Relation):
