@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,15 @@ import pytest
 from app.settings import Settings
 from scene_client import Client
 from tests.chaos.wire import BODY, LIVE, Wire, exchange, wires
-from tests.services import ADMIN_KEY, LiveService, is_ready, launch, live_service, wait_until
+from tests.services import (
+    ADMIN_KEY,
+    LiveService,
+    http_server,
+    is_ready,
+    launch,
+    live_service,
+    wait_until,
+)
 from tests.system.conftest import Proxy, StartProxy
 
 pytestmark = pytest.mark.system
@@ -165,6 +174,36 @@ def lines(service: LiveService) -> int:
 
 
 @pytest.mark.slow
+def test_a_request_that_crashes_a_replica_reaches_no_other(
+    haproxy: StartProxy, configuration: Path, tmp_path: Path
+) -> None:
+    """Three replicas close the connection of each question, as if it had crashed them."""
+    questions = []
+
+    class Crashing(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+
+        def do_POST(self) -> None:
+            questions.append(self.path)
+            self.close_connection = True
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with http_server(Crashing) as url:
+        backend = url.removeprefix("http://")
+        variables = {"PROXY_BACKEND": backend, "PROXY_REPLICAS": "3"}
+        with haproxy(configuration, tmp_path / "log", **variables) as proxy:
+            answer = httpx.post(f"{proxy.address}/outliers", json=SCENE, timeout=30)
+    assert answer.status_code == 502
+    assert questions == ["/outliers"]
+
+
 def test_a_body_that_trickles_in_is_ended_by_the_service(proxy: Proxy) -> None:
     """Every byte restarts the proxy's time-out; the service bounds the time of the whole body."""
     began = time.monotonic()
