@@ -9,11 +9,13 @@ import socket
 import time
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from itertools import cycle
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from tests.http.stores import VOCABULARY, make_store
@@ -141,3 +143,26 @@ def test_few_files_limit_the_connections(tmp_path: Path) -> None:
         for _ in range(20):
             assert service.client.get("/health/live").status_code == 200
         assert "accepts 192 connections" in service.log.read_text()
+
+
+behind_proxy = live_service(SCENE_TRUSTED_PROXIES="127.0.0.1")
+
+
+def test_a_trusted_proxy_tells_clients_apart(behind_proxy: LiveService) -> None:
+    """One client of the proxy holds its quarter of the draws; another one still has its own."""
+    largest = {**SCENE, "count": 64, "steps": 500}
+    quick = {**SCENE, "count": 1, "steps": 1}
+
+    def draw(body: dict[str, Any], client: str) -> int:
+        headers = {"X-Forwarded-For": client, "X-Request-Timeout-Ms": "60000"}
+        return httpx.post(
+            f"{behind_proxy.url}/generate", json=body, headers=headers, timeout=60
+        ).status_code
+
+    with ThreadPoolExecutor() as pool:
+        first = pool.submit(draw, largest, "10.0.0.1")
+        time.sleep(0.2)
+        assert not first.done()
+        other = pool.submit(draw, quick, "10.0.0.2")
+        assert draw(quick, "10.0.0.1") == 429
+        assert (first.result(), other.result()) == (200, 200)
