@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
 from rapidfuzz import process
@@ -34,6 +34,7 @@ comparison grows with the length. All class names have fewer than 32 characters.
 
 _LEAST: Final = 0.6  # minimum similarity of a suggestion
 _BY_REST: Final = 0.9  # factor if the first letters differ, because people rarely mistype them
+_SAME_HEAD: Final = 0.5  # minimum similarity of names with the same last word
 _FARTHER: Final = 0.1  # maximum difference of similarity between a suggestion and the best one
 
 # Costs of edits, in tenths. Typing errors and confused vowels are frequent; other letters rarely
@@ -168,34 +169,56 @@ class NameIndex:
         return Guess(entry, round(1 - cost / 10 / len("".join(words)), 3), "spelling")
 
     def _corrections(self, word: str) -> list[tuple[str, int]]:
-        """Return pairs (known word, cost of the edits), or the word itself if none is similar."""
+        """Return the known words with a similar spelling, as pairs (known word, cost of the edits).
+
+        The list has at most `_MOST_CORRECTIONS` pairs, cheapest first. A short word, or a word
+        without similar words, stands for itself: the list is [(word, 0)].
+        """
         if len(word) < _SHORTEST:
             return [(word, 0)]
+        # An edit changes the length by at most 1, so only words of these lengths can be similar.
         lengths = range(max(_SHORTEST, len(word) - _MOST_EDITS), len(word) + _MOST_EDITS + 1)
-        lexicon = [known for length in lengths for known in self._lexicon.get(length, ())]
-        edits = process.extract(
-            word, lexicon, scorer=OSA.distance, limit=None, score_cutoff=_MOST_EDITS
+        candidates = [known for length in lengths for known in self._lexicon.get(length, ())]
+        matches = process.extract(
+            word, candidates, scorer=OSA.distance, limit=None, score_cutoff=_MOST_EDITS
         )
-        costs = [(known, _cost(word, known, count)) for known, count, _ in edits]
-        return sorted(costs, key=lambda pair: pair[1])[:_MOST_CORRECTIONS] or [(word, 0)]
+        corrections = [(known, _cost(word, known, distance)) for known, distance, _ in matches]
+        cheapest = sorted(corrections, key=lambda correction: correction[1])[:_MOST_CORRECTIONS]
+        return cheapest or [(word, 0)]
 
     def nearest(self, name: str, limit: int) -> tuple[Match, ...]:
-        """Return at most ``limit`` plausible entries, most similar first."""
+        """Return at most ``limit`` plausible entries, most similar first.
+
+        An entry is plausible if its name has a similar spelling or the same last word ("office
+        table" and "table"). Entries that are much less similar than the first one are left out.
+        """
         words = split_words(name)
-        candidates: list[tuple[float, int]] = []
-        joined = "".join(words)
-        if len(joined) <= LONGEST:
-            for key, similarity, row in _alike(joined, self._keys):
-                factor = 1 if key[:1] == joined[:1] else _BY_REST
-                candidates.append((similarity * factor, self._entries[row]))
-        for row in self._by_head.get(words[-1], ()) if words else ():
-            shared = len({*words} & {*self._words[row]}) / len({*words, *self._words[row]})
-            candidates.append((0.5 + shared / 2, self._entries[row]))
+        candidates = [*self._by_spelling("".join(words)), *self._by_last_word(words)]
         # In ascending order, the largest similarity of each entry is the last one.
-        best = {entry: similarity for similarity, entry in sorted(candidates)}
-        ranked = sorted(best.items(), key=lambda entry: (-entry[1], entry[0]))[:limit]
-        least = max(_LEAST, ranked[0][1] - _FARTHER) if ranked else 0.0
-        return tuple(Match(*entry) for entry in ranked if entry[1] >= least)
+        best = {match.entry: match for match in sorted(candidates, key=lambda m: m.similarity)}
+        ranked = sorted(best.values(), key=lambda match: (-match.similarity, match.entry))[:limit]
+        if not ranked:
+            return ()
+        least = max(_LEAST, ranked[0].similarity - _FARTHER)
+        return tuple(match for match in ranked if match.similarity >= least)
+
+    def _by_spelling(self, key: str) -> Iterator[Match]:
+        """Yield the entries whose names have a spelling similar to ``key``, a name in one word."""
+        if len(key) > LONGEST:
+            return
+        for known_key, similarity, row in _alike(key, self._keys):
+            factor = 1 if known_key[:1] == key[:1] else _BY_REST
+            yield Match(self._entries[row], similarity * factor)
+
+    def _by_last_word(self, words: Sequence[str]) -> Iterator[Match]:
+        """Yield the entries whose names have the same last word.
+
+        The similarity grows with the shared words as a share of all words of both names.
+        """
+        for row in self._by_head.get(words[-1], ()) if words else ():
+            known_words = self._words[row]
+            shared = len({*words} & {*known_words}) / len({*words, *known_words})
+            yield Match(self._entries[row], _SAME_HEAD + (1 - _SAME_HEAD) * shared)
 
 
 def spelt_alike(name: str, names: Sequence[str], limit: int = 3) -> list[str]:
