@@ -176,16 +176,22 @@ def occupied_place(
 def altered_case(
     encoded: EncodedScene, structure: Flags, rng: Rng
 ) -> tuple[Scene, Triple | None] | None:
-    """Return a scene with observed relations, and their false triple (relation, subject, object).
+    """Draw observed relations of a scene. With probability 1/2, replace one by a false triple.
 
-    In half of the scenes, all triples are true, and the false triple is None.
+    `structure` is True for structural classes, (classes,).
+
+    Returns:
+        The scene with the observed relations, and the false triple (relation, subject, object).
+        The false triple is None if all observed relations are true. The whole result is None if
+        the scene has fewer than two usable relations, or if no false triple was found.
     """
-    triples = draw_true_relations(encoded, structure, rng)
-    if triples is None:
+    true_triples = draw_true_relations(encoded, structure, rng)
+    if true_triples is None:
         return None
     if rng.random() < 0.5:
-        return scene_of(encoded, range(len(encoded.instance_classes)), triples), None
-    return altered_scene(encoded, structure, triples, rng)
+        all_instances = range(len(encoded.instance_classes))
+        return scene_of(encoded, all_instances, true_triples), None
+    return altered_scene(encoded, structure, true_triples, rng)
 
 
 def draw_true_relations(encoded: EncodedScene, structure: Flags, rng: Rng) -> list[Triple] | None:

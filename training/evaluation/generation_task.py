@@ -183,28 +183,36 @@ def marginal_error(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]
 
 
 def pair_correlation(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]:
-    """Return Pearson r of the covariances of common classes, by weights of held-out scenes."""
-    common = np.argsort(-held_out.sum(0), kind="stable")[:_COMMON_CLASSES]
-    common = common[held_out[:, common].any(0)]
-    x, y = drawn[:, common], held_out[:, common]
-    pair = np.triu_indices(len(common), 1)
+    """Return the pair correlation as a function of the weights of the held-out scenes.
 
-    def covariance(v: Floats, weight: Floats) -> Floats:
+    The pair correlation is Pearson's r between the covariances of the pairs of common classes in
+    generated scenes and in held-out scenes. Common classes are the `_COMMON_CLASSES` most frequent
+    classes of the held-out scenes. The function returns NaN if r is undefined.
+
+    Args:
+        held_out, drawn: presence of each class, (scenes, classes).
+    """
+    most_frequent = np.argsort(-held_out.sum(0), kind="stable")[:_COMMON_CLASSES]
+    common = most_frequent[held_out[:, most_frequent].any(0)]
+    pairs = np.triu_indices(len(common), 1)
+
+    def covariances(v: Floats, weight: Floats) -> Floats:
         total = weight.sum()
         mean = weight @ v / total
-        return ((v.T * weight) @ v / total - np.outer(mean, mean))[pair]
+        return ((v.T * weight) @ v / total - np.outer(mean, mean))[pairs]
 
-    ours = covariance(x, np.ones(len(x)))
+    of_drawn = covariances(drawn[:, common], np.ones(len(drawn)))
+    held_out_common = held_out[:, common]
 
-    def at(weight: Floats) -> float:
+    def correlation(weight: Floats) -> float:
         if not weight.sum() > 0:
             return float("nan")
-        theirs = covariance(y, weight)
-        if len(ours) < 2 or not ours.std() or not theirs.std():
+        of_held_out = covariances(held_out_common, weight)
+        if len(of_drawn) < 2 or not of_drawn.std() or not of_held_out.std():
             return float("nan")
-        return float(np.corrcoef(ours, theirs)[0, 1])
+        return float(np.corrcoef(of_drawn, of_held_out)[0, 1])
 
-    return at
+    return correlation
 
 
 def copies(drawn: Tensor, train: Tensor) -> Floats:
