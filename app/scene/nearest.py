@@ -121,7 +121,10 @@ class NameIndex:
             self._lexicon.setdefault(len(word), []).append(word)
 
     def guess(self, name: str) -> Guess | None:
-        """Return the entry that a name probably stands for, or None."""
+        """Return the entry that a name probably stands for, or None.
+
+        The function first compares the spelling of the whole name, and then its last words.
+        """
         words = split_words(head_of(name) or name)
         if len("".join(words)) > LONGEST or len(words) > _MOST_WORDS or _SEVERAL & {*words}:
             return None
@@ -129,42 +132,55 @@ class NameIndex:
         corrections = {word: [(word, 0)] for word in words}
         if len(unknown) <= _MOST_MISSPELT:
             corrections |= {word: self._corrections(word) for word in unknown}
-        if (guess := self._spelt(words, corrections)) is not None:
+        if (guess := self._by_corrections(words, corrections)) is not None:
             return guess
         prepositions = [k for k, word in enumerate(words) if k and word in _PREPOSITIONS]
         end = prepositions[0] if prepositions else len(words)
-        if _TOGETHER & {*words[end : end + 1]} and self._spelt(words[end + 1 :], corrections):
+        # "vase with flowers" names two objects.
+        names_two = bool(_TOGETHER & {*words[end : end + 1]})
+        if names_two and self._by_corrections(words[end + 1 :], corrections) is not None:
             return None
-        imitations = [word for word in words[: end - 1] if word in _IMITATIONS]
-        for start in range(end):
-            head = imitations[:1] or words[start:end]
+        return self._by_head_words(words[:end])
+
+    def _by_head_words(self, words: Sequence[str]) -> Guess | None:
+        """Return the entry whose name is the longest end of a phrase, or None.
+
+        A phrase with an imitation, such as "toy trailer", stands for the imitation ("toy").
+        """
+        imitations = [word for word in words[:-1] if word in _IMITATIONS]
+        for start in range(len(words)):
+            head = imitations[:1] or words[start:]
             if start and len(head) == 1 and head[0] in _AMBIGUOUS:
                 return None
             if (entry := self._by_key.get("".join(head))) is not None:
                 return Guess(entry, _BY_HEAD, "head")
         return None
 
-    def _spelt(
+    def _by_corrections(
         self, words: Sequence[str], corrections: Mapping[str, Sequence[tuple[str, int]]]
     ) -> Guess | None:
         """Return the entry whose name is the phrase, perhaps with misspelt words.
 
         The result is None if the edits cost too much, or if another entry costs about the same.
+
+        Args:
+            corrections: for each word, pairs (known word, cost of the edits); see `_corrections`.
         """
-        costs: dict[int, tuple[int, int]] = {}  # by entry: cost and maximum cost
+        costs: dict[int, tuple[int, int]] = {}  # by entry: cost and maximum cost, in tenths
         for spelling in itertools.product(*(corrections[word] for word in words)):
             entry = self._by_key.get("".join(known for known, _ in spelling))
-            if entry is not None:
-                allowed = sum(_allowed(known) for known, cost in spelling if cost)
-                if allowed and len(words) > 1:
-                    allowed += _BY_PHRASE
-                pair = (sum(cost for _, cost in spelling), allowed)
-                costs[entry] = min(pair, costs.get(entry, pair))
+            if entry is None:
+                continue
+            cost = sum(cost for _, cost in spelling)
+            max_cost = sum(_max_cost(known) for known, cost in spelling if cost)
+            if max_cost and len(words) > 1:
+                max_cost += _BY_PHRASE
+            costs[entry] = min((cost, max_cost), costs.get(entry, (cost, max_cost)))
         if not costs:
             return None
-        (entry, (cost, allowed)), *others = sorted(costs.items(), key=lambda match: match[1])
+        (entry, (cost, max_cost)), *others = sorted(costs.items(), key=lambda item: item[1])
         second_cost = others[0][1][0] if others else math.inf
-        if cost > allowed or second_cost - cost <= _MARGIN:
+        if cost > max_cost or second_cost - cost <= _MARGIN:
             return None
         return Guess(entry, round(1 - cost / 10 / len("".join(words)), 3), "spelling")
 
@@ -235,8 +251,8 @@ def _alike(
     return process.extract(name, names, scorer=similarity, limit=limit, score_cutoff=_LEAST)
 
 
-def _allowed(known: str) -> int:
-    """Return the maximum cost of the edits that lead to a known word."""
+def _max_cost(known: str) -> int:
+    """Return the maximum cost of the edits that lead to a known word, in tenths."""
     return _SLIP if len(known) < 5 else _EDIT if len(known) < 8 else _EDIT + _SLIP
 
 

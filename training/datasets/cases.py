@@ -209,20 +209,33 @@ def draw_true_relations(encoded: EncodedScene, structure: Flags, rng: Rng) -> li
 def altered_scene(
     encoded: EncodedScene, structure: Flags, triples: Sequence[Triple], rng: Rng
 ) -> tuple[Scene, Triple] | None:
-    """Replace one of `triples` by a false triple. Return the scene and this triple, or None."""
+    """Replace one random triple by a false triple with another relation or another object.
+
+    A triple is false if the scene lists neither it nor its mirror image.
+
+    Args:
+        structure: True for structural classes, (classes,).
+        triples: observed triples (relation, subject, object) of instances.
+
+    Returns:
+        The scene with the altered triples, and the false triple. The result is None if
+        `_ATTEMPTS` draws give no false triple.
+    """
     is_thing = ~structure[encoded.instance_classes]
     holds = encoded.instance_holds
     index = int(rng.integers(len(triples)))
     for _ in range(_ATTEMPTS):
-        a, i, j = triples[index]
+        relation, subject, object_ = triples[index]
         if rng.random() < 0.5:
-            a = int(rng.integers(len(CANONICAL)))
+            relation = int(rng.integers(len(CANONICAL)))
         else:
-            j = int(rng.integers(len(is_thing)))
-        if i == j or not is_thing[j] or holds[a, i, j] or holds[a, j, i]:
+            object_ = int(rng.integers(len(is_thing)))
+        is_listed = holds[relation, subject, object_] or holds[relation, object_, subject]
+        if subject == object_ or not is_thing[object_] or is_listed:
             continue
-        altered = [*triples[:index], (a, i, j), *triples[index + 1 :]]
-        return scene_of(encoded, range(len(is_thing)), altered), (a, i, j)
+        false_triple = relation, subject, object_
+        altered = [*triples[:index], false_triple, *triples[index + 1 :]]
+        return scene_of(encoded, range(len(is_thing)), altered), false_triple
     return None
 
 

@@ -148,38 +148,52 @@ def discrepancy(held_out: Tensor, drawn: Tensor, bandwidth: float) -> Callable[[
     """Return MMD² as a function of the weights of the held-out scenes.
 
     The statistic excludes pairs of a scene with itself, or with a copy of itself in a resample.
+
+    Args:
+        held_out, drawn: presence of each class, (scenes, classes).
+        bandwidth: bandwidth of the kernel, as a Hamming distance.
     """
 
     def kernel(x: Tensor, y: Tensor) -> Floats:
         return torch.exp(-hamming(x, y) / bandwidth).double().numpy()
 
-    yy, xx = kernel(held_out, held_out), kernel(drawn, drawn)
+    # MMD² = E k(x, x') + E k(y, y') - 2 E k(x, y) for generated scenes x and held-out scenes y.
+    xx, yy = kernel(drawn, drawn), kernel(held_out, held_out)
     xy = kernel(drawn, held_out).mean(0)
     n = len(xx)
-    within = float((xx.sum() - np.trace(xx)) / (n * (n - 1)))
+    mean_xx = float((xx.sum() - np.trace(xx)) / (n * (n - 1)))
     np.fill_diagonal(yy, 0.0)
 
-    def at(weight: Floats) -> float:
-        pairs = weight.sum() ** 2 - (weight**2).sum()
-        if not pairs > 0:
+    def squared_mmd(weight: Floats) -> float:
+        pairs_weight = weight.sum() ** 2 - (weight**2).sum()
+        if not pairs_weight > 0:
             return float("nan")
-        across = weight @ xy / weight.sum()
-        return float(within + weight @ yy @ weight / pairs - 2 * across)
+        mean_yy = weight @ yy @ weight / pairs_weight
+        mean_xy = weight @ xy / weight.sum()
+        return float(mean_xx + mean_yy - 2 * mean_xy)
 
-    return at
+    return squared_mmd
 
 
 def marginal_error(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]:
-    """Return the marginal error as a function of the weights of the held-out scenes."""
+    """Return the marginal error as a function of the weights of the held-out scenes.
+
+    The marginal error is sum_i |p_i - q_i| / sum_i q_i. p_i and q_i are the shares of generated and
+    of held-out scenes with class i.
+
+    Args:
+        held_out, drawn: presence of each class, (scenes, classes).
+    """
     p = drawn.mean(0)
 
-    def at(weight: Floats) -> float:
-        q = weight @ held_out
-        if not q.sum() > 0:
+    def error(weight: Floats) -> float:
+        count = weight @ held_out  # total weight of the held-out scenes with each class
+        if not count.sum() > 0:
             return float("nan")
-        return float(np.abs(p - q / weight.sum()).sum() / q.sum() * weight.sum())
+        q = count / weight.sum()
+        return float(np.abs(p - q).sum() / count.sum() * weight.sum())
 
-    return at
+    return error
 
 
 def pair_correlation(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]:
