@@ -48,17 +48,17 @@ class InProcess(httpx.BaseTransport):
                 docs=False,
                 allowed_hosts=("*",),
             )
-        except ValidationError:
+        except ValidationError:  # of the store, because all other values are fixed
             raise InvalidRequestError.about("the store must be an existing directory") from None
         app = create_app(settings)
         self._asgi = httpx.ASGITransport(app, raise_app_exceptions=False)
-        started: Future[asyncio.AbstractEventLoop] = Future()
-        ending = asyncio.Event()
-        thread = Thread(target=_run, args=(app, started, ending), daemon=True, name="scene")
+        loop_future: Future[asyncio.AbstractEventLoop] = Future()
+        stop = asyncio.Event()
+        thread = Thread(target=_run, args=(app, loop_future, stop), daemon=True, name="scene")
         thread.start()
-        self._loop = started.result()
+        self._loop = loop_future.result()  # waits until the application has started
         # The finalizer ends the thread when the transport is closed or deleted, or at program exit.
-        self._finalize = weakref.finalize(self, _stop, self._loop, ending, thread)
+        self._finalize = weakref.finalize(self, _stop, self._loop, stop, thread)
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
         """Send one request to the application and return its response."""
@@ -80,22 +80,26 @@ class InProcess(httpx.BaseTransport):
         self._finalize()
 
 
-def _run(app: FastAPI, started: Future[asyncio.AbstractEventLoop], ending: asyncio.Event) -> None:
-    """Run the application until ``ending`` is set. ``started`` receives the loop or the error."""
+def _run(app: FastAPI, loop_future: Future[asyncio.AbstractEventLoop], stop: asyncio.Event) -> None:
+    """Run the application on a new event loop until ``stop`` is set.
 
-    async def run_until_end() -> None:
+    After the start, ``loop_future`` contains the event loop. If the start fails, it contains the
+    error.
+    """
+
+    async def run_until_stop() -> None:
         async with app.router.lifespan_context(app):
-            started.set_result(asyncio.get_running_loop())
-            await ending.wait()
+            loop_future.set_result(asyncio.get_running_loop())
+            await stop.wait()
 
     try:
-        asyncio.run(run_until_end())
+        asyncio.run(run_until_stop())
     except BaseException as error:
-        if started.done():
+        if loop_future.done():
             raise
-        started.set_exception(error)
+        loop_future.set_exception(error)
 
 
-def _stop(loop: asyncio.AbstractEventLoop, ending: asyncio.Event, thread: Thread) -> None:
-    loop.call_soon_threadsafe(ending.set)
+def _stop(loop: asyncio.AbstractEventLoop, stop: asyncio.Event, thread: Thread) -> None:
+    loop.call_soon_threadsafe(stop.set)
     thread.join()

@@ -161,30 +161,55 @@ class SceneChains:
         return on
 
     def sample_weights(self, conditions: Conditions) -> NDArray[np.float64]:
-        """Return the probability of each stored scene as the start of a chain, (N,); see module."""
-        machine, room, classes = self.machine, conditions.room, conditions.classes
-        log_weights = np.zeros(len(self.mean), np.float32)
-        if room is None:
-            barred = np.isin(machine["fantasy_rooms"], self._excluded)
-            log_weights += np.where(barred, -OTHER_ROOM, 0)
-        elif machine.spec.C:
-            same_room = machine["fantasy_rooms"] == room
-            if same_room.any():
-                log_weights += np.where(same_room, 0, -OTHER_ROOM)
-            else:
-                log_weights += self.mean @ machine["Q"][room]
-                log_weights += self._stored @ machine.room_couplings(room)
-        logits = machine["b"][classes] + self.mean @ machine["W"][classes].T
-        if machine.spec.coupled:
-            logits += self._stored @ machine["L"][:, classes]
-        log_weights -= softplus(-logits).sum(1)
-        unit, state = conditions.held.T
-        others = self.mean.reshape(len(self.mean), -1, machine.spec.states - 1)
-        means = np.concatenate([1 - others.sum(2, keepdims=True), others], 2)
-        log_weights += np.log(np.maximum(means[:, unit, state], 1e-37)).sum(1)
+        """Return the probability of each stored scene as the start of a chain, (N,).
+
+        The log weight of a stored scene is a sum of three terms: of its room type, of the required
+        classes, and of the held states of h1. The module contains the formula.
+        """
+        log_weights = self._room_log_weights(conditions.room)
+        log_weights += self._classes_log_p(conditions.classes)
+        log_weights += self._held_log_p(conditions.held)
         weights = np.exp(log_weights - log_weights.max()).astype(np.float64)
         probabilities: NDArray[np.float64] = weights / weights.sum()
         return probabilities
+
+    def _room_log_weights(self, room: int | None) -> Floats:
+        """Return the log weight of each stored scene for a requested room type, (N,).
+
+        Without a requested room type, the excluded room types have a low weight. If no stored
+        scene has the requested room type, Q and Y of this room type give the log weight.
+        """
+        machine = self.machine
+        stored_rooms = machine["fantasy_rooms"]
+        if room is None:
+            is_other = np.isin(stored_rooms, self._excluded)
+        elif machine.spec.C:
+            is_other = stored_rooms != room
+            if is_other.all():
+                fit: Floats = self.mean @ machine["Q"][room]
+                return fit + self._stored @ machine.room_couplings(room)
+        else:
+            is_other = np.zeros(len(self.mean), np.bool_)
+        return np.where(is_other, -OTHER_ROOM, np.float32(0))
+
+    def _classes_log_p(self, classes: Indices) -> Floats:
+        """Return the log probability of the classes given each stored scene, (N,)."""
+        machine = self.machine
+        logits = machine["b"][classes] + self.mean @ machine["W"][classes].T
+        if machine.spec.coupled:
+            logits += self._stored @ machine["L"][:, classes]
+        log_p: Floats = -softplus(-logits).sum(1)
+        return log_p
+
+    def _held_log_p(self, held: Indices) -> Floats:
+        """Return the log probability of the held states of h1 given each stored scene, (N,)."""
+        unit, state = held.T
+        other_states = self.mean.reshape(len(self.mean), -1, self.machine.spec.states - 1)
+        # `self.mean` leaves out state 0. Its probability is the rest to 1.
+        state_0 = 1 - other_states.sum(2, keepdims=True)
+        p = np.concatenate([state_0, other_states], 2)[:, unit, state]
+        log_p: Floats = np.log(np.maximum(p, 1e-37)).sum(1)
+        return log_p
 
 
 class ConditionedChains:

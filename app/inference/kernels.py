@@ -361,33 +361,41 @@ def log_sums(x):
 
 @compiled
 def source_effects(f, a, classes, presence, rows, targets):
-    """Return sum_q p_q a_qi of N classes i, (N,), and its change by each listed class, (N, n).
+    """Return the effect of the unknown data source on N target classes, and its changes.
+
+    The effect on a class i is the mean base rate sum_q p_q a_qi over the Q data sources. p_q is the
+    probability of source q given the listed classes.
 
     Args:
-        f, a: weights of the data sources; see `weights.layout`.
-        classes, presence: see `ObjectScorer.absent`.
-        rows: (N,) index of each class i among the listed classes. A class is not evidence for
-            itself. `rows` is empty if the classes i are not listed.
-        targets: (N,) the classes i.
+        f, a: weights of the data sources, (Q,) and (Q, V); see `weights.layout`.
+        classes, presence: the n listed classes; see `ObjectScorer.absent`.
+        rows: (N,) index of each target among the listed classes. A class is not evidence for
+            itself. `rows` is empty if the targets are not listed.
+        targets: (N,) the target classes.
+
+    Returns:
+        The effects, (N,), and the change of each effect due to each listed class, (N, n).
     """
-    shares = np.empty((len(classes), len(f)), np.float32)
-    rest, without = np.empty(len(f), np.float32), np.empty(len(f), np.float32)
+    # Part of each listed class in the logit of each source, (n, Q).
+    parts = np.empty((len(classes), len(f)), np.float32)
+    without_target = np.empty(len(f), np.float32)
+    without_both = np.empty(len(f), np.float32)  # without the target and the listed class j
     logits = np.empty(len(f), np.float32)
     for q in range(len(f)):
         logits[q] = f[q]
         for j in range(len(classes)):
-            shares[j, q] = a[q, classes[j]] * presence[j]
-            logits[q] += shares[j, q]
+            parts[j, q] = a[q, classes[j]] * presence[j]
+            logits[q] += parts[j, q]
     mean = np.empty(len(targets), np.float32)
     change = np.empty((len(targets), len(classes)), np.float32)
     for i in range(len(targets)):
         for q in range(len(f)):
-            rest[q] = logits[q] - shares[rows[i], q] if len(rows) else logits[q]
-        mean[i] = _mean(rest, a, targets[i])
+            without_target[q] = logits[q] - parts[rows[i], q] if len(rows) else logits[q]
+        mean[i] = _mean(without_target, a, targets[i])
         for j in range(len(classes)):
             for q in range(len(f)):
-                without[q] = rest[q] - shares[j, q]
-            change[i, j] = mean[i] - _mean(without, a, targets[i])
+                without_both[q] = without_target[q] - parts[j, q]
+            change[i, j] = mean[i] - _mean(without_both, a, targets[i])
     return mean, change
 
 
@@ -1063,15 +1071,18 @@ _OF_ANCHOR: Final = 2.0
 
 @compiled
 def is_smaller(size_i: NDArray[Any], size_j: NDArray[Any]) -> bool:
-    """Return whether box i is smaller than box j, by footprint or else by volume.
+    """Return whether box i is smaller than box j.
 
-    For two boxes of the same size, the result is False in both orders. The sizes (3,) are extents
-    in metres.
+    The function compares the areas of the footprints. If these are equal up to the share `SAME`, it
+    compares the volumes. If the volumes are also equal, no box is smaller than the other.
+
+    Args:
+        size_i, size_j: extents of the boxes in x, y and z, in metres, (3,).
     """
-    a, b = size_i[0] * size_i[1], size_j[0] * size_j[1]
-    if abs(a - b) <= SAME * max(a, b):
-        a, b = a * size_i[2], b * size_j[2]
-    return a < b - SAME * max(a, b)
+    extent_i, extent_j = size_i[0] * size_i[1], size_j[0] * size_j[1]  # areas in m²
+    if abs(extent_i - extent_j) <= SAME * max(extent_i, extent_j):
+        extent_i, extent_j = extent_i * size_i[2], extent_j * size_j[2]  # volumes in m³
+    return extent_i < extent_j - SAME * max(extent_i, extent_j)
 
 
 @compiled

@@ -134,14 +134,15 @@ class ScenePosterior:
     def room_reasons(self) -> Doubles:
         """Return how much each class changes the log-odds of each room type, (C, n).
 
-        An entry is the log-odds of the room type given all classes, minus its log-odds given all
-        classes but one.
+        An entry is the log-odds of the room type given all n classes, minus its log-odds given the
+        scene without the class.
         """
         classes, presence = self._scene
+        # Row k has the logits of h1 and the presence of the classes in the scene without class k.
         x = self.context.x - self.context.shares
-        others = presence * (1 - np.eye(len(classes), dtype=np.float32))
-        without = self._objects.room_log_p(x, classes, others, self._profile)
-        change: Doubles = (_log_odds(self.room_log_p()) - _log_odds(without)).T
+        presence_without = presence * (1 - np.eye(len(classes), dtype=np.float32))
+        log_p_without = self._objects.room_log_p(x, classes, presence_without, self._profile)
+        change: Doubles = (_log_odds(self.room_log_p()) - _log_odds(log_p_without)).T
         return change
 
     def relation_log_odds(self) -> Floats:

@@ -420,25 +420,26 @@ def _chosen_relations(relations: int, only: int | None) -> slice:
 
 
 def _pair_table(weights: Weights) -> tuple[Table, tuple[Indices, Indices]]:
-    """Build the look-up table of `pair_rows`.
+    """Build the hash table of `kernels.pair_rows`.
 
-    The table contains each pair of classes that occurs in `Weights` as part of a triple.
+    Its keys are the pairs of classes of the T stored triples. The keys are sorted by bucket. Bucket
+    k consists of the rows from start[k] to start[k + 1].
 
     Returns:
-        The table: its buckets and its keys. Then two index arrays (T,): the row of each triple's
-        pair in the table, and the relation of each triple.
+        The hash table (start, keys), and two indices of the T triples: the row of the triple's pair
+        in the table, (T,), and the relation, (T,).
     """
-    size = weights.spec.V**2
-    triples = weights.triple_keys
-    pairs = np.unique(triples % size)
+    # A triple (a, i, j) has the key (a V + i) V + j. The key of its pair is i V + j.
+    relation, pair_of_triple = np.divmod(weights.triple_keys, weights.spec.V**2)
+    pairs, pair_index = np.unique(pair_of_triple, return_inverse=True)
     buckets = 1 << (2 * len(pairs)).bit_length()
     bucket = (pairs * kernels.SPREAD >> kernels.SHIFT) & (buckets - 1)
     order = np.argsort(bucket, kind="stable")
-    row = np.empty_like(order)
-    row[order] = np.arange(len(order))
+    row_of_pair = np.empty_like(order)
+    row_of_pair[order] = np.arange(len(order))
     start = np.searchsorted(bucket[order], np.arange(buckets + 1))
-    index = row[np.searchsorted(pairs, triples % size)], triples // size
-    return (start.astype(np.int32), pairs[order].astype(np.int32)), index
+    table = start.astype(np.int32), pairs[order].astype(np.int32)
+    return table, (row_of_pair[pair_index], relation)
 
 
 def _directions(weights: Weights) -> tuple[Floats, Floats]:

@@ -68,10 +68,10 @@ def reasons(
     *,
     least: float = 0.0,
 ) -> list[list[Fields]]:
-    """Return the strongest reasons for each of N explained classes.
+    """Return the strongest reasons for the log-odds of each of N explained classes.
 
-    The reasons are the changes with the largest absolute values, largest first. The object of a
-    reason is the first object of the class that causes the change.
+    A reason is a class of the scene and its change of these log-odds. The reasons with the largest
+    absolute changes come first. The answer names the first object of the class.
 
     Args:
         change: (N, n) change of each explained class's log-odds by each of the n classes of the
@@ -81,7 +81,8 @@ def reasons(
         least: minimum absolute value of a change. Rounding errors of a change of 0 are left out.
 
     Returns:
-        For each class, the fields of `scene_client.schemas.Because`.
+        For each explained class, a list of reasons with the fields of
+        `scene_client.schemas.Because`.
     """
     columns, values = strongest(change, np.zeros(0, np.int64) if rows is None else rows, REASONS)
     strong = np.abs(values) >= max(least, _ROUNDING)
@@ -158,7 +159,7 @@ class SizeLimit:
 
 
 def written(answer: Any) -> bytes:
-    """Write an answer, or a container of answers, as JSON.
+    """Return an answer, or a container of answers, as JSON. Fields without a value are left out.
 
     Raises:
         ValueError: a number in the answer is not finite.
@@ -166,8 +167,8 @@ def written(answer: Any) -> bytes:
     body = orjson.dumps(answer, default=lambda part: to_jsonable_python(part, exclude_none=True))
     if b"null" not in body:
         return body
-    # orjson writes NaN, infinity and fields without a value as `null`. A name may also contain the
-    # text "null". So convert the answer again, with a stricter function.
+    # A `null` in the fast conversion is NaN, infinity, a field without a value, or part of a name.
+    # pydantic's slower conversion leaves out the fields, and writes NaN as `NaN`.
     body = to_json(answer, inf_nan_mode="constants", exclude_none=True)
     try:
         from_json(body, allow_inf_nan=False)

@@ -60,11 +60,11 @@ def missing(
 ) -> Fields:
     """Rank the unlisted classes by the probability that they are present, likeliest first.
 
-    The model assumes that the scene lists the share `coverage` of its classes. If the coverage is
-    low, an unlisted class may well be present. Each class is judged separately, so the
+    The model assumes that the scene lists the share `coverage` of its classes. A lower coverage
+    gives unlisted classes higher probabilities. Each class is judged separately, so the
     probabilities do not sum to 1. The list `missing` never contains listed or structural classes.
-    A kind of a listed class, such as an office chair beside a listed chair, may be the listed
-    object. So the list contains it only if `candidates` names it.
+    It contains a kind of a listed class only if `candidates` names this kind. For example, an
+    office chair may be the listed chair itself.
 
     Args:
         scene: the listed objects, their relations and the room type.

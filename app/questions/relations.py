@@ -51,12 +51,13 @@ def relations(
     flipped: Collection[Triple] = (),
     size_limit: SizeLimit | None = None,
 ) -> Fields:
-    """Return the likeliest relations between the objects of a scene, and its disagreements.
+    """Return the likeliest relations between the objects of a scene, and the disagreements.
 
-    An observed relation has the probability of its evidence. Beside it stands the probability that
-    the model expects without this observation. A relation that is observed not to hold, or that the
-    boxes or other relations exclude, has at most .01. Structural classes (floor, wall) are left out
-    unless `pairs` contains them.
+    A disagreement is an observed relation of two objects for which the model expects another
+    relation. The `probability` of an observed relation is that of its evidence. Its `expected` is
+    the probability of the model without this observation. The probability is at most .01 if the
+    relation is observed not to hold, or if the boxes or other relations exclude it. Structural
+    classes (floor, wall) are left out unless `pairs` contains them.
 
     Args:
         scene: the objects, their observed relations and the room type.
@@ -183,7 +184,7 @@ def _disagreements(
     top_k: int,
     least: float,
 ) -> list[Fields]:
-    """Return the fields of `scene_client.schemas.ExpectedRelation` for each disagreement.
+    """Return the fields of `scene_client.schemas.Disagreement` for each disagreement.
 
     Disagreements with the largest ratio of `probability` to `observed_probability` come first. If a
     pair has several observed relations, the first of them in `CANONICAL` defines the subject of the

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
 from rapidfuzz import process
@@ -34,6 +34,7 @@ comparison grows with the length. All class names have fewer than 32 characters.
 
 _LEAST: Final = 0.6  # minimum similarity of a suggestion
 _BY_REST: Final = 0.9  # factor if the first letters differ, because people rarely mistype them
+_SAME_HEAD: Final = 0.5  # minimum similarity of names with the same last word
 _FARTHER: Final = 0.1  # maximum difference of similarity between a suggestion and the best one
 
 # Costs of edits, in tenths. Typing errors and confused vowels are frequent; other letters rarely
@@ -120,7 +121,10 @@ class NameIndex:
             self._lexicon.setdefault(len(word), []).append(word)
 
     def guess(self, name: str) -> Guess | None:
-        """Return the entry that a name probably stands for, or None."""
+        """Return the entry that a name probably stands for, or None.
+
+        The function first compares the spelling of the whole name, and then its last words.
+        """
         words = split_words(head_of(name) or name)
         if len("".join(words)) > LONGEST or len(words) > _MOST_WORDS or _SEVERAL & {*words}:
             return None
@@ -128,74 +132,109 @@ class NameIndex:
         corrections = {word: [(word, 0)] for word in words}
         if len(unknown) <= _MOST_MISSPELT:
             corrections |= {word: self._corrections(word) for word in unknown}
-        if (guess := self._spelt(words, corrections)) is not None:
+        if (guess := self._by_corrections(words, corrections)) is not None:
             return guess
         prepositions = [k for k, word in enumerate(words) if k and word in _PREPOSITIONS]
         end = prepositions[0] if prepositions else len(words)
-        if _TOGETHER & {*words[end : end + 1]} and self._spelt(words[end + 1 :], corrections):
+        # "vase with flowers" names two objects.
+        names_two = bool(_TOGETHER & {*words[end : end + 1]})
+        if names_two and self._by_corrections(words[end + 1 :], corrections) is not None:
             return None
-        imitations = [word for word in words[: end - 1] if word in _IMITATIONS]
-        for start in range(end):
-            head = imitations[:1] or words[start:end]
+        return self._by_head_words(words[:end])
+
+    def _by_head_words(self, words: Sequence[str]) -> Guess | None:
+        """Return the entry whose name is the longest end of a phrase, or None.
+
+        A phrase with an imitation, such as "toy trailer", stands for the imitation ("toy").
+        """
+        imitations = [word for word in words[:-1] if word in _IMITATIONS]
+        for start in range(len(words)):
+            head = imitations[:1] or words[start:]
             if start and len(head) == 1 and head[0] in _AMBIGUOUS:
                 return None
             if (entry := self._by_key.get("".join(head))) is not None:
                 return Guess(entry, _BY_HEAD, "head")
         return None
 
-    def _spelt(
+    def _by_corrections(
         self, words: Sequence[str], corrections: Mapping[str, Sequence[tuple[str, int]]]
     ) -> Guess | None:
         """Return the entry whose name is the phrase, perhaps with misspelt words.
 
         The result is None if the edits cost too much, or if another entry costs about the same.
+
+        Args:
+            corrections: for each word, pairs (known word, cost of the edits); see `_corrections`.
         """
-        costs: dict[int, tuple[int, int]] = {}  # by entry: cost and maximum cost
+        costs: dict[int, tuple[int, int]] = {}  # by entry: cost and maximum cost, in tenths
         for spelling in itertools.product(*(corrections[word] for word in words)):
             entry = self._by_key.get("".join(known for known, _ in spelling))
-            if entry is not None:
-                allowed = sum(_allowed(known) for known, cost in spelling if cost)
-                if allowed and len(words) > 1:
-                    allowed += _BY_PHRASE
-                pair = (sum(cost for _, cost in spelling), allowed)
-                costs[entry] = min(pair, costs.get(entry, pair))
+            if entry is None:
+                continue
+            cost = sum(cost for _, cost in spelling)
+            max_cost = sum(_max_cost(known) for known, cost in spelling if cost)
+            if max_cost and len(words) > 1:
+                max_cost += _BY_PHRASE
+            costs[entry] = min((cost, max_cost), costs.get(entry, (cost, max_cost)))
         if not costs:
             return None
-        (entry, (cost, allowed)), *others = sorted(costs.items(), key=lambda match: match[1])
+        (entry, (cost, max_cost)), *others = sorted(costs.items(), key=lambda item: item[1])
         second_cost = others[0][1][0] if others else math.inf
-        if cost > allowed or second_cost - cost <= _MARGIN:
+        if cost > max_cost or second_cost - cost <= _MARGIN:
             return None
         return Guess(entry, round(1 - cost / 10 / len("".join(words)), 3), "spelling")
 
     def _corrections(self, word: str) -> list[tuple[str, int]]:
-        """Return pairs (known word, cost of the edits), or the word itself if none is similar."""
+        """Return the known words with a similar spelling, as pairs (known word, cost of the edits).
+
+        The list has at most `_MOST_CORRECTIONS` pairs, cheapest first. A short word, or a word
+        without similar words, stands for itself: the list is [(word, 0)].
+        """
         if len(word) < _SHORTEST:
             return [(word, 0)]
+        # An edit changes the length by at most 1, so only words of these lengths can be similar.
         lengths = range(max(_SHORTEST, len(word) - _MOST_EDITS), len(word) + _MOST_EDITS + 1)
-        lexicon = [known for length in lengths for known in self._lexicon.get(length, ())]
-        edits = process.extract(
-            word, lexicon, scorer=OSA.distance, limit=None, score_cutoff=_MOST_EDITS
+        candidates = [known for length in lengths for known in self._lexicon.get(length, ())]
+        matches = process.extract(
+            word, candidates, scorer=OSA.distance, limit=None, score_cutoff=_MOST_EDITS
         )
-        costs = [(known, _cost(word, known, count)) for known, count, _ in edits]
-        return sorted(costs, key=lambda pair: pair[1])[:_MOST_CORRECTIONS] or [(word, 0)]
+        corrections = [(known, _cost(word, known, distance)) for known, distance, _ in matches]
+        cheapest = sorted(corrections, key=lambda correction: correction[1])[:_MOST_CORRECTIONS]
+        return cheapest or [(word, 0)]
 
     def nearest(self, name: str, limit: int) -> tuple[Match, ...]:
-        """Return at most ``limit`` plausible entries, most similar first."""
+        """Return at most ``limit`` plausible entries, most similar first.
+
+        An entry is plausible if its name has a similar spelling or the same last word ("office
+        table" and "table"). Entries that are much less similar than the first one are left out.
+        """
         words = split_words(name)
-        candidates: list[tuple[float, int]] = []
-        joined = "".join(words)
-        if len(joined) <= LONGEST:
-            for key, similarity, row in _alike(joined, self._keys):
-                factor = 1 if key[:1] == joined[:1] else _BY_REST
-                candidates.append((similarity * factor, self._entries[row]))
-        for row in self._by_head.get(words[-1], ()) if words else ():
-            shared = len({*words} & {*self._words[row]}) / len({*words, *self._words[row]})
-            candidates.append((0.5 + shared / 2, self._entries[row]))
+        candidates = [*self._by_spelling("".join(words)), *self._by_last_word(words)]
         # In ascending order, the largest similarity of each entry is the last one.
-        best = {entry: similarity for similarity, entry in sorted(candidates)}
-        ranked = sorted(best.items(), key=lambda entry: (-entry[1], entry[0]))[:limit]
-        least = max(_LEAST, ranked[0][1] - _FARTHER) if ranked else 0.0
-        return tuple(Match(*entry) for entry in ranked if entry[1] >= least)
+        best = {match.entry: match for match in sorted(candidates, key=lambda m: m.similarity)}
+        ranked = sorted(best.values(), key=lambda match: (-match.similarity, match.entry))[:limit]
+        if not ranked:
+            return ()
+        least = max(_LEAST, ranked[0].similarity - _FARTHER)
+        return tuple(match for match in ranked if match.similarity >= least)
+
+    def _by_spelling(self, key: str) -> Iterator[Match]:
+        """Yield the entries whose names have a spelling similar to ``key``, a name in one word."""
+        if len(key) > LONGEST:
+            return
+        for known_key, similarity, row in _alike(key, self._keys):
+            factor = 1 if known_key[:1] == key[:1] else _BY_REST
+            yield Match(self._entries[row], similarity * factor)
+
+    def _by_last_word(self, words: Sequence[str]) -> Iterator[Match]:
+        """Yield the entries whose names have the same last word.
+
+        The similarity grows with the shared words as a share of all words of both names.
+        """
+        for row in self._by_head.get(words[-1], ()) if words else ():
+            known_words = self._words[row]
+            shared = len({*words} & {*known_words}) / len({*words, *known_words})
+            yield Match(self._entries[row], _SAME_HEAD + (1 - _SAME_HEAD) * shared)
 
 
 def spelt_alike(name: str, names: Sequence[str], limit: int = 3) -> list[str]:
@@ -212,8 +251,8 @@ def _alike(
     return process.extract(name, names, scorer=similarity, limit=limit, score_cutoff=_LEAST)
 
 
-def _allowed(known: str) -> int:
-    """Return the maximum cost of the edits that lead to a known word."""
+def _max_cost(known: str) -> int:
+    """Return the maximum cost of the edits that lead to a known word, in tenths."""
     return _SLIP if len(known) < 5 else _EDIT if len(known) < 8 else _EDIT + _SLIP
 
 

@@ -84,18 +84,18 @@ def canonicalise(subject: End, relation: str, anchor: End) -> tuple[int, End, En
 def contradiction(
     triples: Iterable[tuple[int, End, End]],
 ) -> tuple[tuple[int, End, End], tuple[int, End, End]] | None:
-    """Return two canonical triples that contradict each other, or None.
+    """Return the first two triples that contradict each other, or None without a contradiction.
 
-    The result is None if no triples contradict each other. Subjects and anchors must be *objects*.
-    For objects, ``left(i, j)`` and ``left(j, i)`` contradict each other. For classes with several
-    instances, both triples can hold.
+    The triples (relation, subject, anchor) are canonical. Two triples contradict each other if
+    they differ only by exchanged ends: ``left(i, j)`` and ``left(j, i)``. The ends must be
+    *objects*: for classes with several instances, both triples can hold.
     """
-    seen: set[tuple[int, End, End]] = set()
+    earlier: set[tuple[int, End, End]] = set()
     for relation, subject, anchor in triples:
-        flipped = (relation, anchor, subject)
-        if flipped in seen:
-            return flipped, (relation, subject, anchor)
-        seen.add((relation, subject, anchor))
+        exchanged = (relation, anchor, subject)
+        if exchanged in earlier:
+            return exchanged, (relation, subject, anchor)
+        earlier.add((relation, subject, anchor))
     return None
 
 

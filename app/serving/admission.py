@@ -55,17 +55,18 @@ class Lane:
 
     Args:
         slots: number of requests that run at a time.
-        limit: maximum total weight of the requests that wait or run.
+        limit: maximum total weight of the waiting and running requests.
 
     Attributes:
-        weight: total weight of the requests that wait or run.
+        weight: total weight of the waiting and running requests.
     """
 
     def __init__(self, slots: int, limit: int) -> None:
         self.limit, self.weight = limit, 0
-        self._free = slots
+        self._free_slots = slots
         self._weights: dict[str, int] = {}  # by client
-        self._lines: dict[Hashable, deque[asyncio.Future[None]]] = {}  # the first has the next turn
+        # One queue of waiting requests for each key (`line`). The first queue has the next turn.
+        self._queues: dict[Hashable, deque[asyncio.Future[None]]] = {}
 
     def is_full(self, client: str, weight: int) -> bool:
         """Return whether the lane must refuse a request of this weight."""
@@ -79,7 +80,8 @@ class Lane:
             client: name of the client.
             weight: weight of the request. A weight of 0 is never refused.
             deadline: deadline of the request, as a value of `time.monotonic`.
-            line: key of the requests that wait behind each other; by default, the client.
+            line: key of the queue. Requests with the same key start in their order of arrival, and
+                the keys take turns. The default is the client.
 
         Raises:
             QueueFullError: the lane or the client's share of it is full.
@@ -89,17 +91,20 @@ class Lane:
             raise QueueFullError("The queue, or the share of this client in it, is full.")
         self.weight += weight
         self._weights[client] = self._weights.get(client, 0) + weight
-        if self._free and not self._lines:
-            self._free -= 1
+        if self._free_slots and not self._queues:
+            self._free_slots -= 1
             return
         turn = asyncio.get_running_loop().create_future()
-        self._lines.setdefault(client if line is None else line, deque()).append(turn)
+        self._queues.setdefault(client if line is None else line, deque()).append(turn)
         try:
             async with asyncio.timeout(max(deadline - monotonic(), 0)):
                 await turn
         except BaseException as error:
-            # The turn may have come in the same moment.
-            self._free -= not (turn.done() and not turn.cancelled())
+            # `leave` frees a slot. Take one first, unless `_start_next` gave a slot to this request
+            # in the same moment.
+            has_slot = turn.done() and not turn.cancelled()
+            if not has_slot:
+                self._free_slots -= 1
             self.leave(client, weight)
             if isinstance(error, TimeoutError):
                 detail = "The deadline passed before the request started."
@@ -107,10 +112,10 @@ class Lane:
             raise
 
     def leave(self, client: str, weight: int) -> None:
-        """End the turn of a request. The event loop starts the next one in its next iteration.
+        """End the turn of a request, and free its slot in the event loop's next iteration.
 
-        So at most as many requests as the lane has slots run before the event loop looks at the
-        network again.
+        Between two looks at the network, the event loop therefore starts at most as many requests
+        as the lane has slots.
         """
         self.weight -= weight
         self._weights[client] -= weight
@@ -119,15 +124,16 @@ class Lane:
         asyncio.get_running_loop().call_soon(self._start_next)
 
     def _start_next(self) -> None:
-        self._free += 1
-        while self._free > 0 and self._lines:
-            key = next(iter(self._lines))
-            line = self._lines.pop(key)
-            turn = line.popleft()
-            if line:
-                self._lines[key] = line  # behind all others
-            if not turn.done():
-                self._free -= 1
+        """Free one slot, and start waiting requests while slots are free."""
+        self._free_slots += 1
+        while self._free_slots > 0 and self._queues:
+            key = next(iter(self._queues))
+            queue = self._queues.pop(key)
+            turn = queue.popleft()
+            if queue:
+                self._queues[key] = queue  # a dictionary appends new keys, so the others go first
+            if not turn.done():  # the request has not ended by timeout or cancellation
+                self._free_slots -= 1
                 turn.set_result(None)
 
 

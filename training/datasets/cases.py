@@ -176,16 +176,22 @@ def occupied_place(
 def altered_case(
     encoded: EncodedScene, structure: Flags, rng: Rng
 ) -> tuple[Scene, Triple | None] | None:
-    """Return a scene with observed relations, and their false triple (relation, subject, object).
+    """Draw observed relations of a scene. With probability 1/2, replace one by a false triple.
 
-    In half of the scenes, all triples are true, and the false triple is None.
+    `structure` is True for structural classes, (classes,).
+
+    Returns:
+        The scene with the observed relations, and the false triple (relation, subject, object).
+        The false triple is None if all observed relations are true. The whole result is None if
+        the scene has fewer than two usable relations, or if no false triple was found.
     """
-    triples = draw_true_relations(encoded, structure, rng)
-    if triples is None:
+    true_triples = draw_true_relations(encoded, structure, rng)
+    if true_triples is None:
         return None
     if rng.random() < 0.5:
-        return scene_of(encoded, range(len(encoded.instance_classes)), triples), None
-    return altered_scene(encoded, structure, triples, rng)
+        all_instances = range(len(encoded.instance_classes))
+        return scene_of(encoded, all_instances, true_triples), None
+    return altered_scene(encoded, structure, true_triples, rng)
 
 
 def draw_true_relations(encoded: EncodedScene, structure: Flags, rng: Rng) -> list[Triple] | None:
@@ -203,20 +209,33 @@ def draw_true_relations(encoded: EncodedScene, structure: Flags, rng: Rng) -> li
 def altered_scene(
     encoded: EncodedScene, structure: Flags, triples: Sequence[Triple], rng: Rng
 ) -> tuple[Scene, Triple] | None:
-    """Replace one of `triples` by a false triple. Return the scene and this triple, or None."""
+    """Replace one random triple by a false triple with another relation or another object.
+
+    A triple is false if the scene lists neither it nor its mirror image.
+
+    Args:
+        structure: True for structural classes, (classes,).
+        triples: observed triples (relation, subject, object) of instances.
+
+    Returns:
+        The scene with the altered triples, and the false triple. The result is None if
+        `_ATTEMPTS` draws give no false triple.
+    """
     is_thing = ~structure[encoded.instance_classes]
     holds = encoded.instance_holds
     index = int(rng.integers(len(triples)))
     for _ in range(_ATTEMPTS):
-        a, i, j = triples[index]
+        relation, subject, object_ = triples[index]
         if rng.random() < 0.5:
-            a = int(rng.integers(len(CANONICAL)))
+            relation = int(rng.integers(len(CANONICAL)))
         else:
-            j = int(rng.integers(len(is_thing)))
-        if i == j or not is_thing[j] or holds[a, i, j] or holds[a, j, i]:
+            object_ = int(rng.integers(len(is_thing)))
+        is_listed = holds[relation, subject, object_] or holds[relation, object_, subject]
+        if subject == object_ or not is_thing[object_] or is_listed:
             continue
-        altered = [*triples[:index], (a, i, j), *triples[index + 1 :]]
-        return scene_of(encoded, range(len(is_thing)), altered), (a, i, j)
+        false_triple = relation, subject, object_
+        altered = [*triples[:index], false_triple, *triples[index + 1 :]]
+        return scene_of(encoded, range(len(is_thing)), altered), false_triple
     return None
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import combinations
@@ -102,31 +102,43 @@ def lookalikes(
     compared = [label for label in labels[:_COMPARED] if len(label_key(label.name)) >= _ONE_SLIP]
     curated = {label_key(name) for name in (*names.base, *names.aliases, *names.structure)}
     pairs = list(_similar_pairs([label_key(label.name) for label in compared]))
-    paired = {compared[k].name for pair in pairs for k in pair}
-    together = _pairs_in_one_scene(paired, scenes, names)
+    names_in_pairs = {compared[k].name for pair in pairs for k in pair}
+    in_one_scene = _pairs_in_one_scene(names_in_pairs, scenes, names)
     similar: list[Lookalike] = []
-    aliases: set[str] = set()  # each name is merged at most once, and never into a merged name
+    merged_names: set[str] = set()
     for i, j in pairs:
         # Labels are sorted by frequency, so the second name of a pair is rarer.
-        like, rare = compared[i], compared[j]
-        keys = label_key(like.name), label_key(rare.name)
+        frequent, rare = compared[i], compared[j]
+        keys = {label_key(frequent.name), label_key(rare.name)}
         digits = {"".join(filter(str.isdigit, key)) for key in keys}
-        if set(keys) <= curated or len(digits) == 2:
+        if keys <= curated or len(digits) == 2:
             continue
-        if frozenset((like.name, rare.name)) in together:
-            merged, why = False, "both occur in one scene"
-        elif min(map(len, keys)) < _MERGED_LENGTH or keys[0][0] != keys[1][0]:
-            merged, why = False, "short, or different first letter"
-        elif rare.mentions > max(2, _RARE * like.mentions):
-            merged, why = False, "both are frequent"
-        else:
-            merged, why = True, "rare, one or two letters differ, never in one scene"
-        if merged and aliases & {rare.name, like.name}:
-            merged, why = False, "similar to several names"
-        aliases |= {rare.name} if merged else set()
-        mentions = (rare.mentions, like.mentions)
-        similar.append(Lookalike(rare.name, like.name, mentions, merged, why))
+        objection = _objection(frequent, rare, in_one_scene)
+        # A name is merged at most once, and never into a merged name.
+        if not objection and merged_names & {rare.name, frequent.name}:
+            objection = "similar to several names"
+        if not objection:
+            merged_names.add(rare.name)
+        why = objection or "rare, one or two letters differ, never in one scene"
+        mentions = (rare.mentions, frequent.mentions)
+        similar.append(Lookalike(rare.name, frequent.name, mentions, not objection, why))
     return similar
+
+
+def _objection(frequent: Label, rare: Label, in_one_scene: Collection[frozenset[str]]) -> str:
+    """Return the reason against merging two similar names, or "".
+
+    `in_one_scene` contains the pairs of names that occur in the same scene.
+    """
+    frequent_key, rare_key = label_key(frequent.name), label_key(rare.name)
+    if frozenset((frequent.name, rare.name)) in in_one_scene:
+        return "both occur in one scene"
+    is_short = min(len(frequent_key), len(rare_key)) < _MERGED_LENGTH
+    if is_short or frequent_key[0] != rare_key[0]:
+        return "short, or different first letter"
+    if rare.mentions > max(2, _RARE * frequent.mentions):
+        return "both are frequent"
+    return ""
 
 
 def _similar_pairs(keys: Sequence[str]) -> Iterator[tuple[int, int]]:

@@ -148,63 +148,85 @@ def discrepancy(held_out: Tensor, drawn: Tensor, bandwidth: float) -> Callable[[
     """Return MMD² as a function of the weights of the held-out scenes.
 
     The statistic excludes pairs of a scene with itself, or with a copy of itself in a resample.
+
+    Args:
+        held_out, drawn: presence of each class, (scenes, classes).
+        bandwidth: bandwidth of the kernel, as a Hamming distance.
     """
 
     def kernel(x: Tensor, y: Tensor) -> Floats:
         return torch.exp(-hamming(x, y) / bandwidth).double().numpy()
 
-    yy, xx = kernel(held_out, held_out), kernel(drawn, drawn)
+    # MMD² = E k(x, x') + E k(y, y') - 2 E k(x, y) for generated scenes x and held-out scenes y.
+    xx, yy = kernel(drawn, drawn), kernel(held_out, held_out)
     xy = kernel(drawn, held_out).mean(0)
     n = len(xx)
-    within = float((xx.sum() - np.trace(xx)) / (n * (n - 1)))
+    mean_xx = float((xx.sum() - np.trace(xx)) / (n * (n - 1)))
     np.fill_diagonal(yy, 0.0)
 
-    def at(weight: Floats) -> float:
-        pairs = weight.sum() ** 2 - (weight**2).sum()
-        if not pairs > 0:
+    def squared_mmd(weight: Floats) -> float:
+        pairs_weight = weight.sum() ** 2 - (weight**2).sum()
+        if not pairs_weight > 0:
             return float("nan")
-        across = weight @ xy / weight.sum()
-        return float(within + weight @ yy @ weight / pairs - 2 * across)
+        mean_yy = weight @ yy @ weight / pairs_weight
+        mean_xy = weight @ xy / weight.sum()
+        return float(mean_xx + mean_yy - 2 * mean_xy)
 
-    return at
+    return squared_mmd
 
 
 def marginal_error(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]:
-    """Return the marginal error as a function of the weights of the held-out scenes."""
+    """Return the marginal error as a function of the weights of the held-out scenes.
+
+    The marginal error is sum_i |p_i - q_i| / sum_i q_i. p_i and q_i are the shares of generated and
+    of held-out scenes with class i.
+
+    Args:
+        held_out, drawn: presence of each class, (scenes, classes).
+    """
     p = drawn.mean(0)
 
-    def at(weight: Floats) -> float:
-        q = weight @ held_out
-        if not q.sum() > 0:
+    def error(weight: Floats) -> float:
+        count = weight @ held_out  # total weight of the held-out scenes with each class
+        if not count.sum() > 0:
             return float("nan")
-        return float(np.abs(p - q / weight.sum()).sum() / q.sum() * weight.sum())
+        q = count / weight.sum()
+        return float(np.abs(p - q).sum() / count.sum() * weight.sum())
 
-    return at
+    return error
 
 
 def pair_correlation(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]:
-    """Return Pearson r of the covariances of common classes, by weights of held-out scenes."""
-    common = np.argsort(-held_out.sum(0), kind="stable")[:_COMMON_CLASSES]
-    common = common[held_out[:, common].any(0)]
-    x, y = drawn[:, common], held_out[:, common]
-    pair = np.triu_indices(len(common), 1)
+    """Return the pair correlation as a function of the weights of the held-out scenes.
 
-    def covariance(v: Floats, weight: Floats) -> Floats:
+    The pair correlation is Pearson's r between the covariances of the pairs of common classes in
+    generated scenes and in held-out scenes. Common classes are the `_COMMON_CLASSES` most frequent
+    classes of the held-out scenes. The function returns NaN if r is undefined.
+
+    Args:
+        held_out, drawn: presence of each class, (scenes, classes).
+    """
+    most_frequent = np.argsort(-held_out.sum(0), kind="stable")[:_COMMON_CLASSES]
+    common = most_frequent[held_out[:, most_frequent].any(0)]
+    pairs = np.triu_indices(len(common), 1)
+
+    def covariances(v: Floats, weight: Floats) -> Floats:
         total = weight.sum()
         mean = weight @ v / total
-        return ((v.T * weight) @ v / total - np.outer(mean, mean))[pair]
+        return ((v.T * weight) @ v / total - np.outer(mean, mean))[pairs]
 
-    ours = covariance(x, np.ones(len(x)))
+    of_drawn = covariances(drawn[:, common], np.ones(len(drawn)))
+    held_out_common = held_out[:, common]
 
-    def at(weight: Floats) -> float:
+    def correlation(weight: Floats) -> float:
         if not weight.sum() > 0:
             return float("nan")
-        theirs = covariance(y, weight)
-        if len(ours) < 2 or not ours.std() or not theirs.std():
+        of_held_out = covariances(held_out_common, weight)
+        if len(of_drawn) < 2 or not of_drawn.std() or not of_held_out.std():
             return float("nan")
-        return float(np.corrcoef(ours, theirs)[0, 1])
+        return float(np.corrcoef(of_drawn, of_held_out)[0, 1])
 
-    return at
+    return correlation
 
 
 def copies(drawn: Tensor, train: Tensor) -> Floats:

@@ -62,24 +62,37 @@ def hit_at_1(
 
 
 def outliers_task(model: Model, setting: Setting) -> Outcome | None:
-    """Measure T3: hit@1 by law, and the flagged share of intruders of a published model."""
+    """Measure T3. The result is None if the model does not rank classes by suspicion.
+
+    Each distribution of intruders has the metric hit@1. A published model also has the share of
+    intruders that it flags at medium sensitivity.
+    """
     if model.suspicion is None:
         return None
     scenes, structure = setting.some(), setting.structure
     metrics: dict[str, Metric] = {}
+    # Number of scenes without an intruder, under the distribution with the fewest such scenes.
     skipped = len(scenes)
-    for law, weights in intruder_weights(scenes, setting.train).items():
+    for distribution, weights in intruder_weights(scenes, setting.train).items():
         hits = hit_at_1(scenes, structure, model.suspicion, weights)
         if hits is None:
             continue
-        metrics[f"hit@1, {law}"] = hits
+        metrics[f"hit@1, {distribution}"] = hits
         skipped = min(skipped, int((hits.denominators == 0).sum()))
-        if (flags := model.flags) is not None:
-            scene, v, intruder = with_intruders(scenes, structure, weights)
-            flagged = ask_rows(lambda v: flags(v, "medium").float(), v)
-            caught = flagged.gather(1, intruder.unsqueeze(1)).squeeze(1).numpy()
-            metrics[f"flagged, {law}"] = Ratio.of_items(scene.numpy(), caught, len(scenes))
+        if model.flags is not None:
+            flagged = _flagged_share(scenes, structure, model.flags, weights)
+            metrics[f"flagged, {distribution}"] = flagged
     return Outcome.over(scenes, metrics, skipped)
+
+
+def _flagged_share(
+    scenes: SceneTensors, structure: Tensor, flags: Flagged, weights: Tensor | None
+) -> Ratio:
+    """Return the share of intruders that a model flags at medium sensitivity."""
+    scene, v, intruder = with_intruders(scenes, structure, weights)
+    flagged = ask_rows(lambda rows: flags(rows, "medium").float(), v)
+    is_intruder_flagged = flagged.gather(1, intruder.unsqueeze(1)).squeeze(1).numpy()
+    return Ratio.of_items(scene.numpy(), is_intruder_flagged, len(scenes))
 
 
 def alarms_task(flags: Flagged, setting: Setting) -> Outcome | None:

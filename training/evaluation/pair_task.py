@@ -116,16 +116,25 @@ def _both_ways(table: NDArray[Any], ends: NDArray[Any]) -> NDArray[Any]:
 
 
 def accuracy(p: Floats, listed: Flags) -> Floats:
-    """Return 1 for each pair whose most probable relation is listed, else 0; expected over ties.
+    """Return 1 for each pair whose most probable relation is listed, else 0, (N,).
 
-    The arguments are the probabilities of k relations and whether the scene lists them, (N, k).
+    For ties, the result is the share of listed relations among the most probable ones.
+
+    Args:
+        p: probabilities of k relations of each pair, (N, k).
+        listed: True for relations that the scene lists, (N, k).
     """
     is_best = p == p.max(1, keepdims=True)
     return np.asarray((is_best & listed).sum(1) / is_best.sum(1))
 
 
 def log_loss(p: Floats, listed: Flags) -> Floats:
-    """Return -log of the listed relations' share of the probabilities of each pair, (N,)."""
+    """Return the log-loss of each pair in nats, (N,).
+
+    The log-loss is -log(L / T). L is the sum of the probabilities of the listed relations, and T is
+    the sum of the probabilities of all k relations. If T is 0, all relations count as equally
+    probable. `accuracy` describes the arguments.
+    """
     total = p.sum(1)
     share = np.divide((p * listed).sum(1), total, where=total > 0, out=listed.mean(1))
     return np.asarray(-np.log(np.maximum(share, _LEAST)))

@@ -46,21 +46,22 @@ class Room:
     votes: Floats
 
 
-class _Answer(NamedTuple):
-    """The answers to one question.
+class _Result(NamedTuple):
+    """The result of one question.
 
     Attributes:
-        group: class of the object; its label if the model does not know the object.
-        precision: average precision of each ranking by name, 0 if the question is left out.
-        unknown, receptacles: number of receptacles that the model does not know, and of all.
-        reason: reason for which the question is left out, or an empty string.
+        group: class of the object. If the model does not know the object, it is the label.
+        precision: average precision by name of the ranking, 0 if the question is left out.
+        unknown: number of receptacles that the model does not know.
+        receptacles: number of all receptacles.
+        left_out: reason for leaving out the question, or an empty string.
     """
 
     group: str
     precision: dict[str, float]
     unknown: int
     receptacles: int
-    reason: str
+    left_out: str
 
 
 _UNKNOWN: Final = "left out: unknown object"
@@ -139,33 +140,38 @@ def ask_places(artifact: Artifact, room: Room, *, with_room: bool) -> Floats:
 def placing_metrics(artifact: Artifact, rooms: list[Room]) -> dict[str, Metric]:
     """Return the metrics over all questions of a source.
 
-    Intervals are over the classes of the objects, because all objects of a class get the same
-    answers. If all objects have one class, intervals are over the questions.
+    The metrics are the mAP of each ranking, the share of unknown receptacles, and the shares of
+    left-out questions. Intervals are over the classes of the objects, because all objects of a
+    class get the same answers. If all objects have one class, intervals are over the questions.
     """
-    answers = [answer for room in rooms for answer in _answer(artifact, room)]
-    is_scored = np.array([not answer.reason for answer in answers])
+    results = [result for room in rooms for result in _room_results(artifact, room)]
+    is_scored = np.array([not result.left_out for result in results])
     metrics: dict[str, Metric] = {}
 
-    def mean(name: str) -> Ratio:
-        return Ratio.of_scenes(np.array([a.precision[name] for a in answers]), is_scored)
+    def mean_precision(ranking: str) -> Ratio:
+        precision = np.array([result.precision[ranking] for result in results])
+        return Ratio.of_scenes(precision, is_scored)
 
     if is_scored.any():
-        ours = mean("model")
-        metrics = {"mAP": ours, "mAP, room type listed": mean("model, room type listed")}
-        metrics |= {f"mAP of {name}": mean(name) for name in _RIVALS}
-        metrics |= {f"mAP minus {name}": ours - mean(name) for name in _RIVALS}
-        counts = np.array([(answer.unknown, answer.receptacles) for answer in answers], float)
-        metrics["unknown receptacles"] = Ratio(*(counts.T * is_scored))
+        model = mean_precision("model")
+        metrics["mAP"] = model
+        metrics["mAP, room type listed"] = mean_precision("model, room type listed")
+        metrics |= {f"mAP of {rival}": mean_precision(rival) for rival in _RIVALS}
+        metrics |= {f"mAP minus {rival}": model - mean_precision(rival) for rival in _RIVALS}
+        unknown = np.array([result.unknown for result in results], float)
+        receptacles = np.array([result.receptacles for result in results], float)
+        metrics["unknown receptacles"] = Ratio(unknown * is_scored, receptacles * is_scored)
     for reason in (_UNKNOWN, _TRIVIAL):
-        metrics[reason] = Ratio.of_scenes(np.array([answer.reason == reason for answer in answers]))
-    names, groups = np.unique([answer.group for answer in answers], return_inverse=True)
-    if len(names) < 2:
+        is_left_out = np.array([result.left_out == reason for result in results])
+        metrics[reason] = Ratio.of_scenes(is_left_out)
+    classes, groups = np.unique([result.group for result in results], return_inverse=True)
+    if len(classes) < 2:
         return metrics
     return {name: metric.by(groups) for name, metric in metrics.items()}
 
 
-def _answer(artifact: Artifact, room: Room) -> list[_Answer]:
-    """Return the answers to the questions about the objects of a room."""
+def _room_results(artifact: Artifact, room: Room) -> list[_Result]:
+    """Return the results of the questions about the objects of a room."""
     vocabulary = artifact.vocabulary
     rankings = {
         "model": ask_places(artifact, room, with_room=False),
@@ -174,16 +180,16 @@ def _answer(artifact: Artifact, room: Room) -> list[_Answer]:
         "random order": np.zeros_like(room.votes),
     }
     unknown = sum(vocabulary.index(label) is None for label in room.receptacles)
-    answers = []
+    results = []
     for row, label in enumerate(room.objects):
         relevant = room.votes[row] > 0
         index = vocabulary.index(label)
         is_unknown = index is None or bool(vocabulary.structure[index])
-        reason = _UNKNOWN if is_unknown else _TRIVIAL if relevant.all() else ""
+        left_out = _UNKNOWN if is_unknown else _TRIVIAL if relevant.all() else ""
         precision = {
-            name: 0.0 if reason else average_precision(scores[row], relevant)
+            name: 0.0 if left_out else average_precision(scores[row], relevant)
             for name, scores in rankings.items()
         }
         group = label if index is None else vocabulary.labels[index]
-        answers.append(_Answer(group, precision, unknown, len(relevant), reason))
-    return answers
+        results.append(_Result(group, precision, unknown, len(relevant), left_out))
+    return results

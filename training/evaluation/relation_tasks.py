@@ -204,20 +204,35 @@ def expected_hits(score: Floats, truth: Flags, count: int) -> float:
 
 
 def alter(holds: Flags, allowed: Flags, rng: Rng) -> tuple[Triple, Triple] | None:
-    """Draw a triple of a scene and a false replacement; return (true, false) or None."""
-    triples = np.argwhere(holds & allowed)
-    if len(triples) < 2:
+    """Draw a true triple (relation, subject, object) of a scene and a false replacement.
+
+    The replacement changes the relation with probability 1/2, the subject with probability 1/4 and
+    the object with probability 1/4. It is false if the scene lists neither it nor its mirror
+    image.
+
+    Args:
+        holds: True for triples that hold, (A, n, n) for n classes.
+        allowed: True for triples that the task may use, (A, n, n).
+
+    Returns:
+        The true triple and the false triple. The result is None if the scene has fewer than two
+        true triples, or if `_TRIES` draws give no false triple.
+    """
+    true_triples = np.argwhere(holds & allowed)
+    if len(true_triples) < 2:
         return None
     A, n, _ = holds.shape
-    a, x, y = triples[rng.integers(len(triples))].tolist()
+    relation, subject, object_ = true_triples[rng.integers(len(true_triples))].tolist()
     for _ in range(_TRIES):
-        kind, other = rng.random(), int(rng.integers(n))
-        if kind < 0.5:
-            b, i, j = int(rng.integers(A)), x, y
+        part, new_class = rng.random(), int(rng.integers(n))
+        if part < 0.5:
+            a, i, j = int(rng.integers(A)), subject, object_
+        elif part < 0.75:
+            a, i, j = relation, subject, new_class
         else:
-            b, i, j = (a, x, other) if kind < 0.75 else (a, other, y)
-        if allowed[b, i, j] and not holds[b, i, j] and not holds[b, j, i]:
-            return (a, x, y), (b, i, j)
+            a, i, j = relation, new_class, object_
+        if allowed[a, i, j] and not holds[a, i, j] and not holds[a, j, i]:
+            return (relation, subject, object_), (a, i, j)
     return None
 
 

@@ -217,22 +217,35 @@ def fit_outliers(
     structure: Tensor,
     chosen: Calibration | None = None,
 ) -> dict[str, Any]:
-    """Fit `popularity_weight`, `outlier` and `outlier_lines`, or nothing with too few scenes."""
+    """Fit the calibration of outliers on random parts of scenes, with and without an intruder.
+
+    Args:
+        scenes: validation scenes.
+        train: training scenes. They give the distributions of the intruders.
+        structure: True for structural classes, (classes,) bool.
+        chosen: a calibration whose `popularity_weight` the fit keeps. None means that the fit
+            chooses the weight.
+
+    Returns:
+        The fields `popularity_weight`, `outlier` and `outlier_lines` of a `Calibration`. The result
+        is empty if there are too few scenes or parts.
+    """
     if len(scenes) < _LEAST_SCENES:
         return {}
-    lists = {n: draw_parts(scenes, structure, exactly(n), _SEEDS) for n in LENGTHS}
+    parts_by_length = {n: draw_parts(scenes, structure, exactly(n), _SEEDS) for n in LENGTHS}
     untouched = {
         n: score_lists(artifact, parts)
-        for n, parts in lists.items()
+        for n, parts in parts_by_length.items()
         if len(parts.v) >= _LEAST_SCENES
     }
-    kinds = (None, by_popularity(scenes, train), by_signature(scenes, train))
-    scored = (score_intruders(artifact, scenes, structure, weights) for weights in kinds)
-    altered = [scores for scores in scored if len(scores.size)]
-    if not untouched or not altered:
+    # The intruders are drawn uniformly, by popularity, or from the typical classes of other rooms.
+    distributions = (None, by_popularity(scenes, train), by_signature(scenes, train))
+    scored = (score_intruders(artifact, scenes, structure, weights) for weights in distributions)
+    with_intruder = [scores for scores in scored if len(scores.size)]
+    if not untouched or not with_intruder:
         return {}
-    alpha = chosen.popularity_weight if chosen else choose_alpha(untouched.values(), altered)
-    entry = _fit_intruders(untouched.values(), altered, alpha)
+    alpha = chosen.popularity_weight if chosen else choose_alpha(untouched.values(), with_intruder)
+    entry = _fit_intruders(untouched.values(), with_intruder, alpha)
     lines = {name: fit_line(untouched, entry, alpha, share) for name, share in ALARMS.items()}
     return {"popularity_weight": alpha, "outlier": entry, "outlier_lines": AlarmLines(**lines)}
 

@@ -103,17 +103,24 @@ class LongChains:
         self._streams = [random_stream(seed, k) for k in range(count)]
 
     def run(self, sweeps: int) -> Floats:
-        """Make sweeps; return how often each class is present, (chains, classes), from 0 to 1."""
-        total = np.zeros(self.on.shape)
+        """Run sweeps of each chain, and record the presence of the classes every `RECORDED` sweeps.
+
+        The number of sweeps is rounded up to a multiple of `RECORDED`.
+
+        Returns:
+            The share of the records in which each class is present, (chains, classes).
+        """
+        count = np.zeros(self.on.shape)  # number of records with each class
+        records = range(0, sweeps, RECORDED)
         for room in np.unique(self._rooms).tolist():
             conditions = conditions_of(None if room < 0 else room, self._profile)
             conditioned = self._chains.under(conditions)
             for k in np.flatnonzero(self._rooms == room).tolist():
-                for _ in range(0, sweeps, RECORDED):
+                for _ in records:
                     state = self.on[k], RECORDED, self._streams[k], self._h2[k]
                     _, self._h2[k] = conditioned.sweep(*state)
-                    total[k] += self.on[k]
-        share: Floats = total / -(-sweeps // RECORDED)
+                    count[k] += self.on[k]
+        share: Floats = count / len(records)
         return share
 
 

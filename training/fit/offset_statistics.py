@@ -135,8 +135,9 @@ class _Fit:
 
     Attributes:
         kappa, alpha, beta, mu: parameters of the prior (see the module), one for each axis, (3,).
-        effects, doubts: effects u and v of the classes as subject and as object of the relation,
-            and their variances in units of s / kappa, (2, classes, 3).
+        effects: effects u and v of the classes as subject and as object of the relation,
+            (2, classes, 3).
+        effect_variances: variances of the effects in units of s / kappa, (2, classes, 3).
     """
 
     kappa: Floats
@@ -144,7 +145,7 @@ class _Fit:
     beta: Floats
     mu: Floats
     effects: Floats
-    doubts: Floats
+    effect_variances: Floats
 
     def expected(self, pairs: _Pairs) -> Floats:
         """Return the prior mean of the offset of each pair, (pairs, 3)."""
@@ -153,8 +154,8 @@ class _Fit:
 
     def predict(self, pairs: _Pairs) -> tuple[Floats, Floats]:
         """Return mean and variance of a new offset of each pair, both (pairs, 3)."""
-        of_u, of_v = self.doubts
-        kappa = self.kappa / (1 + of_u[pairs.ends[0]] + of_v[pairs.ends[1]])
+        var_u, var_v = self.effect_variances
+        kappa = self.kappa / (1 + var_u[pairs.ends[0]] + var_v[pairs.ends[1]])
         prior = self.expected(pairs), kappa, self.alpha, self.beta
         return posterior(prior, pairs.n, pairs.mean, pairs.scatter)
 
@@ -166,7 +167,7 @@ class _Fit:
         """
         spread, unknown = self.beta / (self.alpha - 1), 1 / LAMBDA
         relation = np.concatenate([self.mu, spread * (1 + (1 + 2 * unknown) / self.kappa)])
-        variances = spread * (self.doubts - unknown) / self.kappa
+        variances = spread * (self.effect_variances - unknown) / self.kappa
         return relation, np.concatenate([self.effects, variances], axis=2)
 
 
@@ -229,18 +230,24 @@ def _fit_prior(pairs: _Pairs, axis: int, expected: Floats) -> Floats:
 
 
 def _fit_effects(fit: _Fit, pairs: _Pairs, V: int) -> None:
-    """Fit mu and the effects u and v, shrunk towards 0, by alternation, in place."""
+    """Fit mu and the effects u and v of V classes, in place.
+
+    The function updates mu, u and v in turn, `_SWEEPS` times. Each update is a fit by weighted
+    least squares, given the other two. The ridge penalty `LAMBDA` shrinks u and v towards 0.
+    """
+    subject, object_ = pairs.ends
     # Precision of the mean offset of each pair as a measurement of u and v, in units of kappa / s.
     weight = pairs.n / (pairs.n + fit.kappa)
-    below = np.stack([_sums(end, weight, V) for end in pairs.ends]) + LAMBDA
+    precision_u = _sums(subject, weight, V) + LAMBDA
+    precision_v = _sums(object_, weight, V) + LAMBDA
+    u, v = fit.effects
     for _ in range(_SWEEPS):
-        u, v = fit.effects
-        residual = pairs.mean - u[pairs.ends[0]] - v[pairs.ends[1]]
+        residual = pairs.mean - u[subject] - v[object_]
         fit.mu = (weight * residual).sum(axis=0) / weight.sum(axis=0)
-        for own, other in ((0, 1), (1, 0)):
-            residual = pairs.mean - fit.mu - fit.effects[other][pairs.ends[other]]
-            fit.effects[own] = _sums(pairs.ends[own], weight * residual, V) / below[own]
-    fit.doubts = 1 / below
+        u = _sums(subject, weight * (pairs.mean - fit.mu - v[object_]), V) / precision_u
+        v = _sums(object_, weight * (pairs.mean - fit.mu - u[subject]), V) / precision_v
+    fit.effects = np.stack([u, v])
+    fit.effect_variances = 1 / np.stack([precision_u, precision_v])
 
 
 def half_precision(table: Floats) -> NDArray[np.float32]:

@@ -32,13 +32,13 @@ _CHANCES = 10
 def means_of_parts(machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
     """Return the means of h1 given a random subset of the objects, (scenes, H1).
 
-    A class is listed with a chance that is drawn uniformly for each scene. Half of the scenes list
-    their room type.
+    For each scene, the function draws a probability uniformly from [0, 1]. It lists each class of
+    the scene with this probability. It also lists the room type with probability 1/2.
     """
-    chance = torch.rand(len(batch), 1, generator=generator)
-    listed = batch.v * (torch.rand(batch.v.shape, generator=generator) < chance)
-    has_room = torch.rand(len(batch), generator=generator) < 0.5
-    x, _ = machine.context(listed, torch.where(has_room, batch.room, -1))
+    probability = torch.rand(len(batch), 1, generator=generator)
+    listed = batch.v * (torch.rand(batch.v.shape, generator=generator) < probability)
+    lists_room = torch.rand(len(batch), generator=generator) < 0.5
+    x, _ = machine.context(listed, torch.where(lists_room, batch.room, -1))
     return machine.state_means(x)
 
 

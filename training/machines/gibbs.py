@@ -113,15 +113,24 @@ def _draw_coupled(
     classes: int | None,
     generator: torch.Generator,
 ) -> Tensor:
-    """Draw some classes one after another, given all other classes; return v, (chains, classes)."""
+    """Draw coupled classes one after another, each given all other classes.
+
+    Args:
+        field: log-odds of the classes without the effect of the couplings, (chains, classes).
+        couplings: weights between the classes, (classes, classes).
+        classes: number of random classes to draw. None means all.
+
+    Returns:
+        The new presence of the classes, (chains, classes). Other classes keep their presence.
+    """
     # numpy has a smaller overhead than torch for the many small steps.
     V = field.shape[1]
     order = torch.randperm(V, generator=generator)[:classes].tolist()
     uniform = torch.rand(len(order), len(field), generator=generator, dtype=field.dtype).numpy()
-    v, logits, L = chains.v.T.numpy().copy(), field.T.numpy(), couplings.numpy()
-    possible = chains.possible.T.numpy()
-    for row, i in zip(uniform, order, strict=True):
-        logit = np.maximum(logits[i] + L[i] @ v, -80)  # e^89 overflows float32
-        present = row * (1 + np.exp(-logit)) < 1
-        v[i] = present & possible[i]
+    v, field_of_class = chains.v.T.numpy().copy(), field.T.numpy()  # (classes, chains)
+    possible, L = chains.possible.T.numpy(), couplings.numpy()
+    for u, i in zip(uniform, order, strict=True):
+        logit = np.maximum(field_of_class[i] + L[i] @ v, -80)  # e^89 overflows float32
+        is_present = u * (1 + np.exp(-logit)) < 1  # u < sigmoid(logit)
+        v[i] = is_present & possible[i]
     return torch.from_numpy(v.T.copy())

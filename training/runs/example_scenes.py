@@ -98,8 +98,8 @@ def choose_examples(
     """Return up to three typical scenes, if possible of different room types.
 
     A typical scene contains frequent classes, and as many classes as the median scene of its room
-    type: in a complete scene, nothing would be missing. Scenes with positions take precedence.
-    Scenes of research-only data sets are left out.
+    type. In a scene with more classes, `/missing` would propose few objects. Scenes with positions
+    take precedence. Scenes of research-only data sets are left out.
     """
     objects_of = {
         scene: _usable(scene, vocabulary)

@@ -81,16 +81,14 @@ def field_errors(
 
 
 def _all_errors(error: ValidationError, body: Any, form: type[Request]) -> list[ErrorDetails]:
-    """Return pydantic's errors of a request, those of objects first, as in the schema.
+    """Return pydantic's errors of a request, the errors of objects first, as in the schema.
 
-    Validation stops at the first invalid object. So the function replaces this object by a valid
-    one and validates the request again, until it has enough errors.
+    Pydantic reports the errors of the first invalid object only. So the function replaces this
+    object by a valid one and validates the request again, until it has `MAX_ERRORS` errors.
     """
     errors = newest_errors = error.errors(include_url=False)
     while len(errors) < MAX_ERRORS:
-        # An error of the whole list has the location ("objects",), without an index.
-        locations = (details["loc"] for details in newest_errors if _is_of_objects(details))
-        index: Any = next((location[1] for location in locations if location[1:]), None)
+        index = _invalid_object(newest_errors)
         if index is None:
             break
         objects = [*body["objects"]]
@@ -100,12 +98,23 @@ def _all_errors(error: ValidationError, body: Any, form: type[Request]) -> list[
             form.model_validate(body)
             break
         except ValidationError as next_error:
+            # Errors of other fields are already in the list.
             newest_errors = list(filter(_is_of_objects, next_error.errors(include_url=False)))
             errors += newest_errors
     return sorted(errors, key=_is_of_objects, reverse=True)
 
 
+def _invalid_object(errors: list[ErrorDetails]) -> Any:
+    """Return the index of the first invalid object, or None without one."""
+    for details in filter(_is_of_objects, errors):
+        # An error of the whole list has the location ("objects",), without an index.
+        if len(details["loc"]) > 1:
+            return details["loc"][1]
+    return None
+
+
 def _is_of_objects(details: ErrorDetails) -> bool:
+    """Return whether an error is in the field `objects`."""
     return details["loc"][:1] == ("objects",)
 
 

@@ -81,7 +81,7 @@ def train_network(
     Scenes with fewer than two classes are left out.
 
     Raises:
-        ValueError: every scene has fewer than two classes.
+        ValueError: all scenes have fewer than two classes.
     """
     usable = lists.v.sum(1) > 1
     if not usable.any():

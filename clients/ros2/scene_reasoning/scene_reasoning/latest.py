@@ -41,26 +41,29 @@ class Latest(Generic[T, AnswerT]):
         self._ask = ask
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="scene")
         self._lock = Lock()  # a multi-threaded ROS executor may run both callbacks at once
-        self._waiting: list[T] = []
+        self._waiting: list[T] = []  # at most one message
         self._superseded = 0
-        self._asked: tuple[T, Future[AnswerT]] | None = None
+        self._in_progress: tuple[T, Future[AnswerT]] | None = None
 
-    def see(self, thing: T) -> None:
-        """Keep a message for the next question; it replaces a waiting message."""
+    def see(self, message: T) -> None:
+        """Keep a message for the next question. It replaces a waiting message."""
         with self._lock:
             self._superseded += len(self._waiting)
-            self._waiting = [thing]
+            self._waiting = [message]
 
     def tick(self) -> Outcome[T, AnswerT] | None:
-        """Return the outcome of a finished question, and start the next question if possible."""
+        """Return the outcome of a question, and start the next question if possible.
+
+        The result is None if no question has ended since the last call.
+        """
         with self._lock:
             outcome = None
-            if self._asked is not None and self._asked[1].done():
-                outcome = Outcome(*self._asked, self._superseded)
-                self._asked, self._superseded = None, 0
-            if self._asked is None and self._waiting:
-                thing = self._waiting.pop()
-                self._asked = thing, self._thread.submit(self._ask, thing)
+            if self._in_progress is not None and self._in_progress[1].done():
+                outcome = Outcome(*self._in_progress, self._superseded)
+                self._in_progress, self._superseded = None, 0
+            if self._in_progress is None and self._waiting:
+                message = self._waiting.pop()
+                self._in_progress = message, self._thread.submit(self._ask, message)
             return outcome
 
     def close(self) -> None:

@@ -32,7 +32,7 @@ from scene_reasoning.latest import Latest, Outcome
 
 KINDS = {"3d": Detection3DArray, "2d": Detection2DArray}
 
-# A message of detections, and the viewpoint (x, y, yaw) at its arrival.
+# A message of detections, and the viewpoint (x, y in metres, yaw in radians) at its arrival.
 Seen = tuple[Any, "tuple[float, float, float] | None"]
 
 
@@ -57,8 +57,9 @@ class SceneNode(Node):
             boxes=self._parameter("boxes", True),
         )
         self.latest: Latest[Seen, Advice] = Latest(lambda seen: self.advisor.advise(*seen))
-        still = tuple(self._parameter("viewpoint", [math.nan] * 3))
-        self.viewpoint = still if all(map(math.isfinite, still)) else None
+        # The default NaN means that the viewpoint is unknown until the first pose.
+        viewpoint = tuple(self._parameter("viewpoint", [math.nan] * 3))
+        self.viewpoint = viewpoint if all(map(math.isfinite, viewpoint)) else None
         self.pose_frame: str | None = None
 
         kind = KINDS[self._parameter("kind", "3d")]
@@ -80,21 +81,19 @@ class SceneNode(Node):
     # ---------------------------------------------------------------------------- callbacks
 
     def on_detections(self, message: Any) -> None:
-        # A pose is valid only for detections in the frame of the pose.
-        fits = self.pose_frame in (None, message.header.frame_id)
-        self.latest.see((message, self.viewpoint if fits else None))
+        # A pose is valid only for detections in its frame. Without a pose, the viewpoint of the
+        # parameter is valid in every frame.
+        is_valid = self.pose_frame in (None, message.header.frame_id)
+        self.latest.see((message, self.viewpoint if is_valid else None))
 
     def on_label_info(self, message: Any) -> None:
         self.advisor.label_map = message
 
     def on_pose(self, message: Any) -> None:
-        pose = message.pose.pose
-        turn = pose.orientation
-        yaw = math.atan2(
-            2.0 * (turn.w * turn.z + turn.x * turn.y),
-            1.0 - 2.0 * (turn.y * turn.y + turn.z * turn.z),
-        )
-        self.viewpoint = (pose.position.x, pose.position.y, yaw)
+        position, q = message.pose.pose.position, message.pose.pose.orientation
+        # Yaw of the unit quaternion q, in radians.
+        yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+        self.viewpoint = (position.x, position.y, yaw)
         self.pose_frame = message.header.frame_id
 
     def on_tick(self) -> None:
@@ -105,12 +104,11 @@ class SceneNode(Node):
         try:
             advice = outcome.future.result()
         except (ClientError, MessageError) as error:
-            # Errors of the service or of the message are reported. Any other error is a defect of
-            # the node, and ends it.
+            # Any other error is a defect of the node, and ends the node.
             self._report(DiagnosticStatus.ERROR, outcome, f"{type(error).__name__}: {error}")
             return
         self.answers.publish(String(data=json.dumps(advice.to_json())))
-        self.markers.publish(self._drawn(message, ghosts(advice, self.ghosts_shown)))
+        self.markers.publish(self._markers(message, ghosts(advice, self.ghosts_shown)))
         if advice.answers:
             self._report(DiagnosticStatus.OK, outcome, "answered")
         else:
@@ -118,8 +116,8 @@ class SceneNode(Node):
 
     # ------------------------------------------------------------------------------ messages
 
-    def _drawn(self, message: Any, shown: list[Ghost]) -> MarkerArray:
-        """Markers for ghosts: a text, and a sphere if the extent is known.
+    def _markers(self, message: Any, shown: list[Ghost]) -> MarkerArray:
+        """Return the markers of ghosts: a text, and a sphere if the extent is known.
 
         The first marker deletes all earlier markers.
         """
