@@ -199,7 +199,7 @@ class Settings(BaseSettings):
     """Time limit in milliseconds of a request without X-Request-Timeout-Ms."""
     max_request_timeout_ms: Annotated[int, Field(ge=1, le=600_000)] = 60_000
     """Maximum time limit in milliseconds that a client may choose."""
-    drain_seconds: Annotated[float, Field(ge=0, le=300)] = 1.0
+    drain_seconds: Annotated[float, Field(ge=0, le=300)] = 4.0
     """Seconds from SIGTERM until the listening socket closes. The readiness check fails in this
     time, and requests are still answered."""
     drain_timeout: Annotated[int, Field(ge=1, le=3600)] = 25

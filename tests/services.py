@@ -218,7 +218,9 @@ def begin(
     environment = {
         name: value for name, value in os.environ.items() if not name.startswith("SCENE_")
     }
-    environment |= {"SCENE_STORE": str(store), "SCENE_ADMIN_KEY": ADMIN_KEY, **variables}
+    # Without a load balancer, nothing has to notice the end.
+    own = {"SCENE_STORE": str(store), "SCENE_ADMIN_KEY": ADMIN_KEY, "SCENE_DRAIN_SECONDS": "0"}
+    environment |= own | variables
     with log.open("w") as stream:
         return subprocess.Popen(
             [sys.executable, *program], env=environment, stderr=stream, text=True

@@ -35,7 +35,7 @@ class Tally:
 
     def check(self) -> None:
         """Assert that each request has an answer, and that the judge has no complaint."""
-        assert self.faults == []
+        assert self.faults == [], self.faults[:3]
         assert self.statuses.total() == self.sent
 
 

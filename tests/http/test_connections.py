@@ -154,17 +154,3 @@ def test_unfinished_bodies_use_bounded_memory(shared_store: Path, tmp_path: Path
         held.close()
         time.sleep(0.5)
         assert service.client.post("/missing/batch", json=batch).status_code == 200
-
-
-@pytest.mark.slow
-def test_connections_over_the_limit_get_a_plain_503(shared_store: Path, tmp_path: Path) -> None:
-    limit, log = {"SCENE_MAX_CONNECTIONS": "8"}, tmp_path / "log"
-    with launch(shared_store, log, **limit) as service, ExitStack() as held:
-        for _ in range(8):
-            held.enter_context(connect(service))
-        (answer,), closed = exchange(service.port, Wire("", [LIVE], (503,), closes=True))
-        assert (answer.status, answer.body) == (503, b"Service Unavailable")
-        assert closed
-        held.close()
-        time.sleep(0.5)
-        assert service.client.get("/health/ready").status_code == 200

@@ -34,7 +34,7 @@ class Fleet:
         self.replicas = [self.start(number) for number in range(2)]
 
     def start(self, number: int, port: int | None = None, **settings: str) -> LiveService:
-        variables = {"SCENE_STORE_POLL": str(POLL), "SCENE_ACCESS_LOG": "false", **settings}
+        variables = {"SCENE_STORE_POLL": str(POLL), "SCENE_DRAIN_SECONDS": "4", **settings}
         return launch(self.store.root, self.folder / f"log{number}", port=port, **variables)
 
     def promote(self, version: str) -> float:
