@@ -241,8 +241,8 @@ class JSONRoute(APIRoute):
         if len(body) <= SMALL:
             value, data = read(body, schema)
         else:
-            ticket, workers = scope["state"]["ticket"], runtime.admission.workers
-            (value, data), _ = await in_thread(lambda _: read(body, schema), ticket, workers)
+            ticket, worker = scope["state"]["ticket"], runtime.admission.worker
+            (value, data), _ = await in_thread(lambda _: read(body, schema), ticket, worker)
         try:
             answer: bytes = await self.endpoint(data=data, http=http, **scope["path_params"])
         except errors.RequestError as error:

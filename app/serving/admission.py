@@ -73,6 +73,15 @@ class Lane:
         of_client = self._weights.get(client, 0) + weight
         return self.weight + weight > self.limit or of_client > self.limit // SHARE
 
+    async def let_pass(self) -> None:
+        """Let requests of this lane run before the next scene of a batch.
+
+        A turn takes three iterations of the event loop: one to end the turn before it, one to
+        start, and one to answer.
+        """
+        for _ in range(3 if self._queues else 1):
+            await asyncio.sleep(0)
+
     async def enter(self, client: str, weight: int, deadline: float, line: Hashable = None) -> None:
         """Wait for the turn of a request. `leave` ends the turn.
 
@@ -118,9 +127,9 @@ class Lane:
         as the lane has slots.
         """
         self.weight -= weight
-        self._weights[client] -= weight
-        if not self._weights[client]:
-            del self._weights[client]
+        left = self._weights.pop(client, 0) - weight
+        if left:
+            self._weights[client] = left
         asyncio.get_running_loop().call_soon(self._start_next)
 
     def _start_next(self) -> None:
@@ -201,12 +210,12 @@ class Admission:
         self.quick = Lane(QUICK_SLOTS, requests)
         self.slow = Lane(SLOW_SLOTS, rows)
         self.draws = Lane(1, SHARE * MAX_SWEEPS)
-        self.workers = ThreadPoolExecutor(SLOW_SLOTS, "slow", _lower_priority)
+        self.worker = ThreadPoolExecutor(1, "slow", _lower_priority)
         self.drawing = ThreadPoolExecutor(1, "drawing", _lower_priority)
 
     def stop(self) -> None:
         """Stop the threads and drop the computations that have not started."""
-        for executor in (self.workers, self.drawing):
+        for executor in (self.worker, self.drawing):
             executor.shutdown(wait=False, cancel_futures=True)
 
 

@@ -146,7 +146,7 @@ class Request:
         else:
             if ticket.lane is not admission.slow:
                 await ticket.enter(admission.slow, 1)
-            answered, seconds = await in_thread(lambda _: compute(), ticket, admission.workers)
+            answered, seconds = await in_thread(lambda _: compute(), ticket, admission.worker)
             reading, fields = answered
         self._record(model, question.name, rows, seconds)
         answer = envelope(scene, self.id, model.reference, reading)

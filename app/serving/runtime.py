@@ -30,7 +30,7 @@ _LOCK_TIMEOUT = 5.0
 
 # Time in seconds after which the interpreter switches from a worker thread to the event loop.
 # Python's default of 5 ms would delay answers by a quarter of a robot's control cycle (20 ms).
-_SWITCH_INTERVAL = 5e-4
+_SWITCH_INTERVAL = 1e-4
 
 
 class Runtime:

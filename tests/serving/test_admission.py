@@ -71,6 +71,20 @@ async def test_one_client_holds_a_quarter_of_a_lane() -> None:
     assert (lane.weight, lane.is_full("flood", 10)) == (0, False)
 
 
+async def test_refusals_wait_for_a_turn_without_weight() -> None:
+    lane, holder = Lane(1, 4), ticket("flood")
+    await holder.enter(lane, 1)
+    refusals = [ticket("flood") for _ in range(3)]
+    turns = [asyncio.ensure_future(place.enter(lane, 0)) for place in refusals]
+    await asyncio.sleep(0)
+    assert not any(turn.done() for turn in turns)
+    holder.leave()
+    for place, turn in zip(refusals, turns, strict=True):
+        await turn
+        place.leave()
+    assert (lane.weight, lane.is_full("flood", 1)) == (0, False)
+
+
 async def test_a_request_in_a_lane_can_change_to_another() -> None:
     first, second, place = Lane(1, 4), Lane(1, 4), ticket()
     await place.enter(first, 1)
@@ -154,7 +168,7 @@ async def test_a_failure_in_a_thread_keeps_nothing_of_its_request(admission: Adm
             raise ZeroDivisionError(id(body))
 
         with pytest.raises(ZeroDivisionError):
-            await in_thread(broken, ticket(), admission.workers)
+            await in_thread(broken, ticket(), admission.worker)
         return weakref.ref(body)
 
     gc.disable()
