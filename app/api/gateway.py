@@ -39,7 +39,9 @@ An example is an invalid Range header in a request for a static file.
 """
 
 HEALTH: Final = ("/health/live", "/health/ready")
-"""Suffixes of the paths of health checks. These paths accept every Host header.
+"""Suffixes of the paths of health checks. These paths accept every Host header and take no turn.
+
+These are suffixes, because some proxies add a prefix to the path.
 
 Orchestrators and load balancers send the address of a replica as Host header. The answer of a
 health check contains only a status, so it reveals no data.
@@ -50,9 +52,6 @@ health check contains only a status, so it reveals no data.
 _PAGES: Final = ("/", "/docs", "/redoc", "/openapi.json", "/problems")
 OPEN_ROUTES: Final = frozenset((*_PAGES, *HEALTH, *(f"/v2{path}" for path in HEALTH)))
 _OPEN_FOLDERS: Final = ("/docs/", "/redoc/", "/static/", "/problems/")
-# Suffixes of the paths without admission control. These are suffixes, because some proxies add a
-# prefix to the path.
-_NOT_QUEUED: Final = (*HEALTH, "/metrics")
 
 _REQUEST_ID: Final = re.compile(rb"[A-Za-z0-9._~:-]{1,128}")
 _TIMEOUT: Final = re.compile(rb"[1-9][0-9]{0,5}")
@@ -157,7 +156,7 @@ class Gateway:
             if self._settings.api_key is not None and not self._has_access(scope):
                 detail = "This service needs its API key, or the admin key for administration."
                 raise errors.UnauthorizedError(detail)
-            if scope["path"].endswith(_NOT_QUEUED):
+            if scope["path"].endswith(HEALTH):
                 await self._app(scope, receive, send)
             else:
                 await self._take_turn(scope, receive, send)

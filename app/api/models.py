@@ -9,13 +9,15 @@ from typing import Annotated, Final, cast
 from fastapi import APIRouter, Depends, Path, Security
 from fastapi.security import APIKeyHeader, HTTPBearer
 from starlette.requests import Request
+from starlette.responses import Response
 
 from app.api.body import AdminJSONRoute, check_admin
 from app.api.gateway import ADMIN_KEY
 from app.api.openapi import error_responses
+from app.questions.contexts import contexts
 from app.scene.relations import opposite
 from app.scene.vocabulary import ObjectClass
-from app.serving.models import ServedModels
+from app.serving.models import ServedModel, ServedModels
 from app.serving.runtime import Runtime
 from scene_client import schemas
 
@@ -115,26 +117,16 @@ async def show_version(
     )
 
 
-@router.get("/{name}/vocabulary", summary="The vocabulary of a model", responses=_LOADED_ERRORS)
-async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> schemas.VocabularyAnswer:
+@router.get(
+    "/{name}/vocabulary",
+    summary="The vocabulary of a model",
+    response_model=schemas.VocabularyAnswer,
+    responses=_LOADED_ERRORS,
+)
+async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> Response:
     """List the object classes with their aliases, the relations and the room types of a model."""
-    served = runtime.models.resolve(name)
-    canonical = served.artifact.manifest.vocabulary.relations
-    names = (*canonical, *map(opposite, canonical))
-    return schemas.VocabularyAnswer(
-        model=served.reference,
-        objects=[_class(entry) for entry in served.vocabulary.objects],
-        relations=[cast("schemas.RelationName", name) for name in names],
-        room_types=list(served.vocabulary.room_types),
-        rare_room_types=[
-            served.vocabulary.room_types[t] for t in served.artifact.calibration.rare_rooms
-        ],
-        profiles=list(served.artifact.manifest.vocabulary.profiles),
-        examples=[
-            schemas.ExampleScene(name=example.name, scene=example.request())
-            for example in served.artifact.manifest.examples
-        ],
-    )
+    body = runtime.models.resolve(name).document("vocabulary", _vocabulary)
+    return Response(body, media_type="application/json")
 
 
 @router.get(
@@ -162,16 +154,21 @@ async def show_word(name: Reference, word: Word, runtime: RuntimeDep) -> schemas
     )
 
 
-@router.get("/{name}/contexts", summary="The hidden units of a model", responses=_LOADED_ERRORS)
-async def show_contexts(name: Reference, runtime: RuntimeDep) -> schemas.ContextsAnswer:
+@router.get(
+    "/{name}/contexts",
+    summary="The hidden units of a model",
+    response_model=schemas.ContextsAnswer,
+    responses=_LOADED_ERRORS,
+)
+async def show_contexts(name: Reference, runtime: RuntimeDep) -> Response:
     """List the hidden units of a model with the classes of their largest weights.
 
     The field `context` of `POST /generate` accepts the numbers of these units.
     """
     served = runtime.models.resolve(name)
-    # The first access to the contexts of a model takes 0.2 s, so it runs in a thread.
-    layers = await asyncio.to_thread(lambda: served.contexts)
-    return schemas.ContextsAnswer(model=served.reference, layers=dict(layers))
+    # The first request for a model takes 0.3 s, so it runs in a thread.
+    body = await asyncio.to_thread(served.document, "contexts", _contexts)
+    return Response(body, media_type="application/json")
 
 
 @administration.post(
@@ -212,6 +209,29 @@ async def move_alias(
     runtime: Runtime = http.app.state.runtime
     answer = await runtime.move_alias(alias, data, http.state.request_id)
     return answer.model_dump_json(exclude_none=True).encode()
+
+
+def _vocabulary(served: ServedModel) -> schemas.VocabularyAnswer:
+    vocabulary, manifest = served.vocabulary, served.artifact.manifest
+    canonical, rooms = manifest.vocabulary.relations, vocabulary.room_types
+    return schemas.VocabularyAnswer(
+        model=served.reference,
+        objects=[_class(entry) for entry in vocabulary.objects],
+        relations=[
+            cast("schemas.RelationName", name) for name in (*canonical, *map(opposite, canonical))
+        ],
+        room_types=list(rooms),
+        rare_room_types=[rooms[t] for t in served.artifact.calibration.rare_rooms],
+        profiles=list(manifest.vocabulary.profiles),
+        examples=[
+            schemas.ExampleScene(name=example.name, scene=example.request())
+            for example in manifest.examples
+        ],
+    )
+
+
+def _contexts(served: ServedModel) -> schemas.ContextsAnswer:
+    return schemas.ContextsAnswer(model=served.reference, layers=dict(contexts(served.artifact)))
 
 
 def _class(entry: ObjectClass) -> schemas.VocabularyEntry:

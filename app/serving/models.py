@@ -10,12 +10,15 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Mapping
+import threading
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Final
+
+from pydantic import BaseModel
 
 from app.errors import (
     ModelUnavailableError,
@@ -26,13 +29,12 @@ from app.errors import (
 )
 from app.questions import QUESTIONS
 from app.questions.answer import written
-from app.questions.contexts import contexts
 from app.registry import AliasTarget, Artifact, ArtifactError, ModelSet, StoreError
 from app.registry.model_set import EMPTY
 from app.scene.nearest import spelt_alike
 from app.scene.scene import Scene, SceneObject, observe
 from app.scene.vocabulary import Vocabulary
-from scene_client.schemas import ContextUnit, Failure, ModelReference
+from scene_client.schemas import Failure, ModelReference
 
 DEFAULT = "default"
 Key = tuple[str, str]
@@ -50,6 +52,8 @@ class ServedModel:
     """
 
     artifact: Artifact
+    _documents: dict[str, bytes] = field(default_factory=dict)
+    _building: threading.Lock = field(default_factory=threading.Lock)
 
     @cached_property
     def reference(self) -> ModelReference:
@@ -72,13 +76,12 @@ class ServedModel:
         """Object classes and room types of the model."""
         return self.artifact.vocabulary
 
-    @cached_property
-    def contexts(self) -> Mapping[str, list[ContextUnit]]:
-        """Maps each hidden layer to its units, with the objects and relations of largest weight.
-
-        The first access computes the value, which takes 0.2 s.
-        """
-        return contexts(self.artifact)
+    def document(self, name: str, build: Callable[[ServedModel], BaseModel]) -> bytes:
+        """Return an answer about this model as JSON. It never changes, so it is built once."""
+        with self._building:
+            if name not in self._documents:
+                self._documents[name] = build(self).model_dump_json().encode()
+        return self._documents[name]
 
 
 @dataclass(frozen=True, eq=False)

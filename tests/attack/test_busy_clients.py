@@ -59,6 +59,8 @@ GARBAGE = [
     request("missing", {"objects": [f"nonsuch {k}" for k in range(256)]}),
     request("relations", {"objects": ["bed"], "relations": [["a", "left", "b"]] * 4096}),
     request("nowhere", {"a": 1}),
+]
+DOCUMENTS = [
     b"GET /metrics HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
     b"GET /models/default/contexts HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
 ]
@@ -84,9 +86,9 @@ async def ask(
 
 
 async def measure(port: int, hostile: list[bytes], attackers: int) -> Any:
-    """Return statuses of 64 connections, of the attacker, and the seconds of health checks."""
+    """Return statuses of eight robots with 64 connections, of the attacker, and health's seconds."""
     until = time.monotonic() + SECONDS
-    others = [ask(port, "127.0.0.1", cycle([SINGLE]), until, 0) for _ in range(64)]
+    others = [ask(port, f"127.0.1.{k % 8}", cycle([SINGLE]), until, 0) for k in range(64)]
     attack = [ask(port, "127.0.0.2", cycle(hostile), until, 0) for _ in range(attackers)]
     health = ask(port, "127.0.0.3", cycle([HEALTH]), until, 0.02)
     (_, seconds), *answers = await asyncio.gather(health, *others, *attack)
@@ -94,14 +96,26 @@ async def measure(port: int, hostile: list[bytes], attackers: int) -> Any:
     return *statuses, sorted(seconds)
 
 
-@pytest.mark.parametrize("hostile", [BATCHES, DRAWS, GARBAGE, BATCHES + DRAWS + GARBAGE])
-async def test_others_keep_half_of_their_rate(shipped: LiveService, hostile: list[bytes]) -> None:
+@pytest.mark.parametrize(
+    ("hostile", "least"),
+    [
+        # On a free machine, others keep .6 to .8 of their rate. The margin is for a busy machine.
+        (BATCHES, 0.4),
+        (DRAWS, 0.4),
+        (GARBAGE, 0.4),
+        (BATCHES + DRAWS + GARBAGE, 0.4),
+        # This process, which asks for the others too, reads 200 kB of each answer.
+        (DOCUMENTS, 0.15),
+    ],
+)
+async def test_others_keep_half_of_their_rate(
+    shipped: LiveService, hostile: list[bytes], least: float
+) -> None:
     alone, _, usual = await measure(shipped.port, [], 0)
     beside, attacker, delays = await measure(shipped.port, hostile, 24)
     assert set(alone) == set(beside) == {200}  # nobody is refused for the attacker's sake
     assert not {500, 502} & set(attacker)
-    # Half of the rate is the fair share beside one other client. The margin is for a busy machine.
-    assert beside[200] > 0.4 * alone[200]
+    assert beside[200] > least * alone[200]
     median = len(delays) // 2
     assert delays[median] < usual[median] + 0.05
 
@@ -163,7 +177,7 @@ behind_proxy = live_service(SCENE_TRUSTED_PROXIES="127.0.0.1")
 
 def test_a_trusted_proxy_tells_clients_apart(behind_proxy: LiveService) -> None:
     """One client of the proxy holds its quarter of the draws; another one still has its own."""
-    largest = {"objects": ["bed"], "count": 64, "steps": 500}
+    largest = {"objects": [], "temperature": 1.5, "count": 64, "steps": 500}
     quick = {"objects": ["bed"], "count": 1, "steps": 1}
 
     def draw(body: dict[str, Any], client: str) -> int:
@@ -174,7 +188,7 @@ def test_a_trusted_proxy_tells_clients_apart(behind_proxy: LiveService) -> None:
 
     with ThreadPoolExecutor() as pool:
         first = pool.submit(draw, largest, "10.0.0.1")
-        time.sleep(0.2)
+        time.sleep(0.02)
         assert not first.done()
         other = pool.submit(draw, quick, "10.0.0.2")
         assert draw(quick, "10.0.0.1") == 429

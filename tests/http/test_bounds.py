@@ -90,8 +90,9 @@ async def test_queues_are_empty_after_a_request(shared_store: Path, hold: Hold) 
 
         async def pending() -> set[float]:
             text = (await client.get("/metrics")).text
-            return {float(line.split()[-1]) for line in text.splitlines()
-                    if line.startswith("scene_pending{")}  # fmt: skip
+            lanes = tuple(f'scene_pending{{lane="{lane}"}}' for lane in ("slow", "draws"))
+            lines = [line for line in text.splitlines() if line.startswith(lanes)]
+            return {float(line.split()[-1]) for line in lines}
 
         scenes: list[Any] = [SCENE, {**SCENE, "model": "nobody"}, {"model": 7}, [], SCENE]
         await client.post("/missing/batch", json={"scenes": scenes})
