@@ -86,7 +86,7 @@ async def ask(
 
 
 async def measure(port: int, hostile: list[bytes], attackers: int) -> Any:
-    """Return statuses of eight robots with 64 connections, of the attacker, and health's seconds."""
+    """Return statuses of eight robots and of the attacker, and seconds of health checks."""
     until = time.monotonic() + SECONDS
     others = [ask(port, f"127.0.1.{k % 8}", cycle([SINGLE]), until, 0) for k in range(64)]
     attack = [ask(port, "127.0.0.2", cycle(hostile), until, 0) for _ in range(attackers)]
