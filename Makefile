@@ -18,7 +18,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 # One worker more than cores, because the tests spend a third of their time waiting.
 WORKERS ?= $$(($$($(BIN)/python -c 'import os; print(os.cpu_count())') + 1))
 PYTEST := $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadscope --no-loadscope-reorder
-INDEX := $(if $(TORCH_INDEX_URL),--no-deps --index-url $(TORCH_INDEX_URL))
+TORCH := -r requirements-torch.lock $(if $(TORCH_INDEX_URL),--index-url $(TORCH_INDEX_URL))
 
 # A stamp file marks an environment with the packages of its lock file. A newer lock file or
 # pyproject.toml makes the stamp out of date. Both lock files have the same versions, so they share
@@ -118,8 +118,11 @@ $(SERVICE): requirements.lock pyproject.toml clients/python/pyproject.toml | $(B
 
 $(EVERYTHING): requirements-dev.lock requirements-torch.lock pyproject.toml clients/python/pyproject.toml | $(BIN)/python
 	@echo "Installing every package into $(VENV) ..."
+	@# torch first and alone, because a package of the lock file needs it. A CUDA build, from the default
+	@# index, then gets its companions.
+	@$(PIP) install --no-deps $(TORCH)
 	@$(PIP) install --require-hashes -r requirements-dev.lock
-	@$(PIP) install $(INDEX) -r requirements-torch.lock
+	@$(if $(TORCH_INDEX_URL),,$(PIP) install -qq $(TORCH))
 	@$(PIP) install -qq --no-deps --editable clients/python --editable .
 	@echo "Installed."
 	@touch $(SERVICE) $@
