@@ -14,7 +14,7 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
 from itertools import product
@@ -43,6 +43,11 @@ from training.seed.protocol import (
 from training.seed.scenes import Material, read_material
 
 console = Console()
+
+Job = tuple[str, str, int]
+"""Split, variant and training seed of a machine."""
+
+_run_job: Callable[[Job], Run]  # of a worker process
 
 
 class FolderError(ValueError):
@@ -101,10 +106,12 @@ def _train_all(
     """Return the runs by split and variant, from files or worker processes of one thread."""
     runs: dict[str, dict[str, list[Run]]] = {split: {} for split in materials}
     jobs = list(product(materials, VARIANTS, range(seeds)))
-    one = partial(_run, folder=folder, materials=dict(materials), settings=dict(settings))
-    pool = multiprocessing.get_context("spawn").Pool(workers, _start_worker)
+    # Each worker gets the scenes once. With them in every job, the pipe of jobs would be full when
+    # training fails, and the pool could not end.
+    run_job = partial(_run, folder=folder, materials=dict(materials), settings=dict(settings))
+    pool = multiprocessing.get_context("spawn").Pool(workers, _start_worker, (run_job,))
     with console.status(f"training {len(jobs)} machines"), pool:
-        for done, run in enumerate(pool.imap(one, jobs), 1):
+        for done, run in enumerate(pool.imap(_work, jobs), 1):
             split, name, number = jobs[done - 1]
             runs[split].setdefault(name, []).append(run)
             last = run["history"][-1]
@@ -116,14 +123,20 @@ def _train_all(
     return runs
 
 
-def _start_worker() -> None:
+def _start_worker(run_job: Callable[[Job], Run]) -> None:
     """Use one thread, and leave Ctrl-C to the parent process."""
+    global _run_job
+    _run_job = run_job
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
+def _work(job: Job) -> Run:
+    return _run_job(job)
+
+
 def _run(
-    job: tuple[str, str, int],
+    job: Job,
     folder: Path,
     materials: Mapping[str, Material],
     settings: Mapping[str, Any],
