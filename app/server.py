@@ -182,9 +182,12 @@ def _page(host: str, port: int) -> str:
     return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
 
 
-def _most_connections(wanted: int) -> int:
+def most_connections(wanted: int) -> int:
     """Return the number of connections for which the process may open files."""
-    most = max(resource.getrlimit(resource.RLIMIT_NOFILE)[0] - _OTHER_FILES, _OTHER_FILES)
+    files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    if files == resource.RLIM_INFINITY:
+        return wanted
+    most = max(files - _OTHER_FILES, _OTHER_FILES)
     if wanted > most:
         _logger.warning(
             "the service accepts %d connections, not SCENE_MAX_CONNECTIONS=%d, because it may open "
@@ -207,7 +210,7 @@ def build(settings: Settings, began: float) -> Server:
         root_path=settings.root_path,
         http=Connection,
         ws="none",
-        limit_concurrency=_most_connections(settings.max_connections) + _CLOSING,
+        limit_concurrency=most_connections(settings.max_connections) + _CLOSING,
         timeout_keep_alive=KEEP_ALIVE,
         log_config=log_config(settings.log_level, settings.log_format, settings.secrets),
         access_log=False,

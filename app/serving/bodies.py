@@ -28,7 +28,7 @@ def too_large(limit: int) -> errors.BodyTooLargeError:
 class Bodies:
     """The bodies of all requests and answers in progress. Their total size is bounded.
 
-    One client holds at most a quarter of the budget.
+    One client holds at most a quarter of the budget, or a single body.
 
     Attributes:
         held: total size of the bodies in bytes.
@@ -50,7 +50,7 @@ class Bodies:
         """
         self._add(client, size)
         try:
-            self._check(client)
+            self._check(client, size)
             yield
         finally:
             self.release(client, size)
@@ -85,7 +85,7 @@ class Bodies:
                     if len(body) > limit:
                         raise too_large(limit)
                     if not (is_whole and len(body) <= SMALL):
-                        self._check(client)
+                        self._check(client, len(body))
         except BaseException as error:
             self.release(client, len(body))
             if isinstance(error, TimeoutError):
@@ -100,8 +100,8 @@ class Bodies:
         if of_client:
             self._of_clients[client] = of_client
 
-    def _check(self, client: str) -> None:
-        share = self._budget // SHARE
+    def _check(self, client: str, size: int) -> None:
+        share = max(self._budget // SHARE, size)
         if self.held > self._budget or self._of_clients.get(client, 0) > share:
             detail = (
                 f"All bodies in progress exceed {self._budget} bytes together, or those of this "

@@ -113,8 +113,13 @@ async def test_a_request_has_at_most_32_errors(
         ({"objects": ["bed", "lamp"], "relations": [["bed", "left", "lamp"]] * 257}, True),
     ],
 )
+@pytest.mark.parametrize("question", ["outliers", "generate"])
 async def test_large_scenes_are_read_off_the_event_loop(
-    shared_store: Path, monkeypatch: pytest.MonkeyPatch, scene: dict[str, Any], is_large: bool
+    shared_store: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    question: str,
+    scene: dict[str, Any],
+    is_large: bool,
 ) -> None:
     threads = []
 
@@ -124,5 +129,13 @@ async def test_large_scenes_are_read_off_the_event_loop(
 
     async with serve(shared_store) as client:
         monkeypatch.setattr("app.serving.request.read_scene", read)
-        assert (await client.post("/outliers", json=scene)).status_code == 200
+        assert (await client.post(f"/{question}", json=scene)).status_code == 200
     assert (threads[0] is not threading.main_thread()) == is_large
+
+
+async def test_a_client_may_hold_one_body_above_its_share(shared_store: Path) -> None:
+    """A quarter of this budget is less than the batch."""
+    batch = b'{"scenes":[{"objects":["bed"]}]}'.ljust(2**19)
+    async with serve(shared_store, held_body_bytes=2**20) as client:
+        answer = await client.post("/missing/batch", content=batch, headers=JSON)
+    assert answer.status_code == 200

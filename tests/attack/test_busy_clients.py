@@ -18,6 +18,7 @@ from typing import Any
 import httpx
 import pytest
 
+from app.server import most_connections
 from tests.http.stores import make_store
 from tests.services import LiveService, launch, live_service, wait_until
 
@@ -113,7 +114,7 @@ async def test_others_keep_half_of_their_rate(
 ) -> None:
     alone, _, usual = await measure(shipped.port, [], 0)
     beside, attacker, delays = await measure(shipped.port, hostile, 24)
-    assert set(alone) == set(beside) == {200}  # nobody is refused for the attacker's sake
+    assert set(alone) == set(beside) == {200}  # the attack causes no refusal
     assert not {500, 502} & set(attacker)
     assert beside[200] > least * alone[200]
     median = len(delays) // 2
@@ -159,7 +160,7 @@ def test_silent_connections_do_not_keep_health_checks_out(tmp_path: Path) -> Non
 
 
 def test_few_files_limit_the_connections(tmp_path: Path) -> None:
-    """300 connections at `ulimit -n 256`: the service accepts what it has files for."""
+    """300 connections at `ulimit -n 256`: the service keeps 64 files for other purposes."""
     store, (soft, hard) = make_store(tmp_path / "store"), resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
     try:
@@ -170,6 +171,14 @@ def test_few_files_limit_the_connections(tmp_path: Path) -> None:
         for _ in range(20):
             assert service.client.get("/health/live").status_code == 200
         assert "accepts 192 connections" in service.log.read_text()
+
+
+@pytest.mark.parametrize(("files", "most"), [(resource.RLIM_INFINITY, 1024), (1024, 960)])
+def test_connections_fit_the_limit_of_files(
+    monkeypatch: pytest.MonkeyPatch, files: int, most: int
+) -> None:
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (files, files))
+    assert most_connections(1024) == most
 
 
 behind_proxy = live_service(SCENE_TRUSTED_PROXIES="127.0.0.1")

@@ -60,7 +60,7 @@ def faults_of_answer(status: int, headers: Mapping[str, str], body: bytes) -> li
         problems = (faults_of_problem(entry["problem"], entry["status"]) for entry in failed)
         return [*chain.from_iterable(problems)]
     if kind != "application/problem+json":
-        return [f"status {status} is no problem document but {kind}"]
+        return [f"status {status} has the media type {kind}"]
     document = json.loads(body)
     faults = faults_of_problem(document, status)
     if document.get("request_id") != headers.get("x-request-id"):
