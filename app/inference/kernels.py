@@ -275,7 +275,7 @@ def gains(p, factors, group, rows):
 def gain_factors(p, raised, removed):
     """Return the factors of e^gain, (N, units), and of e^-change, (N, n, units).
 
-    A factor is the effect of one hidden unit; see `ObjectScorer._changes`.
+    A factor is the effect of one hidden unit; see `explained_log_odds`.
 
     Args:
         p: (N or 1, units, states) probabilities of the states of h1.
@@ -360,46 +360,6 @@ def log_sums(x):
 
 
 @compiled
-def source_effects(f, a, classes, presence, rows, targets):
-    """Return the effect of the unknown data source on N target classes, and its changes.
-
-    The effect on a class i is the mean base rate sum_q p_q a_qi over the Q data sources. p_q is the
-    probability of source q given the listed classes.
-
-    Args:
-        f, a: weights of the data sources, (Q,) and (Q, V); see `weights.layout`.
-        classes, presence: the n listed classes; see `ObjectScorer.absent`.
-        rows: (N,) index of each target among the listed classes. A class is not evidence for
-            itself. `rows` is empty if the targets are not listed.
-        targets: (N,) the target classes.
-
-    Returns:
-        The effects, (N,), and the change of each effect due to each listed class, (N, n).
-    """
-    # Part of each listed class in the logit of each source, (n, Q).
-    parts = np.empty((len(classes), len(f)), np.float32)
-    without_target = np.empty(len(f), np.float32)
-    without_both = np.empty(len(f), np.float32)  # without the target and the listed class j
-    logits = np.empty(len(f), np.float32)
-    for q in range(len(f)):
-        logits[q] = f[q]
-        for j in range(len(classes)):
-            parts[j, q] = a[q, classes[j]] * presence[j]
-            logits[q] += parts[j, q]
-    mean = np.empty(len(targets), np.float32)
-    change = np.empty((len(targets), len(classes)), np.float32)
-    for i in range(len(targets)):
-        for q in range(len(f)):
-            without_target[q] = logits[q] - parts[rows[i], q] if len(rows) else logits[q]
-        mean[i] = _mean(without_target, a, targets[i])
-        for j in range(len(classes)):
-            for q in range(len(f)):
-                without_both[q] = without_target[q] - parts[j, q]
-            change[i, j] = mean[i] - _mean(without_both, a, targets[i])
-    return mean, change
-
-
-@compiled
 def _mean(logits, a, i):
     """Return the mean of a[q, i] with probabilities softmax(logits) of q, or 0 without sources."""
     top, total, weighted = np.float32(-np.inf), np.float32(0.0), np.float32(0.0)
@@ -410,6 +370,90 @@ def _mean(logits, a, i):
         total += p
         weighted += p * a[q, i]
     return weighted / total if len(logits) else np.float32(0.0)
+
+
+@compiled
+def explained_log_odds(
+    x, shares, W, bias, L, f, a, states, classes, presence, rows, targets, explained
+):
+    """Return the log-odds of N target classes i given the listed classes, and their changes.
+
+    The log-odds are bias_i + gain_i + sum_q p_q a_qi + sum_j presence_j L_ij; see `objects`. The
+    change by class j is their value minus their value without class j.
+
+    Args:
+        x: (H1,) logits of h1 given the n listed classes.
+        shares: (n, H1) contribution of each listed class to x.
+        W, bias, L: (V, H1) weights of h1, (V,) biases, and (V, V) couplings, or (0, V) without
+            couplings.
+        f, a: (Q,) and (Q, V) weights of the Q possible data sources; see `weights.layout`.
+        states: number of states of a hidden unit.
+        classes, presence: (n,) the listed classes; see `ObjectScorer.absent`.
+        rows: (N,) index of each target among the listed classes. A class is not evidence for
+            itself. `rows` is empty if the targets are not listed.
+        targets: (N,) the target classes.
+        explained: whether to compute the changes.
+
+    Returns:
+        The log-odds, (N,), and the changes, (N, n). The changes are (N, 0) if not `explained`.
+    """
+    N, n, coupled = len(targets), len(classes) if explained else 0, len(L) > 0
+    base = np.empty((max(len(rows), 1), len(x)), np.float32)
+    base[0] = x
+    for i in range(len(rows)):
+        base[i] = x - shares[rows[i]]
+    p, raised = all_states(base, states), odds(W[targets], states)
+    factors, ratios = gain_factors(p, raised, odds(-shares[:n], states))
+    log_odds, change = log_sums(factors), np.empty((N, n), np.float32)
+    mean, of_source = _source_effects(f, a, classes, presence, rows, targets, n)
+    for i in range(N):
+        total, change[i] = np.float32(0.0), -log_sums(ratios[i])
+        for j in range(len(classes) if coupled else 0):
+            total += presence[j] * L[classes[j], targets[i]]
+        log_odds[i] = bias[targets[i]] + log_odds[i] + mean[i] + total
+        for j in range(n):
+            if coupled:
+                change[i, j] += L[targets[i], classes[j]] * presence[j]
+            change[i, j] += of_source[i, j]
+        if n and len(rows):
+            change[i, rows[i]] = np.float32(0.0)
+    return log_odds, change
+
+
+@compiled
+def _source_effects(f, a, classes, presence, rows, targets, n):
+    """Return the effect of the unknown data source on N target classes, and its changes.
+
+    The effect on a class i is the mean base rate sum_q p_q a_qi over the Q data sources. p_q is the
+    probability of source q given the listed classes.
+
+    Args:
+        n: number of listed classes whose changes are computed. For the others, see
+            `explained_log_odds`.
+
+    Returns:
+        The effects, (N,), and the change of each effect due to each listed class, (N, n).
+    """
+    # Part of each listed class in the logit of each source.
+    parts = np.empty((len(classes), len(f)), np.float32)
+    without_target = np.empty(len(f), np.float32)
+    without_both = np.empty(len(f), np.float32)  # without the target and the listed class j
+    logits = np.empty(len(f), np.float32)
+    for q in range(len(f)):
+        logits[q] = f[q]
+        for j in range(len(classes)):
+            parts[j, q] = a[q, classes[j]] * presence[j]
+            logits[q] += parts[j, q]
+    mean, change = np.empty(len(targets), np.float32), np.empty((len(targets), n), np.float32)
+    for i in range(len(targets)):
+        for q in range(len(f)):
+            without_target[q] = logits[q] - parts[rows[i], q] if len(rows) else logits[q]
+        mean[i] = _mean(without_target, a, targets[i])
+        for j in range(n):
+            for q in range(len(f)):
+                without_both[q] = without_target[q] - parts[j, q]
+            change[i, j] = mean[i] - _mean(without_both, a, targets[i])
+    return mean, change
 
 
 # ------------------------------------------------------------------- relation units: relations.py
@@ -426,6 +470,8 @@ _GROUPS = 4
 # than three relations add little information.
 _MOST = np.float32(3.0)
 
+# Number of float32 in a vector register. Rows of whole registers are faster.
+_VECTOR: Final = 8
 _ROOT_3 = np.float32(3.0**0.5)
 # Limit of √3 σ. Below this limit, a quadrature with three nodes is accurate enough.
 _NARROW = np.float32(0.75 * 3.0**0.5)
@@ -442,7 +488,7 @@ class SharedArrays(NamedTuple):
         S, O: (V, K + 1) factors of each class as subject and as object. The last column is 1.
         s, o: (V, A) weights of each class as subject and as object of each relation.
         n: (A, 2) weights of the log number of instances of subject and object class.
-        start, key: look-up table of `relation_kernels.pair_rows`.
+        start, key: look-up table of `pair_rows`.
         residual: (pairs + 1, A) residual weight w' of each pair of classes and each relation. The
             last row is 0.
     """
@@ -517,86 +563,90 @@ def placement_ends(candidates, classes, log_counts, presence):
     return Ends(i, j, log_i, log_j, p_i, p_j)
 
 
-@compiled
-def pair_terms(w, first, ends, z, base):
-    """Compute the parts of relation logits that do not depend on the hidden units.
+@compiled_in_any_order
+def normal_logits(w, first, ends, U, Y, C, f):
+    """Return the means and √3 σ of the logits of R relations for P pairs in B batches, (B, R, P).
 
-    The function writes its results to z and base, for R relations of P pairs in each of B batches.
+    The mean of a logit is base + U z, and its variance σ² is q'C q - sum_u (f_u'q)² with q = Y z.
+    z are the factors of the pair, and base are the terms that do not depend on the hidden units;
+    see `relations.SharedUnits`.
 
     Args:
         w: weights of the units; see `relations.SharedArrays`.
         first: index of the first of the R consecutive relations.
         ends: subject and object classes of the pairs, (B, P); see `relations.Ends`.
-        z: (B, K, P') output array for the factors z_e. P' is P plus padding.
-        base: (B, R, P') output array for the terms without z_e.
+        U: (B, R, K) weights of the factors.
+        Y: (R, r, K) matrix Y of each relation. σ is 0 if r is 0.
+        C: (B, R, r (r + 1) / 2) lower half of each symmetric r x r matrix C. Entries off the
+            diagonal are doubled. The function subtracts the products of f from C, in place.
+        f: (units u, B, R, r) vectors f_u.
     """
     # Local names are faster: each access through the tuple would change a reference count.
     S, O, s, o, n, residual = w.S, w.O, w.s, w.o, w.n, w.residual  # noqa: E741
-    for b in range(len(z)):
+    (B, P), (R, r, K) = ends.i.shape, Y.shape
+    width = -(-P // _VECTOR) * _VECTOR
+    z, q = np.zeros((K, B * width), np.float32), np.empty((r, B * width), np.float32)
+    mean, spread = np.empty((B, R, P), np.float32), np.empty((B, R, P), np.float32)
+    row, variance = np.empty(width, np.float32), np.empty(width, np.float32)
+    for b in range(B):
         subjects, objects, log_i, log_j = ends.i[b], ends.j[b], ends.log_i[b], ends.log_j[b]
         pairs = pair_rows(w.start, w.key, subjects * len(S) + objects)
-        for p in range(len(pairs)):
+        for p in range(P):
             i, j = subjects[p], objects[p]
-            S_i, O_j, pair_residual = S[i], O[j], residual[pairs[p]]
-            for k in range(z.shape[1]):
-                z[b, k, p] = S_i[k] * O_j[k]
-            for c in range(base.shape[1]):
+            for k in range(K):
+                z[k, b * width + p] = S[i, k] * O[j, k]
+            for c in range(R):
                 a = first + c
                 of_counts = n[a, 0] * log_i[p] + n[a, 1] * log_j[p]
-                base[b, c, p] = s[i, a] + o[j, a] + of_counts + pair_residual[a]
+                mean[b, c, p] = s[i, a] + o[j, a] + of_counts + residual[pairs[p], a]
+    for c in range(R):
+        for d in range(r):
+            _weighted_sum(Y[c, d], z, 0, q[d])
+        for b in range(B):
+            _weighted_sum(U[b, c], z, b * width, row)
+            for p in range(P):
+                mean[b, c, p] += row[p]
+            lower, t = C[b, c], 0
+            for u in range(len(f)):
+                _subtract_product(f[u, b, c], lower)
+            variance[:] = np.float32(0.0)
+            for d in range(r):
+                _weighted_sum(lower[t : t + d + 1], q, b * width, row)
+                t, q_d = t + d + 1, q[d, b * width : (b + 1) * width]
+                for p in range(width):
+                    variance[p] += row[p] * q_d[p]
+            for p in range(P):
+                spread[b, c, p] = np.sqrt(np.float32(3.0) * max(variance[p], np.float32(0.0)))
+    return mean, spread
 
 
 @compiled_in_any_order
-def spreads(C, q):
-    """Return √3 σ = √(3 q'C q) of the logits of R relations for P pairs in B batches, (B, R, P).
-
-    σ is the standard deviation of a logit. `relations.SharedUnits` defines C and q.
-
-    Args:
-        C: (B, R, r (r + 1) / 2) lower half of each symmetric r x r matrix C. Entries off the
-            diagonal are doubled.
-        q: (B, R, r, P) vectors q of r coordinates.
-    """
-    B, R, r, P = q.shape
-    spread, row = np.empty((B, R, P), np.float32), np.empty(P, np.float32)
-    for b in range(B):
-        for c in range(R):
-            weights, rows, variance, t = C[b, c], q[b, c], spread[b, c], 0
-            variance[:] = np.float32(0.0)
-            for d in range(r):
-                row[:], q_d = np.float32(0.0), rows[d]
-                for u in range(d + 1):
-                    weight, q_u = weights[t + u], rows[u]
-                    for p in range(P):
-                        row[p] += weight * q_u[p]
-                t += d + 1
-                for p in range(P):
-                    variance[p] += row[p] * q_d[p]
-            for p in range(P):
-                variance[p] = np.sqrt(np.float32(3.0) * max(variance[p], np.float32(0.0)))
-    return spread
+def _weighted_sum(weights, rows, start, total):
+    """Write sum_k weights_k rows_k (P,) to total. P columns of the rows begin at column start."""
+    K, P = len(weights), len(total)
+    total[:] = np.float32(0.0)
+    # Two rows at a time halve the reads and writes of the sum.
+    for k in range(0, K - 1, 2):
+        weight, row = weights[k], rows[k, start : start + P]
+        next_weight, next_row = weights[k + 1], rows[k + 1, start : start + P]
+        for p in range(P):
+            total[p] += weight * row[p] + next_weight * next_row[p]
+    if K % 2:
+        weight, row = weights[K - 1], rows[K - 1, start : start + P]
+        for p in range(P):
+            total[p] += weight * row[p]
 
 
-@compiled
-def subtract_products(C, f):
-    """Subtract sum_u f_u f_u' from each symmetric matrix C, in place.
-
-    Args:
-        C: (B, R, r (r + 1) / 2); see `spreads`.
-        f: (units u, B, R, r) vectors f_u.
-    """
-    units, B, R, r = f.shape
-    for b in range(B):
-        for c in range(R):
-            lower = C[b, c]
-            for u in range(units):
-                row, t = f[u, b, c], 0
-                for d in range(r):
-                    double = row[d] + row[d]
-                    for e in range(d):
-                        lower[t + e] -= double * row[e]
-                    lower[t + d] -= row[d] * row[d]
-                    t += d + 1
+@compiled_in_any_order
+def _subtract_product(f, lower):
+    """Subtract f f' from a symmetric matrix, in place; see `normal_logits` for its lower half."""
+    t = 0
+    for d in range(len(f)):
+        double = f[d] + f[d]
+        for e in range(d):
+            lower[t + e] -= double * f[e]
+        lower[t + d] -= f[d] * f[d]
+        t += d + 1
 
 
 @compiled
@@ -1437,6 +1487,27 @@ def _sink(values, heap, size, position):
         heap[node] = heap[child]
         node = child
     heap[node] = position
+
+
+@compiled
+def companions(increase, rank, usable, share, count):
+    """Return the `count` usable classes with the largest ranks, largest first.
+
+    Args:
+        increase, rank: (V,) results of `ObjectScorer.increases`.
+        usable: (V,) bool, True for classes that the result may contain.
+        share: smallest increase in the result, as a share of the largest increase of a usable
+            class.
+        count: maximum number of classes.
+    """
+    largest, chosen = np.float32(0.0), np.empty(len(usable), np.bool_)
+    for j in range(len(usable)):
+        if usable[j]:
+            largest = max(largest, increase[j])
+    least = max(share * largest, 1e-6)
+    for j in range(len(usable)):
+        chosen[j] = usable[j] and increase[j] >= least and rank[j] > 0
+    return best(rank, chosen, count)
 
 
 @compiled

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference import kernels
-from app.inference.elementary import log_softmax
+from app.inference.elementary import log_softmax, sigmoid
 from app.inference.weights import SHARES, Weights
 
 Floats = NDArray[np.float32]
@@ -106,6 +106,8 @@ class ObjectScorer:
     def __init__(self, weights: Weights) -> None:
         self._weights, self._states = weights, weights.spec.states
         self._biases: dict[tuple[float, int | None], Floats] = {}  # by coverage and room type
+        self._increases: dict[int, tuple[Floats, Floats]] = {}
+        self._couplings = weights["L"] if weights.spec.coupled else _NO_COUPLINGS
         self.gains = Gains(weights["W"], self._states)
         self.room_gains = Gains(weights["Q"], self._states)
 
@@ -137,8 +139,9 @@ class ObjectScorer:
             if len(self._biases) < _KEPT_BIASES:
                 self._biases[coverage, room] = bias
         p = weights.source_weights(classes, presence[None], profile)[0]
-        couplings = weights["L"] if weights.spec.coupled else _NO_COUPLINGS
-        return kernels.class_log_odds(gain, bias, p, weights["a"], couplings, classes, presence)
+        return kernels.class_log_odds(
+            gain, bias, p, weights["a"], self._couplings, classes, presence
+        )
 
     def kappa(self, coverage: float) -> Floats:
         """Return the bias of each class for a listed share, interpolated between the bins, (V,)."""
@@ -157,48 +160,24 @@ class ObjectScorer:
         presence: Floats,
         profile: int | None,
         room: int | None = None,
-    ) -> Floats:
-        """Return the log-odds of each listed class given the other listed classes, (n,).
+        *,
+        explained: bool = False,
+    ) -> tuple[Floats, Floats]:
+        """Return the log-odds of each listed class i given the other listed classes, (n,).
+
+        If `explained`, the second result is how much each listed class j changes them, (n, n): the
+        log-odds of i with class j, minus the log-odds of i without class j. An entry with i = j is
+        0. Otherwise this result is (n, 0).
 
         Args:
             x: (H1,) logits of h1 given all listed classes.
             shares: (n, H1) contribution of each class to x.
             classes, presence, profile, room: see `absent`.
         """
-        weights = self._weights
+        weights, rows = self._weights, np.arange(len(classes))
         bias = weights["b"] + weights.room_couplings(room) + weights["kappa"][-1]
-        log_odds = bias[classes]
-        log_odds += self._changes(x - shares, shares[:0], classes)[0]
-        if profile is None:
-            log_odds += self._by_source(classes, presence, np.arange(len(classes)), classes)[0]
-        else:
-            log_odds += weights["a"][profile, classes]
-        if self._weights.spec.coupled:
-            log_odds += _row_sum(self._weights["L"][np.ix_(classes, classes)], presence)
-        return log_odds
-
-    def reasons(
-        self,
-        x: Floats,
-        shares: Floats,
-        classes: Indices,
-        presence: Floats,
-        profile: int | None,
-        rows: Indices,
-    ) -> Floats:
-        """Return how much each class j changes the log-odds of each listed class i, (N, n).
-
-        Each row is one of the N classes i of ``rows``. Each column is one of the n listed classes
-        j. An entry is the log-odds of i with class j, minus the log-odds of i without class j. An
-        entry with i = j is 0.
-        """
-        change = self._changes(x - shares[rows], shares, classes[rows])[1]
-        if self._weights.spec.coupled:
-            change += self._weights["L"][classes[rows, None], classes] * presence
-        if profile is None:
-            change += self._by_source(classes, presence, rows, classes[rows])[1]
-        change[np.arange(len(rows)), rows] = 0
-        return change
+        effects = bias, x, shares, classes, presence, profile, rows, classes
+        return self._explained(*effects, explained=explained)
 
     def reasons_for_absent(
         self,
@@ -210,19 +189,56 @@ class ObjectScorer:
         candidates: Indices,
     ) -> Floats:
         """Return how much each listed class changes the log-odds of N unlisted classes, (N, n)."""
-        change, rows = self._changes(x[None], shares, candidates)[1], classes[:0]
-        if self._weights.spec.coupled:
-            change += self._weights["L"][candidates[:, None], classes] * presence
-        if profile is None:
-            change += self._by_source(classes, presence, rows, candidates)[1]
-        return change
+        bias, rows = self._weights["b"], classes[:0]
+        effects = bias, x, shares, classes, presence, profile, rows, candidates
+        return self._explained(*effects, explained=True)[1]
 
-    def _by_source(
-        self, classes: Indices, presence: Floats, rows: Indices, targets: Indices
+    def _explained(
+        self,
+        bias: Floats,
+        x: Floats,
+        shares: Floats,
+        classes: Indices,
+        presence: Floats,
+        profile: int | None,
+        rows: Indices,
+        targets: Indices,
+        *,
+        explained: bool,
     ) -> tuple[Floats, Floats]:
-        """See `kernels.source_effects`."""
-        f, a = self._weights["f"], self._weights["a"]
-        return kernels.source_effects(f, a, classes, presence, rows, targets)
+        """See `kernels.explained_log_odds`."""
+        weights = self._weights
+        possible = slice(None) if profile is None else slice(profile, profile + 1)
+        log_odds, change = kernels.explained_log_odds(
+            *(x, shares, weights["W"], bias, self._couplings),
+            *(weights["f"][possible], weights["a"][possible], self._states),
+            *(classes, presence, rows, targets, explained),
+        )
+        return log_odds, change
+
+    def increases(self, i: int) -> tuple[Floats, Floats]:
+        """Return how much the presence of class i increases the log-odds of each class, (V,).
+
+        The scene has no other objects. The presence of class j raises the log-odds of class i by
+
+            increase_ij = gain_j(c1 + W_i) - gain_j(c1) + L_ij
+
+        Here c1 are the biases of the hidden units, and W_i are the weights of class i. The increase
+        is symmetric in i and j. The formula is exact for a machine with one hidden layer. It leaves
+        out a second layer, the room type, and what the classes tell about the data source.
+
+        The second result is the increase multiplied by the probability of each class in this scene,
+        (V,). The scorer keeps both results of each class, at most 8 V² bytes.
+        """
+        kept = self._increases.get(i)
+        if kept is None:
+            weights = self._weights
+            alone, empty = self.gains(np.stack([weights["c1"] + weights["W"][i], weights["c1"]]))
+            if weights.spec.coupled:
+                alone += weights["L"][i]
+            increase = alone - empty
+            kept = self._increases[i] = increase, increase * sigmoid(weights["b"] + alone)
+        return kept
 
     def room_evidence(self, x: Floats, classes: Indices, presence: Floats) -> Doubles:
         """Return log p(v | t) of the listed classes v for each room type t, (N, C).
@@ -255,24 +271,3 @@ class ObjectScorer:
         by_source = np.exp(log_softmax(logits[:, None] + weights["y"]))
         p = weights.source_weights(classes, presence, profile)[:, None] @ by_source
         return np.log(np.maximum(p[:, 0], _SMALLEST))
-
-    def _changes(self, x: Floats, shares: Floats, classes: Indices) -> tuple[Floats, Floats]:
-        """Return gain_c(x_c), (N,), and gain_c(x_c) - gain_c(x_c - share_j), (N, n).
-
-        Args:
-            x: (N, H1) logits of h1 for each of N classes c, or (1, H1) for all these classes.
-            shares: (n, H1) contribution of each of n classes j to the logits.
-            classes: (N,) indices of the classes c.
-        """
-        states = self._states
-        raised = kernels.odds(self._weights["W"][classes], states)
-        removed = kernels.odds(-shares, states)
-        gain, ratio = kernels.gain_factors(kernels.all_states(x, states), raised, removed)
-        flat = ratio.reshape(-1, ratio.shape[2])
-        return kernels.log_sums(gain), -kernels.log_sums(flat).reshape(ratio.shape[:2])
-
-
-def _row_sum(rows: Floats, presence: Floats) -> Floats:
-    """Return presence @ rows. Rows of zeros, such as those of structure, do not change a digit."""
-    total: Floats = (presence[:, None] * rows).sum(0)
-    return total

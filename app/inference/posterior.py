@@ -100,18 +100,14 @@ class ScenePosterior:
         of_absent: Floats = log_odds[absent]
         return of_absent
 
-    def log_odds_given_rest(self) -> Floats:
-        """Return the log-odds of each class given the scene without this class, (n,)."""
-        x, shares = self.context.x, self.context.shares
-        return self._objects.given_rest(x, shares, *self._scene, self._profile, self._room)
+    def given_rest(self, *, explained: bool = False) -> tuple[Floats, Floats]:
+        """Return the log-odds of each class given the scene without this class, (n,).
 
-    def reasons(self, rows: Indices) -> Floats:
-        """Return how much each class j changes `log_odds_given_rest` of each class i, (N, n).
-
-        `ObjectScorer.reasons` describes argument and result.
+        If `explained`, the second result is how much each class j changes the log-odds of each
+        class i, (n, n), otherwise (n, 0). `ObjectScorer.given_rest` describes the changes.
         """
-        x, shares = self.context.x, self.context.shares
-        return self._objects.reasons(x, shares, *self._scene, self._profile, rows)
+        scene = self.context.x, self.context.shares, *self._scene, self._profile, self._room
+        return self._objects.given_rest(*scene, explained=explained)
 
     def reasons_for_absent(self, candidates: Indices) -> Floats:
         """Return how much each class of the scene changes the log-odds of absent classes, (N, n).

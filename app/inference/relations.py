@@ -38,9 +38,6 @@ Table = tuple[NDArray[np.int32], NDArray[np.int32]]
 
 NO_VALUES: Final[Floats] = np.zeros((0, 0, 0), dtype=np.float32)
 
-# The number of pairs is padded to a multiple of this number, to fill whole vector registers.
-_WHOLE: Final = 32
-
 # Maximum variance of a logit, averaged over units, that `_directions` may neglect. Neglecting a
 # variance changes a probability by about 1/20 of this variance. The model `indoor-triway` keeps 5
 # of 33 directions.
@@ -342,31 +339,16 @@ class SharedUnits(RelationUnits):
         self, means: Floats, ends: Ends, only: int | None = None, *, certain: bool = False
     ) -> tuple[Floats, Floats]:
         """See `RelationUnits`."""
-        chosen, (B, P) = _chosen_relations(self._A, only), ends.i.shape
-        Y = self._Y[chosen]
-        width = -(-P // _WHOLE) * _WHOLE
-        z = np.zeros((B, Y.shape[2], width), np.float32)
-        mean = np.zeros((B, len(Y), width), np.float32)
-        kernels.pair_terms(self._w, chosen.start, ends, z, mean)
-        mean += (self._products(chosen, means, self._GT) + self._g[chosen]) @ z
-        if certain:
-            return mean[:, :, :P], np.zeros((B, len(Y), P), np.float32)
-        q = (Y.reshape(-1, Y.shape[2]) @ z).reshape(B, *Y.shape[:2], width)
-        spread = kernels.spreads(self._covariances(chosen, means), q)
-        return mean[:, :, :P], spread[:, :, :P]
-
-    def _covariances(self, chosen: slice, means: Floats) -> Floats:
-        """Return C of each chosen relation (see `kernels.spreads`), (B, R, r (r + 1) / 2).
-
-        cov(h1) is diag(m) - m m' within each hidden unit, and 0 between units.
-        """
-        if self._states == 2:
-            return self._products(chosen, means * (1 - means), self._FF)
-        C, (R, r) = self._products(chosen, means, self._FF), self._Y[chosen].shape[:2]
+        chosen = _chosen_relations(self._A, only)
+        Y = self._Y[chosen, :0] if certain else self._Y[chosen]
+        U = self._products(chosen, means, self._GT) + self._g[chosen]
+        # The covariance of h1 is diag(m) - m m' within each hidden unit, and 0 between units.
+        C, (R, r, _) = self._products(chosen, means, self._FF), Y.shape
         by_unit = means.reshape(len(means), -1, self._states - 1).transpose(1, 0, 2)
         f = by_unit @ self._F[:, :, chosen.start * r : chosen.stop * r]
-        kernels.subtract_products(C, f.reshape(-1, len(means), R, r))
-        return C
+        f = f.reshape(len(f), len(means), R, r)
+        mean, spread = kernels.normal_logits(self._w, chosen.start, ends, U, Y, C, f)
+        return mean, spread
 
     def _products(self, chosen: slice, rows: Floats, columns: Floats) -> Floats:
         """Return the product of the rows (B, H1) with n columns of each chosen relation, (B, R, n).

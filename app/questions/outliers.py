@@ -2,21 +2,13 @@
 
 An intruder is an object that does not belong to the scene. An outlier is an object that the service
 reports as a probable intruder. The answer for an outlier names its companions: absent classes that
-usually occur with the class of the outlier. In a scene without other objects, the presence of class
-j raises the log-odds of class i by
-
-    increase_ij = gain_j(c1 + W_i) - gain_j(c1) + L_ij
-
-Here c1 are the biases of the hidden units, W_i are the weights of class i, and `gain` is the
-contribution of the hidden units (`app.inference.objects`). The increase is symmetric in i and j. So
-the gains of all classes at c1 + W_i give the increase by every class j. The formula is exact for a
-machine with one hidden layer. It leaves out a second layer, the room type, and what the classes
-tell about the data source.
+usually occur with the class of the outlier. `ObjectScorer.increases` says how much the presence of a class
+raises the log-odds of the others.
 
 Rare classes have the largest increases, such as a toilet paper holder for a toilet. Common classes
 such as chair are likely in any scene. So companions are ranked by a product: the increase,
-multiplied by the probability of class j in a scene with class i. Classes whose increase is below
-half of the largest increase are ignored.
+multiplied by the probability of the companion in a scene with the outlier. Classes whose increase
+is below half of the largest increase are ignored.
 """
 
 from __future__ import annotations
@@ -28,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference.elementary import sigmoid
-from app.inference.kernels import best
+from app.inference.kernels import companions
 from app.questions.answer import (
     CAUSE_BYTES,
     EXPLAINED,
@@ -139,30 +131,24 @@ def _judged(
     outlier, these objects lower its log-odds. For other objects, they raise the log-odds.
     """
     present, labels = posterior.present, artifact.vocabulary.labels
-    log_odds = posterior.log_odds_given_rest()
+    log_odds, change = posterior.given_rest(explained=details)
     logits, p = _intruder_odds(artifact, entry, posterior, log_odds)
     is_outlier = p >= threshold
     # The order follows the logits, because probabilities near 0 or 1 may round to the same number.
     order = (-logits[present.row]).argsort(kind="stable")
-    rows = present.row[order].tolist()
-    causes: list[list[Fields]] = [[] for _ in present.classes]
-    companions: list[list[str]] = [[] for _ in present.classes]
-    if details:
-        explained = np.array(list(dict.fromkeys(rows[:EXPLAINED])))
-        if len(causes) > 1:
-            change = posterior.reasons(explained)
-            change[is_outlier[explained, None] != (change < 0)] = 0
-            of_explained = reasons(scene, present, change, explained)
-            for row, because in zip(explained.tolist(), of_explained, strict=True):
-                causes[row] = because
-        flagged = explained[is_outlier[explained]]
-        if len(flagged):
-            of_flagged = _companions(artifact, present.classes, present.classes[flagged])
-            for row, companion_labels in zip(flagged.tolist(), of_flagged, strict=True):
-                companions[row] = companion_labels
-    classes, flags = present.classes.tolist(), is_outlier.tolist()
-    probabilities, values = significant(p), significant(log_odds)
+    rows, flags, n = present.row[order].tolist(), is_outlier.tolist(), len(log_odds)
+    causes: list[list[Fields]] = [[] for _ in flags]
+    explained = set(rows[:EXPLAINED])
+    if details and n > 1:
+        lowered, raised = np.minimum(change, 0), np.maximum(change, 0)
+        change = np.where(is_outlier[:, None], lowered, raised)
+        causes = reasons(scene, present, change, np.arange(n))
+    usual: list[list[str]] = [[] for _ in flags]
     judged: list[Fields] = []
+    classes, probabilities, values = present.classes.tolist(), significant(p), significant(log_odds)
+    for row in explained if details else ():
+        if flags[row]:
+            usual[row] = _companions(artifact, present.classes, classes[row])
     for number, row in zip(order.tolist(), rows, strict=True):
         fields: Fields = {
             "object": scene.objects[number].id,
@@ -172,7 +158,8 @@ def _judged(
             "is_outlier": flags[row],
         }
         if details:
-            fields["because"], fields["usually_with"] = causes[row], companions[row]
+            fields["because"] = causes[row] if row in explained else []
+            fields["usually_with"] = usual[row]
         judged.append(fields)
     return judged
 
@@ -193,7 +180,7 @@ def intruders(artifact: Artifact, scene: Scene) -> NDArray[np.int64]:
     classes = posterior.present.classes
     if entry is None or lines is None:
         return classes[:0]
-    _, p = _intruder_odds(artifact, entry, posterior, posterior.log_odds_given_rest())
+    _, p = _intruder_odds(artifact, entry, posterior, posterior.given_rest()[0])
     return classes[p >= lines.medium.threshold(posterior.listed)]
 
 
@@ -215,26 +202,15 @@ def _intruder_odds(
     return logits, p
 
 
-def _companions(
-    artifact: Artifact, present: NDArray[np.int64], flagged: NDArray[np.int64]
-) -> list[list[str]]:
-    """Return the labels of the companions of each outlier, best first; see the module.
+def _companions(artifact: Artifact, present: NDArray[np.int64], flagged: int) -> list[str]:
+    """Return the labels of the companions of an outlier, best first; see the module.
 
     The classes in ``present``, those of the scene, and structural classes are never companions.
     """
     usable = ~artifact.vocabulary.structure
     usable[present] = False
-    if not usable.any():
-        return [[] for _ in flagged]
-    # The rows of the arrays are outliers i, and the columns are classes j.
-    weights, labels = artifact.weights, artifact.vocabulary.labels
-    gain_with_outlier = artifact.objects.gains(weights["c1"] + weights["W"][flagged])
-    if artifact.spec.coupled:
-        gain_with_outlier += weights["L"][flagged]
-    increase = np.where(usable, gain_with_outlier - artifact.empty_gain, 0)
-    least = np.maximum(_LEAST_SHARE * increase.max(1, keepdims=True), 1e-6)
-    score = np.where(increase < least, 0, increase * sigmoid(weights["b"] + gain_with_outlier))
-    return [[labels[index] for index in best(row, row > 0, COMPANIONS).tolist()] for row in score]
+    chosen = companions(*artifact.objects.increases(flagged), usable, _LEAST_SHARE, COMPANIONS)
+    return [artifact.vocabulary.labels[index] for index in chosen.tolist()]
 
 
 def _unjudged(artifact: Artifact, scene: Scene) -> list[SceneWarning]:

@@ -111,12 +111,6 @@ class Artifact:
         rarest, alpha = np.nanmin(popularity), calibration.popularity_weight
         return np.where(np.isnan(popularity), alone - (1 - alpha) * rarest, alpha * popularity)
 
-    @cached_property
-    def empty_gain(self) -> NDArray[np.float32]:
-        """(V,) contribution of the hidden units h1 to each class's log-odds in an empty scene."""
-        gain: NDArray[np.float32] = self.objects.gains(self.weights["c1"][None])[0]
-        return gain
-
     def context_rows(self) -> NDArray[np.float32]:
         """Return the weights between h1 and each of the T triples of the weights, (T, H1)."""
         relation, subject, object_ = self.weights["triples"].astype(np.int64).T.copy()

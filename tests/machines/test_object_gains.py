@@ -134,7 +134,7 @@ def test_log_odds_equal_the_tensors(name, seed):
     found = case.scorer.absent(case.x, *scene, case.profile, 0.15, room)
     kappa = case.machine.kappa.numpy()
     close(found[absent], (case.log_odds() + kappa[0])[absent])
-    found = case.scorer.given_rest(case.x, case.shares, *scene, case.profile, room)
+    found, _ = case.scorer.given_rest(case.x, case.shares, *scene, case.profile, room)
     rest = [case.log_odds(k)[i] + kappa[-1, i] for k, i in enumerate(case.classes)]
     close(found, rest)
     if case.room < 0:
@@ -148,12 +148,11 @@ def test_reasons_are_differences_of_log_odds(name, seed):
     """With class j minus without class j, recomputed; of class i itself, 0."""
     case = Case(name, seed)
     scene = case.x, case.shares, case.classes, case.presence, case.profile
-    rows = np.arange(len(case.classes))[::-2]
-    found, expected = case.scorer.reasons(*scene, rows), np.zeros((len(rows), len(case.classes)))
-    for row, k in enumerate(rows):
+    _, found = case.scorer.given_rest(*scene, explained=True)
+    expected = np.zeros_like(found)
+    for k, i in enumerate(case.classes):
         for j in set(range(len(case.classes))) - {k}:
-            i = case.classes[k]
-            expected[row, j] = case.log_odds(k)[i] - case.log_odds(k, j)[i]
+            expected[k, j] = case.log_odds(k)[i] - case.log_odds(k, j)[i]
     close(found, expected)
     candidates = np.setdiff1d(np.arange(V), case.classes)[::3]
     found = case.scorer.reasons_for_absent(*scene, candidates)
@@ -175,7 +174,7 @@ def test_reasons_of_two_layers_add_the_effects_through_the_second(scale):
         case.room = -1
         rows = np.arange(len(case.classes))
         scene = context.x, context.shares, case.classes, case.presence, case.profile
-        found = ObjectScorer(weights).reasons(*scene, rows)
+        _, found = ObjectScorer(weights).given_rest(*scene, explained=True)
         for k in rows:
             for j in set(rows) - {k}:
                 i = case.classes[k]

@@ -266,7 +266,7 @@ def score_lists(artifact: Artifact, parts: Parts, intruders: Tensor | None = Non
         v = v | is_intruder
     log_odds = np.zeros(v.shape)
     for row, values in zip(v, log_odds, strict=True):
-        values[row] = posterior_of(artifact, torch.from_numpy(row)).log_odds_given_rest()
+        values[row] = posterior_of(artifact, torch.from_numpy(row)).given_rest()[0]
     row, classes = at = np.nonzero(v & judged_classes(artifact))
     return ListScores(row, log_odds[at], popularity[classes], is_intruder[at], v.sum(1))
 
