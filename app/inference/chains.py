@@ -132,12 +132,10 @@ class SceneChains:
             b=weights["b"],
             c2=weights["c2"],
         )
-        # (N, H1) means of h1 given the stored scenes, and (N, V) effect of the couplings.
+        # (N, H1) means of h1 given the stored scenes.
         self.mean: Floats = np.zeros((0, spec.H1), np.float32)
-        self._stored: Floats = np.zeros((0, spec.V), np.float32)
         if spec.N:
-            self._stored = weights.scenes
-            x, _ = weights.with_second_layer(weights["c1"] + self._stored @ W)
+            x, _ = weights.with_second_layer(weights["c1"] + weights.scenes @ W)
             self.mean = weights.state_means(x).astype(np.float32)
 
     def under(self, conditions: Conditions, temperature: float = 1.0) -> ConditionedChains:
@@ -187,7 +185,7 @@ class SceneChains:
             is_other = stored_rooms != room
             if is_other.all():
                 fit: Floats = self.mean @ machine["Q"][room]
-                return fit + self._stored @ machine.room_couplings(room)
+                return fit + machine.scenes @ machine.room_couplings(room)
         else:
             is_other = np.zeros(len(self.mean), np.bool_)
         return np.where(is_other, -OTHER_ROOM, np.float32(0))
@@ -197,7 +195,7 @@ class SceneChains:
         machine = self.machine
         logits = machine["b"][classes] + self.mean @ machine["W"][classes].T
         if machine.spec.coupled:
-            logits += self._stored @ machine["L"][:, classes]
+            logits += machine.scenes @ machine["L"][:, classes]
         log_p: Floats = -softplus(-logits).sum(1)
         return log_p
 

@@ -1568,8 +1568,8 @@ def likeliest_relations(
 
 
 @compiled
-def likeliest_places(slopes, forward, backward, log_counts, count, first):
-    """Return the k likeliest places of each of N candidate classes, likeliest first.
+def likeliest_places(slopes, forward, backward, log_counts, count, first, share, least):
+    """Return the likeliest places of each of N candidate classes, likeliest first.
 
     A place is a relation a to an anchor j, which is a class of the scene. The number of the place
     is (d A + a) m + j. The candidate is the relation's subject if d = 0, and the anchor is the
@@ -1582,13 +1582,15 @@ def likeliest_places(slopes, forward, backward, log_counts, count, first):
         backward: (N, A, m) log-odds of relations with an anchor as subject and a candidate as
             object.
         log_counts: (m,) log of the number of instances of each anchor's class.
-        count: maximum of k.
-        first: number of a place that comes first even if other places are likelier. -1 means that
-            the order depends only on the probabilities.
+        count: maximum number of places of a candidate.
+        first: number of a place that comes first even if other places are likelier, or if it is
+            unlikely. -1 means that the order depends only on the probabilities.
+        share, least: minimum probability of a place, as a share of the candidate's first place, and
+            as a number.
 
     Returns:
-        Five arrays (N k,) with the places of candidate 0, then of candidate 1 and so on: index of
-        the candidate, relation, True if the candidate is the subject, index of the anchor, and
+        Five arrays (k,) with the places of candidate 0, then of candidate 1 and so on: index of the
+        candidate, relation, True if the candidate is the subject, index of the anchor, and
         probability.
     """
     N, A, m = forward.shape
@@ -1596,7 +1598,7 @@ def likeliest_places(slopes, forward, backward, log_counts, count, first):
     to = relation_probability(slopes, forward, log_counts)
     back = relation_probability(slopes, backward, log_counts)
     p, usable = np.empty(2 * size, forward.dtype), np.ones(2 * size, np.bool_)
-    kept, begin = min(count, 2 * size), 0
+    kept, begin, at = min(count, 2 * size), 0, 0
     if first >= 0:
         usable[first], begin = False, 1
     candidate, relation = np.empty(N * kept, np.int64), np.empty(N * kept, np.int64)
@@ -1607,11 +1609,14 @@ def likeliest_places(slopes, forward, backward, log_counts, count, first):
         for e in range(size):
             p[e], p[size + e] = exclusive(p_to[e], p_back[e])
         indices = best(p, usable, kept - begin)
+        enough = max(share * p[first if begin else indices[0]], least)
         for k in range(kept):
-            place, at = first if k < begin else indices[k - begin], c * kept + k
-            candidate[at], relation[at], anchor[at] = c, place // m % A, place % m
-            outgoing[at], probabilities[at] = place < size, p[place]
-    return candidate, relation, outgoing, anchor, probabilities
+            place = first if k < begin else indices[k - begin]
+            if k < begin or p[place] >= enough:
+                candidate[at], relation[at], anchor[at] = c, place // m % A, place % m
+                outgoing[at], probabilities[at] = place < size, p[place]
+                at += 1
+    return candidate[:at], relation[:at], outgoing[:at], anchor[:at], probabilities[:at]
 
 
 @compiled

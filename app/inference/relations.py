@@ -454,7 +454,8 @@ def _directions(weights: Weights) -> tuple[Floats, Floats]:
     vectors = vectors[:, :, -kept:]
     Y = np.linalg.solve(root.T, vectors).transpose(0, 2, 1)
     F = vectors.transpose(0, 2, 1) @ root.T @ rows
-    return F.astype(np.float32), np.roll(Y, -1, axis=2).astype(np.float32)
+    Y = np.ascontiguousarray(np.roll(Y, -1, axis=2), np.float32)
+    return F.astype(np.float32), Y
 
 
 def _mean_covariance(means: NDArray[np.float64], states: int) -> NDArray[np.float64]:

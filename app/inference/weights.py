@@ -197,7 +197,8 @@ class Weights:
         bias: NDArray[Any] = self["b"] + self.room_couplings(room)
         of_room = self["e"] if self.spec.C else np.zeros(1)
         if self.spec.profiles and (len(classes) or profile is not None):
-            p = self.source_weights(classes, np.ones((1, len(classes))), profile)[0]
+            present = np.ones((1, len(classes)), np.float32)
+            p = self.source_weights(classes, present, profile)[0]
             bias = bias + p.astype(bias.dtype) @ (self["a"] + self["u"][:-1])
             of_room = of_room + p @ self["y"] if self.spec.C else of_room
         else:

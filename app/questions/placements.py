@@ -140,12 +140,10 @@ def placements(
         forward[:, INSIDE][candidates_too_large] = NO_UNIT
         backward[:, INSIDE][things_too_large] = NO_UNIT
     slopes, log_counts = artifact.relation_slopes.placement, present.log_counts[anchors]
-    *places, p = likeliest_places(slopes, forward, backward, log_counts, PLACES, first)
-    of_candidate = p.reshape(len(candidates), -1)
-    is_likely = of_candidate >= np.maximum(LEAST_SHARE * of_candidate[:, :1], LEAST_LIKELY)
-    is_likely[:, 0] |= first >= 0
-    likely = is_likely.reshape(-1).nonzero()[0]
-    rows, relations, outgoing, columns = (values[likely] for values in places)
+    limits = PLACES, first, LEAST_SHARE, LEAST_LIKELY
+    rows, relations, outgoing, columns, p = likeliest_places(
+        slopes, forward, backward, log_counts, *limits
+    )
     offsets: Iterator[Fields | None] = repeat(None)
     if artifact.offsets is not None and any(thing.position is not None for thing in things):
         missing, anchor = candidates[rows], classes[columns]
@@ -155,7 +153,7 @@ def placements(
     entries: list[list[Fields]] = [[] for _ in candidates]
     arrays = rows.tolist(), relations.tolist(), outgoing.tolist(), columns.tolist()
     for row, relation, is_subject, column, probability, offset in zip(
-        *arrays, significant(p[likely]), offsets, strict=False
+        *arrays, significant(p), offsets, strict=False
     ):
         thing = things[column]
         name = (RELATIONS if is_subject else _SEEN_FROM_ANCHORS)[relation]
