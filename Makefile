@@ -35,7 +35,7 @@ define compile
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: checks help run ray test test-fast test-slow docs chaos soak image audit setup format bench lock clean
+.PHONY: checks help run ray test test-fast test-slow coverage docs chaos soak image audit setup format bench lock clean
 .DELETE_ON_ERROR:
 
 help:  ## show this help
@@ -66,6 +66,10 @@ checks: $(EVERYTHING)
 	$(BIN)/python -m mypy --no-error-summary; \
 	$(BIN)/lint-imports --no-logo; \
 	wait $$compiling
+
+coverage: $(EVERYTHING)  ## measure which lines the tests run, without the slow tests (build/coverage)
+	$(BIN)/python -m app.compile
+	$(PYTEST) -m "not slow" --cov --cov-report term --cov-report html $(ARGS)
 
 docs: $(EVERYTHING)  ## build the documentation as a site that works without internet (build/site)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
