@@ -434,25 +434,35 @@ def _source_effects(f, a, classes, presence, rows, targets, n):
     Returns:
         The effects, (N,), and the change of each effect due to each listed class, (N, n).
     """
-    # Part of each listed class in the logit of each source.
-    parts = np.empty((len(classes), len(f)), np.float32)
-    without_target = np.empty(len(f), np.float32)
-    without_both = np.empty(len(f), np.float32)  # without the target and the listed class j
-    logits = np.empty(len(f), np.float32)
-    for q in range(len(f)):
-        logits[q] = f[q]
-        for j in range(len(classes)):
+    Q = len(f)
+    # Part of each listed class in the logit of each source, and e^-part.
+    parts, without = np.empty((len(classes), Q), np.float32), np.empty((n, Q), np.float32)
+    logits, p = f.copy(), np.empty(Q, np.float32)
+    for j in range(len(classes)):
+        for q in range(Q):
             parts[j, q] = a[q, classes[j]] * presence[j]
             logits[q] += parts[j, q]
-    mean, change = np.empty(len(targets), np.float32), np.empty((len(targets), n), np.float32)
-    for i in range(len(targets)):
-        for q in range(len(f)):
-            without_target[q] = logits[q] - parts[rows[i], q] if len(rows) else logits[q]
-        mean[i] = _mean(without_target, a, targets[i])
+    for j in range(n):
+        for q in range(Q):
+            without[j, q] = exp(-parts[j, q])
+    mean, change = np.zeros(len(targets), np.float32), np.zeros((len(targets), n), np.float32)
+    for i in range(len(targets) if Q else 0):
+        top, total, weighted = np.float32(-np.inf), np.float32(0.0), np.float32(0.0)
+        for q in range(Q):
+            p[q] = logits[q] - parts[rows[i], q] if len(rows) else logits[q]
+            top = max(top, p[q])
+        for q in range(Q):
+            p[q] = exp(p[q] - top)
+            total += p[q]
+            weighted += p[q] * a[q, targets[i]]
+        mean[i] = weighted / total
         for j in range(n):
-            for q in range(len(f)):
-                without_both[q] = without_target[q] - parts[j, q]
-            change[i, j] = mean[i] - _mean(without_both, a, targets[i])
+            total, weighted = np.float32(0.0), np.float32(0.0)
+            for q in range(Q):
+                weight = p[q] * without[j, q]
+                total += weight
+                weighted += weight * a[q, targets[i]]
+            change[i, j] = mean[i] - weighted / total
     return mean, change
 
 
