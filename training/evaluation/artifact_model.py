@@ -24,7 +24,7 @@ from training.evaluation.asking import (
     room_score,
     suspicion_score,
 )
-from training.evaluation.density_task import DensitySettings, independent_density, machine_density
+from training.evaluation.density_task import independent_density, machine_density
 from training.evaluation.generation_task import (
     held_out_halves,
     independent_sampler,
@@ -39,34 +39,28 @@ from training.machines.arrays import machine_of
 def artifact_model(
     artifact: Artifact,
     train: SceneTensors,
-    settings: DensitySettings = DensitySettings(),  # noqa: B008
     seed: int = 0,
     *,
-    calibrated: bool = True,
     profiles: Sequence[str] = (),
 ) -> Model:
-    """Return the answers of a trained model; only a `calibrated` model judges outliers.
-
-    Requests about rooms may name the `profiles`.
-    """
+    """Return the answers of a trained model. Requests about rooms may name the `profiles`."""
     machine = machine_of(artifact.weights)
-    completion = relation_score(artifact, given=True)
     sampler = machine_sampler(artifact)
-    density = cache(partial(machine_density, machine, train, settings, seed))
+    density = cache(partial(machine_density, machine, train, seed))
     return Model(
         missing=missing_score(artifact),
-        suspicion=suspicion_score(artifact) if calibrated else None,
-        flags=outlier_flags(artifact) if calibrated else None,
+        suspicion=suspicion_score(artifact),
+        flags=outlier_flags(artifact),
         at_place=placed_score(artifact),
         relations=relation_score(artifact, given=False),
-        completion=completion,
-        false_relations=false_relation_score(artifact) if calibrated else completion,
-        misplaced=misplaced_score(artifact) if calibrated else None,
+        completion=relation_score(artifact, given=True),
+        false_relations=false_relation_score(artifact),
+        misplaced=misplaced_score(artifact),
         rooms=room_score(artifact, profiles),
         generate=lambda _: sampler,
         density=lambda _: density(),
         parameters=machine.parameter_count,
-        artifact=artifact if calibrated else None,
+        artifact=artifact,
     )
 
 

@@ -273,7 +273,8 @@ def ask_misplaced(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answer
     ] or None
 
 
-LISTED = (2, 4, 8)  # listed classes in questions about missing classes
+# Numbers of listed classes in questions about missing classes, by name.
+LISTED = {f"missing, {listed} classes": listed for listed in (2, 4, 8)}
 
 QUESTIONS: dict[str, Ask] = {
     "relations": ask_relations,
@@ -284,31 +285,29 @@ QUESTIONS: dict[str, Ask] = {
     "misplaced": ask_misplaced,
 }
 
-NAMES = (*QUESTIONS, *(f"missing, {listed} classes" for listed in LISTED))
+NAMES = (*QUESTIONS, *LISTED)
 """Names of all questions in the metrics of the task."""
 
 
 def calibration_task(artifact: Artifact, setting: Setting) -> Outcome | None:
     """Measure the calibration of the answers to all questions, published and uncalibrated."""
     related = setting.some(related=True, share=3)
-    complete = setting.complete.some(share=3)
+    complete, complete_related = (
+        setting.complete.some(related=related, share=3) for related in (False, True)
+    )
     train, seed = setting.complete.train, setting.seed
     intruders = draw_intruder_choices(complete, setting.structure, train, seed)
-    collects: dict[str, tuple[SceneTensors, Callable[..., Items]]] = {
-        name: (related, partial(collect, ask=ask)) for name, ask in QUESTIONS.items()
-    }
-    at_place = setting.complete.some(related=True, share=3)
-    collects["missing at a place"] = at_place, partial(collect, ask=ask_placed)
-    ask = partial(ask_outliers, intruders=intruders)
-    collects["outliers"] = complete, partial(collect, ask=ask)
-    for n in LISTED:
-        ask_parts = partial(collect_missing, size=exactly(n))
-        collects[f"missing, {n} classes"] = setting.complete.some(), ask_parts
+    ask = QUESTIONS | {"outliers": partial(ask_outliers, intruders=intruders)}
+    scenes_of = {"outliers": complete, "missing at a place": complete_related}
     metrics: dict[str, Metric] = {}
     skipped = 0
-    for name, (scenes, ask_all) in collects.items():
+    for name in NAMES:
+        scenes = scenes_of.get(name, related) if name in QUESTIONS else setting.complete.some()
         for suffix, model in (("", artifact), (", uncalibrated", uncalibrated(artifact))):
-            answers = ask_all(model, scenes, seed=seed)
+            if name in QUESTIONS:
+                answers = collect(model, scenes, ask[name], seed)
+            else:
+                answers = collect_missing(model, scenes, exactly(LISTED[name]), seed)
             skipped += 0 if suffix else answers.skipped
             if not len(answers.scene):
                 break

@@ -87,18 +87,6 @@ DensityOf = Callable[[Setting], ObjectDensity | None]
 Parameters: TypeAlias = Mapping[str, float | int | str]
 
 
-@dataclass(frozen=True)
-class Trial:
-    """The result of one point of a hyperparameter grid.
-
-    `seconds` is the wall time of fit and evaluation, without work done for earlier grid points.
-    """
-
-    parameters: Parameters
-    validation: float
-    seconds: float
-
-
 @dataclass(frozen=True, eq=False)
 class Model:
     """A trained machine, a baseline or a reference, as the tasks of the evaluation ask it.
@@ -117,7 +105,6 @@ class Model:
         generate, density: sampler of T4 and density of objects for a setting.
         artifact: model for Calibration and for all questions to the service.
         parameters: number of trained weights, or None if this number is not meaningful.
-        trials: all settings that the tuning of a baseline tried, in order.
     """
 
     missing: ObjectScore | None = None
@@ -133,7 +120,6 @@ class Model:
     density: DensityOf | None = None
     artifact: Artifact | None = None
     parameters: int | None = None
-    trials: tuple[Trial, ...] = ()
 
     def __post_init__(self) -> None:
         if self.suspicion is None and self.missing is not None:

@@ -1,15 +1,13 @@
 """Reports: the metrics of a model or baseline on one data source, or pooled over data sources.
 
-A `SourceReport` holds the results of one model, training seed and data source. `measure` writes the
-report into a file after each task. A later run skips the tasks in the file. The report stores the
-values of each group of near-duplicate scenes. Reports can therefore be pooled over data sources,
-and compared by paired resampling, without the models.
+A `SourceReport` holds the results of one model, training seed and data source. It stores the values
+of each group of near-duplicate scenes. Reports can therefore be pooled over data sources, and
+compared by paired resampling, without the models.
 """
 
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from hashlib import sha256
@@ -24,7 +22,7 @@ from app.registry import Artifact
 from app.registry import Metric as CardMetric
 from training.datasets.batches import SceneTensors, subset
 from training.evaluation.artifact_model import artifact_model
-from training.evaluation.everyday_task import SOURCE, facts_digest
+from training.evaluation.everyday_task import SOURCE, facts_file
 from training.evaluation.metrics import Metric, Ratio, Resampled, Scored
 from training.evaluation.model import Model
 from training.evaluation.setting import Outcome, Setting
@@ -46,34 +44,27 @@ class SourceReport:
     Attributes:
         source: name of the data source, or "pooled".
         scenes: digest of the questions, see `digest`.
-        outcomes, seconds: metrics and wall time of each task, by task name. The outcome is None if
-            the model does not support the task.
+        outcomes: metrics of each task, by task name; None if the model does not support the task.
     """
 
     source: str
     scenes: str
     outcomes: dict[str, Outcome | None] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return a JSON-serialisable dictionary."""
-        return {
-            "source": self.source,
-            "scenes": self.scenes,
-            "tasks": {
-                task: {
-                    "seconds": self.seconds.get(task, 0.0),
-                    "outcome": outcome
-                    and vars(outcome)
-                    | {"metrics": {k: metric_to_dict(m) for k, m in outcome.metrics.items()}},
-                }
-                for task, outcome in self.outcomes.items()
-            },
+    def write(self, path: Path) -> None:
+        """Write the report into a JSON file."""
+        tasks = {
+            task: outcome
+            and vars(outcome)
+            | {"metrics": {name: metric_to_dict(m) for name, m in outcome.metrics.items()}}
+            for task, outcome in self.outcomes.items()
         }
+        values = {"source": self.source, "scenes": self.scenes, "tasks": tasks}
+        write_whole(path, json.dumps(values, allow_nan=False))
 
     @classmethod
     def read(cls, path: Path, setting: Setting | None = None) -> SourceReport:
-        """Read a report that `measure` wrote.
+        """Read a report from a file.
 
         Raises:
             ValueError: the report does not belong to `setting`.
@@ -85,11 +76,10 @@ class SourceReport:
                 "folder, or delete it"
             )
         report = cls(values["source"], values["scenes"])
-        for task, entry in values["tasks"].items():
-            report.seconds[task] = float(entry["seconds"])
+        for task, outcome in values["tasks"].items():
             report.outcomes[task] = None
-            if outcome := entry["outcome"]:
-                metrics = {k: metric_from_dict(m) for k, m in outcome["metrics"].items()}
+            if outcome:
+                metrics = {name: metric_from_dict(m) for name, m in outcome["metrics"].items()}
                 report.outcomes[task] = Outcome(**outcome | {"metrics": metrics})
         return report
 
@@ -126,8 +116,9 @@ def settings_by_source(
 def digest(setting: Setting) -> str:
     """Return the sha256 of the questions: scene ids, limit, seed and everyday facts."""
     names = [f"{scene.source} {scene.scene_id}" for scene in setting.scenes.scenes]
-    facts = [] if setting.everyday is None else [f"facts {facts_digest(setting.everyday)}"]
-    text = "\n".join([*names, f"limit {setting.limit}", f"seed {setting.seed}", *facts])
+    path = None if setting.everyday is None else facts_file(setting.everyday)
+    facts = "" if path is None else path.read_text(encoding="utf-8")
+    text = "\n".join([*names, f"limit {setting.limit}", f"seed {setting.seed}", facts])
     return sha256(text.encode()).hexdigest()
 
 
@@ -137,32 +128,13 @@ def measure(
     source: str,
     *,
     tasks: Iterable[str] = tuple(TASKS),
-    path: Path | None = None,
     progress: Progress = silent,
 ) -> SourceReport:
-    """Measure tasks. With `path`, skip the tasks in this file, and write it after every task.
-
-    Args:
-        tasks: names of the tasks, which are keys of `EVERY_TASK`.
-
-    Raises:
-        ValueError: a task is unknown, or the file belongs to other scenes or questions.
-    """
-    names = list(tasks)
-    if unknown := sorted(set(names) - set(EVERY_TASK)):
-        raise ValueError(f"unknown tasks {unknown}: choose from {list(EVERY_TASK)}")
+    """Measure tasks, which are keys of `EVERY_TASK`."""
     report = SourceReport(source, digest(setting))
-    if path is not None and path.exists():
-        report = SourceReport.read(path, setting)
-    for task in names:
-        if task in report.outcomes:
-            continue
+    for task in tasks:
         progress(f"{source}: {task}")
-        began = time.perf_counter()
         report.outcomes[task] = EVERY_TASK[task](model, setting)
-        report.seconds[task] = time.perf_counter() - began
-        if path is not None:
-            write_whole(path, json.dumps(report.to_dict(), allow_nan=False))
     return report
 
 
@@ -178,7 +150,6 @@ def pooled(reports: Sequence[SourceReport], source: str = "pooled") -> SourceRep
             if (metric := pool([part.metrics[name] for part in parts if name in part.metrics]))
         }
         counts = sum(part.scenes for part in parts), sum(part.skipped for part in parts)
-        joined.seconds[task] = sum(report.seconds.get(task, 0.0) for report in reports)
         joined.outcomes[task] = Outcome(metrics, *counts) if metrics else None
     return joined
 

@@ -21,7 +21,7 @@ from app.inference.variants import VARIANTS
 from training.datasets.batches import TrainingData, seen_triples, subset
 from training.evaluation.artifact_model import relation_score as artifact_relation_score
 from training.evaluation.parts import validation_score
-from training.evaluation.relation_tasks import rank_relations
+from training.evaluation.relation_tasks import r_precision, score_scenes
 from training.fit.checkpoint import (
     CurvePoint,
     TrainingResult,
@@ -261,5 +261,6 @@ def relation_score(machine: BoltzmannMachine, data: TrainingData) -> float:
         return math.nan
     chosen = annotated[:: max(1, len(annotated) // _SCORED)]
     score = artifact_relation_score(draft_artifact(machine, data.classes), given=False)
-    ranking = rank_relations(subset(data.validation, torch.tensor(chosen)), data.structure, score)
-    return float(ranking.hits.sum() / max(ranking.annotated.sum(), 1))
+    scenes = subset(data.validation, torch.tensor(chosen))
+    precision = r_precision(score_scenes(scenes, data.structure, score), len(scenes))
+    return 0.0 if precision is None else precision.value

@@ -2,11 +2,10 @@
 
 An entry is one model of an experiment: a machine, a baseline or a reference.
 
-<folder>/<name>/seed-<n>/row.json         settings, training scenes (as digest), number of weights
-                        trials.jsonl      all settings that the tuning of a baseline tried
-                        run/              training run of a machine, and its calibration
-                        <source>.json     report on one data source
-                        pooled.json       report on all data sources together (tasks of `WHOLE_SET`)
+<folder>/<name>/seed-<n>/row.json       settings and training scenes (as digest), number of weights
+                        run/            training run of a machine, and its calibration
+                        <source>.json   report on one data source
+                        pooled.json     report on all data sources together (tasks of `WHOLE_SET`)
 
 Several processes fill these files in parallel. One process with one thread measures each entry.
 """
@@ -20,15 +19,13 @@ import pickle  # nosec B403
 import re
 import shutil
 import signal
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
-from multiprocessing.queues import SimpleQueue
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import torch
 import typer
@@ -38,8 +35,15 @@ from rich.progress import Progress as Bar
 
 from training.datasets import DatasetError
 from training.datasets.batches import TrainingData
-from training.evaluation.model import Model
-from training.evaluation.report import SourceReport, digest, measure, pooled, write_whole
+from training.evaluation.report import (
+    Progress,
+    SourceReport,
+    digest,
+    measure,
+    pooled,
+    silent,
+    write_whole,
+)
 from training.evaluation.results import Reports
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import ONCE, WHOLE_SET
@@ -47,16 +51,8 @@ from training.fit.checkpoint import RunError
 from training.fit.configuration import ConfigError
 from training.research.entries import Entry
 
-# A progress function receives the row, the source, and a note on the current step.
-Progress: TypeAlias = Callable[[str, str, str], None]
-
-# Seconds between two checks for messages of the processes.
-_TICK = 0.2
 # Linear algebra libraries read these variables when a process loads them.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
-# The last note on a row and source tells whether the report was measured now or read from a file.
-DONE, KNOWN = "done", "known"
 
 POOLED = "pooled"
 """Name of the union of all data sources."""
@@ -67,10 +63,9 @@ class BenchmarkError(RuntimeError):
 
 
 @contextmanager
-def resumable(console: Console, *others: type[Exception]) -> Iterator[None]:
-    """Print expected errors, and those of the types `others`; after Ctrl-C, how to continue."""
-    ours = (ConfigError, DatasetError, BenchmarkError, RunError, BrokenProcessPool)
-    expected: tuple[type[Exception], ...] = (*ours, *others)
+def resumable(console: Console) -> Iterator[None]:
+    """Print expected errors; after Ctrl-C, print how to continue."""
+    expected = (ConfigError, DatasetError, BenchmarkError, RunError, BrokenProcessPool, ValueError)
     try:
         yield
     except expected as error:
@@ -109,25 +104,20 @@ class Plan:
     def claim(self, entry: Entry) -> None:
         """Reserve the folder of an entry. Another entry or other scenes are a BenchmarkError."""
         path = self.folder_of(entry) / "row.json"
-        row = {"name": entry.name, "seed": entry.seed, "identity": entry.identity}
-        row["material"] = self.data.digest
+        row = {"identity": entry.identity, "material": self.data.digest}
         if not path.exists():
             write_whole(path, json.dumps(row))
-        stored, reason = _read_row(path), ""
-        if stored["identity"] != entry.identity:
-            reason = f"{path.parent} holds reports of another configuration of {entry.name}"
-        elif stored.get("material") != self.data.digest:
-            reason = (
-                f"the reports in {path.parent} belong to other training scenes, or do not record "
-                "their scenes (files, sources, limit, split and vocabulary must be equal)"
+        if row.items() - _read_row(path).items():
+            raise BenchmarkError(
+                f"{path.parent} holds reports of another configuration of {entry.name}, or of "
+                "other training scenes (files, sources, limit, split and vocabulary must be "
+                "equal): use --fresh or another folder"
             )
-        if reason:
-            raise BenchmarkError(f"{reason}: use --fresh or another folder")
 
     def parameters(self, entries: Sequence[Entry]) -> dict[str, int]:
         """Return the number of trained weights by name, for entries that record this number."""
-        rows = [_read_row(self.folder_of(entry) / "row.json") for entry in entries]
-        return {row["name"]: row["parameters"] for row in rows if row.get("parameters") is not None}
+        rows = {entry.name: _read_row(self.folder_of(entry) / "row.json") for entry in entries}
+        return {name: row["parameters"] for name, row in rows.items() if row.get("parameters")}
 
     def finished(self, entry: Entry) -> dict[str, SourceReport]:
         """Return the finished reports of an entry, by data source.
@@ -142,10 +132,7 @@ class Plan:
             if not self.tasks_on(source):
                 reports[source] = SourceReport(source, digest(setting))
             elif path.exists():
-                try:
-                    report = SourceReport.read(path, setting)
-                except ValueError as error:
-                    raise BenchmarkError(str(error)) from error
+                report = SourceReport.read(path, setting)
                 if set(self.tasks_on(source)) <= set(report.outcomes):
                     reports[source] = report
         return reports
@@ -155,107 +142,84 @@ class Plan:
 
         The model is trained only if a report is missing.
         """
-        reports, folder = self.finished(entry), self.folder_of(entry)
-        model: Model | None = None
-        for source, setting in self.settings.items():
-            if source in reports:
-                progress(entry.name, source, KNOWN)
-                continue
-            say = partial(progress, entry.name, source)
-            if model is None:
-                say("training")
-                model = entry.make(self.data, folder, say)
-                if model.parameters is not None:
-                    row = _read_row(folder / "row.json") | {"parameters": model.parameters}
-                    write_whole(folder / "row.json", json.dumps(row))
-            path = folder / f"{source}.json"
-            measure(model, setting, source, tasks=self.tasks_on(source), path=path, progress=say)
-            say(DONE)
+        folder, finished = self.folder_of(entry), self.finished(entry)
+        missing = [source for source in self.settings if source not in finished]
+        if not missing:
+            return
+        model = entry.make(self.data, folder, progress)
+        row = _read_row(folder / "row.json") | {"parameters": model.parameters}
+        write_whole(folder / "row.json", json.dumps(row))
+        for source in missing:
+            tasks = self.tasks_on(source)
+            report = measure(model, self.settings[source], source, tasks=tasks, progress=progress)
+            report.write(folder / f"{source}.json")
 
     def report(self, entry: Entry) -> dict[str, SourceReport]:
         """Return the reports of an entry, by data source. The pooled report has all tasks."""
         reports = self.finished(entry)
-        if POOLED in self.settings:
-            merged = pooled([reports[name] for name in self.settings if name != POOLED], POOLED)
-            merged.outcomes |= reports[POOLED].outcomes
-            reports[POOLED] = merged
+        merged = pooled([reports[name] for name in self.settings if name != POOLED], POOLED)
+        merged.outcomes |= reports[POOLED].outcomes
+        reports[POOLED] = merged
         return {source: reports[source] for source in self.settings}
 
 
 def measure_entries(
-    plan: Plan,
-    entries: Sequence[Entry],
-    progress: Progress,
-    *,
-    workers: int = 1,
-    fresh: bool = False,
-    failures: tuple[type[Exception], ...] = (),
+    plan: Plan, entries: Sequence[Entry], console: Console, *, workers: int = 1, fresh: bool = False
 ) -> tuple[Reports, dict[str, str]]:
     """Measure all entries, and skip finished reports. KeyboardInterrupt stops the processes.
 
     Args:
         workers: number of processes with one thread each. 1 measures in this process.
         fresh: delete earlier reports of these entries.
-        failures: exception types that end only the entry in which they occur.
 
     Returns:
-        The reports by (name, seed), and the error messages of failed entries by name.
+        The reports by (name, seed), and the error messages of diverged entries by name.
     """
     if fresh:
         for entry in entries:
             shutil.rmtree(plan.folder_of(entry), ignore_errors=True)
     missing = [entry for entry in entries if len(plan.finished(entry)) < len(plan.settings)]
-    for entry in entries:
-        if entry not in missing:
-            plan.measure(entry, progress)
-    if missing and workers > 1:
-        failed = _in_processes(plan, failures, missing, progress, min(workers, len(missing)))
-    else:
-        failed = [_measure(plan, failures, entry, progress) for entry in missing]
-    reasons = {
-        entry.name: f"seed {entry.seed}: {error}"
-        for entry, error in zip(missing, failed, strict=True)
-        if error
-    }
-    measured = [entry for entry in entries if entry.name not in reasons]
-    return {(entry.name, entry.seed): plan.report(entry) for entry in measured}, reasons
+    columns = BarColumn(), "{task.completed}/{task.total}", TimeElapsedColumn()
+    failures = {}
+    with Bar(*columns, TextColumn("{task.description}"), console=console) as bar:
+        task = bar.add_task("", total=len(entries), completed=len(entries) - len(missing))
+
+        def say(note: str) -> None:
+            bar.update(task, description=note)
+
+        if workers > 1:
+            outcomes = _in_processes(plan, missing, workers)
+        else:
+            outcomes = ((entry, _measure(plan, entry, say)) for entry in missing)
+        for entry, error in outcomes:
+            bar.update(task, advance=1, description=entry.name)
+            if error:
+                failures[entry.name] = f"seed {entry.seed}: {error}"
+    measured = [entry for entry in entries if entry.name not in failures]
+    return {(entry.name, entry.seed): plan.report(entry) for entry in measured}, failures
 
 
-def _measure(
-    plan: Plan, failures: tuple[type[Exception], ...], entry: Entry, progress: Progress
-) -> Exception | None:
-    """Measure an entry; return its error if it failed."""
+def _measure(plan: Plan, entry: Entry, progress: Progress) -> str:
+    """Measure an entry. If its training diverges, return the message of the error."""
     try:
-        plan.measure(entry, progress)
-    except failures as error:
-        return error
-    return None
+        plan.measure(entry, lambda note: progress(f"{entry.name}, {note}"))
+    except FloatingPointError as error:
+        return str(error)
+    return ""
 
 
 def _in_processes(
-    plan: Plan,
-    failures: tuple[type[Exception], ...],
-    entries: Sequence[Entry],
-    progress: Progress,
-    workers: int,
-) -> list[Exception | None]:
-    """Measure entries in processes; return the error of each entry that failed, else None."""
+    plan: Plan, entries: Sequence[Entry], workers: int
+) -> Iterator[tuple[Entry, str]]:
+    """Measure entries in processes, and yield them as they end, with the results of `_measure`."""
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
     context = multiprocessing.get_context("spawn")
-    # SimpleQueue has no sending thread, so the queue has all messages of a finished entry.
-    messages: SimpleQueue[tuple[str, str, str]] = context.SimpleQueue()
     # Pickling avoids the shared memory of torch, which is small in containers.
-    begin = (pickle.dumps(partial(_measure, plan, failures)), messages)
-    with _one_thread(), ProcessPoolExecutor(workers, context, _start_worker, begin) as pool:
+    with ProcessPoolExecutor(workers, context, _start_worker, (pickle.dumps(plan),)) as pool:
         try:
-            futures = [pool.submit(_measure_here, entry) for entry in entries]
-            while True:
-                done, waiting = wait(futures, _TICK, FIRST_EXCEPTION)
-                while not messages.empty():
-                    progress(*messages.get())
-                for future in done:
-                    future.result()  # raises an unexpected error at once
-                if not waiting:
-                    return [future.result() for future in futures]
+            futures = {pool.submit(_measure_here, entry): entry for entry in entries}
+            for future in as_completed(futures):
+                yield futures[future], future.result()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             for process in multiprocessing.active_children():
@@ -263,58 +227,20 @@ def _in_processes(
             raise
 
 
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let processes that start here use one thread each."""
-    earlier = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in earlier.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+_plan: Plan
 
 
-_work: Callable[[Entry, Progress], Exception | None]
-_progress: Progress
-
-
-def _start_worker(material: bytes, messages: SimpleQueue[tuple[str, str, str]]) -> None:
-    global _work, _progress  # set once in each process
+def _start_worker(plan: bytes) -> None:
+    global _plan  # set once in each process
     torch.set_num_threads(1)
     # Ctrl-C reaches every process of the terminal; only the main process handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # The main process wrote these bytes and passed them on in memory.
-    _work = pickle.loads(material)  # noqa: S301  # nosec B301
-    _progress = lambda *message: messages.put(message)  # noqa: E731
+    _plan = pickle.loads(plan)  # noqa: S301  # nosec B301
 
 
-def _measure_here(entry: Entry) -> Exception | None:
-    return _work(entry, _progress)
-
-
-@contextmanager
-def shown(console: Console, title: str, total: int) -> Iterator[Progress]:
-    """Show a progress bar for finished pairs (row, data source). `total` is the number of pairs."""
-    columns = (
-        "[progress.description]{task.description}",
-        BarColumn(),
-        "{task.completed}/{task.total}",
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[note]}"),
-    )
-    with Bar(*columns, console=console) as bar:
-        task = bar.add_task(title, total=total, note="")
-
-        def show(row: str, source: str, note: str) -> None:
-            bar.update(task, note=f"{row}, {source}: {note}")
-            if note in (DONE, KNOWN):
-                bar.advance(task)
-
-        yield show
+def _measure_here(entry: Entry) -> str:
+    return _measure(_plan, entry, silent)
 
 
 def _read_row(path: Path) -> dict[str, Any]:

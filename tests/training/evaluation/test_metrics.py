@@ -8,16 +8,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from training.evaluation.item_statistics import BINS, STATISTICS
 from training.evaluation.metrics import (
+    BINS,
+    STATISTICS,
     Figure,
     Ratio,
     Resampled,
     Scored,
-    mean_over_seeds,
     paired_difference,
 )
 from training.evaluation.report import metric_from_dict, metric_to_dict, pool
+from training.evaluation.results import mean_over_seeds
 
 
 def ints(*values):
@@ -92,8 +93,6 @@ def test_metrics_survive_json(metric):
 def test_unknown_metrics_are_refused():
     with pytest.raises(ValueError, match="kind must be"):
         metric_from_dict({"kind": "guess"})
-    with pytest.raises(ValueError, match="unknown statistic"):
-        replace(SCORED, statistic="guess")
     with pytest.raises(ValueError, match="no scene"):
         Ratio(np.zeros(2), np.zeros(2))
 
@@ -182,19 +181,6 @@ def test_copies_of_a_scene_in_a_group_narrow_no_interval():
     assert naive.high - naive.low < 0.6 * (one.high - one.low)
 
 
-def test_intervals_over_groups_hold_the_truth_about_as_often_as_they_say():
-    """Groups of unequal size whose scenes are alike; the true difference is 0."""
-    rng, held, trials = np.random.default_rng(1), 0, 200
-    for _ in range(trials):
-        sizes = rng.integers(1, 6, 30)
-        groups = np.repeat(np.arange(30), sizes)
-        effect = np.repeat(rng.normal(0, 1, 30), sizes)
-        a = mean_of(effect + rng.normal(0, 0.2, len(groups)))
-        figure = a.by(groups).figure()
-        held += figure.low <= 0 <= figure.high
-    assert 0.87 * trials <= held <= 0.99 * trials
-
-
 @pytest.mark.parametrize("groups", [6, 20])
 def test_intervals_over_few_groups_hold_the_truth_in_95_percent(groups):
     """1000 samples of N(0, 1) x groups: 0 is within the interval 919 to 976 times.
@@ -225,7 +211,3 @@ def test_a_mean_over_seeds_is_resampled_scene_by_scene():
     np.testing.assert_allclose(mean.draws, together.draws)
     difference = paired_difference(mean, together)
     assert (difference.low, difference.high) == pytest.approx((0.0, 0.0))
-    with pytest.raises(ValueError, match="same groups"):
-        mean_over_seeds([mean_of([1.0]), mean_of([1.0, 0.0])])
-    with pytest.raises(ValueError, match="at least one"):
-        mean_over_seeds([])

@@ -1,4 +1,4 @@
-"""T2, T2-at and the effect of structure by hand, and that nothing of a hidden object can leak."""
+"""T2 and T2-at by hand, and that nothing of a hidden object can leak."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from app.registry import PlaceFit
 from app.scene import CANONICAL, OPPOSITES, Scene, SceneObject
 from tests.questions.answers import missing as ask_missing
 from tests.questions.artifacts import LARGER, larger_artifact
-from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, room_model, rooms
+from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
 from tests.training.evaluation.scenes import (
     NO_STRUCTURE,
     WIDE,
@@ -19,7 +19,6 @@ from tests.training.evaluation.scenes import (
     scene,
     tensors,
 )
-from training.evaluation import missing_tasks
 from training.evaluation.artifact_model import placed_score
 from training.evaluation.asking import LeakError, missing_probabilities, missing_score, of_classes
 from training.evaluation.missing_tasks import (
@@ -28,10 +27,9 @@ from training.evaluation.missing_tasks import (
     missing_task,
     rank_missing,
     removed_places,
-    structure_task,
 )
 from training.evaluation.model import Places
-from training.evaluation.parts import all_but_one, draw_parts, one_quarter, up_to_longest
+from training.evaluation.parts import all_but_one, draw_parts, one_quarter
 from training.evaluation.setting import Setting
 
 DATA = tensors(random_scenes(20), WIDE)
@@ -115,24 +113,6 @@ def test_the_score_is_the_ranking_of_the_service():
         assert torch.equal(usable, (row == 0) & ~STRUCTURE & ~is_kind)
         assert torch.allclose(own[usable].exp(), p[usable])
     assert kinds
-
-
-def test_the_change_by_structure_by_hand(monkeypatch):
-    """The first ten probabilities of one part, with and without another class as structure."""
-    setting = Setting(rooms(30, 1), STRUCTURE, limit=8)
-    assert structure_task(room_model(), setting) is None
-    monkeypatch.setattr(missing_tasks, "_STRUCTURE", ("floor", VOCABULARY.labels[3]))
-    outcome = structure_task(room_model(), setting)
-    parts = draw_parts(setting.some(), STRUCTURE, up_to_longest)
-    listed = parts.v[0].nonzero().squeeze(1).tolist()
-    assert 3 not in listed
-    p, q = (missing_probabilities(room_model(), of_classes(c)) for c in (listed, [*listed, 3]))
-    # Class 3 itself is no candidate of the second request.
-    first = [k for k in np.argsort(-p, kind="stable")[:10] if k != 3]
-    metric = outcome.metrics["change of p"]
-    group = np.flatnonzero(metric.groups == setting.some().group_ids[parts.scene[0]])
-    assert metric.numerators[group] == pytest.approx(np.abs(p[first] - q[first]).mean())
-    assert metric.value > 0
 
 
 # ------------------------------------------------------------------------------------------ T2-at

@@ -110,6 +110,9 @@ def test_a_score_that_follows_the_order_is_caught():
     leaking = lambda _: [{"subject": "0", "probability": next(turn) / 1e4}]  # noqa: E731
     with pytest.raises(LeakError):
         moved_task(leaking, Setting(LISTED, NO_STRUCTURE))
+    undefined = lambda _: [{"subject": "0", "probability": np.nan}]  # noqa: E731
+    with pytest.raises(FloatingPointError, match="NaN"):
+        moved_task(undefined, Setting(LISTED, NO_STRUCTURE))
 
 
 def test_the_service_sees_the_poses_of_a_request():

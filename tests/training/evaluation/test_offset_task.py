@@ -44,9 +44,6 @@ def test_draws_of_a_known_normal_are_covered_as_promised():
     assert share["in the ellipse, left"] == pytest.approx(0.8, abs=0.05)
     assert share["in the ellipsoid, left"] == pytest.approx(0.8, abs=0.05)
     assert found.metrics["in the ellipse, left"].n == 2000
-    narrow, wide = (outcome(draws(MEAN, STD * k, 400, 0), test) for k in (0.5, 2))
-    assert values(narrow)["in the ellipse, left"] < 0.5
-    assert values(wide)["in the ellipse, left"] > 0.95
 
 
 def test_distances_are_from_the_mean_and_from_what_the_relation_says():
