@@ -3,9 +3,8 @@
 Each question is asked twice about the same scene: with the object labels only, and with labels and
 one kind of evidence. The result is the paired change of a metric, with an interval over scenes.
 
-    T2   (missing objects) One class is removed with all its instances. The evidence is the room
-         type. Metric: change of the mean reciprocal rank (MRR) of the removed class among absent
-         classes
+    T2   (missing objects) Two of the classes are removed in turn. The evidence is the room type.
+         Metric: change of the mean reciprocal rank (MRR) of the removed class among absent classes
     T1   (relations) The evidence is the relations or poses between the instances of half of the
          classes. Metric: change of R-precision on all other ordered pairs. The number of
          predictions is the number of listed relations. An unlisted relation counts as wrong
@@ -16,63 +15,62 @@ do not hold. Only data sources with positions have poses. The evidence never con
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, NamedTuple
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
 from app.registry import Artifact
 from app.scene import PoseRelations, Scene
-from training.datasets.array_types import Flags
+from training.datasets.array_types import Flags, Floats
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import scene_of, scene_rng
-from training.evaluation.asking import (
-    ask_every,
-    missing_probabilities,
-    relation_probabilities,
-    thing_instances,
-)
+from training.evaluation.asking import ask_every, ask_rows, relation_probabilities, score_missing
 from training.evaluation.metrics import Metric, Ratio
+from training.evaluation.parts import all_but_one, draw_parts, rank_hidden
 from training.evaluation.relation_tasks import expected_hits
+from training.evaluation.room_task import with_room_type
 from training.evaluation.setting import Outcome, Setting
 
 OF_RELATIONS = ("relations", "poses")
 OF_OBJECTS = ("room type",)
 """Kinds of evidence for relations (T1) and for objects (T2)."""
 
-# Number of questions per scene in T2, each with another removed class. With one question per scene,
-# the random choice of the class changes the result of a small data source by about 0.01.
-_REMOVALS = 2
-
 
 class Case(NamedTuple):
-    """One question about a scene, asked with labels only and with additional evidence.
+    """One question of T1.
 
     Attributes:
         scene_index: index of the scene in its set.
         scene: the scene with the evidence.
-        asked: index of the removed class in T2. In T1, the queried relations and those that hold,
-            both (relations, objects, objects) bool.
-        items: number of relations to find in T1; 1 in T2.
+        queried, truth: (relations, objects, objects) bool, the queried relations, and those of
+            them that hold.
     """
 
     scene_index: int
     scene: Scene
-    asked: Any
-    items: int = 1
+    queried: Flags
+    truth: Flags
 
 
-def removals(scenes: SceneTensors, structure: Flags, seed: int = 0) -> Iterator[Case]:
-    """Generate the T2 questions: up to two questions per scene, each with one removed class."""
-    for index, encoded in enumerate(scenes.scenes):
-        classes = encoded.evidence.classes
-        removable = classes[~structure[classes]]
-        if len(removable) < 2 or encoded.room_type < 0:
-            continue
-        for target in scene_rng(encoded, seed).permutation(removable)[:_REMOVALS].tolist():
-            kept = thing_instances(encoded, structure, {target})
-            yield Case(index, scene_of(encoded, kept, ()), target)
+def missing_evidence_task(artifact: Artifact, setting: Setting) -> Outcome | None:
+    """Measure T2 (missing objects) with labels only and with the room type."""
+    scenes, structure = with_room_type(setting.some()), setting.structure
+    # With one question per scene, the random choice of the class changes the result of a small data
+    # source by about 0.01.
+    parts = draw_parts(scenes, structure, all_but_one, (setting.seed, setting.seed + 1))
+    if not len(parts.v):
+        return None
+    score = partial(score_missing, artifact)
+    room = scenes.room[parts.scene]
+    without, informed = (
+        rank_hidden(parts, structure, ask_rows(score, *columns)).mrr()
+        for columns in ((parts.v,), (parts.v, room))
+    )
+    metrics = _changes("MRR", "room type", without, informed)
+    return Outcome.over(scenes, metrics, parts.skipped)
 
 
 def halves(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -> Iterator[Case]:
@@ -94,77 +92,37 @@ def halves(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -> 
         scene = replace(scene_of(encoded, range(len(instances)), triples), room_type=None)
         if kind == "poses":
             scene = replace(scene, poses=PoseRelations(given, encoded.instance_observed & between))
-        yield Case(index, scene, (queried, truth), int(truth.sum()))
-
-
-def reciprocal_rank(artifact: Artifact, scene: Scene, target: int) -> float:
-    """Return the reciprocal rank of a removed class among absent classes, expected over ties."""
-    p = missing_probabilities(artifact, scene)
-    above, ties = int((p > p[target]).sum()), int((p == p[target]).sum())
-    return float((1.0 / np.arange(above + 1, above + ties + 1)).mean())
-
-
-def missing_evidence_task(artifact: Artifact, setting: Setting) -> Outcome | None:
-    """Measure T2 (missing objects) with labels only and with additional evidence."""
-
-    def cases(scenes: SceneTensors, _: str) -> Iterator[Case]:
-        return removals(scenes, setting.structure.numpy(), setting.seed)
-
-    def value(scene: Scene, target: int) -> float:
-        return reciprocal_rank(artifact, scene, target)
-
-    return _changes("MRR", setting, cases, value, OF_OBJECTS)
+        yield Case(index, scene, queried, truth)
 
 
 def relations_evidence_task(artifact: Artifact, setting: Setting) -> Outcome | None:
-    """Measure T1 (relations) with labels only and with additional evidence."""
-
-    def cases(scenes: SceneTensors, kind: str) -> Iterator[Case]:
-        return halves(scenes, setting.structure.numpy(), kind, setting.seed)
-
-    def value(scene: Scene, asked: tuple[Flags, Flags]) -> float:
-        queried, truth = asked
-        p = relation_probabilities(artifact, scene)[queried]
-        return expected_hits(p, truth[queried], int(truth.sum()))
-
-    return _changes("R-precision", setting, cases, value, OF_RELATIONS)
-
-
-def _changes(
-    metric: str,
-    setting: Setting,
-    cases_of: Callable[[SceneTensors, str], Iterator[Case]],
-    value: Callable[[Scene, Any], float],
-    kinds: tuple[str, ...],
-) -> Outcome | None:
-    """Return the metric without and with each kind of evidence, and the change of the metric.
-
-    Args:
-        cases_of: function that yields the questions about scenes for a kind of evidence.
-        value: function of a scene with or without evidence, and `Case.asked`. It returns the
-            metric of the answer, summed over the items of the question.
-    """
-    scenes = setting.some(related=kinds == OF_RELATIONS)
+    """Measure T1 (relations) with labels only, and with relations or poses."""
+    scenes, structure = setting.some(related=True), setting.structure.numpy()
     metrics: dict[str, Metric] = {}
     skipped: list[int] = []
 
-    def ask(case: Case) -> np.ndarray:
-        bare = replace(case.scene, room_type=None, relations=None, poses=None)
-        return np.array([value(scene, case.asked) for scene in (bare, case.scene)])
+    def ask(case: Case) -> Floats:
+        count, truth = int(case.truth.sum()), case.truth[case.queried]
+        bare = replace(case.scene, relations=None, poses=None)
+        p = (relation_probabilities(artifact, scene) for scene in (bare, case.scene))
+        return np.array([expected_hits(x[case.queried], truth, count) for x in p])
 
-    for kind in kinds:
-        cases = list(cases_of(scenes, kind))
+    for kind in OF_RELATIONS:
+        cases = list(halves(scenes, structure, kind, setting.seed))
         if not cases:
             continue
-        index = [case.scene_index for case in cases]
-        without, informed, items = (
-            np.bincount(index, weights=column, minlength=len(scenes)).astype(np.float64)
-            for column in (*np.array(ask_every(ask, cases)).T, [case.items for case in cases])
-        )
-        metrics |= {
-            f"change of {metric}, {kind}": Ratio(informed - without, items),
-            f"{metric}, {kind}": Ratio(informed, items),
-            f"{metric}, {kind} withheld": Ratio(without, items),
-        }
+        without, informed, items = np.zeros((3, len(scenes)))
+        for case, hits in zip(cases, ask_every(ask, cases), strict=True):
+            without[case.scene_index], informed[case.scene_index] = hits
+            items[case.scene_index] = case.truth.sum()
+        metrics |= _changes("R-precision", kind, Ratio(without, items), Ratio(informed, items))
         skipped.append(int((items == 0).sum()))
     return Outcome.over(scenes, metrics, skipped[0] if skipped else 0)
+
+
+def _changes(metric: str, kind: str, without: Ratio, informed: Ratio) -> dict[str, Metric]:
+    return {
+        f"change of {metric}, {kind}": informed - without,
+        f"{metric}, {kind}": informed,
+        f"{metric}, {kind} withheld": without,
+    }

@@ -45,11 +45,13 @@ class SourceReport:
         source: name of the data source, or "pooled".
         scenes: digest of the questions, see `digest`.
         outcomes: metrics of each task, by task name; None if the model does not support the task.
+        parameters: number of trained weights of the model, if any.
     """
 
     source: str
     scenes: str
     outcomes: dict[str, Outcome | None] = field(default_factory=dict)
+    parameters: int | None = None
 
     def write(self, path: Path) -> None:
         """Write the report into a JSON file."""
@@ -59,29 +61,19 @@ class SourceReport:
             | {"metrics": {name: metric_to_dict(m) for name, m in outcome.metrics.items()}}
             for task, outcome in self.outcomes.items()
         }
-        values = {"source": self.source, "scenes": self.scenes, "tasks": tasks}
-        write_whole(path, json.dumps(values, allow_nan=False))
+        write_whole(path, json.dumps(vars(self) | {"outcomes": tasks}, allow_nan=False))
 
     @classmethod
-    def read(cls, path: Path, setting: Setting | None = None) -> SourceReport:
-        """Read a report from a file.
-
-        Raises:
-            ValueError: the report does not belong to `setting`.
-        """
-        values = json.loads(path.read_text(encoding="utf-8"))
-        if setting is not None and values["scenes"] != digest(setting):
-            raise ValueError(
-                f"the report {path} belongs to other scenes or tasks: use --fresh, use another "
-                "folder, or delete it"
-            )
-        report = cls(values["source"], values["scenes"])
-        for task, outcome in values["tasks"].items():
-            report.outcomes[task] = None
+    def read(cls, path: Path) -> SourceReport:
+        """Read a report from a file."""
+        values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        outcomes: dict[str, Outcome | None] = {}
+        for task, outcome in values["outcomes"].items():
+            outcomes[task] = None
             if outcome:
                 metrics = {name: metric_from_dict(m) for name, m in outcome["metrics"].items()}
-                report.outcomes[task] = Outcome(**outcome | {"metrics": metrics})
-        return report
+                outcomes[task] = Outcome(**outcome | {"metrics": metrics})
+        return cls(**values | {"outcomes": outcomes})
 
 
 def write_whole(path: Path, text: str) -> None:
@@ -131,7 +123,7 @@ def measure(
     progress: Progress = silent,
 ) -> SourceReport:
     """Measure tasks, which are keys of `EVERY_TASK`."""
-    report = SourceReport(source, digest(setting))
+    report = SourceReport(source, digest(setting), parameters=model.parameters)
     for task in tasks:
         progress(f"{source}: {task}")
         report.outcomes[task] = EVERY_TASK[task](model, setting)
@@ -141,7 +133,8 @@ def measure(
 def pooled(reports: Sequence[SourceReport], source: str = "pooled") -> SourceReport:
     """Pool the reports on several data sources, without metrics of a whole set of scenes (T4)."""
     together = sha256("\n".join(report.scenes for report in reports).encode()).hexdigest()
-    joined = SourceReport(source, together)
+    parameters = reports[0].parameters if reports else None
+    joined = SourceReport(source, together, parameters=parameters)
     for task in dict.fromkeys(task for report in reports for task in report.outcomes):
         parts = [outcome for report in reports if (outcome := report.outcomes.get(task))]
         metrics = {
@@ -238,14 +231,7 @@ def metric_to_dict(metric: Metric) -> dict[str, Any]:
 
 
 def metric_from_dict(values: dict[str, Any]) -> Metric:
-    """Create a metric from the output of `metric_to_dict`.
-
-    Raises:
-        ValueError: the kind of metric is unknown.
-    """
-    kind = values.get("kind")
-    if kind not in _KINDS:
-        raise ValueError(f"metric kind must be one of {sorted(_KINDS)}, not {kind!r}")
+    """Create a metric from the output of `metric_to_dict`."""
     # JSON has no NaN, so null marks a resample in which the metric is undefined. numpy reads None
     # as NaN.
     entries = {
@@ -253,7 +239,7 @@ def metric_from_dict(values: dict[str, Any]) -> Metric:
         for name, value in values.items()
         if name != "kind"
     }
-    metric: Metric = _KINDS[kind](**entries)
+    metric: Metric = _KINDS[values["kind"]](**entries)
     return metric
 
 

@@ -77,19 +77,6 @@ class Difference:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """Number of scenes of one task, for one row, training seed and data source."""
-
-    row: str
-    seed: int
-    task: str
-    source: str
-    scenes: int
-    skipped: int
-    notes: Mapping[str, float]
-
-
-@dataclass(frozen=True)
 class Results:
     """The results of an experiment, sorted by row, data source and task.
 
@@ -97,14 +84,14 @@ class Results:
         ours: name of the reference row of all comparisons.
         differences: paired differences from the reference row.
         parameters: number of trained weights by row name, for rows with weights.
-        asked: number of scenes of each task.
+        asked: number of scenes and of skipped scenes, and notes, by row, seed, source and task.
     """
 
     ours: str
     cells: tuple[Cell, ...]
     differences: tuple[Difference, ...]
     parameters: Mapping[str, int] = field(default_factory=dict)
-    asked: tuple[Asked, ...] = ()
+    asked: tuple[dict[str, Any], ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-serialisable dictionary."""
@@ -113,7 +100,7 @@ class Results:
             "parameters": dict(self.parameters),
             "cells": [asdict(cell) for cell in self.cells],
             "differences": [asdict(row) | {"verdict": row.verdict} for row in self.differences],
-            "asked": [asdict(entry) for entry in self.asked],
+            "asked": list(self.asked),
         }
 
     def markdown(self, shown: Shown = SHOWN) -> str:
@@ -157,8 +144,9 @@ class Results:
         """Generate a sentence on skipped scenes, with the highest number of each source."""
         skipped: dict[str, int] = {}
         for entry in self.asked:
-            if entry.task == task and entry.skipped:
-                skipped[entry.source] = max(entry.skipped, skipped.get(entry.source, 0))
+            if entry["task"] == task and entry["skipped"]:
+                source = entry["source"]
+                skipped[source] = max(entry["skipped"], skipped.get(source, 0))
         if skipped:
             counts = ", ".join(f"{count:,} of {source}" for source, count in skipped.items())
             yield f"Scenes that could not be scored: {counts}."
@@ -176,7 +164,7 @@ def write(folder: Path, values: Mapping[str, Any], text: str) -> None:
     write_whole(folder / "results.json", json.dumps(values, indent=1) + "\n")
 
 
-def summarise(reports: Reports, ours: str, parameters: Mapping[str, int] | None = None) -> Results:
+def summarise(reports: Reports, ours: str) -> Results:
     """Compute the metrics of every row, and the paired differences from the reference row.
 
     Metrics over the scenes of a single group are left out, because they have no interval.
@@ -185,14 +173,15 @@ def summarise(reports: Reports, ours: str, parameters: Mapping[str, int] | None 
         ValueError: the reports lack the reference row.
     """
     members: dict[tuple[str, str, str, str], list[Metric]] = {}
-    asked: list[Asked] = []
+    asked: list[dict[str, Any]] = []
     for (row, seed), by_source in reports.items():
         for source, report in by_source.items():
             for task, outcome in report.outcomes.items():
                 if outcome is None:
                     continue
-                counts = outcome.scenes, outcome.skipped
-                asked.append(Asked(row, seed, task, source, *counts, outcome.notes))
+                place = {"row": row, "seed": seed, "task": task, "source": source}
+                numbers = {name: getattr(outcome, name) for name in ("scenes", "skipped", "notes")}
+                asked.append(place | numbers)
                 for name, metric in outcome.metrics.items():
                     members.setdefault((row, source, task, name), []).append(metric)
     rows = [row for row, _ in reports]
@@ -218,7 +207,13 @@ def summarise(reports: Reports, ours: str, parameters: Mapping[str, int] | None 
         # A row may lack a pooled metric on some data sources. Its scenes then cannot be paired.
         and _same_groups(mine, mean)
     )
-    return Results(ours, cells, differences, parameters or {}, tuple(asked))
+    parameters = {
+        row: report.parameters
+        for (row, _), by_source in reports.items()
+        for report in by_source.values()
+        if report.parameters is not None
+    }
+    return Results(ours, cells, differences, parameters, tuple(asked))
 
 
 def mean_over_seeds(members: Sequence[Metric]) -> Resampled:

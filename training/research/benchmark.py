@@ -1,7 +1,6 @@
 """`python -m training benchmark`: compare machines and baselines on the same scenes.
 
 Each machine or baseline is one row of the result tables. An interrupted run can be continued.
-Configurations with the same data section are compared with each other, in one folder.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from training.evaluation.report import settings_by_source
 from training.evaluation.results import SHOWN, Shown, grid, summarise, write
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import TASKS
-from training.fit.configuration import Config, ConfigError, DataConfig
+from training.fit.configuration import Config, ConfigError
 from training.research.entries import Entry, baseline_entries, machine_entry, reference_entries
 from training.research.measure import POOLED, Plan, measure_entries, resumable
 from training.research.plots import write_plots
@@ -41,8 +40,8 @@ def benchmark(
     machines: Annotated[
         list[str] | None,
         typer.Argument(
-            help="configurations; those with the same data section are compared with each other, "
-            "and the first is the reference. Default: the indoor machines."
+            help="configurations with the same data section; the first is the reference. "
+            "Default: the indoor machines."
         ),
     ] = None,
     data: Data = None,
@@ -64,46 +63,40 @@ def benchmark(
 ) -> None:
     """Train machines and baselines on the same scenes, and evaluate all on the same test scenes.
 
-    The command writes results.json, results.md and plots into one folder per data section. After
-    Ctrl-C, run the same command again: it continues and skips finished tasks.
+    The command writes results.json, results.md and plots into a folder with the first word of the
+    first configuration. After Ctrl-C, run the same command again: it skips finished reports.
     """
     with resumable(console):
         shown = {name: SHOWN[name] for name in chosen_tasks(task)}
         baselines = None if baseline is None else [name for name in baseline if name != "none"]
         names = machines or DEFAULT
-        domains = read_domains(names)
-        root = data_folder(names[0], next(iter(domains.values()))[0], data)
-        for domain, configs in domains.items():
-            results = folder / domain
-            compare_machines(
-                configs, root, results, shown,
-                seeds=seeds, baselines=baselines, limit=limit, workers=workers, fresh=fresh,
-            )  # fmt: skip
+        configs = read_configs(names)
+        # The first name without its last word: "indoor".
+        results = folder / (configs[0].name.rpartition("-")[0] or configs[0].name)
+        compare_machines(
+            configs, data_folder(names[0], configs[0], data), results, shown,
+            seeds=seeds, baselines=baselines, limit=limit, workers=workers, fresh=fresh,
+        )  # fmt: skip
 
 
-def read_domains(references: Sequence[str]) -> dict[str, list[Config]]:
-    """Read configurations, and group them by data section. A key is the name of a folder.
+def read_configs(references: Sequence[str]) -> list[Config]:
+    """Read the configurations to compare.
 
     Raises:
-        ConfigError: a configuration cannot be read, or a name occurs twice.
+        ConfigError: a configuration cannot be read, a name occurs twice, or the data sections
+            differ.
     """
-    groups: dict[DataConfig, list[Config]] = {}
-    for reference in references:
-        config = load_config(reference)
-        if any(config.name == other.name for group in groups.values() for other in group):
+    configs = [load_config(reference) for reference in references]
+    first, *others = configs
+    for number, config in enumerate(others, 1):
+        if config.name in {other.name for other in configs[:number]}:
             raise ConfigError(f"two configurations have the name {config.name}: rename one of them")
-        groups.setdefault(config.data, []).append(config)
-    domains: dict[str, list[Config]] = {}
-    for configs in groups.values():
-        # The first name without its last word: "indoor".
-        name = configs[0].name.rpartition("-")[0] or configs[0].name
-        if name in domains:
+        if config.data != first.data:
             raise ConfigError(
-                f"{configs[0].name} and {domains[name][0].name} have different data sections, but "
-                f"their results have the same folder {name!r}: rename one of them"
+                f"{config.name} and {first.name} have different data sections, so they cannot be "
+                "compared: measure each of them with a command of its own"
             )
-        domains[name] = configs
-    return domains
+    return configs
 
 
 def chosen_tasks(names: Sequence[str] | None) -> tuple[str, ...]:
@@ -164,7 +157,7 @@ def compare_machines(
     entries += reference_entries()
     reports, failures = measure_entries(plan, entries, console, workers=workers, fresh=fresh)
     with console.status("resampling scenes"):
-        results = summarise(reports, configs[0].name, plan.parameters(entries))
+        results = summarise(reports, configs[0].name)
     contents = {"contents": dict(scenes.digests), "failures": failures}
     remarks = [f"{name} could not be measured: {reason}" for name, reason in failures.items()]
     table = grid(["", ""], ([config.name, config.description] for config in configs))

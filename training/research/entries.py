@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from app.registry import Calibration
 from training.datasets.batches import SceneTensors, TrainingData, subset
 from training.datasets.cases import some_scenes
 from training.evaluation.artifact_model import artifact_model, floor_model, independent_model
@@ -22,7 +21,7 @@ from training.evaluation.baselines.fitting import TRIALS, Baseline
 from training.evaluation.intruders import intruder_weights
 from training.evaluation.model import Model, ObjectScore, suspicion_of
 from training.evaluation.outlier_tasks import first_shares, with_intruders
-from training.evaluation.report import Progress, write_whole
+from training.evaluation.report import Progress
 from training.fit.calibrate import calibrate
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, ObjectsConfig
@@ -33,7 +32,6 @@ from training.machines import BoltzmannMachine
 from training.research.baselines import BASELINES
 from training.runs.folder import load_run, save_run
 
-CALIBRATION = "calibration.json"  # in the folder of the run of a machine
 # Weights of log popularity in the ranking of intruders: scores of baselines have different scales.
 _WEIGHTS = (0.0, *np.geomspace(0.005, 2.0, TRIALS - 1).tolist())
 _SCENES = 300  # maximum scenes that choose a weight
@@ -169,14 +167,8 @@ def _machine_model(config: Config, data: TrainingData, folder: Path, say: Progre
     run, seed = folder / "run", config.training.seed
     machine = _train_once(config, data, run, say)
     draft = placed_draft(machine, data)
-    path = run / CALIBRATION
-    if path.exists():
-        calibration = Calibration.model_validate_json(path.read_text(encoding="utf-8"))
-    else:
-        say("calibrating")
-        calibration = calibrate(draft, data, config.objects, seed)
-        write_whole(path, calibration.model_dump_json(indent=1))
-    artifact = replace(draft, calibration=calibration)
+    say("calibrating")
+    artifact = replace(draft, calibration=calibrate(draft, data, config.objects, seed))
     profiles = ObjectScenes.of(data.train, data.structure, config.objects).sources
     model = artifact_model(artifact, data.train, seed=seed, profiles=profiles)
     zero = sum(machine.get_parameter(name).numel() for name in config.machine.without)

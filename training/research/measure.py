@@ -2,17 +2,19 @@
 
 An entry is one model of an experiment: a machine, a baseline or a reference.
 
-<folder>/<name>/seed-<n>/row.json       settings and training scenes (as digest), number of weights
-                        run/            training run of a machine, and its calibration
-                        <source>.json   report on one data source
-                        pooled.json     report on all data sources together (tasks of `WHOLE_SET`)
+<folder>/<name>/seed-<n>-<digest>/run/                    training run of a machine
+                                 <source>-<digest>.json   report on one data source
+                                 pooled-<digest>.json     report on all data sources together (tasks
+                                                          of `WHOLE_SET`)
+
+The digests cover the settings and training scenes, and the questions. So another experiment has
+other folders and files.
 
 Several processes fill these files in parallel. One process with one thread measures each entry.
 """
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
 import pickle  # nosec B403
@@ -24,8 +26,8 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
 import torch
 import typer
@@ -42,7 +44,6 @@ from training.evaluation.report import (
     measure,
     pooled,
     silent,
-    write_whole,
 )
 from training.evaluation.results import Reports
 from training.evaluation.setting import Setting
@@ -58,14 +59,10 @@ POOLED = "pooled"
 """Name of the union of all data sources."""
 
 
-class BenchmarkError(RuntimeError):
-    """A folder or report belongs to another experiment. The message names the folder or file."""
-
-
 @contextmanager
 def resumable(console: Console) -> Iterator[None]:
     """Print expected errors; after Ctrl-C, print how to continue."""
-    expected = (ConfigError, DatasetError, BenchmarkError, RunError, BrokenProcessPool, ValueError)
+    expected = (ConfigError, DatasetError, RunError, BrokenProcessPool, ValueError)
     try:
         yield
     except expected as error:
@@ -92,8 +89,14 @@ class Plan:
     tasks: Sequence[str]
 
     def folder_of(self, entry: Entry) -> Path:
-        """Return the folder of an entry and its training seed."""
-        return self.folder / slug(entry.name) / f"seed-{entry.seed}"
+        """Return the folder of an entry with its training seed and scenes."""
+        name = f"seed-{entry.seed}-{_short_digest(entry.identity, self.data.digest)}"
+        return self.folder / slug(entry.name) / name
+
+    def path_of(self, entry: Entry, source: str) -> Path:
+        """Return the file of a report."""
+        questions = _short_digest(digest(self.settings[source]), *self.tasks_on(source))
+        return self.folder_of(entry) / f"{source}-{questions}.json"
 
     def tasks_on(self, source: str) -> list[str]:
         """Return the names of the tasks to measure on a data source, or on `POOLED`."""
@@ -101,58 +104,20 @@ class Plan:
             return [task for task in self.tasks if task in WHOLE_SET]
         return [task for task in self.tasks if task not in ONCE]
 
-    def claim(self, entry: Entry) -> None:
-        """Reserve the folder of an entry. Another entry or other scenes are a BenchmarkError."""
-        path = self.folder_of(entry) / "row.json"
-        row = {"identity": entry.identity, "material": self.data.digest}
-        if not path.exists():
-            write_whole(path, json.dumps(row))
-        if row.items() - _read_row(path).items():
-            raise BenchmarkError(
-                f"{path.parent} holds reports of another configuration of {entry.name}, or of "
-                "other training scenes (files, sources, limit, split and vocabulary must be "
-                "equal): use --fresh or another folder"
-            )
-
-    def parameters(self, entries: Sequence[Entry]) -> dict[str, int]:
-        """Return the number of trained weights by name, for entries that record this number."""
-        rows = {entry.name: _read_row(self.folder_of(entry) / "row.json") for entry in entries}
-        return {name: row["parameters"] for name, row in rows.items() if row.get("parameters")}
-
     def finished(self, entry: Entry) -> dict[str, SourceReport]:
-        """Return the finished reports of an entry, by data source.
-
-        Raises:
-            BenchmarkError: the folder belongs to other scenes or another entry.
-        """
-        self.claim(entry)
-        reports = {}
-        for source, setting in self.settings.items():
-            path = self.folder_of(entry) / f"{source}.json"
-            if not self.tasks_on(source):
-                reports[source] = SourceReport(source, digest(setting))
-            elif path.exists():
-                report = SourceReport.read(path, setting)
-                if set(self.tasks_on(source)) <= set(report.outcomes):
-                    reports[source] = report
-        return reports
+        """Return the finished reports of an entry, by data source."""
+        paths = {source: self.path_of(entry, source) for source in self.settings}
+        return {source: SourceReport.read(path) for source, path in paths.items() if path.exists()}
 
     def measure(self, entry: Entry, progress: Progress) -> None:
-        """Measure an entry on every data source that lacks a finished report.
-
-        The model is trained only if a report is missing.
-        """
-        folder, finished = self.folder_of(entry), self.finished(entry)
-        missing = [source for source in self.settings if source not in finished]
-        if not missing:
-            return
-        model = entry.make(self.data, folder, progress)
-        row = _read_row(folder / "row.json") | {"parameters": model.parameters}
-        write_whole(folder / "row.json", json.dumps(row))
-        for source in missing:
-            tasks = self.tasks_on(source)
-            report = measure(model, self.settings[source], source, tasks=tasks, progress=progress)
-            report.write(folder / f"{source}.json")
+        """Train an entry, and measure it on every data source that lacks a finished report."""
+        finished = self.finished(entry)
+        model = entry.make(self.data, self.folder_of(entry), progress)
+        for source, setting in self.settings.items():
+            if source not in finished:
+                tasks = self.tasks_on(source)
+                report = measure(model, setting, source, tasks=tasks, progress=progress)
+                report.write(self.path_of(entry, source))
 
     def report(self, entry: Entry) -> dict[str, SourceReport]:
         """Return the reports of an entry, by data source. The pooled report has all tasks."""
@@ -243,9 +208,8 @@ def _measure_here(entry: Entry) -> str:
     return _measure(_plan, entry, silent)
 
 
-def _read_row(path: Path) -> dict[str, Any]:
-    row: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return row
+def _short_digest(*parts: str) -> str:
+    return sha256("\n".join(parts).encode()).hexdigest()[:8]
 
 
 def slug(name: str) -> str:

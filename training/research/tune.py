@@ -19,6 +19,7 @@ import math
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -28,8 +29,8 @@ from pydantic import BaseModel, ValidationError
 from rich.console import Console
 
 from training.datasets.batches import TrainingData
-from training.evaluation.artifact_model import relation_score
-from training.evaluation.asking import missing_score
+from training.evaluation.artifact_model import score_relations
+from training.evaluation.asking import score_missing
 from training.evaluation.metrics import Metric, paired_difference
 from training.evaluation.model import Model
 from training.evaluation.report import SourceReport, measure, pooled, settings_by_source
@@ -264,8 +265,8 @@ class Search:
 
     def _measure(self, machine: BoltzmannMachine, folder: Path) -> None:
         data, artifact = self.data, draft_artifact(machine, self.data.classes)
-        relations = relation_score(artifact, given=False)
-        model = Model(missing=missing_score(artifact), relations=relations)
+        relations = partial(score_relations, artifact, given=False)
+        model = Model(missing=partial(score_missing, artifact), relations=relations)
         tasks = [task for task, _ in FIGURES.values()]
         settings = settings_by_source(data.validation, data.structure, data.train, seen=None)
         for source, setting in settings:
@@ -296,9 +297,7 @@ def _write_best(
     comment = [
         f"{original.name}, {shown(settings)}.",
         f"Metrics on validation scenes, {search.config.objects.steps} steps: {figures}.",
-        f"Paired difference from {original.name}: {', '.join(gains)}.",
-        f"The figures of the best of {len(study.trials)} trials are optimistic: train both "
-        "configurations with several seeds.",
+        f"Paired difference from {original.name}, optimistic: {', '.join(gains)}.",
     ]
     tuned = with_settings(original, settings).model_copy(update={"name": f"{original.name}-tuned"})
     path = search.folder / "best.toml"

@@ -19,8 +19,8 @@ from tests.training.evaluation.scenes import (
     scene,
     tensors,
 )
-from training.evaluation.artifact_model import placed_score
-from training.evaluation.asking import LeakError, missing_probabilities, missing_score, of_classes
+from training.evaluation.artifact_model import score_placed
+from training.evaluation.asking import LeakError, missing_probabilities, of_classes, score_missing
 from training.evaluation.missing_tasks import (
     SEEDS,
     leave_one_out_at,
@@ -104,7 +104,7 @@ def test_the_score_is_the_ranking_of_the_service():
     v = draw_parts(rooms(10, 1), STRUCTURE, one_quarter).v
     parents = torch.tensor(room_model().vocabulary.parents.tolist())
     kinds = 0
-    for row, own in zip(v, missing_score(room_model())(v), strict=True):
+    for row, own in zip(v, score_missing(room_model(), v), strict=True):
         asked = of_classes(row.nonzero().squeeze(1).tolist())
         p = torch.from_numpy(missing_probabilities(room_model(), asked))
         usable = p > -torch.inf
@@ -183,7 +183,7 @@ def test_the_question_names_the_place_as_a_robot_does(name, outgoing):
     # Another row must not disturb the first.
     relation, anchor = torch.tensor([2, 0]), torch.tensor([2, 5])
     places = Places(v, number, relation, anchor, torch.tensor([outgoing, not outgoing]))
-    values = placed_score(artifact)(places)[0]
+    values = score_placed(artifact, places)[0]
     things = tuple(SceneObject(str(k), "x", c) for k, c in enumerate([0, 2, 2, 5]))
     spoken = CANONICAL[2] if outgoing else OPPOSITES[CANONICAL[2]]
     answers = ask_missing(artifact, Scene(things), top_k=artifact.spec.V, at=(spoken, 1))

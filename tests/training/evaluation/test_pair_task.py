@@ -134,14 +134,6 @@ def test_inside_pairs_have_ten_candidates():
     assert ignorant["accuracy of ten, inside pairs"].value == pytest.approx(1 / 10)
 
 
-def test_pairs_without_a_possible_relation_count_as_a_guess():
-    data = tensors([scene([0, 1], [(ON, 1, 0)])])
-    never = lambda batch: torch.full(batch.holds.shape, -torch.inf)  # noqa: E731
-    metrics = pairs_task(Model(relations=never), Setting(data, NO_STRUCTURE)).metrics
-    assert metrics["log-loss"].value == pytest.approx(np.log(8))
-    assert metrics["accuracy"].value == pytest.approx(1 / 8)
-
-
 def test_unseen_pairs_are_those_that_no_training_relation_joins():
     data = tensors([scene([0, 1, 2], [(ON, 1, 0), (ON, 2, 1)])])
     # left(1, 0) is listed in training: the pair is seen, whatever the relation.

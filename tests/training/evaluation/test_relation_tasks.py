@@ -22,7 +22,7 @@ from tests.training.evaluation.scenes import (
 )
 from training.datasets import AnnotatedObject, AnnotatedScene, encode
 from training.datasets.batches import seen_triples
-from training.evaluation.artifact_model import relation_score
+from training.evaluation.artifact_model import score_relations
 from training.evaluation.relation_tasks import (
     alter,
     complete_scenes,
@@ -188,8 +188,8 @@ def test_classes_related_both_ways_are_stated_of_different_instances():
     data = tensors([both, scene(classes, [(0, 0, 1)], relations=known)], artifact.spec.V)
     batch = data.batch(torch.arange(2))
     told = telling(batch, batch.holds > 0)
-    values = relation_score(artifact, given=True)(told)
-    blind = relation_score(artifact, given=False)(told)
+    values = score_relations(artifact, told, given=True)
+    blind = score_relations(artifact, told, given=False)
     assert torch.isfinite(values).all()
     assert not torch.allclose(values[0], values[1])
     torch.testing.assert_close(blind[0], blind[1])

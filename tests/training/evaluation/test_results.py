@@ -7,7 +7,7 @@ import pytest
 
 from training.evaluation.metrics import Figure, Ratio
 from training.evaluation.report import SourceReport
-from training.evaluation.results import Asked, Cell, Difference, Results, summarise
+from training.evaluation.results import Cell, Difference, Results, summarise
 from training.evaluation.setting import Outcome
 
 
@@ -51,8 +51,8 @@ def test_results_list_the_questions():
 
 
 def test_skipped_scenes_are_told_by_source():
-    asked = [Asked(r, 0, "T2", s, 90, k, {}) for r, s, k in [("a", "x", 8), ("b", "x", 9)]]
-    asked.append(Asked("a", 0, "T2", "y", 1200, 0, {}))
+    skipped = (("x", 8), ("x", 9), ("y", 0))
+    asked = [{"task": "T2", "source": source, "skipped": count} for source, count in skipped]
     cells = (Cell("a", "T2", "x", "MRR", figure(0.1), (0.1,)),)
     text = Results("a", cells, (), asked=tuple(asked)).markdown({"T2": ("MRR",)})
     assert text.endswith("\n\nScenes that could not be scored: 9 of x.\n")

@@ -11,7 +11,7 @@ from training.evaluation.tasks import TASKS
 from training.fit.configuration import ConfigError
 from training.fit.relations import RelationFit
 from training.fit.trainer import Trainer
-from training.research.benchmark import DEFAULT, chosen_tasks, read_domains
+from training.research.benchmark import DEFAULT, chosen_tasks, read_configs
 from training.research.entries import baseline_entries
 from training.runs.folder import load_run
 
@@ -52,6 +52,10 @@ def read(folder):
     return results, cells
 
 
+def trained(folder):
+    return load_run(next(folder.glob("seed-0-*/run"))).machine
+
+
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """A finished small benchmark: (its arguments, the folder of its results)."""
@@ -79,7 +83,7 @@ def test_every_row_is_measured_and_compared(finished):
     assert {("EASE", "T2 missing"), ("rooms-rbm", "T1b completion")} <= compared
     text = (finished[1] / "results.md").read_text()
     assert "### T2 missing: MRR, one removed" in text
-    machine = load_run(finished[1] / "rooms-rbm/seed-0/run").machine
+    machine = trained(finished[1] / "rooms-rbm")
     assert results["parameters"]["rooms-rbm"] == machine.parameter_count
     assert results["parameters"]["popularity"] == machine.spec.V
     assert f"{machine.parameter_count:,}" in text
@@ -101,7 +105,7 @@ def test_finished_rows_are_never_trained_again(finished, monkeypatch):
     """A lost report is made again from the finished run."""
     arguments, folder = finished
     before = read(folder)
-    (folder / "rooms-triway/seed-0/rooms.json").unlink()
+    next(folder.glob("rooms-triway/seed-0-*/rooms-*.json")).unlink()
     monkeypatch.setattr(Trainer, "run", None)
     invoke("benchmark", *arguments)
     assert read(folder) == before
@@ -118,14 +122,12 @@ def test_bad_requests_are_named(tmp_path, others, message):
     assert message in invoke("benchmark", write(tmp_path), "--folder", tmp_path, *others, code=1)
 
 
-def test_configurations_of_one_data_section_are_a_domain(tmp_path):
-    found = read_domains([*DEFAULT, "open-triway"])
-    assert list(found) == ["indoor", "open"]
-    assert [config.name for config in found["indoor"]] == [*DEFAULT]
+def test_configurations_of_other_scenes_are_refused():
+    assert [config.name for config in read_configs(DEFAULT)] == [*DEFAULT]
     with pytest.raises(ConfigError, match="two configurations have the name indoor-rbm"):
-        read_domains(["indoor-rbm", "indoor-rbm"])
+        read_configs(["indoor-rbm", "indoor-rbm"])
     with pytest.raises(ConfigError, match="different data sections"):
-        read_domains([str(write(tmp_path)), str(write(tmp_path, variant="rbm", rooms=50))])
+        read_configs(["indoor-rbm", "open-triway"])
 
 
 def test_baselines_that_no_seed_changes_are_trained_once():
@@ -172,11 +174,11 @@ def test_ablations_are_compared_with_the_full_model(ablated):
     text = (ablated / "results.md").read_text()
     assert "diverging could not be measured: seed 0: " in text
     assert "| no-counts | instances are not counted |" in text
-    machine = load_run(ablated / "no-counts/seed-0/run").machine
+    machine = trained(ablated / "no-counts")
     assert not machine.n.any()
-    trained = machine.parameter_count - machine.n.numel()
-    assert results["parameters"]["no-counts"] == trained
-    assert f"| no-counts | {trained:,} | " in text
+    weights = machine.parameter_count - machine.n.numel()
+    assert results["parameters"]["no-counts"] == weights
+    assert f"| no-counts | {weights:,} | " in text
 
 
 def test_an_interrupted_ablation_goes_on(ablated, tmp_path, monkeypatch):
