@@ -91,7 +91,7 @@ def scene_sampler(scenes: SceneTensors) -> Sampler:
     return sample
 
 
-def machine_sampler(artifact: Artifact, *, steps: int = STEPS) -> Sampler:
+def machine_sampler(artifact: Artifact) -> Sampler:
     """Return a sampler that runs the Gibbs chains of the service, and also samples relations.
 
     Of two contradictory relations a(x, y) and a(y, x), the service keeps only one. This sampler
@@ -111,7 +111,7 @@ def machine_sampler(artifact: Artifact, *, steps: int = STEPS) -> Sampler:
                 held2=np.zeros(0, np.int64),
                 room=room_type if room_type >= 0 and artifact.spec.C else None,
             )
-            state = chains.under(conditions).draw(steps, random_stream(seed, row))
+            state = chains.under(conditions).draw(STEPS, random_stream(seed, row))
             objects[row, torch.from_numpy(state.classes)] = 1.0
             grid = torch.from_numpy(state.r).float().unsqueeze(0)
             contradictions.append(count_contradictions(grid))

@@ -89,14 +89,6 @@ def test_classes_that_a_source_cannot_show_are_left_out():
     assert len(every.score) - len(found.score) == int((listed == 0).sum())
 
 
-@pytest.mark.parametrize("question", ["missing at a place", "outliers"])
-def test_scenes_with_incomplete_object_lists_are_not_asked_about_objects(question):
-    """An unlisted class may be there all the same."""
-    some = tensors([replace(entry, complete=False) for entry in DATA.scenes], V)
-    found = collect(ARTIFACT, some, QUESTIONS[question])
-    assert (len(found.score), found.skipped) == (0, 30)
-
-
 def test_half_of_the_scenes_have_an_intruder():
     """Of 30 fair draws fewer than 5 or more than 25 happen with probability below 1e-4."""
     found = collect(ARTIFACT, DATA, QUESTIONS["outliers"])

@@ -1,4 +1,4 @@
-"""T4: each figure by hand, the floor, and samples of small machines."""
+"""T4: each figure by hand, and the samplers."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.enumeration.small_machines import SMALL, enumerate_joint, small_machine, with_mean_rates
+from tests.enumeration.small_machines import small_machine
 from tests.questions.artifacts import artifact_of
 from tests.training.evaluation.scenes import WIDE, random_scenes, scene, tensors
 from training.evaluation.contradictions import contradiction_metrics, count_contradictions
@@ -136,24 +136,9 @@ def test_independent_classes_have_the_frequencies_of_training():
     assert bool((v[:, 3] == 1).all())
 
 
-@pytest.mark.parametrize("name", SMALL)
-def test_machines_are_sampled_from_their_distribution(name):
-    """Marginals of 2,000 chains of 20 sweeps, within 5 standard errors of the exact ones."""
-    machine = small_machine(name)
-    if machine.spec.coupled:
-        machine.L.copy_(machine.couplings)
-    joint = enumerate_joint(with_mean_rates(machine))
-    given = torch.zeros(2000, machine.spec.V, dtype=torch.bool)
-    room = torch.full((2000,), -1)
-    drawn = machine_sampler(artifact_of(machine.float()), steps=20)(given, room, 0)
-    p = joint.p @ joint.v
-    deviation = (p * (1 - p) / 2000).sqrt()
-    assert bool(((drawn.v.mean(0) - p).abs() < 5 * deviation).all())
-
-
 def test_given_classes_stay():
     artifact = artifact_of(small_machine("triway-deep").float())
     given = torch.tensor([[True, False]]).expand(50, -1)
-    drawn = machine_sampler(artifact, steps=5)(given, torch.full((50,), -1), 1)
+    drawn = machine_sampler(artifact)(given, torch.full((50,), -1), 1)
     assert bool((drawn.v[:, 0] == 1).all())
     assert 0 < float(drawn.v[:, 1].mean()) < 1

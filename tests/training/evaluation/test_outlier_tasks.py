@@ -21,7 +21,6 @@ from training.evaluation.missing_tasks import SEEDS
 from training.evaluation.model import Model, suspicion_of
 from training.evaluation.outlier_tasks import (
     alarms_task,
-    first_shares,
     hit_at_1,
     outliers_task,
     with_intruders,
@@ -46,11 +45,6 @@ def test_suspicions_that_know_everything_or_nothing():
     assert hit_at_1(data, NO_STRUCTURE, wrong, None).value == 0.0
     assert hit_at_1(data, NO_STRUCTURE, suspicion_of(torch.zeros_like), None).value == 1 / 4
     assert hit_at_1(tensors([scene([0, 1])]), NO_STRUCTURE, wrong, None) is None
-
-
-def test_the_highest_value_is_first_and_ties_share():
-    values = torch.tensor([[0.2, 0.9], [0.5, 0.5], [-torch.inf, 0.4]])
-    assert first_shares(values, torch.tensor([1, 0, 0])).tolist() == [1, 0.5, 0]
 
 
 def test_an_object_is_judged_by_the_rest_without_itself():
@@ -87,13 +81,6 @@ def test_intruders_are_absent_and_no_structure():
     assert set(draw_intruders(data, structure).tolist()) == {3}
     small = tensors([scene([0, 1]), scene([0, 1, 4])])
     assert draw_intruders(small, structure).tolist() == [-1, -1]
-
-
-def test_the_intruder_depends_on_the_scene_alone():
-    scenes = [scene([0, 1], []), *(scene([0, 1, 2]) for _ in range(9))]
-    together = draw_intruders(tensors(scenes), NO_STRUCTURE).tolist()
-    assert together == [int(draw_intruders(tensors([s]), NO_STRUCTURE)[0]) for s in scenes]
-    assert len(set(together[1:])) == 2
 
 
 def test_popular_intruders_follow_training():

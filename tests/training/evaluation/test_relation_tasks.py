@@ -170,16 +170,6 @@ def test_a_relation_in_both_spellings_is_one_triple():
     assert r_precision(complete_scenes(data, torch.zeros(2, dtype=torch.bool), flat), 1) is None
 
 
-def test_the_split_depends_on_the_scene_alone():
-    def keys(data, seed=0):
-        found = complete_scenes(data, WIDE_STRUCTURE, flat, seed=seed)
-        return [entry.key.tolist() for entry in found]
-
-    alone = [key for entry in DATA.scenes for key in keys(tensors([entry], WIDE))]
-    assert keys(DATA) == alone
-    assert keys(DATA) != keys(DATA, seed=1)
-
-
 def test_classes_related_both_ways_are_stated_of_different_instances():
     """Two lamps on either side of a bed: left(lamp, bed) and left(bed, lamp) hold of classes."""
     artifact = larger_artifact("triway-implications")

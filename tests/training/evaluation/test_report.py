@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.questions.artifacts import LARGER, larger_artifact, lines
+from tests.questions.artifacts import LARGER, larger_artifact
 from tests.training.evaluation.scenes import flat, knowing, random_scenes, scene, tensors
 from training.datasets.batches import seen_triples
 from training.datasets.cases import some_scenes
@@ -165,22 +165,6 @@ def test_publishing_measures_the_tasks_of_a_card_on_every_source():
         if not metric.endswith(missing)
     }
     assert found == card
-
-
-def test_published_figures_are_those_of_the_calibrated_artifact():
-    """Other lines, other alarms; and no more scenes than the limit allows."""
-
-    def alarms(threshold, limit=100):
-        limits = {"outlier_lines": lines(threshold, threshold, threshold)}
-        artifact = replace(ARTIFACT, calibration=ARTIFACT.calibration.model_copy(update=limits))
-        rows = evaluate(*(artifact, DATA, NO_STRUCTURE, TRAIN), limit=limit, tasks=("T3 alarms",))
-        assert {row.source for row in rows} == {"toy"}
-        (row,) = (row for row in rows if row.metric == "alarms, medium, 2 classes")
-        return row
-
-    every, none = alarms(-1e3), alarms(1e3, limit=7)
-    assert (every.value, none.value) == (1.0, 0.0)
-    assert (every.n, none.n) == (40, 7)
 
 
 def test_completion_has_the_metrics_of_relations():
