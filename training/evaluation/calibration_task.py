@@ -22,7 +22,7 @@ does not return are left out.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -42,7 +42,7 @@ from app.registry import (
 )
 from app.scene import CANONICAL, Scene, Vocabulary, canonicalise
 from training.datasets import EncodedScene
-from training.datasets.array_types import Flags, Ints, Rng
+from training.datasets.array_types import Flags, Floats, Ints, Rng
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import (
     altered_case,
@@ -62,7 +62,7 @@ from training.evaluation.asking import (
     with_intruder,
 )
 from training.evaluation.intruders import draw_intruder_choices
-from training.evaluation.metrics import Items, Metric
+from training.evaluation.metrics import Metric, Scored
 from training.evaluation.parts import Size, draw_parts, exactly, up_to_longest
 from training.evaluation.setting import Outcome, Setting
 
@@ -73,6 +73,24 @@ _NO_ALARM = AlarmLine(intercept=1e3)
 # (probability, truth) of each answer about one scene.
 Answered = list[tuple[float, bool]]
 Ask = Callable[[Artifact, EncodedScene, Rng], Answered | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Items:
+    """N scored items of some scenes, such as answers: scene, score and truth value, all (N,).
+
+    `skipped` is the number of scenes that could not be scored.
+    """
+
+    scene: Ints
+    score: Floats
+    truth: Flags
+    scenes: int
+    skipped: int = 0
+
+    def metric(self, statistic: str) -> Scored:
+        """Return one of `STATISTICS`."""
+        return Scored(statistic, self.scene, self.score, self.truth, np.arange(self.scenes))
 
 
 def uncalibrated(artifact: Artifact) -> Artifact:

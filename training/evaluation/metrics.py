@@ -346,24 +346,6 @@ STATISTICS: dict[str, Callable[[Floats, Floats, Floats], float]] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Items:
-    """N scored items of some scenes, such as answers: scene, score and truth value, all (N,).
-
-    `skipped` is the number of scenes that could not be scored.
-    """
-
-    scene: Ints
-    score: Floats
-    truth: Flags
-    scenes: int
-    skipped: int = 0
-
-    def metric(self, statistic: str) -> Scored:
-        """Return one of `STATISTICS`."""
-        return Scored(statistic, self.scene, self.score, self.truth, np.arange(self.scenes))
-
-
-@dataclass(frozen=True, eq=False)
 class Resampled(Metric):
     """A metric of which only its value and its resamples are kept, such as one of whole sets.
 

@@ -71,10 +71,10 @@ class ObjectDensity:
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """Generated scenes, (scenes, V), and `count_contradictions` of their relations, if any."""
+    """Generated scenes, (scenes, V), and `count_contradictions` of their relations."""
 
     v: Tensor
-    contradictions: Tensor | None = None
+    contradictions: Tensor
 
 
 # Function that generates scenes from the classes that each scene must contain, (scenes, classes)

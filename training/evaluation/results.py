@@ -174,8 +174,11 @@ def summarise(reports: Reports, ours: str) -> Results:
     """
     members: dict[tuple[str, str, str, str], list[Metric]] = {}
     asked: list[dict[str, Any]] = []
+    parameters: dict[str, int] = {}
     for (row, seed), by_source in reports.items():
         for source, report in by_source.items():
+            if report.parameters is not None:
+                parameters[row] = report.parameters
             for task, outcome in report.outcomes.items():
                 if outcome is None:
                     continue
@@ -207,12 +210,6 @@ def summarise(reports: Reports, ours: str) -> Results:
         # A row may lack a pooled metric on some data sources. Its scenes then cannot be paired.
         and _same_groups(mine, mean)
     )
-    parameters = {
-        row: report.parameters
-        for (row, _), by_source in reports.items()
-        for report in by_source.values()
-        if report.parameters is not None
-    }
     return Results(ours, cells, differences, parameters, tuple(asked))
 
 

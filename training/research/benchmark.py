@@ -130,17 +130,13 @@ def compare_machines(
     """Measure machines and baselines on test scenes, and write tables and plots into the folder.
 
     The first configuration is the reference of all differences. A model whose training diverges
-    has its error in the results instead of metrics.
+    has its error in the results instead of metrics. The commands describe the other arguments.
 
     Args:
         configs: configurations with the same data section.
         root: folder of the scene files.
         shown: the tasks to measure, and their metrics in the tables.
-        seeds: number of training seeds of each model with random training.
         baselines: names of baselines; None means all.
-        limit: maximum number of scenes per data source in slow tasks.
-        workers: number of processes.
-        fresh: delete earlier runs and reports.
 
     Raises:
         ValueError: a baseline is unknown, or the reference has no metric.

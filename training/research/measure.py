@@ -62,7 +62,9 @@ POOLED = "pooled"
 @contextmanager
 def resumable(console: Console) -> Iterator[None]:
     """Print expected errors; after Ctrl-C, print how to continue."""
-    expected = (ConfigError, DatasetError, RunError, BrokenProcessPool, ValueError)
+    expected = (
+        ConfigError, DatasetError, RunError, BrokenProcessPool, ValueError, FloatingPointError
+    )  # fmt: skip
     try:
         yield
     except expected as error:
