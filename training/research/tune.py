@@ -1,9 +1,9 @@
 """`python -m training tune`: search for settings on validation scenes with optuna.
 
-<folder>/<configuration>/study.log    all trials, as a journal of optuna
-                         <settings>/  curve, reports and checkpoint of a trial, by digest of its
-                                      settings
-                         best.toml    the best configuration
+<folder>/<configuration>/<digest>/  curve, reports and checkpoint of the settings of a trial
+                         best.toml  the best configuration
+
+The same seed draws the same settings. So the same command repeats its trials from these folders.
 
 A search space is a TOML file of settings with choices or intervals:
 
@@ -15,11 +15,13 @@ Source: Akiba et al., "Optuna: a next-generation hyperparameter optimization fra
 
 from __future__ import annotations
 
+import json
 import math
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -33,7 +35,13 @@ from training.evaluation.artifact_model import score_relations
 from training.evaluation.asking import score_missing
 from training.evaluation.metrics import Metric, paired_difference
 from training.evaluation.model import Model
-from training.evaluation.report import SourceReport, measure, pooled, settings_by_source
+from training.evaluation.report import (
+    SourceReport,
+    measure,
+    pooled,
+    settings_by_source,
+    write_whole,
+)
 from training.fit.checkpoint import CurvePoint
 from training.fit.configuration import Config, ConfigError, first_error
 from training.fit.draft import draft_artifact
@@ -112,9 +120,8 @@ def tune(
         with console.status("reading and encoding scenes"):
             scenes = prepare(config, data_folder(configuration, config, data))
         search = Search(results, config, scenes.training_data(), distributions)
-        study = search.open(scenes.digest)
         unchanged = search.metrics_of({})
-        search.run(study, trials, seed)
+        study = search.run(trials, seed)
     _write_best(search, study, original, unchanged)
 
 
@@ -167,47 +174,23 @@ class Search:
     data: TrainingData
     space: Mapping[str, BaseDistribution]
 
-    def open(self, scenes: str) -> Study:
-        """Open the optuna study, or create it. A study of another search is a ConfigError."""
+    def run(self, trials: int, seed: int) -> Study:
+        """Run trials, and return the study. A finished trial is read from its folder."""
         import optuna
-        from optuna.storages.journal import JournalFileBackend
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        self.folder.mkdir(parents=True, exist_ok=True)
-        backend = JournalFileBackend(str(self.folder / "study.log"))
         study = optuna.create_study(
-            storage=optuna.storages.JournalStorage(backend),
-            study_name=self.config.name,
             direction="maximize",
-            load_if_exists=True,
+            sampler=optuna.samplers.TPESampler(seed=seed),
             pruner=optuna.pruners.MedianPruner(_RIVALS, _WARM_UP),
         )
-        identity = {"config": self.config.digest, "scenes": scenes}
-        if study.user_attrs.setdefault("identity", identity) != identity:
-            raise ConfigError(
-                f"{self.folder} holds a search with another configuration or other scenes; use "
-                "--fresh or another folder"
-            )
-        study.set_user_attr("identity", identity)
-        return study
-
-    def run(self, study: Study, trials: int, seed: int) -> None:
-        """Run trials until the study has `trials`, without interrupted ones."""
-        import optuna
-
-        state = optuna.trial.TrialState
-        if study.trials and (last := study.trials[-1]).state == state.RUNNING:
-            # The search was interrupted in this trial, which resumes from a checkpoint.
-            study.enqueue_trial(last.params)
-            study.tell(last.number, state=state.FAIL)
-        ended = len(study.get_trials(states=(state.COMPLETE, state.PRUNED)))
-        for number in range(ended, trials):
-            study.sampler = optuna.samplers.TPESampler(seed=seed + number)
+        for _ in range(trials):
             trial = study.ask(dict(self.space))
             try:
                 study.tell(trial, self.value_of(trial))
             except optuna.TrialPruned:
-                study.tell(trial, state=state.PRUNED)
+                study.tell(trial, state=optuna.trial.TrialState.PRUNED)
+        return study
 
     def value_of(self, trial: Trial) -> float:
         """Train the machine of one trial, and return its metric on validation scenes.
@@ -246,16 +229,21 @@ class Search:
             FloatingPointError: the training diverged.
         """
         config = with_settings(self.config, settings)
-        folder = self.folder / config.digest[:12]
-        sources = sorted({scene.source for scene in self.data.validation.scenes})
-        paths = [folder / f"{source}.json" for source in sources]
-        if not all(path.exists() for path in paths):
+        digest = sha256(f"{config.digest} {self.data.digest}".encode()).hexdigest()
+        folder = self.folder / digest[:12]
+        if (curve := folder / "curve.json").exists():
+            for values in json.loads(curve.read_text(encoding="utf-8")):
+                passed(CurvePoint(**values))
+        else:
             trainer = Trainer(config, self.data, folder)
             trainer.resume()
             for point in trainer.curve:
                 passed(point)
             self._measure(trainer.run(passed=passed).machine, folder)
+            write_whole(curve, json.dumps([asdict(point) for point in trainer.curve]))
             (folder / "checkpoint.pt").unlink(missing_ok=True)
+        sources = sorted({scene.source for scene in self.data.validation.scenes})
+        paths = [folder / f"{source}.json" for source in sources]
         report = pooled([SourceReport.read(path) for path in paths])
         return {
             name: outcome.metrics[metric]
