@@ -149,7 +149,7 @@ def measure_entries(
     columns = BarColumn(), "{task.completed}/{task.total}", TimeElapsedColumn()
     failures = {}
     with Bar(*columns, TextColumn("{task.description}"), console=console) as bar:
-        task = bar.add_task("", total=len(entries), completed=len(entries) - len(missing))
+        task = bar.add_task("training", total=len(entries), completed=len(entries) - len(missing))
 
         def say(note: str) -> None:
             bar.update(task, description=note)
