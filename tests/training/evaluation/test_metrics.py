@@ -37,7 +37,6 @@ RATIO = Ratio(floats(1, 0, 3), floats(2, 0, 4))
 SCORED = Scored(
     "Brier skill", ints(0, 0, 1), floats(0.9, 0.1, 0.4), np.array([True, False, False]), ints(0, 1)
 )
-ITEM = ("unit", "score", "truth")
 RESAMPLED = Resampled.of(lambda weight: float(weight @ [1, 2]) / 2, ints(4, 7), 9, 50)
 POOLABLE = {"ratio": RATIO, "scored": SCORED}
 each = pytest.mark.parametrize("metric", POOLABLE.values(), ids=POOLABLE)
@@ -47,9 +46,6 @@ def test_metrics_by_hand():
     assert RATIO.value == pytest.approx(4 / 6)
     assert (RATIO.n, len(RATIO.groups)) == (6, 3)
     assert RATIO.mean_over_scenes().value == pytest.approx((1 / 2 + 3 / 4) / 2)
-    # Items count as often as their scene.
-    twice = {name: np.r_[getattr(SCORED, name)[:2], getattr(SCORED, name)] for name in ITEM}
-    assert SCORED.at(floats(2, 1)) == pytest.approx(replace(SCORED, **twice).value)
 
 
 @each

@@ -177,9 +177,7 @@ def test_completion_has_the_metrics_of_relations():
     some = completion_task(knowing(DATA), SETTING).metrics
     assert 0 < some["R-precision, zero-shot"].n < some["R-precision"].n
     ignorant = completion_task(flat, replace(SETTING, seen=None)).metrics
-    recalls = [ignorant[f"R@{k}"].value for k in (20, 50, 100)]
-    assert recalls == sorted(recalls)
-    assert 0 < recalls[0] < 1
+    assert 0 < ignorant["R@20"].value < ignorant["R@100"].value
     assert "R-precision, zero-shot" not in ignorant
 
 
