@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ from training.datasets.batches import TrainingData, subset
 from training.datasets.cases import some_scenes
 from training.domain.candidates import Candidate, stored_candidate
 from training.domain.compare import Comparison, difference_text
-from training.evaluation.asking import missing_score
+from training.evaluation.asking import score_missing
 from training.evaluation.baselines import EASE, POPULARITY
 from training.evaluation.metrics import FEWEST_GROUPS, Figure, Ratio, paired_difference
 from training.evaluation.missing_tasks import rank_missing
@@ -108,7 +109,7 @@ def measure_usefulness(
             raise ValueError("the model has no score of missing objects")
         return rank_missing(scenes, data.structure, score).mrr().by(scenes.group_ids)
 
-    ours, values, gaps = mrr(missing_score(artifact)), {}, {}
+    ours, values, gaps = mrr(partial(score_missing, artifact)), {}, {}
     for baseline in (POPULARITY, EASE):
         say(f"fitting {baseline.name}")
         theirs = mrr(baseline.fit(data.train, data.validation, data.structure).missing)

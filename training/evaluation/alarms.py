@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from scipy.stats import beta
+from scipy.stats import binomtest
 
 from app import questions
 from app.registry import Artifact, Sensitivity
@@ -53,9 +53,8 @@ class Alarms:
     @property
     def at_least(self) -> float:
         """Exact 95 % lower bound of the share of scenes with an alarm."""
-        if not self.alarms:
-            return 0.0
-        return float(beta.ppf(0.05, self.alarms, self.scenes - self.alarms + 1))
+        test = binomtest(self.alarms, self.scenes, alternative="greater")
+        return float(test.proportion_ci(0.95, method="exact").low)
 
     def objection(self) -> str | None:
         """Return the reason against the model, or None if the share may agree with the promise."""

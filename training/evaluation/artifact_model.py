@@ -15,23 +15,23 @@ from app.registry import Artifact
 from app.scene import CANONICAL, OPPOSITES, Scene
 from training.datasets.batches import Batch, SceneTensors
 from training.evaluation.asking import (
+    flag_outliers,
     instances_of,
     log_of,
-    misplaced_score,
     missing_probabilities,
-    missing_score,
-    outlier_flags,
-    room_score,
-    suspicion_score,
+    score_misplaced,
+    score_missing,
+    score_rooms,
+    score_suspicion,
 )
-from training.evaluation.density_task import DensitySettings, independent_density, machine_density
+from training.evaluation.density_task import independent_density, machine_density
 from training.evaluation.generation_task import (
     held_out_halves,
     independent_sampler,
     machine_sampler,
     scene_sampler,
 )
-from training.evaluation.model import Model, PlacedScore, Places, RelationScore, Sampler
+from training.evaluation.model import Model, Places, Sampler
 from training.evaluation.setting import Setting
 from training.machines.arrays import machine_of
 
@@ -39,70 +39,57 @@ from training.machines.arrays import machine_of
 def artifact_model(
     artifact: Artifact,
     train: SceneTensors,
-    settings: DensitySettings = DensitySettings(),  # noqa: B008
     seed: int = 0,
     *,
-    calibrated: bool = True,
     profiles: Sequence[str] = (),
 ) -> Model:
-    """Return the answers of a trained model; only a `calibrated` model judges outliers.
-
-    Requests about rooms may name the `profiles`.
-    """
+    """Return the answers of a trained model. Requests about rooms may name the `profiles`."""
     machine = machine_of(artifact.weights)
-    completion = relation_score(artifact, given=True)
     sampler = machine_sampler(artifact)
-    density = cache(partial(machine_density, machine, train, settings, seed))
+    density = cache(partial(machine_density, machine, train, seed))
+    judges_relations = artifact.calibration.misplaced.judges_relations
     return Model(
-        missing=missing_score(artifact),
-        suspicion=suspicion_score(artifact) if calibrated else None,
-        flags=outlier_flags(artifact) if calibrated else None,
-        at_place=placed_score(artifact),
-        relations=relation_score(artifact, given=False),
-        completion=completion,
-        false_relations=false_relation_score(artifact) if calibrated else completion,
-        misplaced=misplaced_score(artifact) if calibrated else None,
-        rooms=room_score(artifact, profiles),
+        missing=partial(score_missing, artifact),
+        suspicion=partial(score_suspicion, artifact),
+        flags=partial(flag_outliers, artifact),
+        at_place=partial(score_placed, artifact),
+        relations=partial(score_relations, artifact, given=False),
+        completion=partial(score_relations, artifact, given=True),
+        false_relations=partial(score_false_relations, artifact),
+        misplaced=partial(score_misplaced, artifact) if judges_relations else None,
+        rooms=partial(score_rooms, artifact, profiles) if artifact.spec.C else None,
         generate=lambda _: sampler,
         density=lambda _: density(),
         parameters=machine.parameter_count,
-        artifact=artifact if calibrated else None,
+        artifact=artifact,
     )
 
 
-def relation_score(artifact: Artifact, *, given: bool) -> RelationScore:
-    """Return a function that computes the log-odds of each relation between two present classes.
+def score_relations(artifact: Artifact, batch: Batch, *, given: bool) -> Tensor:
+    """Return the log-odds of each relation between two present classes, (B, A, n, n).
 
     With `given`, the other observed relations that hold are evidence. The log-odds of a relation
     never use the observed value of this relation.
     """
-
-    def score(batch: Batch) -> Tensor:
-        log_odds = torch.full(batch.holds.shape, -torch.inf)
-        for row, (scene, _) in enumerate(_scenes(batch, given)):
-            values = Posterior(artifact, scene).relation_log_odds()
-            a, n, _ = values.shape
-            log_odds[row, :a, :n, :n] = torch.from_numpy(values)
-        return log_odds
-
-    return score
+    log_odds = torch.full(batch.holds.shape, -torch.inf)
+    for row, (scene, _) in enumerate(_scenes(batch, given)):
+        values = Posterior(artifact, scene).relation_log_odds()
+        a, n, _ = values.shape
+        log_odds[row, :a, :n, :n] = torch.from_numpy(values)
+    return log_odds
 
 
-def false_relation_score(artifact: Artifact) -> RelationScore:
-    """Return a function that computes the log-odds that observed relations hold.
+def score_false_relations(artifact: Artifact, batch: Batch) -> Tensor:
+    """Return the log-odds that observed relations hold, (B, A, n, n); others are -inf.
 
-    `/outliers` ranks the observed relations by these log-odds. Other entries are -inf.
+    `/outliers` ranks the observed relations by these log-odds.
     """
-
-    def score(batch: Batch) -> Tensor:
-        log_odds = torch.full(batch.holds.shape, -torch.inf)
-        for row, (scene, triples) in enumerate(_scenes(batch)):
-            wrong = wrong_relations(artifact, scene)
-            for pair, stated in triples.items():
-                log_odds[(row, *pair)] = -wrong.get(stated, 0.0)
-        return log_odds
-
-    return score
+    log_odds = torch.full(batch.holds.shape, -torch.inf)
+    for row, (scene, triples) in enumerate(_scenes(batch)):
+        wrong = wrong_relations(artifact, scene)
+        for pair, stated in triples.items():
+            log_odds[(row, *pair)] = -wrong.get(stated, 0.0)
+    return log_odds
 
 
 def _scenes(batch: Batch, given: bool = True) -> Iterator[tuple[Scene, dict[Triple, Triple]]]:
@@ -126,28 +113,24 @@ def _scenes(batch: Batch, given: bool = True) -> Iterator[tuple[Scene, dict[Trip
         yield Scene(scene.objects, tuple(triples.values()) or None), triples
 
 
-def placed_score(artifact: Artifact) -> PlacedScore:
-    """Return a function that computes the log-probability of each class at a place.
+def score_placed(artifact: Artifact, places: Places) -> Tensor:
+    """Return the log-probability of each class at B places by `/missing`, (B, V).
 
-    `/missing` computes these probabilities. The value is -inf for classes it cannot propose.
+    The value is -inf for classes it cannot propose.
     """
-
-    def score(places: Places) -> Tensor:
-        rows = []
-        for row, v in enumerate(places.v):
-            classes = v.nonzero().squeeze(1)
-            scene, first = instances_of(classes, places.counts[row, classes])
-            relation = CANONICAL[int(places.relation[row])]
-            anchor = int(first[int((classes == places.anchor[row]).nonzero())])
-            # The request names the relation from the missing object to the anchor.
-            name = relation if places.outgoing[row] else OPPOSITES[relation]
-            # A model without this relation cannot use the place.
-            at = (name, anchor) if places.relation[row] < artifact.spec.A else None
-            p = missing_probabilities(artifact, scene, at=at)
-            rows.append(log_of(p).masked_fill(torch.from_numpy(p < 0), -torch.inf))
-        return torch.stack(rows).to(places.v.dtype)
-
-    return score
+    rows = []
+    for row, v in enumerate(places.v):
+        classes = v.nonzero().squeeze(1)
+        scene, first = instances_of(classes, places.counts[row, classes])
+        relation = CANONICAL[int(places.relation[row])]
+        anchor = int(first[int((classes == places.anchor[row]).nonzero())])
+        # The request names the relation from the missing object to the anchor.
+        name = relation if places.outgoing[row] else OPPOSITES[relation]
+        # A model without this relation cannot use the place.
+        at = (name, anchor) if places.relation[row] < artifact.spec.A else None
+        p = missing_probabilities(artifact, scene, at=at)
+        rows.append(log_of(p).masked_fill(torch.from_numpy(p < 0), -torch.inf))
+    return torch.stack(rows).to(places.v.dtype)
 
 
 def floor_model() -> Model:

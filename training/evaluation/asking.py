@@ -21,7 +21,6 @@ from app.scene import CANONICAL, Scene, SceneObject, canonicalise, observe
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats
 from training.datasets.cases import scene_of
-from training.evaluation.model import MisplacedScore, RoomScore
 
 Case = TypeVar("Case")
 
@@ -161,45 +160,40 @@ def log_of(p: Floats) -> Tensor:
     return torch.from_numpy(np.log(np.maximum(p, np.finfo(np.float64).tiny)))
 
 
-def missing_score(artifact: Artifact) -> Callable[[Tensor], Tensor]:
-    """Return a function from lists (B, V) to the log-probabilities of `/missing`, (B, V)."""
+def score_missing(artifact: Artifact, v: Tensor, room: Tensor | None = None) -> Tensor:
+    """Return the log-probabilities of `/missing`, (B, V), for lists v (B, V).
 
-    def score(v: Tensor) -> Tensor:
-        return log_of(np.stack([missing_probabilities(artifact, scene) for scene in _scenes(v)]))
-
-    return score
-
-
-def room_score(artifact: Artifact, profiles: Sequence[str]) -> RoomScore | None:
-    """Return a function for the log-probabilities of `/rooms`, or None without room types.
-
-    Requests name only the profiles of the model, `profiles`.
+    `room` (B,) are the room types to state. None states no room type.
     """
-    types, names = artifact.spec.C, artifact.vocabulary.room_types
-    if not types:
-        return None
-
-    def score(v: Tensor, profile: str) -> Tensor:
-        index = profiles.index(profile) if profile in profiles else None
-        p = np.zeros((len(v), types))
-        for row, scene in zip(p, _scenes(v), strict=True):
-            scene = replace(scene, profile=index)
-            answer = questions.rooms(artifact, scene, top_k=types, details=False)
-            for entry in answer["room_types"]:
-                row[names.index(entry["room_type"])] = entry["probability"]
-        return log_of(p)
-
-    return score
+    types = [None] * len(v) if room is None else room.tolist()
+    scenes = (replace(s, room_type=t) for s, t in zip(_scenes(v), types, strict=True))
+    return log_of(np.stack([missing_probabilities(artifact, scene) for scene in scenes]))
 
 
-def suspicion_score(artifact: Artifact) -> Callable[[Tensor], Tensor]:
-    """Return a function from lists (B, V) to the probabilities of `/outliers`, or -inf, (B, V)."""
-    return lambda v: _judged(artifact, v, 0, "medium", -torch.inf)
+def score_rooms(artifact: Artifact, profiles: Sequence[str], v: Tensor, profile: str) -> Tensor:
+    """Return the log-probabilities of `/rooms`, (B, room types), for lists v (B, V).
+
+    The requests name the profile if it is one of the `profiles` of the model.
+    """
+    names = artifact.vocabulary.room_types
+    index = profiles.index(profile) if profile in profiles else None
+    p = np.zeros((len(v), artifact.spec.C))
+    for row, scene in zip(p, _scenes(v), strict=True):
+        scene = replace(scene, profile=index)
+        answer = questions.rooms(artifact, scene, top_k=len(row), details=False)
+        for entry in answer["room_types"]:
+            row[names.index(entry["room_type"])] = entry["probability"]
+    return log_of(p)
 
 
-def outlier_flags(artifact: Artifact) -> Callable[[Tensor, Sensitivity], Tensor]:
-    """Return a function from lists (B, V) and a sensitivity to the reported outliers, (B, V)."""
-    return lambda v, sensitivity: _judged(artifact, v, 2, sensitivity, 0.0) > 0
+def score_suspicion(artifact: Artifact, v: Tensor) -> Tensor:
+    """Return the probabilities of `/outliers`, or -inf, (B, V), for lists v (B, V)."""
+    return _judged(artifact, v, 0, "medium", -torch.inf)
+
+
+def flag_outliers(artifact: Artifact, v: Tensor, sensitivity: Sensitivity) -> Tensor:
+    """Return the reported outliers, (B, V) bool, for lists v (B, V)."""
+    return _judged(artifact, v, 2, sensitivity, 0.0) > 0
 
 
 def _judged(
@@ -216,20 +210,14 @@ def _scenes(v: Tensor) -> Iterator[Scene]:
     return (of_classes(row.nonzero().squeeze(1).tolist()) for row in v)
 
 
-def misplaced_score(artifact: Artifact) -> MisplacedScore | None:
-    """Return a function from a scene to its misplaced relations, or None if none are judged.
+def score_misplaced(artifact: Artifact, scene: Scene) -> list[dict[str, Any]]:
+    """Return the misplaced relations of a scene.
 
     Relations of scenes with poses follow from the poses, as in a request in viewer axes.
     """
-    if not artifact.calibration.misplaced.judges_relations:
-        return None
-    sizes = artifact.vocabulary.sizes
     roles = None if artifact.places is None else artifact.places.roles
-
-    def score(scene: Scene) -> list[dict[str, Any]]:
-        return questions.misplaced(artifact, observe(scene, typical_sizes=sizes, roles=roles))
-
-    return score
+    observed = observe(scene, typical_sizes=artifact.vocabulary.sizes, roles=roles)
+    return questions.misplaced(artifact, observed)
 
 
 def relation_probabilities(

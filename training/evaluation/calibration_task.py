@@ -22,7 +22,7 @@ does not return are left out.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -42,7 +42,7 @@ from app.registry import (
 )
 from app.scene import CANONICAL, Scene, Vocabulary, canonicalise
 from training.datasets import EncodedScene
-from training.datasets.array_types import Flags, Ints, Rng
+from training.datasets.array_types import Flags, Floats, Ints, Rng
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import (
     altered_case,
@@ -62,7 +62,7 @@ from training.evaluation.asking import (
     with_intruder,
 )
 from training.evaluation.intruders import draw_intruder_choices
-from training.evaluation.metrics import Items, Metric
+from training.evaluation.metrics import Metric, Scored
 from training.evaluation.parts import Size, draw_parts, exactly, up_to_longest
 from training.evaluation.setting import Outcome, Setting
 
@@ -73,6 +73,24 @@ _NO_ALARM = AlarmLine(intercept=1e3)
 # (probability, truth) of each answer about one scene.
 Answered = list[tuple[float, bool]]
 Ask = Callable[[Artifact, EncodedScene, Rng], Answered | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Items:
+    """N scored items of some scenes, such as answers: scene, score and truth value, all (N,).
+
+    `skipped` is the number of scenes that could not be scored.
+    """
+
+    scene: Ints
+    score: Floats
+    truth: Flags
+    scenes: int
+    skipped: int = 0
+
+    def metric(self, statistic: str) -> Scored:
+        """Return one of `STATISTICS`."""
+        return Scored(statistic, self.scene, self.score, self.truth, np.arange(self.scenes))
 
 
 def uncalibrated(artifact: Artifact) -> Artifact:
@@ -273,7 +291,8 @@ def ask_misplaced(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answer
     ] or None
 
 
-LISTED = (2, 4, 8)  # listed classes in questions about missing classes
+# Numbers of listed classes in questions about missing classes, by name.
+LISTED = {f"missing, {listed} classes": listed for listed in (2, 4, 8)}
 
 QUESTIONS: dict[str, Ask] = {
     "relations": ask_relations,
@@ -284,31 +303,29 @@ QUESTIONS: dict[str, Ask] = {
     "misplaced": ask_misplaced,
 }
 
-NAMES = (*QUESTIONS, *(f"missing, {listed} classes" for listed in LISTED))
+NAMES = (*QUESTIONS, *LISTED)
 """Names of all questions in the metrics of the task."""
 
 
 def calibration_task(artifact: Artifact, setting: Setting) -> Outcome | None:
     """Measure the calibration of the answers to all questions, published and uncalibrated."""
     related = setting.some(related=True, share=3)
-    complete = setting.complete.some(share=3)
+    complete, complete_related = (
+        setting.complete.some(related=related, share=3) for related in (False, True)
+    )
     train, seed = setting.complete.train, setting.seed
     intruders = draw_intruder_choices(complete, setting.structure, train, seed)
-    collects: dict[str, tuple[SceneTensors, Callable[..., Items]]] = {
-        name: (related, partial(collect, ask=ask)) for name, ask in QUESTIONS.items()
-    }
-    at_place = setting.complete.some(related=True, share=3)
-    collects["missing at a place"] = at_place, partial(collect, ask=ask_placed)
-    ask = partial(ask_outliers, intruders=intruders)
-    collects["outliers"] = complete, partial(collect, ask=ask)
-    for n in LISTED:
-        ask_parts = partial(collect_missing, size=exactly(n))
-        collects[f"missing, {n} classes"] = setting.complete.some(), ask_parts
+    ask = QUESTIONS | {"outliers": partial(ask_outliers, intruders=intruders)}
+    scenes_of = {"outliers": complete, "missing at a place": complete_related}
     metrics: dict[str, Metric] = {}
     skipped = 0
-    for name, (scenes, ask_all) in collects.items():
+    for name in NAMES:
+        scenes = scenes_of.get(name, related) if name in QUESTIONS else setting.complete.some()
         for suffix, model in (("", artifact), (", uncalibrated", uncalibrated(artifact))):
-            answers = ask_all(model, scenes, seed=seed)
+            if name in QUESTIONS:
+                answers = collect(model, scenes, ask[name], seed)
+            else:
+                answers = collect_missing(model, scenes, exactly(LISTED[name]), seed)
             skipped += 0 if suffix else answers.skipped
             if not len(answers.scene):
                 break

@@ -16,8 +16,6 @@ Source: Neal, "Annealed importance sampling" (2001), run in both directions as i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -31,24 +29,14 @@ from training.machines import BoltzmannMachine, MachineSpec, build
 from training.machines.gibbs import start_chains, sweep
 from training.machines.partition import LogPartition, ais, reverse_ais
 
+CHAINS = 128
+"""Number of Gibbs chains of each AIS run."""
 
-@dataclass(frozen=True)
-class DensitySettings:
-    """Number of samples and sweeps of the density estimates.
+TEMPERATURES = 1000
+"""Number of inverse temperatures of each AIS run."""
 
-    Attributes:
-        chains: number of Gibbs chains of each AIS run.
-        temperatures: number of inverse temperatures of each AIS run.
-        burn_in: number of Gibbs sweeps from training scenes before the reverse AIS run.
-    """
-
-    chains: int = 128
-    temperatures: int = 1000
-    burn_in: int = 500
-
-    def betas(self) -> list[float]:
-        """Return inverse temperatures from 0 to 1, denser near 1, where p(v) changes most."""
-        return [float(x) for x in 1 - np.linspace(1.0, 0.0, self.temperatures) ** 2]
+BURN_IN = 500
+"""Number of Gibbs sweeps from training scenes before the reverse AIS run."""
 
 
 def independent_density(train: SceneTensors) -> ObjectDensity:
@@ -75,10 +63,7 @@ def ising_machine(b: Tensor, W: Tensor) -> BoltzmannMachine:
 
 
 def machine_density(
-    machine: BoltzmannMachine,
-    train: SceneTensors,
-    settings: DensitySettings = DensitySettings(),
-    seed: int = 0,
+    machine: BoltzmannMachine, train: SceneTensors, seed: int = 0
 ) -> ObjectDensity | None:
     """Return the density of a machine with one hidden layer, or None for two layers.
 
@@ -87,7 +72,7 @@ def machine_density(
     """
     if machine.spec.H2:
         return None
-    below, above = log_partition(machine, train, settings, seed)
+    below, above = log_partition(machine, train, seed)
     notes = {
         "log Z, AIS": below.log_z,
         "standard error, AIS": below.standard_error,
@@ -100,16 +85,17 @@ def machine_density(
 
 @torch.no_grad()
 def log_partition(
-    machine: BoltzmannMachine, train: SceneTensors, settings: DensitySettings, seed: int = 0
+    machine: BoltzmannMachine, train: SceneTensors, seed: int
 ) -> tuple[LogPartition, LogPartition]:
     """Run forward and reverse AIS for the objects of a machine."""
     generator = torch.Generator().manual_seed(seed)
-    betas = settings.betas()
+    # Denser near 1, where p(v) changes most.
+    betas = (1 - np.linspace(1.0, 0.0, TEMPERATURES) ** 2).tolist()
     base = _class_log_odds(train)
-    below = ais(machine, betas, settings.chains, generator, base)
-    start = torch.randint(len(train), (settings.chains,), generator=generator)
+    below = ais(machine, betas, CHAINS, generator, base)
+    start = torch.randint(len(train), (CHAINS,), generator=generator)
     chains = start_chains(machine, train.v[start], generator)
-    for _ in range(settings.burn_in):
+    for _ in range(BURN_IN):
         sweep(machine, chains, generator)
     return below, reverse_ais(machine, betas, chains, generator, base)
 

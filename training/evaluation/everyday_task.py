@@ -8,8 +8,7 @@ parameters of the service. Labels outside the vocabulary are ignored.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from hashlib import sha256
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -17,9 +16,12 @@ from typing import Any
 import numpy as np
 
 from app import questions
-from app.questions.answer import Fields
+from app.errors import RequestError
+from app.questions.names import ErrorList
+from app.questions.reading import Limits, Reading, read_scene
 from app.registry import Artifact
-from app.scene import Scene, SceneObject, opposite
+from app.scene import Scene, opposite
+from scene_client.schemas import SceneRequest
 from training.datasets.files import DATA
 from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.setting import Outcome, Setting
@@ -65,12 +67,6 @@ def facts_file(folder: Path = EVERYDAY) -> Path | None:
     return path if path.is_file() else None
 
 
-def facts_digest(folder: Path) -> str:
-    """Return the SHA-256 of the facts file, or an empty string if the file does not exist."""
-    path = facts_file(folder)
-    return "" if path is None else sha256(path.read_bytes()).hexdigest()
-
-
 def everyday_task(artifact: Artifact, setting: Setting) -> Outcome | None:
     """Measure the everyday facts. Each fact counts as one scene. `setting.scenes` is not used."""
     folder = setting.everyday
@@ -92,120 +88,81 @@ def ask_everyday(artifact: Artifact, folder: Path = EVERYDAY) -> Lines:
     Raises:
         FileNotFoundError: the folder contains no facts.
     """
-    path = facts_file(folder)
-    if path is None:
-        raise FileNotFoundError(f"{folder} contains no facts.json")
-    facts: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return (
-        _relations(artifact, facts["relations"])
-        | _missing(artifact, "missing", facts["missing"])
-        | _missing(artifact, "missing_at", facts["missing_at"])
-        | _outliers(artifact, facts["intruders"], facts["plain"])
-        | _scenes(artifact, facts["rooms"], facts["seeds"])
-    )
+    facts: dict[str, Any] = json.loads((folder / "facts.json").read_text(encoding="utf-8"))
+    lines: Lines = {name: [] for name in LINES}
 
+    def add(names: Sequence[str], hits: Iterable[int], asked: int = 1) -> None:
+        for name, count in zip(names, hits, strict=True):
+            lines[name].append((int(count), asked))
 
-def _scene(artifact: Artifact, labels: Sequence[str]) -> Scene:
-    """Build a scene of the known labels; several objects of a label have the ids label_number."""
-    objects = []
-    ids: set[str] = set()
-    for label in labels:
-        name, number = label, 0
-        while name in ids or (number == 0 and labels.count(label) > 1):
-            number += 1
-            name = f"{label}_{number}"
-        ids.add(name)
-        if (index := artifact.vocabulary.index(label)) is not None:
-            objects.append(SceneObject(name, label, index))
-    return Scene(tuple(objects))
-
-
-def _relations(artifact: Artifact, facts: list[dict[str, str]]) -> Lines:
-    rows = []
-    for fact in facts:
-        p = _relation_probabilities(artifact, fact["subject"], fact["object"])
-        likeliest = max(p, key=p.__getitem__, default="")
-        vertical = max(_VERTICAL & p.keys(), key=p.__getitem__, default="")
-        relation = fact["relation"]
-        rows.append((likeliest == relation, vertical == relation, p.get(relation, 0.0) >= 0.5))
-    return _count_hits(LINES[:3], rows)
-
-
-def _count_hits(names: Sequence[str], rows: Sequence[Sequence[bool]]) -> Lines:
-    """Return the hits of each name, from one row of hits per fact."""
-    return {name: [(int(row[k]), 1) for row in rows] for k, name in enumerate(names)}
-
-
-def _relation_probabilities(artifact: Artifact, subject: str, other: str) -> dict[str, float]:
-    """Return the probability of each of the eight relations of the subject to the other object.
-
-    The facts were written before the relations inside and contains existed, so these are left out.
-    """
-    scene = _scene(artifact, [subject, other])
-    answer = questions.relations(artifact, scene, top_k=_RELATIONS, include_opposites=True)
-    p: dict[str, float] = {}
-    for entry in answer["relations"]:
-        name = entry["relation"]
-        if name not in _NEWER:
-            name = name if entry["subject"] == subject else opposite(name)
-            p[name] = max(p.get(name, 0.0), entry["probability"])
-    return p
-
-
-def _missing(artifact: Artifact, name: str, facts: list[dict[str, Any]]) -> Lines:
-    hits = [
-        [any(entry["label"] in fact["expected"] for entry in _first_missing(artifact, fact))]
-        for fact in facts
-    ]
-    return _count_hits([f"{name}: an expected object is among five"], hits)
-
-
-def _first_missing(artifact: Artifact, fact: dict[str, Any]) -> list[Fields]:
-    """Return the first five answers, or an empty list if the service would reject the request."""
-    scene, at = _scene(artifact, fact["objects"]), None
-    if "at" in fact:
-        if (anchor := _object_index(artifact, scene, fact["at"]["object"])) is None:
-            return []
-        at = fact["at"]["relation"], anchor
-    if not scene.objects:
-        return []
-    entries: list[Fields] = questions.missing(artifact, scene, top_k=_LISTED, at=at)["missing"]
-    return entries
-
-
-def _object_index(artifact: Artifact, scene: Scene, name: str) -> int | None:
-    """Return the index of the object with the id `name`, or of the only object of class `name`."""
-    index = artifact.vocabulary.index(name)
-    named = [k for k, thing in enumerate(scene.objects) if thing.id == name]
-    indices = named or [k for k, thing in enumerate(scene.objects) if thing.class_index == index]
-    return indices[0] if len(indices) == 1 else None
-
-
-def _outliers(
-    artifact: Artifact, intruders: list[dict[str, Any]], plain: list[dict[str, Any]]
-) -> Lines:
-    def ask(labels: Sequence[str]) -> tuple[list[str], set[str]]:
-        """Return the labels, the most suspicious first, and the labels of reported outliers."""
-        entries = questions.outliers(artifact, _scene(artifact, labels))["outliers"]
-        flagged = {entry["label"] for entry in entries if entry["is_outlier"]}
-        return [entry["label"] for entry in entries], flagged
-
-    rows = []
-    for fact in intruders:
-        ranked, flagged = ask([*fact["objects"], fact["intruder"]])
-        rows.append((ranked[:1] == [fact["intruder"]], fact["intruder"] in flagged))
-    alarms = [[bool(ask(fact["objects"])[1])] for fact in plain]
-    return _count_hits(LINES[5:7], rows) | _count_hits(LINES[7:8], alarms)
-
-
-def _scenes(artifact: Artifact, rooms: list[dict[str, Any]], seeds: list[int]) -> Lines:
-    rows = []
-    for room, seed in product(rooms, seeds):
+    for fact in facts["relations"]:
+        add(LINES[:3], _relation_hits(artifact, fact))
+    for name, line in (("missing", LINES[3]), ("missing_at", LINES[4])):
+        for fact in facts[name]:
+            labels = _first_missing(artifact, fact)
+            add([line], [any(label in fact["expected"] for label in labels)])
+    for fact in facts["intruders"]:
+        ranked, flagged = _outliers(artifact, [*fact["objects"], fact["intruder"]])
+        add(LINES[5:7], (ranked[:1] == [fact["intruder"]], fact["intruder"] in flagged))
+    for fact in facts["plain"]:
+        add(LINES[7:8], [bool(_outliers(artifact, fact["objects"])[1])])
+    for room, seed in product(facts["rooms"], facts["seeds"]):
         empty = Scene((), room_type=artifact.vocabulary.room_index(room["room"]))
         answer = questions.generate(artifact, empty, count=_DRAWN, seed=seed)
         scenes = [set(scene["objects"]) for scene in answer["scenes"]]
         typical = sum(bool(labels & set(room["one_of"])) for labels in scenes)
         foreign = sum(bool(labels & set(room["never"])) for labels in scenes)
-        few = sum(len(labels) < _FEW for labels in scenes)
-        rows.append([(count, len(scenes)) for count in (typical, foreign, few)])
-    return {name: [row[k] for row in rows] for k, name in enumerate(LINES[8:])}
+        add(LINES[8:], (typical, foreign, sum(len(s) < _FEW for s in scenes)), len(scenes))
+    return lines
+
+
+def _read(artifact: Artifact, labels: Sequence[str]) -> Reading | None:
+    """Read the labels as a request does. Return None if the model knows none of them."""
+    request = SceneRequest(objects=list(labels), unknown_labels="ignore")
+    try:
+        return read_scene(request, artifact.vocabulary, Limits())
+    except RequestError:
+        return None
+
+
+def _relation_hits(artifact: Artifact, fact: Mapping[str, str]) -> tuple[bool, bool, bool]:
+    """Return whether the relation is the likeliest, the likeliest vertical one, and has p >= .5.
+
+    The facts were written before the relations inside and contains existed, so these are left out.
+    """
+    subject, relation = fact["subject"], fact["relation"]
+    p: dict[str, float] = {}
+    if (reading := _read(artifact, [subject, fact["object"]])) is not None:
+        answer = questions.relations(
+            artifact, reading.scene, top_k=_RELATIONS, include_opposites=True
+        )
+        for entry in answer["relations"]:
+            name = entry["relation"]
+            if name not in _NEWER:
+                name = name if entry["subject"] == subject else opposite(name)
+                p[name] = max(p.get(name, 0.0), entry["probability"])
+    likeliest = max(p, key=p.__getitem__, default="")
+    vertical = max(_VERTICAL & p.keys(), key=p.__getitem__, default="")
+    return likeliest == relation, vertical == relation, p.get(relation, 0.0) >= 0.5
+
+
+def _first_missing(artifact: Artifact, fact: Mapping[str, Any]) -> list[str]:
+    """Return the first five labels, or an empty list if the service would reject the request."""
+    reading, at = _read(artifact, fact["objects"]), None
+    if reading is None:
+        return []
+    if "at" in fact:
+        anchor = reading.names.find(fact["at"]["object"], ("at", "object"), ErrorList())
+        if anchor is None:
+            return []
+        at = fact["at"]["relation"], anchor
+    answer = questions.missing(artifact, reading.scene, top_k=_LISTED, at=at)
+    return [entry["label"] for entry in answer["missing"]]
+
+
+def _outliers(artifact: Artifact, labels: Sequence[str]) -> tuple[list[str], set[str]]:
+    """Return the labels, the most suspicious first, and the labels of reported outliers."""
+    reading = _read(artifact, labels)
+    entries = [] if reading is None else questions.outliers(artifact, reading.scene)["outliers"]
+    flagged = {entry["label"] for entry in entries if entry["is_outlier"]}
+    return [entry["label"] for entry in entries], flagged

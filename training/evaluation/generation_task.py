@@ -58,7 +58,7 @@ def independent_sampler(train: SceneTensors) -> Sampler:
     def sample(given: Tensor, room: Tensor, seed: int) -> Drawn:  # noqa: ARG001
         generator = torch.Generator().manual_seed(seed)
         v = torch.rand(given.shape, generator=generator) < frequency
-        return Drawn((v | given).to(train.v.dtype))
+        return Drawn((v | given).to(train.v.dtype), torch.zeros(len(v), 4))
 
     return sample
 
@@ -66,32 +66,23 @@ def independent_sampler(train: SceneTensors) -> Sampler:
 def scene_sampler(scenes: SceneTensors) -> Sampler:
     """Return a sampler that returns real scenes, to estimate the best possible value of a metric.
 
-    Without given classes, sample k is scene k if its room type fits. Otherwise it is a random scene
-    with the given classes and room type. Without such a scene, the sampler raises a ValueError.
+    Without given classes, sample k is scene k, which has the given room type in `generation_task`.
+    Otherwise it is a random scene with the given classes.
     """
-    counts = drawn_of(scenes).contradictions
+    drawn = drawn_of(scenes)
 
-    def sample(given: Tensor, room: Tensor, seed: int) -> Drawn:
+    def sample(given: Tensor, room: Tensor, seed: int) -> Drawn:  # noqa: ARG001
+        if not given.any():
+            return drawn
         rng = np.random.default_rng(seed)
-        is_free = not bool(given.any())
-        rows = []
-        for row in range(len(given)):
-            fits = (scenes.v >= given[row].to(scenes.v.dtype)).all(1)
-            if room[row] >= 0:
-                fits &= scenes.room == room[row]
-            fitting = fits.nonzero().squeeze(1).numpy()
-            if not len(fitting):
-                raise ValueError(
-                    f"no real scene has the observed classes and the room type of test scene {row}"
-                )
-            rows.append(row if is_free and row in fitting else int(rng.choice(fitting)))
-        index = torch.tensor(rows)
-        return Drawn(scenes.v[index], None if counts is None else counts[index])
+        fits = given.float() @ (scenes.v == 0).float().T == 0
+        index = torch.tensor([int(rng.choice(row.nonzero().squeeze(1).numpy())) for row in fits])
+        return Drawn(drawn.v[index], drawn.contradictions[index])
 
     return sample
 
 
-def machine_sampler(artifact: Artifact, *, steps: int = STEPS) -> Sampler:
+def machine_sampler(artifact: Artifact) -> Sampler:
     """Return a sampler that runs the Gibbs chains of the service, and also samples relations.
 
     Of two contradictory relations a(x, y) and a(y, x), the service keeps only one. This sampler
@@ -111,7 +102,7 @@ def machine_sampler(artifact: Artifact, *, steps: int = STEPS) -> Sampler:
                 held2=np.zeros(0, np.int64),
                 room=room_type if room_type >= 0 and artifact.spec.C else None,
             )
-            state = chains.under(conditions).draw(steps, random_stream(seed, row))
+            state = chains.under(conditions).draw(STEPS, random_stream(seed, row))
             objects[row, torch.from_numpy(state.classes)] = 1.0
             grid = torch.from_numpy(state.r).float().unsqueeze(0)
             contradictions.append(count_contradictions(grid))
@@ -268,9 +259,7 @@ def generation_metrics(
     pairs = resampled(pair_correlation(theirs, ours))
     if np.isfinite(pairs.value):
         metrics["pair correlation"] = pairs
-    if drawn.contradictions is not None:
-        metrics |= contradiction_metrics(drawn.contradictions)
-    return metrics
+    return metrics | contradiction_metrics(drawn.contradictions)
 
 
 def generation_task(sampler_of: SamplerOf, setting: Setting) -> Outcome | None:

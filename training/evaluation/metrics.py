@@ -13,7 +13,6 @@ Sources: Efron and Tibshirani, "An introduction to the bootstrap" (1993); Field 
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
@@ -24,9 +23,10 @@ from numpy.typing import NDArray
 from scipy.stats import norm, t
 
 from training.datasets.array_types import Flags, Floats, Ints
-from training.evaluation.item_statistics import STATISTICS, by_score, reliability
 
 RESAMPLES = 1000
+BINS = 10
+_EDGES = np.linspace(0.0, 1.0, BINS + 1)
 
 FEWEST_GROUPS = 6
 """Minimum number of groups of near-duplicate scenes for a paired difference. A useless model is
@@ -61,7 +61,7 @@ class Figure:
         return f"{self.value:.3f} [{self.low:.3f}, {self.high:.3f}]"
 
 
-class Metric(ABC):
+class Metric:
     """A metric over a set of scenes that can be resampled.
 
     Attributes:
@@ -75,9 +75,9 @@ class Metric(ABC):
     n: int
     draws: Floats
 
-    @abstractmethod
     def at(self, weight: Floats) -> float:
         """Return the metric with group k counted weight[k] times; NaN if undefined."""
+        raise NotImplementedError
 
     def by(self, groups: Ints) -> Metric:
         """Return the metric with its values summed by group; `groups` (G,) has the new ids."""
@@ -197,6 +197,11 @@ class Ratio(Metric):
         top, below = weights @ self.numerators, weights @ self.denominators
         return np.divide(top, below, where=below > 0, out=np.full(len(weights), np.nan))
 
+    @property
+    def skipped(self) -> int:
+        """Number of scenes without an item."""
+        return int((self.denominators == 0).sum())
+
     def mean_over_scenes(self) -> Ratio:
         """Return the metric with equal weight for every scored scene."""
         is_scored = self.denominators > 0
@@ -222,14 +227,16 @@ class Ratio(Metric):
 
 @dataclass(frozen=True, eq=False)
 class Scored(Metric):
-    """One of `STATISTICS` of the scores of N items that belong to scenes.
+    """One of `STATISTICS` of N items that belong to scenes, such as answers.
+
+    For items of equal score, the statistic is the expectation under random order.
 
     Attributes:
         unit: (N,) position of the scene or group of each item in `groups`.
         score, truth: (N,) score and truth value of each item.
 
     Raises:
-        ValueError: there are no items, or the statistic is unknown.
+        ValueError: there are no items.
     """
 
     statistic: str
@@ -239,10 +246,6 @@ class Scored(Metric):
     groups: Ints
 
     def __post_init__(self) -> None:
-        if self.statistic not in STATISTICS:
-            raise ValueError(
-                f"unknown statistic {self.statistic!r}: must be one of {sorted(STATISTICS)}"
-            )
         if not len(self.unit):
             raise ValueError("no scene could be scored")
 
@@ -263,17 +266,26 @@ class Scored(Metric):
         return len(self.unit)
 
     @cached_property
-    def _by_score(self) -> tuple[Floats, Callable[[Floats], tuple[Floats, Floats]]]:
-        return by_score(self.score, self.truth)  # sorts the items once for all resamples
+    def _levels(self) -> tuple[Floats, Ints]:
+        """The distinct scores, lowest first, and their index for each item."""
+        scores, level = np.unique(self.score, return_inverse=True)
+        return scores, level
+
+    def _weights(self, weight: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return the distinct scores, and the weights of all and of the true items of each."""
+        scores, level = self._levels
+        each = weight[self.unit]
+        total, true = (
+            np.bincount(level, w, len(scores)).astype(np.float64) for w in (each, each * self.truth)
+        )
+        return scores, total, true
 
     def at(self, weight: Floats) -> float:
-        scores, count = self._by_score
-        return STATISTICS[self.statistic](scores, *count(weight[self.unit]))
+        return STATISTICS[self.statistic](*self._weights(weight))
 
     def reliability(self) -> tuple[Floats, Floats]:
         """Return the mean score and the share of true items of each bin of the ECE."""
-        scores, count = self._by_score
-        return reliability(scores, *count(np.ones(self.n)))
+        return reliability(*self._weights(np.ones(len(self.groups))))
 
     @cached_property
     def draws(self) -> Floats:  # type: ignore[override]
@@ -282,31 +294,55 @@ class Scored(Metric):
         return _centred(values, self.value) if self.statistic == "ECE" else values
 
 
-@dataclass(frozen=True, eq=False)
-class Items:
-    """N scored items of some scenes, such as answers: scene, score and truth value, all (N,).
+def reliability(scores: Floats, totals: Floats, true: Floats) -> tuple[Floats, Floats]:
+    """Return the mean probability and the share of true items of each bin, both (bins,).
 
-    `skipped` is the number of scenes that could not be scored.
+    The items are sorted by probability and divided into `BINS` bins of equal weight. If a bin
+    border divides items of equal score, each bin gets a proportional part of the true items.
+
+    Args:
+        scores: the distinct scores, lowest first.
+        totals, true: weights of all and of the true items of each score.
     """
+    total = totals.sum()
+    last = np.concatenate([[0.0], np.cumsum(totals)])
 
-    scene: Ints
-    score: Floats
-    truth: Flags
-    scenes: int
-    skipped: int = 0
+    def means(values: Floats) -> Floats:
+        upto = np.interp(total * _EDGES, last, np.concatenate([[0.0], np.cumsum(values)]))
+        return (upto[1:] - upto[:-1]) * (BINS / total)
 
-    def hit_at_1(self) -> Ratio:
-        """Return the share of scenes whose highest-scored item is true; expected over ties."""
-        highest = np.full(self.scenes, -np.inf)
-        np.maximum.at(highest, self.scene, self.score)
-        is_highest = self.score == highest[self.scene]
-        ties = np.bincount(self.scene[is_highest], minlength=self.scenes)
-        hits = np.bincount(self.scene[is_highest & self.truth], minlength=self.scenes)
-        return Ratio.of_scenes(hits / np.maximum(ties, 1), ties > 0)
+    return means(totals * scores), means(true)
 
-    def metric(self, statistic: str) -> Scored:
-        """Return one of `STATISTICS`."""
-        return Scored(statistic, self.scene, self.score, self.truth, np.arange(self.scenes))
+
+def calibration_error(scores: Floats, totals: Floats, true: Floats) -> float:
+    """Return the expected calibration error (ECE) of probabilities; NaN without items.
+
+    The ECE is the mean over the bins of |mean probability - share of true items|.
+    """
+    if not totals.sum():
+        return float("nan")
+    p, y = reliability(scores, totals, true)
+    return float(np.abs(p - y).mean())
+
+
+def brier_skill(scores: Floats, totals: Floats, true: Floats) -> float:
+    """Return the Brier skill: 1 - Brier score / Brier score of the base rate.
+
+    The base rate is the share of true items. The skill is 0 if all probabilities are the base rate.
+    It is NaN if no item or every item is true.
+    """
+    total = totals.sum()
+    rate = true.sum() / total if total else 0.0
+    base = rate * (1 - rate)
+    brier = (true * (1 - scores) ** 2 + (totals - true) * scores**2).sum()
+    return float(1 - brier / total / base) if base > 0 else float("nan")
+
+
+STATISTICS: dict[str, Callable[[Floats, Floats, Floats], float]] = {
+    "ECE": calibration_error,
+    "Brier skill": brier_skill,
+}
+"""Functions of scores and weights, see `reliability`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,23 +384,3 @@ class Resampled(Metric):
     @property
     def draws(self) -> Floats:  # type: ignore[override]
         return self.drawn
-
-    def at(self, weight: Floats) -> float:
-        raise NotImplementedError("a resampled metric cannot be computed for weights")
-
-
-def mean_over_seeds(members: Sequence[Metric]) -> Resampled:
-    """Return the mean of a metric over training seeds; all seeds use the same resamples.
-
-    Raises:
-        ValueError: there is no metric, or the metrics have different groups.
-    """
-    if not members:
-        raise ValueError("a mean over seeds needs at least one metric")
-    groups = members[0].groups
-    if not all(np.array_equal(member.groups, groups) for member in members):
-        raise ValueError("all seeds must have results on the same groups of scenes")
-    shortest = min(len(member.draws) for member in members)
-    drawn: Floats = np.mean([member.draws[:shortest] for member in members], axis=0)
-    value = float(np.mean([member.value for member in members]))
-    return Resampled(value, drawn, groups, members[0].n)

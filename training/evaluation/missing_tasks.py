@@ -1,13 +1,11 @@
 """T2: rank of objects that were hidden from a scene.
 
-    T2         a request lists all classes of a scene but one, or 25 % of its classes. All instances
-               of a hidden class are hidden. The request contains no relations, which could reveal a
-               hidden object. The parts are drawn three times, see `training.evaluation.parts`
-    T2-at      each class with a relation to another class is removed in turn. One of these
-               relations, drawn at random, gives its place: the relation, its direction and the
-               class at its other end
-    Structure  change of the probabilities of `/missing` if a request also lists floor, wall and
-               ceiling
+    T2     a request lists all classes of a scene but one, or 25 % of its classes. All instances
+           of a hidden class are hidden. The request contains no relations, which could reveal a
+           hidden object. The parts are drawn three times, see `training.evaluation.parts`
+    T2-at  each class with a relation to another class is removed in turn. One of these
+           relations, drawn at random, gives its place: the relation, its direction and the
+           class at its other end
 
 Structure classes are neither listed, nor hidden, nor candidates. Further metrics of T2 list the
 structure that the scene annotates. Scenes with fewer than two other classes are skipped. T2-at
@@ -22,12 +20,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from app.registry import Artifact
 from app.scene import CANONICAL
 from training.datasets.array_types import Ints
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import scene_rng
-from training.evaluation.asking import ask_every, ask_rows, missing_probabilities, of_classes
+from training.evaluation.asking import ask_rows
 from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.model import ObjectScore, PlacedScore, Places
 from training.evaluation.parts import (
@@ -37,7 +34,6 @@ from training.evaluation.parts import (
     draw_parts,
     one_quarter,
     rank_hidden,
-    up_to_longest,
 )
 from training.evaluation.setting import Outcome, Setting
 
@@ -47,11 +43,8 @@ SEEDS: Final = (0, 1, 2)
 SIZES: Final[dict[str, Size]] = {"one removed": all_but_one, "25 % shown": one_quarter}
 """Parts that T2 lists, by name."""
 
-TOP: Final = (1, 2, 3, 5, 10, 20, 50)
+TOP: Final = (1, 3, 5, 10)
 """Values of k for top-k accuracy."""
-
-_STRUCTURE = ("floor", "wall", "ceiling")
-_FIRST = 10  # entries of an answer, by default
 
 
 def rank_missing(
@@ -92,27 +85,6 @@ def _with_unknown(mrr: Ratio, scenes: SceneTensors, structure: Tensor) -> Ratio:
     known = ((scenes.v > 0) & ~structure).sum(1).clamp(min=1).double().numpy()
     unknown = np.array([len(scene.unknown) for scene in scenes.scenes])
     return Ratio(mrr.numerators, mrr.denominators * (1 + unknown / known))
-
-
-def structure_task(artifact: Artifact, setting: Setting) -> Outcome | None:
-    """Measure the mean change of the first ten probabilities if the request lists structure."""
-    scenes = setting.some()
-    parts = draw_parts(scenes, setting.structure, up_to_longest, (setting.seed,))
-    labels = (artifact.vocabulary.index(label) for label in _STRUCTURE)
-    added = [index for index in labels if index is not None]
-    if not added or not len(parts.v):
-        return None
-    lists = [v.nonzero().squeeze(1).tolist() for v in parts.v]
-
-    def change(classes: list[int]) -> np.ndarray:
-        p, q = (missing_probabilities(artifact, of_classes(c)) for c in (classes, classes + added))
-        first = np.argsort(-p, kind="stable")[:_FIRST]
-        first = first[(p[first] > -np.inf) & (q[first] > -np.inf)]
-        return np.array([np.abs(p[first] - q[first]).mean() if len(first) else 0.0])
-
-    changes = np.concatenate(ask_every(change, lists))
-    metric = Ratio.of_items(parts.scene.numpy(), changes, len(scenes))
-    return Outcome.over(scenes, {"change of p": metric}, parts.skipped)
 
 
 def removed_places(

@@ -71,10 +71,10 @@ class ObjectDensity:
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """Generated scenes, (scenes, V), and `count_contradictions` of their relations, if any."""
+    """Generated scenes, (scenes, V), and `count_contradictions` of their relations."""
 
     v: Tensor
-    contradictions: Tensor | None = None
+    contradictions: Tensor
 
 
 # Function that generates scenes from the classes that each scene must contain, (scenes, classes)
@@ -85,18 +85,6 @@ SamplerOf = Callable[[Setting], Sampler | None]
 DensityOf = Callable[[Setting], ObjectDensity | None]
 
 Parameters: TypeAlias = Mapping[str, float | int | str]
-
-
-@dataclass(frozen=True)
-class Trial:
-    """The result of one point of a hyperparameter grid.
-
-    `seconds` is the wall time of fit and evaluation, without work done for earlier grid points.
-    """
-
-    parameters: Parameters
-    validation: float
-    seconds: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +105,6 @@ class Model:
         generate, density: sampler of T4 and density of objects for a setting.
         artifact: model for Calibration and for all questions to the service.
         parameters: number of trained weights, or None if this number is not meaningful.
-        trials: all settings that the tuning of a baseline tried, in order.
     """
 
     missing: ObjectScore | None = None
@@ -133,7 +120,6 @@ class Model:
     density: DensityOf | None = None
     artifact: Artifact | None = None
     parameters: int | None = None
-    trials: tuple[Trial, ...] = ()
 
     def __post_init__(self) -> None:
         if self.suspicion is None and self.missing is not None:

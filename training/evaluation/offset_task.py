@@ -43,8 +43,6 @@ def offsets_task(artifact: Artifact, setting: Setting) -> Outcome | None:
         return None
     scenes = setting.scenes.scenes
     all_offsets = observed_offsets(scenes)
-    # An older model lacks the relation inside.
-    all_offsets = all_offsets.rows(all_offsets.relation < len(offsets.relation_scenes))
     has_statistics = offsets.relation_scenes[all_offsets.relation] > 0
     if not has_statistics.any():
         return None

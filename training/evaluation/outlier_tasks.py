@@ -78,7 +78,7 @@ def outliers_task(model: Model, setting: Setting) -> Outcome | None:
         if hits is None:
             continue
         metrics[f"hit@1, {distribution}"] = hits
-        skipped = min(skipped, int((hits.denominators == 0).sum()))
+        skipped = min(skipped, hits.skipped)
         if model.flags is not None:
             flagged = _flagged_share(scenes, structure, model.flags, weights)
             metrics[f"flagged, {distribution}"] = flagged

@@ -185,9 +185,7 @@ def real_sources(scenes: SceneTensors) -> Iterator[tuple[str, SceneTensors]]:
 
 
 @torch.no_grad()
-def validation_score(
-    score_function: ListScore, scenes: SceneTensors, structure: Tensor, seed: int = 0
-) -> float:
+def validation_score(score_function: ListScore, scenes: SceneTensors, structure: Tensor) -> float:
     """Return the mean over real sources of the MRR of hidden classes; NaN without hidden classes.
 
     The MRR of a source is the mean of two MRRs: of random parts of 1 to `LONGEST` classes, and of
@@ -201,9 +199,9 @@ def validation_score(
     values = []
     some = scenes.complete if bool(scenes.complete.any()) else ~scenes.complete
     for _, own in real_sources(subset(scenes, some.nonzero().squeeze(1))):
-        sample = some_scenes(own, _SCENES, seed)
+        sample = some_scenes(own, _SCENES)
         for size in (up_to_longest, all_but_one):
-            parts = draw_parts(sample, structure, size, (seed,))
+            parts = draw_parts(sample, structure, size)
             if not len(parts.v):
                 continue
             listed = parts.v.sum(1)

@@ -52,8 +52,7 @@ class _Result(NamedTuple):
     Attributes:
         group: class of the object. If the model does not know the object, it is the label.
         precision: average precision by name of the ranking, 0 if the question is left out.
-        unknown: number of receptacles that the model does not know.
-        receptacles: number of all receptacles.
+        unknown, receptacles: number of receptacles that the model does not know, and of all.
         left_out: reason for leaving out the question, or an empty string.
     """
 

@@ -32,14 +32,13 @@ from app.scene import CANONICAL
 from training.datasets.array_types import Flags, Floats, Ints, Rng
 from training.datasets.batches import Batch, SceneTensors
 from training.datasets.cases import Triple, scene_rng
-from training.evaluation.metrics import Items, Metric, Ratio
+from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.model import RelationScore
 from training.evaluation.setting import Outcome, Setting
 from training.machines.edges import triple_keys
 
-FIRST = (1, 2, 5, 10, 20, 50, 100)
+FIRST = (20, 50, 100)
 """Numbers of predictions per scene for recall."""
-_RECALLS = (20, 50, 100)
 _TRIES = 50
 
 
@@ -148,42 +147,20 @@ def random_half(truth: Tensor, scenes: SceneTensors, index: Sequence[int], seed:
     return half
 
 
-@dataclass(frozen=True, eq=False)
-class RelationRanking:
-    """Number of annotated triples of each scene, and of hits among the predictions, (scenes,)."""
+def r_precision(
+    ranked: Iterable[Candidates], scenes: int, *, first: int | None = None
+) -> Ratio | None:
+    """Return the share of annotated triples among the first candidates; None without such triples.
 
-    annotated: Ints
-    hits: Floats
-
-    @property
-    def skipped(self) -> int:
-        """Number of scenes without annotated triples."""
-        return int((self.annotated == 0).sum())
-
-    def pooled(self) -> Ratio:
-        """Return the R-precision pooled over scenes."""
-        return Ratio(self.hits, self.annotated.astype(np.float64))
-
-    def per_scene(self) -> Ratio:
-        """Return the mean over scenes of their R-precision."""
-        return self.pooled().mean_over_scenes()
-
-
-def rank(ranked: Iterable[Candidates], scenes: int, *, first: int | None = None) -> RelationRanking:
-    """Count annotated triples among the first candidates, by default as many as are annotated."""
-    annotated, hits = np.zeros(scenes, dtype=np.int64), np.zeros(scenes)
+    By default, a scene has as many first candidates as it has annotated triples. The share is
+    pooled over scenes.
+    """
+    hits, annotated = np.zeros((2, scenes))
     for scene in ranked:
         if count := int(scene.truth.sum()):
             annotated[scene.scene] = count
             hits[scene.scene] = expected_hits(scene.score, scene.truth, first or count)
-    return RelationRanking(annotated, hits)
-
-
-def rank_relations(
-    scenes: SceneTensors, structure: Tensor, score: RelationScore
-) -> RelationRanking:
-    """Compute the R-precision of a score on a set of scenes."""
-    return rank(score_scenes(scenes, structure, score), len(scenes))
+    return Ratio(hits, annotated) if annotated.any() else None
 
 
 def unseen(scored: Sequence[Candidates], seen: Tensor, classes: int) -> list[Candidates]:
@@ -237,15 +214,14 @@ def alter(holds: Flags, allowed: Flags, rng: Rng) -> tuple[Triple, Triple] | Non
 
 
 @torch.no_grad()
-def placement_scores(
+def false_hits(
     scenes: SceneTensors, structure: Tensor, score: RelationScore, *, seed: int = 0
-) -> Items:
-    """Return the suspicion that each triple is false, in scenes with one false triple.
+) -> Ratio | None:
+    """Return the share of false triples that rank first in their scene; None without any.
 
-    The truth of an item is True for the false triple. `score` must judge each observed triple
-    without using that triple.
+    `score` must judge each observed triple without using that triple.
     """
-    parts: list[Tensor] = [torch.zeros(0, 3, dtype=torch.float64)]
+    hits: list[tuple[int, float]] = []
     for index, batch in _batches(scenes, 2):
         mask = scorable(batch, structure)
         truth = (batch.holds > 0) & mask
@@ -257,12 +233,16 @@ def placement_scores(
                 observed[row] = truth[row]
                 observed[row][true_triple] = False
                 observed[row][false_triple] = is_false[row][false_triple] = True
-        log_odds = score(telling(batch, observed))[observed].double()
-        scene_index = torch.tensor(index)[observed.nonzero()[:, 0]]
-        parts.append(torch.stack([scene_index, -log_odds, is_false[observed]], 1))
-    scene, suspicion, false = torch.cat(parts).numpy().T
-    skipped = len(scenes) - len(np.unique(scene))
-    return Items(scene.astype(np.int64), suspicion, false > 0, len(scenes), skipped)
+        log_odds = score(telling(batch, observed)).double()
+        for row, k in enumerate(index):
+            stated = observed[row]
+            if stated.any():
+                suspicion, target = -log_odds[row][stated].numpy(), is_false[row][stated].numpy()
+                hits.append((k, expected_hits(suspicion, target, 1)))
+    if not hits:
+        return None
+    scene, values = zip(*hits, strict=True)
+    return Ratio.of_items(np.array(scene), np.array(values), len(scenes))
 
 
 def relations_task(score: RelationScore, setting: Setting) -> Outcome | None:
@@ -270,58 +250,50 @@ def relations_task(score: RelationScore, setting: Setting) -> Outcome | None:
     scenes, structure = setting.scenes, setting.structure
     with_counts = score_scenes(scenes, structure, score)
     uncounted = score_scenes(scenes, structure, score, counts=False)
-    if not _any_true(uncounted):
+    ranking, counted = (r_precision(scored, len(scenes)) for scored in (uncounted, with_counts))
+    if ranking is None or counted is None:
         return None
-    ranking, counted = rank(uncounted, len(scenes)), rank(with_counts, len(scenes))
     metrics: dict[str, Metric] = {
-        "R-precision, distinct classes": ranking.pooled(),
-        "R-precision, instance counts": counted.pooled(),
-        "R-precision, distinct classes, mean over scenes": ranking.per_scene(),
-        "R-precision, mean over scenes": counted.per_scene(),
+        "R-precision, distinct classes": ranking,
+        "R-precision, instance counts": counted,
+        "R-precision, distinct classes, mean over scenes": ranking.mean_over_scenes(),
+        "R-precision, mean over scenes": counted.mean_over_scenes(),
     }
-    metrics |= _details(with_counts, setting, FIRST)
-    return Outcome.over(scenes, metrics, ranking.skipped)
+    return Outcome.over(scenes, metrics | _details(with_counts, setting), ranking.skipped)
 
 
 def completion_task(score: RelationScore, setting: Setting) -> Outcome | None:
     """Measure T1b."""
     scenes = setting.scenes
     candidates = complete_scenes(scenes, setting.structure, score, seed=setting.seed)
-    if not _any_true(candidates):
+    ranking = r_precision(candidates, len(scenes))
+    if ranking is None:
         return None
-    ranking = rank(candidates, len(scenes))
     metrics: dict[str, Metric] = {
-        "R-precision": ranking.pooled(),
-        "R-precision, mean over scenes": ranking.per_scene(),
+        "R-precision": ranking,
+        "R-precision, mean over scenes": ranking.mean_over_scenes(),
     }
-    metrics |= _details(candidates, setting, _RECALLS)
-    return Outcome.over(scenes, metrics, ranking.skipped)
+    return Outcome.over(scenes, metrics | _details(candidates, setting), ranking.skipped)
 
 
-def _any_true(scored: list[Candidates]) -> bool:
-    return any(scene.truth.any() for scene in scored)
-
-
-def _details(scored: list[Candidates], setting: Setting, first: Sequence[int]) -> dict[str, Metric]:
+def _details(scored: list[Candidates], setting: Setting) -> dict[str, Metric]:
     """Return R-precision by relation, recall at k, and R-precision of unseen triples."""
     count = len(setting.scenes)
-    metrics: dict[str, Metric] = {}
+    metrics: dict[str, Ratio | None] = {}
     for a, name in enumerate(CANONICAL):
         candidates = [scene.where(scene.relation == a) for scene in scored]
-        if _any_true(candidates):
-            metrics[f"R-precision, {name}"] = rank(candidates, count).pooled()
-    for k in first:
-        metrics[f"R@{k}"] = rank(scored, count, first=k).per_scene()
+        metrics[f"R-precision, {name}"] = r_precision(candidates, count)
+    for k in FIRST:
+        recall = r_precision(scored, count, first=k)
+        metrics[f"R@{k}"] = recall and recall.mean_over_scenes()
     if setting.seen is not None:
         new = unseen(scored, setting.seen, setting.scenes.v.shape[1])
-        if _any_true(new):
-            metrics["R-precision, zero-shot"] = rank(new, count).pooled()
-    return metrics
+        metrics["R-precision, zero-shot"] = r_precision(new, count)
+    return {name: metric for name, metric in metrics.items() if metric is not None}
 
 
 def placement_task(score: RelationScore, setting: Setting) -> Outcome | None:
     """Measure T3b."""
     scenes = setting.some(related=True)
-    scores = placement_scores(scenes, setting.structure, score, seed=setting.seed)
-    metrics = {"hit@1": scores.hit_at_1()} if len(scores.scene) else {}
-    return Outcome.over(scenes, metrics, scores.skipped)
+    hits = false_hits(scenes, setting.structure, score, seed=setting.seed)
+    return None if hits is None else Outcome.over(scenes, {"hit@1": hits}, hits.skipped)

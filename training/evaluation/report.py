@@ -1,15 +1,13 @@
 """Reports: the metrics of a model or baseline on one data source, or pooled over data sources.
 
-A `SourceReport` holds the results of one model, training seed and data source. `measure` writes the
-report into a file after each task. A later run skips the tasks in the file. The report stores the
-values of each group of near-duplicate scenes. Reports can therefore be pooled over data sources,
-and compared by paired resampling, without the models.
+A `SourceReport` holds the results of one model, training seed and data source. It stores the values
+of each group of near-duplicate scenes. Reports can therefore be pooled over data sources, and
+compared by paired resampling, without the models.
 """
 
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from hashlib import sha256
@@ -24,7 +22,7 @@ from app.registry import Artifact
 from app.registry import Metric as CardMetric
 from training.datasets.batches import SceneTensors, subset
 from training.evaluation.artifact_model import artifact_model
-from training.evaluation.everyday_task import SOURCE, facts_digest
+from training.evaluation.everyday_task import SOURCE, facts_file
 from training.evaluation.metrics import Metric, Ratio, Resampled, Scored
 from training.evaluation.model import Model
 from training.evaluation.setting import Outcome, Setting
@@ -46,52 +44,36 @@ class SourceReport:
     Attributes:
         source: name of the data source, or "pooled".
         scenes: digest of the questions, see `digest`.
-        outcomes, seconds: metrics and wall time of each task, by task name. The outcome is None if
-            the model does not support the task.
+        outcomes: metrics of each task, by task name; None if the model does not support the task.
+        parameters: number of trained weights of the model, if any.
     """
 
     source: str
     scenes: str
     outcomes: dict[str, Outcome | None] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
+    parameters: int | None = None
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return a JSON-serialisable dictionary."""
-        return {
-            "source": self.source,
-            "scenes": self.scenes,
-            "tasks": {
-                task: {
-                    "seconds": self.seconds.get(task, 0.0),
-                    "outcome": outcome
-                    and vars(outcome)
-                    | {"metrics": {k: metric_to_dict(m) for k, m in outcome.metrics.items()}},
-                }
-                for task, outcome in self.outcomes.items()
-            },
+    def write(self, path: Path) -> None:
+        """Write the report into a JSON file."""
+        tasks = {
+            task: outcome
+            and vars(outcome)
+            | {"metrics": {name: metric_to_dict(m) for name, m in outcome.metrics.items()}}
+            for task, outcome in self.outcomes.items()
         }
+        write_whole(path, json.dumps(vars(self) | {"outcomes": tasks}, allow_nan=False))
 
     @classmethod
-    def read(cls, path: Path, setting: Setting | None = None) -> SourceReport:
-        """Read a report that `measure` wrote.
-
-        Raises:
-            ValueError: the report does not belong to `setting`.
-        """
-        values = json.loads(path.read_text(encoding="utf-8"))
-        if setting is not None and values["scenes"] != digest(setting):
-            raise ValueError(
-                f"the report {path} belongs to other scenes or tasks: use --fresh, use another "
-                "folder, or delete it"
-            )
-        report = cls(values["source"], values["scenes"])
-        for task, entry in values["tasks"].items():
-            report.seconds[task] = float(entry["seconds"])
-            report.outcomes[task] = None
-            if outcome := entry["outcome"]:
-                metrics = {k: metric_from_dict(m) for k, m in outcome["metrics"].items()}
-                report.outcomes[task] = Outcome(**outcome | {"metrics": metrics})
-        return report
+    def read(cls, path: Path) -> SourceReport:
+        """Read a report from a file."""
+        values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        outcomes: dict[str, Outcome | None] = {}
+        for task, outcome in values["outcomes"].items():
+            outcomes[task] = None
+            if outcome:
+                metrics = {name: metric_from_dict(m) for name, m in outcome["metrics"].items()}
+                outcomes[task] = Outcome(**outcome | {"metrics": metrics})
+        return cls(**values | {"outcomes": outcomes})
 
 
 def write_whole(path: Path, text: str) -> None:
@@ -126,8 +108,9 @@ def settings_by_source(
 def digest(setting: Setting) -> str:
     """Return the sha256 of the questions: scene ids, limit, seed and everyday facts."""
     names = [f"{scene.source} {scene.scene_id}" for scene in setting.scenes.scenes]
-    facts = [] if setting.everyday is None else [f"facts {facts_digest(setting.everyday)}"]
-    text = "\n".join([*names, f"limit {setting.limit}", f"seed {setting.seed}", *facts])
+    path = None if setting.everyday is None else facts_file(setting.everyday)
+    facts = "" if path is None else path.read_text(encoding="utf-8")
+    text = "\n".join([*names, f"limit {setting.limit}", f"seed {setting.seed}", facts])
     return sha256(text.encode()).hexdigest()
 
 
@@ -137,39 +120,21 @@ def measure(
     source: str,
     *,
     tasks: Iterable[str] = tuple(TASKS),
-    path: Path | None = None,
     progress: Progress = silent,
 ) -> SourceReport:
-    """Measure tasks. With `path`, skip the tasks in this file, and write it after every task.
-
-    Args:
-        tasks: names of the tasks, which are keys of `EVERY_TASK`.
-
-    Raises:
-        ValueError: a task is unknown, or the file belongs to other scenes or questions.
-    """
-    names = list(tasks)
-    if unknown := sorted(set(names) - set(EVERY_TASK)):
-        raise ValueError(f"unknown tasks {unknown}: choose from {list(EVERY_TASK)}")
-    report = SourceReport(source, digest(setting))
-    if path is not None and path.exists():
-        report = SourceReport.read(path, setting)
-    for task in names:
-        if task in report.outcomes:
-            continue
+    """Measure tasks, which are keys of `EVERY_TASK`."""
+    report = SourceReport(source, digest(setting), parameters=model.parameters)
+    for task in tasks:
         progress(f"{source}: {task}")
-        began = time.perf_counter()
         report.outcomes[task] = EVERY_TASK[task](model, setting)
-        report.seconds[task] = time.perf_counter() - began
-        if path is not None:
-            write_whole(path, json.dumps(report.to_dict(), allow_nan=False))
     return report
 
 
 def pooled(reports: Sequence[SourceReport], source: str = "pooled") -> SourceReport:
     """Pool the reports on several data sources, without metrics of a whole set of scenes (T4)."""
     together = sha256("\n".join(report.scenes for report in reports).encode()).hexdigest()
-    joined = SourceReport(source, together)
+    parameters = reports[0].parameters if reports else None
+    joined = SourceReport(source, together, parameters=parameters)
     for task in dict.fromkeys(task for report in reports for task in report.outcomes):
         parts = [outcome for report in reports if (outcome := report.outcomes.get(task))]
         metrics = {
@@ -178,7 +143,6 @@ def pooled(reports: Sequence[SourceReport], source: str = "pooled") -> SourceRep
             if (metric := pool([part.metrics[name] for part in parts if name in part.metrics]))
         }
         counts = sum(part.scenes for part in parts), sum(part.skipped for part in parts)
-        joined.seconds[task] = sum(report.seconds.get(task, 0.0) for report in reports)
         joined.outcomes[task] = Outcome(metrics, *counts) if metrics else None
     return joined
 
@@ -267,14 +231,7 @@ def metric_to_dict(metric: Metric) -> dict[str, Any]:
 
 
 def metric_from_dict(values: dict[str, Any]) -> Metric:
-    """Create a metric from the output of `metric_to_dict`.
-
-    Raises:
-        ValueError: the kind of metric is unknown.
-    """
-    kind = values.get("kind")
-    if kind not in _KINDS:
-        raise ValueError(f"metric kind must be one of {sorted(_KINDS)}, not {kind!r}")
+    """Create a metric from the output of `metric_to_dict`."""
     # JSON has no NaN, so null marks a resample in which the metric is undefined. numpy reads None
     # as NaN.
     entries = {
@@ -282,7 +239,7 @@ def metric_from_dict(values: dict[str, Any]) -> Metric:
         for name, value in values.items()
         if name != "kind"
     }
-    metric: Metric = _KINDS[kind](**entries)
+    metric: Metric = _KINDS[values["kind"]](**entries)
     return metric
 
 

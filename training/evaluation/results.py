@@ -12,12 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich import box
-from rich.table import Table
 
-from training.evaluation.metrics import Figure, Metric, mean_over_seeds, paired_difference
+from training.datasets.array_types import Floats
+from training.evaluation.metrics import Figure, Metric, Resampled, paired_difference
 from training.evaluation.report import SourceReport, write_whole
-from training.evaluation.tasks import TASKS, in_words
+from training.evaluation.tasks import TASKS
 
 Reports = Mapping[tuple[str, int], Mapping[str, SourceReport]]
 Shown = Mapping[str, tuple[str, ...]]
@@ -37,7 +36,6 @@ _LOWER_IS_BETTER = (
     "mirrored",
     "on-top cycles",
     "alarms",
-    "change of p",
     "ECE",
     "error",
     "log-loss",
@@ -79,19 +77,6 @@ class Difference:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """Number of scenes of one task, for one row, training seed and data source."""
-
-    row: str
-    seed: int
-    task: str
-    source: str
-    scenes: int
-    skipped: int
-    notes: Mapping[str, float]
-
-
-@dataclass(frozen=True)
 class Results:
     """The results of an experiment, sorted by row, data source and task.
 
@@ -99,14 +84,14 @@ class Results:
         ours: name of the reference row of all comparisons.
         differences: paired differences from the reference row.
         parameters: number of trained weights by row name, for rows with weights.
-        asked: number of scenes of each task.
+        asked: number of scenes and of skipped scenes, and notes, by row, seed, source and task.
     """
 
     ours: str
     cells: tuple[Cell, ...]
     differences: tuple[Difference, ...]
     parameters: Mapping[str, int] = field(default_factory=dict)
-    asked: tuple[Asked, ...] = ()
+    asked: tuple[dict[str, Any], ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-serialisable dictionary."""
@@ -115,55 +100,33 @@ class Results:
             "parameters": dict(self.parameters),
             "cells": [asdict(cell) for cell in self.cells],
             "differences": [asdict(row) | {"verdict": row.verdict} for row in self.differences],
-            "asked": [asdict(entry) for entry in self.asked],
+            "asked": list(self.asked),
         }
 
-    def markdown(self, shown: Shown = SHOWN, *, changes: bool = False) -> str:
-        """Return one Markdown table per metric, and remarks on each task.
+    def markdown(self, shown: Shown = SHOWN) -> str:
+        """Return one Markdown table per metric, and the number of skipped scenes of each task.
 
         A star marks a row that is worse than the reference row: the whole interval of the paired
-        difference agrees. With `changes`, the intervals are those of the differences, the row minus
-        the reference row.
+        difference agrees.
         """
         parts: list[str] = []
         for task, metrics in shown.items():
-            tables = [table for name in metrics if (table := self._table(task, name, changes))]
+            tables = [table for name in metrics if (table := self._table(task, name))]
             if tables:
-                parts += [*tables, *remarks([entry for entry in self.asked if entry.task == task])]
+                parts += [*tables, *self._skipped(task)]
         return "\n\n".join(parts) + "\n"
 
-    def tables(self, shown: Shown = SHOWN) -> Iterator[Table]:
-        """Generate one table per task for the terminal, of the pooled sources if there are any."""
-        sources = list(dict.fromkeys(cell.source for cell in self.cells))
-        columns = [source for source in sources if "pooled" in source] or sources
-        for task, metrics in shown.items():
-            table = Table("metric, model", *columns, title=in_words(task), box=box.SIMPLE_HEAD)
-            for metric in metrics:
-                texts = self._texts(task, metric)
-                rows = {row: cells for row, cells in texts.items() if cells.keys() & set(columns)}
-                if rows:
-                    table.add_row(f"[bold]{metric}[/bold]")
-                for row, cells in rows.items():
-                    table.add_row(f"  {row}", *(cells.get(source, "") for source in columns))
-            if table.row_count:
-                yield table
-
-    def _texts(self, task: str, metric: str, changes: bool = False) -> dict[str, dict[str, str]]:
-        """Return the cells of a metric as texts, by row and data source."""
-        differences = {
-            (difference.row, difference.source): difference
+    def _table(self, task: str, metric: str) -> str:
+        worse = {
+            (difference.row, difference.source)
             for difference in self.differences
-            if (difference.task, difference.metric) == (task, metric)
+            if (difference.task, difference.metric, difference.verdict) == (task, metric, "better")
         }
         texts: dict[str, dict[str, str]] = {}
         for cell in self.cells:
             if (cell.task, cell.metric) == (task, metric):
-                difference = differences.get((cell.row, cell.source))
-                texts.setdefault(cell.row, {})[cell.source] = _text(cell, difference, changes)
-        return texts
-
-    def _table(self, task: str, metric: str, changes: bool) -> str:
-        texts = self._texts(task, metric, changes)
+                star = " *" if (cell.row, cell.source) in worse else ""
+                texts.setdefault(cell.row, {})[cell.source] = f"{cell.figure}{star}"
         if not texts:
             return ""
         sources = list(dict.fromkeys(source for cells in texts.values() for source in cells))
@@ -175,20 +138,18 @@ class Results:
         parts = [f"### {task}: {metric}"]
         if task.startswith(_RELATION_TASKS):
             parts.append(f"{UNLISTED}.")
-        if changes:
-            parts.append(f"In brackets: paired 95 % interval of the row minus {self.ours}.")
         return "\n\n".join([*parts, grid(["", "weights", *sources], lines)])
 
-
-def _text(cell: Cell, difference: Difference | None, changes: bool) -> str:
-    if changes and difference is not None:
-        # 0.0 - x avoids the text "-0.000".
-        low, high = (0.0 - round(x, 3) for x in (difference.figure.high, difference.figure.low))
-        return f"{cell.figure.value:.3f} ({low:+.3f}, {high:+.3f})"
-    if changes:
-        return f"{cell.figure.value:.3f}"
-    is_worse = difference is not None and difference.verdict == "better"
-    return f"{cell.figure} *" if is_worse else str(cell.figure)
+    def _skipped(self, task: str) -> Iterator[str]:
+        """Generate a sentence on skipped scenes, with the highest number of each source."""
+        skipped: dict[str, int] = {}
+        for entry in self.asked:
+            if entry["task"] == task and entry["skipped"]:
+                source = entry["source"]
+                skipped[source] = max(entry["skipped"], skipped.get(source, 0))
+        if skipped:
+            counts = ", ".join(f"{count:,} of {source}" for source, count in skipped.items())
+            yield f"Scenes that could not be scored: {counts}."
 
 
 def grid(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -203,7 +164,7 @@ def write(folder: Path, values: Mapping[str, Any], text: str) -> None:
     write_whole(folder / "results.json", json.dumps(values, indent=1) + "\n")
 
 
-def summarise(reports: Reports, ours: str, parameters: Mapping[str, int] | None = None) -> Results:
+def summarise(reports: Reports, ours: str) -> Results:
     """Compute the metrics of every row, and the paired differences from the reference row.
 
     Metrics over the scenes of a single group are left out, because they have no interval.
@@ -212,14 +173,18 @@ def summarise(reports: Reports, ours: str, parameters: Mapping[str, int] | None 
         ValueError: the reports lack the reference row.
     """
     members: dict[tuple[str, str, str, str], list[Metric]] = {}
-    asked: list[Asked] = []
+    asked: list[dict[str, Any]] = []
+    parameters: dict[str, int] = {}
     for (row, seed), by_source in reports.items():
         for source, report in by_source.items():
+            if report.parameters is not None:
+                parameters[row] = report.parameters
             for task, outcome in report.outcomes.items():
                 if outcome is None:
                     continue
-                counts = outcome.scenes, outcome.skipped
-                asked.append(Asked(row, seed, task, source, *counts, outcome.notes))
+                place = {"row": row, "seed": seed, "task": task, "source": source}
+                numbers = {name: getattr(outcome, name) for name in ("scenes", "skipped", "notes")}
+                asked.append(place | numbers)
                 for name, metric in outcome.metrics.items():
                     members.setdefault((row, source, task, name), []).append(metric)
     rows = [row for row, _ in reports]
@@ -245,7 +210,15 @@ def summarise(reports: Reports, ours: str, parameters: Mapping[str, int] | None 
         # A row may lack a pooled metric on some data sources. Its scenes then cannot be paired.
         and _same_groups(mine, mean)
     )
-    return Results(ours, cells, differences, parameters or {}, tuple(asked))
+    return Results(ours, cells, differences, parameters, tuple(asked))
+
+
+def mean_over_seeds(members: Sequence[Metric]) -> Resampled:
+    """Return the mean of a metric over training seeds; all seeds use the same resamples."""
+    shortest = min(len(member.draws) for member in members)
+    drawn: Floats = np.mean([member.draws[:shortest] for member in members], axis=0)
+    value = float(np.mean([member.value for member in members]))
+    return Resampled(value, drawn, members[0].groups, members[0].n)
 
 
 def _same_groups(a: Metric, b: Metric) -> bool:
@@ -265,45 +238,3 @@ def only(report: SourceReport, wanted: Mapping[str, Sequence[str]]) -> SourceRep
         for outcome in [report.outcomes[task]]
     }
     return replace(report, outcomes=outcomes)
-
-
-def remarks(asked: Sequence[Asked]) -> list[str]:
-    """Return remarks on one task: the number of skipped scenes, and a table of the notes."""
-    skipped = []
-    for source in dict.fromkeys(entry.source for entry in asked):
-        entries = [entry for entry in asked if entry.source == source]
-        if any(entry.skipped for entry in entries):
-            count, scenes = (_range(getattr(e, x) for e in entries) for x in ("skipped", "scenes"))
-            skipped.append(f"{source} {count} of {scenes}")
-    parts = [f"Scenes that could not be scored: {', '.join(skipped)}."] if skipped else []
-    with_notes = [entry for entry in asked if entry.notes]
-    return [*parts, _notes(with_notes)] if with_notes else parts
-
-
-def _range(counts: Iterable[int]) -> str:
-    """Format one count if all rows have the same count, else the range of the counts."""
-    low, *others = sorted(set(counts))
-    return f"{low:,}–{others[-1]:,}" if others else f"{low:,}"
-
-
-def _notes(asked: Sequence[Asked]) -> str:
-    """Return a table of notes, with one line per source or row if the others have equal notes."""
-    notes: dict[str, Mapping[str, float]] = {}
-    for key_format in (
-        "{0.source}",
-        "{0.row}, seed {0.seed}",
-        "{0.row}, seed {0.seed}, {0.source}",
-    ):
-        notes = {key_format.format(entry): entry.notes for entry in asked}
-        if all(notes[key_format.format(entry)] == entry.notes for entry in asked):
-            break
-    names = list(dict.fromkeys(name for values in notes.values() for name in values))
-    rows = (
-        [key, *(_number(values[name]) if name in values else "" for name in names)]
-        for key, values in notes.items()
-    )
-    return grid(["", *names], rows)
-
-
-def _number(value: float) -> str:
-    return f"{value:,.0f}" if float(value).is_integer() else f"{value:,.3f}"

@@ -26,7 +26,7 @@ from torch import Tensor
 from training.datasets.array_types import Rng
 from training.datasets.batches import SceneTensors, subset
 from training.evaluation.asking import ask_rows
-from training.evaluation.metrics import Items, Metric, Ratio
+from training.evaluation.metrics import Metric, Ratio, Scored
 from training.evaluation.missing_tasks import SEEDS
 from training.evaluation.model import RoomScore
 from training.evaluation.parts import (
@@ -82,7 +82,7 @@ def room_figures(
         "top-1": ranking.top(1),
         "top-3": ranking.top(3),
         "log-loss": Ratio.of_items(scene, loss.double().numpy(), count),
-        "ECE": Items(scene, p.numpy(), hit, count).metric("ECE"),
+        "ECE": Scored("ECE", scene, p.numpy(), hit, np.arange(count)),
     }
 
 

@@ -18,7 +18,7 @@ from training.evaluation.density_task import density_task
 from training.evaluation.everyday_task import LINES, everyday_task
 from training.evaluation.generation_task import generation_task
 from training.evaluation.intruders import LAWS
-from training.evaluation.missing_tasks import SIZES, missing_task, placed_task, structure_task
+from training.evaluation.missing_tasks import SIZES, missing_task, placed_task
 from training.evaluation.model import Model
 from training.evaluation.moved_task import METRICS, moved_task
 from training.evaluation.outlier_tasks import LENGTHS, alarms_task, outliers_task
@@ -110,9 +110,6 @@ TASKS: dict[str, Task] = {
         (*_MRR, *_each(_MRR, ("structure listed",))),
         (*_MRR, "top-1", "top-10"),
     ),
-    "Structure": _task(
-        "floor, wall and ceiling listed", "artifact", structure_task, ("change of p",)
-    ),
     "T2 with evidence": _task(
         *("missing object, with the room type", "artifact", evidence.missing_evidence_task),
         _each(("change of MRR",), evidence.OF_OBJECTS),
@@ -133,10 +130,6 @@ TASKS: dict[str, Task] = {
     "T3 alarms": _task(
         *("alarms in untouched parts", "flags", alarms_task),
         tuple(f"alarms, {name}, {n} classes" for n in LENGTHS for name in SENSITIVITIES),
-    ),
-    "T3 with evidence": _task(
-        *("intruder, with the room type", "artifact", evidence.outliers_evidence_task),
-        _each(("change of hit@1",), evidence.OF_OBJECTS),
     ),
     "T3b placement": _task(
         "false relation", "false_relations", placement_task, ("hit@1",), of_objects=False

@@ -19,9 +19,9 @@ from torch import Tensor
 
 from app.inference.variants import VARIANTS
 from training.datasets.batches import TrainingData, seen_triples, subset
-from training.evaluation.artifact_model import relation_score as artifact_relation_score
+from training.evaluation.artifact_model import score_relations
 from training.evaluation.parts import validation_score
-from training.evaluation.relation_tasks import rank_relations
+from training.evaluation.relation_tasks import r_precision, score_scenes
 from training.fit.checkpoint import (
     CurvePoint,
     TrainingResult,
@@ -260,6 +260,7 @@ def relation_score(machine: BoltzmannMachine, data: TrainingData) -> float:
     if not annotated:
         return math.nan
     chosen = annotated[:: max(1, len(annotated) // _SCORED)]
-    score = artifact_relation_score(draft_artifact(machine, data.classes), given=False)
-    ranking = rank_relations(subset(data.validation, torch.tensor(chosen)), data.structure, score)
-    return float(ranking.hits.sum() / max(ranking.annotated.sum(), 1))
+    score = partial(score_relations, draft_artifact(machine, data.classes), given=False)
+    scenes = subset(data.validation, torch.tensor(chosen))
+    precision = r_precision(score_scenes(scenes, data.structure, score), len(scenes))
+    return 0.0 if precision is None else precision.value

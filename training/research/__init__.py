@@ -6,8 +6,8 @@ model and one reference model (`evaluation.results`).
 
 entries.py    the entries of a result table, and the training of their models
 measure.py    evaluation of entries in several processes, with reports on disk
-plots.py      plots of the results
-benchmark.py  comparison of machines and baselines, and two further experiments with them
+plots.py      plots of the calibration
+benchmark.py  comparison of machines and baselines
 ablate.py     comparison of a configuration with variants of it
 tune.py       search for better settings on validation scenes
 """

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -12,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from app.registry import Calibration
 from training.datasets.batches import SceneTensors, TrainingData, subset
 from training.datasets.cases import some_scenes
 from training.evaluation.artifact_model import artifact_model, floor_model, independent_model
@@ -23,18 +21,17 @@ from training.evaluation.baselines.fitting import TRIALS, Baseline
 from training.evaluation.intruders import intruder_weights
 from training.evaluation.model import Model, ObjectScore, suspicion_of
 from training.evaluation.outlier_tasks import first_shares, with_intruders
-from training.evaluation.report import Progress, write_whole
+from training.evaluation.report import Progress
 from training.fit.calibrate import calibrate
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, ObjectsConfig
-from training.fit.draft import draft_artifact, placed_draft
+from training.fit.draft import placed_draft
 from training.fit.objects import ObjectScenes
 from training.fit.trainer import Trainer
 from training.machines import BoltzmannMachine
 from training.research.baselines import BASELINES
 from training.runs.folder import load_run, save_run
 
-CALIBRATION = "calibration.json"  # in the folder of the run of a machine
 # Weights of log popularity in the ranking of intruders: scores of baselines have different scales.
 _WEIGHTS = (0.0, *np.geomspace(0.005, 2.0, TRIALS - 1).tolist())
 _SCENES = 300  # maximum scenes that choose a weight
@@ -61,7 +58,6 @@ def baseline_entries(
     names: Sequence[str] | None = None,
     *,
     related: bool = True,
-    whole: bool = True,
     learning: ObjectsConfig | None = None,
 ) -> Iterator[Entry]:
     """Generate the entries of the baselines in `names`; None means all baselines.
@@ -70,7 +66,6 @@ def baseline_entries(
 
     Args:
         related: False leaves out relation baselines.
-        whole: True adds place scores to object baselines.
         learning: settings of the machines for objects, see `object_scenes`.
 
     Raises:
@@ -84,7 +79,7 @@ def baseline_entries(
         is_usable = related or not baseline.learns_relations
         is_selected = names is None or name in names
         if is_usable and is_selected and (baseline.stochastic or seed == 0):
-            make = partial(_baseline_model, baseline, seed, whole, config)
+            make = partial(_baseline_model, baseline, seed, config)
             yield Entry(name, seed, f"{name}, seed {seed}, {decisive}", make)
 
 
@@ -99,20 +94,18 @@ def _reference_model(name: str, data: TrainingData, folder: Path, say: Progress)
     return independent_model(classes) if name == "independent classes" else floor_model()
 
 
-def machine_entry(config: Config, *, calibrated: bool = True) -> Entry:
-    """Return the entry of a machine, calibrated as for publication if `calibrated`."""
-    identity = f"{config.digest}, calibrated" if calibrated else config.digest
-    make = partial(_machine_model, config, calibrated)
-    return Entry(config.name, config.training.seed, identity, make)
+def machine_entry(config: Config) -> Entry:
+    """Return the entry of a machine, calibrated as for publication."""
+    identity = f"{config.digest}, calibrated"
+    return Entry(config.name, config.training.seed, identity, partial(_machine_model, config))
 
 
 def _baseline_model(
     baseline: Baseline,
     seed: int,
-    whole: bool,
     learning: ObjectsConfig,
     data: TrainingData,
-    folder: Path,
+    folder: Path,  # noqa: ARG001
     say: Progress,
 ) -> Model:
     """Fit a baseline; one for objects or rooms to `object_scenes`.
@@ -120,17 +113,21 @@ def _baseline_model(
     An object baseline ranks intruders with a prior of popularity, as `/outliers` does. For T2-at
     (missing object at a place), its score is multiplied by a frequency table.
     """
+
+    def fit(baseline: Baseline, data: TrainingData) -> Model:
+        parts = data.train, data.validation, data.structure
+        return baseline.fit(*parts, seed=seed, progress=say)
+
     if baseline.scores not in (("missing",), ("rooms",)):
-        return _fit(baseline, data, seed, folder, say)
+        return fit(baseline, data)
     objects = replace(data, train=object_scenes(data.train, data.structure, learning))
-    model = _fit(baseline, objects, seed, folder, say)
+    model = fit(baseline, objects)
     if model.missing is None:
         return model
     model = replace(model, suspicion=tuned_suspicion(model.missing, objects, seed))
-    if not whole or not data.related:
+    if not data.related:
         return model
-    table = _fit(PLACED, data, seed, folder, say)
-    product = _fit(placed_product(baseline.name, model, table), objects, seed, folder, say)
+    product = fit(placed_product(baseline.name, model, fit(PLACED, data)), objects)
     return replace(model, at_place=product.at_place)
 
 
@@ -166,36 +163,16 @@ def tuned_suspicion(score: ObjectScore, data: TrainingData, seed: int) -> Object
     return suspicion_of(score, log_popularity, max(hits, key=lambda weight: hits[weight]))
 
 
-def _fit(baseline: Baseline, data: TrainingData, seed: int, folder: Path, say: Progress) -> Model:
-    """Fit a baseline, and write its trials into trials.jsonl in place of its earlier trials."""
-    model = baseline.fit(data.train, data.validation, data.structure, seed=seed, progress=say)
-    trials = folder / "trials.jsonl"
-    lines_before = trials.read_text(encoding="utf-8").splitlines() if trials.exists() else []
-    lines = [line for line in lines_before if json.loads(line)["model"] != baseline.name]
-    lines += [json.dumps({"model": baseline.name, **asdict(trial)}) for trial in model.trials]
-    write_whole(trials, "".join(f"{line}\n" for line in lines))
-    return model
-
-
-def _machine_model(
-    config: Config, calibrated: bool, data: TrainingData, folder: Path, say: Progress
-) -> Model:
+def _machine_model(config: Config, data: TrainingData, folder: Path, say: Progress) -> Model:
     run, seed = folder / "run", config.training.seed
     machine = _train_once(config, data, run, say)
-    if not calibrated:
-        draft = draft_artifact(machine.requires_grad_(False), data.classes)
-        return artifact_model(draft, data.train, seed=seed, calibrated=False)
     draft = placed_draft(machine, data)
-    path = run / CALIBRATION
-    if path.exists():
-        calibration = Calibration.model_validate_json(path.read_text(encoding="utf-8"))
-    else:
-        say("calibrating")
-        calibration = calibrate(draft, data, config.objects, seed)
-        write_whole(path, calibration.model_dump_json(indent=1))
-    artifact = replace(draft, calibration=calibration)
+    say("calibrating")
+    artifact = replace(draft, calibration=calibrate(draft, data, config.objects, seed))
     profiles = ObjectScenes.of(data.train, data.structure, config.objects).sources
-    return artifact_model(artifact, data.train, seed=seed, profiles=profiles)
+    model = artifact_model(artifact, data.train, seed=seed, profiles=profiles)
+    zero = sum(machine.get_parameter(name).numel() for name in config.machine.without)
+    return replace(model, parameters=machine.parameter_count - zero)
 
 
 def _train_once(config: Config, data: TrainingData, run: Path, say: Progress) -> BoltzmannMachine:

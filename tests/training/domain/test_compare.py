@@ -41,7 +41,7 @@ def test_scenes_with_incomplete_lists_are_compared_on_relations_alone() -> None:
         for baseline in (EASE, POPULARITY)
     ]
     results = side_by_side(("a", "b"), (fitted[0], fitted[1]), scenes, STRUCTURE)
-    scenes_of = {asked.task: asked.scenes for asked in results.asked if asked.row == "a"}
+    scenes_of = {x["task"]: x["scenes"] for x in results.asked if x["row"] == "a"}
     assert scenes_of["T1a relations"] == 60
     assert scenes_of["T2 missing"] == 30
     assert {row.task for row in results.differences} >= {"T1a relations", "T2 missing"}

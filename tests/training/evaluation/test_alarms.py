@@ -3,21 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import comb
-
-import pytest
 
 from tests.training.evaluation.furnished_rooms import room_model, rooms
 from training.evaluation.alarms import ALARMS, EXCESS, Alarms, untouched_alarms
 from training.fit.calibrate_objects import recalibrated
-
-
-@pytest.mark.parametrize(("alarms", "scenes"), [(0, 9), (3, 9), (9, 9), (30, 200)])
-def test_the_lower_bound_is_the_share_at_which_so_many_alarms_are_unlikely(alarms, scenes):
-    """By the sum over the binomial distribution; P(at least so many alarms) is 5 %."""
-    p = Alarms("own", "objects", "medium", scenes, alarms).at_least
-    tail = sum(comb(scenes, k) * p**k * (1 - p) ** (scenes - k) for k in range(alarms, scenes + 1))
-    assert tail == pytest.approx(0.05 if alarms else 1.0)
 
 
 def test_the_first_alarms_are_accepted_and_too_many_refused():

@@ -17,15 +17,16 @@ from tests.enumeration.small_machines import (
     small_machine,
 )
 from tests.training.evaluation.scenes import scene, tensors
-from training.evaluation.density_task import (
-    DensitySettings,
-    independent_density,
-    ising_machine,
-    machine_density,
-)
+from training.evaluation import density_task
+from training.evaluation.density_task import independent_density, ising_machine, machine_density
 
 TRAIN = tensors([scene([0]), scene([0, 1]), scene([1]), scene([0, 1])], 2)
-SETTINGS = DensitySettings(chains=200, temperatures=200, burn_in=50)
+
+
+@pytest.fixture(autouse=True)
+def _effort(monkeypatch):
+    for name, value in (("CHAINS", 200), ("TEMPERATURES", 200), ("BURN_IN", 50)):
+        monkeypatch.setattr(density_task, name, value)
 
 
 def check_log_z(density, exact):
@@ -41,7 +42,7 @@ def test_log_likelihoods_are_those_of_the_joint(name):
     machine = small_machine(name).float()
     train = tensors([scene([0]), scene([0, 1]), scene([1])], machine.spec.V)
     joint = enumerate_joint(small_machine(name))
-    density = machine_density(machine, train, SETTINGS)
+    density = machine_density(machine, train)
     for v in binary(machine.spec.V):
         exact = joint.log_sum(same(joint.v, v))
         ours = density.log_unnormalised(v.float().unsqueeze(0))
@@ -51,7 +52,7 @@ def test_log_likelihoods_are_those_of_the_joint(name):
 
 @pytest.mark.parametrize("name", TWO_LAYERS)
 def test_machines_with_two_layers_have_no_density(name):
-    assert machine_density(small_machine(name), TRAIN, SETTINGS) is None
+    assert machine_density(small_machine(name), TRAIN) is None
 
 
 def test_independent_classes_by_hand():
@@ -70,6 +71,6 @@ def test_the_pairwise_model_by_enumeration():
     every = binary(6).float()
     log_p = every @ b + ((every @ W) * every).sum(1) / 2 + math.log(2)
     train = tensors([scene([k, 5]) for k in range(5)], 6)
-    density = machine_density(ising_machine(b, W), train, SETTINGS)
+    density = machine_density(ising_machine(b, W), train)
     torch.testing.assert_close(density.log_unnormalised(every), log_p)
     check_log_z(density, float(log_p.logsumexp(0)))

@@ -16,15 +16,8 @@ from app.scene import Scene, SceneObject, opposite
 from tests.questions.answers import relations
 from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
 from training.evaluation import everyday_task as everyday
-from training.evaluation.everyday_task import (
-    EVERYDAY,
-    LINES,
-    everyday_task,
-    facts_digest,
-    facts_file,
-)
-from training.evaluation.model import Model
-from training.evaluation.report import evaluate, measure
+from training.evaluation.everyday_task import EVERYDAY, LINES, everyday_task, facts_file
+from training.evaluation.report import digest, evaluate
 from training.evaluation.setting import Setting
 
 REPOSITORY = Path(__file__).resolve().parents[3]
@@ -97,10 +90,19 @@ def test_the_service_gives_the_same_eleven_lines(shipped, model, made, folder, m
     assert tuple(found) == LINES
 
 
-def test_unknown_labels_count_as_missed(folder):
+def test_the_task_has_a_metric_for_each_line_and_unknown_labels_count_as_missed(folder):
     found = ask_everyday(room_model(), folder)
     assert [found[line][1] for line in LINES] == [3, 3, 3, 2, 3, 1, 1, 1, 16, 16, 16]
     assert found["missing: an expected object is among five"][0] <= 1
+    outcome = everyday_task(room_model(), Setting(rooms(5, 1), STRUCTURE, everyday=folder))
+    assert tuple(outcome.metrics) == LINES
+    for line, (hits, asked) in found.items():
+        assert outcome.metrics[line].value == pytest.approx(hits / asked)
+        assert outcome.metrics[line].n == asked
+    rows = evaluate(room_model(), rooms(8, 1), STRUCTURE, rooms(9, 2), limit=2, everyday=folder)
+    card = [(row.source, row.metric) for row in rows if row.task == "Everyday"]
+    # A single fact has no interval.
+    assert card == [("facts", x) for x in LINES if len(outcome.metrics[x].groups) > 1]
 
 
 def test_a_fact_and_its_mirror_image_are_the_same_fact(tmp_path):
@@ -126,41 +128,13 @@ def test_a_fact_and_its_mirror_image_are_the_same_fact(tmp_path):
     assert ask_everyday(model, tmp_path)["relations: the fact is the likeliest of eight"] == (2, 3)
 
 
-def test_the_task_has_a_metric_for_each_line(folder):
-    setting = Setting(rooms(5, 1), STRUCTURE, everyday=folder)
-    outcome = everyday_task(room_model(), setting)
-    assert tuple(outcome.metrics) == LINES
-    for line, (hits, asked) in ask_everyday(room_model(), folder).items():
-        assert outcome.metrics[line].value == pytest.approx(hits / asked)
-        assert outcome.metrics[line].n == asked
-
-
-def test_an_absent_folder_leaves_the_task_out(tmp_path):
+def test_absent_facts_leave_the_task_out_and_other_facts_are_other_questions(folder, tmp_path):
     for place in (None, tmp_path / "nowhere"):
         assert everyday_task(room_model(), Setting(rooms(5, 1), STRUCTURE, everyday=place)) is None
-    with pytest.raises(FileNotFoundError, match=r"no facts\.json"):
-        ask_everyday(room_model(), tmp_path)
-    assert facts_digest(tmp_path) == ""
-
-
-def test_other_facts_are_other_questions(folder, tmp_path):
-    before = Setting(rooms(5, 1), STRUCTURE, everyday=folder)
-    path = tmp_path / "report.json"
-    report = measure(Model(), before, "pooled", tasks=("Everyday",), path=path)
-    assert report.outcomes == {"Everyday": None}
-    (folder / "facts.json").write_text(json.dumps(FACTS | {"seeds": [7]}))
-    with pytest.raises(ValueError, match="other scenes or tasks"):
-        measure(Model(), before, "pooled", tasks=("T2 missing",), path=path)
-
-
-def test_a_card_has_the_lines_once(folder):
-    rows = evaluate(room_model(), rooms(8, 1), STRUCTURE, rooms(9, 2), limit=2, everyday=folder)
-    found = [(row.source, row.metric) for row in rows if row.task == "Everyday"]
-    # A single fact has no interval.
     setting = Setting(rooms(5, 1), STRUCTURE, everyday=folder)
-    metrics = everyday_task(room_model(), setting).metrics
-    assert found == [("facts", line) for line in LINES if len(metrics[line].groups) > 1]
-    assert len(found) > 5
+    before = digest(setting)
+    (folder / "facts.json").write_text(json.dumps(FACTS | {"seeds": [7]}))
+    assert digest(setting) != before
 
 
 def test_no_training_or_tuning_asks_the_facts():

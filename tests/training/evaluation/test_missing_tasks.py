@@ -1,4 +1,4 @@
-"""T2, T2-at and the effect of structure by hand, and that nothing of a hidden object can leak."""
+"""T2 and T2-at by hand, and that nothing of a hidden object can leak."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from app.registry import PlaceFit
 from app.scene import CANONICAL, OPPOSITES, Scene, SceneObject
 from tests.questions.answers import missing as ask_missing
 from tests.questions.artifacts import LARGER, larger_artifact
-from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, room_model, rooms
+from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
 from tests.training.evaluation.scenes import (
     NO_STRUCTURE,
     WIDE,
@@ -19,19 +19,17 @@ from tests.training.evaluation.scenes import (
     scene,
     tensors,
 )
-from training.evaluation import missing_tasks
-from training.evaluation.artifact_model import placed_score
-from training.evaluation.asking import LeakError, missing_probabilities, missing_score, of_classes
+from training.evaluation.artifact_model import score_placed
+from training.evaluation.asking import LeakError, missing_probabilities, of_classes, score_missing
 from training.evaluation.missing_tasks import (
     SEEDS,
     leave_one_out_at,
     missing_task,
     rank_missing,
     removed_places,
-    structure_task,
 )
 from training.evaluation.model import Places
-from training.evaluation.parts import all_but_one, draw_parts, one_quarter, up_to_longest
+from training.evaluation.parts import all_but_one, draw_parts, one_quarter
 from training.evaluation.setting import Setting
 
 DATA = tensors(random_scenes(20), WIDE)
@@ -106,7 +104,7 @@ def test_the_score_is_the_ranking_of_the_service():
     v = draw_parts(rooms(10, 1), STRUCTURE, one_quarter).v
     parents = torch.tensor(room_model().vocabulary.parents.tolist())
     kinds = 0
-    for row, own in zip(v, missing_score(room_model())(v), strict=True):
+    for row, own in zip(v, score_missing(room_model(), v), strict=True):
         asked = of_classes(row.nonzero().squeeze(1).tolist())
         p = torch.from_numpy(missing_probabilities(room_model(), asked))
         usable = p > -torch.inf
@@ -115,24 +113,6 @@ def test_the_score_is_the_ranking_of_the_service():
         assert torch.equal(usable, (row == 0) & ~STRUCTURE & ~is_kind)
         assert torch.allclose(own[usable].exp(), p[usable])
     assert kinds
-
-
-def test_the_change_by_structure_by_hand(monkeypatch):
-    """The first ten probabilities of one part, with and without another class as structure."""
-    setting = Setting(rooms(30, 1), STRUCTURE, limit=8)
-    assert structure_task(room_model(), setting) is None
-    monkeypatch.setattr(missing_tasks, "_STRUCTURE", ("floor", VOCABULARY.labels[3]))
-    outcome = structure_task(room_model(), setting)
-    parts = draw_parts(setting.some(), STRUCTURE, up_to_longest)
-    listed = parts.v[0].nonzero().squeeze(1).tolist()
-    assert 3 not in listed
-    p, q = (missing_probabilities(room_model(), of_classes(c)) for c in (listed, [*listed, 3]))
-    # Class 3 itself is no candidate of the second request.
-    first = [k for k in np.argsort(-p, kind="stable")[:10] if k != 3]
-    metric = outcome.metrics["change of p"]
-    group = np.flatnonzero(metric.groups == setting.some().group_ids[parts.scene[0]])
-    assert metric.numerators[group] == pytest.approx(np.abs(p[first] - q[first]).mean())
-    assert metric.value > 0
 
 
 # ------------------------------------------------------------------------------------------ T2-at
@@ -203,7 +183,7 @@ def test_the_question_names_the_place_as_a_robot_does(name, outgoing):
     # Another row must not disturb the first.
     relation, anchor = torch.tensor([2, 0]), torch.tensor([2, 5])
     places = Places(v, number, relation, anchor, torch.tensor([outgoing, not outgoing]))
-    values = placed_score(artifact)(places)[0]
+    values = score_placed(artifact, places)[0]
     things = tuple(SceneObject(str(k), "x", c) for k, c in enumerate([0, 2, 2, 5]))
     spoken = CANONICAL[2] if outgoing else OPPOSITES[CANONICAL[2]]
     answers = ask_missing(artifact, Scene(things), top_k=artifact.spec.V, at=(spoken, 1))

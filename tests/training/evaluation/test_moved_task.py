@@ -14,8 +14,8 @@ from app.scene import observe
 from tests.questions.artifacts import lines
 from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, room_model, rooms
 from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
-from training.evaluation import moved_task as module
-from training.evaluation.asking import LeakError, misplaced_score
+from training.evaluation.artifact_model import artifact_model
+from training.evaluation.asking import LeakError, score_misplaced
 from training.evaluation.moved_task import flagged, moved_cases, moved_task
 from training.evaluation.setting import Setting
 
@@ -100,21 +100,19 @@ def test_a_model_without_entries_names_and_flags_nothing():
     assert moved_task(lambda _: [], Setting(silent, NO_STRUCTURE)) is None
 
 
-def test_at_most_so_many_scenes_are_asked(monkeypatch):
-    monkeypatch.setattr(module, "_SCENES", 3)
-    assert moved_task(oracle(*BOTH[1]), Setting(*BOTH[1])).scenes == 3
-
-
 def test_a_score_that_follows_the_order_is_caught():
     turn = count()
     leaking = lambda _: [{"subject": "0", "probability": next(turn) / 1e4}]  # noqa: E731
     with pytest.raises(LeakError):
         moved_task(leaking, Setting(LISTED, NO_STRUCTURE))
+    undefined = lambda _: [{"subject": "0", "probability": np.nan}]  # noqa: E731
+    with pytest.raises(FloatingPointError, match="NaN"):
+        moved_task(undefined, Setting(LISTED, NO_STRUCTURE))
 
 
 def test_the_service_sees_the_poses_of_a_request():
     artifact = room_model()
-    assert misplaced_score(artifact) is None
+    assert artifact_model(artifact, POSED).misplaced is None
     terms = {"intercept": 0.0, "relation": -1.0, "change": -1.0, "stand": 0.0, "supporter": 0.0}
     unlikely = Judgement(**terms, lines=lines(0.9, 0.8, 0.7))
     judging = artifact.calibration.model_copy(
@@ -122,7 +120,7 @@ def test_the_service_sees_the_poses_of_a_request():
     )
     artifact = replace(artifact, calibration=judging)
     case = moved_cases(POSED, STRUCTURE)[0]
-    entries = misplaced_score(artifact)(case.moved)
+    entries = score_misplaced(artifact, case.moved)
     assert entries == questions.misplaced(
         artifact, observe(case.moved, typical_sizes=VOCABULARY.sizes)
     )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from app.scene.relations import INSIDE, LEFT, ON_TOP
+from app.scene.relations import LEFT, ON_TOP
 from tests.questions.artifacts import LARGER, larger_artifact
 from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, rooms
 from tests.training.evaluation.scenes import scene, tensors
@@ -44,9 +44,6 @@ def test_draws_of_a_known_normal_are_covered_as_promised():
     assert share["in the ellipse, left"] == pytest.approx(0.8, abs=0.05)
     assert share["in the ellipsoid, left"] == pytest.approx(0.8, abs=0.05)
     assert found.metrics["in the ellipse, left"].n == 2000
-    narrow, wide = (outcome(draws(MEAN, STD * k, 400, 0), test) for k in (0.5, 2))
-    assert values(narrow)["in the ellipse, left"] < 0.5
-    assert values(wide)["in the ellipse, left"] > 0.95
 
 
 def test_distances_are_from_the_mean_and_from_what_the_relation_says():
@@ -64,16 +61,6 @@ def test_relations_never_seen_in_training_are_not_judged():
     assert both.skipped == 5
     regions = {"in the ellipse, left", "in the ellipsoid, left"}
     assert set(values(both)) == {*regions, "distance (m)", "distance (m), relation alone"}
-
-
-def test_relations_that_a_model_lacks_are_not_judged():
-    offsets = fit_offsets(draws(MEAN, STD, 20, 0), V)
-    names = ("relation", "relation_scenes", "subject", "object")
-    older = replace(offsets, **{name: getattr(offsets, name)[:INSIDE] for name in names})
-    artifact = replace(larger_artifact("triway"), offsets=older)
-    test = draws(MEAN, STD, 5, 1, relation=INSIDE) + draws(MEAN, STD, 5, 2)
-    found = offsets_task(artifact, Setting(tensors(test, V), NO_STRUCTURE))
-    assert found.metrics["distance (m)"].n == found.skipped == 5
 
 
 def test_models_and_sources_without_poses_have_no_figures():

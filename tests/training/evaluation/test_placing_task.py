@@ -110,15 +110,6 @@ def test_an_unknown_receptacle_ranks_last():
     assert metrics["mAP"].value == pytest.approx((1 / 2 + 1) / 2)
 
 
-def test_a_receptacle_of_the_class_of_the_object_ranks_last():
-    """The service never proposes a listed class."""
-    votes = {("bed", "bed"): 5, ("lamp", "desk"): 5}
-    metrics = placing_metrics(room_model(), rooms_of(placings(votes)))
-    score = [asked_one_by_one(room_model(), "lamp", place) for place in ("bed", "desk")]
-    lamp = enumerated(score, [False, True])
-    assert metrics["mAP"].value == pytest.approx((1 / 2 + lamp) / 2)
-
-
 def test_questions_that_are_left_out_are_counted():
     values = VOCABULARY.to_dict()
     for entry in values["objects"]:

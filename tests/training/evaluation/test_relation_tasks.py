@@ -22,14 +22,13 @@ from tests.training.evaluation.scenes import (
 )
 from training.datasets import AnnotatedObject, AnnotatedScene, encode
 from training.datasets.batches import seen_triples
-from training.evaluation.artifact_model import relation_score
+from training.evaluation.artifact_model import score_relations
 from training.evaluation.relation_tasks import (
     alter,
     complete_scenes,
     expected_hits,
-    placement_scores,
-    rank,
-    rank_relations,
+    false_hits,
+    r_precision,
     score_scenes,
     telling,
     unseen,
@@ -68,38 +67,33 @@ def related(triples):
 def test_r_precision_by_hand():
     """Two annotated triples; the two best scores hit one of them."""
     data = tensors([toy([0, 1], [(0, 0, 1), (1, 1, 0)]), toy([0, 1], [(0, 0, 1)]), toy([0, 1])])
-    ranking = rank_relations(data, NO_STRUCTURE, by_hand)
-    assert (ranking.annotated.tolist(), ranking.skipped) == ([2, 1, 0], 1)
-    assert ranking.pooled().value == pytest.approx(2 / 3)
-    assert ranking.per_scene().value == pytest.approx((1 / 2 + 1) / 2)
-    scored = score_scenes(data, NO_STRUCTURE, by_hand)[:1]
-    assert rank([scored[0].where(scored[0].relation == 0)], 1).pooled().value == 1.0
-    assert [rank(scored, 1, first=k).pooled().value for k in (1, 3, 20)] == [0.5, 1.0, 1.0]
+    scored = score_scenes(data, NO_STRUCTURE, by_hand)
+    ratio = r_precision(scored, 3)
+    assert (ratio.denominators.tolist(), ratio.skipped) == ([2, 1, 0], 1)
+    assert ratio.value == pytest.approx(2 / 3)
+    assert ratio.mean_over_scenes().value == pytest.approx((1 / 2 + 1) / 2)
+    first = scored[:1]
+    assert r_precision([first[0].where(first[0].relation == 0)], 1).value == 1.0
+    assert [r_precision(first, 1, first=k).value for k in (1, 3, 20)] == [0.5, 1.0, 1.0]
     # left(0, 1) was seen; of the others left(1, 0) comes first and front(1, 0) is the true one.
-    new = rank(unseen(scored, torch.tensor([[0, 0, 1]]), V), 1)
-    assert (new.annotated.tolist(), new.pooled().value) == ([1], 0.0)
+    new = r_precision(unseen(first, torch.tensor([[0, 0, 1]]), V), 1)
+    assert (new.denominators.tolist(), new.value) == ([1], 0.0)
     both = torch.tensor([[0, 0, 1], [0, 1, 0]])
-    assert rank(unseen(scored, both, V), 1).pooled().value == 1.0
+    assert r_precision(unseen(first, both, V), 1).value == 1.0
 
 
 def test_scores_that_know_everything_or_nothing():
     """A flat score hits R of R out of k candidates: R² / k in expectation."""
-    assert rank_relations(DATA, WIDE_STRUCTURE, knowing(DATA)).pooled().value == 1.0
-    ranking = rank_relations(DATA, WIDE_STRUCTURE, flat)
-    n = np.array([len(evidence.classes) for evidence in related(1)])
-    R = ranking.annotated[ranking.annotated > 0]
-    assert ranking.hits[ranking.annotated > 0] == pytest.approx(R**2 / (A * n * (n - 1)))
-    half = complete_scenes(DATA, WIDE_STRUCTURE, knowing(DATA))
-    assert rank(half, len(DATA)).pooled().value == 1.0
-    for asked in complete_scenes(DATA, WIDE_STRUCTURE, flat):
-        held = asked.truth.sum()
-        hits = expected_hits(asked.score, asked.truth, held)
-        assert not held or hits == pytest.approx(held**2 / len(asked.score))
-    scores = placement_scores(DATA, WIDE_STRUCTURE, knowing(DATA))
-    assert scores.hit_at_1().value == 1.0
-    scores = placement_scores(DATA, WIDE_STRUCTURE, flat)
-    triples = np.bincount(scores.scene)
-    assert scores.hit_at_1().value == pytest.approx((1 / triples[triples > 0]).mean())
+    knows, n = knowing(DATA), len(DATA)
+    for scored in (score_scenes, complete_scenes):
+        assert r_precision(scored(DATA, WIDE_STRUCTURE, knows), n).value == 1.0
+        for asked in scored(DATA, WIDE_STRUCTURE, flat):
+            held = asked.truth.sum()
+            hits = expected_hits(asked.score, asked.truth, held)
+            assert not held or hits == pytest.approx(held**2 / len(asked.score))
+    assert false_hits(DATA, WIDE_STRUCTURE, knows).value == 1.0
+    chance = [1 / evidence.holds.sum() for evidence in related(2)]
+    assert false_hits(DATA, WIDE_STRUCTURE, flat).value == pytest.approx(np.mean(chance))
 
 
 def test_expected_hits_shares_ties():
@@ -113,7 +107,7 @@ def test_structure_is_no_end_of_a_relation():
     data = tensors([scene([0, 1, 2], [(0, 0, 1), (0, 0, 2), (1, 0, 2)])])
     (scored,) = score_scenes(data, FLOOR, flat)
     assert (len(scored.score), scored.truth.sum()) == (A * 2, 2)
-    assert placement_scores(data, FLOOR, flat).scene.tolist() == [0, 0]
+    assert false_hits(data, FLOOR, flat).value == 1 / 2
 
 
 def test_relation_scores_are_asked_without_relations():
@@ -129,7 +123,7 @@ def test_relation_scores_are_asked_without_relations():
 def test_a_score_that_is_no_number_is_an_error():
     data = tensors([scene([0, 1], [(0, 0, 1)])])
     with pytest.raises(FloatingPointError, match="NaN"):
-        rank_relations(data, NO_STRUCTURE, lambda batch: flat(batch) * float("nan"))
+        score_scenes(data, NO_STRUCTURE, lambda batch: flat(batch) * float("nan"))
 
 
 def test_seen_triples_are_counted_by_scene():
@@ -161,7 +155,7 @@ def test_repeating_what_was_given_gains_nothing():
     mutual = [scene([0, 1, 2], [(0, 0, 1), (0, 1, 0), (1, 1, 2), (1, 2, 1)]) for _ in range(8)]
     for data, structure in ((DATA, WIDE_STRUCTURE), (tensors(mutual), NO_STRUCTURE)):
         copied, blind = (
-            rank(complete_scenes(data, structure, score), len(data)).hits.tolist()
+            r_precision(complete_scenes(data, structure, score), len(data)).numerators.tolist()
             for score in (lambda batch: batch.holds + batch.holds.mT, flat)
         )
         assert copied == blind
@@ -173,17 +167,7 @@ def test_a_relation_in_both_spellings_is_one_triple():
     twice = AnnotatedScene("s", "toy", "g", None, objects, ((0, "left", 1), (1, "right", 0)))
     vocabulary = Vocabulary([ObjectClass("bed"), ObjectClass("lamp")])
     data = tensors(encode([twice], vocabulary), len(vocabulary))
-    assert rank(complete_scenes(data, torch.zeros(2, dtype=torch.bool), flat), 1).skipped == 1
-
-
-def test_the_split_depends_on_the_scene_alone():
-    def keys(data, seed=0):
-        found = complete_scenes(data, WIDE_STRUCTURE, flat, seed=seed)
-        return [entry.key.tolist() for entry in found]
-
-    alone = [key for entry in DATA.scenes for key in keys(tensors([entry], WIDE))]
-    assert keys(DATA) == alone
-    assert keys(DATA) != keys(DATA, seed=1)
+    assert r_precision(complete_scenes(data, torch.zeros(2, dtype=torch.bool), flat), 1) is None
 
 
 def test_classes_related_both_ways_are_stated_of_different_instances():
@@ -194,8 +178,8 @@ def test_classes_related_both_ways_are_stated_of_different_instances():
     data = tensors([both, scene(classes, [(0, 0, 1)], relations=known)], artifact.spec.V)
     batch = data.batch(torch.arange(2))
     told = telling(batch, batch.holds > 0)
-    values = relation_score(artifact, given=True)(told)
-    blind = relation_score(artifact, given=False)(told)
+    values = score_relations(artifact, told, given=True)
+    blind = score_relations(artifact, told, given=False)
     assert torch.isfinite(values).all()
     assert not torch.allclose(values[0], values[1])
     torch.testing.assert_close(blind[0], blind[1])
@@ -207,7 +191,7 @@ def test_classes_related_both_ways_are_stated_of_different_instances():
 def test_one_triple_is_replaced_by_a_false_one():
     """All others stay; what replaces it shares two of relation, subject, object with it."""
     spy = Spy()
-    placement_scores(DATA, WIDE_STRUCTURE, spy)
+    false_hits(DATA, WIDE_STRUCTURE, spy)
     kinds = set()
     for one, evidence in zip(spy.rows, related(2), strict=True):
         n = len(evidence.classes)
@@ -230,6 +214,6 @@ def test_without_a_false_triple_there_is_no_case():
     one[0, 0, 1] = True
     assert alter(one, np.broadcast_to(off, one.shape), rng) is None
     data = tensors([scene([0, 1], [(0, 0, 1)]), scene([0, 1], [(0, 0, 1), (1, 0, 1)])])
-    scores = placement_scores(data, NO_STRUCTURE, flat)
-    assert (scores.scenes, scores.skipped, scores.scene.tolist()) == (2, 1, [1, 1])
-    assert len(placement_scores(tensors([scene([0, 1])]), NO_STRUCTURE, flat).scene) == 0
+    hits = false_hits(data, NO_STRUCTURE, flat)
+    assert (hits.numerators.tolist(), hits.skipped) == ([0, 1 / 2], 1)
+    assert false_hits(tensors([scene([0, 1])]), NO_STRUCTURE, flat) is None

@@ -1,16 +1,13 @@
-"""Tables and their remarks."""
+"""Tables, verdicts and differences."""
 
 from __future__ import annotations
 
-import io
-
 import numpy as np
 import pytest
-from rich.console import Console
 
 from training.evaluation.metrics import Figure, Ratio
 from training.evaluation.report import SourceReport
-from training.evaluation.results import Asked, Cell, Difference, Results, remarks, summarise
+from training.evaluation.results import Cell, Difference, Results, summarise
 from training.evaluation.setting import Outcome
 
 
@@ -32,7 +29,6 @@ def test_precision_of_relations_says_what_counts_as_wrong():
         ("MRR", -0.2, -0.1, "worse"),
         ("MMD², free", -0.2, -0.1, "better"),
         ("ECE, missing, 2 classes", 0.1, 0.2, "worse"),
-        ("change of p", 0.1, 0.2, "worse"),
         ("change of MRR, poses", 0.1, 0.2, "better"),
         ("mirrored relations, free", -0.2, -0.1, "better"),
         ("on-top cycles, free", 0.1, 0.2, "worse"),
@@ -54,39 +50,12 @@ def test_results_list_the_questions():
     }  # fmt: skip
 
 
-def test_remarks_stand_below_the_tables_of_their_task():
-    cells = (Cell("a", "T4 generate", "x", "MMD², free", figure(0.1), (0.1,)),)
-    asked = (
-        Asked("a", 0, "T4 generate", "x", 7, 0, {"bandwidth": 4.5, "drawn scenes": 1200}),
-        Asked("a", 0, "T2 missing", "x", 90, 8, {}),
-    )
-    text = Results("a", cells, (), asked=asked).markdown()
-    assert text.endswith(
-        "\n\n|  | bandwidth | drawn scenes |\n|---|---|---|\n| x | 4.500 | 1,200 |\n"
-    )
-    assert "could not be scored" not in text
-
-
-def test_notes_go_by_source_or_by_row_or_by_both():
-    def asked(row, source, value):
-        return Asked(row, 0, "Density", source, 5, 0, {"log Z, AIS": value})
-
-    def keys(*some):
-        (table,) = remarks(some)
-        return [line.split(" | ")[0].strip("| ") for line in table.splitlines()[2:]]
-
-    rows = asked("a", "x", 1.5), asked("a", "y", 1.5), asked("b", "x", 2.5), asked("b", "y", 2.5)
-    assert keys(*rows) == ["a, seed 0", "b, seed 0"]
-    assert keys(asked("a", "x", 1.5), asked("b", "x", 1.5), asked("b", "y", 2.5)) == ["x", "y"]
-    assert keys(*rows, asked("b", "z", 3.5)) == [
-        "a, seed 0, x", "a, seed 0, y", "b, seed 0, x", "b, seed 0, y", "b, seed 0, z",
-    ]  # fmt: skip
-
-
 def test_skipped_scenes_are_told_by_source():
-    asked = [Asked(r, 0, "T2", s, 90, k, {}) for r, s, k in [("a", "x", 8), ("b", "x", 9)]]
-    asked.append(Asked("a", 0, "T2", "y", 1200, 0, {}))
-    assert remarks(asked) == ["Scenes that could not be scored: x 8–9 of 90."]
+    skipped = (("x", 8), ("x", 9), ("y", 0))
+    asked = [{"task": "T2", "source": source, "skipped": count} for source, count in skipped]
+    cells = (Cell("a", "T2", "x", "MRR", figure(0.1), (0.1,)),)
+    text = Results("a", cells, (), asked=tuple(asked)).markdown({"T2": ("MRR",)})
+    assert text.endswith("\n\nScenes that could not be scored: 9 of x.\n")
 
 
 def test_a_row_is_compared_by_scene_where_the_reference_row_has_the_metric():
@@ -111,28 +80,6 @@ def test_a_row_is_compared_by_scene_where_the_reference_row_has_the_metric():
     wider = 4.3027 / 1.9600 * np.sqrt(3 / 2)
     assert gap.figure.low == pytest.approx(0.25 - wider * 0.5, rel=1e-3)
     assert gap.figure.high == pytest.approx(0.25 + wider * 0.25, rel=1e-3)
-
-
-def test_tables_for_terminals_name_tasks_in_words_and_fit_80_columns():
-    cells = tuple(
-        Cell(row, "T1a relations", source, metric, figure(0.5), (0.5,))
-        for row in ("indoor-triway-deep", "frequency table, completing")
-        for source in ("validation pooled", "test pooled", "sunrgbd")
-        for metric in ("R-precision, distinct classes", "R-precision, instance counts")
-    )
-    gaps = (
-        Difference("indoor-triway-deep", "T1a relations", "test pooled", cells[0].metric,
-                   figure(0.1)),
-    )  # fmt: skip
-    console = Console(width=80, file=io.StringIO())
-    console.print(*Results("ours", cells, gaps).tables())
-    shown = console.file.getvalue()
-    assert "relations of a scene" in shown
-    assert "T1a" not in shown
-    assert "sunrgbd" not in shown  # where there are pooled figures, the file has the others
-    assert shown.count("0.500 [0.500, 0.500]") == 8
-    assert shown.count("*") == 1
-    assert "…" not in shown
 
 
 def test_a_summary_needs_our_row_and_pairs_equal_scenes():

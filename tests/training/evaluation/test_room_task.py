@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import torch
 from app import questions
 from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, room_model, rooms
 from tests.training.evaluation.scenes import NO_STRUCTURE, V, scene, tensors
-from training.evaluation.asking import of_classes, room_score
+from training.evaluation.asking import of_classes, score_rooms
 from training.evaluation.room_task import LEAST, LISTS, mean_log_p, rooms_task
 from training.evaluation.setting import Setting
 
@@ -71,7 +72,7 @@ def test_real_rooms_have_their_own_rows():
 
 def test_the_service_is_asked_as_a_robot_asks():
     scenes = rooms(6, 3)
-    score = room_score(room_model(), ())
+    score = partial(score_rooms, room_model(), ())
     v = scenes.v * ~STRUCTURE
     log_p = score(v, "a profile of another model")
     for row, values in zip(v, log_p, strict=True):

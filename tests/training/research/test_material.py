@@ -11,8 +11,6 @@ import pytest
 
 from tests.training.commands import invoke, small_config, write_config
 from training.fit.configuration import ConfigError, DataConfig
-from training.research.benchmark import Options, compare_on_shuffled, read_domains
-from training.research.entries import baseline_entries
 from training.runs.pipeline import read_sources, split_and_encode
 
 LABELS = ["bed", "sink", "lamp", "oven", "sofa", "desk", "shelf", "towel", "plant", "chair"]
@@ -33,10 +31,6 @@ def write_scenes(folder, source, *, seed=0, relations=False):
         lines.append(json.dumps(scene))
     with gzip.open(folder / f"{source}.jsonl.gz", "wt") as file:
         file.write("\n".join(lines))
-
-
-def rows_of(results):
-    return {cell["row"] for cell in results["cells"]}
 
 
 def material(folder, **settings):
@@ -84,47 +78,18 @@ def test_relations_are_needed_to_learn_from_and_to_tune_on(tmp_path):
         assert not replace(found, **{part: bare.train}).related
 
 
-@pytest.fixture(scope="module")
-def unrelated(tmp_path_factory):
-    """Everything that a quick run does, on scenes without relations."""
-    folder = tmp_path_factory.mktemp("unrelated")
-    write_scenes(folder, "flats")
+def test_rows_of_relations_are_left_out_where_there_are_none(tmp_path):
+    write_scenes(tmp_path, "flats")
     data = {"sources": ["flats"], "vocabulary": "source"}
-    config = write_config(folder / "config.toml", small_config("flats-rbm", "rbm", **data))
-    where = ("--data", folder, "--folder", folder / "reports", "--workers", "1")
-    invoke("benchmark", config, *where, "--quick", "--shuffled")
-    return folder
-
-
-def test_rows_of_relations_are_left_out_where_there_are_none(unrelated):
-    folder = unrelated / "reports/flats"
-    results = json.loads((folder / "results.json").read_text())
-    assert {"flats-rbm", "popularity", "EASE"} <= rows_of(results)
+    config = write_config(tmp_path / "config.toml", small_config("flats-rbm", "rbm", **data))
+    where = ("--data", tmp_path, "--folder", tmp_path / "reports", "--workers", "1")
+    names = ("popularity", "EASE", "frequency table", "frequency table p(i | a, j)")
+    chosen = (word for name in names for word in ("--baseline", name))
+    tasks = ("--task", "T1", "--task", "T2", "--task", "T3")
+    invoke("benchmark", config, *where, *chosen, *tasks, "--seeds", "1", "--limit", "30")
+    results = json.loads((tmp_path / "reports/flats/results.json").read_text())
+    assert {cell["row"] for cell in results["cells"]} == {"flats-rbm", "popularity", "EASE"}
     tasks = {cell["task"] for cell in results["cells"]}
     assert {"T2 missing", "T3 outliers"} <= tasks
     assert not {task for task in tasks if task.startswith(("T1", "T2-at", "T3b"))}
-    assert not (folder / "frequency-table").exists()
-    (page,) = (folder / "shuffled").glob("*/results.json")
-    assert page.parent.name == "t2-missing"
-    assert rows_of(json.loads(page.read_text())) >= {"flats-rbm", "popularity"}
-
-
-def test_a_control_of_relations_alone_needs_some(unrelated, tmp_path):
-    (domain,) = read_domains([str(unrelated / "config.toml")])
-    options = Options(unrelated, ("T1a relations",), quick=True)
-    with pytest.raises(ValueError, match="the scenes of flats contain no relations"):
-        compare_on_shuffled(domain, tmp_path, options)
-
-
-def test_every_trial_stands_once_when_a_row_is_made_again(tmp_path):
-    write_scenes(tmp_path, "flats", relations=True)
-    some = material(tmp_path).complete_data()
-    (entry,) = baseline_entries(0, ["EASE"])
-    kept = []
-    for _ in range(2):
-        entry.make(some, tmp_path / "row", lambda _: None)
-        lines = (tmp_path / "row/trials.jsonl").read_text().splitlines()
-        trials = [json.loads(line) for line in lines]
-        kept.append([{k: v for k, v in trial.items() if k != "seconds"} for trial in trials])
-    assert kept[1] == kept[0]
-    assert {trial["model"] for trial in kept[0]} > {"EASE"}
+    assert not (tmp_path / "reports/flats/frequency-table").exists()

@@ -25,7 +25,7 @@ RELATIONS: Final = ("relations", "false_relations")
 POPULARITY: Final = Baseline("popularity", classes.popularity)
 EASE: Final = Baseline("EASE", classes.ease)
 FREQUENCY_TABLE: Final = Baseline(
-    "frequency table", triples.frequency_table, fitting.r_precision, RELATIONS
+    "frequency table", triples.frequency_table, fitting.relation_precision, RELATIONS
 )
 PLACED: Final = Baseline(
     "frequency table p(i | a, j)", triples.placed_table, fitting.placed_mrr, ("at_place",)

@@ -17,23 +17,11 @@ from training.evaluation.model import ObjectScore
 class LinearScore:
     """The linear score bias + v · weights of each class, with bias (V,) and weights (V, V).
 
-    Rows of the weights are present classes, columns are scored classes.
-
-    Raises:
-        ValueError: the shapes of bias and weights do not match, or the diagonal is not zero.
+    Rows of the weights are present classes, columns are scored classes. The diagonal is zero.
     """
 
     bias: Tensor
     weights: Tensor
-
-    def __post_init__(self) -> None:
-        V = len(self.bias)
-        if self.weights.shape != (V, V):
-            raise ValueError(
-                f"the shape of weights must be ({V}, {V}), not {tuple(self.weights.shape)}"
-            )
-        if self.weights.diagonal().any():
-            raise ValueError("the diagonal of the weights must be zero")
 
     @property
     def parameter_count(self) -> int:

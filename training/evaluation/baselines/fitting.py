@@ -10,7 +10,6 @@ generator function, which never sees the validation scenes.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -30,11 +29,15 @@ from training.evaluation.model import (
     Parameters,
     PlacedScore,
     RelationScore,
-    Trial,
 )
 from training.evaluation.moved_task import ask_moved, moved_cases
 from training.evaluation.parts import validation_score
-from training.evaluation.relation_tasks import complete_scenes, rank, rank_relations
+from training.evaluation.relation_tasks import (
+    Candidates,
+    complete_scenes,
+    r_precision,
+    score_scenes,
+)
 
 _SCENES = 1000
 
@@ -90,14 +93,21 @@ def placed_mrr(scenes: SceneTensors, structure: Tensor, score: PlacedScore) -> f
     return leave_one_out_at(some_scenes(scenes, _SCENES), structure, score)[0].mrr().value
 
 
-def r_precision(scenes: SceneTensors, structure: Tensor, score: RelationScore) -> float:
+def relation_precision(scenes: SceneTensors, structure: Tensor, score: RelationScore) -> float:
     """Return the R-precision of relations, given the instance counts of classes (task T1a)."""
-    return rank_relations(scenes, structure, score).pooled().value
+    return _precision(score_scenes(scenes, structure, score), scenes)
 
 
-def completion_r_precision(scenes: SceneTensors, structure: Tensor, score: RelationScore) -> float:
+def completion_precision(scenes: SceneTensors, structure: Tensor, score: RelationScore) -> float:
     """Return the R-precision of half of the relations, given the other half (task T1b)."""
-    return rank(complete_scenes(scenes, structure, score), len(scenes)).pooled().value
+    return _precision(complete_scenes(scenes, structure, score), scenes)
+
+
+def _precision(scored: list[Candidates], scenes: SceneTensors) -> float:
+    ratio = r_precision(scored, len(scenes))
+    if ratio is None:
+        raise ValueError("no scene has an annotated relation between two things")
+    return ratio.value
 
 
 def named_moved(scenes: SceneTensors, structure: Tensor, score: MisplacedScore) -> float:
@@ -155,23 +165,14 @@ class Baseline:
         If two grid points have the same metric, the first is the best.
 
         Raises:
-            ValueError: the numbers of classes differ, or scenes needed for fit or metric are
-                missing.
+            ValueError: scenes needed for fit or metric are missing.
             FloatingPointError: the metric of a grid point is NaN.
         """
-        V = train.v.shape[1]
-        if validation.v.shape[1] != V or structure.shape != (V,):
-            raise ValueError(
-                f"the numbers of classes differ: training scenes have {V} classes, validation "
-                f"scenes {validation.v.shape[1]}, and structure has shape {tuple(structure.shape)}"
-            )
         if not train.v.any():
             raise ValueError(
                 f"the {len(train)} training scenes contain no objects; a baseline needs objects"
             )
-        trials: list[Trial] = []
         best, highest = None, -math.inf
-        start = time.perf_counter()
         proposals = self.propose(train, structure, seed)
         proposal = next(proposals, None)
         while proposal is not None:
@@ -184,11 +185,8 @@ class Baseline:
                 )
             if metric > highest:
                 best, highest = score, metric
-            now = time.perf_counter()
-            trials.append(Trial(dict(parameters), metric, now - start))
             text = ", ".join(f"{key} {value}" for key, value in parameters.items())
             progress(f"{self.name} {text}: {metric:.4f}")
-            start = now
             try:
                 proposal = proposals.send(metric)
             except StopIteration:
@@ -197,4 +195,4 @@ class Baseline:
         if "density" in answers:
             answers["density"] = lambda _: best
         count = getattr(best, "parameter_count", None) if "missing" in answers else None
-        return Model(**answers, parameters=count, trials=tuple(trials))
+        return Model(**answers, parameters=count)

@@ -35,23 +35,26 @@ _EVERY: tuple[Baseline, ...] = (
     Baseline("most common room type", room_models.most_common, mean_log_p, ("rooms",)),
     Baseline("naive Bayes of rooms", room_models.naive_bayes, mean_log_p, ("rooms",)),
     Baseline(
-        "relation popularity", relation_models.relation_popularity, fitting.r_precision, RELATIONS
+        "relation popularity",
+        relation_models.relation_popularity,
+        fitting.relation_precision,
+        RELATIONS,
     ),
     FREQUENCY_TABLE,
     Baseline(
-        *("ComplEx", relation_models.complex_embedding, fitting.r_precision, RELATIONS),
+        *("ComplEx", relation_models.complex_embedding, fitting.relation_precision, RELATIONS),
         stochastic=True,
     ),
     Baseline(
         "frequency table, completing",
         triples.frequency_table,
-        fitting.completion_r_precision,
+        fitting.completion_precision,
         ("completion",),
     ),
     Baseline(
         "frequency table + closure, completing",
         relation_models.frequency_table_with_closure,
-        fitting.completion_r_precision,
+        fitting.completion_precision,
         ("completion",),
     ),
     PLACED,

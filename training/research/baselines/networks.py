@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Final
 
 import torch
@@ -36,19 +36,10 @@ _WARM_UP = 0.1
 _ONE_HIDDEN = 0.3
 _LEAST_SHARE = 0.05
 _STEPS = 800
+_OFFERS = (0.6, 0.8, 1.0)  # shares of the steps after which a network is a candidate
+_BATCH = 256
 LOSSES: Final = ("softmax", "binary")
-
-
-@dataclass(frozen=True)
-class Course:
-    """Settings of the training of a network, a candidate at the shares `offers` of `steps`."""
-
-    learning_rate: float
-    weight_decay: float
-    loss: str = "softmax"
-    steps: int = _STEPS
-    batch_size: int = 256
-    offers: tuple[float, ...] = (0.6, 0.8, 1.0)
+_SIZES: Final = ("width", "dropout", "layers")
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +65,15 @@ class NetworkScore:
 
 
 def train_network(
-    network: nn.Module, lists: Lists, structure: Tensor, course: Course, seed: int
+    network: nn.Module,
+    lists: Lists,
+    structure: Tensor,
+    seed: int,
+    *,
+    learning_rate: float,
+    weight_decay: float,
+    loss: str,
+    steps: int,
 ) -> Iterator[tuple[int, NetworkScore]]:
     """Train a network. At each candidate step, yield the step and the score of averaged weights.
 
@@ -87,28 +86,24 @@ def train_network(
     if not usable.any():
         raise ValueError("no training scene has two classes without structure")
     v, labelled, weight = lists.v[usable], lists.labelled[usable], lists.weight[usable]
-    optimiser = torch.optim.AdamW(
-        network.parameters(), lr=course.learning_rate, weight_decay=course.weight_decay
-    )
-    schedule = OneCycleLR(
-        optimiser, course.learning_rate, total_steps=course.steps + 1, pct_start=_WARM_UP
-    )
+    optimiser = torch.optim.AdamW(network.parameters(), lr=learning_rate, weight_decay=weight_decay)
+    schedule = OneCycleLR(optimiser, learning_rate, total_steps=steps + 1, pct_start=_WARM_UP)
     average = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(_AVERAGING))
-    candidates = {max(1, round(share * course.steps)) for share in course.offers}
-    for step in range(1, course.steps + 1):
+    candidates = {max(1, round(share * steps)) for share in _OFFERS}
+    for step in range(1, steps + 1):
         # Dropout uses the global random generator. The fork restores its state after the block.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed * 1_000_003 + step)
             network.train()
-            index = weight.multinomial(course.batch_size, replacement=True)
+            index = weight.multinomial(_BATCH, replacement=True)
             optimiser.zero_grad()
-            hidden_loss(network, v[index], labelled[index], course.loss).backward()
+            hidden_loss(network, v[index], labelled[index], loss).backward()
             optimiser.step()
             schedule.step()
             average.update_parameters(network)
         if step in candidates:
             trained = copy.deepcopy(average.module).eval()
-            yield step, NetworkScore(trained, structure, course.loss == "softmax")
+            yield step, NetworkScore(trained, structure, loss == "softmax")
 
 
 def draw_lists(v: Tensor) -> Tensor:
@@ -147,20 +142,17 @@ _AUTOENCODER: Final[dict[str, Sequence[Any]]] = {
 }
 
 
-def build_autoencoder(popularity: Tensor, width: int, dropout: float, seed: int) -> nn.Sequential:
+def build_autoencoder(popularity: Tensor, width: int, dropout: float) -> nn.Sequential:
     """Return an untrained autoencoder; the class frequencies (V,) initialise its output bias."""
     V = len(popularity)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        output = nn.Linear(width, V)
-        network = nn.Sequential(
-            nn.Linear(V, width), nn.LayerNorm(width), nn.GELU(), nn.Dropout(dropout),
-            nn.Linear(width, width), nn.LayerNorm(width), nn.GELU(), nn.Dropout(dropout),
-            output,
-        )  # fmt: skip
+    output = nn.Linear(width, V)
     with torch.no_grad():
         output.bias.copy_(popularity.log())
-    return network
+    return nn.Sequential(
+        nn.Linear(V, width), nn.LayerNorm(width), nn.GELU(), nn.Dropout(dropout),
+        nn.Linear(width, width), nn.LayerNorm(width), nn.GELU(), nn.Dropout(dropout),
+        output,
+    )  # fmt: skip
 
 
 def autoencoder(train: SceneTensors, structure: Tensor, seed: int) -> Proposals[ObjectScore]:
@@ -192,16 +184,14 @@ class SetTransformer(nn.Module):
     The log of the share of scenes with each class, (classes,), initialises the output bias.
     """
 
-    def __init__(
-        self, popularity: Tensor, *, width: int, heads: int, layers: int, dropout: float
-    ) -> None:
+    def __init__(self, popularity: Tensor, width: int, dropout: float, layers: int) -> None:
         super().__init__()
         V = len(popularity)
         self.classes = V
         # Token V is the query token. Token V + 1 is padding.
         self.embedding = nn.Embedding(V + 2, width)
         layer = nn.TransformerEncoderLayer(
-            width, heads, 2 * width, dropout, activation="gelu", batch_first=True, norm_first=True
+            width, _HEADS, 2 * width, dropout, activation="gelu", batch_first=True, norm_first=True
         )
         self.encoder = nn.TransformerEncoder(
             layer, layers, norm=nn.LayerNorm(width), enable_nested_tensor=False
@@ -222,18 +212,9 @@ class SetTransformer(nn.Module):
         return encoded[:, 0] @ self.embedding.weight[: self.classes].T + self.bias
 
 
-def build_transformer(
-    popularity: Tensor, width: int, dropout: float, seed: int, layers: int
-) -> SetTransformer:
-    """Return an untrained transformer."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        return SetTransformer(popularity, width=width, heads=_HEADS, layers=layers, dropout=dropout)
-
-
 def transformer(train: SceneTensors, structure: Tensor, seed: int) -> Proposals[ObjectScore]:
     """Yield the score of a transformer for each setting and step."""
-    return _networks(build_transformer, _TRANSFORMER, _SHORT_RUNGS, train, structure, seed)
+    return _networks(SetTransformer, _TRANSFORMER, _SHORT_RUNGS, train, structure, seed)
 
 
 def _networks(
@@ -248,12 +229,14 @@ def _networks(
     lists = dict(training_lists(train, structure))
 
     def fit(setting: dict[str, Any], share: float) -> Iterator[tuple[Parameters, ObjectScore]]:
-        names = {field.name for field in fields(Course)}
-        options = {key: value for key, value in setting.items() if key in names}
-        sizes = {key: setting[key] for key in grid if key not in names}
-        course, chosen = Course(**options, steps=round(share * _STEPS)), lists[setting["scenes"]]
-        network = build(chosen.frequency(), seed=seed, **sizes)
-        for step, score in train_network(network, chosen, structure, course, seed):
+        chosen, options = lists[setting["scenes"]], setting.copy()
+        options.pop("scenes")
+        sizes = {name: options.pop(name) for name in _SIZES if name in options}
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            network = build(chosen.frequency(), **sizes)
+        steps = round(share * _STEPS)
+        for step, score in train_network(network, chosen, structure, seed, **options, steps=steps):
             yield {"steps": step}, score
 
     settings = drawn_settings(scenes=tuple(lists), loss=LOSSES, **grid)

@@ -16,7 +16,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits, embedding_bag,
 from training.datasets.batches import SceneTensors
 from training.evaluation.baselines.classes import LinearScore, Lists, frequency, training_lists
 from training.evaluation.baselines.fitting import TRIALS, Proposals, drawn_settings, halving
-from training.evaluation.density_task import DensitySettings, ising_machine, machine_density
+from training.evaluation.density_task import ising_machine, machine_density
 from training.evaluation.model import ObjectDensity, ObjectScore, Parameters
 
 # Co-occurrence: Bernoulli naive Bayes, with the present classes as evidence.
@@ -102,8 +102,6 @@ def nearest(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[Obj
 _PAIRWISE_L2 = (50.0, 30.0, 20.0, 10.0, 5.0, 3.0)
 _DENSITY_L2 = (30.0, 10.0, 3.0)
 _ITERATIONS = 25
-# Settings for the estimate of log Z. Its error is about 0.01 nats.
-_EFFORT = DensitySettings(chains=128, temperatures=1500, burn_in=500)
 
 
 def fit_pairwise(
@@ -168,7 +166,7 @@ def pairwise_densities(
     for l2 in _DENSITY_L2:
         score = fit_pairwise(lists, l2, start=score)
         machine = ising_machine(score.bias, score.weights)
-        density = machine_density(machine, train, _EFFORT, seed)
+        density = machine_density(machine, train, seed)
         yield {"l2": l2}, cast(ObjectDensity, density)  # an Ising machine has one layer
 
 

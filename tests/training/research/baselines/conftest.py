@@ -6,8 +6,8 @@ import pytest
 
 from tests.training.research.baselines.furnished import furnished
 from training.datasets.batches import SceneTensors
-from training.evaluation.density_task import DensitySettings
-from training.research.baselines import networks, object_models
+from training.evaluation import density_task
+from training.research.baselines import networks
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -15,7 +15,8 @@ def _short_courses() -> Iterator[None]:
     """A few steps suffice for two kinds of rooms."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(networks, "_STEPS", 60)
-        patch.setattr(object_models, "_EFFORT", DensitySettings(64, 300, 100))
+        for name, value in (("CHAINS", 64), ("TEMPERATURES", 300), ("BURN_IN", 100)):
+            patch.setattr(density_task, name, value)
         yield
 
 

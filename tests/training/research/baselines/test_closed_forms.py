@@ -20,7 +20,6 @@ from tests.training.research.baselines.furnished import (
     tensors,
 )
 from training.evaluation.baselines.classes import (
-    LinearScore,
     Lists,
     fit_ease,
     frequency,
@@ -43,7 +42,7 @@ from training.research.baselines.object_models import (
     fit_pairwise,
     nearest_score,
 )
-from training.research.baselines.relation_models import closure_score, complex_logits, fit_complex
+from training.research.baselines.relation_models import closure_score, complex_logits
 
 
 def lists_of(v):
@@ -101,13 +100,6 @@ def test_nearest_scenes_are_scikit_learns(v, sharpness):
     assert score(query).sigmoid().numpy() == pytest.approx(expected, abs=1e-5)
 
 
-def test_only_the_nearest_vote(v):
-    """With one neighbour, equal to the query, its classes come first."""
-    train = torch.eye(4)[:, [0, 1, 2, 3]] + torch.eye(4)[:, [1, 2, 3, 0]]
-    values = nearest_score(lists_of(train), neighbours=1, sharpness=1.0)(train[:1])
-    assert set(values[0].topk(2).indices.tolist()) == set(train[0].nonzero().flatten().tolist())
-
-
 def test_pairwise_weights_are_a_stationary_point(v):
     """The gradient of the penalised pseudo-likelihood, written out, vanishes."""
     l2 = 5.0
@@ -136,13 +128,6 @@ def test_the_rbms_log_odds_are_scikit_learns_free_energies(v):
         expected = rbm._free_energy(off.numpy()) - rbm._free_energy(on.numpy())
         values = score(off)[:, i].numpy()
         assert values == pytest.approx(expected, abs=1e-3)
-
-
-def test_weights_of_a_class_on_itself_are_refused():
-    with pytest.raises(ValueError, match="diagonal"):
-        LinearScore(torch.zeros(2), torch.eye(2))
-    with pytest.raises(ValueError, match=r"must be \(2, 2\), not \(3, 3\)"):
-        LinearScore(torch.zeros(2), torch.zeros(3, 3))
 
 
 @pytest.mark.parametrize(("loss", "expected"), [("softmax", np.log(3)), ("binary", 3 * np.log(2))])
@@ -277,13 +262,6 @@ def test_complex_logits_by_einsum():
     s = torch.randn(5, 3, dtype=torch.cfloat, generator=generator)
     expected = torch.einsum("ik,ak,jk->aij", s, r, s.conj()).real + bias[:, None, None]
     torch.testing.assert_close(complex_logits(bias, r, s), expected)
-
-
-def test_complex_learns_that_left_is_not_right(related):
-    counts = count_triples(related, STRUCTURE)
-    p = fit_complex(counts, rank=4, penalty=0.01, seed=0).sigmoid()
-    assert p[ON_TOP, 0, 1] == pytest.approx(2 / 3, abs=0.1)
-    assert p[ON_TOP, 1, 0] < 0.1
 
 
 def test_places_by_hand(related):
