@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections.abc import Callable
+from threading import Lock
 from typing import Annotated, Final, cast
+from weakref import WeakKeyDictionary
 
 from fastapi import APIRouter, Depends, Path, Security
 from fastapi.security import APIKeyHeader, HTTPBearer
+from pydantic import BaseModel
 from starlette.requests import Request
 from starlette.responses import Response
 
@@ -15,9 +19,10 @@ from app.api.body import AdminJSONRoute, check_admin
 from app.api.gateway import ADMIN_KEY
 from app.api.openapi import error_responses
 from app.questions.contexts import contexts
+from app.registry import Artifact
 from app.scene.relations import opposite
 from app.scene.vocabulary import ObjectClass
-from app.serving.models import ServedModel, ServedModels
+from app.serving.models import ServedModels
 from app.serving.runtime import Runtime
 from scene_client import schemas
 
@@ -104,7 +109,7 @@ async def show_version(
     served = models.served.get((name, version))
     if served is None:
         return schemas.VersionDetails(name=name, **dict(summary))
-    manifest = served.artifact.manifest
+    manifest = served.manifest
     return schemas.VersionDetails(
         name=name,
         **dict(summary),
@@ -113,7 +118,7 @@ async def show_version(
         metrics=[schemas.Metric(**metric.model_dump()) for metric in manifest.metrics],
         data=[schemas.TrainingSource(**source.model_dump()) for source in manifest.data],
         terms=manifest.terms,
-        card=served.artifact.card,
+        card=served.card,
     )
 
 
@@ -125,8 +130,7 @@ async def show_version(
 )
 async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> Response:
     """List the object classes with their aliases, the relations and the room types of a model."""
-    body = runtime.models.resolve(name).document("vocabulary", _vocabulary)
-    return Response(body, media_type="application/json")
+    return _document(runtime.models.resolve(name), _vocabulary)
 
 
 @router.get(
@@ -165,10 +169,8 @@ async def show_contexts(name: Reference, runtime: RuntimeDep) -> Response:
 
     The field `context` of `POST /generate` accepts the numbers of these units.
     """
-    served = runtime.models.resolve(name)
     # The first request for a model takes 0.3 s, so it runs in a thread.
-    body = await asyncio.to_thread(served.document, "contexts", _contexts)
-    return Response(body, media_type="application/json")
+    return await asyncio.to_thread(_document, runtime.models.resolve(name), _contexts)
 
 
 @administration.post(
@@ -211,8 +213,21 @@ async def move_alias(
     return answer.model_dump_json(exclude_none=True).encode()
 
 
-def _vocabulary(served: ServedModel) -> schemas.VocabularyAnswer:
-    vocabulary, manifest = served.vocabulary, served.artifact.manifest
+_documents: Final[WeakKeyDictionary[Artifact, dict[object, bytes]]] = WeakKeyDictionary()
+_building: Final = Lock()
+
+
+def _document(model: Artifact, build: Callable[[Artifact], BaseModel]) -> Response:
+    """Return an answer about a model. It never changes, so it is built once."""
+    with _building:
+        documents = _documents.setdefault(model, {})
+        if build not in documents:
+            documents[build] = build(model).model_dump_json().encode()
+    return Response(documents[build], media_type="application/json")
+
+
+def _vocabulary(served: Artifact) -> schemas.VocabularyAnswer:
+    vocabulary, manifest = served.vocabulary, served.manifest
     canonical, rooms = manifest.vocabulary.relations, vocabulary.room_types
     return schemas.VocabularyAnswer(
         model=served.reference,
@@ -221,7 +236,7 @@ def _vocabulary(served: ServedModel) -> schemas.VocabularyAnswer:
             cast("schemas.RelationName", name) for name in (*canonical, *map(opposite, canonical))
         ],
         room_types=list(rooms),
-        rare_room_types=[rooms[t] for t in served.artifact.calibration.rare_rooms],
+        rare_room_types=[rooms[t] for t in served.calibration.rare_rooms],
         profiles=list(manifest.vocabulary.profiles),
         examples=[
             schemas.ExampleScene(name=example.name, scene=example.request())
@@ -230,8 +245,8 @@ def _vocabulary(served: ServedModel) -> schemas.VocabularyAnswer:
     )
 
 
-def _contexts(served: ServedModel) -> schemas.ContextsAnswer:
-    return schemas.ContextsAnswer(model=served.reference, layers=dict(contexts(served.artifact)))
+def _contexts(served: Artifact) -> schemas.ContextsAnswer:
+    return schemas.ContextsAnswer(model=served.reference, layers=dict(contexts(served)))
 
 
 def _class(entry: ObjectClass) -> schemas.VocabularyEntry:

@@ -33,6 +33,7 @@ from app.registry.offsets import Offsets
 from app.registry.places import Places
 from app.registry.tensors import StorageDtype, pack, require_equal, unpack
 from app.scene.vocabulary import Vocabulary
+from scene_client.schemas import ModelReference
 
 MAX_MANIFEST_BYTES: Final = 4 * 2**20
 """Maximum size of a manifest in bytes. A manifest of 785 classes has 162 kB."""
@@ -74,6 +75,19 @@ class Artifact:
     offsets: Offsets | None = None
     counts: Counts | None = None
     places: Places | None = None
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Name and version of the model."""
+        return self.manifest.name, self.manifest.version
+
+    @cached_property
+    def reference(self) -> ModelReference:
+        """Name, version, variant and digest of the model, in the form of the field `model`."""
+        name, version = self.key
+        return ModelReference(
+            name=name, version=version, variant=self.manifest.variant, digest=self.digest
+        )
 
     @cached_property
     def spec(self) -> MachineSpec:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, Final, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -39,6 +39,8 @@ class ObjectClass:
     Raises:
         ValueError: a name is empty, or the size is not three positive finite numbers.
     """
+
+    __pydantic_config__: ClassVar = {"extra": "forbid"}  # for classes in JSON
 
     label: str
     aliases: tuple[str, ...] = ()
@@ -134,9 +136,6 @@ class Vocabulary:
 
     def __hash__(self) -> int:
         return hash((self.objects, self.room_types))
-
-    def __repr__(self) -> str:
-        return f"Vocabulary({len(self)} object classes, {len(self.room_types)} room types)"
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
@@ -265,7 +264,7 @@ class Vocabulary:
         return None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return JSON-compatible values that `from_dict` accepts."""
+        """Return JSON-compatible values, without absent parents and flags."""
         aliases = {room: list(names) for room, names in self.room_aliases.items()}
         return {
             "objects": [
@@ -281,28 +280,6 @@ class Vocabulary:
             ],
             "room_types": list(self.room_types),
         } | ({"room_aliases": aliases} if aliases else {})
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Build a vocabulary from the result of `to_dict`.
-
-        All fields of a class except ``label``, and ``room_aliases``, are optional.
-
-        Raises:
-            ValueError: a field is missing, unknown or of the wrong type. `Vocabulary` lists more
-                reasons.
-        """
-        if not isinstance(values.get("objects"), list):
-            raise ValueError("a vocabulary must have the field 'objects' with a list of classes")
-        rooms = values.get("room_types", [])
-        if not isinstance(rooms, list):
-            raise ValueError(f"'room_types' must be a list, not {rooms!r}")
-        if not _are_strings(rooms):
-            raise ValueError("'room_types' must be a list of strings")
-        aliases = values.get("room_aliases", {})
-        if not isinstance(aliases, Mapping) or not all(map(_are_strings, aliases.values())):
-            raise ValueError("'room_aliases' must map room types to lists of strings")
-        return cls([_object_class(entry) for entry in values["objects"]], rooms, aliases)
 
 
 def do_not_fit(inner: NDArray[np.float64], outer: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -339,39 +316,5 @@ def _read_only(values: ArrayLike) -> NDArray[Any]:
     return array
 
 
-_FIELDS: Final = tuple(field.name for field in fields(ObjectClass))
-
-
-def _are_strings(values: object) -> bool:
-    return isinstance(values, list) and all(isinstance(value, str) for value in values)
-
-
 def _are_extents(size: Sequence[float]) -> bool:
     return len(size) == 3 and all(math.isfinite(side) and side > 0 for side in size)
-
-
-def _object_class(entry: Any) -> ObjectClass:
-    if not isinstance(entry, Mapping) or not isinstance(entry.get("label"), str):
-        raise ValueError(f"an object class must be a mapping with a string 'label', not {entry!r}")
-    if unknown := sorted(set(entry) - set(_FIELDS)):
-        raise ValueError(
-            f"object class {entry['label']!r} has unknown fields {unknown}; the known fields are "
-            f"{', '.join(_FIELDS)}"
-        )
-    aliases, parent = entry.get("aliases", []), entry.get("parent")
-    if not _are_strings(aliases):
-        raise ValueError(f"aliases of {entry['label']!r} must be a string list, not {aliases!r}")
-    for name in ("structure", "anywhere"):
-        if not isinstance(flag := entry.get(name, False), bool):
-            raise ValueError(f"{name} of {entry['label']!r} must be a boolean, not {flag!r}")
-    if parent is not None and not isinstance(parent, str):
-        raise ValueError(f"parent of {entry['label']!r} must be a string, not {parent!r}")
-    size = entry.get("size")
-    if size is not None:
-        try:
-            size = tuple(float(side) for side in size)
-        except (TypeError, ValueError):
-            raise ValueError(
-                f"size of {entry['label']!r} must be three numbers, not {size!r}"
-            ) from None
-    return ObjectClass(**{**entry, "aliases": tuple(aliases), "size": size})

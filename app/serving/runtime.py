@@ -19,7 +19,7 @@ from app.registry import AliasTarget, Store, StoreError, StoreState, load_model_
 from app.serving.admission import Admission
 from app.serving.bodies import Bodies
 from app.serving.metrics import Change, Metrics
-from app.serving.models import DEFAULT, NO_MODELS, Key, ServedModels, prepare
+from app.serving.models import DEFAULT, NO_MODELS, Key, ServedModels, warm_up
 from app.settings import Settings
 from scene_client.schemas import AliasAnswer, AliasRequest, RefreshAnswer
 
@@ -214,9 +214,8 @@ class Runtime:
         # Read the state before the files. So the next check of the store finds changes that other
         # processes make during the load.
         self._loaded_state = self._store.state()
-        models = self.models
         with progress(KERNELS):
-            return prepare(load_model_set(self._store, models.store), models)
+            return ServedModels(load_model_set(self._store, self.models.store, warm_up))
 
     def _target(self, reference: str) -> AliasTarget:
         try:
