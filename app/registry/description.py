@@ -352,8 +352,6 @@ class Description(Frozen):
             raise ValueError(f"the vocabulary has {types} room types, but the spec has C = {rooms}")
         if any(t >= rooms for t in self.calibration.rare_rooms):
             raise ValueError(f"calibration.rare_rooms must be below C = {rooms}")
-        for example in self.examples:
-            example.require_known(words.vocabulary())
         return self
 
     @property
