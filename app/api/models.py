@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from starlette.requests import Request
 from starlette.responses import Response
 
-from app.api.body import AdminJSONRoute, check_admin
+from app.api.body import JSONRoute, check_admin
 from app.api.gateway import ADMIN_KEY
 from app.api.openapi import error_responses
 from app.questions.contexts import contexts
@@ -64,7 +64,7 @@ RuntimeDep = Annotated[Runtime, Depends(_runtime)]
 router = APIRouter(prefix="/models", tags=["models"])
 administration = APIRouter(prefix="/models", tags=["administration"], dependencies=_SCHEMES)
 changes = APIRouter(
-    prefix="/models", tags=["administration"], route_class=AdminJSONRoute, dependencies=_SCHEMES
+    prefix="/models", tags=["administration"], route_class=JSONRoute, dependencies=_SCHEMES
 )
 
 

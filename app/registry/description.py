@@ -243,13 +243,9 @@ class VocabularyEntry(Frozen):
         cls, vocabulary: Vocabulary, relations: int = len(CANONICAL), profiles: Sequence[str] = ()
     ) -> Self:
         """Return the manifest entry of a vocabulary for a machine with A = ``relations``."""
-        return cls(
-            objects=vocabulary.objects,
-            relations=CANONICAL[:relations],
-            room_types=vocabulary.room_types,
-            room_aliases=vocabulary.room_aliases,
-            profiles=tuple(profiles),
-        )
+        words = {name: getattr(vocabulary, name) for name in ("objects", "room_types")}
+        words |= {"relations": CANONICAL[:relations], "profiles": profiles}
+        return cls.model_validate(words | {"room_aliases": vocabulary.room_aliases})
 
     def vocabulary(self) -> Vocabulary:
         """Return the vocabulary."""

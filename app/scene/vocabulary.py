@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from types import MappingProxyType
 from typing import Any, ClassVar, Final, Literal, NamedTuple
 
 import numpy as np
@@ -67,6 +66,7 @@ class LookUp(NamedTuple):
     certain: bool
 
 
+@dataclass(unsafe_hash=True, repr=False)
 class Vocabulary:
     """The V object classes and C room types of a model, in a fixed order. Do not change it.
 
@@ -74,6 +74,7 @@ class Vocabulary:
         objects: object classes. Their order defines the class indices.
         room_types: canonical names of the room types. Their order defines the room indices.
         room_aliases: maps room types to their synonyms.
+        parents: (V,) index of the parent of each class, -1 without a parent.
 
     Raises:
         ValueError: the list of classes is empty, a room type has an empty name, a key of
@@ -82,24 +83,23 @@ class Vocabulary:
             with the same `label_key`.
     """
 
-    def __init__(
-        self,
-        objects: Sequence[ObjectClass],
-        room_types: Sequence[str] = (),
-        room_aliases: Mapping[str, Sequence[str]] = MappingProxyType({}),
-    ) -> None:
-        if not objects:
+    objects: Sequence[ObjectClass]
+    room_types: Sequence[str] = ()
+    room_aliases: Mapping[str, Sequence[str]] = field(default_factory=dict, hash=False)
+
+    def __post_init__(self) -> None:
+        if not self.objects:
             raise ValueError("a vocabulary needs at least one object class")
-        self.objects = tuple(objects)
-        self.room_types = tuple(room_types)
-        self.room_aliases = {room: tuple(names) for room, names in room_aliases.items()}
+        self.objects = tuple(self.objects)
+        self.room_types = tuple(self.room_types)
+        self.room_aliases = {room: tuple(names) for room, names in self.room_aliases.items()}
         if others := self.room_aliases.keys() - set(self.room_types):
             raise ValueError(f"room_aliases names unknown room types: {sorted(others)}")
         names = [(entry.label, *entry.aliases) for entry in self.objects]
         clash = "two object classes have the name {name!r}: {first!r} and {second!r}"
         self._by_spelling, self._by_key = _tables(names, "an object class", clash)
         self._bare = {name: SceneObject(name, name, k) for name, k in self._by_spelling.items()}
-        self._parents = self._parent_indices()
+        self.parents = self._parent_indices()
         names = [(room, *self.room_aliases.get(room, ())) for room in self.room_types]
         clash = "room types {first!r} and {second!r} have the same name"
         self._room_by_spelling, self._room_by_key = _tables(names, "a room type", clash)
@@ -109,12 +109,10 @@ class Vocabulary:
         parents = np.full(len(self.objects), -1, dtype=np.int64)
         for index, entry in enumerate(self.objects):
             if entry.parent is not None:
-                if entry.parent not in index_of:
-                    raise ValueError(
-                        f"the parent {entry.parent!r} of {entry.label!r} is not the label of a "
-                        "class"
-                    )
-                parents[index] = index_of[entry.parent]
+                if (parent := index_of.get(entry.parent)) is None:
+                    text = f"the parent {entry.parent!r} of {entry.label!r}"
+                    raise ValueError(f"{text} is not the label of a class")
+                parents[index] = parent
         ancestors = parents.copy()
         while (ancestors >= 0).any():
             if (own := np.flatnonzero(ancestors == np.arange(len(ancestors)))).size:
@@ -124,18 +122,6 @@ class Vocabulary:
 
     def __len__(self) -> int:
         return len(self.objects)
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Vocabulary):
-            return NotImplemented
-        return (
-            self.objects == other.objects
-            and self.room_types == other.room_types
-            and self.room_aliases == other.room_aliases
-        )
-
-    def __hash__(self) -> int:
-        return hash((self.objects, self.room_types))
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
@@ -154,11 +140,6 @@ class Vocabulary:
     def structure(self) -> NDArray[np.bool_]:
         """(V,) True for structural classes, which a model never proposes."""
         return _read_only([entry.structure for entry in self.objects])
-
-    @property
-    def parents(self) -> NDArray[np.int64]:
-        """(V,) index of the parent of each class, -1 without a parent."""
-        return self._parents
 
     @cached_property
     def anywhere(self) -> NDArray[np.bool_]:

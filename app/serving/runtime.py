@@ -16,8 +16,7 @@ from app.compiling import check_cache, progress
 from app.inference.kernels import KERNELS
 from app.questions.reading import Limits
 from app.registry import AliasTarget, Store, StoreError, StoreState, load_model_set
-from app.serving.admission import Admission
-from app.serving.bodies import Bodies
+from app.serving.admission import Admission, Bodies
 from app.serving.metrics import Change, Metrics
 from app.serving.models import DEFAULT, NO_MODELS, Key, ServedModels, warm_up
 from app.settings import Settings
