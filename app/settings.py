@@ -36,12 +36,9 @@ _PREFIX: Final = "SCENE_"
 # Variables of the clients, which may run in the same environment.
 _OF_CLIENTS: Final = ("URL",)
 _NO_STREAMS: Final = "the service has no streams; send each scene in a request of its own"
-_NO_REMOTE_STORES: Final = "a store is a folder; mount the models and set SCENE_STORE"
 _REMOVED: Final = {
     "WORKERS": "a replica is one process; start several replicas",
     **dict.fromkeys(("MAX_STREAMS", "STREAM_IDLE", "STREAM_RESUME"), _NO_STREAMS),
-    **dict.fromkeys(("STORE_CACHE", "STORE_CACHE_BYTES", "STORE_MAX_AGE"), _NO_REMOTE_STORES),
-    **dict.fromkeys(("TRUSTED_KEYS", "UNSIGNED_STORE", "SIGNING_KEY"), _NO_REMOTE_STORES),
 }
 # Kubernetes sets such variables in each pod, for every Service whose name starts with `scene`.
 _SERVICE_LINK: Final = re.compile(

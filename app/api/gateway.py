@@ -18,7 +18,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app import errors
-from app.api.problems import answer, from_exception, report_defect
+from app.api.problems import answer, from_exception
 from app.serving.admission import SMALL, Ticket
 from app.serving.models import NO_MODELS
 from app.serving.request import SUCCESS, Record
@@ -203,10 +203,8 @@ class Gateway:
 
     async def _fail(self, error: Exception, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a failure, or close the connection if a response has started already."""
-        problem = from_exception(error)
+        problem = from_exception(error, scope["state"]["request_id"])
         record: Record = scope["state"]["record"]
-        if problem.status == 500:
-            report_defect(error, scope["state"]["request_id"])
         if record.status:
             # A part of the response has been sent already. The raised error makes the server close
             # the connection.

@@ -14,7 +14,7 @@ from starlette.requests import Request
 
 from app.api.body import JSONRoute, validated
 from app.api.openapi import error_responses, operation_id
-from app.api.problems import from_exception, report_defect
+from app.api.problems import from_exception
 from app.errors import RequestError
 from app.questions import QUESTIONS, Question
 from app.questions.answer import written
@@ -81,9 +81,7 @@ def _failed(error: Exception, number: int, scene: Any, request_id: str) -> tuple
     """
     if isinstance(error, RequestError):
         error.locate(scene, ("scenes", number))
-    failure = from_exception(error)
-    if failure.status == 500:
-        report_defect(error, request_id)
+    failure = from_exception(error, request_id)
     body = failure.describe(request_id).model_dump_json(exclude_none=True).encode()
     return failure.slug, b'{"status":%d,"problem":%b}' % (failure.status, body)
 

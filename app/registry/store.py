@@ -153,17 +153,15 @@ class Store:
                     files += [folder / file for file in (MANIFEST, WEIGHTS, CARD)]
         return tuple((str(file), *_file_state(file)) for file in files)
 
-    def require_new(self, name: str, version: str, alias: str | None = None) -> None:
+    def require_new(self, name: str, version: str) -> None:
         """Check that a version can be published: its number is valid and new.
-
-        If ``alias`` is not None, this alias will point at the version.
 
         Raises:
             StoreError: `version_exists`, `name_conflict`, `invalid_reference`, `invalid_aliases`,
                 or `unreadable`.
         """
         check_version(version)
-        if name == alias or name in self.aliases():
+        if name in self.aliases():
             reason = f"'{name}' is the name of an alias, so it cannot be the name of a model"
             raise StoreError("name_conflict", reason)
         if version in (published := self.versions(name)):
@@ -177,13 +175,12 @@ class Store:
         state: Mapping[str, ArrayLike],
         *,
         storage_dtype: StorageDtype = "float32",
-        alias: str | None = None,
     ) -> Artifact:
-        """Publish a version permanently, optionally point an alias at it, and return the artifact.
+        """Publish a version permanently, and return the artifact.
 
         The method writes the artifact to a temporary folder and loads it from there. So it never
-        publishes a version that the service would refuse. Then it renames the folder and changes
-        the alias. See `write_artifact` for the other arguments.
+        publishes a version that the service would refuse. Then it renames the folder. See
+        `write_artifact` for the arguments.
 
         Raises:
             ArtifactError: the artifact is not valid.
@@ -191,14 +188,8 @@ class Store:
                 `unsafe_path`, `locked`, or `not_writable`.
         """
         name, version = description.name, description.version
-        if alias is not None:
-            check_name(alias, "alias")
         with self._writing():
-            self.require_new(name, version, alias)
-            table = None
-            if alias is not None:
-                self._require_no_model(alias)
-                table = self._changed_table(alias, AliasTarget(name=name, version=version))
+            self.require_new(name, version)
             folder = self.root / name
             if os.path.lexists(folder) and not _is_directory(folder):
                 raise StoreError("unsafe_path", f"the path of model '{name}' is not a directory")
@@ -215,8 +206,6 @@ class Store:
                 rename(temporary, path)
             finally:
                 shutil.rmtree(temporary, ignore_errors=True)
-            if table is not None:
-                self._replace_table(table)
         return dataclasses.replace(artifact, path=path)
 
     def set_alias(
@@ -241,13 +230,15 @@ class Store:
         """
         check_name(alias, "alias")
         with self._writing():
-            self._require_no_model(alias)
+            if self.versions(alias):
+                reason = f"'{alias}' is the name of a model, so it cannot be the name of an alias"
+                raise StoreError("name_conflict", reason)
             current = self.aliases().get(alias)  # None for a missing alias
             if expected not in ("any", current):
                 targets = f"{current or 'nothing'}, not at {expected or 'nothing'}"
                 raise StoreError("alias_conflict", f"alias '{alias}' points at {targets}")
             resolve_reference(str(target), {}, self.versions)
-            self._replace_table(self._changed_table(alias, target))
+            self._change_table(alias, target)
 
     def remove_alias(self, alias: str) -> None:
         """Remove an alias. The errors are those of `set_alias`."""
@@ -255,7 +246,7 @@ class Store:
         with self._writing():
             if alias not in self.aliases():
                 raise StoreError("unknown_model", f"no alias has the name '{alias}'")
-            self._replace_table(self._changed_table(alias, None))
+            self._change_table(alias, None)
 
     def _folders(self) -> list[str]:
         try:
@@ -263,18 +254,11 @@ class Store:
         except OSError as error:
             raise StoreError("unreadable", f"the store cannot be read: {cause(error)}") from None
 
-    def _changed_table(self, alias: str, target: AliasTarget | None) -> bytes:
-        """Return the new alias file, with another target of one alias. None removes the alias."""
-        table = {name: entry for name, entry in self.aliases().items() if name != alias}
-        return aliases_to_bytes(table if target is None else {**table, alias: target})
-
-    def _require_no_model(self, alias: str) -> None:
-        if self.versions(alias):
-            reason = f"'{alias}' is the name of a model, so it cannot be the name of an alias"
-            raise StoreError("name_conflict", reason)
-
-    def _replace_table(self, table: bytes) -> None:
-        replace_file(self.root / ALIASES, table, prefix=TEMPORARY)
+    def _change_table(self, alias: str, target: AliasTarget | None) -> None:
+        """Give one alias another target in the file of aliases. None removes the alias."""
+        table = {**self.aliases(), alias: target}
+        kept = {name: entry for name, entry in table.items() if entry is not None}
+        replace_file(self.root / ALIASES, aliases_to_bytes(kept), prefix=TEMPORARY)
 
     @contextmanager
     def _writing(self) -> Iterator[None]:

@@ -38,7 +38,8 @@ class Runtime:
     Attributes:
         admission: lanes of requests, and worker threads.
         bodies: bodies of the requests and answers in progress.
-        draining: whether the service is shutting down.
+        draining: whether the service is shutting down. Readiness checks then fail, and connections
+            close after their answers.
         limits: limits on scenes and answers.
         metrics: metrics of the service.
         models: current snapshot of the models; `NO_MODELS` before the start.
@@ -70,10 +71,6 @@ class Runtime:
         if self.draining:
             raise errors.DrainingError
         self.models.resolve(DEFAULT)
-
-    def drain(self) -> None:
-        """Answer readiness checks with 503, and close connections after answers."""
-        self.draining = True
 
     async def start(self) -> None:
         """Load, verify and warm up all versions in the store.

@@ -462,7 +462,3 @@ def _fail(message: str, status: int = MEANINGLESS) -> NoReturn:
         message, style="red"
     )
     raise typer.Exit(status)
-
-
-if __name__ == "__main__":
-    app()
