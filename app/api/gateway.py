@@ -128,12 +128,11 @@ class Gateway:
             await send(message)
 
         try:
-            if self._hosts is None or self._accepts_host(headers, scope["path"]):
-                await self._admitted(scope, receive, send_completed)
-            else:
+            if self._hosts is not None and not self._accepts_host(headers, scope["path"]):
                 detail = "SCENE_ALLOWED_HOSTS does not list the name in the Host header."
-                await answer(errors.HostRefusedError(detail), scope, receive, send_completed)
-        except errors.OriginRefusedError as refused:
+                raise errors.HostRefusedError(detail)
+            await self._admitted(scope, receive, send_completed)
+        except (errors.HostRefusedError, errors.OriginRefusedError) as refused:
             await answer(refused, scope, receive, send_completed)
         except Exception:
             raise

@@ -254,12 +254,19 @@ def read_verified(directory: Path, max_weights_bytes: int) -> tuple[Manifest, st
     except OSError as error:
         raise _unreadable("the artifact's directory", error) from None
     try:
-        _require_no_other_file(folder)
+        with os.scandir(folder) as entries:
+            extra = {entry.name for entry in entries} - {MANIFEST, WEIGHTS, CARD}
+        if extra:
+            names = ", ".join(sorted(ascii(name) for name in extra)[:8])
+            reason = f"the artifact's directory has unexpected files: {names}"
+            raise ArtifactError("unexpected_file", reason)
         text = _read(folder, MANIFEST, MAX_MANIFEST_BYTES)
         _require_size(MANIFEST, len(text), MAX_MANIFEST_BYTES)
         manifest = Manifest.from_bytes(text)
         weights = _read_checked(folder, WEIGHTS, manifest.files[WEIGHTS], max_weights_bytes)
         card = _read_checked(folder, CARD, manifest.files[CARD], MAX_CARD_BYTES)
+    except OSError as error:
+        raise _unreadable("the artifact's directory", error) from None
     finally:
         os.close(folder)
     try:
@@ -267,18 +274,6 @@ def read_verified(directory: Path, max_weights_bytes: int) -> tuple[Manifest, st
     except UnicodeDecodeError:
         raise ArtifactError("invalid_manifest", f"{CARD} is not UTF-8") from None
     return manifest, hashlib.sha256(text).hexdigest(), weights, page
-
-
-def _require_no_other_file(folder: int) -> None:
-    try:
-        with os.scandir(folder) as entries:
-            extra = {entry.name for entry in entries} - {MANIFEST, WEIGHTS, CARD}
-    except OSError as error:
-        raise _unreadable("the artifact's directory", error) from None
-    if extra:
-        names = ", ".join(sorted(ascii(name) for name in extra)[:8])
-        reason = f"the artifact's directory has unexpected files: {names}"
-        raise ArtifactError("unexpected_file", reason)
 
 
 def _require_size(name: str, size: int, limit: int) -> None:

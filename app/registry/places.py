@@ -114,7 +114,8 @@ class Places(TensorGroup):
         A single scene may be an error, so two scenes are needed. The class indices are (N,) and
         (M,).
         """
-        return self._held(relation, subject, other) >= _SHOWN
+        V = len(self.frequency)
+        return triple_counts(self.triple, self.held, V, relation, subject, other) >= _SHOWN
 
     def supporters(self, subject: Indices, other: Indices) -> Floats:
         """Return the share of each other class among the supporters of each subject, (N, M).
@@ -139,12 +140,6 @@ class Places(TensorGroup):
         by_pair = np.bincount(keys, held, V * V).reshape(V, V)
         count = by_pair.sum(0) + _SEEN
         return by_pair.sum(1), count / count.sum(), by_pair.astype(np.float32)
-
-    def _held(self, relation: int, subject: Indices, other: Indices) -> Floats:
-        """Return the number of training scenes with a relation between classes, (N, M)."""
-        V = len(self.frequency)
-        held: Floats = triple_counts(self.triple, self.held, V, relation, subject, other)
-        return held
 
     @cached_property
     def unseen(self) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:

@@ -78,7 +78,6 @@ class Runtime:
         Afterwards, `models.failures` contains the refused versions and aliases.
         """
         sys.setswitchinterval(_SWITCH_INTERVAL)
-        self.metrics.started()
         check_cache()
         # The models load on this thread, because the service has no requests yet. Another thread
         # would cost time and memory.
