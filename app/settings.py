@@ -10,7 +10,6 @@ from importlib.util import find_spec
 from ipaddress import IPv6Address, ip_address
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal
-from urllib.parse import urlsplit
 
 from pydantic import (
     BeforeValidator,
@@ -83,18 +82,15 @@ def _in_host_header(text: str) -> str:
     return f"[{IPv6Address(name.removeprefix('[').removesuffix(']'))}]"
 
 
+_ORIGIN: Final = re.compile(r"(https?)://([\w.-]+|\[[0-9a-f:.]+\])(:[1-9][0-9]{0,4})?")
+
+
 def _is_origin(text: str) -> bool:
     """Return whether a browser could send exactly this text as the Origin header."""
-    try:
-        parts = urlsplit(text)
-        port = parts.port
-    except ValueError:
+    match = _ORIGIN.fullmatch(text)
+    if match is None or text != text.lower():
         return False
-    if parts.scheme not in {"http", "https"} or not parts.hostname or "*" in parts.hostname:
-        return False
-    host = f"[{parts.hostname}]" if ":" in parts.hostname else parts.hostname
-    usual = {"http": 80, "https": 443}[parts.scheme]
-    return text == f"{parts.scheme}://{host}" + ("" if port in {None, usual} else f":{port}")
+    return match[3] != {"http": ":80", "https": ":443"}[match[1]]
 
 
 class _Environment(EnvSettingsSource):

@@ -20,7 +20,7 @@ from starlette.types import Receive, Scope, Send
 
 from app import errors
 from app.api.gateway import ADMIN_KEY, has_key
-from app.serving.admission import SMALL, in_thread
+from app.serving.admission import SMALL, Bodies, in_thread
 from app.serving.runtime import Runtime
 from scene_client.schemas import FieldError
 from scene_client.schemas import Request as Form
@@ -231,23 +231,28 @@ class JSONRoute(APIRoute):
         except errors.RequestError as error:
             error.locate(value)
             raise
-        headers = [
-            (b"content-length", b"%d" % len(answer)),
-            (b"content-type", b"application/json"),
-        ]
-        start = {"type": "http.response.start", "status": 200, "headers": headers}
-        if len(answer) <= _PART:
-            await send(start)
-            await send({"type": "http.response.body", "body": answer})
-            return
-        with runtime.bodies.hold(ticket.client, len(answer)):
-            await send(start)
-            # The server closes the connection of a client that does not read the whole answer.
-            with suppress(TimeoutError):
-                async with asyncio.timeout(runtime.bodies.patience):
-                    for begin in range(0, len(answer), _PART):
-                        part, more = answer[begin : begin + _PART], begin + _PART < len(answer)
-                        await send({"type": "http.response.body", "body": part, "more_body": more})
+        await _send(answer, runtime.bodies, ticket.client, send)
+
+
+async def _send(answer: bytes, bodies: Bodies, client: str, send: Send) -> None:
+    """Send an answer to a client. A large answer is sent in parts."""
+    headers = [
+        (b"content-length", b"%d" % len(answer)),
+        (b"content-type", b"application/json"),
+    ]
+    start = {"type": "http.response.start", "status": 200, "headers": headers}
+    if len(answer) <= _PART:
+        await send(start)
+        await send({"type": "http.response.body", "body": answer})
+        return
+    with bodies.hold(client, len(answer)):
+        await send(start)
+        # The server closes the connection of a client that does not read the whole answer.
+        with suppress(TimeoutError):
+            async with asyncio.timeout(bodies.patience):
+                for at in range(0, len(answer), _PART):
+                    part, more = answer[at : at + _PART], at + _PART < len(answer)
+                    await send({"type": "http.response.body", "body": part, "more_body": more})
 
 
 def check_admin(http: Request) -> None:

@@ -76,7 +76,7 @@ class Artifact:
     counts: Counts | None = None
     places: Places | None = None
 
-    @property
+    @cached_property
     def key(self) -> tuple[str, str]:
         """Name and version of the model."""
         return self.manifest.name, self.manifest.version

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any, Final, Literal, NamedTuple, Self
+from typing import Annotated, Any, Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from app.registry.fields import Count, Frozen, Many, Sha256, Text, Timestamp, to
 from app.registry.references import ModelName, Version
 from app.scene.relations import CANONICAL
 from app.scene.vocabulary import ObjectClass, Vocabulary
+from scene_client.schemas import Sensitivity as Sensitivity
 
 Floats = NDArray[np.floating[Any]]
 
@@ -69,10 +70,6 @@ class Sharpness(Frozen):
     def of(self, n: int) -> float:
         """Return the exponent for a list of n classes. It is at least 0.05."""
         return max(self.slope + self.log_count * math.log(max(n, 1)), 0.05)
-
-
-Sensitivity = Literal["low", "medium", "high"]
-"""Name of an alarm line."""
 
 
 class AlarmLine(Frozen):
