@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Callable
+from dataclasses import asdict
 from threading import Lock
 from typing import Annotated, Final, cast
 from weakref import WeakKeyDictionary
@@ -20,7 +21,7 @@ from app.api.gateway import ADMIN_KEY
 from app.api.openapi import error_responses
 from app.questions.contexts import contexts
 from app.registry import Artifact
-from app.scene.relations import opposite
+from app.scene.relations import relation_names
 from app.scene.vocabulary import ObjectClass
 from app.serving.models import ServedModels
 from app.serving.runtime import Runtime
@@ -109,16 +110,12 @@ async def show_version(
     served = models.served.get((name, version))
     if served is None:
         return schemas.VersionDetails(name=name, **dict(summary))
-    manifest = served.manifest
     return schemas.VersionDetails(
         name=name,
         **dict(summary),
-        created=manifest.created,
-        parameters=sum(math.prod(tensor.shape) for tensor in manifest.weights.values()),
-        metrics=[schemas.Metric(**metric.model_dump()) for metric in manifest.metrics],
-        data=[schemas.TrainingSource(**source.model_dump()) for source in manifest.data],
-        terms=manifest.terms,
+        parameters=sum(math.prod(entry.shape) for entry in served.manifest.weights.values()),
         card=served.card,
+        **served.manifest.model_dump(include={"created", "metrics", "data", "terms"}),
     )
 
 
@@ -228,13 +225,11 @@ def _document(model: Artifact, build: Callable[[Artifact], BaseModel]) -> Respon
 
 def _vocabulary(served: Artifact) -> schemas.VocabularyAnswer:
     vocabulary, manifest = served.vocabulary, served.manifest
-    canonical, rooms = manifest.vocabulary.relations, vocabulary.room_types
+    relations, rooms = relation_names(served.spec.A), vocabulary.room_types
     return schemas.VocabularyAnswer(
         model=served.reference,
         objects=[_class(entry) for entry in vocabulary.objects],
-        relations=[
-            cast("schemas.RelationName", name) for name in (*canonical, *map(opposite, canonical))
-        ],
+        relations=[cast("schemas.RelationName", name) for name in relations],
         room_types=list(rooms),
         rare_room_types=[rooms[t] for t in served.calibration.rare_rooms],
         profiles=list(manifest.vocabulary.profiles),
@@ -250,15 +245,8 @@ def _contexts(served: Artifact) -> schemas.ContextsAnswer:
 
 
 def _class(entry: ObjectClass) -> schemas.VocabularyEntry:
-    size = entry.size and schemas.Size(**dict(zip("xyz", entry.size, strict=True)))
-    return schemas.VocabularyEntry(
-        label=entry.label,
-        aliases=list(entry.aliases),
-        structure=entry.structure,
-        size=size,
-        parent=entry.parent,
-        anywhere=entry.anywhere,
-    )
+    size = entry.size and dict(zip("xyz", entry.size, strict=True))
+    return schemas.VocabularyEntry(**asdict(entry) | {"size": size})
 
 
 def _name(models: ServedModels, reference: str) -> str:
