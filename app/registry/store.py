@@ -29,12 +29,10 @@ from app.registry.durable import exclusive, make_directory, rename, replace_file
 from app.registry.errors import ArtifactError, StoreError, cause
 from app.registry.manifest import CARD, MANIFEST, WEIGHTS
 from app.registry.references import (
+    NAME,
+    VERSION,
     AliasTarget,
     aliases_to_bytes,
-    check_name,
-    check_version,
-    is_name,
-    is_version,
     read_aliases,
     resolve_reference,
     version_key,
@@ -94,7 +92,7 @@ class Store:
         Raises:
             StoreError: `invalid_reference`, or `unreadable`.
         """
-        folder = self.root / check_name(name)
+        folder = self.root / NAME.check(name, "model name")
         if not _is_directory(folder):
             return ()
         try:
@@ -102,7 +100,7 @@ class Store:
         except OSError as error:
             reason = f"the folder of model '{name}' cannot be read: {cause(error)}"
             raise StoreError("unreadable", reason) from None
-        return tuple(sorted(filter(is_version, entries), key=version_key))
+        return tuple(sorted(filter(VERSION.fits, entries), key=version_key))
 
     def aliases(self) -> Mapping[str, AliasTarget]:
         """Return the target of each alias.
@@ -129,7 +127,7 @@ class Store:
                 another name or version than the folder.
             StoreError: `invalid_reference`, or `unknown_version`.
         """
-        folder = self.root / check_name(name) / check_version(version)
+        folder = self.root / NAME.check(name, "model name") / VERSION.check(version, "version")
         exists = _is_directory(folder.parent) and os.path.lexists(folder)
         if not exists or _is_unfinished(folder):
             raise StoreError("unknown_version", f"model '{name}' does not have version {version}")
@@ -160,7 +158,7 @@ class Store:
             StoreError: `version_exists`, `name_conflict`, `invalid_reference`, `invalid_aliases`,
                 or `unreadable`.
         """
-        check_version(version)
+        VERSION.check(version, "version")
         if name in self.aliases():
             reason = f"'{name}' is the name of an alias, so it cannot be the name of a model"
             raise StoreError("name_conflict", reason)
@@ -228,7 +226,7 @@ class Store:
                 also if the table of aliases would be too large for readers; `unknown_model`;
                 `unknown_version`; `name_conflict`; `invalid_reference`; `invalid_aliases`; `locked`
         """
-        check_name(alias, "alias")
+        NAME.check(alias, "alias")
         with self._writing():
             if self.versions(alias):
                 reason = f"'{alias}' is the name of a model, so it cannot be the name of an alias"
@@ -242,7 +240,7 @@ class Store:
 
     def remove_alias(self, alias: str) -> None:
         """Remove an alias. The errors are those of `set_alias`."""
-        check_name(alias, "alias")
+        NAME.check(alias, "alias")
         with self._writing():
             if alias not in self.aliases():
                 raise StoreError("unknown_model", f"no alias has the name '{alias}'")
@@ -250,7 +248,7 @@ class Store:
 
     def _folders(self) -> list[str]:
         try:
-            return sorted(entry.name for entry in self.root.iterdir() if is_name(entry.name))
+            return sorted(entry.name for entry in self.root.iterdir() if NAME.fits(entry.name))
         except OSError as error:
             raise StoreError("unreadable", f"the store cannot be read: {cause(error)}") from None
 
