@@ -107,13 +107,14 @@ def load_model_set(
         aliases, failure = {}, StoreError(error.code, error.reason)
     keys: list[tuple[str, str]] = []
     try:
-        for name, versions in store.published().items():
-            if isinstance(versions, StoreError):  # only this model's folder is unreadable
-                failure = versions
-            else:
-                keys += [(name, version) for version in versions]
+        names = store.names()
     except StoreError as error:
-        failure = StoreError(error.code, error.reason)
+        names, failure = [], StoreError(error.code, error.reason)
+    for name in names:
+        try:
+            keys += [(name, version) for version in store.versions(name)]
+        except StoreError as error:  # only this model's folder is unreadable
+            failure = StoreError(error.code, error.reason)
     entries = {key: _load(store, *key, previous.usable.get(key), check) for key in keys}
     return ModelSet(MappingProxyType(entries), MappingProxyType(dict(aliases)), failure)
 

@@ -66,21 +66,16 @@ class Store:
         self._lock_timeout = lock_timeout
         self._max_weights_bytes = max_weights_bytes
 
-    def published(self) -> dict[str, tuple[str, ...] | StoreError]:
-        """Return the versions of each model, or the error of an unreadable folder, by sorted name.
+    def names(self) -> list[str]:
+        """Return the names of the models in alphabetical order.
 
         Raises:
             StoreError: `unreadable` if the root is not a readable directory.
         """
-        models: dict[str, tuple[str, ...] | StoreError] = {}
-        for name in self._folders():
-            try:
-                versions = self.versions(name)
-            except StoreError as error:
-                models[name] = StoreError(error.code, error.reason)
-            else:
-                models |= {name: versions} if versions else {}
-        return models
+        try:
+            return sorted(entry.name for entry in self.root.iterdir() if NAME.fits(entry.name))
+        except OSError as error:
+            raise StoreError("unreadable", f"the store cannot be read: {cause(error)}") from None
 
     def versions(self, name: str) -> tuple[str, ...]:
         """Return the published versions of a model in ascending order. The result may be empty.
@@ -145,10 +140,10 @@ class Store:
         """
         files = [self.root / ALIASES]
         with suppress(StoreError):
-            for name, versions in self.published().items():
-                for version in () if isinstance(versions, StoreError) else versions:
-                    folder = self.root / name / version
-                    files += [folder / file for file in (MANIFEST, WEIGHTS, CARD)]
+            for name in self.names():
+                with suppress(StoreError):
+                    folders = [self.root / name / version for version in self.versions(name)]
+                    files += [f / file for f in folders for file in (MANIFEST, WEIGHTS, CARD)]
         return tuple((str(file), *_file_state(file)) for file in files)
 
     def require_new(self, name: str, version: str) -> None:
@@ -246,12 +241,6 @@ class Store:
                 raise StoreError("unknown_model", f"no alias has the name '{alias}'")
             self._change_table(alias, None)
 
-    def _folders(self) -> list[str]:
-        try:
-            return sorted(entry.name for entry in self.root.iterdir() if NAME.fits(entry.name))
-        except OSError as error:
-            raise StoreError("unreadable", f"the store cannot be read: {cause(error)}") from None
-
     def _change_table(self, alias: str, target: AliasTarget | None) -> None:
         """Give one alias another target in the file of aliases. None removes the alias."""
         table = {**self.aliases(), alias: target}
@@ -271,7 +260,7 @@ class Store:
             raise StoreError("not_writable", reason) from error
 
     def _clear_leftovers(self) -> None:
-        folders = [self.root, *(self.root / name for name in self._folders())]
+        folders = [self.root, *(self.root / name for name in self.names())]
         for folder in filter(_is_directory, folders):
             for entry in folder.iterdir():
                 if not entry.name.startswith(TEMPORARY):

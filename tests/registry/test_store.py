@@ -31,6 +31,10 @@ def publish(store: Store, version: str = "1.0.0", *, name: str = "tiny", seed: i
     store.publish(description(name, version), state(seed=seed))
 
 
+def published(store: Store) -> dict[str, tuple[str, ...]]:
+    return {name: versions for name in store.names() if (versions := store.versions(name))}
+
+
 def tree(root: Path) -> dict[str, bytes]:
     return {
         str(path.relative_to(root)): path.read_bytes()
@@ -43,11 +47,11 @@ def tree(root: Path) -> dict[str, bytes]:
 
 
 def test_publishes_what_a_reader_loads(store: Store) -> None:
-    published = publish_as(store, "default", description(), state(), storage_dtype="float16")
+    new = publish_as(store, "default", description(), state(), storage_dtype="float16")
     loaded = store.load(*store.resolve("default"))
-    assert published.path == loaded.path == store.root / "tiny" / "1.0.0"
-    assert published.digest == loaded.digest
-    weights = published.weights
+    assert new.path == loaded.path == store.root / "tiny" / "1.0.0"
+    assert new.digest == loaded.digest
+    weights = new.weights
     assert all(np.array_equal(array, weights[k]) for k, array in loaded.weights.arrays.items())
     assert sorted(tree(store.root)) == [
         "aliases.json",
@@ -61,7 +65,7 @@ def test_lists_names_and_versions_in_order(store: Store) -> None:
     for version in ("1.10.0", "1.9.0", "0.2.0"):
         publish(store, version)
     publish(store, name="another")
-    assert [*store.published().items()] == [
+    assert [*published(store).items()] == [
         ("another", ("1.0.0",)),
         ("tiny", ("0.2.0", "1.9.0", "1.10.0")),
     ]
@@ -124,9 +128,9 @@ def test_waits_for_another_writer_but_not_for_ever(tmp_path: Path) -> None:
         thread.start()
         thread.join(0.1)
         assert thread.is_alive()
-        assert store.published() == {}, "readers do not wait"
+        assert published(store) == {}, "readers do not wait"
     thread.join(30)
-    assert store.published() == {"tiny": ("1.0.0",)}
+    assert published(store) == {"tiny": ("1.0.0",)}
 
 
 def test_everything_is_on_disk_before_it_is_pointed_at(
@@ -207,7 +211,7 @@ def test_an_alias_needs_a_target_and_a_name_of_its_own(store: Store) -> None:
             store.set_alias(alias, AliasTarget.of(target))
     with refused("name_conflict"):
         store.publish(description("taken", "2.0.0"), state())
-    assert store.published() == {"tiny": ("1.0.0",)}
+    assert published(store) == {"tiny": ("1.0.0",)}
 
 
 def test_the_writer_of_aliases_applies_the_limits_of_the_reader(store: Store) -> None:
@@ -277,10 +281,10 @@ def test_readers_see_no_leftovers_and_the_next_writer_clears_them(store: Store) 
     (store.root / "plain").write_text("a file")
     (store.root / "lost+found").mkdir()
     (store.root / "tiny" / "notes").mkdir()
-    assert store.published() == {"tiny": ("1.0.0",)}
+    assert published(store) == {"tiny": ("1.0.0",)}
     publish(store, "2.0.0")
     assert not any(leftover.exists() for leftover in (half, only, table))
-    assert store.published() == {"tiny": ("1.0.0", "2.0.0")}
+    assert published(store) == {"tiny": ("1.0.0", "2.0.0")}
     assert (store.root / "README.md").read_text() == "about"
 
 
@@ -326,7 +330,7 @@ def test_a_model_outside_the_root_is_no_model(store: Store, tmp_path: Path) -> N
     outside = Store(tmp_path / "outside")
     publish(outside, name="foreign")
     (store.root / "foreign").symlink_to(outside.root / "foreign")
-    assert store.published() == {"tiny": ("1.0.0",)}
+    assert published(store) == {"tiny": ("1.0.0",)}
     with refused("unknown_model"):
         store.resolve("foreign")
     with refused("unsafe_path"):
@@ -347,9 +351,9 @@ def test_no_name_leads_out_of_the_root(name: str, store: Store) -> None:
 
 def test_a_missing_store_is_an_error_and_an_empty_one_is_not(store: Store) -> None:
     with refused("unreadable"):
-        store.published()
+        published(store)
     store.root.mkdir()
-    assert store.published() == store.aliases() == {}
+    assert published(store) == store.aliases() == {}
 
 
 # -- the command --------------------------------------------------------------------------------
