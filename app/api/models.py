@@ -127,7 +127,7 @@ async def show_version(
 )
 async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> Response:
     """List the object classes with their aliases, the relations and the room types of a model."""
-    return _document(runtime.models.resolve(name), _vocabulary)
+    return _vocabulary(runtime.models.resolve(name))
 
 
 @router.get(
@@ -167,7 +167,7 @@ async def show_contexts(name: Reference, runtime: RuntimeDep) -> Response:
     The field `context` of `POST /generate` accepts the numbers of these units.
     """
     # The first request for a model takes 0.3 s, so it runs in a thread.
-    return await asyncio.to_thread(_document, runtime.models.resolve(name), _contexts)
+    return await asyncio.to_thread(_contexts, runtime.models.resolve(name))
 
 
 @administration.post(
@@ -210,19 +210,21 @@ async def move_alias(
     return answer.model_dump_json(exclude_none=True).encode()
 
 
-_documents: Final[WeakKeyDictionary[Artifact, dict[object, bytes]]] = WeakKeyDictionary()
-_building: Final = Lock()
+def _once(build: Callable[[Artifact], BaseModel]) -> Callable[[Artifact], Response]:
+    """Return a function that builds an answer about a model once, because it never changes."""
+    documents: WeakKeyDictionary[Artifact, bytes] = WeakKeyDictionary()
+    building = Lock()
+
+    def answer(model: Artifact) -> Response:
+        with building:
+            if model not in documents:
+                documents[model] = build(model).model_dump_json().encode()
+        return Response(documents[model], media_type="application/json")
+
+    return answer
 
 
-def _document(model: Artifact, build: Callable[[Artifact], BaseModel]) -> Response:
-    """Return an answer about a model. It never changes, so it is built once."""
-    with _building:
-        documents = _documents.setdefault(model, {})
-        if build not in documents:
-            documents[build] = build(model).model_dump_json().encode()
-    return Response(documents[build], media_type="application/json")
-
-
+@_once
 def _vocabulary(served: Artifact) -> schemas.VocabularyAnswer:
     vocabulary, manifest = served.vocabulary, served.manifest
     relations, rooms = relation_names(served.spec.A), vocabulary.room_types
@@ -240,6 +242,7 @@ def _vocabulary(served: Artifact) -> schemas.VocabularyAnswer:
     )
 
 
+@_once
 def _contexts(served: Artifact) -> schemas.ContextsAnswer:
     return schemas.ContextsAnswer(model=served.reference, layers=dict(contexts(served)))
 
