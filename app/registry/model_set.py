@@ -44,7 +44,7 @@ class ModelSet:
         return {name: tuple(v for _, v in group) for name, group in groupby(keys, itemgetter(0))}
 
     @cached_property
-    def usable(self) -> Mapping[tuple[str, str], Artifact]:
+    def artifacts(self) -> Mapping[tuple[str, str], Artifact]:
         """Maps each usable (name, version) to its artifact."""
         return {key: e for key, e in self.entries.items() if isinstance(e, Artifact)}
 
@@ -115,7 +115,7 @@ def load_model_set(
             keys += [(name, version) for version in store.versions(name)]
         except StoreError as error:  # only this model's folder is unreadable
             failure = StoreError(error.code, error.reason)
-    entries = {key: _load(store, *key, previous.usable.get(key), check) for key in keys}
+    entries = {key: _load(store, *key, previous.artifacts.get(key), check) for key in keys}
     return ModelSet(MappingProxyType(entries), MappingProxyType(dict(aliases)), failure)
 
 

@@ -54,7 +54,7 @@ class ServedModels:
     @property
     def served(self) -> Mapping[Key, Artifact]:
         """Maps the (name, version) of each usable model to the model."""
-        return self.store.usable
+        return self.store.artifacts
 
     def resolve(self, reference: str) -> Artifact:
         """Return the model that an alias, `name` or `name@version` points at.
