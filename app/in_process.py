@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
 import secrets
 import weakref
-from concurrent.futures import Future
+from contextlib import ExitStack
 from pathlib import Path
-from threading import Thread
 
 import httpx
-from fastapi import FastAPI
+from anyio.from_thread import start_blocking_portal
 from pydantic import SecretStr, ValidationError
 
 from app.main import create_app
@@ -52,17 +50,16 @@ class InProcess(httpx.BaseTransport):
             raise InvalidRequestError.about("the store must be an existing directory") from None
         app = create_app(settings)
         self._asgi = httpx.ASGITransport(app, raise_app_exceptions=False)
-        loop_future: Future[asyncio.AbstractEventLoop] = Future()
-        stop = asyncio.Event()
-        thread = Thread(target=_run, args=(app, loop_future, stop), daemon=True, name="scene")
-        thread.start()
-        self._loop = loop_future.result()  # waits until the application has started
-        # The finalizer ends the thread when the transport is closed or deleted, or at program exit.
-        self._finalize = weakref.finalize(self, _stop, self._loop, stop, thread)
+        with ExitStack() as stack:
+            self._portal = stack.enter_context(start_blocking_portal(name="scene"))
+            lifespan = app.router.lifespan_context(app)
+            stack.enter_context(self._portal.wrap_async_context_manager(lifespan))
+            # It ends the thread when the transport is closed or deleted, or at program exit.
+            self._finalize = weakref.finalize(self, stack.pop_all().close)
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
         """Send one request to the application and return its response."""
-        future = asyncio.run_coroutine_threadsafe(self._answer(request), self._loop)
+        future = self._portal.start_task_soon(self._answer, request)
         try:
             return future.result(request.extensions["timeout"]["read"])
         except TimeoutError:
@@ -78,28 +75,3 @@ class InProcess(httpx.BaseTransport):
     def close(self) -> None:
         """End the application and its thread."""
         self._finalize()
-
-
-def _run(app: FastAPI, loop_future: Future[asyncio.AbstractEventLoop], stop: asyncio.Event) -> None:
-    """Run the application on a new event loop until ``stop`` is set.
-
-    After the start, ``loop_future`` contains the event loop. If the start fails, it contains the
-    error.
-    """
-
-    async def run_until_stop() -> None:
-        async with app.router.lifespan_context(app):
-            loop_future.set_result(asyncio.get_running_loop())
-            await stop.wait()
-
-    try:
-        asyncio.run(run_until_stop())
-    except BaseException as error:
-        if loop_future.done():
-            raise
-        loop_future.set_exception(error)
-
-
-def _stop(loop: asyncio.AbstractEventLoop, stop: asyncio.Event, thread: Thread) -> None:
-    loop.call_soon_threadsafe(stop.set)
-    thread.join()

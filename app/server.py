@@ -152,12 +152,11 @@ class Server(uvicorn.Server):
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Start the shutdown. A second signal ends the first step of the shutdown at once."""
-        if sig == signal.SIGTERM and not self._runtime.draining:
-            self._runtime.drain()
+        is_first, self._runtime.draining = not self._runtime.draining, True
+        if sig == signal.SIGTERM and is_first:
             self._closing_at = monotonic() + self._drain_seconds
-            return
-        self._runtime.drain()
-        super().handle_exit(sig, frame)
+        else:
+            super().handle_exit(sig, frame)
 
     async def on_tick(self, counter: int) -> bool:
         """Return whether the server must stop. uvicorn calls this method ten times per second."""

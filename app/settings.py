@@ -10,7 +10,6 @@ from importlib.util import find_spec
 from ipaddress import IPv6Address, ip_address
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal
-from urllib.parse import urlsplit
 
 from pydantic import (
     BeforeValidator,
@@ -36,12 +35,9 @@ _PREFIX: Final = "SCENE_"
 # Variables of the clients, which may run in the same environment.
 _OF_CLIENTS: Final = ("URL",)
 _NO_STREAMS: Final = "the service has no streams; send each scene in a request of its own"
-_NO_REMOTE_STORES: Final = "a store is a folder; mount the models and set SCENE_STORE"
 _REMOVED: Final = {
     "WORKERS": "a replica is one process; start several replicas",
     **dict.fromkeys(("MAX_STREAMS", "STREAM_IDLE", "STREAM_RESUME"), _NO_STREAMS),
-    **dict.fromkeys(("STORE_CACHE", "STORE_CACHE_BYTES", "STORE_MAX_AGE"), _NO_REMOTE_STORES),
-    **dict.fromkeys(("TRUSTED_KEYS", "UNSIGNED_STORE", "SIGNING_KEY"), _NO_REMOTE_STORES),
 }
 # Kubernetes sets such variables in each pod, for every Service whose name starts with `scene`.
 _SERVICE_LINK: Final = re.compile(
@@ -86,18 +82,15 @@ def _in_host_header(text: str) -> str:
     return f"[{IPv6Address(name.removeprefix('[').removesuffix(']'))}]"
 
 
+_ORIGIN: Final = re.compile(r"(https?)://([\w.-]+|\[[0-9a-f:.]+\])(:[1-9][0-9]{0,4})?")
+
+
 def _is_origin(text: str) -> bool:
     """Return whether a browser could send exactly this text as the Origin header."""
-    try:
-        parts = urlsplit(text)
-        port = parts.port
-    except ValueError:
+    match = _ORIGIN.fullmatch(text)
+    if match is None or text != text.lower():
         return False
-    if parts.scheme not in {"http", "https"} or not parts.hostname or "*" in parts.hostname:
-        return False
-    host = f"[{parts.hostname}]" if ":" in parts.hostname else parts.hostname
-    usual = {"http": 80, "https": 443}[parts.scheme]
-    return text == f"{parts.scheme}://{host}" + ("" if port in {None, usual} else f":{port}")
+    return match[3] != {"http": ":80", "https": ":443"}[match[1]]
 
 
 class _Environment(EnvSettingsSource):

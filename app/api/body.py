@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from email.message import Message
 from functools import cache
@@ -20,8 +20,7 @@ from starlette.types import Receive, Scope, Send
 
 from app import errors
 from app.api.gateway import ADMIN_KEY, has_key
-from app.serving.admission import in_thread
-from app.serving.bodies import SMALL
+from app.serving.admission import SMALL, Bodies, in_thread
 from app.serving.runtime import Runtime
 from scene_client.schemas import FieldError
 from scene_client.schemas import Request as Form
@@ -73,16 +72,6 @@ def _most_entries(form: type[Form]) -> dict[str, int]:
     }
 
 
-def read(body: bytes, form: type[FormT]) -> tuple[Any, FormT]:
-    """Return the JSON value of a body, and the same value as a ``form``.
-
-    Raises:
-        NotJSONError, InvalidRequestError: see `parse` and `validated`.
-    """
-    value = parse(body)
-    return value, validated(value, form)
-
-
 def parse(body: bytes) -> Any:
     """Parse one JSON value. Refuse texts that different JSON parsers read in different ways.
 
@@ -127,11 +116,8 @@ def _not_finite(body: bytes) -> list[FieldError]:
     try:
         constants = islice(_constants(_LENIENT.decode(body.decode())), MAX_ERRORS)
         return [
-            FieldError(
-                pointer=pointer(tuple(reversed(steps))),
-                message=f"must be a finite number, not {name}",
-            )
-            for name, steps in constants
+            FieldError(pointer=pointer(at), message=f"must be a finite number, not {name}")
+            for name, at in constants
         ]
     except (ValueError, RecursionError):
         return []
@@ -141,19 +127,16 @@ class _Constant(str):
     """NaN, Infinity or -Infinity in a body."""
 
 
-def _constants(value: Any) -> Iterator[tuple[str, list[str | int]]]:
-    """Yield the name of each constant in a value, and the steps from the constant to the root."""
+def _constants(value: Any, at: errors.Location = ()) -> Iterator[tuple[str, errors.Location]]:
+    """Yield the name and the location of each constant in a value at a location."""
     if isinstance(value, _Constant):
-        yield value, []
-    elif isinstance(value, dict | list):
-        parts: Iterable[tuple[str | int, Any]] = (
-            value.items() if isinstance(value, dict) else enumerate(value)
-        )
-        for step, part in parts:
-            if isinstance(part, dict | list | _Constant):
-                for name, steps in _constants(part):
-                    steps.append(step)
-                    yield name, steps
+        yield value, at
+    elif isinstance(value, dict):
+        for name, part in value.items():
+            yield from _constants(part, (*at, name))
+    elif isinstance(value, list):
+        for index, part in enumerate(value):
+            yield from _constants(part, (*at, index))
 
 
 class _RepeatedNameError(ValueError):
@@ -184,12 +167,12 @@ def _check_media(scope: Scope) -> None:
     Raises:
         UnsupportedMediaTypeError: the headers declare something else.
     """
-    content_type, detail, codings = b"", "", list[bytes]()
+    content_type, detail, is_coded = b"", "", False
     for name, value in scope["headers"]:
         if name == b"content-type":
             content_type = content_type or value
         elif name == b"content-encoding":
-            codings.append(value)
+            is_coded = is_coded or value.lower() != b"identity"
     if content_type != b"application/json":
         message = Message()
         message["content-type"] = content_type.decode("latin-1")
@@ -198,16 +181,10 @@ def _check_media(scope: Scope) -> None:
             detail = "The header Content-Type must be application/json."
         elif message.get_content_charset("utf-8") not in {"utf-8", "utf8"}:
             detail = "The charset in the header Content-Type must be utf-8."
-    if any(coding.lower() != b"identity" for coding in codings):
+    if is_coded:
         detail = "The body must not be compressed: leave the header Content-Encoding out."
     if detail:
         raise errors.UnsupportedMediaTypeError(detail)
-
-
-async def _send_parts(answer: bytes, send: Send) -> None:
-    for start in range(0, len(answer), _PART):
-        part, more = answer[start : start + _PART], start + _PART < len(answer)
-        await send({"type": "http.response.body", "body": part, "more_body": more})
 
 
 class JSONRoute(APIRoute):
@@ -215,7 +192,7 @@ class JSONRoute(APIRoute):
 
     FastAPI only documents the route, because FastAPI's JSON parser is too lenient. The endpoint
     receives the validated body as ``data``, the HTTP request as ``http`` and the path parameters.
-    It returns the answer as bytes.
+    It returns the answer as bytes. Routes with the tag "administration" require the admin key.
     """
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -228,7 +205,8 @@ class JSONRoute(APIRoute):
             await super().handle(scope, receive, send)
             return
         http = Request(scope, receive)
-        self.check(http)
+        if "administration" in self.tags:
+            check_admin(http)
         if scope["query_string"]:
             detail = "This route has no query parameters. Send all fields in the JSON body."
             raise errors.BadRequestError(detail)
@@ -238,42 +216,43 @@ class JSONRoute(APIRoute):
             raise errors.NotJSONError("The body is empty.")
         runtime: Runtime = scope["app"].state.runtime
         schema: Any = self.body_field.field_info.annotation  # type: ignore[union-attr]
+
+        def read(_: object) -> tuple[Any, Any]:
+            value = parse(body)
+            return value, validated(value, schema)
+
+        ticket = scope["state"]["ticket"]
         if len(body) <= SMALL:
-            value, data = read(body, schema)
+            value, data = read(None)
         else:
-            ticket, worker = scope["state"]["ticket"], runtime.admission.worker
-            (value, data), _ = await in_thread(lambda _: read(body, schema), ticket, worker)
+            (value, data), _ = await in_thread(read, ticket, runtime.admission.worker)
         try:
             answer: bytes = await self.endpoint(data=data, http=http, **scope["path_params"])
         except errors.RequestError as error:
             error.locate(value)
             raise
-        headers = [
-            (b"content-length", b"%d" % len(answer)),
-            (b"content-type", b"application/json"),
-        ]
-        start = {"type": "http.response.start", "status": 200, "headers": headers}
-        if len(answer) <= _PART:
-            await send(start)
-            await send({"type": "http.response.body", "body": answer})
-            return
-        with runtime.bodies.hold(scope["state"]["ticket"].client, len(answer)):
-            await send(start)
-            # The server closes the connection of a client that does not read the whole answer.
-            with suppress(TimeoutError):
-                async with asyncio.timeout(runtime.bodies.patience):
-                    await _send_parts(answer, send)
-
-    def check(self, http: Request) -> None:
-        """Check a request before its body is parsed. Subclasses may raise `ServiceError`."""
+        await _send(answer, runtime.bodies, ticket.client, send)
 
 
-class AdminJSONRoute(JSONRoute):
-    """A `JSONRoute` that requires the admin key."""
-
-    def check(self, http: Request) -> None:
-        """Check the admin key with `check_admin`."""
-        check_admin(http)
+async def _send(answer: bytes, bodies: Bodies, client: str, send: Send) -> None:
+    """Send an answer to a client. A large answer is sent in parts."""
+    headers = [
+        (b"content-length", b"%d" % len(answer)),
+        (b"content-type", b"application/json"),
+    ]
+    start = {"type": "http.response.start", "status": 200, "headers": headers}
+    if len(answer) <= _PART:
+        await send(start)
+        await send({"type": "http.response.body", "body": answer})
+        return
+    with bodies.hold(client, len(answer)):
+        await send(start)
+        # The server closes the connection of a client that does not read the whole answer.
+        with suppress(TimeoutError):
+            async with asyncio.timeout(bodies.patience):
+                for at in range(0, len(answer), _PART):
+                    part, more = answer[at : at + _PART], at + _PART < len(answer)
+                    await send({"type": "http.response.body", "body": part, "more_body": more})
 
 
 def check_admin(http: Request) -> None:

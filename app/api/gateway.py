@@ -18,9 +18,8 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app import errors
-from app.api.problems import answer, from_exception, report_defect
-from app.serving.admission import Ticket
-from app.serving.bodies import SMALL, too_large
+from app.api.problems import answer, from_exception
+from app.serving.admission import SMALL, Ticket
 from app.serving.models import NO_MODELS
 from app.serving.request import SUCCESS, Record
 from app.serving.runtime import Runtime
@@ -129,12 +128,11 @@ class Gateway:
             await send(message)
 
         try:
-            if self._hosts is None or self._accepts_host(headers, scope["path"]):
-                await self._admitted(scope, receive, send_completed)
-            else:
+            if self._hosts is not None and not self._accepts_host(headers, scope["path"]):
                 detail = "SCENE_ALLOWED_HOSTS does not list the name in the Host header."
-                await answer(errors.HostRefusedError(detail), scope, receive, send_completed)
-        except errors.OriginRefusedError as refused:
+                raise errors.HostRefusedError(detail)
+            await self._admitted(scope, receive, send_completed)
+        except (errors.HostRefusedError, errors.OriginRefusedError) as refused:
             await answer(refused, scope, receive, send_completed)
         except Exception:
             raise
@@ -167,23 +165,22 @@ class Gateway:
         """Read the body of a request and wait for its turn. Then answer the request."""
         if self._runtime.models is NO_MODELS:
             raise errors.NotReadyError("The service is starting.")
-        timeout = size = None
+        timeout, length = None, b""
         for name, value in scope["headers"]:
             if name == b"x-request-timeout-ms":
                 timeout = timeout or value
             elif name == b"content-length":
-                size = value
+                length = value
         seconds = self._timeout if timeout is None else self._seconds(timeout)
         client = (scope.get("client") or ("",))[0]
         is_gone = Request(scope, receive).is_disconnected
         ticket = Ticket(client, monotonic() + seconds, is_gone)
         body = b""
         if scope["method"] in _WITH_BODY:
-            limit = self._limit(scope["path"])
-            # int() must not parse very long numbers, so the length is checked first.
-            if size and size.isdigit() and (len(size) > 18 or int(size) > limit):
-                raise too_large(limit)
-            body = await self._runtime.bodies.read(receive, client, limit)
+            limit = self._settings.max_body_bytes
+            if not scope["path"].endswith("/batch"):
+                limit = min(self._settings.max_scene_bytes, limit)
+            body = await self._runtime.bodies.read(receive, client, limit, length)
         scope["state"] |= {"body": body, "ticket": ticket}
         quick, slow = self._admission.quick, self._admission.slow
         try:
@@ -203,17 +200,10 @@ class Gateway:
             # The ticket refers to the scope: without this deletion, they form a reference cycle.
             del scope["state"]["ticket"]
 
-    def _limit(self, path: str) -> int:
-        """Return the maximum size of the body of a request in bytes."""
-        most = self._settings.max_body_bytes
-        return most if path.endswith("/batch") else min(self._settings.max_scene_bytes, most)
-
     async def _fail(self, error: Exception, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a failure, or close the connection if a response has started already."""
-        problem = from_exception(error)
+        problem = from_exception(error, scope["state"]["request_id"])
         record: Record = scope["state"]["record"]
-        if problem.status == 500:
-            report_defect(error, scope["state"]["request_id"])
         if record.status:
             # A part of the response has been sent already. The raised error makes the server close
             # the connection.

@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections.abc import Callable
+from dataclasses import asdict
+from threading import Lock
 from typing import Annotated, Final, cast
+from weakref import WeakKeyDictionary
 
 from fastapi import APIRouter, Depends, Path, Security
 from fastapi.security import APIKeyHeader, HTTPBearer
+from pydantic import BaseModel
 from starlette.requests import Request
 from starlette.responses import Response
 
-from app.api.body import AdminJSONRoute, check_admin
+from app.api.body import JSONRoute, check_admin
 from app.api.gateway import ADMIN_KEY
 from app.api.openapi import error_responses
 from app.questions.contexts import contexts
-from app.scene.relations import opposite
+from app.registry import Artifact
+from app.scene.relations import relation_names
 from app.scene.vocabulary import ObjectClass
-from app.serving.models import ServedModel, ServedModels
+from app.serving.models import ServedModels
 from app.serving.runtime import Runtime
 from scene_client import schemas
 
@@ -59,7 +65,7 @@ RuntimeDep = Annotated[Runtime, Depends(_runtime)]
 router = APIRouter(prefix="/models", tags=["models"])
 administration = APIRouter(prefix="/models", tags=["administration"], dependencies=_SCHEMES)
 changes = APIRouter(
-    prefix="/models", tags=["administration"], route_class=AdminJSONRoute, dependencies=_SCHEMES
+    prefix="/models", tags=["administration"], route_class=JSONRoute, dependencies=_SCHEMES
 )
 
 
@@ -104,16 +110,12 @@ async def show_version(
     served = models.served.get((name, version))
     if served is None:
         return schemas.VersionDetails(name=name, **dict(summary))
-    manifest = served.artifact.manifest
     return schemas.VersionDetails(
         name=name,
         **dict(summary),
-        created=manifest.created,
-        parameters=sum(math.prod(tensor.shape) for tensor in manifest.weights.values()),
-        metrics=[schemas.Metric(**metric.model_dump()) for metric in manifest.metrics],
-        data=[schemas.TrainingSource(**source.model_dump()) for source in manifest.data],
-        terms=manifest.terms,
-        card=served.artifact.card,
+        parameters=sum(math.prod(entry.shape) for entry in served.manifest.weights.values()),
+        card=served.card,
+        **served.manifest.model_dump(include={"created", "metrics", "data", "terms"}),
     )
 
 
@@ -125,8 +127,7 @@ async def show_version(
 )
 async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> Response:
     """List the object classes with their aliases, the relations and the room types of a model."""
-    body = runtime.models.resolve(name).document("vocabulary", _vocabulary)
-    return Response(body, media_type="application/json")
+    return _vocabulary(runtime.models.resolve(name))
 
 
 @router.get(
@@ -165,10 +166,8 @@ async def show_contexts(name: Reference, runtime: RuntimeDep) -> Response:
 
     The field `context` of `POST /generate` accepts the numbers of these units.
     """
-    served = runtime.models.resolve(name)
     # The first request for a model takes 0.3 s, so it runs in a thread.
-    body = await asyncio.to_thread(served.document, "contexts", _contexts)
-    return Response(body, media_type="application/json")
+    return await asyncio.to_thread(_contexts, runtime.models.resolve(name))
 
 
 @administration.post(
@@ -211,17 +210,30 @@ async def move_alias(
     return answer.model_dump_json(exclude_none=True).encode()
 
 
-def _vocabulary(served: ServedModel) -> schemas.VocabularyAnswer:
-    vocabulary, manifest = served.vocabulary, served.artifact.manifest
-    canonical, rooms = manifest.vocabulary.relations, vocabulary.room_types
+def _once(build: Callable[[Artifact], BaseModel]) -> Callable[[Artifact], Response]:
+    """Return a function that builds an answer about a model once, because it never changes."""
+    documents: WeakKeyDictionary[Artifact, bytes] = WeakKeyDictionary()
+    building = Lock()
+
+    def answer(model: Artifact) -> Response:
+        with building:
+            if model not in documents:
+                documents[model] = build(model).model_dump_json().encode()
+        return Response(documents[model], media_type="application/json")
+
+    return answer
+
+
+@_once
+def _vocabulary(served: Artifact) -> schemas.VocabularyAnswer:
+    vocabulary, manifest = served.vocabulary, served.manifest
+    relations, rooms = relation_names(served.spec.A), vocabulary.room_types
     return schemas.VocabularyAnswer(
         model=served.reference,
         objects=[_class(entry) for entry in vocabulary.objects],
-        relations=[
-            cast("schemas.RelationName", name) for name in (*canonical, *map(opposite, canonical))
-        ],
+        relations=[cast("schemas.RelationName", name) for name in relations],
         room_types=list(rooms),
-        rare_room_types=[rooms[t] for t in served.artifact.calibration.rare_rooms],
+        rare_room_types=[rooms[t] for t in served.calibration.rare_rooms],
         profiles=list(manifest.vocabulary.profiles),
         examples=[
             schemas.ExampleScene(name=example.name, scene=example.request())
@@ -230,20 +242,14 @@ def _vocabulary(served: ServedModel) -> schemas.VocabularyAnswer:
     )
 
 
-def _contexts(served: ServedModel) -> schemas.ContextsAnswer:
-    return schemas.ContextsAnswer(model=served.reference, layers=dict(contexts(served.artifact)))
+@_once
+def _contexts(served: Artifact) -> schemas.ContextsAnswer:
+    return schemas.ContextsAnswer(model=served.reference, layers=dict(contexts(served)))
 
 
 def _class(entry: ObjectClass) -> schemas.VocabularyEntry:
-    size = entry.size and schemas.Size(**dict(zip("xyz", entry.size, strict=True)))
-    return schemas.VocabularyEntry(
-        label=entry.label,
-        aliases=list(entry.aliases),
-        structure=entry.structure,
-        size=size,
-        parent=entry.parent,
-        anywhere=entry.anywhere,
-    )
+    size = entry.size and dict(zip("xyz", entry.size, strict=True))
+    return schemas.VocabularyEntry(**asdict(entry) | {"size": size})
 
 
 def _name(models: ServedModels, reference: str) -> str:

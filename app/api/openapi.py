@@ -12,6 +12,7 @@ from app.api.gateway import API_KEY, HEALTH, OPEN_ROUTES, TIMEOUT_HEADER
 from app.api.problems import MEDIA_TYPE
 from app.errors import ERRORS, Step
 from app.questions.question import Example
+from app.settings import Settings
 from scene_client.schemas import MAX_SEED, Problem
 
 Responses = dict[int | str, dict[str, Any]]
@@ -90,32 +91,39 @@ class DocumentedAPI(FastAPI):
     def openapi(self) -> dict[str, Any]:
         """Return FastAPI's OpenAPI document with examples and with problems as error responses."""
         if self.openapi_schema is None:
-            document = super().openapi()
+            document, settings = super().openapi(), self.state.settings
             schemas = document["components"]["schemas"]
             problem = Problem.model_json_schema(mode="serialization", ref_template=_REFERENCE)
             schemas |= problem.pop("$defs") | {"Problem": problem}
-            timeout = _timeout_parameter(self.state.settings.max_request_timeout_ms)
-            for path in document["paths"].values():
-                for operation in path.values():
-                    (ok,) = operation["responses"]["200"]["content"].values()
-                    ok["example"] = examples.ANSWERS[operation["operationId"]]
-                    if "requestBody" in operation:
-                        (body,) = operation["requestBody"]["content"].values()
-                        cases = examples.REQUESTS[operation["operationId"]].items()
-                        body["examples"] = {name: described(case) for name, case in cases}
-                    if "504" in operation["responses"]:
-                        operation.setdefault("parameters", []).append(timeout)
-                    content = operation["responses"].get("422", {}).get("content", {})
-                    if "application/json" in content:
-                        del operation["responses"]["422"]
+            for path, operations in document["paths"].items():
+                for operation in operations.values():
+                    _complete(operation, path, settings)
             schemas.pop("HTTPValidationError", None)
             schemas.pop("ValidationError", None)
-            if self.state.settings.api_key is not None:
-                _ask_for_keys(document)
-            if self.state.settings.accepted_hosts is not None:
-                _refuse_other_hosts(document)
+            if settings.api_key is not None:
+                document["components"].setdefault("securitySchemes", {}).update(_KEY_SCHEMES)
             _state_whole_numbers(document)
         return super().openapi()
+
+
+def _complete(operation: dict[str, Any], path: str, settings: Settings) -> None:
+    """Add the examples, the time limit, the API key and the problems of an operation."""
+    responses, name = operation["responses"], operation["operationId"]
+    (ok,) = responses["200"]["content"].values()
+    ok["example"] = examples.ANSWERS[name]
+    if "requestBody" in operation:
+        (body,) = operation["requestBody"]["content"].values()
+        body["examples"] = {case: described(one) for case, one in examples.REQUESTS[name].items()}
+    if "504" in responses:
+        timeout = _timeout_parameter(settings.max_request_timeout_ms)
+        operation.setdefault("parameters", []).append(timeout)
+    if "application/json" in responses.get("422", {}).get("content", {}):
+        del responses["422"]
+    if settings.api_key is not None and path not in OPEN_ROUTES and "security" not in operation:
+        operation["security"] = [{scheme: []} for scheme in _KEY_SCHEMES]
+        responses["401"] = error_responses("key")[401]
+    if settings.accepted_hosts is not None and not path.endswith(HEALTH):
+        responses["421"] = error_responses("host")[421]
 
 
 def _timeout_parameter(most: int) -> dict[str, Any]:
@@ -128,21 +136,3 @@ def _timeout_parameter(most: int) -> dict[str, Any]:
         "schema": {"type": "integer", "minimum": 1, "maximum": most},
         "examples": {"second": {"summary": "one second", "value": min(1000, most)}},
     }
-
-
-def _refuse_other_hosts(document: dict[str, Any]) -> None:
-    """Add the problem `host-refused` to each operation except health checks."""
-    refused = error_responses("host")[421]
-    for path, operations in document["paths"].items():
-        for operation in () if path.endswith(HEALTH) else operations.values():
-            operation["responses"]["421"] = refused
-
-
-def _ask_for_keys(document: dict[str, Any]) -> None:
-    """Add the API key to each operation that needs this key."""
-    document["components"].setdefault("securitySchemes", {}).update(_KEY_SCHEMES)
-    for path, operations in document["paths"].items():
-        for operation in operations.values():
-            if path not in OPEN_ROUTES and "security" not in operation:
-                operation["security"] = [{name: []} for name in _KEY_SCHEMES]
-                operation["responses"]["401"] = error_responses("key")[401]

@@ -26,8 +26,8 @@ _HEADERS: Final = {401: {"WWW-Authenticate": "Bearer"}, 408: {"Connection": "clo
 _OF_STATUS: Final = {kind.status: kind for kind in ERRORS.values() if "http" in kind.steps}
 
 
-def from_exception(error: Exception) -> ServiceError:
-    """Return the error of the service for any exception; an unexpected one is an internal error."""
+def from_exception(error: Exception, request_id: str) -> ServiceError:
+    """Return the error of the service for any exception. Log an unexpected one: it is a defect."""
     if isinstance(error, ServiceError):
         return error
     if isinstance(error, MemoryError):
@@ -37,12 +37,8 @@ def from_exception(error: Exception) -> ServiceError:
         headers = error.headers or {}
         detail = f"This route accepts only {headers['Allow']}." if "Allow" in headers else ""
         return _OF_STATUS[error.status_code](detail, headers=headers)
-    return InternalError("The service failed. Its log contains the error.")
-
-
-def report_defect(error: Exception, request_id: str) -> None:
-    """Log an internal error. The client receives only the problem type, without details."""
     _logger.error("request failed", exc_info=error, extra={"request_id": request_id})
+    return InternalError("The service failed. Its log contains the error.")
 
 
 def respond(request: Request, error: ServiceError) -> Response:
@@ -67,7 +63,7 @@ async def answer(error: ServiceError, scope: Scope, receive: Receive, send: Send
 
 
 async def _handle(request: Request, error: Exception) -> Response:
-    problem = from_exception(error)
+    problem = from_exception(error, request.scope["state"]["request_id"])
     if problem is not error and isinstance(problem, NotFoundError):
         path = request.scope["path"][:64].lower()
         similar = get_close_matches(path, request.app.state.paths)

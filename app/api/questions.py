@@ -14,7 +14,7 @@ from starlette.requests import Request
 
 from app.api.body import JSONRoute, validated
 from app.api.openapi import error_responses, operation_id
-from app.api.problems import from_exception, report_defect
+from app.api.problems import from_exception
 from app.errors import RequestError
 from app.questions import QUESTIONS, Question
 from app.questions.answer import written
@@ -45,13 +45,7 @@ def serving_request(http: Request) -> serving.Request:
     """Create the serving request of an HTTP request. It uses one snapshot of the models."""
     state, runtime = http.scope["state"], http.scope["app"].state.runtime
     return serving.Request(
-        id=state["request_id"],
-        ticket=state["ticket"],
-        admission=runtime.admission,
-        record=state["record"],
-        models=runtime.models,
-        limits=runtime.limits,
-        metrics=runtime.metrics,
+        state["request_id"], state["ticket"], state["record"], runtime, runtime.models
     )
 
 
@@ -59,28 +53,23 @@ async def _answer_each(
     http: Request, batch: BatchRequest[RequestT], question: Question[RequestT]
 ) -> bytes:
     request = serving_request(http)
-
-    def count(outcome: str) -> None:
-        request.metrics.entry_answered(question.name, outcome)
-
     results: list[bytes] = []
-    left = request.limits.answer_bytes
-    await request.ticket.enter(request.admission.slow, len(batch.scenes))
+    left, admission = request.runtime.limits.answer_bytes, request.runtime.admission
+    await request.ticket.enter(admission.slow, len(batch.scenes))
     for number, scene in enumerate(batch.scenes):
         try:
             request.ticket.check()
             # Only this validation may fail because of the client. Any later validation error is a
             # defect of the service.
             data = validated(scene, question.request, at=("scenes", number))
-            answer = written(await request.with_answer_bytes(left).answer(question, data))
-            results.append(b'{"status":200,"result":%b}' % answer)
-            count(serving.SUCCESS)
+            answer = written(await request.answer(question, data, left))
+            outcome, result = serving.SUCCESS, b'{"status":200,"result":%b}' % answer
         except Exception as error:  # noqa: BLE001 — any error fails only this scene
-            outcome, failed = _failed(error, number, scene, request.id)
-            count(outcome)
-            results.append(failed)
-        left = max(0, left - len(results[-1]))
-        await request.admission.quick.let_pass()
+            outcome, result = _failed(error, number, scene, request.id)
+        request.runtime.metrics.entry_answered(question.name, outcome)
+        results.append(result)
+        left = max(0, left - len(result))
+        await admission.quick.let_pass()
     return b'{"request_id":%b,"results":[%b]}' % (to_json(request.id), b",".join(results))
 
 
@@ -92,9 +81,7 @@ def _failed(error: Exception, number: int, scene: Any, request_id: str) -> tuple
     """
     if isinstance(error, RequestError):
         error.locate(scene, ("scenes", number))
-    failure = from_exception(error)
-    if failure.status == 500:
-        report_defect(error, request_id)
+    failure = from_exception(error, request_id)
     body = failure.describe(request_id).model_dump_json(exclude_none=True).encode()
     return failure.slug, b'{"status":%d,"problem":%b}' % (failure.status, body)
 

@@ -14,13 +14,11 @@ from fastapi.telemetry import TelemetryConfig
 
 from app import __version__
 
-_SERVICE: Final = "scene-boltzmann"
 # Orchestrators and Prometheus poll these paths every few seconds, and pages load static files.
 # So spans of these requests would be more numerous than all other spans.
 _UNTRACED: Final = ("/health", "/v2/health", "/metrics", "/static")
 # FastAPI copies these span attributes from the request, so they may contain private data.
 _MADE_UP: Final = ("url.path", "url.query", "http.request.method_original")
-_REDACTED: Final = "REDACTED"
 
 
 def configuration(*, enabled: bool) -> TelemetryConfig:
@@ -33,7 +31,7 @@ def configuration(*, enabled: bool) -> TelemetryConfig:
         return TelemetryConfig(tracing=False, metrics=False, logs=False, auto_configure=False)
     # These packages are installed only with the dependency group `telemetry`.
     from opentelemetry.context import Context
-    from opentelemetry.sdk.resources import SERVICE_NAME, SERVICE_VERSION, Resource
+    from opentelemetry.sdk.resources import SERVICE_VERSION, Resource
     from opentelemetry.sdk.trace import Span, SpanProcessor, TracerProvider
 
     class Redaction(SpanProcessor):
@@ -42,10 +40,10 @@ def configuration(*, enabled: bool) -> TelemetryConfig:
         def on_start(self, span: Span, parent_context: Context | None = None) -> None:
             for name in _MADE_UP:
                 if name in (span.attributes or {}):
-                    span.set_attribute(name, _REDACTED)
+                    span.set_attribute(name, "REDACTED")
 
-    name = os.environ.get("OTEL_SERVICE_NAME", _SERVICE)
-    resource = Resource.create({SERVICE_NAME: name, SERVICE_VERSION: __version__})
+    os.environ.setdefault("OTEL_SERVICE_NAME", "scene-boltzmann")
+    resource = Resource.create({SERVICE_VERSION: __version__})
     provider = TracerProvider(resource=resource, shutdown_on_exit=False)
     provider.add_span_processor(Redaction())
     return TelemetryConfig(

@@ -33,6 +33,7 @@ from app.registry.offsets import Offsets
 from app.registry.places import Places
 from app.registry.tensors import StorageDtype, pack, require_equal, unpack
 from app.scene.vocabulary import Vocabulary
+from scene_client.schemas import ModelReference
 
 MAX_MANIFEST_BYTES: Final = 4 * 2**20
 """Maximum size of a manifest in bytes. A manifest of 785 classes has 162 kB."""
@@ -74,6 +75,19 @@ class Artifact:
     offsets: Offsets | None = None
     counts: Counts | None = None
     places: Places | None = None
+
+    @cached_property
+    def key(self) -> tuple[str, str]:
+        """Name and version of the model."""
+        return self.manifest.name, self.manifest.version
+
+    @cached_property
+    def reference(self) -> ModelReference:
+        """Name, version, variant and digest of the model, in the form of the field `model`."""
+        name, version = self.key
+        return ModelReference(
+            name=name, version=version, variant=self.manifest.variant, digest=self.digest
+        )
 
     @cached_property
     def spec(self) -> MachineSpec:
@@ -240,12 +254,19 @@ def read_verified(directory: Path, max_weights_bytes: int) -> tuple[Manifest, st
     except OSError as error:
         raise _unreadable("the artifact's directory", error) from None
     try:
-        _require_no_other_file(folder)
+        with os.scandir(folder) as entries:
+            extra = {entry.name for entry in entries} - {MANIFEST, WEIGHTS, CARD}
+        if extra:
+            names = ", ".join(sorted(ascii(name) for name in extra)[:8])
+            reason = f"the artifact's directory has unexpected files: {names}"
+            raise ArtifactError("unexpected_file", reason)
         text = _read(folder, MANIFEST, MAX_MANIFEST_BYTES)
         _require_size(MANIFEST, len(text), MAX_MANIFEST_BYTES)
         manifest = Manifest.from_bytes(text)
         weights = _read_checked(folder, WEIGHTS, manifest.files[WEIGHTS], max_weights_bytes)
         card = _read_checked(folder, CARD, manifest.files[CARD], MAX_CARD_BYTES)
+    except OSError as error:
+        raise _unreadable("the artifact's directory", error) from None
     finally:
         os.close(folder)
     try:
@@ -253,18 +274,6 @@ def read_verified(directory: Path, max_weights_bytes: int) -> tuple[Manifest, st
     except UnicodeDecodeError:
         raise ArtifactError("invalid_manifest", f"{CARD} is not UTF-8") from None
     return manifest, hashlib.sha256(text).hexdigest(), weights, page
-
-
-def _require_no_other_file(folder: int) -> None:
-    try:
-        with os.scandir(folder) as entries:
-            extra = {entry.name for entry in entries} - {MANIFEST, WEIGHTS, CARD}
-    except OSError as error:
-        raise _unreadable("the artifact's directory", error) from None
-    if extra:
-        names = ", ".join(sorted(ascii(name) for name in extra)[:8])
-        reason = f"the artifact's directory has unexpected files: {names}"
-        raise ArtifactError("unexpected_file", reason)
 
 
 def _require_size(name: str, size: int, limit: int) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final, Self
+from typing import Annotated, Any, ClassVar, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from app.inference.kernels import SINGLE as SINGLE
 from app.registry.fields import TensorGroup
 
 Table = NDArray[np.float32]
+Ints = NDArray[np.integer[Any]]
 
 
 EXPONENTS: Final = 2
@@ -41,11 +42,12 @@ class Counts(TensorGroup):
     """
 
     prefix: ClassVar[str] = "counts."
+    integers = ("classes", "most")
 
-    classes: NDArray[np.integer[Any]]
-    most: NDArray[np.integer[Any]]
-    log_share: Table
-    weights: Table
+    classes: Annotated[Ints, "K"]
+    most: Annotated[Ints, "K"]
+    log_share: Annotated[Table, "K", "M"]
+    weights: Annotated[Table, "K", EXPONENTS, "features"]
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, NDArray[Any]], V: int, C: int) -> Self:
@@ -54,15 +56,8 @@ class Counts(TensorGroup):
         Raises:
             ArtifactError: `wrong_shape` or `invalid_tensor`; see `TensorGroup.read`.
         """
-        K = cls.length(tensors, "classes")
-        M = np.atleast_1d(tensors.get(f"{cls.prefix}log_share", ())).shape[-1]
-        shapes = {
-            "classes": (K,),
-            "most": (K,),
-            "log_share": (K, M),
-            "weights": (K, EXPONENTS, ROOM + C + V),
-        }
-        counts = cls.read(tensors, shapes, ("classes", "most"))
+        counts = cls.read(tensors, features=ROOM + C + V)
+        K, M = counts.log_share.shape
         counts.require(K, "there must be at least one class")
         counts.require_keys("classes", V)
         counts.require(2 <= M <= _MOST, f"log_share must have 2 to {_MOST} columns")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any, Final, Literal, NamedTuple, Self
+from typing import Annotated, Any, Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,8 @@ from app.registry.examples import Examples
 from app.registry.fields import Count, Frozen, Many, Sha256, Text, Timestamp, to_json
 from app.registry.references import ModelName, Version
 from app.scene.relations import CANONICAL
-from app.scene.vocabulary import Vocabulary
+from app.scene.vocabulary import ObjectClass, Vocabulary
+from scene_client.schemas import Sensitivity as Sensitivity
 
 Floats = NDArray[np.floating[Any]]
 
@@ -69,10 +70,6 @@ class Sharpness(Frozen):
     def of(self, n: int) -> float:
         """Return the exponent for a list of n classes. It is at least 0.05."""
         return max(self.slope + self.log_count * math.log(max(n, 1)), 0.05)
-
-
-Sensitivity = Literal["low", "medium", "high"]
-"""Name of an alarm line."""
 
 
 class AlarmLine(Frozen):
@@ -218,28 +215,13 @@ class RelationSlopes(NamedTuple):
         return cls(*(np.array(part, np.float32).reshape(-1, 3) for part in rows))
 
 
-class ClassEntry(Frozen):
-    """One object class.
-
-    `size` is the typical extent (x, y, z) in metres. None means that the size is unknown. The other
-    fields are those of `app.scene.vocabulary.ObjectClass`.
-    """
-
-    label: Text
-    aliases: Many[Text] = ()
-    structure: bool = False
-    size: tuple[float, float, float] | None = None
-    parent: Text | None = None
-    anywhere: bool = False
-
-
 class VocabularyEntry(Frozen):
     """The object classes, relations, room types and profiles of a model, by their indices.
 
     A profile is a data source whose base rates a request can choose.
     """
 
-    objects: Many[ClassEntry]
+    objects: Many[ObjectClass]
     relations: Many[str] = CANONICAL
     room_types: Many[Text] = ()
     room_aliases: dict[Text, Many[Text]] = Field(default_factory=dict)
@@ -250,8 +232,7 @@ class VocabularyEntry(Frozen):
     def _is_a_vocabulary(self) -> Self:
         if self.relations != CANONICAL[: len(self.relations)]:
             raise ValueError(f"relations must be the first of {CANONICAL}, in the same order")
-        words = self.model_dump(mode="json", exclude={"relations", "profiles"})
-        self._words = Vocabulary.from_dict(words)
+        self._words = Vocabulary(self.objects, self.room_types, self.room_aliases)
         return self
 
     @classmethod
@@ -259,8 +240,9 @@ class VocabularyEntry(Frozen):
         cls, vocabulary: Vocabulary, relations: int = len(CANONICAL), profiles: Sequence[str] = ()
     ) -> Self:
         """Return the manifest entry of a vocabulary for a machine with A = ``relations``."""
-        names = {"relations": CANONICAL[:relations], "profiles": profiles}
-        return cls.model_validate(vocabulary.to_dict() | names)
+        words = {name: getattr(vocabulary, name) for name in ("objects", "room_types")}
+        words |= {"relations": CANONICAL[:relations], "profiles": profiles}
+        return cls.model_validate(words | {"room_aliases": vocabulary.room_aliases})
 
     def vocabulary(self) -> Vocabulary:
         """Return the vocabulary."""
@@ -363,8 +345,6 @@ class Description(Frozen):
             raise ValueError(f"the vocabulary has {types} room types, but the spec has C = {rooms}")
         if any(t >= rooms for t in self.calibration.rare_rooms):
             raise ValueError(f"calibration.rare_rooms must be below C = {rooms}")
-        for example in self.examples:
-            example.require_known(words.vocabulary())
         return self
 
     @property

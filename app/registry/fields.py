@@ -6,7 +6,7 @@ import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime
-from typing import Annotated, Any, ClassVar, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Self, TypeVar, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,38 +64,37 @@ class Frozen(BaseModel):
 class TensorGroup:
     """Base class of groups of arrays that an artifact stores beside the tensors of the machine.
 
-    A subclass is a dataclass whose fields are the arrays. The names of the stored tensors begin
-    with `prefix`.
+    A subclass is a dataclass whose fields are the arrays. The annotation of a field contains the
+    name or the number of each size: `Annotated[Table, "V", 3]`. The names of the stored tensors
+    begin with `prefix`. The fields in `integers` have integers, all others floating-point numbers.
     """
 
     prefix: ClassVar[str]
+    integers: ClassVar[Collection[str]]
 
     def tensors(self) -> dict[str, NDArray[Any]]:
         """Return a mapping of tensor names in an artifact to the arrays."""
         return {f"{self.prefix}{field.name}": getattr(self, field.name) for field in fields(self)}
 
     @classmethod
-    def length(cls, tensors: Mapping[str, NDArray[Any]], name: str) -> int:
-        """Return the length of a stored tensor's first axis, 0 if the tensor does not exist."""
-        return len(np.atleast_1d(tensors.get(f"{cls.prefix}{name}", ())))
-
-    @classmethod
-    def read(
-        cls,
-        tensors: Mapping[str, NDArray[Any]],
-        shapes: Mapping[str, tuple[int, ...]],
-        integers: Collection[str],
-    ) -> Self:
+    def read(cls, tensors: Mapping[str, NDArray[Any]], **sizes: int) -> Self:
         """Build the group from stored tensors.
 
         Args:
-            shapes: the required shape of each field.
-            integers: the fields with integers. All others have floating-point numbers.
+            sizes: named sizes of the model. The first field with another size defines it.
 
         Raises:
             ArtifactError: `wrong_shape` if a tensor is missing, unexpected or of a wrong shape;
                 `invalid_tensor` if a tensor has a wrong dtype.
         """
+        shapes = {}
+        for name, hint in get_type_hints(cls, include_extras=True).items():
+            if axes := getattr(hint, "__metadata__", ()):
+                actual = np.shape(tensors.get(f"{cls.prefix}{name}", ()))
+                sizes = dict(zip(axes, actual, strict=False)) | sizes
+                shapes[name] = tuple(
+                    sizes.get(axis, 0) if isinstance(axis, str) else axis for axis in axes
+                )
         for name in sorted(tensors.keys() | {f"{cls.prefix}{name}" for name in shapes}):
             required = shapes.get(name.removeprefix(cls.prefix))
             shape = tensors[name].shape if name in tensors else None
@@ -107,10 +106,12 @@ class TensorGroup:
                 )
         group = cls(**{name: tensors[f"{cls.prefix}{name}"] for name in shapes})
         for name in shapes:
-            kind = np.integer if name in integers else np.floating
-            words = "integers" if name in integers else "floating-point numbers"
-            is_right = np.issubdtype(getattr(group, name).dtype, kind)
-            group.require(is_right, f"{name} must be {words}")
+            is_integer = name in cls.integers
+            words = "integers" if is_integer else "floating-point numbers"
+            kind = np.integer if is_integer else np.floating
+            group.require(
+                np.issubdtype(getattr(group, name).dtype, kind), f"{name} must be {words}"
+            )
         return group
 
     def require(self, condition: object, complaint: str) -> None:

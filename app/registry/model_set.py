@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
@@ -41,16 +41,17 @@ class ModelSet:
     def versions(self) -> Mapping[str, tuple[str, ...]]:
         """Maps each model to its versions in ascending order, including unusable versions."""
         keys = sorted(self.entries, key=lambda key: (key[0], version_key(key[1])))
-        return MappingProxyType(
-            {name: tuple(v for _, v in group) for name, group in groupby(keys, itemgetter(0))}
-        )
+        return {name: tuple(v for _, v in group) for name, group in groupby(keys, itemgetter(0))}
+
+    @cached_property
+    def artifacts(self) -> Mapping[tuple[str, str], Artifact]:
+        """Maps each usable (name, version) to its artifact."""
+        return {key: e for key, e in self.entries.items() if isinstance(e, Artifact)}
 
     @cached_property
     def failures(self) -> Mapping[tuple[str, str], ArtifactError]:
         """Maps each unusable (name, version) to the reason."""
-        return MappingProxyType(
-            {key: e for key, e in self.entries.items() if isinstance(e, ArtifactError)}
-        )
+        return {key: e for key, e in self.entries.items() if isinstance(e, ArtifactError)}
 
     def resolve(self, reference: str) -> Artifact:
         """Return the model that an alias, `name` or `name@version` points at.
@@ -83,11 +84,18 @@ EMPTY: Final = ModelSet({}, {})
 """The state of a store without models."""
 
 
-def load_model_set(store: Store, previous: ModelSet = EMPTY) -> ModelSet:
+def load_model_set(
+    store: Store,
+    previous: ModelSet = EMPTY,
+    check: Callable[[Artifact], None] = lambda _: None,
+) -> ModelSet:
     """Load and verify every version of a store.
 
     The result contains all errors, such as invalid versions, unreadable aliases or a missing store.
     An artifact of the previous snapshot is verified again, and reused if its digest is unchanged.
+
+    Args:
+        check: further check of each new artifact. It raises `ArtifactError`.
     """
     failure: StoreError | None = None
     aliases: Mapping[str, AliasTarget]
@@ -99,22 +107,30 @@ def load_model_set(store: Store, previous: ModelSet = EMPTY) -> ModelSet:
         aliases, failure = {}, StoreError(error.code, error.reason)
     keys: list[tuple[str, str]] = []
     try:
-        for name, versions in store.published().items():
-            if isinstance(versions, StoreError):  # only this model's folder is unreadable
-                failure = versions
-            else:
-                keys += [(name, version) for version in versions]
+        names = store.names()
     except StoreError as error:
-        failure = StoreError(error.code, error.reason)
-    entries = {key: _load(store, *key, previous.entries.get(key)) for key in keys}
+        names, failure = [], StoreError(error.code, error.reason)
+    for name in names:
+        try:
+            keys += [(name, version) for version in store.versions(name)]
+        except StoreError as error:  # only this model's folder is unreadable
+            failure = StoreError(error.code, error.reason)
+    entries = {key: _load(store, *key, previous.artifacts.get(key), check) for key in keys}
     return ModelSet(MappingProxyType(entries), MappingProxyType(dict(aliases)), failure)
 
 
 def _load(
-    store: Store, name: str, version: str, previous: Artifact | ArtifactError | None
+    store: Store,
+    name: str,
+    version: str,
+    previous: Artifact | None,
+    check: Callable[[Artifact], None],
 ) -> Artifact | ArtifactError:
     try:
-        return store.load(name, version, previous if isinstance(previous, Artifact) else None)
+        artifact = store.load(name, version, previous)
+        if artifact is not previous:
+            check(artifact)
+        return artifact
     except ArtifactError as error:
         return ArtifactError(error.code, error.reason)
     except StoreError as error:  # for example, the version was removed after it was listed

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,14 +40,15 @@ class Offsets(TensorGroup):
     """
 
     prefix: ClassVar[str] = "offsets."
+    integers = ("relation_scenes", "pair", "pair_scenes")
 
-    relation: Table
-    relation_scenes: Ints
-    subject: Table
-    object: Table
-    pair: Ints
-    pair_offset: Table
-    pair_scenes: Ints
+    relation: Annotated[Table, "A", 6]
+    relation_scenes: Annotated[Ints, "A"]
+    subject: Annotated[Table, "A", "V", 6]
+    object: Annotated[Table, "A", "V", 6]
+    pair: Annotated[Ints, "P"]
+    pair_offset: Annotated[Table, "P", 6]
+    pair_scenes: Annotated[Ints, "P"]
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, NDArray[Any]], A: int, V: int) -> Self:
@@ -56,17 +57,7 @@ class Offsets(TensorGroup):
         Raises:
             ArtifactError: `wrong_shape` or `invalid_tensor`; see `TensorGroup.read`.
         """
-        P = cls.length(tensors, "pair")
-        shapes = {
-            "relation": (A, 6),
-            "relation_scenes": (A,),
-            "subject": (A, V, 6),
-            "object": (A, V, 6),
-            "pair": (P,),
-            "pair_offset": (P, 6),
-            "pair_scenes": (P,),
-        }
-        offsets = cls.read(tensors, shapes, ("relation_scenes", "pair", "pair_scenes"))
+        offsets = cls.read(tensors, A=A, V=V)
         offsets.require_keys("pair", A * V * V)
         is_right = (offsets.relation_scenes >= 0).all() and (offsets.pair_scenes >= 1).all()
         offsets.require(is_right, "relation_scenes must be at least 0 and pair_scenes at least 1")

@@ -15,7 +15,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Final, Self
+from typing import Annotated, Any, ClassVar, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,14 +52,15 @@ class Places(TensorGroup):
     """
 
     prefix: ClassVar[str] = "places."
+    integers = ("triple", "role_pair")
 
-    triple: NDArray[np.int32]
-    held: NDArray[np.float32]
-    frequency: NDArray[np.float32]
-    role_pair: NDArray[np.int32]
-    role_counts: NDArray[np.float32]
-    role_anchor: NDArray[np.float32]
-    stands: NDArray[np.float32]
+    triple: Annotated[NDArray[np.int32], "N"]
+    held: Annotated[NDArray[np.float32], "N"]
+    frequency: Annotated[NDArray[np.float32], "V"]
+    role_pair: Annotated[NDArray[np.int32], "P"]
+    role_counts: Annotated[NDArray[np.float32], "P", 3]
+    role_anchor: Annotated[NDArray[np.float32], "V", 3]
+    stands: Annotated[NDArray[np.float32], "V", 3]
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, NDArray[Any]], A: int, V: int) -> Self:
@@ -68,18 +69,8 @@ class Places(TensorGroup):
         Raises:
             ArtifactError: `wrong_shape` or `invalid_tensor`; see `TensorGroup.read`.
         """
-        N, P = cls.length(tensors, "triple"), cls.length(tensors, "role_pair")
-        shapes = {
-            "triple": (N,),
-            "held": (N,),
-            "frequency": (V,),
-            "role_pair": (P,),
-            "role_counts": (P, 3),
-            "role_anchor": (V, 3),
-            "stands": (V, 3),
-        }
-        places = cls.read(tensors, shapes, ("triple", "role_pair"))
-        places.require(N, "there must be at least one triple")
+        places = cls.read(tensors, V=V)
+        places.require(len(places.triple), "there must be at least one triple")
         places.require_keys("triple", A * V * V)
         places.require_keys("role_pair", V * V)
         counts = places.held, places.role_counts, places.role_anchor, places.stands
@@ -114,7 +105,8 @@ class Places(TensorGroup):
         A single scene may be an error, so two scenes are needed. The class indices are (N,) and
         (M,).
         """
-        return self._held(relation, subject, other) >= _SHOWN
+        V = len(self.frequency)
+        return triple_counts(self.triple, self.held, V, relation, subject, other) >= _SHOWN
 
     def supporters(self, subject: Indices, other: Indices) -> Floats:
         """Return the share of each other class among the supporters of each subject, (N, M).
@@ -139,12 +131,6 @@ class Places(TensorGroup):
         by_pair = np.bincount(keys, held, V * V).reshape(V, V)
         count = by_pair.sum(0) + _SEEN
         return by_pair.sum(1), count / count.sum(), by_pair.astype(np.float32)
-
-    def _held(self, relation: int, subject: Indices, other: Indices) -> Floats:
-        """Return the number of training scenes with a relation between classes, (N, M)."""
-        V = len(self.frequency)
-        held: Floats = triple_counts(self.triple, self.held, V, relation, subject, other)
-        return held
 
     @cached_property
     def unseen(self) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:

@@ -15,7 +15,7 @@ import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Final, Self
+from typing import Annotated, Final, NamedTuple, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, TypeAdapter, ValidationError
 
@@ -23,35 +23,41 @@ from app.registry.errors import StoreError, cause
 
 MAX_ALIASES_BYTES: Final = 256 * 2**10
 
-_NAME = re.compile(r"[a-z0-9](?:[a-z0-9_-]{0,62}[a-z0-9])?")
-_VERSION = re.compile(r"(?:0|[1-9][0-9]{0,8})(?:\.(?:0|[1-9][0-9]{0,8})){2}")
 
+class Spelling(NamedTuple):
+    """The valid spelling of a text, as a pattern and in words."""
 
-def is_name(text: str) -> bool:
-    """Return whether text is a valid name of a model or alias."""
-    return _NAME.fullmatch(text) is not None
+    pattern: re.Pattern[str]
+    rule: str
 
+    def fits(self, text: str) -> bool:
+        """Return whether a text is valid."""
+        return self.pattern.fullmatch(text) is not None
 
-def is_version(text: str) -> bool:
-    """Return whether text is a valid version: three decimal numbers without leading zeros."""
-    return _VERSION.fullmatch(text) is not None
-
-
-def _require_name(text: str) -> str:
-    if is_name(text):
+    def require(self, text: str) -> str:
+        """Return a valid text unchanged. Raise ValueError for another text."""
+        if not self.fits(text):
+            raise ValueError(self.rule)
         return text
-    characters = "1 to 64 characters a-z, 0-9, '_' or '-'"
-    raise ValueError(f"must have {characters}, and must start and end with a-z or 0-9")
 
-
-def _require_version(text: str) -> str:
-    if is_version(text):
+    def check(self, text: str, what: str) -> str:
+        """Return a valid text unchanged. Raise StoreError `invalid_reference` for another text."""
+        if not self.fits(text):
+            raise StoreError("invalid_reference", f"a {what} {self.rule}")
         return text
-    raise ValueError("must be MAJOR.MINOR.PATCH without leading zeros, for example 1.0.0")
 
 
-ModelName = Annotated[str, AfterValidator(_require_name)]
-Version = Annotated[str, AfterValidator(_require_version)]
+NAME: Final = Spelling(
+    re.compile(r"[a-z0-9](?:[a-z0-9_-]{0,62}[a-z0-9])?"),
+    "must have 1 to 64 characters a-z, 0-9, '_' or '-', and must start and end with a-z or 0-9",
+)
+"""Names of models and aliases."""
+VERSION: Final = Spelling(
+    re.compile(r"(?:0|[1-9][0-9]{0,8})(?:\.(?:0|[1-9][0-9]{0,8})){2}"),
+    "must be MAJOR.MINOR.PATCH without leading zeros, for example 1.0.0",
+)
+ModelName = Annotated[str, AfterValidator(NAME.require)]
+Version = Annotated[str, AfterValidator(VERSION.require)]
 
 
 class AliasTarget(BaseModel):
@@ -78,23 +84,6 @@ class AliasTarget(BaseModel):
 _TABLE: Final = TypeAdapter(dict[ModelName, AliasTarget])
 
 
-def check_name(text: str, what: str = "model name") -> str:
-    """Return a valid name unchanged. Raise StoreError `invalid_reference` for another text."""
-    return _checked(_require_name, text, what)
-
-
-def check_version(text: str) -> str:
-    """Return a valid version unchanged. Raise StoreError `invalid_reference` for another text."""
-    return _checked(_require_version, text, "version")
-
-
-def _checked(require: Callable[[str], str], text: str, what: str) -> str:
-    try:
-        return require(text)
-    except ValueError as error:
-        raise StoreError("invalid_reference", f"a {what} {error}") from None
-
-
 def version_key(version: str) -> tuple[int, ...]:
     """Return the sort key of a version: its three numbers."""
     return tuple(int(part) for part in version.split("."))
@@ -115,9 +104,9 @@ def resolve_reference(
             the target of an alias does not exist.
     """
     name, at, version = reference.partition("@")
-    check_name(name)
+    NAME.check(name, "model name")
     if at:
-        return _pick(AliasTarget(name=name, version=check_version(version)), versions)
+        return _pick(AliasTarget(name=name, version=VERSION.check(version, "version")), versions)
     if (target := aliases.get(name)) is None:
         return _pick(AliasTarget(name=name), versions)
     try:

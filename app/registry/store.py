@@ -29,12 +29,10 @@ from app.registry.durable import exclusive, make_directory, rename, replace_file
 from app.registry.errors import ArtifactError, StoreError, cause
 from app.registry.manifest import CARD, MANIFEST, WEIGHTS
 from app.registry.references import (
+    NAME,
+    VERSION,
     AliasTarget,
     aliases_to_bytes,
-    check_name,
-    check_version,
-    is_name,
-    is_version,
     read_aliases,
     resolve_reference,
     version_key,
@@ -68,21 +66,16 @@ class Store:
         self._lock_timeout = lock_timeout
         self._max_weights_bytes = max_weights_bytes
 
-    def published(self) -> dict[str, tuple[str, ...] | StoreError]:
-        """Return the versions of each model, or the error of an unreadable folder, by sorted name.
+    def names(self) -> list[str]:
+        """Return the names of the models in alphabetical order.
 
         Raises:
             StoreError: `unreadable` if the root is not a readable directory.
         """
-        models: dict[str, tuple[str, ...] | StoreError] = {}
-        for name in self._folders():
-            try:
-                versions = self.versions(name)
-            except StoreError as error:
-                models[name] = StoreError(error.code, error.reason)
-            else:
-                models |= {name: versions} if versions else {}
-        return models
+        try:
+            return sorted(entry.name for entry in self.root.iterdir() if NAME.fits(entry.name))
+        except OSError as error:
+            raise StoreError("unreadable", f"the store cannot be read: {cause(error)}") from None
 
     def versions(self, name: str) -> tuple[str, ...]:
         """Return the published versions of a model in ascending order. The result may be empty.
@@ -94,7 +87,7 @@ class Store:
         Raises:
             StoreError: `invalid_reference`, or `unreadable`.
         """
-        folder = self.root / check_name(name)
+        folder = self.root / NAME.check(name, "model name")
         if not _is_directory(folder):
             return ()
         try:
@@ -102,7 +95,7 @@ class Store:
         except OSError as error:
             reason = f"the folder of model '{name}' cannot be read: {cause(error)}"
             raise StoreError("unreadable", reason) from None
-        return tuple(sorted(filter(is_version, entries), key=version_key))
+        return tuple(sorted(filter(VERSION.fits, entries), key=version_key))
 
     def aliases(self) -> Mapping[str, AliasTarget]:
         """Return the target of each alias.
@@ -129,7 +122,7 @@ class Store:
                 another name or version than the folder.
             StoreError: `invalid_reference`, or `unknown_version`.
         """
-        folder = self.root / check_name(name) / check_version(version)
+        folder = self.root / NAME.check(name, "model name") / VERSION.check(version, "version")
         exists = _is_directory(folder.parent) and os.path.lexists(folder)
         if not exists or _is_unfinished(folder):
             raise StoreError("unknown_version", f"model '{name}' does not have version {version}")
@@ -147,23 +140,21 @@ class Store:
         """
         files = [self.root / ALIASES]
         with suppress(StoreError):
-            for name, versions in self.published().items():
-                for version in () if isinstance(versions, StoreError) else versions:
-                    folder = self.root / name / version
-                    files += [folder / file for file in (MANIFEST, WEIGHTS, CARD)]
+            for name in self.names():
+                with suppress(StoreError):
+                    folders = [self.root / name / version for version in self.versions(name)]
+                    files += [f / file for f in folders for file in (MANIFEST, WEIGHTS, CARD)]
         return tuple((str(file), *_file_state(file)) for file in files)
 
-    def require_new(self, name: str, version: str, alias: str | None = None) -> None:
+    def require_new(self, name: str, version: str) -> None:
         """Check that a version can be published: its number is valid and new.
-
-        If ``alias`` is not None, this alias will point at the version.
 
         Raises:
             StoreError: `version_exists`, `name_conflict`, `invalid_reference`, `invalid_aliases`,
                 or `unreadable`.
         """
-        check_version(version)
-        if name == alias or name in self.aliases():
+        VERSION.check(version, "version")
+        if name in self.aliases():
             reason = f"'{name}' is the name of an alias, so it cannot be the name of a model"
             raise StoreError("name_conflict", reason)
         if version in (published := self.versions(name)):
@@ -177,13 +168,12 @@ class Store:
         state: Mapping[str, ArrayLike],
         *,
         storage_dtype: StorageDtype = "float32",
-        alias: str | None = None,
     ) -> Artifact:
-        """Publish a version permanently, optionally point an alias at it, and return the artifact.
+        """Publish a version permanently, and return the artifact.
 
         The method writes the artifact to a temporary folder and loads it from there. So it never
-        publishes a version that the service would refuse. Then it renames the folder and changes
-        the alias. See `write_artifact` for the other arguments.
+        publishes a version that the service would refuse. Then it renames the folder. See
+        `write_artifact` for the arguments.
 
         Raises:
             ArtifactError: the artifact is not valid.
@@ -191,14 +181,8 @@ class Store:
                 `unsafe_path`, `locked`, or `not_writable`.
         """
         name, version = description.name, description.version
-        if alias is not None:
-            check_name(alias, "alias")
         with self._writing():
-            self.require_new(name, version, alias)
-            table = None
-            if alias is not None:
-                self._require_no_model(alias)
-                table = self._changed_table(alias, AliasTarget(name=name, version=version))
+            self.require_new(name, version)
             folder = self.root / name
             if os.path.lexists(folder) and not _is_directory(folder):
                 raise StoreError("unsafe_path", f"the path of model '{name}' is not a directory")
@@ -215,8 +199,6 @@ class Store:
                 rename(temporary, path)
             finally:
                 shutil.rmtree(temporary, ignore_errors=True)
-            if table is not None:
-                self._replace_table(table)
         return dataclasses.replace(artifact, path=path)
 
     def set_alias(
@@ -239,42 +221,31 @@ class Store:
                 also if the table of aliases would be too large for readers; `unknown_model`;
                 `unknown_version`; `name_conflict`; `invalid_reference`; `invalid_aliases`; `locked`
         """
-        check_name(alias, "alias")
+        NAME.check(alias, "alias")
         with self._writing():
-            self._require_no_model(alias)
+            if self.versions(alias):
+                reason = f"'{alias}' is the name of a model, so it cannot be the name of an alias"
+                raise StoreError("name_conflict", reason)
             current = self.aliases().get(alias)  # None for a missing alias
             if expected not in ("any", current):
                 targets = f"{current or 'nothing'}, not at {expected or 'nothing'}"
                 raise StoreError("alias_conflict", f"alias '{alias}' points at {targets}")
             resolve_reference(str(target), {}, self.versions)
-            self._replace_table(self._changed_table(alias, target))
+            self._change_table(alias, target)
 
     def remove_alias(self, alias: str) -> None:
         """Remove an alias. The errors are those of `set_alias`."""
-        check_name(alias, "alias")
+        NAME.check(alias, "alias")
         with self._writing():
             if alias not in self.aliases():
                 raise StoreError("unknown_model", f"no alias has the name '{alias}'")
-            self._replace_table(self._changed_table(alias, None))
+            self._change_table(alias, None)
 
-    def _folders(self) -> list[str]:
-        try:
-            return sorted(entry.name for entry in self.root.iterdir() if is_name(entry.name))
-        except OSError as error:
-            raise StoreError("unreadable", f"the store cannot be read: {cause(error)}") from None
-
-    def _changed_table(self, alias: str, target: AliasTarget | None) -> bytes:
-        """Return the new alias file, with another target of one alias. None removes the alias."""
-        table = {name: entry for name, entry in self.aliases().items() if name != alias}
-        return aliases_to_bytes(table if target is None else {**table, alias: target})
-
-    def _require_no_model(self, alias: str) -> None:
-        if self.versions(alias):
-            reason = f"'{alias}' is the name of a model, so it cannot be the name of an alias"
-            raise StoreError("name_conflict", reason)
-
-    def _replace_table(self, table: bytes) -> None:
-        replace_file(self.root / ALIASES, table, prefix=TEMPORARY)
+    def _change_table(self, alias: str, target: AliasTarget | None) -> None:
+        """Give one alias another target in the file of aliases. None removes the alias."""
+        table = {**self.aliases(), alias: target}
+        kept = {name: entry for name, entry in table.items() if entry is not None}
+        replace_file(self.root / ALIASES, aliases_to_bytes(kept), prefix=TEMPORARY)
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
@@ -289,7 +260,7 @@ class Store:
             raise StoreError("not_writable", reason) from error
 
     def _clear_leftovers(self) -> None:
-        folders = [self.root, *(self.root / name for name in self._folders())]
+        folders = [self.root, *(self.root / name for name in self.names())]
         for folder in filter(_is_directory, folders):
             for entry in folder.iterdir():
                 if not entry.name.startswith(TEMPORARY):

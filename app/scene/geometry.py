@@ -107,12 +107,10 @@ def to_viewer_frame(
             of the frame.
 
     Raises:
-        ValueError: a shape is wrong, or the viewpoint is not finite.
+        ValueError: a shape is wrong.
     """
     points = _array("positions", positions, (len(positions), 3))
     turns = np.zeros(len(points)) if yaws is None else _array("yaws", yaws, (len(points),))
-    if not all(map(math.isfinite, viewpoint)):
-        raise ValueError(f"viewpoint must be finite, not {tuple(viewpoint)}")
     cos, sin = math.cos(viewpoint.yaw), math.sin(viewpoint.yaw)
     dx, dy = points[:, 0] - viewpoint.x, points[:, 1] - viewpoint.y
     turned = np.stack([cos * dx + sin * dy, cos * dy - sin * dx, points[:, 2]], axis=1)

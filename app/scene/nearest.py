@@ -237,9 +237,9 @@ class NameIndex:
             yield Match(self._entries[row], _SAME_HEAD + (1 - _SAME_HEAD) * shared)
 
 
-def spelt_alike(name: str, names: Sequence[str], limit: int = 3) -> list[str]:
-    """Return the names with a similar spelling, most similar first, without reading words."""
-    matches = _alike(name[:LONGEST], [other[:LONGEST] for other in names], limit)
+def spelt_alike(name: str, names: Sequence[str]) -> list[str]:
+    """Return up to three names of similar spelling, most similar first, without reading words."""
+    matches = _alike(name[:LONGEST], [other[:LONGEST] for other in names], 3)
     return [names[row] for _, _, row in matches]
 
 

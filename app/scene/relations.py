@@ -81,24 +81,6 @@ def canonicalise(subject: End, relation: str, anchor: End) -> tuple[int, End, En
     return number - len(CANONICAL), anchor, subject
 
 
-def contradiction(
-    triples: Iterable[tuple[int, End, End]],
-) -> tuple[tuple[int, End, End], tuple[int, End, End]] | None:
-    """Return the first two triples that contradict each other, or None without a contradiction.
-
-    The triples (relation, subject, anchor) are canonical. Two triples contradict each other if
-    they differ only by exchanged ends: ``left(i, j)`` and ``left(j, i)``. The ends must be
-    *objects*: for classes with several instances, both triples can hold.
-    """
-    earlier: set[tuple[int, End, End]] = set()
-    for relation, subject, anchor in triples:
-        exchanged = (relation, anchor, subject)
-        if exchanged in earlier:
-            return exchanged, (relation, subject, anchor)
-        earlier.add((relation, subject, anchor))
-    return None
-
-
 def support_cycle(triples: Iterable[tuple[int, End, End]]) -> list[End] | None:
     """Return objects that support each other in a circle, each on or in the next, or None.
 

@@ -1,12 +1,12 @@
-"""A scene as observed by one viewer: objects, their relations, and their evidence about classes.
+"""A scene as observed by one viewer: objects, and their relations.
 
 `observe` derives the relations of a scene from the poses of its objects.
 
-Scenes contain instances (objects), but models only know classes. `pool_instances` converts the
-evidence about instances (`instance_evidence`) to evidence about classes. A relation is on if it
-holds, and off if it was observed not to hold. Relation a between classes x and y is on if at least
-one instance of x has relation a to an instance of y. Pairs of instances without an observed
-relation have no influence.
+Scenes contain instances (objects), but models only know classes. `pool_classes` and
+`pool_relations` convert the evidence about instances (`instance_evidence`) to evidence about
+classes. A relation is on if it holds, and off if it was observed not to hold. Relation a between
+classes x and y is on if at least one instance of x has relation a to an instance of y. Pairs of
+instances without an observed relation have no influence.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +29,7 @@ from app.scene.geometry import (
     is_world_fixed,
     to_viewer_frame,
 )
-from app.scene.relations import CANONICAL, contradiction
+from app.scene.relations import CANONICAL
 from app.scene.roles import RoleCounts
 
 A = len(CANONICAL)
@@ -54,9 +53,6 @@ class SceneObject:
             the position is unknown.
         size: extents (x, y, z) in metres before the rotation. None means that the size is unknown.
         yaw: rotation of the object about z in radians.
-
-    Raises:
-        ValueError: a value is outside its range.
     """
 
     id: str
@@ -66,25 +62,6 @@ class SceneObject:
     position: Point | None = None
     size: Point | None = None
     yaw: float = 0.0
-
-    def __post_init__(self) -> None:
-        if self.class_index is not None and self.class_index < 0:
-            raise ValueError(
-                f"class_index of {self.id!r} must not be negative, but is {self.class_index}"
-            )
-        if not 0.0 < self.confidence <= 1.0:
-            raise ValueError(f"confidence of {self.id!r} must be in (0, 1], not {self.confidence}")
-        position, size = self.position, self.size
-        if position is not None and not _are_finite(position):
-            raise ValueError(f"position of {self.id!r} must be three finite numbers (metres)")
-        if size is not None and not (_are_finite(size) and min(size) >= 0):
-            raise ValueError(f"size of {self.id!r} must be three numbers of at least 0 (metres)")
-        if self.yaw and not isfinite(self.yaw):
-            raise ValueError(f"yaw of {self.id!r} must be finite, not {self.yaw}")
-
-
-def _are_finite(point: Sequence[float]) -> bool:
-    return len(point) == 3 and isfinite(point[0]) and isfinite(point[1]) and isfinite(point[2])
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,11 +84,6 @@ class Scene:
         excluded: (A, n, n) bool, True for relations that the poses of the objects exclude, without
             the stated relations. Left and front also count if the objects are far apart. None means
             that no object has a position.
-
-    Raises:
-        ValueError: two objects have the same id, a triple is invalid, or `relations_complete` is
-            True although `relations` is None. A triple is invalid if it has an invalid index,
-            relates an object to itself or contradicts another triple.
     """
 
     objects: tuple[SceneObject, ...]
@@ -121,43 +93,6 @@ class Scene:
     profile: int | None = None
     poses: PoseRelations | None = field(default=None, compare=False, repr=False)
     excluded: NDArray[np.bool_] | None = field(default=None, compare=False, repr=False)
-
-    def __post_init__(self) -> None:
-        n = len(self.objects)
-        if len({thing.id for thing in self.objects}) < n:
-            raise ValueError("two objects of the scene have the same id; each id must be unique")
-        if self.relations is None:
-            if self.relations_complete:
-                raise ValueError(
-                    "relations_complete is True, but relations is None; pass a tuple of relations"
-                )
-        elif self.poses is None:
-            for triple in self.relations:
-                self._check(triple, n)
-            if clash := contradiction(self.relations):
-                (relation, i, j), _ = clash
-                first, second = self.objects[i].id, self.objects[j].id
-                raise ValueError(
-                    f"{CANONICAL[relation]!r} is stated from {first!r} to {second!r} and also from "
-                    f"{second!r} to {first!r}, but both cannot hold"
-                )
-        holds = None if self.poses is None else self.poses.holds
-        for name, array in (("poses", holds), ("excluded", self.excluded)):
-            if array is not None and array.shape != (A, n, n):
-                raise ValueError(f"{name} must have the shape {(A, n, n)}, not {array.shape}")
-
-    def _check(self, triple: tuple[int, int, int], n: int) -> None:
-        relation, subject, anchor = triple
-        if not 0 <= relation < A:
-            raise ValueError(f"a relation index must be from 0 to {A - 1}, not {relation}")
-        for end in (subject, anchor):
-            if not 0 <= end < n:
-                raise ValueError(f"the object index {end} of a relation is not from 0 to {n - 1}")
-        if subject == anchor:
-            raise ValueError(
-                f"{self.objects[subject].id!r} has the relation {CANONICAL[relation]} to itself; a "
-                "relation needs two different objects"
-            )
 
 
 # ------------------------------------------------------------------------- relations from poses
@@ -247,69 +182,6 @@ def boxes_of(
         elif thing.class_index is None:
             extents[row] = math.nan
     return centres, extents
-
-
-# -------------------------------------------------------------------------- evidence of classes
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ClassEvidence:
-    """The n distinct classes of a scene and their observed relations.
-
-    Attributes:
-        classes: (n,) int64, distinct indices of the classes, in ascending order.
-        counts: (n,) int64, number of instances of each class.
-        confidence: (n,) float64 in (0, 1], probability that at least one instance of the class
-            exists.
-        holds: (A, n, n) bool, True for relations that hold. ``holds[a, x, y]`` means that
-            classes[x] has relation a to classes[y].
-        observed: (A, n, n) bool, True for relations that were observed, whether they hold or not.
-            ``holds`` implies ``observed``.
-        room_type: index of the room type, or None if the room type is unknown.
-    """
-
-    classes: NDArray[np.int64]
-    counts: NDArray[np.int64]
-    confidence: NDArray[np.float64]
-    holds: NDArray[np.bool_]
-    observed: NDArray[np.bool_]
-    room_type: int | None
-
-
-def pool_instances(
-    classes: NDArray[np.int64],
-    confidence: NDArray[np.float64],
-    holds: NDArray[np.bool_],
-    observed: NDArray[np.bool_],
-    room_type: int | None = None,
-) -> ClassEvidence:
-    """Pool the instances of each class by a logical OR.
-
-    A relation between classes is on if the relation holds for at least one pair of instances. The
-    relation is off if it was observed for at least one pair, but holds for none. Otherwise the
-    relation is unobserved. If a class has a single instance, the relations between the class and
-    itself stay unobserved.
-
-    Args:
-        classes: (N,) index of the class of each instance.
-        confidence: (N,) probability that the instance exists. Instances count as independent
-            detections, so a class exists with probability 1 - prod(1 - confidence).
-        holds, observed: (A, N, N) bool, see `instance_evidence`.
-        room_type: index of the room type, or None if the room type is unknown.
-
-    Raises:
-        ValueError: the shapes do not match.
-    """
-    size = len(classes)
-    for name, array in (("holds", holds), ("observed", observed)):
-        if array.shape != (A, size, size):
-            raise ValueError(f"{name} must have the shape {(A, size, size)}, not {array.shape}")
-    if confidence.shape != (size,):
-        raise ValueError(f"confidence must have the shape {(size,)}, not {confidence.shape}")
-    labels = np.asarray(classes, dtype=np.int64)
-    distinct, _, row, counts, present = pool_classes(labels, np.asarray(confidence, np.float64))
-    class_holds, class_observed = pool_relations(row, len(distinct), holds, observed)
-    return ClassEvidence(distinct, counts, present, class_holds, class_observed, room_type)
 
 
 def instance_evidence(scene: Scene) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field
 from functools import cached_property
-from types import MappingProxyType
-from typing import Any, Final, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,6 +39,8 @@ class ObjectClass:
         ValueError: a name is empty, or the size is not three positive finite numbers.
     """
 
+    __pydantic_config__: ClassVar = {"extra": "forbid"}  # for classes in JSON
+
     label: str
     aliases: tuple[str, ...] = ()
     structure: bool = False
@@ -65,6 +66,7 @@ class LookUp(NamedTuple):
     certain: bool
 
 
+@dataclass(unsafe_hash=True, repr=False)
 class Vocabulary:
     """The V object classes and C room types of a model, in a fixed order. Do not change it.
 
@@ -72,6 +74,7 @@ class Vocabulary:
         objects: object classes. Their order defines the class indices.
         room_types: canonical names of the room types. Their order defines the room indices.
         room_aliases: maps room types to their synonyms.
+        parents: (V,) index of the parent of each class, -1 without a parent.
 
     Raises:
         ValueError: the list of classes is empty, a room type has an empty name, a key of
@@ -80,24 +83,23 @@ class Vocabulary:
             with the same `label_key`.
     """
 
-    def __init__(
-        self,
-        objects: Sequence[ObjectClass],
-        room_types: Sequence[str] = (),
-        room_aliases: Mapping[str, Sequence[str]] = MappingProxyType({}),
-    ) -> None:
-        if not objects:
+    objects: Sequence[ObjectClass]
+    room_types: Sequence[str] = ()
+    room_aliases: Mapping[str, Sequence[str]] = field(default_factory=dict, hash=False)
+
+    def __post_init__(self) -> None:
+        if not self.objects:
             raise ValueError("a vocabulary needs at least one object class")
-        self.objects = tuple(objects)
-        self.room_types = tuple(room_types)
-        self.room_aliases = {room: tuple(names) for room, names in room_aliases.items()}
+        self.objects = tuple(self.objects)
+        self.room_types = tuple(self.room_types)
+        self.room_aliases = {room: tuple(names) for room, names in self.room_aliases.items()}
         if others := self.room_aliases.keys() - set(self.room_types):
             raise ValueError(f"room_aliases names unknown room types: {sorted(others)}")
         names = [(entry.label, *entry.aliases) for entry in self.objects]
         clash = "two object classes have the name {name!r}: {first!r} and {second!r}"
         self._by_spelling, self._by_key = _tables(names, "an object class", clash)
         self._bare = {name: SceneObject(name, name, k) for name, k in self._by_spelling.items()}
-        self._parents = self._parent_indices()
+        self.parents = self._parent_indices()
         names = [(room, *self.room_aliases.get(room, ())) for room in self.room_types]
         clash = "room types {first!r} and {second!r} have the same name"
         self._room_by_spelling, self._room_by_key = _tables(names, "a room type", clash)
@@ -107,12 +109,10 @@ class Vocabulary:
         parents = np.full(len(self.objects), -1, dtype=np.int64)
         for index, entry in enumerate(self.objects):
             if entry.parent is not None:
-                if entry.parent not in index_of:
-                    raise ValueError(
-                        f"the parent {entry.parent!r} of {entry.label!r} is not the label of a "
-                        "class"
-                    )
-                parents[index] = index_of[entry.parent]
+                if (parent := index_of.get(entry.parent)) is None:
+                    text = f"the parent {entry.parent!r} of {entry.label!r}"
+                    raise ValueError(f"{text} is not the label of a class")
+                parents[index] = parent
         ancestors = parents.copy()
         while (ancestors >= 0).any():
             if (own := np.flatnonzero(ancestors == np.arange(len(ancestors)))).size:
@@ -122,21 +122,6 @@ class Vocabulary:
 
     def __len__(self) -> int:
         return len(self.objects)
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Vocabulary):
-            return NotImplemented
-        return (
-            self.objects == other.objects
-            and self.room_types == other.room_types
-            and self.room_aliases == other.room_aliases
-        )
-
-    def __hash__(self) -> int:
-        return hash((self.objects, self.room_types))
-
-    def __repr__(self) -> str:
-        return f"Vocabulary({len(self)} object classes, {len(self.room_types)} room types)"
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
@@ -155,11 +140,6 @@ class Vocabulary:
     def structure(self) -> NDArray[np.bool_]:
         """(V,) True for structural classes, which a model never proposes."""
         return _read_only([entry.structure for entry in self.objects])
-
-    @property
-    def parents(self) -> NDArray[np.int64]:
-        """(V,) index of the parent of each class, -1 without a parent."""
-        return self._parents
 
     @cached_property
     def anywhere(self) -> NDArray[np.bool_]:
@@ -265,7 +245,7 @@ class Vocabulary:
         return None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return JSON-compatible values that `from_dict` accepts."""
+        """Return JSON-compatible values, without absent parents and flags."""
         aliases = {room: list(names) for room, names in self.room_aliases.items()}
         return {
             "objects": [
@@ -281,28 +261,6 @@ class Vocabulary:
             ],
             "room_types": list(self.room_types),
         } | ({"room_aliases": aliases} if aliases else {})
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Build a vocabulary from the result of `to_dict`.
-
-        All fields of a class except ``label``, and ``room_aliases``, are optional.
-
-        Raises:
-            ValueError: a field is missing, unknown or of the wrong type. `Vocabulary` lists more
-                reasons.
-        """
-        if not isinstance(values.get("objects"), list):
-            raise ValueError("a vocabulary must have the field 'objects' with a list of classes")
-        rooms = values.get("room_types", [])
-        if not isinstance(rooms, list):
-            raise ValueError(f"'room_types' must be a list, not {rooms!r}")
-        if not _are_strings(rooms):
-            raise ValueError("'room_types' must be a list of strings")
-        aliases = values.get("room_aliases", {})
-        if not isinstance(aliases, Mapping) or not all(map(_are_strings, aliases.values())):
-            raise ValueError("'room_aliases' must map room types to lists of strings")
-        return cls([_object_class(entry) for entry in values["objects"]], rooms, aliases)
 
 
 def do_not_fit(inner: NDArray[np.float64], outer: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -339,39 +297,5 @@ def _read_only(values: ArrayLike) -> NDArray[Any]:
     return array
 
 
-_FIELDS: Final = tuple(field.name for field in fields(ObjectClass))
-
-
-def _are_strings(values: object) -> bool:
-    return isinstance(values, list) and all(isinstance(value, str) for value in values)
-
-
 def _are_extents(size: Sequence[float]) -> bool:
     return len(size) == 3 and all(math.isfinite(side) and side > 0 for side in size)
-
-
-def _object_class(entry: Any) -> ObjectClass:
-    if not isinstance(entry, Mapping) or not isinstance(entry.get("label"), str):
-        raise ValueError(f"an object class must be a mapping with a string 'label', not {entry!r}")
-    if unknown := sorted(set(entry) - set(_FIELDS)):
-        raise ValueError(
-            f"object class {entry['label']!r} has unknown fields {unknown}; the known fields are "
-            f"{', '.join(_FIELDS)}"
-        )
-    aliases, parent = entry.get("aliases", []), entry.get("parent")
-    if not _are_strings(aliases):
-        raise ValueError(f"aliases of {entry['label']!r} must be a string list, not {aliases!r}")
-    for name in ("structure", "anywhere"):
-        if not isinstance(flag := entry.get(name, False), bool):
-            raise ValueError(f"{name} of {entry['label']!r} must be a boolean, not {flag!r}")
-    if parent is not None and not isinstance(parent, str):
-        raise ValueError(f"parent of {entry['label']!r} must be a string, not {parent!r}")
-    size = entry.get("size")
-    if size is not None:
-        try:
-            size = tuple(float(side) for side in size)
-        except (TypeError, ValueError):
-            raise ValueError(
-                f"size of {entry['label']!r} must be three numbers, not {size!r}"
-            ) from None
-    return ObjectClass(**{**entry, "aliases": tuple(aliases), "size": size})

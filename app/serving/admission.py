@@ -1,4 +1,4 @@
-"""Admission: when a request starts, and in which thread its computation runs.
+"""Admission: when a request starts, in which thread it runs, and how many bytes requests hold.
 
 Requests of different cost wait in different lanes:
 
@@ -25,24 +25,33 @@ import asyncio
 import os
 import threading
 from collections import deque
-from collections.abc import Awaitable, Callable, Hashable
+from collections.abc import Awaitable, Callable, Hashable, Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from time import monotonic
 from typing import Final, TypeVar
 
-from app.errors import DeadlinePassedError, DisconnectedError, QueueFullError
+from starlette.types import Receive
+
+from app import errors
+from app.settings import Settings
 from scene_client.schemas.generate import MAX_SWEEPS
 
 T = TypeVar("T")
 
 SHARE: Final = 4
-"""One client holds at most this part of a lane: a quarter."""
+"""One client holds at most this part of a lane, and of the bytes of all bodies: a quarter."""
 
 QUICK_SLOTS: Final = 8
 SLOW_SLOTS: Final = 2
 """Number of requests of a lane that run at a time."""
+
+SMALL: Final = 16 * 1024
+"""Maximum size in bytes of a body that the event loop parses, in less than a millisecond.
+
+The service accepts such a body if it arrives in one piece, also when other bodies fill the budget.
+"""
 
 # Time in seconds between two checks of the client's connection during a computation in a thread.
 _LOOK: Final = 0.25
@@ -97,7 +106,7 @@ class Lane:
             DeadlinePassedError: the deadline passed while the request was waiting.
         """
         if weight and self.is_full(client, weight):
-            raise QueueFullError("The queue, or the share of this client in it, is full.")
+            raise errors.QueueFullError("The queue, or the share of this client in it, is full.")
         self.weight += weight
         self._weights[client] = self._weights.get(client, 0) + weight
         if self._free_slots and not self._queues:
@@ -117,7 +126,7 @@ class Lane:
             self.leave(client, weight)
             if isinstance(error, TimeoutError):
                 detail = "The deadline passed before the request started."
-                raise DeadlinePassedError(detail) from None
+                raise errors.DeadlinePassedError(detail) from None
             raise
 
     def leave(self, client: str, weight: int) -> None:
@@ -187,7 +196,7 @@ class Ticket:
             DeadlinePassedError: the deadline has passed.
         """
         if monotonic() >= self.deadline:
-            raise DeadlinePassedError("The deadline passed before the computation started.")
+            raise errors.DeadlinePassedError("The deadline passed before the computation started.")
 
     async def check_connected(self) -> None:
         """Check that the client is still connected.
@@ -196,7 +205,7 @@ class Ticket:
             DisconnectedError: the client has disconnected.
         """
         if self.is_gone is not None and await self.is_gone():
-            raise DisconnectedError("The client has disconnected.")
+            raise errors.DisconnectedError("The client has disconnected.")
 
 
 class Admission:
@@ -248,7 +257,7 @@ async def in_thread(
     def compute() -> tuple[T, float]:
         # The computation of an ended request is still in the executor's queue, so skip it here.
         if has_ended:
-            raise DeadlinePassedError("The request ended before the computation started.")
+            raise errors.DeadlinePassedError("The request ended before the computation started.")
         began = monotonic()
         ticket.waited += began - called_at
         return call(lambda: has_ended), monotonic() - began
@@ -261,7 +270,9 @@ async def in_thread(
             if future.done():
                 return future.result()
             if left <= _LOOK:
-                raise DeadlinePassedError("The deadline passed before the computation finished.")
+                raise errors.DeadlinePassedError(
+                    "The deadline passed before the computation finished."
+                )
             await ticket.check_connected()
     finally:
         has_ended = True
@@ -269,3 +280,98 @@ async def in_thread(
         # The frame, the future and its error form a reference cycle. Without this deletion, the
         # cycle would keep the whole request in memory until the garbage collector runs.
         del future
+
+
+class Bodies:
+    """The bodies of all requests and answers in progress. Their total size is bounded.
+
+    One client holds at most a quarter of the budget, or a single body.
+
+    Attributes:
+        held: total size of the bodies in bytes.
+        patience: maximum time in seconds to receive a body or to send an answer.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._budget = settings.held_body_bytes
+        self.patience = settings.client_timeout
+        self._of_clients: dict[str, int] = {}
+        self.held = 0
+
+    @contextmanager
+    def hold(self, client: str, size: int) -> Iterator[None]:
+        """Count a large answer of a client until the ``with`` block ends.
+
+        Raises:
+            BodiesFullError: the budget is full.
+        """
+        self._add(client, size)
+        try:
+            self._check(client, size)
+            yield
+        finally:
+            self.release(client, size)
+
+    def release(self, client: str, size: int) -> None:
+        """Stop counting a body of a client."""
+        self._add(client, -size)
+
+    async def read(self, receive: Receive, client: str, limit: int, length: bytes = b"") -> bytes:
+        """Read a whole body of at most ``limit`` bytes. The caller must `release` it.
+
+        Args:
+            length: the header Content-Length, or an empty text.
+
+        Raises:
+            ServiceError: the body is too large, too slow or incomplete, or the budget is full.
+        """
+        # int() must not parse very long numbers, so the length is checked first.
+        if length.isdigit() and (len(length) > 18 or int(length) > limit):
+            raise _too_large(limit)
+        body: bytes | bytearray = b""
+        try:
+            async with asyncio.timeout(self.patience):
+                more = True
+                while more:
+                    message = await receive()
+                    if message["type"] != "http.request":
+                        detail = "The connection closed before the body was complete."
+                        raise errors.BadRequestError(detail)
+                    part, more = message.get("body", b""), message.get("more_body", False)
+                    is_whole = not (more or body)
+                    self._add(client, len(part))
+                    if is_whole:
+                        body = part
+                    else:
+                        body = bytearray(body) if isinstance(body, bytes) else body
+                        body += part
+                    if len(body) > limit:
+                        raise _too_large(limit)
+                    if not (is_whole and len(body) <= SMALL):
+                        self._check(client, len(body))
+        except BaseException as error:
+            self.release(client, len(body))
+            if isinstance(error, TimeoutError):
+                detail = f"The body did not arrive within {self.patience:g} seconds."
+                raise errors.RequestTimeoutError(detail) from None
+            raise
+        return bytes(body)
+
+    def _add(self, client: str, size: int) -> None:
+        self.held += size
+        of_client = self._of_clients.pop(client, 0) + size
+        if of_client:
+            self._of_clients[client] = of_client
+
+    def _check(self, client: str, size: int) -> None:
+        share = max(self._budget // SHARE, size)
+        if self.held > self._budget or self._of_clients.get(client, 0) > share:
+            detail = (
+                f"All bodies in progress exceed {self._budget} bytes together, or those of this "
+                f"client {share} bytes."
+            )
+            raise errors.BodiesFullError(detail)
+
+
+def _too_large(limit: int) -> errors.BodyTooLargeError:
+    return errors.BodyTooLargeError(f"The body must not be larger than {limit} bytes.")

@@ -107,9 +107,9 @@ class Metrics:
             "Attempts to change the served models: refreshes, alias changes, polls of the store",
             ("change", "outcome"),
         )
-        self._started = gauge(
+        gauge(
             "scene_start_time_seconds", "Unix time when the process began to load its models"
-        )
+        ).set(time.time())
         self._ready = gauge(
             "scene_ready_time_seconds", "Unix time when the default model first answered; 0 before"
         )
@@ -122,10 +122,6 @@ class Metrics:
         # series are kept here: of requests, and of the questions of each served model.
         self._of_requests: dict[tuple[str, str, str], tuple[Counter, Histogram]] = {}
         self._of_model: dict[Key, dict[str, tuple[Histogram, Histogram, Histogram]]] = {}
-
-    def started(self) -> None:
-        """Record that the process begins to load its models."""
-        self._started.set(time.time())
         for change in get_args(Change):
             for outcome in get_args(Outcome):
                 self._reloads.labels(change, outcome)

@@ -10,15 +10,12 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Final
-
-from pydantic import BaseModel
 
 from app.errors import (
     ModelUnavailableError,
@@ -34,7 +31,7 @@ from app.registry.model_set import EMPTY
 from app.scene.nearest import spelt_alike
 from app.scene.scene import Scene, SceneObject, observe
 from app.scene.vocabulary import Vocabulary
-from scene_client.schemas import Failure, ModelReference
+from scene_client.schemas import Failure
 
 DEFAULT = "default"
 Key = tuple[str, str]
@@ -44,60 +41,22 @@ _UNKNOWN = {"unknown_model", "unknown_version", "invalid_reference"}
 
 
 @dataclass(frozen=True, eq=False)
-class ServedModel:
-    """A model that has passed its warm-up: it has answered each question once.
-
-    Attributes:
-        artifact: weights, vocabulary and calibration of the model.
-    """
-
-    artifact: Artifact
-    _documents: dict[str, bytes] = field(default_factory=dict)
-    _building: threading.Lock = field(default_factory=threading.Lock)
-
-    @cached_property
-    def reference(self) -> ModelReference:
-        """Name, version, variant and digest of the model, in the form of the field `model`."""
-        manifest = self.artifact.manifest
-        return ModelReference(
-            name=manifest.name,
-            version=manifest.version,
-            variant=manifest.variant,
-            digest=self.artifact.digest,
-        )
-
-    @cached_property
-    def key(self) -> Key:
-        """Name and version of the model."""
-        return self.artifact.manifest.name, self.artifact.manifest.version
-
-    @cached_property
-    def vocabulary(self) -> Vocabulary:
-        """Object classes and room types of the model."""
-        return self.artifact.vocabulary
-
-    def document(self, name: str, build: Callable[[ServedModel], BaseModel]) -> bytes:
-        """Return an answer about this model as JSON. It never changes, so it is built once."""
-        with self._building:
-            if name not in self._documents:
-                self._documents[name] = build(self).model_dump_json().encode()
-        return self._documents[name]
-
-
-@dataclass(frozen=True, eq=False)
 class ServedModels:
     """A snapshot of served models, refused versions and aliases.
 
     Attributes:
         store: snapshot of the registry, with all versions and aliases. The models that failed
             their warm-up are among its failures.
-        served: dictionary from (name, version) to the served model. It contains all usable models.
     """
 
     store: ModelSet
-    served: Mapping[Key, ServedModel]
 
-    def resolve(self, reference: str) -> ServedModel:
+    @property
+    def served(self) -> Mapping[Key, Artifact]:
+        """Maps the (name, version) of each usable model to the model."""
+        return self.store.artifacts
+
+    def resolve(self, reference: str) -> Artifact:
         """Return the model that an alias, `name` or `name@version` points at.
 
         Raises:
@@ -109,14 +68,13 @@ class ServedModels:
         if (cached := self._resolved.get(reference)) is not None:
             return cached
         try:
-            manifest = self.store.resolve(reference).manifest
+            model = self._resolved[reference] = self.store.resolve(reference)
         except (StoreError, ArtifactError) as error:
             if reference == DEFAULT:
                 raise NotReadyError("The default model is not usable.") from None
             if isinstance(error, StoreError) and error.code in _UNKNOWN:
                 raise self.unknown(reference) from None
             raise ModelUnavailableError("The service refused to load this model.") from None
-        model = self._resolved[reference] = self.served[manifest.name, manifest.version]
         return model
 
     def unknown(self, reference: str) -> UnknownModelError:
@@ -138,10 +96,10 @@ class ServedModels:
     def with_alias(self, alias: str, target: AliasTarget) -> ServedModels:
         """Return a copy of the snapshot in which an alias has another target."""
         aliases = MappingProxyType({**self.store.aliases, alias: target})
-        return replace(self, store=replace(self.store, aliases=aliases))
+        return ServedModels(replace(self.store, aliases=aliases))
 
     @cached_property
-    def _resolved(self) -> dict[str, ServedModel]:
+    def _resolved(self) -> dict[str, Artifact]:
         # The cache contains only valid references, because clients can send any number of invalid
         # references. The contents of the store limit the number of valid references.
         return {}
@@ -168,7 +126,7 @@ class ServedModels:
     @cached_property
     def generation(self) -> str:
         """Digest of the served versions and aliases. Equal digests mean equal states."""
-        versions = {"@".join(key): model.artifact.digest for key, model in self.served.items()}
+        versions = {"@".join(key): model.digest for key, model in self.served.items()}
         aliases = {alias: str(target) for alias, target in self.store.aliases.items()}
         text = json.dumps([versions, aliases], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -192,50 +150,28 @@ class ServedModels:
         }
 
 
-NO_MODELS: Final = ServedModels(EMPTY, MappingProxyType({}))
+NO_MODELS: Final = ServedModels(EMPTY)
 """The snapshot before the service has loaded its models."""
-
-
-def prepare(store: ModelSet, previous: ServedModels) -> ServedModels:
-    """Warm up every verified model. Return the models that can be served, and all failures.
-
-    If ``previous`` already serves a model from the same artifact, the function skips its warm-up.
-    """
-    served: dict[Key, ServedModel] = {}
-    entries = dict(store.entries)
-    for key, artifact in store.entries.items():
-        if not isinstance(artifact, Artifact):
-            continue
-        before = previous.served.get(key)
-        if before is not None and before.artifact is artifact:
-            served[key] = before
-            continue
-        try:
-            warm_up(artifact)
-        except Exception:
-            # A broken model may raise any exception. The service must still serve other models.
-            _logger.exception("the warm-up of model %s failed", "@".join(key))
-            entries[key] = ArtifactError(
-                "warm_up_failed", "the files are valid, but the model could not answer a question"
-            )
-        else:
-            served[key] = ServedModel(artifact)
-    return ServedModels(replace(store, entries=MappingProxyType(entries)), MappingProxyType(served))
 
 
 def warm_up(artifact: Artifact) -> None:
     """Ask each question about three scenes: with relations, without relations, and with poses.
 
     Raises:
-        ValueError: an answer contains a number that is not finite.
-        Exception: any other error of the model.
+        ArtifactError: `warm_up_failed` if the model could not answer a question.
     """
     related = _scene(artifact.vocabulary)
     bare = replace(related, relations=None)
     posed = observe(bare, typical_sizes=artifact.vocabulary.sizes)
-    for question in QUESTIONS:
-        for answer in question.warm_up(artifact, (related, bare, posed)):
-            written(answer)
+    try:
+        for question in QUESTIONS:
+            for answer in question.warm_up(artifact, (related, bare, posed)):
+                written(answer)
+    except Exception:
+        # A broken model may raise any exception. The service must still serve other models.
+        _logger.exception("the warm-up of model %s failed", "@".join(artifact.key))
+        reason = "the files are valid, but the model could not answer a question"
+        raise ArtifactError("warm_up_failed", reason) from None
 
 
 def _scene(vocabulary: Vocabulary) -> Scene:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from time import monotonic, perf_counter
 from typing import Final, TypeVar
@@ -11,10 +11,10 @@ from app.questions.answer import Fields, SizeLimit, envelope
 from app.questions.generate import STEPS
 from app.questions.names import LookUps
 from app.questions.question import Question
-from app.questions.reading import Limits, Reading, read_scene
-from app.serving.admission import Admission, Ticket, in_thread
-from app.serving.metrics import Metrics
-from app.serving.models import Key, ServedModel, ServedModels
+from app.questions.reading import Reading, read_scene
+from app.serving.admission import Ticket, in_thread
+from app.serving.models import Key, ServedModels
+from app.serving.runtime import Runtime
 from scene_client.schemas import SceneRequest
 
 RequestT = TypeVar("RequestT", bound=SceneRequest)
@@ -75,28 +75,27 @@ class Request:
     Attributes:
         id: request id. Every answer contains it.
         ticket: place of the request in a lane, and its deadline.
-        admission: lanes and threads of the service.
-        models: snapshot of the models.
-        limits: limits on the scenes and answers of the request.
-        metrics: metrics of the service.
         record: values for the log and the metrics.
+        runtime: lanes, threads, limits and metrics of the service.
+        models: snapshot of the models.
         look_ups: searches for classes similar to unknown labels, shared by all scenes of the
             request.
     """
 
     id: str
     ticket: Ticket
-    admission: Admission
-    models: ServedModels
-    limits: Limits
-    metrics: Metrics
     record: Record
+    runtime: Runtime
+    models: ServedModels
     look_ups: LookUps = field(default_factory=LookUps)
 
-    async def answer(self, question: Question[RequestT], scene: RequestT) -> Fields:
+    async def answer(
+        self, question: Question[RequestT], scene: RequestT, most_bytes: int | None = None
+    ) -> Fields:
         """Ask the model in the field `model` of a scene one question.
 
-        The answer has the fields of `scene_client.schemas.Answer` and of the question.
+        The answer has the fields of `scene_client.schemas.Answer` and of the question, and at most
+        ``most_bytes`` bytes. By default, this limit is the limit of the service.
 
         Raises:
             UnknownModelError: the model does not exist.
@@ -104,22 +103,22 @@ class Request:
             RequestError: the scene is invalid, or the answer would be too large.
             QueueFullError, DeadlinePassedError, DisconnectedError: see `admission`.
         """
-        model = self.models.resolve(scene.model)
-        self.record.models.add(model.key)
-        artifact, admission, ticket = model.artifact, self.admission, self.ticket
+        artifact = self.models.resolve(scene.model)
+        self.record.models.add(artifact.key)
+        limits, admission, ticket = self.runtime.limits, self.runtime.admission, self.ticket
 
         def read() -> tuple[Reading, partial[Fields]]:
             reading = read_scene(
                 scene,
-                model.vocabulary,
-                self.limits,
+                artifact.vocabulary,
+                limits,
                 self.look_ups,
                 roles=None if artifact.places is None else artifact.places.roles,
                 profiles=artifact.manifest.vocabulary.profiles,
                 may_be_empty=question.samples,
             )
             options = question.read(scene, artifact, reading)
-            limit = SizeLimit(reading, self.limits.answer_bytes)
+            limit = SizeLimit(reading, limits.answer_bytes if most_bytes is None else most_bytes)
             call = partial(question.answer, artifact, reading.scene, **options, size_limit=limit)
             return reading, call
 
@@ -138,7 +137,7 @@ class Request:
             rows = ask.keywords["count"]
             weight = rows * (ask.keywords["steps"] or STEPS)
             # The models of a client take turns, too.
-            await ticket.enter(admission.draws, weight, line=(ticket.client, model.key))
+            await ticket.enter(admission.draws, weight, line=(ticket.client, artifact.key))
             fields, seconds = await in_thread(
                 lambda stop: ask(stop=stop), ticket, admission.drawing
             )
@@ -151,23 +150,19 @@ class Request:
         else:
             answered, seconds = await in_thread(lambda _: compute(), ticket, admission.worker)
             reading, fields = answered
-        self._record(model, question.name, rows, seconds)
-        answer = envelope(scene, self.id, model.reference, reading)
+        self._record(artifact.key, question.name, rows, seconds)
+        answer = envelope(scene, self.id, artifact.reference, reading)
         warnings = [*reading.warnings, *fields.pop("warnings", ())]
         return answer | fields | {"warnings": warnings}
 
-    def _record(self, model: ServedModel, name: str, rows: int, seconds: float) -> None:
+    def _record(self, model: Key, name: str, rows: int, seconds: float) -> None:
         """Record the times of a computation, for log and metrics."""
         record, waited = self.record, self.ticket.waited
         new = waited - (record.queue_seconds or 0.0)
         record.queue_seconds = waited
         record.compute_seconds = (record.compute_seconds or 0.0) + seconds
         record.answered_at = perf_counter()
-        self.metrics.computed(model.key, name, rows, new, seconds)
-
-    def with_answer_bytes(self, left: int) -> Request:
-        """Return a copy of the request that limits the next answer to ``left`` bytes."""
-        return replace(self, limits=replace(self.limits, answer_bytes=left))
+        self.runtime.metrics.computed(model, name, rows, new, seconds)
 
 
 QUICK_OBJECTS: Final = 32

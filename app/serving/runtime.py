@@ -16,10 +16,9 @@ from app.compiling import check_cache, progress
 from app.inference.kernels import KERNELS
 from app.questions.reading import Limits
 from app.registry import AliasTarget, Store, StoreError, StoreState, load_model_set
-from app.serving.admission import Admission
-from app.serving.bodies import Bodies
+from app.serving.admission import Admission, Bodies
 from app.serving.metrics import Change, Metrics
-from app.serving.models import DEFAULT, NO_MODELS, Key, ServedModels, prepare
+from app.serving.models import DEFAULT, NO_MODELS, Key, ServedModels, warm_up
 from app.settings import Settings
 from scene_client.schemas import AliasAnswer, AliasRequest, RefreshAnswer
 
@@ -39,7 +38,8 @@ class Runtime:
     Attributes:
         admission: lanes of requests, and worker threads.
         bodies: bodies of the requests and answers in progress.
-        draining: whether the service is shutting down.
+        draining: whether the service is shutting down. Readiness checks then fail, and connections
+            close after their answers.
         limits: limits on scenes and answers.
         metrics: metrics of the service.
         models: current snapshot of the models; `NO_MODELS` before the start.
@@ -72,17 +72,12 @@ class Runtime:
             raise errors.DrainingError
         self.models.resolve(DEFAULT)
 
-    def drain(self) -> None:
-        """Answer readiness checks with 503, and close connections after answers."""
-        self.draining = True
-
     async def start(self) -> None:
         """Load, verify and warm up all versions in the store.
 
         Afterwards, `models.failures` contains the refused versions and aliases.
         """
         sys.setswitchinterval(_SWITCH_INTERVAL)
-        self.metrics.started()
         check_cache()
         # The models load on this thread, because the service has no requests yet. Another thread
         # would cost time and memory.
@@ -214,9 +209,8 @@ class Runtime:
         # Read the state before the files. So the next check of the store finds changes that other
         # processes make during the load.
         self._loaded_state = self._store.state()
-        models = self.models
         with progress(KERNELS):
-            return prepare(load_model_set(self._store, models.store), models)
+            return ServedModels(load_model_set(self._store, self.models.store, warm_up))
 
     def _target(self, reference: str) -> AliasTarget:
         try:

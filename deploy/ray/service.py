@@ -38,7 +38,7 @@ class Replica:
 
     def __del__(self) -> None:
         """Refuse further requests. Ray Serve calls this method after the requests in progress."""
-        self._runtime.drain()
+        self._runtime.draining = True
 
 
 app = Replica.bind()

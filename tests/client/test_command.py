@@ -131,27 +131,6 @@ def test_everything_has_a_table(scene: Any, line: str, words: tuple[str, ...]) -
         assert word in done.stdout
 
 
-def test_scenes_are_drawn(scene: Any, tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
-    path = tmp_path / "out.png"
-    done = scene("generate", "--room-type", "office", "--count", "2", "--plot", str(path))
-    assert done.exit_code == 0, done.stderr
-    assert path.read_bytes().startswith(b"\x89PNG")
-    done = scene("generate", "--plot", str(tmp_path / "out.doc"))
-    assert done.exit_code == 2
-    assert "cannot draw the picture" in done.stderr
-
-
-def test_plot_without_matplotlib_names_the_package(
-    scene: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("scene_client.command.find_spec", lambda _: None)
-    done = scene("generate", "--plot", str(tmp_path / "out.png"))
-    assert done.exit_code == 2
-    assert "pip install matplotlib" in done.stderr
-    assert done.stdout == ""
-
-
 SCENES = [
     {
         "scene_id": "one", "room_type": "bedroom",

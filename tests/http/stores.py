@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from app.registry import Calibration, Counts, Offsets, Store, VocabularyEntry
+from app.registry import AliasTarget, Calibration, Counts, Offsets, Store, VocabularyEntry
 from app.scene.relations import CANONICAL
 from app.scene.vocabulary import ObjectClass, Vocabulary
 from tests.registry.small_artifacts import JUDGING, description
@@ -100,8 +100,9 @@ def publish(
         machine.state_dict()
         | ({} if offsets is None else offsets.tensors())
         | ({} if counts is None else counts.tensors()),
-        alias=alias,
     )
+    if alias is not None:
+        Store(root).set_alias(alias, AliasTarget(name=name, version=version))
 
 
 def make_store(root: Path) -> Path:

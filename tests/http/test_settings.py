@@ -115,7 +115,6 @@ def test_origins_are_listed_as_browsers_send_them(
         ("SCENE_HTTP_PORT", "80", "unknown setting"),
         ("SCENE_ZZ", "1", "unknown setting; app/settings.py lists the settings"),
         ("SCENE_WORKERS", "2", "this setting is removed: a replica is one process"),
-        ("SCENE_SIGNING_KEY", "a.pem", "this setting is removed: a store is a folder"),
         ("SCENE_STREAM_RESUME", "1", "this setting is removed: the service has no streams"),
         ("SCENE_PORT", "tcp://10.0.0.1:8000", "Input should be a valid integer"),
     ],

@@ -14,6 +14,8 @@ import pytest
 from app.registry import (
     AlarmLine,
     AlarmLines,
+    AliasTarget,
+    Artifact,
     ArtifactError,
     Calibration,
     CountSlope,
@@ -21,6 +23,7 @@ from app.registry import (
     Judgement,
     Manifest,
     Misplaced,
+    Store,
     StoreError,
     VocabularyEntry,
 )
@@ -143,3 +146,13 @@ def read_manifest(directory: Path) -> Manifest:
 def refused(code: str) -> pytest.RaisesExc[ArtifactError | StoreError]:
     """Expect an error of the registry with this code."""
     return pytest.raises((ArtifactError, StoreError), check=lambda error: error.code == code)
+
+
+def publish_as(
+    store: Store, alias: str, described: Description, weights: Any, **options: Any
+) -> Artifact:
+    """Publish a version, and point an alias at it."""
+    artifact = store.publish(described, weights, **options)
+    name, version = artifact.key
+    store.set_alias(alias, AliasTarget(name=name, version=version))
+    return artifact

@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from app.registry import ModelSet, Store, StoreError, load_model_set
-from tests.registry.small_artifacts import description, state
+from app.registry import AliasTarget, ModelSet, Store, StoreError, load_model_set
+from tests.registry.small_artifacts import description, publish_as, state
 
 pytestmark = pytest.mark.system
 
@@ -49,7 +49,7 @@ def publish_until(root: Path, steps: int) -> None:
 
     sys.addaudithook(hook)
     os.fsync = watched
-    store.publish(description(version="2.0.0"), WEIGHTS, alias="default")
+    publish_as(store, "default", description(version="2.0.0"), WEIGHTS)
     os._exit(0)
 
 
@@ -58,7 +58,7 @@ def race(root: Path, results: Path, versions: int) -> None:
     store, won = Store(root), []
     for major in range(1, versions + 1):
         try:
-            store.publish(description(version=f"{major}.0.0"), WEIGHTS, alias="default")
+            store.publish(description(version=f"{major}.0.0"), WEIGHTS)
         except StoreError as error:
             if error.code != "version_exists":
                 raise
@@ -93,7 +93,7 @@ def check_survivor(root: Path) -> tuple[str, str, bool]:
     assert not models.failures
     newest, default = models.versions["tiny"][-1], models.resolve("default").manifest.version
     store = Store(root, lock_timeout=5)
-    store.publish(description(version="3.0.0"), WEIGHTS, alias="default")
+    publish_as(store, "default", description(version="3.0.0"), WEIGHTS)
     assert not leftovers(root)
     assert load_model_set(store).resolve("default").manifest.version == "3.0.0"
     return newest, default, left
@@ -101,7 +101,7 @@ def check_survivor(root: Path) -> tuple[str, str, bool]:
 
 def test_a_publisher_may_stop_before_any_step(tmp_path: Path) -> None:
     published = tmp_path / "published"
-    Store(published).publish(description(), WEIGHTS, alias="default")
+    publish_as(Store(published), "default", description(), WEIGHTS)
     seen, ended = set(), None
     for steps in range(200):
         root = tmp_path / str(steps)
@@ -123,6 +123,8 @@ def test_a_publisher_may_stop_before_any_step(tmp_path: Path) -> None:
 
 def test_concurrent_publishers_and_readers(tmp_path: Path) -> None:
     root, versions = tmp_path / "store", 12
+    Store(root).publish(description(version="0.0.1"), WEIGHTS)
+    Store(root).set_alias("default", AliasTarget(name="tiny"))
     results = [tmp_path / f"{n}.json" for n in range(4)]
     publishers = [start(race, root, path, versions) for path in results]
     models, highest, deadline = ModelSet({}, {}), 0, time.monotonic() + 60
@@ -130,10 +132,9 @@ def test_concurrent_publishers_and_readers(tmp_path: Path) -> None:
         assert time.monotonic() < deadline
         models = load_model_set(Store(root), models)
         assert not models.failures
-        if "default" in models.aliases:
-            version = int(models.resolve("default").manifest.version.split(".")[0])
-            assert version >= highest
-            highest = version
+        version = int(models.resolve("default").manifest.version.split(".")[0])
+        assert version >= highest
+        highest = version
     assert [exit_code(process) for process in publishers] == [0] * 4
     won = sorted(major for path in results for major in json.loads(path.read_text()))
     assert won == list(range(1, versions + 1)), "each version was published once"

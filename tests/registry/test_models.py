@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from app.registry import AliasTarget, ArtifactError, Store, load_model_set
-from tests.registry.small_artifacts import description, refused, rewrite_manifest, state
+from tests.registry.small_artifacts import description, publish_as, refused, rewrite_manifest, state
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def test_holds_every_version_and_alias(store: Store) -> None:
 
 def test_a_snapshot_does_not_change_with_the_store(store: Store) -> None:
     models = load_model_set(store)
-    store.publish(description(version="3.0.0"), state(), alias="newest")
+    publish_as(store, "newest", description(version="3.0.0"), state())
     assert models.resolve("tiny").manifest.version == "2.0.0"
     assert "newest" not in models.aliases
     with pytest.raises(TypeError):
@@ -129,7 +129,7 @@ def test_a_publication_between_two_looks_leaves_no_alias_dangling(store: Store) 
         def overtake(self) -> None:
             if not self.overtaken:
                 self.overtaken = True
-                store.publish(description(name="zeta"), state(), alias="default")
+                publish_as(store, "default", description(name="zeta"), state())
 
         def aliases(self) -> Mapping[str, AliasTarget]:
             found = super().aliases()

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.registry import AliasTarget
-from app.registry.references import is_name, is_version, resolve_reference, version_key
+from app.registry.references import NAME, VERSION, resolve_reference, version_key
 from tests.registry.small_artifacts import refused
 
 VERSIONS = {"rooms": ("1.0.0", "1.9.0", "1.10.0"), "halls": ("0.1.0",)}
@@ -63,11 +63,11 @@ def test_refuses(reference: str, code: str) -> None:
 
 @given(st.text(max_size=70))
 def test_accepted_names_and_versions_are_plain_file_names(text: str) -> None:
-    if is_name(text) or is_version(text):
+    if NAME.fits(text) or VERSION.fits(text):
         assert text
         assert not set(text) - set("abcdefghijklmnopqrstuvwxyz0123456789_-.")
         assert not text.startswith(".")
-        assert not (is_name(text) and "." in text)
+        assert not (NAME.fits(text) and "." in text)
 
 
 parts = st.tuples(*[st.integers(0, 10**9 - 1)] * 3)
@@ -76,5 +76,5 @@ parts = st.tuples(*[st.integers(0, 10**9 - 1)] * 3)
 @given(parts, parts)
 def test_versions_are_ordered_as_numbers(one: tuple[int, ...], other: tuple[int, ...]) -> None:
     first, second = (".".join(map(str, version)) for version in (one, other))
-    assert is_version(first)
+    assert VERSION.fits(first)
     assert (version_key(first) < version_key(second)) == (one < other)

@@ -14,9 +14,10 @@ from app.scene import (
     Scene,
     SceneObject,
     instance_evidence,
-    pool_instances,
 )
 from app.scene.relations import LEFT, ON_TOP
+from app.scene.scene import pool_classes
+from training.datasets.encoding import pool_instances
 
 A = len(CANONICAL)
 
@@ -35,13 +36,14 @@ def test_classes_are_the_or_over_instance_pairs(
     drawn: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
 ) -> None:
     classes, confidence, holds, observed = drawn
-    evidence = pool_instances(*drawn, room_type=3)
+    evidence = pool_instances(classes, holds, observed, room_type=3)
+    *_, presence = pool_classes(classes, confidence)
     assert evidence.room_type == 3
     assert evidence.classes.tolist() == sorted(set(classes.tolist()))
     assert evidence.counts.tolist() == [(classes == c).sum() for c in evidence.classes]
     for x, c in enumerate(evidence.classes):
         members = np.flatnonzero(classes == c)
-        assert evidence.confidence[x] == pytest.approx(1 - np.prod(1 - confidence[members]))
+        assert presence[x] == pytest.approx(1 - np.prod(1 - confidence[members]))
         for y, d in enumerate(evidence.classes):
             pairs = [(i, j) for i in members for j in np.flatnonzero(classes == d) if i != j]
             for a in range(A):
@@ -63,11 +65,3 @@ def test_the_evidence_about_instances_is_stated_complete_or_from_poses() -> None
     poses = PoseRelations(holds, np.roll(holds, 1))
     of_poses = instance_evidence(Scene(things, relations=((LEFT, 0, 1),), poses=poses))
     assert of_poses == (poses.holds, poses.observed)
-
-
-def test_shapes_are_checked() -> None:
-    nothing = np.zeros((A, 2, 2), bool)
-    with pytest.raises(ValueError, match=rf"holds must have the shape \({A}, 1, 1\)"):
-        pool_instances(np.array([0]), np.ones(1), nothing, nothing)
-    with pytest.raises(ValueError, match="confidence must have the shape"):
-        pool_instances(np.array([0, 1]), np.ones(1), nothing, nothing)

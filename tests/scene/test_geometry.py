@@ -304,8 +304,3 @@ def test_bad_poses_are_refused(positions: list, sizes: list, yaws: list, message
 def test_classes_must_have_counts(classes: list[int]) -> None:
     with pytest.raises(ValueError, match="classes must be 2 indices below 17"):
         derive_relations([[0, 0, 0]] * 2, [CUBE] * 2, classes=np.array(classes), roles=COUNTS)
-
-
-def test_a_viewpoint_must_be_finite() -> None:
-    with pytest.raises(ValueError, match="viewpoint must be finite"):
-        to_viewer_frame([[0, 0, 0]], Viewpoint(0.0, NAN, 0.0))

@@ -12,7 +12,6 @@ from app.scene.relations import (
     OPPOSITES,
     RELATIONS,
     canonicalise,
-    contradiction,
     opposite,
     support_cycle,
 )
@@ -45,11 +44,6 @@ def test_unknown_relations_are_refused(name: str) -> None:
         canonicalise(0, name, 1)
     with pytest.raises(ValueError, match=rf"unknown relation '{name}'"):
         opposite(name)
-
-
-def test_contradictions() -> None:
-    assert contradiction([(0, 1, 2), (1, 2, 1), (0, 1, 2)]) is None
-    assert contradiction([(0, 1, 2), (3, 0, 1), (0, 2, 1)]) == ((0, 1, 2), (0, 2, 1))
 
 
 def test_supports_in_a_circle_are_found() -> None:

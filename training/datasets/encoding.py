@@ -15,7 +15,6 @@ import numpy as np
 
 from app.scene import (
     CANONICAL,
-    ClassEvidence,
     PoseRelations,
     RoleCounts,
     Viewpoint,
@@ -23,12 +22,12 @@ from app.scene import (
     canonicalise,
     derive_relations,
     label_key,
-    pool_instances,
     to_viewer_frame,
 )
 from app.scene.geometry import CONTACT
 from app.scene.relations import INSIDE, ON_TOP, STACKED, SUPPORTS
 from app.scene.roles import IN, ON, likely_role
+from app.scene.scene import pool_classes, pool_relations
 from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN, Heights, stands_of
 from scene_client.image_plane import are_neighbours, relation_between
 from training.datasets.array_types import Flags, Floats, Ints
@@ -41,6 +40,46 @@ A = len(CANONICAL)
 # Roles of an object at its support.
 _SUPPORTED: Final = np.isin(range(3), (ON, IN))
 _IN_THE_IMAGE: Final = [CANONICAL.index("left"), CANONICAL.index("above")]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClassEvidence:
+    """The n distinct classes of a scene and their observed relations.
+
+    Attributes:
+        classes: (n,) distinct indices of the classes, in ascending order.
+        counts: (n,) number of instances of each class.
+        holds: (A, n, n), True for relations that hold. ``holds[a, x, y]`` means that classes[x] has
+            relation a to classes[y].
+        observed: (A, n, n), True for relations that were observed, whether they hold or not.
+            ``holds`` implies ``observed``.
+        room_type: index of the room type, or None if the room type is unknown.
+    """
+
+    classes: Ints
+    counts: Ints
+    holds: Flags
+    observed: Flags
+    room_type: int | None
+
+
+def pool_instances(
+    classes: Ints, holds: Flags, observed: Flags, room_type: int | None = None
+) -> ClassEvidence:
+    """Pool the instances of each class by a logical OR.
+
+    A relation between classes is on if the relation holds for at least one pair of instances. The
+    relation is off if it was observed for at least one pair, but holds for none. Otherwise the
+    relation is unobserved. If a class has a single instance, the relations between the class and
+    itself stay unobserved.
+
+    Args:
+        classes: (N,) index of the class of each instance.
+        holds, observed: (A, N, N), see `app.scene.instance_evidence`.
+    """
+    distinct, _, row, counts, _ = pool_classes(classes, np.ones(len(classes)))
+    on, known = pool_relations(row, len(distinct), holds, observed)
+    return ClassEvidence(distinct, counts, on, known, room_type)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +115,7 @@ class EncodedScene:
         tables = (self.instance_holds, self.instance_observed)
         holds, observed = (table[:, index][:, :, index] for table in tables)
         classes = arrays["instance_classes"]
-        evidence = pool_instances(classes, np.ones(len(index)), holds, observed, room)
+        evidence = pool_instances(classes, holds, observed, room)
         arrays |= {"instance_holds": holds, "instance_observed": observed}
         return replace(self, evidence=evidence, **arrays)
 
@@ -153,7 +192,7 @@ class _Encoder:
             array[:, structure[kept]] = array[:, :, structure[kept]] = False
         room = curated_names().canonical_room(scene.room_type)
         room_type = None if room is None else self.vocabulary.room_index(room)
-        evidence = pool_instances(classes, np.ones(len(kept)), holds, observed, room_type)
+        evidence = pool_instances(classes, holds, observed, room_type)
         if any(thing.count > 1 for thing in scene.objects):
             # One object entry can mean several instances.
             counts = np.zeros_like(evidence.counts)

@@ -19,9 +19,8 @@ from typing import Final
 
 import numpy as np
 
-from app.scene import ClassEvidence
 from training.datasets.array_types import Flags, Ints, Rng
-from training.datasets.encoding import EncodedScene
+from training.datasets.encoding import ClassEvidence, EncodedScene
 
 # Number of attempted exchanges, divided by the number of slots. An exchange draws two slots, so
 # each slot is drawn about 20 times.
@@ -79,7 +78,6 @@ def _relabel(scene: EncodedScene, labels: Ints, room: int) -> EncodedScene:
     evidence = ClassEvidence(
         classes=labels[order],
         counts=before.counts[order],
-        confidence=before.confidence[order],
         holds=before.holds[:, order][:, :, order],
         observed=before.observed[:, order][:, :, order],
         room_type=None if room < 0 else room,

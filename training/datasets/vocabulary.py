@@ -10,7 +10,10 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from pydantic import ValidationError
 
+from app.registry import VocabularyEntry
+from app.registry.fields import first_error
 from app.scene import ObjectClass, Vocabulary, label_key
 from training.datasets.names import Names, curated_names
 from training.datasets.records import AnnotatedScene
@@ -128,7 +131,10 @@ def read_vocabulary(path: Path) -> Vocabulary:
         OSError: the file cannot be read.
         ValueError: the content of the file is not JSON or not a vocabulary.
     """
-    return Vocabulary.from_dict(json.loads(path.read_text(encoding="utf-8")))
+    try:
+        return VocabularyEntry.model_validate_json(path.read_bytes()).vocabulary()
+    except ValidationError as error:
+        raise ValueError(first_error(error)) from None
 
 
 def indoor_vocabulary() -> Vocabulary:

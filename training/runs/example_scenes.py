@@ -17,6 +17,8 @@ from typing import Any, Final
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
+from app.errors import RequestError
+from app.questions.reading import Limits, read_scene
 from app.registry.examples import MAX_WORD, Example, Examples
 from app.scene import Vocabulary, canonicalise
 from training.datasets import AnnotatedScene
@@ -64,15 +66,17 @@ def read_examples(reference: str, root: Path) -> tuple[Example, ...]:
 def known_examples(
     examples: Sequence[Example], vocabulary: Vocabulary
 ) -> tuple[tuple[Example, ...], list[str]]:
-    """Return the examples that a vocabulary covers, and the reasons against the others."""
-    covered_examples, reasons = [], []
+    """Return the examples that a model of this vocabulary accepts, and reasons against others."""
+    accepted, reasons = [], []
     for example in examples:
         try:
-            example.require_known(vocabulary)
-            covered_examples.append(example)
-        except ValueError as error:
-            reasons.append(str(error))
-    return tuple(covered_examples), reasons
+            read_scene(example.scene, vocabulary, Limits())
+            accepted.append(example)
+        except RequestError as error:
+            error.locate(example.request())
+            first = error.errors[0]
+            reasons.append(f"{example.name}: {first.pointer}: {first.message}")
+    return tuple(accepted), reasons
 
 
 def examples_json(examples: Sequence[Example]) -> str:

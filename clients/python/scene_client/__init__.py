@@ -24,24 +24,13 @@ if TYPE_CHECKING:
 __version__ = "1.0.0"
 
 __all__ = [
-    "AnswerError",
-    "AsyncClient",
-    "Client",
-    "ClientError",
-    "DeadlineError",
-    "InvalidRequestError",
-    "OfflineClient",
-    "ProblemError",
-    "UnreachableError",
-]
+    "AnswerError", "AsyncClient", "Client", "ClientError", "DeadlineError", "InvalidRequestError",
+    "OfflineClient", "ProblemError", "UnreachableError",
+]  # fmt: skip
 
 # Maps each name to the module that defines the name. The package imports the module on first use of
 # the name. So the service, which needs only the schemas, starts without httpx.
-_MODULES = {
-    "AsyncClient": "asynchronous",
-    "Client": "sync",
-    "OfflineClient": "offline",
-}
+_MODULES = {"AsyncClient": "asynchronous", "Client": "sync", "OfflineClient": "offline"}
 
 
 def __getattr__(name: str) -> Any:

@@ -30,17 +30,13 @@ LONGEST_PAUSE: Final = 2.0
 The pause is random. Its upper limit starts at `FIRST_PAUSE` and doubles with each attempt.
 """
 
-Objects: TypeAlias = Iterable[str | schemas.Detection | schemas.Body]
-"""Objects of a scene: labels, `Detection` objects, or dictionaries with the same fields."""
-
-
 T = TypeVar("T", bound=BaseModel)
 AnswerT = TypeVar("AnswerT", bound=schemas.Answer)
 RequestT = TypeVar("RequestT", bound=schemas.SceneRequest)
 FormT = TypeVar("FormT", bound=schemas.Request)
 
-Scene: TypeAlias = Objects | RequestT | schemas.Body
-"""A list of objects, or a whole request as an object or a dictionary."""
+Scene: TypeAlias = Iterable[str | schemas.Detection | schemas.Body] | RequestT | schemas.Body
+"""A list of objects (labels, `Detection` objects or dictionaries), or a whole request."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import partial
-from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, Final, NoReturn, TypeVar, get_args
@@ -103,7 +102,7 @@ def _show(
     question: Callable[[Client], AnswerT],
     table: Callable[[AnswerT], RenderableType],
     request: Any = None,
-) -> AnswerT:
+) -> None:
     """Print the answer to a question as JSON or as a table. An error ends the program.
 
     Args:
@@ -117,7 +116,7 @@ def _show(
         answer = question(client)
     if options.as_json:
         print(answer.model_dump_json(exclude_unset=True))
-        return answer
+        return
     console = Console(markup=False, highlight=False, emoji=False)
     if not console.is_terminal:
         # The output goes to a file or a program, so rich must not cut or wrap the table.
@@ -125,7 +124,6 @@ def _show(
     console.print(table(answer))
     for note in tables.notes(answer):
         print(note, file=sys.stderr)
-    return answer
 
 
 def _version(is_set: bool) -> None:
@@ -314,31 +312,16 @@ def generate(
         float | None,
         typer.Option(help="Sampling temperature, 0.05 to 1.5. High values give varied scenes."),
     ] = None,
-    plot: Annotated[
-        Path | None,
-        typer.Option(
-            help="Draw the scenes as a picture into this file (.png, .svg or .pdf).", dir_okay=False
-        ),
-    ] = None,
     relations: Stated = None,
     room_type: RoomType = None,
     unknown_labels: Unknown = None,
     label_map: LabelMap = None,
 ) -> None:
     """Sample scenes that contain the given objects."""
-    if plot is not None and find_spec("matplotlib") is None:
-        _fail("the option --plot needs matplotlib: run pip install matplotlib")
     things = things or []
     scene = _scene(things, label_map, relations, room_type=room_type, unknown_labels=unknown_labels)
     request = scene | _named(count=count, seed=seed, steps=steps, temperature=temperature)
-    answer = _show(context, lambda client: client.generate(request), tables.generate, request)
-    if plot is not None:
-        from scene_client.plot import draw
-
-        try:
-            draw(answer, plot)
-        except (OSError, ValueError) as error:
-            _fail(f"the command cannot draw the picture: {error}")
+    _show(context, lambda client: client.generate(request), tables.generate, request)
 
 
 # ------------------------------------------------------------------------------------- models
@@ -479,7 +462,3 @@ def _fail(message: str, status: int = MEANINGLESS) -> NoReturn:
         message, style="red"
     )
     raise typer.Exit(status)
-
-
-if __name__ == "__main__":
-    app()

@@ -49,7 +49,6 @@ def test_classes_counts_and_unknown_labels() -> None:
     assert scene.instance_classes.tolist() == [MONITOR, DESK, MONITOR, WALL]
     assert scene.evidence.classes.tolist() == [DESK, MONITOR, WALL]
     assert scene.evidence.counts.tolist() == [1, 2, 1]
-    assert scene.evidence.confidence.tolist() == [1.0, 1.0, 1.0]
     assert scene.unknown == ("Goblets",)
     assert scene.room_type == scene.evidence.room_type == 0  # a toilet is a bathroom
     assert not scene.evidence.observed.any()

@@ -9,9 +9,10 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.scene import CANONICAL, ClassEvidence, pool_instances
+from app.scene import CANONICAL
 from app.scene.stands import UNKNOWN
 from training.datasets import EncodedScene, shuffle_objects
+from training.datasets.encoding import ClassEvidence, pool_instances
 
 V = 9
 STRUCTURE = np.arange(V) >= 7
@@ -28,8 +29,7 @@ def made(
     pairs = thing[:, None] & thing & ~np.eye(len(classes), dtype=np.bool_)
     observed = pairs & (rng.random((A, len(classes), len(classes))) < 0.6)
     holds = observed & (rng.random(observed.shape) < 0.4)
-    confidence = rng.uniform(0.2, 1.0, len(classes))
-    evidence = pool_instances(classes, confidence, holds, observed, None if room < 0 else room)
+    evidence = pool_instances(classes, holds, observed, None if room < 0 else room)
     stands = np.full(len(classes), UNKNOWN)
     return EncodedScene(
         *(str(number), source, f"group {number}", room, evidence),
@@ -51,9 +51,10 @@ def presence(scenes: list[EncodedScene]) -> np.ndarray:
     return np.array(rows).reshape(-1, V)
 
 
-def slots(evidence: ClassEvidence) -> list[tuple[int, float]]:
-    """Count and confidence of each slot; the confidences differ."""
-    return sorted(zip(evidence.counts.tolist(), evidence.confidence.tolist(), strict=True))
+def slots(evidence: ClassEvidence) -> list[tuple[int, int, int]]:
+    """Count and number of relations of each slot."""
+    numbers = evidence.counts, evidence.holds.sum((0, 1)), evidence.observed.sum((0, 1))
+    return sorted(zip(*(array.tolist() for array in numbers), strict=True))
 
 
 seeds = st.integers(0, 2**32 - 1)
@@ -89,10 +90,7 @@ def test_shuffled_scenes_are_valid_and_keep_other_fields(scenes, seed):
         assert new.instance_holds is old.instance_holds
         assert (new.room_type < 0) is (old.room_type < 0)
         assert e.room_type == (None if new.room_type < 0 else new.room_type)
-        certain = np.ones(len(new.instance_classes))
-        pooled = pool_instances(
-            new.instance_classes, certain, new.instance_holds, new.instance_observed
-        )
+        pooled = pool_instances(new.instance_classes, new.instance_holds, new.instance_observed)
         for name in ("classes", "counts", "holds", "observed"):
             np.testing.assert_array_equal(getattr(pooled, name), getattr(e, name))
 

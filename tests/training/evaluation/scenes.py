@@ -9,10 +9,11 @@ from itertools import count
 import numpy as np
 import torch
 
-from app.scene import CANONICAL, pool_instances
+from app.scene import CANONICAL
 from app.scene.stands import UNKNOWN
 from training.datasets import EncodedScene
 from training.datasets.batches import SceneTensors, scene_tensors
+from training.datasets.encoding import pool_instances
 
 V = 5
 NO_STRUCTURE = torch.zeros(V, dtype=torch.bool)
@@ -42,7 +43,7 @@ def scene(
         holds[a, classes.index(i), classes.index(j)] = True
     labels = np.array(classes, dtype=np.int64)
     observed = np.broadcast_to(~np.eye(n, dtype=np.bool_) & annotated, holds.shape).copy()
-    evidence = pool_instances(labels, np.ones(n), holds, observed)
+    evidence = pool_instances(labels, holds, observed)
     cut = {"holds": evidence.holds[:relations], "observed": evidence.observed[:relations]}
     scene_id = name or f"scene {next(_names)}"
     return EncodedScene(

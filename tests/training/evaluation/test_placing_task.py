@@ -111,10 +111,10 @@ def test_an_unknown_receptacle_ranks_last():
 
 
 def test_questions_that_are_left_out_are_counted():
-    values = VOCABULARY.to_dict()
-    for entry in values["objects"]:
-        entry["structure"] = entry["label"] == "door"  # the service never proposes structure
-    artifact = replace(room_model(), vocabulary=Vocabulary.from_dict(values))
+    # The service never proposes structure.
+    objects = [replace(entry, structure=entry.label == "door") for entry in VOCABULARY.objects]
+    words = Vocabulary(objects, VOCABULARY.room_types, VOCABULARY.room_aliases)
+    artifact = replace(room_model(), vocabulary=words)
     votes = VOTES | {("zeppelin", "bed"): 5, ("door", "bed"): 5}
     votes |= {("plant", place): 5 for place in ("bed", "desk", "dresser", "nightstand")}
     metrics = placing_metrics(artifact, rooms_of(placings(votes)))
