@@ -175,7 +175,7 @@ class NotJSONError(ServiceError, slug="not-json", status=400, steps=("body",)):
 
     The body must be one JSON value in UTF-8 without a byte order mark. The service refuses NaN,
     Infinity, lone surrogates, duplicate member names in an object and nesting deeper than 200. JSON
-    parsers read such texts in different ways. In a body of at most 64 KiB, `errors` points at each
+    parsers read such texts in different ways. In a body of at most 16 KiB, `errors` points at each
     NaN and Infinity.
     """
 

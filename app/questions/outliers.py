@@ -2,8 +2,8 @@
 
 An intruder is an object that does not belong to the scene. An outlier is an object that the service
 reports as a probable intruder. The answer for an outlier names its companions: absent classes that
-usually occur with the class of the outlier. `ObjectScorer.increases` says how much the presence of a class
-raises the log-odds of the others.
+usually occur with the class of the outlier. `ObjectScorer.increases` says how much the presence of
+a class raises the log-odds of the others.
 
 Rare classes have the largest increases, such as a toilet paper holder for a toilet. Common classes
 such as chair are likely in any scene. So companions are ranked by a product: the increase,

@@ -10,12 +10,13 @@ import math
 from collections.abc import Mapping, Sequence
 from itertools import compress
 from statistics import median
-from typing import Final, Literal
+from typing import Final
 
 from app.scene.geometry import LARGEST, MOST_DISTANT, SMALLEST, is_optical, is_world_fixed
 from app.scene.scene import Point, Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
 from scene_client.schemas import Detection, SceneRequest, SceneWarning
+from scene_client.schemas.answers import WarningCode
 
 _ORIGIN: Final[Point] = (0.0, 0.0, 0.0)
 _SAME_DEPTH: Final = 1e-3  # maximum difference in m of depths that count as equal
@@ -52,17 +53,6 @@ _UNSIZED: Final = (
     "class has no typical size"
 )
 
-Code = Literal[
-    "implausible-position",
-    "implausible-size",
-    "implausible-scale",
-    "y-axis-up",
-    "rolled-objects",
-    "flat-scene",
-    "unknown-sizes",
-]
-
-
 def scene_warnings(
     scene: Scene,
     detections: Mapping[int, Detection],
@@ -94,7 +84,7 @@ def scene_warnings(
     optical = request.frame_id is not None and is_optical(request.frame_id)
     y_up = () if optical else _y_up([fit for fit in fits if fit[0] not in rolled])
     unsized = _unsized(placed, vocabulary) if derived and len(placed) > 1 else ()
-    kinds: list[tuple[Code, str, Sequence[SceneObject]]] = [
+    kinds: list[tuple[WarningCode, str, Sequence[SceneObject]]] = [
         ("implausible-position", _TOO_FAR, _distant(placed, request)),
         ("implausible-size", _ODD_SIZE, odd),
         ("implausible-scale", _SCALED.format(factor), scaled),

@@ -102,19 +102,22 @@ class Mapped(Reply):
     chair`). Guesses: spelling (`nigthstand`), head (`office table`)"""
 
 
+WarningCode = Literal[
+    "implausible-position",
+    "implausible-size",
+    "implausible-scale",
+    "y-axis-up",
+    "rolled-objects",
+    "flat-scene",
+    "unknown-sizes",
+    "not-judged",
+]
+
+
 class SceneWarning(Reply):
     """A probable mistake in the scene, or a limit of the model. The service still answers."""
 
-    code: Literal[
-        "implausible-position",
-        "implausible-size",
-        "implausible-scale",
-        "y-axis-up",
-        "rolled-objects",
-        "flat-scene",
-        "unknown-sizes",
-        "not-judged",
-    ]
+    code: WarningCode
     """implausible-position: an object is more than 100 m from the viewer. implausible-size: all
     sides of an object are below 1 mm, or one is above 20 m. implausible-scale: the sizes of the
     objects differ from the typical sizes of their classes by a common factor. y-axis-up: the sizes
