@@ -1919,7 +1919,7 @@ def add_unseen(shown, change, candidates, classes, forward, backward):
     """Add the changes of stacked relations that training never shows to log-odds, in place.
 
     Args:
-        shown: (3, V, V) bool, whether training shows each stacked relation of two classes.
+        shown: (V, V) stacked relations of two classes that training shows. Bit a is relation a.
         change: (3, V) change for each subject class.
         candidates, classes: (N,) and (m,) classes.
         forward, backward: (N, A, m) log-odds with the candidate and with the other class as
@@ -1929,9 +1929,9 @@ def add_unseen(shown, change, candidates, classes, forward, backward):
         for a in range(forward.shape[1] - ON_TOP):
             for k in range(len(classes)):
                 i, j = candidates[c], classes[k]
-                if not shown[a, i, j]:
+                if not shown[i, j] >> a & 1:
                     forward[c, ON_TOP + a, k] += change[a, i]
-                if not shown[a, j, i]:
+                if not shown[j, i] >> a & 1:
                     backward[c, ON_TOP + a, k] += change[a, j]
 
 

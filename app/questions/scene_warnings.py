@@ -53,6 +53,7 @@ _UNSIZED: Final = (
     "class has no typical size"
 )
 
+
 def scene_warnings(
     scene: Scene,
     detections: Mapping[int, Detection],

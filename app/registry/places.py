@@ -114,26 +114,25 @@ class Places(TensorGroup):
         A supporter is an object on or in which the subject is. The class indices are (N,) and (M,).
         The counts of a subject are smoothed by `_SUPPORTER` supporters of all classes.
         """
-        total, share, held = self._supporters
-        of_pairs = held[subject[:, None], other] + _SUPPORTER * share[other]
+        total, share = self._supporters
+        V, of_pairs = len(self.frequency), _SUPPORTER * share[other]
+        for a in SUPPORTS:
+            of_pairs = of_pairs + triple_counts(self.triple, self.held, V, a, subject, other)
         shares: Floats = of_pairs / (total[subject, None] + _SUPPORTER)
         return shares
 
     @cached_property
-    def _supporters(self) -> tuple[Floats, Floats, NDArray[np.float32]]:
-        """Number of supporters of each class, its share among all supporters, and by pair.
-
-        The shapes are (V,), (V,) and (V supported classes, V supporters).
-        """
+    def _supporters(self) -> tuple[Floats, Floats]:
+        """Number of supporters of each class, (V,), and its share among all supporters, (V,)."""
         V = len(self.frequency)
         is_support = np.isin(self.triple // (V * V), SUPPORTS)
-        keys, held = self.triple[is_support] % (V * V), self.held[is_support]
-        by_pair = np.bincount(keys, held, V * V).reshape(V, V)
-        count = by_pair.sum(0) + _SEEN
-        return by_pair.sum(1), count / count.sum(), by_pair.astype(np.float32)
+        subject, other = np.divmod(self.triple[is_support] % (V * V), V)
+        held = self.held[is_support]
+        total, count = (np.bincount(end, held, V).astype(float) for end in (subject, other))
+        return total, (count + _SEEN) / (count + _SEEN).sum()
 
     @cached_property
-    def unseen(self) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+    def unseen(self) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Change of the log-odds of stacked relations that training never shows.
 
         The change is the log share of the subject's stand: on a wall for above, on or in an object
@@ -141,12 +140,14 @@ class Places(TensorGroup):
         do not change the log-odds.
 
         Returns:
-            Whether training shows each relation of `STACKED`, (3, V, V), and the change for each
-            subject class, (3, V); see `kernels.add_unseen`.
+            Relations of `STACKED` that training shows, (V, V): bit a is relation a. Then the change
+            for each subject class, (3, V); see `kernels.add_unseen`.
         """
         shares = np.log(np.minimum(np.maximum(self.stands, _LEAST_STAND) / USUAL, 1.0))
         every = np.arange(len(shares))
-        shown = np.stack([self.shows(a, every, every) for a in STACKED])
+        shown = np.zeros((len(every), len(every)), np.uint8)
+        for bit, a in enumerate(STACKED):
+            shown |= self.shows(a, every, every).astype(np.uint8) << bit
         return shown, shares.T[[SUPPORTED, HANGS, SUPPORTED]].astype(np.float32)
 
     def under_evidence(self, upper: int, lower: int) -> float:
