@@ -89,9 +89,6 @@ def train(
             "--publish then copies the test results of the finished run without --final",
         ),
     ] = False,
-    tensorboard: Annotated[
-        Path | None, typer.Option("--tensorboard", help="write TensorBoard logs to this folder")
-    ] = None,
     publish: Annotated[str | None, typer.Option(help="publish the run as this version")] = None,
     store: StorePath = STORE,
 ) -> None:
@@ -112,7 +109,7 @@ def train(
         scenes = _prepare(config, root)
         for name in ("checkpoint.pt", "result.json") if fresh else ():
             (folder / name).unlink(missing_ok=True)
-        _train(config, scenes, folder, root, tensorboard)
+        _train(config, scenes, folder, root)
         if publish is None and not final:
             next_steps(folder, console)
         if publish is not None:
@@ -241,21 +238,19 @@ def _prepare(config: Config, data: Path) -> SplitScenes:
     return replace(scenes, examples=examples)
 
 
-def _train(
-    config: Config, scenes: SplitScenes, folder: Path, root: Path, tensorboard: Path | None
-) -> None:
+def _train(config: Config, scenes: SplitScenes, folder: Path, root: Path) -> None:
     trainer = Trainer(config, scenes.training_data(), folder)
     if trainer.resume():
         console.print(f"resuming after {trainer.position}")
     console.print(f"{config.name}: {trainer.machine.parameter_count:,} weights")
     try:
-        with Display(trainer, console, tensorboard) as display:
-            result = trainer.run(display.progress, display.passed)
+        with Display(trainer, console) as display:
+            result = trainer.run(display.progress)
     except KeyboardInterrupt:
         console.print(f"stopped after {trainer.position}; run the same command to continue")
         raise typer.Exit(130) from None
     save_run(folder, config, result, data=root, scenes=scenes.digest)
-    summarise(result, trainer, folder, console)
+    summarise(result, folder, console)
 
 
 def _publish(
@@ -319,7 +314,7 @@ def _promote(
             try:
                 new = Candidate(NEW, run.config, scenes.digests, artifact, root)
                 sides = (new, served.candidate, root)
-                comparison = compare(*sides, limit=limit, examples=3, say=say)
+                comparison = compare(*sides, limit=limit, say=say)
                 show(comparison, console)
                 reasons += losses(comparison, margin)
             except ConfigError as error:

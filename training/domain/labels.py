@@ -33,7 +33,6 @@ class Label:
 
     name: str  # curated name, or the most frequent spelling
     mentions: int  # number of objects with this name
-    scenes: int
     spellings: tuple[str, ...]  # most frequent first
 
 
@@ -74,20 +73,16 @@ def count_labels(scenes: Iterable[AnnotatedScene], names: Names) -> list[Label]:
     """Count all names, most frequent first. Spellings with the same key count as one name."""
     spellings: defaultdict[str, Counter[str]] = defaultdict(Counter)
     names_of: defaultdict[str, Counter[str]] = defaultdict(Counter)
-    scenes_of: Counter[str] = Counter()
     canonical = cache(names.canonical)
-    for scene in scenes:
-        keys = set()
-        for thing in scene.objects:
-            name = canonical(thing.label)
-            keys.add(key := label_key(name))
-            spellings[key][thing.label] += 1
-            names_of[key][name] += 1
-        scenes_of.update(keys)
+    for thing in (thing for scene in scenes for thing in scene.objects):
+        name = canonical(thing.label)
+        key = label_key(name)
+        spellings[key][thing.label] += 1
+        names_of[key][name] += 1
     labels = []
     for key, counts in spellings.items():
         spelt = tuple(sorted(counts, key=lambda label: (-counts[label], label)))
-        labels.append(Label(most_frequent(names_of[key]), counts.total(), scenes_of[key], spelt))
+        labels.append(Label(most_frequent(names_of[key]), counts.total(), spelt))
     return sorted(labels, key=lambda label: (-label.mentions, label.name))
 
 

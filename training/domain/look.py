@@ -41,7 +41,6 @@ class Facts:
     objects_per_scene: tuple[int, float, int]  # minimum, mean and maximum
     rooms: dict[str, int]  # number of scenes of each canonical room type
     shares: dict[str, float]  # share of scenes with each kind of annotation, such as "positions"
-    relations: dict[str, int]  # number of annotated triples of each relation
     findings: tuple[Finding, ...]
 
     @property
@@ -52,17 +51,10 @@ class Facts:
 
 
 def look(scenes: Sequence[AnnotatedScene], names: Names) -> Facts:
-    """Compute the statistics and findings of scenes.
-
-    Raises:
-        ValueError: the list of scenes is empty.
-    """
-    if not scenes:
-        raise ValueError("there are no scenes to analyse; pass at least one scene")
+    """Compute the statistics and findings of scenes, at least one."""
     sizes = [len(scene.objects) for scene in scenes]
     canonical = [names.canonical_room(scene.room_type) for scene in scenes]
     rooms = Counter(room for room in canonical if room is not None)
-    relations = Counter(r for scene in scenes for _, r, _ in scene.relations or ())
 
     def share(attribute: str) -> float:
         return sum(any(getattr(t, attribute) for t in s.objects) for s in scenes) / len(scenes)
@@ -82,7 +74,6 @@ def look(scenes: Sequence[AnnotatedScene], names: Names) -> Facts:
             "boxes in an image": share("box2d"),
             "viewer axes": sum(scene.viewer_frame for scene in scenes) / len(scenes),
         },
-        relations=dict(relations.most_common()),
         findings=tuple(finding for finding in _findings(scenes, rooms, names) if finding.count),
     )
 
@@ -120,15 +111,6 @@ def _findings(
             for scene, triples in listed
             for a, i, j in sorted(triples)
             if a == ON_TOP and (ABOVE, j, i) in triples
-        ),
-    )
-    yield finding(
-        "Objects support each other in a cycle (on-top or supported_by).",
-        "Correct the cycle: an object cannot stand on an object that it supports.",
-        (
-            f"{scene.scene_id}: {', '.join(cycle)}"
-            for scene, triples in listed
-            if (cycle := _support_cycle(scene, triples))
         ),
     )
     yield finding(
@@ -192,24 +174,6 @@ def _invalid_labels(scenes: Sequence[AnnotatedScene], names: Names) -> Iterator[
 def _describe_pair(scene: AnnotatedScene, i: int, j: int) -> str:
     a, b = scene.objects[i], scene.objects[j]
     return f"{scene.scene_id}: {a.label} ({a.id}) and {b.label} ({b.id})"
-
-
-def _support_cycle(scene: AnnotatedScene, triples: set[tuple[int, int, int]]) -> list[str]:
-    """Return the labels of objects that support each other in a cycle, or an empty list."""
-    index_of = {thing.id: index for index, thing in enumerate(scene.objects)}
-    supports = [(i, thing.supported_by) for i, thing in enumerate(scene.objects)]
-    links = {(i, index_of[support]) for i, support in supports if support is not None}
-    # Skip pairs of objects that are on top of each other. Another finding reports such pairs.
-    links |= {(i, j) for a, i, j in triples if a == ON_TOP and (a, j, i) not in triples}
-    # Repeatedly remove objects without supports. Then only cycles remain.
-    while free := {j for _, j in links} - {i for i, _ in links}:
-        links = {(i, j) for i, j in links if j not in free}
-    if not links:
-        return []
-    path = [min(links)[0]]
-    while (following := min(j for i, j in links if i == path[-1])) not in path:
-        path.append(following)
-    return [scene.objects[i].label for i in path[path.index(following) :]]
 
 
 def _duplicates(scenes: Sequence[AnnotatedScene]) -> Iterator[str]:

@@ -27,14 +27,11 @@ from training.runs.example_scenes import choose_examples
 
 # Possible minimum numbers of objects of a class. A class with few objects is hardly trained. Few
 # scenes need a small minimum, so that the vocabulary covers enough objects.
-_MINIMA: Final = (2, 3, 5, 8)
+_MINIMA: Final = (8, 5, 3, 2)
 _COVERED: Final = 0.97
-_TABLE: Final = (*_MINIMA, 16, 30)
 # docs/decisions/own-scenes.md gives the measurement behind these two numbers of scenes.
 FEWEST_SCENES: Final = 20
 FEW_SCENES: Final = 80
-# Maximum number of classes. docs/benchmarks.md gives the cost of larger vocabularies.
-_MOST_CLASSES: Final = 2000
 _SPLIT_SEEDS: Final = 50
 # Accepted relative deviation of a part of the split from its target share of scenes.
 _TOLERANCE: Final = 0.2
@@ -51,7 +48,7 @@ class Proposal:
     labels: tuple[Label, ...]
     lookalikes: tuple[Lookalike, ...]
     minimum: int  # number of objects of a class
-    covered: dict[int, tuple[int, float]]  # number and coverage of the classes, for each minimum
+    coverage: float  # share of the objects whose label has a class
     vocabulary: Vocabulary  # merged similar labels are aliases
     dropped: tuple[tuple[str, int, str], ...]  # names without a class: name, objects, reason
     values: dict[str, Any]  # sections of the configuration
@@ -91,20 +88,19 @@ def propose(
     Raises:
         ConfigError: there are fewer than `FEWEST_SCENES` scenes, no label occurs often enough, or
             the scenes cannot be split.
-        ValueError: the list of scenes is empty.
     """
-    names = curated_names()
-    facts = look(scenes, names)
     if len(scenes) < FEWEST_SCENES:
         raise ConfigError(
             f"{len(scenes)} scenes are too few: from fewer than {FEWEST_SCENES} scenes, a model "
             "may learn no more than the frequency of each class. Provide at least "
             f"{FEWEST_SCENES} scenes, better {FEW_SCENES} scenes of {FEW_SCENES // 2} places"
         )
+    names = curated_names()
+    facts = look(scenes, names)
     labels = count_labels(scenes, names)
     similar = lookalikes(labels, scenes, names)
-    minimum, covered = _choose_minimum(scenes, similar)
-    vocabulary = _use_frequent_names(_vocabulary(scenes, similar, minimum), scenes)
+    minimum, found = _choose_vocabulary(scenes, similar)
+    vocabulary = _use_frequent_names(found, scenes)
     seed, parts, test_groups = _split(scenes)
     settings, reasons = _configuration(facts, parts)
     reasons |= {
@@ -126,7 +122,7 @@ def propose(
         labels=tuple(labels),
         lookalikes=tuple(similar),
         minimum=minimum,
-        covered=covered,
+        coverage=coverage(found, scenes),
         vocabulary=vocabulary,
         dropped=tuple(_dropped(labels, vocabulary, names, minimum)),
         values=values,
@@ -138,27 +134,21 @@ def propose(
     )
 
 
-def _choose_minimum(
+def _choose_vocabulary(
     scenes: Sequence[AnnotatedScene], pairs: Sequence[Lookalike]
-) -> tuple[int, dict[int, tuple[int, float]]]:
-    """Choose the minimum number of objects of a class; return it and `Proposal.covered`.
+) -> tuple[int, Vocabulary]:
+    """Return the largest of `_MINIMA` whose classes cover enough objects, and the classes.
 
-    The choice is the largest minimum whose classes cover enough objects, or the smallest minimum.
-    A choice that gives too many classes is raised.
+    Without such a minimum, the result is the smallest one.
     """
-    covered: dict[int, tuple[int, float]] = {}
-    for minimum in _TABLE:
+    for minimum in _MINIMA:
         try:
             vocabulary = _vocabulary(scenes, pairs, minimum)
         except ValueError:
             continue  # no label has so many mentions
-        covered[minimum] = (len(vocabulary), coverage(vocabulary, scenes))
-    if not covered:
-        raise ConfigError("every label occurs only once: training needs labels with more objects")
-    sufficient = [m for m, (_, share) in covered.items() if share >= _COVERED and m in _MINIMA]
-    chosen = max(sufficient, default=min(covered))
-    affordable = [m for m, (classes, _) in covered.items() if classes <= _MOST_CLASSES]
-    return max(chosen, min(affordable, default=chosen)), covered
+        if minimum == _MINIMA[-1] or coverage(vocabulary, scenes) >= _COVERED:
+            return minimum, vocabulary
+    raise ConfigError("every label occurs only once: training needs labels with more objects")
 
 
 def _vocabulary(

@@ -28,7 +28,7 @@ def difference(task: str, metric: str, low: float, high: float) -> Difference:
 def comparison(*rows: tuple[str, str, float, float]) -> Comparison:
     """Of rows (task, metric, low, high)."""
     results = Results("new", (), tuple(difference(*row) for row in rows))
-    return Comparison(results, "old", 40, 20, True, (), ())
+    return Comparison(results, "old", 40, 20, True, ())
 
 
 @pytest.mark.parametrize(
