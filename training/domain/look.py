@@ -114,7 +114,7 @@ def _findings(
         ),
     )
     yield finding(
-        f"Labels are blank, longer than {LONGEST} characters or not printable.",
+        f"Labels are longer than {LONGEST} characters or not printable.",
         "A request cannot contain such a label. Use other labels.",
         _invalid_labels(scenes, names),
     )
@@ -167,7 +167,7 @@ def _invalid_labels(scenes: Sequence[AnnotatedScene], names: Names) -> Iterator[
     """Generate the labels that a request refuses, at most 100 characters of each."""
     for label in sorted({thing.label for scene in scenes for thing in scene.objects}):
         name = names.canonical(label)
-        if not name.strip() or len(name) > LONGEST or not name.isprintable():
+        if len(name) > LONGEST or not name.isprintable():
             yield repr(label) if len(label) <= LONGEST else f"{label[:40]!r} …"
 
 

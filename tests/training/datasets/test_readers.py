@@ -124,7 +124,7 @@ def test_each_invalid_line_of_jsonl_is_an_error(tmp_path: Path) -> None:
     errors = (first, second, third, fourth, fifth)
     wheres = [getattr(error, "where", None) for error in errors]
     assert wheres == ["line 4", "line 5", "line 6", "line 8", "line 9"]
-    with pytest.raises(DatasetError, match="line 4: a scene must be a JSON object"):
+    with pytest.raises(DatasetError, match="line 4: Input should be an object"):
         read_scenes(path)
 
 
@@ -175,11 +175,10 @@ def test_counts_name_labels_with_one_object(tmp_path: Path) -> None:
     assert [thing.count for thing in scene.objects] == [3, 1]
     for counts, problem in (
         ({"fork": 1}, "'fork', which needs exactly one object, but the scene has 0"),
-        ({"cup": 0}, "must be 1 to 1000000"),
-        ({"cup": 10**20}, "must be 1 to 1000000"),
-        ({"cup": 1.5}, "must be an integer"),
-        ({"cup": True}, "must be an integer"),
-        ([3], "must be null, or an object"),
+        ({"cup": 0}, "count: .* greater than or equal to 1"),
+        ({"cup": 10**20}, "count: .* less than or equal to 1000000"),
+        ({"cup": 1.5}, r"counts\.cup: .* integer"),
+        ({"cup": True}, r"counts\.cup: .* integer"),
     ):
         with pytest.raises(ValueError, match=problem):
             read_scenes(write_scene(tmp_path, counts=counts))
@@ -199,25 +198,22 @@ def test_files_of_named_sources_are_read_from_the_folder_extra(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("{", "not JSON"),
-        ([], "a scene must be a JSON object, not list"),
-        ({"scene_id": "a"}, "a scene lacks objects"),
+        ("{", "Invalid JSON"),
+        ([], "Input should be an object"),
+        ({"scene_id": "a"}, "objects: Field required"),
         *(
             (BARE_SCENE | fields, message)
             for fields, message in (
-                ({"scene_id": " "}, "scene_id must be a non-empty string"),
-                ({"colour": "red"}, "unknown fields: colour"),
-                ({"objects": {}}, "objects must be a list"),
-                ({"objects": [["bed"]]}, "an object must be a JSON object"),
-                ({"objects": [{"id": 0}]}, "an object lacks label"),
-                ({"objects": [{"id": 0, "label": ""}]}, "label must be"),
-                ({"objects": [{"id": 1.5, "label": "a"}]}, "an id must be"),
+                ({"scene_id": " "}, "scene_id: "),
+                ({"colour": "red"}, "colour: Extra inputs"),
+                ({"objects": [["bed"]]}, r"objects\.0: "),
+                ({"objects": [{"id": 0}]}, r"0\.label: "),
+                ({"objects": [{"id": 0, "label": "a", "sizes": 1}]}, r"0\.sizes: "),
+                ({"objects": [{"id": 1.5, "label": "a"}]}, r"0\.id: "),
                 ({"objects": BARE_SCENE["objects"] * 2}, "with the same id"),
-                ({"room_type": 3}, "room_type must be"),
-                ({"viewer_frame": "yes"}, "viewer_frame must be"),
-                ({"relations": {}}, "relations must be a list or null"),
-                ({"relations": [[0, "left"]]}, "a relation is"),
-                ({"relations": [{"subject": 0, "object": 0}]}, "a relation is"),
+                ({"viewer_frame": "yes"}, "viewer_frame: "),
+                ({"relations": [[0, "left"]]}, r"relations\.0"),
+                ({"relations": [{"subject": 0, "object": 0}]}, r"relations\.0"),
                 ({"relations": [[0, "left", 7]]}, "not in the scene"),
             )
         ),
@@ -229,14 +225,12 @@ def test_files_of_named_sources_are_read_from_the_folder_extra(tmp_path: Path) -
         *(
             (BARE_SCENE | {"objects": [{"id": 0, "label": "a"} | extra]}, message)
             for extra, message in (
-                ({"position": [1, 2]}, "position must be a list of 3 numbers"),
-                ({"position": [1, 2, "3"]}, "position must be a list of 3 numbers"),
-                ({"position": {"x": 1, "y": 2}}, "position must be a list of 3 numbers"),
-                ({"position": [1, 2, math.inf]}, "position of '0' must be 3 finite"),
-                ({"size": [1, 2, -1]}, "size of '0' must not be negative"),
-                ({"yaw": "north"}, "yaw must be a number"),
-                ({"yaw": math.nan}, "yaw of '0' must be finite"),
-                ({"box2d": [3, 0, 1, 1]}, "box2d of '0' must be"),
+                ({"position": [1, 2]}, r"0\.position"),
+                ({"position": [1, 2, "3"]}, r"0\.position\.2"),
+                ({"position": {"x": 1, "y": 2}}, r"0\.position"),
+                ({"size": [1, 2, -1]}, r"0\.size\.2"),
+                ({"yaw": math.nan}, r"0\.yaw: .* finite"),
+                ({"box2d": [3, 0, 1, 1]}, r"0\.box2d: must be \(xmin"),
                 ({"supported_by": 9}, "supported_by of '0' is '9', which is no object"),
             )
         ),
@@ -300,9 +294,9 @@ def test_3dssg_needs_its_other_files(tmp_path: Path) -> None:
     for file, content, message in (
         ("other.json", [], r"3RScan\.json: cannot be read"),
         ("3RScan.json", RESCANS, r"objects\.json: cannot be read"),
-        ("objects.json", {"scans": []}, r"scans\[0\]: scan room-2 is not in objects\.json"),
+        ("objects.json", {"scans": []}, r"scans\.0: scan room-2 is not in objects\.json"),
         ("objects.json", OBJECTS, None),
-        ("3RScan.json", RESCANS[:1], r"scans\[0\]: scan room-2 is not in 3RScan\.json"),
+        ("3RScan.json", RESCANS[:1], r"scans\.0: scan room-2 is not in 3RScan\.json"),
     ):
         write_json(tmp_path / file, content)
         if message:
@@ -311,22 +305,16 @@ def test_3dssg_needs_its_other_files(tmp_path: Path) -> None:
 
 
 MALFORMED_3DSSG = [
-    ([], "must be an object, not list"),
-    ({}, "lacks 'scans'"),
-    ({"scans": {}}, "'scans' must be of type list"),
-    ({"scans": ["room-1"]}, r"scans\[0\]: must be an object"),
+    ({}, "scans: Field required"),
     *(
         ({"scans": [SCAN | fields]}, message)
         for fields, message in (
-            ({"scan": 3}, r"scans\[0\]: 'scan' must be of type str"),
-            ({"objects": []}, r"scans\[0\]: 'objects' must be of type dict"),
-            ({"objects": {"1": ""}, "relationships": []}, "empty label"),
-            ({"relationships": 1}, "'relationships' must be of type list"),
-            ({"relationships": [[7, 4]]}, r"relationships\[0\]: must be \[subject"),
-            ({"relationships": [[9, 4, 1, "left"]]}, "not in the scan"),
+            ({"objects": {"1": ""}, "relationships": []}, r"scans\.0\.objects\.1: "),
+            ({"relationships": [[7, 4]]}, r"scans\.0\.relationships\.0\.2: "),
+            ({"relationships": [[9, 4, 1, "left"]]}, r"scans\.0: .* not in the scan"),
         )
     ),
-    ({"scans": [SCAN, SCAN]}, r"scans\[1\]: scene 3dssg-room-1b-2 is listed twice"),
+    ({"scans": [SCAN, SCAN]}, r"scans\.1: scene 3dssg-room-1b-2 is listed twice"),
 ]
 
 
@@ -417,21 +405,19 @@ def expected_corners(box: dict[str, Any]) -> list[list[float]]:
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("field", "value"),
     [
-        ({"coeffs": np.array([[1.0, 0.5]])}, r"coeffs must be finite, of shape \(3,\)"),
-        ({"centroid": np.array([[1.0, math.nan, 0.0]])}, "centroid must be finite"),
-        ({"basis": "none"}, "basis is not numeric"),
-        ({"classname": ""}, "classname must be a non-empty string"),
-        (None, "lacks 'classname'"),
+        ("coeffs", np.array([[1.0, 0.5]])),
+        ("centroid", np.array([[1.0, math.nan, 0.0]])),
+        ("basis", "none"),
+        ("classname", ""),
     ],
 )
-def test_malformed_sunrgbd_mat(tmp_path: Path, change: Any, message: str) -> None:
-    named = BOXES[0] | (change or {})
-    broken = named if change else {name: x for name, x in named.items() if name != "classname"}
+def test_malformed_sunrgbd_mat(tmp_path: Path, field: str, value: Any) -> None:
     path = tmp_path / "SUNRGBDMeta3DBB_v2.mat"
-    savemat(path, {"SUNRGBDMeta": struct_array([frame("SUNRGBD/kv2/a/1", [broken])])})
-    check_malformed(path, message, "SUNRGBDMeta(1).groundtruth3DBB(1)")
+    boxes = [BOXES[0] | {field: value}]
+    savemat(path, {"SUNRGBDMeta": struct_array([frame("SUNRGBD/kv2/a/1", boxes)])})
+    check_malformed(path, field, f"0.groundtruth3DBB.0.{field}")
 
 
 def test_mat_files_of_other_content(tmp_path: Path) -> None:
@@ -439,7 +425,7 @@ def test_mat_files_of_other_content(tmp_path: Path) -> None:
     savemat(path, {"data": np.eye(2)})
     check_malformed(path, "lacks the variable SUNRGBDMeta")
     savemat(path, {"SUNRGBDMeta": struct_array([{"K": np.eye(3)}])})
-    check_malformed(path, "lacks 'sequenceName'", "SUNRGBDMeta(1)")
+    check_malformed(path, "Field required", "0.sequenceName")
 
 
 # ------------------------------------------------------------------------------- COCO
@@ -469,21 +455,14 @@ def test_coco(tmp_path: Path) -> None:
 
 
 MALFORMED_COCO = [
-    ([], "must be an object"),
-    ({"images": [], "annotations": []}, "lacks 'categories'"),
-    (COCO | {"categories": [{"id": 62}]}, r"categories\[0\]: lacks 'name'"),
-    (COCO | {"images": []}, r"annotations\[0\]: image_id 9 is not among the images"),
-    (COCO | {"categories": []}, r"annotations\[0\]: category_id 62 is not among"),
+    ({"images": [], "annotations": []}, "categories: Field required"),
+    (COCO | {"images": []}, r"annotations\.0: image_id 9 is not among the images"),
+    (COCO | {"categories": []}, r"annotations\.0: category_id 62 is not among"),
     *(
-        (COCO | {"annotations": [COCO["annotations"][0] | extra]}, message)
-        for extra, message in (
-            ({"bbox": [1, 2, 3]}, r"annotations\[0\]: bbox must be"),
-            ({"bbox": [1, 2, -3, 4]}, "bbox must be"),
-            ({"bbox": [1, 2, 3, "4"]}, "bbox must be"),
-            ({"id": "first"}, "'id' must be of type int"),
-        )
+        (COCO | {"annotations": [COCO["annotations"][0] | {"bbox": box}]}, r"\.0\.bbox\.")
+        for box in ([1, 2, 3], [1, 2, -3, 4], [1, 2, 3, "4"])
     ),
-    (COCO | {"annotations": COCO["annotations"][:1] * 2}, "two annotations have the same id"),
+    (COCO | {"annotations": COCO["annotations"][:1] * 2}, r"annotations\.1: two annotations"),
 ]
 
 
@@ -540,11 +519,10 @@ def test_missing_and_malformed_files(name: str, content: bytes | None, tmp_path:
     assert caught.value.problem
 
 
-def test_a_number_of_400_digits_in_a_json_file_is_an_error(tmp_path: Path) -> None:
+@pytest.mark.parametrize("box", ["9" * 400 + ", 1, 1, 1]}]}", "[" * 100_000])
+def test_huge_numbers_and_deep_lists_in_a_json_file_are_errors(tmp_path: Path, box: str) -> None:
     path = tmp_path / "instances.json"
-    path.write_text('{"categories": [], "images": [], "annotations": [{"bbox": [' + "9" * 400)
-    with pytest.raises(DatasetError, match=r"is not JSON: an integer of 400 digits"):
-        read_scenes(path)
-    path.write_text("[" * 100_000)
-    with pytest.raises(DatasetError, match=r"instances\.json: is not JSON"):
+    annotation = '{"id": 1, "image_id": 1, "category_id": 1, "bbox": ['
+    path.write_text('{"categories": [], "images": [], "annotations": [' + annotation + box)
+    with pytest.raises(DatasetError, match=r"instances\.json"):
         read_scenes(path)

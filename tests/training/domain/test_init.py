@@ -96,8 +96,8 @@ def test_each_invalid_line_is_named_up_to_a_bound(tmp_path) -> None:
     output = init(path, folder=tmp_path / "lab", code=1)
     assert "34 lines are not scenes" in output
     for line, reason in (
-        (4, "lacks label"), (5, "names an object that is not in the scene"),
-        (6, "is on line 1 already"), (7, "not JSON"), (23, ""),
+        (4, "objects.0.label: Field required"), (5, "names an object that is not in the scene"),
+        (6, "is on line 1 already"), (7, "Invalid JSON"), (23, ""),
     ):  # fmt: skip
         assert reason in output.split(f"line {line}: ")[1]
     assert "line 24" not in output
