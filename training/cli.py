@@ -13,9 +13,8 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
-from app.registry import Artifact, RegistryError, Store, load_model_set
+from app.registry import Artifact, RegistryError, Store
 from app.registry.references import AliasTarget
 from training.datasets import DatasetError
 from training.datasets.files import DATA
@@ -32,7 +31,7 @@ from training.fit.trainer import Trainer
 from training.research.ablate import ablate
 from training.research.benchmark import benchmark
 from training.research.tune import tune
-from training.runs.config_files import data_folder, load_config, shipped_configs, with_settings
+from training.runs.config_files import data_folder, load_config, with_settings
 from training.runs.example_scenes import known_examples, read_examples
 from training.runs.folder import FinishedRun, load_run, save_run
 from training.runs.live import Display, next_steps, summarise
@@ -150,9 +149,6 @@ def publish(
     even_if_worse: Annotated[
         bool, typer.Option("--even-if-worse", "--force", help="publish even a refused version")
     ] = False,
-    limit: Annotated[
-        int, typer.Option(min=2, help="with --promote: number of scenes for the comparison")
-    ] = 300,
 ) -> None:
     """Calibrate, evaluate and publish a finished run, or refit the statistics of a version.
 
@@ -192,7 +188,6 @@ def publish(
                 *(run, scenes, root, models, version),
                 alias=alias or "default",
                 margin=margin,
-                limit=limit,
                 even_if_worse=even_if_worse,
             )
         else:
@@ -202,23 +197,6 @@ def publish(
         _exit_refused(error, "; --even-if-worse publishes the version all the same")
     except (RunError, ConfigError, DatasetError, RegistryError) as error:
         fail(error)
-
-
-@app.command(name="list")
-def list_command(store: StorePath = STORE) -> None:
-    """List the models in the store and the shipped configurations."""
-    try:
-        models = load_model_set(Store(store))
-    except RegistryError as error:
-        fail(error)
-    table = Table("model", "version", "variant", "state", title="Published")
-    for (name, version), entry in sorted(models.entries.items()):
-        variant = entry.manifest.variant if hasattr(entry, "manifest") else "?"
-        table.add_row(name, version, variant, getattr(entry, "reason", "verified"))
-    console.print(table)
-    for alias, target in models.aliases.items():
-        console.print(f"{alias} → {target}")
-    console.print("Configurations:", ", ".join(shipped_configs()))
 
 
 def _prepare(config: Config, data: Path) -> SplitScenes:
@@ -299,14 +277,13 @@ def _promote(
     *,
     alias: str,
     margin: float,
-    limit: int,
     even_if_worse: bool,
 ) -> None:
     """Publish the version and point the alias at it, unless the gate refuses the version."""
     served = served_model(store, alias)
 
     def judge(artifact: Artifact, say: Progress) -> list[str]:
-        useful = measure_usefulness(artifact, scenes.training_data(), limit=limit, say=say)
+        useful = measure_usefulness(artifact, scenes.training_data(), say=say)
         for line in useful.lines():
             console.print(line, highlight=False)
         reasons = useful.objections()
@@ -314,7 +291,7 @@ def _promote(
             try:
                 new = Candidate(NEW, run.config, scenes.digests, artifact, root)
                 sides = (new, served.candidate, root)
-                comparison = compare(*sides, limit=limit, say=say)
+                comparison = compare(*sides, say=say)
                 show(comparison, console)
                 reasons += losses(comparison, margin)
             except ConfigError as error:

@@ -16,11 +16,11 @@ from rich.table import Table
 from torch import Tensor
 
 from app.registry import RegistryError, Store
-from training.datasets import DatasetError, annotated_classes, encode
+from training.datasets import AnnotatedScene, DatasetError, annotated_classes, encode
 from training.datasets.batches import SceneTensors, scene_tensors
 from training.datasets.cases import some_scenes
 from training.datasets.files import DATA
-from training.domain.candidates import BASELINES, Candidate, HeldOut, find, held_out
+from training.domain.candidates import BASELINES, Candidate, find, held_out
 from training.domain.init_command import STORE, StorePath, fail
 from training.domain.translation import Translation, same_classes
 from training.evaluation.metrics import Figure
@@ -47,6 +47,9 @@ higher is better."""
 RELATIONAL = ("T1a relations", "T1b completion", "T2-at missing at a place", "T3b placement")
 """Tasks that need scenes with relations."""
 
+SCENES = 300
+"""Maximum number of compared scenes."""
+
 _COLOURS = {"better": "green", "worse": "red"}
 
 console = Console()
@@ -64,7 +67,6 @@ class Comparison:
     b: str  # title of the second model
     scenes: int
     groups: int  # groups of near-duplicates among the compared scenes
-    certain: bool  # False if a model may have learnt from some of the scenes
     notes: tuple[str, ...]
     unmeasured: tuple[str, ...] = ()
 
@@ -98,7 +100,6 @@ def compare_command(
         Path | None, typer.Option("--data", help="folder with the scenes of the first model")
     ] = None,
     store: StorePath = STORE,
-    limit: Annotated[int, typer.Option(min=2, help="maximum number of scenes")] = 300,
     output: Annotated[Path | None, typer.Option("--json", help="write all results here")] = None,
 ) -> None:
     """Compare two models on scenes held out from both.
@@ -115,7 +116,7 @@ def compare_command(
             served = "default" if "default" in models.aliases() else BASELINES
             b = find(old or served, models, data, say)
             root = data or a.data or b.data or DATA
-            comparison = compare(a, b, root, limit=limit, say=say)
+            comparison = compare(a, b, root, say=say)
     except (ConfigError, DatasetError, RegistryError, RunError) as error:
         fail(error)
     if output is not None:
@@ -161,9 +162,7 @@ def difference_text(figure: Figure) -> str:
     return f"{figure.value:+.3f} [{figure.low:+.3f}, {figure.high:+.3f}]"
 
 
-def compare(
-    a: Candidate, b: Candidate, root: Path, *, limit: int | None, say: Progress
-) -> Comparison:
+def compare(a: Candidate, b: Candidate, root: Path, *, say: Progress) -> Comparison:
     """Measure both models on the tasks of `COMPARED`. The questions use the first model's classes.
 
     Args:
@@ -180,11 +179,11 @@ def compare(
         )
     say("reading scenes")
     sources = read_sources(a.config.data, root)
-    test = held_out(a, b, sources, root)
+    test, remarks = held_out(a, b, sources)
     data = split_and_encode(a.config.data, sources, root, a.vocabulary).training_data()
-    encoded = encode(test.scenes, a.vocabulary)
+    encoded = encode(test, a.vocabulary)
     annotated = annotated_classes(encoded, a.vocabulary)
-    scenes = some_scenes(scene_tensors(encoded, annotated, len(a.vocabulary)), limit)
+    scenes = some_scenes(scene_tensors(encoded, annotated, len(a.vocabulary)), SCENES)
     models = (a.model(a.vocabulary, data, say), b.model(a.vocabulary, data, say))
     try:
         titles = a.title, b.title if b.title != a.title else f"{b.title} (second)"
@@ -201,8 +200,7 @@ def compare(
         b=titles[1],
         scenes=len(scenes),
         groups=len({scene.group for scene in scenes.scenes}),
-        certain=test.certain,
-        notes=tuple(_notes(a, b, test, limit)),
+        notes=(*remarks, *_notes(a, b, test)),
         unmeasured=unmeasured(results.differences, b),
     )
 
@@ -239,13 +237,12 @@ def unmeasured(rows: Sequence[Difference], other: Candidate) -> tuple[str, ...]:
     return tuple(task for task in RELATIONAL if task in measured)
 
 
-def _notes(a: Candidate, b: Candidate, test: HeldOut, limit: int | None) -> Iterator[str]:
-    """Generate remarks on the results: held-out scenes, unknown classes of the second model."""
-    yield from test.notes
+def _notes(a: Candidate, b: Candidate, test: Sequence[AnnotatedScene]) -> Iterator[str]:
+    """Generate remarks on unknown classes of the second model, and on the number of scenes."""
     ours, theirs = a.vocabulary, b.vocabulary
     if ours is not None and theirs is not None and not same_classes(ours, theirs):
         is_unknown = Translation.between(ours, theirs).model_class < 0
-        labels = [thing.label for scene in test.scenes for thing in scene.objects]
+        labels = [thing.label for scene in test for thing in scene.objects]
         mentions = [index for label in labels if (index := ours.index(label)) is not None]
         if missing := int(is_unknown.sum()):
             share = int(is_unknown[mentions].sum()) / max(len(mentions), 1)
@@ -254,5 +251,5 @@ def _notes(a: Candidate, b: Candidate, test: HeldOut, limit: int | None) -> Iter
                 f"{missing} of these classes ({share:.0%} of the objects in the scenes). Objects "
                 "of these classes are not part of its input, and it ranks these classes last"
             )
-    if limit is not None and len(test.scenes) > limit:
-        yield f"only {limit} of {len(test.scenes)} held-out scenes are compared, because of --limit"
+    if len(test) > SCENES:
+        yield f"{SCENES} random scenes of {len(test)} held-out scenes are compared"

@@ -18,7 +18,7 @@ from app.registry.references import AliasTarget
 from training.datasets.batches import TrainingData, subset
 from training.datasets.cases import some_scenes
 from training.domain.candidates import Candidate, stored_candidate
-from training.domain.compare import Comparison, difference_text
+from training.domain.compare import SCENES, Comparison, difference_text
 from training.evaluation.asking import missing_score
 from training.evaluation.baselines import EASE, POPULARITY
 from training.evaluation.metrics import FEWEST_GROUPS, Figure, Ratio, paired_difference
@@ -86,16 +86,14 @@ class Usefulness:
         return f"{self.scenes} test scenes of {self.groups} groups"
 
 
-def measure_usefulness(
-    artifact: Artifact, data: TrainingData, *, limit: int | None, say: Progress
-) -> Usefulness:
+def measure_usefulness(artifact: Artifact, data: TrainingData, *, say: Progress) -> Usefulness:
     """Compare a new version with popularity and EASE on the test scenes of its run.
 
     The baselines learn from the training scenes of the run. Scenes with incomplete object lists are
     left out, unless all test scenes are such scenes.
     """
     complete = data.test.complete.nonzero().squeeze(1)
-    scenes = some_scenes(subset(data.test, complete) if len(complete) else data.test, limit)
+    scenes = some_scenes(subset(data.test, complete) if len(complete) else data.test, SCENES)
     # A question hides one class and lists the others.
     has_two_classes = ((scenes.v > 0) & ~data.structure).sum(1) > 1
     scenes = subset(scenes, has_two_classes.nonzero().squeeze(1))

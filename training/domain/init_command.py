@@ -10,7 +10,6 @@ from typing import Annotated, Literal, NoReturn
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from app.registry import RegistryError
 from app.scene import label_key
@@ -118,7 +117,7 @@ def _read(path: Path) -> list[AnnotatedScene]:
 
 
 def _show(proposal: Proposal) -> None:
-    """Print the facts about the scenes, joined and similar labels, and what the user must check."""
+    """Print the facts about the scenes, joined labels, and what the user must check."""
     facts = proposal.facts
     least, mean, most = facts.objects_per_scene
     rooms = ", ".join(f"{room} {count}" for room, count in list(facts.rooms.items())[:ROWS])
@@ -141,13 +140,6 @@ def _show(proposal: Proposal) -> None:
         [f"{label} ({count}): {why}" for label, count, why in proposal.dropped],
     )
     console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
-    table = Table("label", "like", "mentions", "proposal", "why", title="Similar labels")
-    for pair in sorted(proposal.lookalikes, key=lambda pair: not pair.merged)[:ROWS]:
-        a, b = pair.mentions
-        action = "alias" if pair.merged else "two objects: check"
-        table.add_row(pair.name, pair.like, f"{a}, {b}", action, pair.why)
-    if table.row_count:
-        console.print(table)
     console.print("Please check:" if facts.findings else "no contradictions found")
     for finding in facts.findings:
         console.print(f"  [yellow]{finding.count}[/yellow] × {finding.what}")

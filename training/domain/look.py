@@ -13,6 +13,7 @@ from app.scene.geometry import LARGEST, MOST_DISTANT
 from app.scene.relations import ABOVE, ON_TOP
 from training.datasets import AnnotatedScene
 from training.datasets.names import Names
+from training.domain.labels import Label, similar_labels
 
 # Maximum number of examples in a finding. Further cases are only counted.
 SHOWN = 5
@@ -50,8 +51,8 @@ class Facts:
         return any(self.shares[name] > 0 for name in sources)
 
 
-def look(scenes: Sequence[AnnotatedScene], names: Names) -> Facts:
-    """Compute the statistics and findings of scenes, at least one."""
+def look(scenes: Sequence[AnnotatedScene], labels: Sequence[Label], names: Names) -> Facts:
+    """Compute the statistics and findings of scenes, at least one, and of their labels."""
     sizes = [len(scene.objects) for scene in scenes]
     canonical = [names.canonical_room(scene.room_type) for scene in scenes]
     rooms = Counter(room for room in canonical if room is not None)
@@ -74,12 +75,12 @@ def look(scenes: Sequence[AnnotatedScene], names: Names) -> Facts:
             "boxes in an image": share("box2d"),
             "viewer axes": sum(scene.viewer_frame for scene in scenes) / len(scenes),
         },
-        findings=tuple(finding for finding in _findings(scenes, rooms, names) if finding.count),
+        findings=tuple(x for x in _findings(scenes, labels, rooms, names) if x.count),
     )
 
 
 def _findings(
-    scenes: Sequence[AnnotatedScene], rooms: Counter[str], names: Names
+    scenes: Sequence[AnnotatedScene], labels: Sequence[Label], rooms: Counter[str], names: Names
 ) -> Iterator[Finding]:
     def finding(what: str, advice: str, cases: Iterable[str]) -> Finding:
         examples = list(cases)
@@ -111,6 +112,15 @@ def _findings(
             for scene, triples in listed
             for a, i, j in sorted(triples)
             if a == ON_TOP and (ABOVE, j, i) in triples
+        ),
+    )
+    yield finding(
+        "Two labels differ by one or two letters.",
+        "If one of them is a typing error, correct the scenes, or merge the classes in "
+        "vocabulary.json.",
+        (
+            f"{rare.name} ({rare.mentions}) and {frequent.name} ({frequent.mentions})"
+            for rare, frequent in similar_labels(labels, names)
         ),
     )
     yield finding(

@@ -14,11 +14,11 @@ from typing import Any, Final
 
 from app.registry import Example
 from app.scene import Vocabulary, label_key
-from training.datasets import AnnotatedObject, AnnotatedScene, source_vocabulary, split
+from training.datasets import AnnotatedScene, source_vocabulary, split
 from training.datasets.names import Names, curated_names
 from training.datasets.splits import FRACTIONS
 from training.datasets.vocabulary import coverage
-from training.domain.labels import Label, Lookalike, count_labels, lookalikes
+from training.domain.labels import Label, count_labels
 from training.domain.look import Facts, look
 from training.evaluation.metrics import FEWEST_GROUPS
 from training.fit.configuration import Config, ConfigError
@@ -46,10 +46,9 @@ class Proposal:
     name: str
     facts: Facts
     labels: tuple[Label, ...]
-    lookalikes: tuple[Lookalike, ...]
     minimum: int  # number of objects of a class
     coverage: float  # share of the objects whose label has a class
-    vocabulary: Vocabulary  # merged similar labels are aliases
+    vocabulary: Vocabulary
     dropped: tuple[tuple[str, int, str], ...]  # names without a class: name, objects, reason
     values: dict[str, Any]  # sections of the configuration
     config: Config
@@ -96,10 +95,9 @@ def propose(
             f"{FEWEST_SCENES} scenes, better {FEW_SCENES} scenes of {FEW_SCENES // 2} places"
         )
     names = curated_names()
-    facts = look(scenes, names)
     labels = count_labels(scenes, names)
-    similar = lookalikes(labels, scenes, names)
-    minimum, found = _choose_vocabulary(scenes, similar)
+    facts = look(scenes, labels, names)
+    minimum, found = _choose_vocabulary(scenes)
     vocabulary = _use_frequent_names(found, scenes)
     seed, parts, test_groups = _split(scenes)
     settings, reasons = _configuration(facts, parts)
@@ -120,7 +118,6 @@ def propose(
         name=name,
         facts=facts,
         labels=tuple(labels),
-        lookalikes=tuple(similar),
         minimum=minimum,
         coverage=coverage(found, scenes),
         vocabulary=vocabulary,
@@ -134,45 +131,19 @@ def propose(
     )
 
 
-def _choose_vocabulary(
-    scenes: Sequence[AnnotatedScene], pairs: Sequence[Lookalike]
-) -> tuple[int, Vocabulary]:
+def _choose_vocabulary(scenes: Sequence[AnnotatedScene]) -> tuple[int, Vocabulary]:
     """Return the largest of `_MINIMA` whose classes cover enough objects, and the classes.
 
     Without such a minimum, the result is the smallest one.
     """
     for minimum in _MINIMA:
         try:
-            vocabulary = _vocabulary(scenes, pairs, minimum)
+            vocabulary = source_vocabulary(scenes, minimum=minimum)
         except ValueError:
             continue  # no label has so many mentions
         if minimum == _MINIMA[-1] or coverage(vocabulary, scenes) >= _COVERED:
             return minimum, vocabulary
     raise ConfigError("every label occurs only once: training needs labels with more objects")
-
-
-def _vocabulary(
-    scenes: Sequence[AnnotatedScene], pairs: Sequence[Lookalike], minimum: int
-) -> Vocabulary:
-    merged = {label_key(pair.name): pair for pair in pairs if pair.merged}
-
-    def renamed(thing: AnnotatedObject) -> AnnotatedObject:
-        pair = merged.get(label_key(thing.label))
-        return thing if pair is None else replace(thing, label=pair.like)
-
-    vocabulary = source_vocabulary(
-        [replace(scene, objects=tuple(map(renamed, scene.objects))) for scene in scenes],
-        minimum=minimum,
-    )
-    aliases: defaultdict[str, list[str]] = defaultdict(list)
-    for pair in merged.values():
-        if vocabulary.index(pair.name) is None:
-            aliases[label_key(pair.like)].append(pair.name)
-    objects = [
-        replace(entry, aliases=(*entry.aliases, *aliases[label_key(entry.label)]))
-        for entry in vocabulary.objects
-    ]
-    return Vocabulary(objects, vocabulary.room_types)
 
 
 def _use_frequent_names(vocabulary: Vocabulary, scenes: Sequence[AnnotatedScene]) -> Vocabulary:

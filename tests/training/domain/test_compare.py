@@ -62,7 +62,7 @@ def test_a_comparison_fits_into_80_columns_and_notes_lacking_classes_alone(lacki
         Candidate(title, CONFIG, scenes.digests, draft_artifact(as_stored(machine), vocabulary))
         for title, vocabulary in (("new", scenes.vocabulary), ("old", other))
     )
-    found = compare(a, b, Path(), limit=None, say=lambda _: None)
+    found = compare(a, b, Path(), say=lambda _: None)
     assert ["old lacks 1 of these classes" in note for note in found.notes] == [True] * lacking
     assert {row.task for row in found.results.differences} == set(COMPARED)
     console = Console(file=io.StringIO(), width=80)

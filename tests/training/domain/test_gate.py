@@ -28,7 +28,7 @@ def difference(task: str, metric: str, low: float, high: float) -> Difference:
 def comparison(*rows: tuple[str, str, float, float]) -> Comparison:
     """Of rows (task, metric, low, high)."""
     results = Results("new", (), tuple(difference(*row) for row in rows))
-    return Comparison(results, "old", 40, 20, True, ())
+    return Comparison(results, "old", 40, 20, ())
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def trained(scenes: SplitScenes, **objects: float) -> Artifact:
 
 
 def usefulness(artifact: Artifact, data: TrainingData) -> Usefulness:
-    return measure_usefulness(artifact, data, limit=300, say=lambda _: None)
+    return measure_usefulness(artifact, data, say=lambda _: None)
 
 
 def test_a_trained_model_is_better_than_popularity(rooms) -> None:

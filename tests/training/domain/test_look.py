@@ -10,14 +10,20 @@ from tests.training.scenes import scene
 from training.datasets import generate_rooms
 from training.datasets.names import Names
 from training.datasets.rooms import DOMAINS
-from training.domain.look import LONGEST, look
+from training.domain import look as module
+from training.domain.labels import count_labels
+from training.domain.look import LONGEST, Facts
 
 NAMES = Names()
 
 
+def look(scenes) -> Facts:
+    return module.look(scenes, count_labels(scenes, NAMES), NAMES)
+
+
 def finding(words: str, *scenes) -> tuple[int, list[str]]:
     """Number and examples of the finding whose sentence contains some words."""
-    findings = look(scenes, NAMES).findings
+    findings = look(scenes).findings
     return next(((f.count, f.examples) for f in findings if words in f.what), (0, []))
 
 
@@ -29,15 +35,21 @@ def test_facts_are_counted() -> None:
         [
             scene("a", "cup", "table", relations=[CUP_ON_TABLE], room="Kitchen"),
             scene("b", "cup", "table", "lamp", group="a", position=[(0.0, 0.0, 1.0)] * 3),
-        ],
-        NAMES,
+        ]
     )
     assert (facts.scenes, facts.groups, facts.objects) == (2, 1, 5)
     assert facts.objects_per_scene == (2, 2.5, 3)
     assert facts.rooms == {"kitchen": 1}
     assert facts.shares["relations"] == facts.shares["positions"] == 0.5
     assert facts.related
-    assert not look([scene("a", "cup", "table"), scene("b", "lamp", "bed")], NAMES).related
+    assert not look([scene("a", "cup", "table"), scene("b", "lamp", "bed")]).related
+
+
+def test_similar_labels_are_found() -> None:
+    some = [scene(str(k), "soldering iron") for k in range(3)]
+    slip = scene("slip", "soldering irom")
+    pair = "soldering irom (1) and soldering iron (3)"
+    assert finding("one or two letters", *some, slip) == (1, [pair])
 
 
 def test_relations_in_both_directions_are_found_in_either_wording() -> None:
@@ -96,6 +108,6 @@ def test_millimetres_are_found() -> None:
 
 
 def test_generated_scenes_contradict_nothing() -> None:
-    facts = look(generate_rooms(60, 0, DOMAINS["workplaces"]), NAMES)
-    assert not facts.findings
+    facts = look(generate_rooms(60, 0, DOMAINS["workplaces"]))
+    assert [x.examples for x in facts.findings] == [["pallet jack (3) and pallet rack (31)"]]
     assert facts.shares["viewer axes"] == 1.0

@@ -77,7 +77,6 @@ def test_the_model_is_accurate(workplace) -> None:
     }
     assert values["T2 missing", "MRR, one removed"] > 0.6
     assert values["T3 outliers", "hit@1, uniform"] > 0.8
-    assert comparison["certain"]
 
 
 async def test_the_service_answers_with_the_model(workplace) -> None:
@@ -176,6 +175,5 @@ def test_versions_of_a_growing_data_set_are_compared_on_common_test_scenes(workp
     config.write_text(re.sub(r"steps = \d+", "steps = 2", text))
     invoke("train", config, "--runs", grown / "runs")
     comparison = workplace.compare(grown / "runs" / "my-lab" / "seed-0", "my-lab@1.0.0")
-    assert comparison["certain"]
     assert comparison["scenes"] > 10
     assert comparison["differences"][0]["verdict"] == "worse"
