@@ -92,12 +92,3 @@ def test_files_that_are_no_table(tmp_path: Path) -> None:
         read_prior_scenes(tmp_path / "none.tsv.gz")
     with pytest.raises(DatasetError, match="line 1: must name the columns source, subject"):
         read_prior_scenes(table(tmp_path, head="a\tb"))
-
-
-def test_the_real_table(repository: Path) -> None:
-    path = repository.parent / "shared" / "data" / "extra" / f"{SOURCE}.tsv.gz"
-    if not path.is_file():
-        pytest.skip("the table of ../shared/data is not here")
-    scenes = read_prior_scenes(path)
-    assert len(scenes) > 1000
-    assert "kettle stove" in {scene.group for scene in scenes}

@@ -142,26 +142,12 @@ def write_scene(folder: Path, **fields: Any) -> Path:
     return write_json(folder / "scene.jsonl", scene | fields)
 
 
-@pytest.mark.parametrize(
-    ("source", "listed", "relations"),
-    [
-        ("vrd", [[0, "on the top of", 1], [0, "wear", 1], [1, "beneath", 1]], [(0, "on-top", 1)]),
-        (
-            "3dssg", [[0, "lying on", 1], [1, "close by", 0], [1, "lower than", 0]],
-            [(0, "on-top", 1), (1, "below", 0)],
-        ),
-        (
-            "alfred", [[0, "on-top", 1], [0, "inside", 1], [1, "covered", 0]],
-            [(0, "on-top", 1), (0, "inside", 1)],
-        ),
-    ],
-)  # fmt: skip
-def test_jsonl_translates_the_predicates_of_known_sources(
-    tmp_path: Path, source: str, listed: list[Any], relations: list[Any]
-) -> None:
-    fields = {"relations": listed, "false_relations": [*listed[:1], [1, "under", 0]]}
-    (scene,) = read_scenes(write_scene(tmp_path, source=source, **fields))
-    assert scene.relations == tuple(relations)
+def test_jsonl_translates_the_predicates_of_known_sources(tmp_path: Path) -> None:
+    listed = [[0, "on the top of", 1], [0, "wear", 1], [1, "beneath", 1]]
+    denied = [[0, "on", 1], [1, "under", 0]]
+    fields = {"source": "vrd", "relations": listed, "false_relations": denied}
+    (scene,) = read_scenes(write_scene(tmp_path, **fields))
+    assert scene.relations == ((0, "on-top", 1),)
     assert scene.false_relations == ((0, "on-top", 1), (1, "under", 0))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -300,53 +299,6 @@ def context(likely):
 TARGET = 0.6 * context((0.9, 0.9, 0.1, 0.15)) + 0.4 * context((0.1, 0.1, 0.9, 0.85))
 TARGET = torch.where(EVERY.sum(1) >= 2, TARGET, 0) / TARGET[EVERY.sum(1) >= 2].sum()
 """Two contexts, in scenes of at least two classes."""
-
-
-def masked_divergence(log_odds):
-    """Excess of the expected leave-one-out loss over its minimum, in nats, for log_odds(x) (V,).
-
-    Class j is present beside the list x with the mass p(x + j), as its weight is the number of
-    classes, and absent with the mass sum_{i != j} p(x + i) / n(x + i).
-    """
-    total = 0.0
-    for code, x in list(enumerate(EVERY))[1:-1]:
-        mass = {i: float(TARGET[code + 2**i]) for i in range(V) if not x[i]}
-        for j, on in mass.items():
-            off = (sum(mass.values()) - on) / (float(x.sum()) + 1)
-            total += loss(on, off, float(log_odds(x)[j]))
-            if on and off > 1e-12:
-                total -= loss(on, off, math.log(on / off))
-    return total
-
-
-def loss(on, off, log_odds):
-    return on * math.log1p(math.exp(-log_odds)) + off * math.log1p(math.exp(log_odds))
-
-
-@pytest.mark.parametrize("name", SPECS)
-def test_training_brings_the_conditional_divergence_down(name):
-    """Far below that of classes that do not depend on the list.
-
-    No machine reaches 0, because its log-odds are those of one joint: larger machines reach .33.
-    """
-    changes = {"leave_one_out": 1.0, "rate_prior": 0.0, "generative_weight": 0.0, "steps": 600}
-    config = CONFIG.model_copy(update=changes)
-
-    def trained(without):
-        machine, scenes = machine_of(name, profiles=1), target_scenes()
-        for weight in without:
-            machine.get_parameter(weight).data.zero_()
-            machine.get_parameter(weight).requires_grad_(False)
-        fit_objects(ObjectFit(machine, scenes, config, seed=0))
-        share = torch.tensor([ALL_BUT_ONE])
-        return masked_divergence(
-            lambda x: machine.object_log_odds(x[None].float(), share=share)[0].detach()
-        )
-
-    coupled = ["L"] if SPECS[name].coupled else []
-    reached, alone = trained([]), trained(["W", *coupled])
-    assert alone > 1.5
-    assert reached < 0.6
 
 
 @pytest.mark.parametrize("name", SPECS)
