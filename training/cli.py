@@ -23,7 +23,7 @@ from training.domain.compare import compare, compare_command, show
 from training.domain.evaluate_command import evaluate_command
 from training.domain.gate import MARGIN, NEW, losses, measure_usefulness, served_model
 from training.domain.init_command import STORE, StorePath, example, fail, init
-from training.domain.labels import outside_vocabulary
+from training.domain.look import outside_vocabulary
 from training.evaluation.report import Progress
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, ConfigError, is_file, source_name

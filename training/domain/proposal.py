@@ -15,11 +15,9 @@ from typing import Any, Final
 from app.registry import Example
 from app.scene import Vocabulary, label_key
 from training.datasets import AnnotatedScene, source_vocabulary, split
-from training.datasets.names import Names, curated_names
 from training.datasets.splits import FRACTIONS
-from training.datasets.vocabulary import coverage
-from training.domain.labels import Label, count_labels
-from training.domain.look import Facts, look
+from training.datasets.vocabulary import Names, coverage, curated_names
+from training.domain.look import Facts, Label, count_labels, look
 from training.evaluation.metrics import FEWEST_GROUPS
 from training.fit.configuration import Config, ConfigError
 from training.runs.config_files import sections_toml

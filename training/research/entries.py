@@ -183,7 +183,7 @@ def _machine_model(
     run, seed = folder / "run", config.training.seed
     machine = _train_once(config, data, run, say)
     if not calibrated:
-        draft = draft_artifact(machine.requires_grad_(False), data.classes)
+        draft = draft_artifact(machine.requires_grad_(False), data.vocabulary)
         return artifact_model(draft, data.train, seed=seed, calibrated=False)
     draft = placed_draft(machine, data)
     path = run / CALIBRATION

@@ -297,7 +297,7 @@ class Search:
         return sum(metrics[name].value for name in _BY[self.by] if name in metrics)
 
     def _measure(self, machine: BoltzmannMachine, folder: Path) -> dict[str, Metric]:
-        data, artifact = self.data, draft_artifact(machine, self.data.classes)
+        data, artifact = self.data, draft_artifact(machine, self.data.vocabulary)
         relations = relation_score(artifact, given=False)
         model = Model(missing=missing_score(artifact), relations=relations)
         tasks = [task for task, _ in FIGURES.values()]

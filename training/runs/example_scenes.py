@@ -21,9 +21,9 @@ from app.registry.examples import MAX_WORD, Example, Examples
 from app.scene import Vocabulary, canonicalise
 from training.datasets import AnnotatedScene
 from training.datasets.encoding import room_viewpoint
-from training.datasets.names import curated_names
 from training.datasets.records import AnnotatedObject
 from training.datasets.sources import source_of
+from training.datasets.vocabulary import curated_names
 from training.fit.configuration import ConfigError, first_error
 
 _SHIPPED: Final = Path(__file__).parent / "examples"

@@ -14,13 +14,14 @@ from training.datasets import (
     read_scenes,
     source_vocabulary,
 )
-from training.datasets.names import Names, curated_names
 from training.datasets.vocabulary import (
     INDOOR_FILE,
     MINIMUM_MENTIONS,
+    Names,
     build_indoor_vocabulary,
     build_vocabulary,
     coverage,
+    curated_names,
     indoor_vocabulary,
     vocabulary_json,
     with_room_aliases,

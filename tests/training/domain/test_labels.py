@@ -4,8 +4,8 @@ import pytest
 
 from tests.training.evaluation.scenes import scene as encoded_scene
 from tests.training.scenes import scene
-from training.datasets.names import Names
-from training.domain.labels import count_labels, outside_vocabulary, similar_labels
+from training.datasets.vocabulary import Names
+from training.domain.look import count_labels, outside_vocabulary, similar_labels
 
 NAMES = Names(base=("cup", "table"), aliases={"sofa": ("couch",)})
 

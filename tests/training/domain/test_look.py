@@ -8,11 +8,10 @@ from pydantic import ValidationError
 from scene_client.schemas import MissingRequest
 from tests.training.scenes import scene
 from training.datasets import generate_rooms
-from training.datasets.names import Names
 from training.datasets.rooms import DOMAINS
+from training.datasets.vocabulary import Names
 from training.domain import look as module
-from training.domain.labels import count_labels
-from training.domain.look import LONGEST, Facts
+from training.domain.look import LONGEST, Facts, count_labels
 
 NAMES = Names()
 

@@ -46,9 +46,8 @@ from training.fit.calibrate_objects import (
     served_scenes,
 )
 from training.fit.configuration import ObjectsConfig
-from training.fit.draft import draft_artifact
+from training.fit.draft import draft_artifact, fit_places
 from training.fit.objects import ObjectFit, ObjectScenes, served_popularity, start_objects
-from training.fit.place_statistics import fit_places
 from training.machines import MachineSpec, build
 
 ROOM_COUNT = 400
@@ -71,7 +70,7 @@ def model():
 
 def data_of(validation) -> TrainingData:
     train = rooms(ROOM_COUNT, 2)
-    return TrainingData(train, validation, validation, STRUCTURE, A, len(VOCABULARY.room_types))
+    return TrainingData(train, validation, validation, STRUCTURE, VOCABULARY)
 
 
 @pytest.fixture(scope="module")

@@ -23,8 +23,7 @@ from training.datasets.roles import count_roles
 from training.evaluation.alarms import ALARMS
 from training.fit import calibrate_misplaced as module
 from training.fit.calibrate_misplaced import fit_misplaced, hardest_quantile
-from training.fit.draft import draft_artifact
-from training.fit.place_statistics import fit_places
+from training.fit.draft import draft_artifact, fit_places
 from training.machines import MachineSpec, build
 
 V, SUPPORTERS = 9, 4

@@ -16,7 +16,7 @@ import pytest
 
 from app.inference.variants import VARIANTS, Variant
 from app.scene import ObjectClass, Vocabulary
-from tests.training.research.baselines.furnished import STRUCTURE, A, V, furnished, tensors
+from tests.training.research.baselines.furnished import STRUCTURE, V, furnished, tensors
 from training.datasets import shuffle_objects
 from training.datasets.batches import SceneTensors, TrainingData
 from training.evaluation.artifact_model import relation_score
@@ -107,7 +107,7 @@ def test_machines_fall_to_popularity(variant):
 
 
 VOCABULARY = Vocabulary(
-    [ObjectClass(f"class {k}", structure=bool(STRUCTURE[k])) for k in range(V)], ()
+    [ObjectClass(f"class {k}", structure=bool(STRUCTURE[k])) for k in range(V)], ("first", "second")
 )
 
 
@@ -125,10 +125,5 @@ def trained(variant: Variant, train: SceneTensors, validation: SceneTensors):
             "relations": {"epochs": 6, "batch_size": 32, "learning_rate": 0.04},
         }
     )
-    data = TrainingData(
-        *(train, validation, HELD_OUT, STRUCTURE),
-        relations=A,
-        room_types=2,
-        vocabulary=VOCABULARY,
-    )
+    data = TrainingData(train, validation, HELD_OUT, STRUCTURE, VOCABULARY)
     return Trainer(config, data).run().machine.requires_grad_(False)
