@@ -101,35 +101,27 @@ def choose_examples(
     type. In a scene with more classes, `/missing` would propose few objects. Scenes with positions
     take precedence. Scenes of research-only data sets are left out.
     """
-    objects_of = {
-        scene: _usable(scene, vocabulary)
-        for scene in scenes
-        if not source_of(scene.source).research_only
-    }
+    own = [scene for scene in scenes if not source_of(scene.source).research_only]
+    objects_of = {scene: _usable(scene, vocabulary) for scene in own}
     classes = {scene: {index for index, _ in pairs} for scene, pairs in objects_of.items()}
     frequency = Counter(index for indices in classes.values() for index in indices)
-    candidates = [scene for scene in objects_of if len(classes[scene]) >= _FEWEST_CLASSES]
+    candidates = [scene for scene in own if len(classes[scene]) >= _FEWEST_CLASSES]
     sizes: defaultdict[str | None, list[int]] = defaultdict(list)
     for scene in candidates:
         sizes[scene.room_type].append(len(classes[scene]))
-    median_size = {room: np.median(counts) for room, counts in sizes.items()}
-    ranked = sorted(
-        candidates,
-        key=lambda scene: (
-            not any(thing.position for _, thing in objects_of[scene]),
-            abs(len(classes[scene]) - median_size[scene.room_type]),
-            -sum(frequency[index] for index in classes[scene]),
-        ),
-    )
-    first_of_room: dict[str | None, AnnotatedScene] = {}
-    for scene in ranked:
-        first_of_room.setdefault(scene.room_type, scene)
-    groups = {scene.group for scene in first_of_room.values()}
-    others = [scene for scene in ranked if scene.group not in groups]
-    return tuple(
-        _make_example(scene, objects_of[scene], vocabulary, frequency)
-        for scene in [*first_of_room.values(), *others][:_CHOSEN]
-    )
+
+    def rank(scene: AnnotatedScene) -> tuple[bool, float, int]:
+        distance = abs(len(classes[scene]) - np.median(sizes[scene.room_type]))
+        bare = not any(thing.position for _, thing in objects_of[scene])
+        return bare, float(distance), -sum(frequency[index] for index in classes[scene])
+
+    ranked = sorted(candidates, key=rank)
+    # The first scene of each room type, and then the others.
+    first = {scene.room_type: scene for scene in reversed(ranked)}
+    ranked.sort(key=lambda scene: first[scene.room_type] is not scene)
+    chosen = {scene.group: scene for scene in reversed(ranked)}
+    typical = [scene for scene in ranked if chosen[scene.group] is scene][:_CHOSEN]
+    return tuple(_make_example(x, objects_of[x], vocabulary, frequency) for x in typical)
 
 
 def _usable(scene: AnnotatedScene, vocabulary: Vocabulary) -> list[tuple[int, AnnotatedObject]]:
