@@ -99,8 +99,3 @@ def test_examples_beyond_an_edited_vocabulary_are_left_out_with_the_reason() -> 
     kept, reasons = known_examples(examples, Vocabulary([ObjectClass("bed")], ["bedroom"]))
     assert kept == (examples[0],)
     assert ["'unicorn'" in reasons[0], "'cave'" in reasons[1]] == [True, True]
-
-
-def test_a_label_alone_is_an_object() -> None:
-    example = Example.model_validate({"name": "a", "scene": {"objects": ["bed", "lamp"]}})
-    assert example.request() == {"objects": [{"label": "bed"}, {"label": "lamp"}]}
