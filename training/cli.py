@@ -26,7 +26,7 @@ from training.domain.init_command import STORE, StorePath, example, fail, init
 from training.domain.look import outside_vocabulary
 from training.evaluation.report import Progress
 from training.fit.checkpoint import RunError
-from training.fit.configuration import Config, ConfigError, is_file, source_name
+from training.fit.configuration import Config, ConfigError
 from training.fit.trainer import Trainer
 from training.research.ablate import ablate
 from training.research.benchmark import benchmark
@@ -205,12 +205,8 @@ def _prepare(config: Config, data: Path) -> SplitScenes:
     examples, reasons = known_examples(read_examples(config.examples, data), scenes.vocabulary)
     sizes = ", ".join(f"{len(part)} {name}" for name, part in scenes.parts.items())
     console.print(f"{len(scenes.vocabulary)} object classes; scenes: {sizes}")
-    files = {source_name(source) for source in config.data.sources if is_file(source)}
-    for named in (True, False):
-        all_scenes = (scene for part in scenes.parts.values() for scene in part)
-        selected = (scene for scene in all_scenes if (scene.source in files) == named)
-        if line := outside_vocabulary(selected, named=named):
-            console.print(line, soft_wrap=True, markup=False, highlight=False)
+    if line := outside_vocabulary(scene for part in scenes.parts.values() for scene in part):
+        console.print(line, soft_wrap=True, markup=False, highlight=False)
     for reason in reasons:
         console.print(f"[yellow]note:[/yellow] an example is left out: {reason}", soft_wrap=True)
     return replace(scenes, examples=examples)

@@ -227,8 +227,8 @@ class Label:
     spellings: tuple[str, ...]  # most frequent first
 
 
-def outside_vocabulary(scenes: Iterable[EncodedScene], *, named: bool) -> str:
-    """Return one line that counts or names the labels outside the vocabulary, "" without any."""
+def outside_vocabulary(scenes: Iterable[EncodedScene]) -> str:
+    """Return one line that names the labels outside the vocabulary, "" without any."""
     with_labels = [scene.unknown for scene in scenes if scene.unknown]
     spellings: dict[str, Counter[str]] = {}
     for label, count in Counter(label for labels in with_labels for label in labels).items():
@@ -241,7 +241,7 @@ def outside_vocabulary(scenes: Iterable[EncodedScene], *, named: bool) -> str:
     are, they = ("is", "it is") if len(counts) == 1 else ("are", "they are")
     return (
         f"{_number(len(counts), 'label')} in {_number(len(with_labels), 'scene')} {are} not in "
-        f"the vocabulary{': ' + ', '.join(listed) if named else ''}; {they} left out"
+        f"the vocabulary: {', '.join(listed)}; {they} left out"
     )
 
 
