@@ -141,15 +141,11 @@ def _make_example(
     vocabulary: Vocabulary,
     frequency: Counter[int],
 ) -> Example:
-    """Build a request from a scene, with at most `_MOST_OBJECTS` objects and distinct ids."""
-    kept = _select_objects(usable, frequency)
-    labels = {thing.id: vocabulary.labels[index] for index, thing in kept}
-    label_counts = Counter(labels.values())
-    numbers: Counter[str] = Counter()
-    names: dict[str, str] = {}
-    for thing_id, label in labels.items():
-        numbers[label] += 1
-        names[thing_id] = f"{label[:90]}_{numbers[label]}" if label_counts[label] > 1 else label
+    """Build a request from a scene, with the first object of each of the most frequent classes."""
+    first = dict(reversed(usable))
+    classes = sorted(first, key=lambda index: -frequency[index])[:_MOST_OBJECTS]
+    kept = [(index, thing) for index, thing in usable if index in classes and first[index] is thing]
+    names = {thing.id: vocabulary.labels[index] for index, thing in kept}
     values: dict[str, Any] = {}
     room = curated_names().canonical_room(scene.room_type)
     if room is not None and vocabulary.room_index(room) is not None:
@@ -158,24 +154,10 @@ def _make_example(
         values |= {"frame_id": "map", "viewpoint": _viewpoint(scene)}
     elif relations := _relations(scene, names):
         values["relations"] = relations
-    values["objects"] = [
-        {"id": names[thing.id], "label": labels[thing.id], **_pose(thing)} for _, thing in kept
-    ]
+    values["objects"] = [{"label": names[thing.id]} | _pose(thing) for _, thing in kept]
     scene_id = "".join(filter(str.isprintable, scene.scene_id))
     title = f"{values.get('room_type', 'scene').capitalize()}, {scene_id}"
     return Example.model_validate({"name": title[:MAX_WORD], "scene": values})
-
-
-def _select_objects(
-    objects: Sequence[tuple[int, AnnotatedObject]], frequency: Counter[int]
-) -> list[tuple[int, AnnotatedObject]]:
-    """Return the first objects of all classes, frequent classes first, then the second ones."""
-    counts: Counter[int] = Counter()
-    ranks = []
-    for position, (index, _) in enumerate(objects):
-        ranks.append((counts[index], -frequency[index], position))
-        counts[index] += 1
-    return [objects[position] for position in sorted(p for *_, p in sorted(ranks)[:_MOST_OBJECTS])]
 
 
 def _viewpoint(scene: AnnotatedScene) -> dict[str, float]:
