@@ -137,7 +137,7 @@ def _show(proposal: Proposal) -> None:
     )
     lines += _listing(
         "labels without a class:",
-        [f"{label} ({count}): {why}" for label, count, why in proposal.dropped],
+        [f"{label.name} ({label.mentions})" for label in proposal.dropped],
     )
     console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
     console.print("Please check:" if facts.findings else "no contradictions found")

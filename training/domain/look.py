@@ -20,9 +20,6 @@ from training.datasets.vocabulary import Names, most_frequent
 # Maximum number of examples in a finding. Further cases are only counted.
 SHOWN = 5
 
-# Maximum length of a label in a request, as in `scene_client.schemas.Label`.
-LONGEST = 100
-
 
 @dataclass(frozen=True)
 class Finding:
@@ -40,7 +37,6 @@ class Facts:
 
     scenes: int
     groups: int  # of near-duplicates
-    objects: int
     objects_per_scene: tuple[int, float, int]  # minimum, mean and maximum
     rooms: dict[str, int]  # number of scenes of each canonical room type
     shares: dict[str, float]  # share of scenes with each kind of annotation, such as "positions"
@@ -65,7 +61,6 @@ def look(scenes: Sequence[AnnotatedScene], labels: Sequence[Label], names: Names
     return Facts(
         scenes=len(scenes),
         groups=len({scene.group for scene in scenes}),
-        objects=sum(sizes),
         objects_per_scene=(min(sizes), sum(sizes) / len(sizes), max(sizes)),
         rooms=dict(rooms.most_common()),
         shares={
@@ -126,11 +121,6 @@ def _findings(
         ),
     )
     yield finding(
-        f"Labels are longer than {LONGEST} characters or not printable.",
-        "A request cannot contain such a label. Use other labels.",
-        _invalid_labels(scenes, names),
-    )
-    yield finding(
         "Scenes of different groups have the same objects in the same places or relations.",
         "Remove copies or put them into one group. Otherwise test scenes occur in training.",
         _duplicates(scenes),
@@ -173,14 +163,6 @@ def _beyond_metres(scene: AnnotatedScene) -> bool:
     sides = [side for thing in scene.objects for side in thing.size or ()]
     far = np.linalg.norm(points - middle, axis=1).max() > MOST_DISTANT
     return bool(far or max(sides, default=0) > LARGEST)
-
-
-def _invalid_labels(scenes: Sequence[AnnotatedScene], names: Names) -> Iterator[str]:
-    """Generate the labels that a request refuses, at most 100 characters of each."""
-    for label in sorted({thing.label for scene in scenes for thing in scene.objects}):
-        name = names.canonical(label)
-        if len(name) > LONGEST or not name.isprintable():
-            yield repr(label) if len(label) <= LONGEST else f"{label[:40]!r} …"
 
 
 def _describe_pair(scene: AnnotatedScene, i: int, j: int) -> str:

@@ -16,7 +16,7 @@ from app.registry import Example
 from app.scene import Vocabulary, label_key
 from training.datasets import AnnotatedScene, source_vocabulary, split
 from training.datasets.splits import FRACTIONS
-from training.datasets.vocabulary import Names, coverage, curated_names
+from training.datasets.vocabulary import coverage, curated_names
 from training.domain.look import Facts, Label, count_labels, look
 from training.evaluation.metrics import FEWEST_GROUPS
 from training.fit.configuration import Config, ConfigError
@@ -47,7 +47,7 @@ class Proposal:
     minimum: int  # number of objects of a class
     coverage: float  # share of the objects whose label has a class
     vocabulary: Vocabulary
-    dropped: tuple[tuple[str, int, str], ...]  # names without a class: name, objects, reason
+    dropped: tuple[Label, ...]  # names without a class
     values: dict[str, Any]  # sections of the configuration
     config: Config
     reasons: dict[str, str]  # reason for the value of "section.entry"
@@ -119,7 +119,7 @@ def propose(
         minimum=minimum,
         coverage=coverage(found, scenes),
         vocabulary=vocabulary,
-        dropped=tuple(_dropped(labels, vocabulary, names, minimum)),
+        dropped=tuple(label for label in labels if vocabulary.index(label.name) is None),
         values=values,
         config=Config.model_validate(values),
         reasons=reasons,
@@ -162,17 +162,6 @@ def _use_frequent_names(vocabulary: Vocabulary, scenes: Sequence[AnnotatedScene]
         objects.append(replace(entry, label=label, aliases=tuple(others)))
     objects = [replace(x, parent=name_of[x.parent]) if x.parent else x for x in objects]
     return Vocabulary(objects, vocabulary.room_types)
-
-
-def _dropped(
-    labels: Sequence[Label], vocabulary: Vocabulary, names: Names, minimum: int
-) -> list[tuple[str, int, str]]:
-    reasons = {label_key(name): "not an object" for name in names.not_objects}
-    return [
-        (x.name, x.mentions, reasons.get(label_key(x.name), f"under {minimum} mentions"))
-        for x in labels
-        if vocabulary.index(x.name) is None
-    ]
 
 
 def _split(scenes: Sequence[AnnotatedScene]) -> tuple[int, dict[str, int], int]:
