@@ -15,7 +15,7 @@ from app.scene import CANONICAL, canonicalise, label_key
 from app.scene.geometry import LARGEST, MOST_DISTANT
 from app.scene.relations import ABOVE, ON_TOP
 from training.datasets import AnnotatedScene, EncodedScene
-from training.datasets.vocabulary import Names, most_frequent
+from training.datasets.vocabulary import curated_names, most_frequent
 
 # Maximum number of examples in a finding. Further cases are only counted.
 SHOWN = 5
@@ -49,10 +49,10 @@ class Facts:
         return any(self.shares[name] > 0 for name in sources)
 
 
-def look(scenes: Sequence[AnnotatedScene], labels: Sequence[Label], names: Names) -> Facts:
+def look(scenes: Sequence[AnnotatedScene], labels: Sequence[Label]) -> Facts:
     """Compute the statistics and findings of scenes, at least one, and of their labels."""
     sizes = [len(scene.objects) for scene in scenes]
-    canonical = [names.canonical_room(scene.room_type) for scene in scenes]
+    canonical = [curated_names().canonical_room(scene.room_type) for scene in scenes]
     rooms = Counter(room for room in canonical if room is not None)
 
     def share(attribute: str) -> float:
@@ -72,12 +72,12 @@ def look(scenes: Sequence[AnnotatedScene], labels: Sequence[Label], names: Names
             "boxes in an image": share("box2d"),
             "viewer axes": sum(scene.viewer_frame for scene in scenes) / len(scenes),
         },
-        findings=tuple(x for x in _findings(scenes, labels, rooms, names) if x.count),
+        findings=tuple(x for x in _findings(scenes, labels, rooms) if x.count),
     )
 
 
 def _findings(
-    scenes: Sequence[AnnotatedScene], labels: Sequence[Label], rooms: Counter[str], names: Names
+    scenes: Sequence[AnnotatedScene], labels: Sequence[Label], rooms: Counter[str]
 ) -> Iterator[Finding]:
     def finding(what: str, advice: str, cases: Iterable[str]) -> Finding:
         examples = list(cases)
@@ -117,7 +117,7 @@ def _findings(
         "vocabulary.json.",
         (
             f"{rare.name} ({rare.mentions}) and {frequent.name} ({frequent.mentions})"
-            for rare, frequent in similar_labels(labels, names)
+            for rare, frequent in similar_labels(labels)
         ),
     )
     yield finding(
@@ -231,11 +231,11 @@ def _number(count: int, noun: str) -> str:
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
-def count_labels(scenes: Iterable[AnnotatedScene], names: Names) -> list[Label]:
+def count_labels(scenes: Iterable[AnnotatedScene]) -> list[Label]:
     """Count all names, most frequent first. Spellings with the same key count as one name."""
     spellings: defaultdict[str, Counter[str]] = defaultdict(Counter)
     names_of: defaultdict[str, Counter[str]] = defaultdict(Counter)
-    canonical = cache(names.canonical)
+    canonical = cache(curated_names().canonical)
     for thing in (thing for scene in scenes for thing in scene.objects):
         name = canonical(thing.label)
         key = label_key(name)
@@ -248,7 +248,7 @@ def count_labels(scenes: Iterable[AnnotatedScene], names: Names) -> list[Label]:
     return sorted(labels, key=lambda label: (-label.mentions, label.name))
 
 
-def similar_labels(labels: Sequence[Label], names: Names) -> Iterator[tuple[Label, Label]]:
+def similar_labels(labels: Sequence[Label]) -> Iterator[tuple[Label, Label]]:
     """Generate pairs (rarer, more frequent) of names that differ by a likely typing error.
 
     The names differ by one edit, or by two edits if long. Two curated names, or two names with
@@ -256,6 +256,7 @@ def similar_labels(labels: Sequence[Label], names: Names) -> Iterator[tuple[Labe
     """
     compared = [label for label in labels[:_COMPARED] if len(label_key(label.name)) >= _ONE_SLIP]
     keys = [label_key(label.name) for label in compared]
+    names = curated_names()
     curated = {label_key(name) for name in (*names.base, *names.aliases, *names.structure)}
     for i, key in enumerate(keys):
         slips = 2 if len(key) >= _TWO_SLIPS else 1

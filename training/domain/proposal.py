@@ -16,7 +16,7 @@ from app.registry import Example
 from app.scene import Vocabulary, label_key
 from training.datasets import AnnotatedScene, source_vocabulary, split
 from training.datasets.splits import FRACTIONS
-from training.datasets.vocabulary import coverage, curated_names
+from training.datasets.vocabulary import coverage
 from training.domain.look import Facts, Label, count_labels, look
 from training.evaluation.metrics import FEWEST_GROUPS
 from training.fit.configuration import Config, ConfigError
@@ -92,9 +92,8 @@ def propose(
             "may learn no more than the frequency of each class. Provide at least "
             f"{FEWEST_SCENES} scenes, better {FEW_SCENES} scenes of {FEW_SCENES // 2} places"
         )
-    names = curated_names()
-    labels = count_labels(scenes, names)
-    facts = look(scenes, labels, names)
+    labels = count_labels(scenes)
+    facts = look(scenes, labels)
     minimum, found = _choose_vocabulary(scenes)
     vocabulary = _use_frequent_names(found, scenes)
     seed, parts, test_groups = _split(scenes)

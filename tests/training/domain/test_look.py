@@ -8,15 +8,12 @@ from tests.training.evaluation.scenes import scene as encoded_scene
 from tests.training.scenes import scene
 from training.datasets import generate_rooms
 from training.datasets.rooms import DOMAINS
-from training.datasets.vocabulary import Names
 from training.domain import look as module
 from training.domain.look import Facts, count_labels, outside_vocabulary, similar_labels
 
-NAMES = Names()
-
 
 def look(scenes) -> Facts:
-    return module.look(scenes, count_labels(scenes, NAMES), NAMES)
+    return module.look(scenes, count_labels(scenes))
 
 
 def finding(words: str, *scenes) -> tuple[int, list[str]]:
@@ -98,12 +95,9 @@ def test_generated_scenes_contradict_nothing() -> None:
     assert facts.shares["viewer axes"] == 1.0
 
 
-CURATED = Names(base=("cup", "table"), aliases={"sofa": ("couch",)})
-
-
 def test_spellings_and_aliases_count_as_one_label() -> None:
     scenes = [scene("a", "Lab Stool", "lab_stools", "couch"), scene("b", "lab stool", "sofa")]
-    found = {label.name: label for label in count_labels(scenes, CURATED)}
+    found = {label.name: label for label in count_labels(scenes)}
     assert set(found) == {"lab stool", "sofa"}
     stool = found["lab stool"]
     assert stool.mentions == 3
@@ -124,13 +118,11 @@ def test_likely_typing_errors_are_found() -> None:
         "conveyor 2": 1,
     }
     scenes = [scene(f"{label} {k}", label) for label, n in counts.items() for k in range(n)]
-    (pair,) = similar_labels(count_labels(scenes, CURATED), CURATED)
+    (pair,) = similar_labels(count_labels(scenes))
     assert [(label.name, label.mentions) for label in pair] == [
         ("osciloscope", 2),
         ("oscilloscope", 30),
     ]
-    curated = Names(base=("cushion", "pushion"))
-    assert not list(similar_labels(count_labels([scene("a", *curated.base)], curated), curated))
 
 
 def test_labels_outside_the_vocabulary_are_one_line() -> None:
