@@ -14,9 +14,9 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
-from functools import partial
+from functools import cache, partial
 from itertools import product
 from pathlib import Path
 from statistics import fmean, median, stdev
@@ -53,8 +53,6 @@ Run = dict[str, Any]
 Row = dict[str, float]
 """Figures by metric."""
 
-_run_job: Callable[[Job], Run]  # of a worker process
-
 
 class FolderError(ValueError):
     """A folder contains figures of other scenes or settings. The message names the file."""
@@ -80,10 +78,11 @@ def seed(
     """
     try:
         with console.status("reading scenes"):
-            materials = read_material(source, data)
+            materials = _materials(source, data)
         folder = out / Path(source).name.split(".")[0]
         settings = {"epochs": epochs, "learning_rate": learning_rate}
-        runs = _train_all(materials, folder, seeds, settings, workers)
+        run_job = partial(_run, source=source, data=data, folder=folder, settings=settings)
+        runs = _train_all(run_job, list(product(materials, VARIANTS, range(seeds))), workers)
     except (DatasetError, FolderError, FloatingPointError) as error:
         console.print(f"[red]error:[/red] {error}", soft_wrap=True)
         raise typer.Exit(1) from None
@@ -102,22 +101,20 @@ def seed(
     console.print(f"results: {folder}/results.md, results.json, errors.png", soft_wrap=True)
 
 
+@cache
+def _materials(source: str, data: Path) -> dict[str, Material]:
+    """Read the scenes once in each process."""
+    return read_material(source, data)
+
+
 def _train_all(
-    materials: Mapping[str, Material],
-    folder: Path,
-    seeds: int,
-    settings: Mapping[str, float],
-    workers: int,
+    run_job: Callable[[Job], Run], jobs: Sequence[Job], workers: int
 ) -> dict[str, dict[str, list[Run]]]:
     """Return the runs by split and variant, from files or worker processes of one thread."""
-    runs: dict[str, dict[str, list[Run]]] = {split: {} for split in materials}
-    jobs = list(product(materials, VARIANTS, range(seeds)))
-    # Each worker gets the scenes once. With them in every job, the pipe of jobs would be full when
-    # training fails, and the pool could not end.
-    run_job = partial(_run, folder=folder, materials=dict(materials), settings=dict(settings))
-    pool = multiprocessing.get_context("spawn").Pool(workers, _start_worker, (run_job,))
+    runs: dict[str, dict[str, list[Run]]] = {split: {} for split, _, _ in jobs}
+    pool = multiprocessing.get_context("spawn").Pool(workers, _start_worker)
     with console.status(f"training {len(jobs)} machines"), pool:
-        for done, run in enumerate(pool.imap(_work, jobs), 1):
+        for done, run in enumerate(pool.imap(run_job, jobs), 1):
             split, name, number = jobs[done - 1]
             runs[split].setdefault(name, []).append(run)
             last = run["history"][-1]
@@ -129,24 +126,13 @@ def _train_all(
     return runs
 
 
-def _start_worker(run_job: Callable[[Job], Run]) -> None:
+def _start_worker() -> None:
     """Use one thread, and leave Ctrl-C to the parent process."""
-    global _run_job
-    _run_job = run_job
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _work(job: Job) -> Run:
-    return _run_job(job)
-
-
-def _run(
-    job: Job,
-    folder: Path,
-    materials: Mapping[str, Material],
-    settings: Mapping[str, Any],
-) -> Run:
+def _run(job: Job, source: str, data: Path, folder: Path, settings: Mapping[str, Any]) -> Run:
     """Return the run in a file, or train and measure a machine and write the file.
 
     A job is a split, a variant and a training seed.
@@ -157,7 +143,7 @@ def _run(
     """
     split, name, number = job
     path = folder / split / f"{name}-seed-{number}.json"
-    material = materials[split]
+    material = _materials(source, data)[split]
     settings = {"scenes": material.digest, **settings}
     if path.exists():
         run: Run = json.loads(path.read_text(encoding="utf-8"))

@@ -129,5 +129,5 @@ def test_errors_are_named(finished, tmp_path, monkeypatch):
     def stopped(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(command, "read_material", stopped)
+    monkeypatch.setattr(command, "_materials", stopped)
     assert "run the same command again" in invoke(*again, code=130)
