@@ -44,23 +44,24 @@ class Usefulness:
 
     scenes: int
     groups: int  # of near-duplicates among the scenes
-    ours: float | None = None  # MRR of the new version; None if too few groups can be used
-    theirs: Mapping[str, float] = field(default_factory=dict)  # MRR of each baseline, by name
+    # MRR of the new version and of each baseline, by name; empty with too few groups.
+    mrr: Mapping[str, float] = field(default_factory=dict)
     differences: Mapping[str, Figure] = field(default_factory=dict)  # new version minus baseline
 
     def lines(self) -> Iterator[str]:
         """Generate the results as lines of at most 80 characters."""
-        if self.ours is None:
+        if not self.mrr:
             return
         yield f"mean reciprocal rank of a missing object, {self._sample_text()}:"
-        yield f"  {NEW:16} {self.ours:.3f}"
-        for name, value in self.theirs.items():
-            yield f"  {name:16} {value:.3f}  difference {difference_text(self.differences[name])}"
+        for name, value in self.mrr.items():
+            gap = self.differences.get(name)
+            text = "" if gap is None else f"  difference {difference_text(gap)}"
+            yield f"  {name:16} {value:.3f}{text}"
         yield f"  required over {POPULARITY.name}: {_REQUIRED}"
 
     def objections(self) -> list[str]:
         """Return the reasons against the new version; an empty list if it is useful."""
-        if self.ours is None or self.groups < FEWEST_GROUPS:
+        if self.groups < FEWEST_GROUPS:
             return [
                 f"{NEW} cannot be compared with {POPULARITY.name}: {self._sample_text()}, and a "
                 f"comparison needs test scenes of at least {FEWEST_GROUPS} groups with two or more "
@@ -106,12 +107,13 @@ def measure_usefulness(artifact: Artifact, data: TrainingData, *, say: Progress)
             raise ValueError("the model has no score of missing objects")
         return rank_missing(scenes, data.structure, score).mrr().by(scenes.group_ids)
 
-    ours, values, gaps = mrr(missing_score(artifact)), {}, {}
+    ours, gaps = mrr(missing_score(artifact)), {}
+    values = {NEW: ours.value}
     for baseline in (POPULARITY, EASE):
         say(f"fitting {baseline.name}")
         theirs = mrr(baseline.fit(data.train, data.validation, data.structure).missing)
         values[baseline.name], gaps[baseline.name] = theirs.value, paired_difference(ours, theirs)
-    return replace(usefulness, ours=ours.value, theirs=values, differences=gaps)
+    return replace(usefulness, mrr=values, differences=gaps)
 
 
 class ServedModel(NamedTuple):
