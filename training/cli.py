@@ -13,9 +13,8 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
-from app.registry import Artifact, RegistryError, Store, load_model_set
+from app.registry import Artifact, RegistryError, Store
 from app.registry.references import AliasTarget
 from training.datasets import DatasetError
 from training.datasets.files import DATA
@@ -24,15 +23,15 @@ from training.domain.compare import compare, compare_command, show
 from training.domain.evaluate_command import evaluate_command
 from training.domain.gate import MARGIN, NEW, losses, measure_usefulness, served_model
 from training.domain.init_command import STORE, StorePath, example, fail, init
-from training.domain.labels import outside_vocabulary
+from training.domain.look import outside_vocabulary
 from training.evaluation.report import Progress
 from training.fit.checkpoint import RunError
-from training.fit.configuration import Config, ConfigError, is_file, source_name
+from training.fit.configuration import Config, ConfigError
 from training.fit.trainer import Trainer
 from training.research.ablate import ablate
 from training.research.benchmark import benchmark
 from training.research.tune import tune
-from training.runs.config_files import data_folder, load_config, shipped_configs, with_settings
+from training.runs.config_files import data_folder, load_config, with_settings
 from training.runs.example_scenes import known_examples, read_examples
 from training.runs.folder import FinishedRun, load_run, save_run
 from training.runs.live import Display, next_steps, summarise
@@ -89,9 +88,6 @@ def train(
             "--publish then copies the test results of the finished run without --final",
         ),
     ] = False,
-    tensorboard: Annotated[
-        Path | None, typer.Option("--tensorboard", help="write TensorBoard logs to this folder")
-    ] = None,
     publish: Annotated[str | None, typer.Option(help="publish the run as this version")] = None,
     store: StorePath = STORE,
 ) -> None:
@@ -112,7 +108,7 @@ def train(
         scenes = _prepare(config, root)
         for name in ("checkpoint.pt", "result.json") if fresh else ():
             (folder / name).unlink(missing_ok=True)
-        _train(config, scenes, folder, root, tensorboard)
+        _train(config, scenes, folder, root)
         if publish is None and not final:
             next_steps(folder, console)
         if publish is not None:
@@ -153,9 +149,6 @@ def publish(
     even_if_worse: Annotated[
         bool, typer.Option("--even-if-worse", "--force", help="publish even a refused version")
     ] = False,
-    limit: Annotated[
-        int, typer.Option(min=2, help="with --promote: number of scenes for the comparison")
-    ] = 300,
 ) -> None:
     """Calibrate, evaluate and publish a finished run, or refit the statistics of a version.
 
@@ -195,7 +188,6 @@ def publish(
                 *(run, scenes, root, models, version),
                 alias=alias or "default",
                 margin=margin,
-                limit=limit,
                 even_if_worse=even_if_worse,
             )
         else:
@@ -207,55 +199,32 @@ def publish(
         fail(error)
 
 
-@app.command(name="list")
-def list_command(store: StorePath = STORE) -> None:
-    """List the models in the store and the shipped configurations."""
-    try:
-        models = load_model_set(Store(store))
-    except RegistryError as error:
-        fail(error)
-    table = Table("model", "version", "variant", "state", title="Published")
-    for (name, version), entry in sorted(models.entries.items()):
-        variant = entry.manifest.variant if hasattr(entry, "manifest") else "?"
-        table.add_row(name, version, variant, getattr(entry, "reason", "verified"))
-    console.print(table)
-    for alias, target in models.aliases.items():
-        console.print(f"{alias} → {target}")
-    console.print("Configurations:", ", ".join(shipped_configs()))
-
-
 def _prepare(config: Config, data: Path) -> SplitScenes:
     with console.status("reading and encoding scenes"):
         scenes = prepare(config, data)
     examples, reasons = known_examples(read_examples(config.examples, data), scenes.vocabulary)
     sizes = ", ".join(f"{len(part)} {name}" for name, part in scenes.parts.items())
     console.print(f"{len(scenes.vocabulary)} object classes; scenes: {sizes}")
-    files = {source_name(source) for source in config.data.sources if is_file(source)}
-    for named in (True, False):
-        all_scenes = (scene for part in scenes.parts.values() for scene in part)
-        selected = (scene for scene in all_scenes if (scene.source in files) == named)
-        if line := outside_vocabulary(selected, named=named):
-            console.print(line, soft_wrap=True, markup=False, highlight=False)
+    if line := outside_vocabulary(scene for part in scenes.parts.values() for scene in part):
+        console.print(line, soft_wrap=True, markup=False, highlight=False)
     for reason in reasons:
         console.print(f"[yellow]note:[/yellow] an example is left out: {reason}", soft_wrap=True)
     return replace(scenes, examples=examples)
 
 
-def _train(
-    config: Config, scenes: SplitScenes, folder: Path, root: Path, tensorboard: Path | None
-) -> None:
+def _train(config: Config, scenes: SplitScenes, folder: Path, root: Path) -> None:
     trainer = Trainer(config, scenes.training_data(), folder)
     if trainer.resume():
         console.print(f"resuming after {trainer.position}")
     console.print(f"{config.name}: {trainer.machine.parameter_count:,} weights")
     try:
-        with Display(trainer, console, tensorboard) as display:
-            result = trainer.run(display.progress, display.passed)
+        with Display(trainer, console) as display:
+            result = trainer.run(display.progress)
     except KeyboardInterrupt:
         console.print(f"stopped after {trainer.position}; run the same command to continue")
         raise typer.Exit(130) from None
     save_run(folder, config, result, data=root, scenes=scenes.digest)
-    summarise(result, trainer, folder, console)
+    summarise(result, folder, console)
 
 
 def _publish(
@@ -304,14 +273,13 @@ def _promote(
     *,
     alias: str,
     margin: float,
-    limit: int,
     even_if_worse: bool,
 ) -> None:
     """Publish the version and point the alias at it, unless the gate refuses the version."""
     served = served_model(store, alias)
 
     def judge(artifact: Artifact, say: Progress) -> list[str]:
-        useful = measure_usefulness(artifact, scenes.training_data(), limit=limit, say=say)
+        useful = measure_usefulness(artifact, scenes.training_data(), say=say)
         for line in useful.lines():
             console.print(line, highlight=False)
         reasons = useful.objections()
@@ -319,7 +287,7 @@ def _promote(
             try:
                 new = Candidate(NEW, run.config, scenes.digests, artifact, root)
                 sides = (new, served.candidate, root)
-                comparison = compare(*sides, limit=limit, examples=3, say=say)
+                comparison = compare(*sides, say=say)
                 show(comparison, console)
                 reasons += losses(comparison, margin)
             except ConfigError as error:

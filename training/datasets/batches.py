@@ -32,10 +32,6 @@ class Batch:
     def __len__(self) -> int:
         return len(self.v)
 
-    def to(self, device: torch.device) -> Batch:
-        """Return the batch on a device."""
-        return Batch(*(tensor.to(device) for tensor in vars(self).values()))
-
     def rows(self, index: Tensor) -> Batch:
         """Return the scenes at the given indices. A mask selects the scenes where it is True."""
         return Batch(*(tensor[index] for tensor in vars(self).values()))
@@ -134,31 +130,20 @@ def seen_triples(scenes: Sequence[EncodedScene], size: int, minimum: int = 1) ->
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Scenes of the train, validation and test part, and data for the sizes of the machine."""
+    """Scenes of the train, validation and test part, with their classes and room types."""
 
     train: SceneTensors
     validation: SceneTensors
     test: SceneTensors
-    structure: Tensor
-    relations: int
-    room_types: int
+    structure: Tensor  # True for structural classes, (classes,)
+    vocabulary: Vocabulary
     digest: str = ""  # of the scenes, their vocabulary and split, for the resumption of a run
     words: Tensor | None = None  # (V, D) unit word vectors of the classes, 0 where unknown
-    vocabulary: Vocabulary | None = None  # None if the classes have no names
     roles: RoleCounts | None = None  # of the classes in the training scenes
 
     @property
-    def classes(self) -> Vocabulary:
-        """The object classes and room types, or a ValueError if the classes have no names."""
-        if self.vocabulary is None:
-            raise ValueError("the classes of the training scenes have no names")
-        return self.vocabulary
-
-    @cached_property
     def parents(self) -> Tensor:
         """(V,) int64 index of the parent of each class, -1 without a parent."""
-        if self.vocabulary is None:
-            return torch.full((len(self.structure),), -1, dtype=torch.int64)
         return torch.from_numpy(self.vocabulary.parents.copy())
 
     @property

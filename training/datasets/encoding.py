@@ -31,10 +31,10 @@ from app.scene.scene import pool_classes, pool_relations
 from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN, Heights, stands_of
 from scene_client.image_plane import are_neighbours, relation_between
 from training.datasets.array_types import Flags, Floats, Ints
-from training.datasets.names import curated_names
 from training.datasets.records import AnnotatedObject, AnnotatedScene, Box2d
 from training.datasets.roles import lift_of
 from training.datasets.sources import Meaning, meaning_of, source_of
+from training.datasets.vocabulary import curated_names
 
 A = len(CANONICAL)
 # Roles of an object at its support.

@@ -13,18 +13,56 @@ A reader raises a DatasetError if a file is missing or does not have the officia
 
 from __future__ import annotations
 
-import math
-from collections import defaultdict
 from collections.abc import Callable
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from training.datasets.files import Node, load_json
+from pydantic import BaseModel
+
+from training.datasets.files import read_json
 from training.datasets.jsonl import read_jsonl
-from training.datasets.records import AnnotatedObject, AnnotatedScene, Box2d, DatasetError
+from training.datasets.records import (
+    AnnotatedObject,
+    AnnotatedScene,
+    DatasetError,
+    Id,
+    Length,
+    Number,
+    Text,
+)
 from training.datasets.sources import relations_of, supported_subjects
 from training.datasets.sunrgbd_mat import read_sunrgbd_mat
+
+
+class _Scan(BaseModel):
+    scan: str
+    split: int | str | None = None
+    objects: dict[str, Text] | None = None  # labels by object; None: see objects.json
+    relationships: list[tuple[Id, Id, Any, str]]  # subject, object, id and name of the predicate
+
+
+class _Scans(BaseModel):
+    scans: list[_Scan]
+
+
+class _Thing(BaseModel):
+    id: Id
+    label: Text
+
+
+class _LabelledScan(BaseModel):
+    scan: str
+    objects: list[_Thing]
+
+
+class _LabelledScans(BaseModel):
+    scans: list[_LabelledScan]
+
+
+class _Room(BaseModel):
+    reference: str
+    scans: list[_Room] = []  # of the same room
 
 
 def read_3dssg(path: Path) -> list[AnnotatedScene]:
@@ -32,77 +70,64 @@ def read_3dssg(path: Path) -> list[AnnotatedScene]:
 
     All scans of a room are in one group. The official files contain no room types and no poses.
     """
-    scans = load_json(path).entries("scans")
-    rooms = _rooms(path.with_name("3RScan.json"))
-    whole: dict[str, dict[str, str]] | None = None
+    scans = read_json(path, _Scans).scans
+    rooms = read_json(path.with_name("3RScan.json"), list[_Room])
+    room_of = {scan.reference: room.reference for room in rooms for scan in (room, *room.scans)}
+    labels_of: dict[str, dict[str, str]] = {}
+    if any(scan.objects is None for scan in scans):
+        for labelled in read_json(path.with_name("objects.json"), _LabelledScans).scans:
+            labels = {thing.id: thing.label for thing in labelled.objects}
+            labels_of.setdefault(labelled.scan, {}).update(labels)
     scenes: dict[str, AnnotatedScene] = {}
-    for scan in scans:
-        name = scan.take("scan", str)
-        if "objects" in scan.value:
-            labels = scan.take("objects", dict)
-        else:
-            whole = _labels(path.with_name("objects.json")) if whole is None else whole
-            labels = whole.get(name)
-        if labels is None:
-            raise scan.error(f"scan {name} is not in objects.json")
-        if name not in rooms:
-            raise scan.error(f"scan {name} is not in 3RScan.json")
-        part = f"-{scan.value['split']}" if "split" in scan.value else ""
-        scene_id = f"3dssg-{name}{part}"
-        if scene_id in scenes:
-            raise scan.error(f"scene {scene_id} is listed twice")
-        triples = _triples(scan, list(labels))
-        with scan.located():
-            scenes[scene_id] = AnnotatedScene(
-                scene_id=scene_id,
-                source="3dssg",
-                group=f"3rscan-{rooms[name]}",
-                room_type=None,
-                objects=tuple(AnnotatedObject(key, label) for key, label in labels.items()),
-                relations=relations_of("3dssg", triples),
-                supported=supported_subjects("3dssg", triples),
-            )
+    for number, scan in enumerate(scans):
+        name, labels = scan.scan, scan.objects or labels_of.get(scan.scan, {})
+        scene_id = f"3dssg-{name}" if scan.split is None else f"3dssg-{name}-{scan.split}"
+        index_of = {key: index for index, key in enumerate(labels)}
+        problems = {
+            f"scan {name} is not in 3RScan.json": name not in room_of,
+            f"scan {name} is not in objects.json": scan.objects is None and name not in labels_of,
+            f"scene {scene_id} is listed twice": scene_id in scenes,
+            "a relationship names an object that is not in the scan": any(
+                not {subject, anchor} <= labels.keys() for subject, anchor, *_ in scan.relationships
+            ),
+        }
+        for problem, is_found in problems.items():
+            if is_found:
+                raise DatasetError(path, f"scans.{number}", problem)
+        triples = [(index_of[i], name, index_of[j]) for i, j, _, name in scan.relationships]
+        scenes[scene_id] = AnnotatedScene(
+            scene_id=scene_id,
+            source="3dssg",
+            group=f"3rscan-{room_of[name]}",
+            room_type=None,
+            objects=tuple(AnnotatedObject(key, label) for key, label in labels.items()),
+            relations=relations_of("3dssg", triples),
+            supported=supported_subjects("3dssg", triples),
+        )
     return list(scenes.values())
 
 
-def _triples(scan: Node, ids: list[str]) -> list[tuple[int, str, int]]:
-    """Return the triples (subject index, predicate, object index) of a scan."""
-    index_of = {key: index for index, key in enumerate(ids)}
-    triples = []
-    for entry in scan.entries("relationships"):
-        values = entry.value
-        if not isinstance(values, list) or len(values) != 4 or not isinstance(values[3], str):
-            raise entry.error(f"must be [subject, object, predicate id, predicate], not {values!r}")
-        subject, anchor = index_of.get(str(values[0])), index_of.get(str(values[1]))
-        if subject is None or anchor is None:
-            raise entry.error(f"{values!r} names an object that is not in the scan")
-        triples.append((subject, values[3], anchor))
-    return triples
+class _Annotation(BaseModel):
+    id: int
+    image_id: int
+    category_id: int
+    bbox: tuple[Number, Number, Length, Length]  # x, y, width, height
+    iscrowd: bool = False
 
 
-def _labels(path: Path) -> dict[str, dict[str, str]]:
-    """Read ``objects.json``. Return a mapping from scan id to object id to label."""
-    labels: dict[str, dict[str, str]] = defaultdict(dict)
-    for scan in load_json(path).entries("scans"):
-        labels[scan.take("scan", str)] |= {
-            str(thing.take("id", (str, int))): thing.take("label", str)
-            for thing in scan.entries("objects")
-        }
-    return labels
+class _Image(BaseModel):
+    id: int
 
 
-def _rooms(path: Path) -> dict[str, str]:
-    """Read ``3RScan.json``. Map each scan id to the id of the reference scan of the same room."""
-    rooms: dict[str, str] = {}
-    content = load_json(path)
-    if not isinstance(content.value, list):
-        raise content.error("the file must contain a list of reference scans")
-    for number, entry in enumerate(content.value):
-        room = Node(path, entry, f"[{number}]")
-        reference = room.take("reference", str)
-        names = (rescan.take("reference", str) for rescan in room.entries("scans"))
-        rooms |= dict.fromkeys((reference, *names), reference)
-    return rooms
+class _Category(BaseModel):
+    id: int
+    name: Text
+
+
+class _Instances(BaseModel):
+    images: list[_Image]
+    categories: list[_Category]
+    annotations: list[_Annotation]
 
 
 def read_coco(path: Path) -> list[AnnotatedScene]:
@@ -111,38 +136,30 @@ def read_coco(path: Path) -> list[AnnotatedScene]:
     Boxes around crowds are also skipped, because they contain several objects. Boxes are in the
     image plane. Encoding later derives the relations left and above from boxes.
     """
-    content = load_json(path)
-    categories = {c.take("id", int): c.take("name", str) for c in content.entries("categories")}
-    images: dict[int, dict[int, AnnotatedObject]]
-    images = {image.take("id", int): {} for image in content.entries("images")}
-    for entry in content.entries("annotations"):
-        image, category = entry.take("image_id", int), entry.take("category_id", int)
-        if image not in images:
-            raise entry.error(f"image_id {image} is not among the images of the file")
-        if category not in categories:
-            raise entry.error(f"category_id {category} is not among the categories")
-        if entry.value.get("iscrowd"):
-            continue
-        key = entry.take("id", int)
-        if key in images[image]:
-            raise DatasetError(path, f"image {image}", "two annotations have the same id")
-        with entry.located():
-            box = _box(entry)
-            images[image][key] = AnnotatedObject(str(key), categories[category], box2d=box)
+    content = read_json(path, _Instances)
+    categories = {category.id: category.name for category in content.categories}
+    images: dict[int, dict[int, AnnotatedObject]] = {image.id: {} for image in content.images}
+    for number, entry in enumerate(content.annotations):
+        where = f"annotations.{number}"
+        if entry.image_id not in images:
+            raise DatasetError(path, where, f"image_id {entry.image_id} is not among the images")
+        if entry.category_id not in categories:
+            problem = f"category_id {entry.category_id} is not among the categories"
+            raise DatasetError(path, where, problem)
+        things = images[entry.image_id]
+        if entry.id in things:
+            raise DatasetError(path, where, f"two annotations of the image have the id {entry.id}")
+        if not entry.iscrowd:
+            x, y, width, height = entry.bbox
+            label = categories[entry.category_id]
+            things[entry.id] = AnnotatedObject(
+                str(entry.id), label, box2d=(x, y, x + width, y + height)
+            )
     return [
         AnnotatedScene(f"coco-{image}", "coco", f"coco-{image}", None, tuple(objects.values()))
         for image, objects in images.items()
         if objects
     ]
-
-
-def _box(entry: Node) -> Box2d:
-    bbox = entry.take("bbox", list)
-    numbers = all(isinstance(v, (int, float)) and math.isfinite(v) for v in bbox)
-    if len(bbox) != 4 or not numbers or min(bbox[2:]) < 0:
-        raise entry.error(f"bbox must be [x, y, width, height], not {bbox!r}")
-    x, y, width, height = map(float, bbox)
-    return (x, y, x + width, y + height)
 
 
 READERS: Final[dict[str, Callable[[Path], list[AnnotatedScene]]]] = {

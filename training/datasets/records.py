@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Any, Final
+
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
+from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from app.scene import RELATIONS
 
-Point = tuple[float, float, float]
 Box2d = tuple[float, float, float, float]
 
 MAX_COUNT: Final = 1_000_000
@@ -31,39 +32,47 @@ class DatasetError(ValueError):
         self.problem = problem
 
 
-@dataclass(frozen=True, slots=True)
+def _of_request(values: Any) -> Any:
+    """Return the values of an object {x, y, z}, as in a request; other values as they are."""
+    if isinstance(values, dict) and set(values) == {"x", "y", "z"}:
+        return [values[axis] for axis in "xyz"]
+    return values
+
+
+def _ordered(box: Box2d) -> Box2d:
+    if box[0] > box[2] or box[1] > box[3]:
+        raise ValueError(f"must be (xmin, ymin, xmax, ymax), not {box}")
+    return box
+
+
+Text = Annotated[str, Field(pattern=r"\S")]
+"""A text that is not blank."""
+Id = Annotated[str, BeforeValidator(lambda x: str(x) if type(x) is int else x)]
+"""An id: a text, or an integer, which is converted to text."""
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Length = Annotated[Number, Field(ge=0)]
+
+
+@pydantic_dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid"))
 class AnnotatedObject:
     """One annotated object. None means that a value is unknown.
 
     Raises:
-        ValueError: the label is empty, or a number is not finite or out of range.
+        ValueError: the label is blank, or a number is not finite or out of range.
     """
 
-    id: str  # distinct within the scene
-    label: str
-    position: Point | None = None  # centre (x, y, z) in metres
-    size: Point | None = None  # extents before rotation by the yaw, (x, y, z) in metres
-    yaw: float = 0.0  # rotation about the z axis in radians
-    supported_by: str | None = None  # id of the supporting object
-    box2d: Box2d | None = None  # (xmin, ymin, xmax, ymax) in the image, with y downwards
-    count: int = 1  # number of instances that this entry represents
-
-    def __post_init__(self) -> None:
-        if not self.label:
-            raise ValueError(f"object {self.id!r} has an empty label")
-        for name, length in (("position", 3), ("size", 3), ("box2d", 4)):
-            x = getattr(self, name)
-            if x is not None and (len(x) != length or not all(map(math.isfinite, x))):
-                raise ValueError(f"{name} of {self.id!r} must be {length} finite numbers, not {x}")
-        if self.size is not None and min(self.size) < 0:
-            raise ValueError(f"size of {self.id!r} must not be negative, but is {self.size}")
-        if self.box2d and (self.box2d[0] > self.box2d[2] or self.box2d[1] > self.box2d[3]):
-            corners = "(xmin, ymin, xmax, ymax)"
-            raise ValueError(f"box2d of {self.id!r} must be {corners}, not {self.box2d}")
-        if not math.isfinite(self.yaw):
-            raise ValueError(f"yaw of {self.id!r} must be finite, not {self.yaw}")
-        if not 1 <= self.count <= MAX_COUNT:
-            raise ValueError(f"count of {self.id!r} must be 1 to {MAX_COUNT}, not {self.count}")
+    id: Id  # distinct within the scene
+    label: Text
+    # Centre (x, y, z) in metres.
+    position: Annotated[tuple[Number, Number, Number], BeforeValidator(_of_request)] | None = None
+    # Extents before rotation by the yaw, (x, y, z) in metres.
+    size: Annotated[tuple[Length, Length, Length], BeforeValidator(_of_request)] | None = None
+    yaw: Number = 0.0  # rotation about the z axis in radians
+    supported_by: Id | None = None  # id of the supporting object
+    # (xmin, ymin, xmax, ymax) in the image, with y downwards.
+    box2d: Annotated[tuple[Number, Number, Number, Number], AfterValidator(_ordered)] | None = None
+    # Number of instances that this entry represents.
+    count: Annotated[int, Field(strict=True, ge=1, le=MAX_COUNT)] = 1
 
 
 @dataclass(frozen=True, slots=True)

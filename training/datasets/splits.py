@@ -23,8 +23,8 @@ from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Final, Literal
 
-from training.datasets.names import curated_names
 from training.datasets.records import AnnotatedScene
+from training.datasets.vocabulary import curated_names
 
 Part = Literal["train", "test", "validation"]
 Protocol = Literal["group", "stable", "final", "paper", "paper groups"]

@@ -15,14 +15,16 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
+from pydantic import BaseModel, BeforeValidator, Field, TypeAdapter, ValidationError
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
-from training.datasets.files import Node, check_size
-from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
+from training.datasets.array_types import Floats
+from training.datasets.files import check_size, position_and_problem
+from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError, Text
 
 SOURCE = "sunrgbd-mat"
 
@@ -38,6 +40,59 @@ _ENTRY = 64
 _BLOCK = 20  # consecutive frames in a group; they often show the same place
 
 
+def _structs(value: Any) -> list[Any]:
+    """Convert a struct array to a list: a struct, several, or an empty matrix for none."""
+    if isinstance(value, dict):
+        return [value]
+    return list(value) if isinstance(value, list) else list(np.atleast_1d(value))
+
+
+def _finite(*shape: int) -> BeforeValidator:
+    """Return a check that a value is an array of finite numbers of a shape."""
+
+    def check(value: Any) -> Floats:
+        array = np.asarray(value, dtype=np.float64)
+        if array.shape != shape or not np.isfinite(array).all():
+            raise ValueError(f"must be finite, of shape {shape}, not {value!r}")
+        return array
+
+    return BeforeValidator(check)
+
+
+class _Box(BaseModel):
+    """A box. The rows of the basis are its axes, and coeffs the half extents along them."""
+
+    basis: Annotated[Any, _finite(3, 3)]
+    coeffs: Annotated[Any, _finite(3)]
+    centroid: Annotated[Any, _finite(3)]
+    classname: Text
+
+    def to_object(self, number: int) -> AnnotatedObject:
+        """Return the object of the box. Its upright axis has the largest z component."""
+        # Some boxes in the file have negative half extents, so use the absolute values.
+        size = (2 * np.abs(self.coeffs)).tolist()
+        x, y, z = self.centroid.tolist()
+        upright = int(np.abs(self.basis[:, 2]).argmax())
+        ahead, aside = (upright + 1) % 3, (upright + 2) % 3
+        return AnnotatedObject(
+            id=str(number),
+            label=self.classname.strip(),
+            # In the file, x points right and y away from the camera. In viewer axes, x points away
+            # from the viewer and y left.
+            position=(y, -x, z),
+            size=(size[ahead], size[aside], size[upright]),
+            yaw=math.atan2(-float(self.basis[ahead, 0]), float(self.basis[ahead, 1])),
+        )
+
+
+class _Frame(BaseModel):
+    name: Annotated[Text, Field(alias="sequenceName")]
+    boxes: Annotated[list[_Box], BeforeValidator(_structs), Field(alias="groundtruth3DBB")]
+
+
+_FRAMES = TypeAdapter(Annotated[list[_Frame], BeforeValidator(_structs)])
+
+
 def read_sunrgbd_mat(path: Path) -> list[AnnotatedScene]:
     """Read all camera frames with boxes as scenes.
 
@@ -45,21 +100,21 @@ def read_sunrgbd_mat(path: Path) -> list[AnnotatedScene]:
     SUN3D place are in one group. Other frames form groups of 20 consecutive frames from one sensor
     and collection. The file may have at most `MAX_BYTES`.
     """
+    try:
+        frames = _FRAMES.validate_python(_load(path))
+    except ValidationError as error:
+        raise DatasetError(path, *position_and_problem(error)) from error
     scenes: list[AnnotatedScene] = []
-    frames: Counter[str] = Counter()
-    for number, value in enumerate(_structs(_load(path)), 1):
-        frame = Node(path, value, f"SUNRGBDMeta({number})")
-        name = _text(frame, "sequenceName").strip("/")
+    counts: Counter[str] = Counter()
+    for frame in frames:
+        name = frame.name.strip().strip("/")
         collection = "/".join(name.split("/")[:3])
         if "sun3ddata" in name:
             group = "sunrgbd-" + "/".join(name.split("/")[:4])
         else:
-            group = f"sunrgbd-{collection}-{frames[collection] // _BLOCK}"
-        frames[collection] += 1
-        objects = tuple(
-            _box(Node(path, box, f"{frame.where}.groundtruth3DBB({index + 1})"), index)
-            for index, box in enumerate(_structs(frame.take("groundtruth3DBB")))
-        )
+            group = f"sunrgbd-{collection}-{counts[collection] // _BLOCK}"
+        counts[collection] += 1
+        objects = tuple(box.to_object(index) for index, box in enumerate(frame.boxes))
         if objects:
             note = path.parent / name / "scene.txt"
             room = (note.read_text(encoding="utf-8").strip() if note.is_file() else "") or None
@@ -136,48 +191,3 @@ def _entries(body: memoryview, order: str) -> int:
         return count
     _, (_, length), (_, names) = (next(parts, (0, body[:0])) for _ in range(3))
     return count * (len(names) // max(1, struct.unpack_from(f"{order}i", length)[0]))
-
-
-def _structs(value: Any) -> list[Any]:
-    """Convert a struct array to a list: a struct, several, or an empty matrix for none."""
-    if isinstance(value, dict):
-        return [value]
-    return list(value) if isinstance(value, list) else list(np.atleast_1d(value))
-
-
-def _text(node: Node, name: str) -> str:
-    value = node.take(name)
-    if not isinstance(value, str) or not value.strip():
-        raise node.error(f"{name} must be a non-empty string, not {value!r}")
-    return value.strip()
-
-
-def _array(node: Node, name: str, shape: tuple[int, ...]) -> np.ndarray:
-    value = node.take(name)
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise node.error(f"{name} is not numeric") from error
-    if array.shape != shape or not np.isfinite(array).all():
-        raise node.error(f"{name} must be finite, of shape {shape}, not {value!r}")
-    return array
-
-
-def _box(node: Node, number: int) -> AnnotatedObject:
-    """Convert a box of the file. Its upright axis is the one with the largest z component."""
-    basis = _array(node, "basis", (3, 3))
-    # Some boxes in the file have negative half extents, so use the absolute values.
-    size = 2 * np.abs(_array(node, "coeffs", (3,)))
-    x, y, z = _array(node, "centroid", (3,)).tolist()
-    upright = int(np.abs(basis[:, 2]).argmax())
-    ahead, aside = (upright + 1) % 3, (upright + 2) % 3
-    with node.located():
-        return AnnotatedObject(
-            id=str(number),
-            label=_text(node, "classname"),
-            # In the file, x points right and y away from the camera. In viewer axes, x points away
-            # from the viewer and y left.
-            position=(y, -x, z),
-            size=(float(size[ahead]), float(size[aside]), float(size[upright])),
-            yaw=math.atan2(-float(basis[ahead, 0]), float(basis[ahead, 1])),
-        )

@@ -8,13 +8,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 from pydantic import ValidationError
 
 from app.registry import Artifact, Store, StoreError
 from app.scene import Vocabulary
-from training.datasets import AnnotatedScene, DatasetError, split
+from training.datasets import AnnotatedScene, split
 from training.datasets.batches import TrainingData, has_relations
 from training.datasets.records import digest_of
 from training.datasets.splits import stable_part
@@ -25,9 +24,9 @@ from training.evaluation.baselines.fitting import Baseline
 from training.evaluation.model import Model
 from training.evaluation.report import Progress
 from training.fit.checkpoint import RunError
-from training.fit.configuration import Config, ConfigError, DataConfig, source_name
+from training.fit.configuration import Config, ConfigError, source_name
 from training.runs.folder import load_run
-from training.runs.pipeline import prepare, read_sources
+from training.runs.pipeline import prepare
 from training.runs.publish import calibrated_draft
 
 BASELINES = "baselines"
@@ -145,18 +144,11 @@ def _baselines(data: TrainingData, say: Progress) -> Model:
 Sources = Mapping[str, Sequence[AnnotatedScene]]
 
 
-class HeldOut(NamedTuple):
-    """Scenes held out from models, and remarks on their choice.
-
-    `certain` is False if a model may have learnt from some of the scenes.
-    """
-
-    scenes: list[AnnotatedScene]
-    notes: tuple[str, ...] = ()
-    certain: bool = True
+HeldOut = tuple[list[AnnotatedScene], tuple[str, ...]]
+"""Scenes held out from models, and remarks on their choice."""
 
 
-def held_out(a: Candidate, b: Candidate, sources: Sources, root: Path) -> HeldOut:
+def held_out(a: Candidate, b: Candidate, sources: Sources) -> HeldOut:
     """Return the first model's test scenes without scenes that the second model learnt from.
 
     Args:
@@ -180,27 +172,25 @@ def held_out(a: Candidate, b: Candidate, sources: Sources, root: Path) -> HeldOu
                 "compare the run without --final"
             )
         raise ConfigError("the test part contains no scenes: provide more scenes or more groups")
-    first = _drop_learnt(a, test_scenes, sources, root)
-    unlearnt, notes, certain = _drop_learnt(b, first.scenes, sources, root)
+    first, notes = _drop_learnt(a, test_scenes, sources)
+    unlearnt, more = _drop_learnt(b, first, sources)
     if not unlearnt:
         raise ConfigError(
             f"no scene is held out from both models: {b.title} has learnt from all test scenes of "
             f"{a.title}"
         )
     if dropped := len(test_scenes) - len(unlearnt):
-        notes += (
+        more += (
             f"{dropped} of {len(test_scenes)} test scenes of {a.title} are left out: {b.title} has "
             "learnt from these scenes or from near-duplicates (same group)",
         )
-    return HeldOut(unlearnt, first.notes + notes, first.certain and certain)
+    return unlearnt, notes + more
 
 
-def _drop_learnt(
-    candidate: Candidate, scenes: list[AnnotatedScene], sources: Sources, root: Path
-) -> HeldOut:
+def _drop_learnt(candidate: Candidate, scenes: list[AnnotatedScene], sources: Sources) -> HeldOut:
     """Leave out the scenes that a candidate learnt from."""
     if candidate.artifact is None:
-        return HeldOut(scenes)  # baselines are fitted on the training scenes of the first model
+        return scenes, ()  # baselines are fitted on the training scenes of the first model
     digests = {name: digest_of(source) for name, source in sources.items()}
     shared = {
         name
@@ -208,49 +198,23 @@ def _drop_learnt(
         if name in candidate.learnt or digest in candidate.learnt.values()
     }
     if not shared:
-        names = ", ".join(candidate.learnt) or "unknown"
-        return HeldOut(scenes, (f"{candidate.title} learnt from other data sources ({names})",))
-    if candidate.config is None:
-        note = f"{candidate.title} does not record its split and may have learnt from these scenes"
-        return HeldOut(scenes, (note,), certain=False)
-    data = candidate.config.data
-    if data.split == "stable":
+        origin = ", ".join(candidate.learnt) or "unknown"
+        return scenes, (f"{candidate.title} learnt from other data sources ({origin})",)
+    data = None if candidate.config is None else candidate.config.data
+    if data is not None and data.split == "stable":
         seed = data.split_seed
         test = {scene.group for scene in scenes if stable_part(scene.group, seed) == "test"}
-        return HeldOut([s for s in scenes if s.source not in shared or s.group in test])
-    all_scenes = _scenes_of(data, candidate.learnt, sources, digests, root)
-    if all_scenes is None:
+        return [s for s in scenes if s.source not in shared or s.group in test], ()
+    names = [] if data is None else list(map(source_name, data.sources))
+    if data is None or any(candidate.learnt.get(x) != digests.get(x, "") for x in names):
         note = (
-            f"{candidate.title} may have learnt from these scenes: it learnt from other versions "
-            f"of {', '.join(sorted(shared))}, so its split cannot be reproduced. Use the "
-            "stable split to avoid this"
+            f"{candidate.title} may have learnt from these scenes: its split cannot be reproduced, "
+            f"because it learnt from other versions of {', '.join(sorted(shared))}, or from more "
+            "data sources. Use the stable split to avoid this"
         )
-        return HeldOut(scenes, (note,), certain=False)
+        return scenes, (note,)
+    all_scenes = [scene for name in names for scene in sources[name]]
     parts = split(all_scenes, seed=data.split_seed, protocol=data.split)
     # Filter by group for all protocols: scenes of one group are near-duplicates.
     groups = {scene.group for part in ("train", "validation") for scene in parts[part]}
-    return HeldOut([scene for scene in scenes if scene.group not in groups])
-
-
-def _scenes_of(
-    data: DataConfig,
-    learnt: Mapping[str, str],
-    sources: Sources,
-    digests: Mapping[str, str],
-    root: Path,
-) -> list[AnnotatedScene] | None:
-    """Return all scenes of a candidate before its split, or None if a data source has changed."""
-    scenes: list[AnnotatedScene] = []
-    for source in data.sources:
-        name = source_name(source)
-        own: Sequence[AnnotatedScene] = sources.get(name, ())
-        if digests.get(name) != learnt.get(name):
-            try:
-                source_data = data.model_copy(update={"sources": (source,), "words": ""})
-                (own,) = read_sources(source_data, root).values()
-            except (ConfigError, DatasetError):
-                return None
-            if digest_of(own) != learnt.get(name):
-                return None
-        scenes += own
-    return scenes
+    return [scene for scene in scenes if scene.group not in groups], ()

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import torch
 import typer
 from rich import box
 from rich.console import Console
@@ -17,18 +16,15 @@ from rich.table import Table
 from torch import Tensor
 
 from app.registry import RegistryError, Store
-from app.scene import Vocabulary
-from training.datasets import DatasetError, annotated_classes, encode
+from training.datasets import AnnotatedScene, DatasetError, annotated_classes, encode
 from training.datasets.batches import SceneTensors, scene_tensors
 from training.datasets.cases import some_scenes
 from training.datasets.files import DATA
-from training.domain.candidates import BASELINES, Candidate, HeldOut, find, held_out
+from training.domain.candidates import BASELINES, Candidate, find, held_out
 from training.domain.init_command import STORE, StorePath, fail
-from training.domain.translation import BEYOND, Translation, same_classes
-from training.evaluation.asking import ask_rows
+from training.domain.translation import Translation, same_classes
 from training.evaluation.metrics import Figure
-from training.evaluation.model import Model, ObjectScore
-from training.evaluation.parts import all_but_one, draw_parts, rank_hidden
+from training.evaluation.model import Model
 from training.evaluation.report import Progress, measure, silent
 from training.evaluation.results import Difference, Results, only, summarise
 from training.evaluation.setting import Setting
@@ -51,23 +47,12 @@ higher is better."""
 RELATIONAL = ("T1a relations", "T1b completion", "T2-at missing at a place", "T3b placement")
 """Tasks that need scenes with relations."""
 
-# Number of answers per model in an example.
-_FIRST = 3
+SCENES = 300
+"""Maximum number of compared scenes."""
+
 _COLOURS = {"better": "green", "worse": "red"}
 
 console = Console()
-
-
-@dataclass(frozen=True)
-class Example:
-    """An example question: a scene with one removed object, and the answers of both models."""
-
-    scene: str
-    room_type: str  # "" if unknown
-    shown: tuple[str, ...]
-    removed: str
-    ranks: tuple[int, ...]  # of the removed object; objects with equal scores share the best rank
-    answers: tuple[tuple[str, ...], ...]  # most probable missing objects
 
 
 @dataclass(frozen=True)
@@ -82,9 +67,7 @@ class Comparison:
     b: str  # title of the second model
     scenes: int
     groups: int  # groups of near-duplicates among the compared scenes
-    certain: bool  # False if a model may have learnt from some of the scenes
     notes: tuple[str, ...]
-    examples: tuple[Example, ...]  # questions for which the answers of the models differ most
     unmeasured: tuple[str, ...] = ()
 
     @property
@@ -117,8 +100,6 @@ def compare_command(
         Path | None, typer.Option("--data", help="folder with the scenes of the first model")
     ] = None,
     store: StorePath = STORE,
-    limit: Annotated[int, typer.Option(min=2, help="maximum number of scenes")] = 300,
-    examples: Annotated[int, typer.Option(min=0, help="number of example questions to show")] = 3,
     output: Annotated[Path | None, typer.Option("--json", help="write all results here")] = None,
 ) -> None:
     """Compare two models on scenes held out from both.
@@ -135,7 +116,7 @@ def compare_command(
             served = "default" if "default" in models.aliases() else BASELINES
             b = find(old or served, models, data, say)
             root = data or a.data or b.data or DATA
-            comparison = compare(a, b, root, limit=limit, examples=examples, say=say)
+            comparison = compare(a, b, root, say=say)
     except (ConfigError, DatasetError, RegistryError, RunError) as error:
         fail(error)
     if output is not None:
@@ -145,7 +126,7 @@ def compare_command(
 
 
 def show(comparison: Comparison, console: Console) -> None:
-    """Print the metrics of a comparison as a table, with its notes and examples."""
+    """Print the metrics of a comparison as a table, with its notes."""
     titles = (comparison.a, comparison.b)
     heading = f"{comparison.scenes} held-out scenes of {comparison.groups} groups"
     text = f"{heading}\nA: {comparison.a}\nB: {comparison.b}"
@@ -174,16 +155,6 @@ def show(comparison: Comparison, console: Console) -> None:
         notes.append(f"{comparison.a} was not measured in {names}: the scenes contain no relations")
     for note in notes:
         console.print(f"note: {note}", markup=False, soft_wrap=True)
-    heading = "Questions with the most different answers (one object removed from each scene):"
-    if comparison.examples:
-        console.print(heading)
-    for example in comparison.examples:
-        room = f" ({example.room_type})" if example.room_type else ""
-        lines = [f"  {example.scene}{room}: {', '.join(example.shown)}"]
-        lines.append(f"    removed: {example.removed}")
-        for name, rank, answers in zip(titles, example.ranks, example.answers, strict=True):
-            lines.append(f"    {name}, rank {rank}: {', '.join(answers)}, …")
-        console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
 
 
 def difference_text(figure: Figure) -> str:
@@ -191,9 +162,7 @@ def difference_text(figure: Figure) -> str:
     return f"{figure.value:+.3f} [{figure.low:+.3f}, {figure.high:+.3f}]"
 
 
-def compare(
-    a: Candidate, b: Candidate, root: Path, *, limit: int | None, examples: int, say: Progress
-) -> Comparison:
+def compare(a: Candidate, b: Candidate, root: Path, *, say: Progress) -> Comparison:
     """Measure both models on the tasks of `COMPARED`. The questions use the first model's classes.
 
     Args:
@@ -210,11 +179,11 @@ def compare(
         )
     say("reading scenes")
     sources = read_sources(a.config.data, root)
-    test = held_out(a, b, sources, root)
+    test, remarks = held_out(a, b, sources)
     data = split_and_encode(a.config.data, sources, root, a.vocabulary).training_data()
-    encoded = encode(test.scenes, a.vocabulary)
+    encoded = encode(test, a.vocabulary)
     annotated = annotated_classes(encoded, a.vocabulary)
-    scenes = some_scenes(scene_tensors(encoded, annotated, len(a.vocabulary)), limit)
+    scenes = some_scenes(scene_tensors(encoded, annotated, len(a.vocabulary)), SCENES)
     models = (a.model(a.vocabulary, data, say), b.model(a.vocabulary, data, say))
     try:
         titles = a.title, b.title if b.title != a.title else f"{b.title} (second)"
@@ -226,16 +195,12 @@ def compare(
             f"the {len(scenes)} held-out scenes are unsuitable for all compared tasks: provide "
             "scenes with at least two object classes"
         )
-    say("looking for examples")
-    scores = [model.missing for model in models if model.missing is not None]
     return Comparison(
         results=results,
         b=titles[1],
         scenes=len(scenes),
         groups=len({scene.group for scene in scenes.scenes}),
-        certain=test.certain,
-        notes=tuple(_notes(a, b, test, limit)),
-        examples=tuple(changed_most(scores, scenes, data.structure, a.vocabulary, examples)),
+        notes=(*remarks, *_notes(a, b, test)),
         unmeasured=unmeasured(results.differences, b),
     )
 
@@ -272,13 +237,12 @@ def unmeasured(rows: Sequence[Difference], other: Candidate) -> tuple[str, ...]:
     return tuple(task for task in RELATIONAL if task in measured)
 
 
-def _notes(a: Candidate, b: Candidate, test: HeldOut, limit: int | None) -> Iterator[str]:
-    """Generate remarks on the results: held-out scenes, unknown classes of the second model."""
-    yield from test.notes
+def _notes(a: Candidate, b: Candidate, test: Sequence[AnnotatedScene]) -> Iterator[str]:
+    """Generate remarks on unknown classes of the second model, and on the number of scenes."""
     ours, theirs = a.vocabulary, b.vocabulary
     if ours is not None and theirs is not None and not same_classes(ours, theirs):
         is_unknown = Translation.between(ours, theirs).model_class < 0
-        labels = [thing.label for scene in test.scenes for thing in scene.objects]
+        labels = [thing.label for scene in test for thing in scene.objects]
         mentions = [index for label in labels if (index := ours.index(label)) is not None]
         if missing := int(is_unknown.sum()):
             share = int(is_unknown[mentions].sum()) / max(len(mentions), 1)
@@ -287,51 +251,5 @@ def _notes(a: Candidate, b: Candidate, test: HeldOut, limit: int | None) -> Iter
                 f"{missing} of these classes ({share:.0%} of the objects in the scenes). Objects "
                 "of these classes are not part of its input, and it ranks these classes last"
             )
-    if limit is not None and len(test.scenes) > limit:
-        yield f"only {limit} of {len(test.scenes)} held-out scenes are compared, because of --limit"
-
-
-def changed_most(
-    scores: Sequence[ObjectScore],
-    scenes: SceneTensors,
-    structure: Tensor,
-    vocabulary: Vocabulary,
-    count: int,
-) -> Iterator[Example]:
-    """Generate the questions for which the reciprocal ranks of two models differ most.
-
-    Each question removes one object from a scene. There are at most `count` examples, and at most
-    one per group of near-duplicate scenes; none if a model does not score missing objects.
-    """
-    if len(scores) < 2:
-        return
-    parts, labels = draw_parts(scenes, structure, all_but_one), vocabulary.labels
-    groups: set[str] = set()
-    ranked = [rank_hidden(parts, structure, ask_rows(score, parts.v)) for score in scores]
-    change = np.abs(np.subtract(*(ranks.reciprocal_rank() for ranks in ranked)))
-    for question in np.argsort(-change, kind="stable").tolist():
-        scene, v = scenes.scenes[int(ranked[0].scene[question])], parts.v[question]
-        if len(groups) == count or not change[question]:
-            return
-        if scene.group in groups:
-            continue
-        groups.add(scene.group)
-        yield Example(
-            scene=scene.scene_id,
-            room_type=vocabulary.room_types[scene.room_type] if scene.room_type >= 0 else "",
-            shown=tuple(labels[k] for k in v.nonzero().squeeze(1).tolist()),
-            removed=labels[int(ranked[0].target[question])],
-            ranks=tuple(int(ranks.above[question]) + 1 for ranks in ranked),
-            answers=tuple(_answers(score, v, structure, vocabulary) for score in scores),
-        )
-
-
-@torch.no_grad()
-def _answers(
-    score: ObjectScore, v: Tensor, structure: Tensor, vocabulary: Vocabulary
-) -> tuple[str, ...]:
-    """Return the labels of the most probable missing objects, best first."""
-    values = score(v.unsqueeze(0))[0].masked_fill((v > 0) | structure, -torch.inf)
-    order = values.argsort(descending=True, stable=True)[:_FIRST].tolist()
-    # The score -BEYOND marks classes that the model lacks.
-    return tuple(vocabulary.labels[index] for index in order if values[index] > -BEYOND)
+    if len(test) > SCENES:
+        yield f"{SCENES} random scenes of {len(test)} held-out scenes are compared"

@@ -26,7 +26,6 @@ from training.fit.configuration import Config, ConfigError, source_name
 from training.runs.pipeline import prepare
 
 Figures = dict[str, list[Metric]]
-PARTS = ("train", "validation", "test")
 
 console = Console()
 
@@ -38,7 +37,7 @@ def evaluate_command(
         typer.Option(
             "--file",
             help="your own test: a file of scenes (*.jsonl), or a table of places (*.tsv). It "
-            "replaces the scenes of the training split (--data, --source, --part)",
+            "replaces the scenes of the training split (--data, --source)",
         ),
     ] = None,
     data: Annotated[
@@ -51,7 +50,6 @@ def evaluate_command(
     ] = None,
     store: StorePath = STORE,
     source: Annotated[list[str] | None, typer.Option(help="use only these data sources")] = None,
-    part: Annotated[str, typer.Option(help="scenes: train, validation or test")] = "test",
     output: Annotated[Path | None, typer.Option("--json", help="write figures to a file")] = None,
 ) -> None:
     """Evaluate stored models on scenes of the same split as in training, or on your own file.
@@ -74,7 +72,7 @@ def evaluate_command(
                     rows[name].append(row.model_dump() | origin)
         if not files:
             figures = {
-                name: _measure(name, artifact, data or DATA, source, part)
+                name: _measure(name, artifact, data or DATA, source)
                 for name, artifact in artifacts.items()
             }
             _show(figures)
@@ -100,25 +98,22 @@ def _ask(test: OutsideTest, artifacts: dict[str, Artifact]) -> Figures:
 
 
 def _measure(
-    reference: str, artifact: Artifact, data: Path, sources: list[str] | None, part: str
+    reference: str, artifact: Artifact, data: Path, sources: list[str] | None
 ) -> list[Metric]:
-    """Return the figures of a model on a part of the scenes of its configuration."""
+    """Return the figures of a model on the test scenes of its configuration."""
     config = Config.model_validate(artifact.manifest.training["config"])
     names = sources or list(map(source_name, config.data.sources))
     with console.status("reading scenes"):
         # The split must include all data sources, as in training. Otherwise the test part
         # could contain training scenes.
         scenes = prepare(config, data, artifact.vocabulary)
-    if part not in PARTS:
-        raise ConfigError(f"--part is {part!r}; it must be one of {', '.join(PARTS)}")
     tensors = scenes.training_data()
-    tested = getattr(tensors, part)
-    index = [k for k, scene in enumerate(tested.scenes) if scene.source in names]
+    index = [k for k, scene in enumerate(tensors.test.scenes) if scene.source in names]
     if not index:
         raise ConfigError(
-            f"{reference}: the {part} part has no scenes of the sources {', '.join(names)}"
+            f"{reference}: the test part has no scenes of the sources {', '.join(names)}"
         )
-    test = subset(tested, torch.tensor(index, dtype=torch.int64))
+    test = subset(tensors.test, torch.tensor(index, dtype=torch.int64))
     with console.status(reference) as status:
         return evaluate(
             *(artifact, test, tensors.structure, tensors.train),

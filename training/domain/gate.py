@@ -19,7 +19,7 @@ from app.registry.references import AliasTarget
 from training.datasets.batches import TrainingData, subset
 from training.datasets.cases import some_scenes
 from training.domain.candidates import Candidate, stored_candidate
-from training.domain.compare import Comparison, difference_text
+from training.domain.compare import SCENES, Comparison, difference_text
 from training.evaluation.asking import score_missing
 from training.evaluation.baselines import EASE, POPULARITY
 from training.evaluation.metrics import FEWEST_GROUPS, Figure, Ratio, paired_difference
@@ -45,23 +45,24 @@ class Usefulness:
 
     scenes: int
     groups: int  # of near-duplicates among the scenes
-    ours: float | None = None  # MRR of the new version; None if too few groups can be used
-    theirs: Mapping[str, float] = field(default_factory=dict)  # MRR of each baseline, by name
+    # MRR of the new version and of each baseline, by name; empty with too few groups.
+    mrr: Mapping[str, float] = field(default_factory=dict)
     differences: Mapping[str, Figure] = field(default_factory=dict)  # new version minus baseline
 
     def lines(self) -> Iterator[str]:
         """Generate the results as lines of at most 80 characters."""
-        if self.ours is None:
+        if not self.mrr:
             return
         yield f"mean reciprocal rank of a missing object, {self._sample_text()}:"
-        yield f"  {NEW:16} {self.ours:.3f}"
-        for name, value in self.theirs.items():
-            yield f"  {name:16} {value:.3f}  difference {difference_text(self.differences[name])}"
+        for name, value in self.mrr.items():
+            gap = self.differences.get(name)
+            text = "" if gap is None else f"  difference {difference_text(gap)}"
+            yield f"  {name:16} {value:.3f}{text}"
         yield f"  required over {POPULARITY.name}: {_REQUIRED}"
 
     def objections(self) -> list[str]:
         """Return the reasons against the new version; an empty list if it is useful."""
-        if self.ours is None or self.groups < FEWEST_GROUPS:
+        if self.groups < FEWEST_GROUPS:
             return [
                 f"{NEW} cannot be compared with {POPULARITY.name}: {self._sample_text()}, and a "
                 f"comparison needs test scenes of at least {FEWEST_GROUPS} groups with two or more "
@@ -87,16 +88,14 @@ class Usefulness:
         return f"{self.scenes} test scenes of {self.groups} groups"
 
 
-def measure_usefulness(
-    artifact: Artifact, data: TrainingData, *, limit: int | None, say: Progress
-) -> Usefulness:
+def measure_usefulness(artifact: Artifact, data: TrainingData, *, say: Progress) -> Usefulness:
     """Compare a new version with popularity and EASE on the test scenes of its run.
 
     The baselines learn from the training scenes of the run. Scenes with incomplete object lists are
     left out, unless all test scenes are such scenes.
     """
     complete = data.test.complete.nonzero().squeeze(1)
-    scenes = some_scenes(subset(data.test, complete) if len(complete) else data.test, limit)
+    scenes = some_scenes(subset(data.test, complete) if len(complete) else data.test, SCENES)
     # A question hides one class and lists the others.
     has_two_classes = ((scenes.v > 0) & ~data.structure).sum(1) > 1
     scenes = subset(scenes, has_two_classes.nonzero().squeeze(1))
@@ -109,12 +108,13 @@ def measure_usefulness(
             raise ValueError("the model has no score of missing objects")
         return rank_missing(scenes, data.structure, score).mrr().by(scenes.group_ids)
 
-    ours, values, gaps = mrr(partial(score_missing, artifact)), {}, {}
+    ours, gaps = mrr(partial(score_missing, artifact)), {}
+    values = {NEW: ours.value}
     for baseline in (POPULARITY, EASE):
         say(f"fitting {baseline.name}")
         theirs = mrr(baseline.fit(data.train, data.validation, data.structure).missing)
         values[baseline.name], gaps[baseline.name] = theirs.value, paired_difference(ours, theirs)
-    return replace(usefulness, ours=ours.value, theirs=values, differences=gaps)
+    return replace(usefulness, mrr=values, differences=gaps)
 
 
 class ServedModel(NamedTuple):

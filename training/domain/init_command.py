@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Sequence
@@ -13,20 +12,22 @@ import typer
 from rich.console import Console
 
 from app.registry import RegistryError
+from app.scene import label_key
 from training.datasets import AnnotatedScene, DatasetError, generate_rooms
 from training.datasets.jsonl import scan_jsonl, write_jsonl
-from training.datasets.readers import READERS, guess_format
+from training.datasets.readers import guess_format, read_scenes
 from training.datasets.rooms import DOMAINS
 from training.datasets.vocabulary import vocabulary_json
-from training.domain.proposal import propose
-from training.domain.proposal_report import as_dict, show
+from training.domain.proposal import Proposal, propose
 from training.evaluation.report import write_whole
-from training.fit.configuration import ConfigError, is_file, source_name
+from training.fit.configuration import ConfigError
 from training.runs.config_files import shipped_configs
 from training.runs.example_scenes import examples_json
 
 # Maximum number of invalid lines that are printed. Further invalid lines are only counted.
 BAD_LINES = 20
+ROWS = 12
+"""Maximum number of entries of a printed list."""
 
 StorePath = Annotated[str, typer.Option("--store", help="folder of the model store")]
 STORE = "model_store"
@@ -46,12 +47,7 @@ def init(
     output: Annotated[
         Path | None, typer.Option(help="output folder; default: a folder named like the model")
     ] = None,
-    format_: Annotated[
-        str | None,
-        typer.Option("--format", help=f"{', '.join(READERS)}; default: derived from file names"),
-    ] = None,
     terms: Annotated[str, typer.Option(help="terms of use of the scenes (model card)")] = "",
-    report: Annotated[Path | None, typer.Option("--json", help="file for a JSON report")] = None,
     force: Annotated[bool, typer.Option("--force", help="overwrite existing files")] = False,
 ) -> None:
     """Analyse your scenes, and propose a vocabulary and a training configuration.
@@ -61,29 +57,29 @@ def init(
     with --force.
     """
     folder = Path(name) if output is None else output
+    targets = [folder / file for file in (f"{name}.toml", "vocabulary.json", "examples.json")]
     try:
         _check_name(name)
-        targets = [folder / file for file in (f"{name}.toml", "vocabulary.json", "examples.json")]
         with console.status("reading scenes"):
-            scenes_of = {file: _read(file, format_) for file in files}
-        sources, copies = _sources_and_copies(folder, scenes_of)
-        _require_new([*targets, *copies], force=force)
-        all_scenes = [scene for scenes in scenes_of.values() for scene in scenes]
+            scenes = [scene for file in files for scene in _read(file)]
+        existing = [str(path) for path in targets if path.exists()]
+        if existing and not force:
+            raise ConfigError(
+                f"{' and '.join(existing)} would be overwritten: use --force, or choose another "
+                "folder with --output"
+            )
+        sources = [Path(os.path.relpath(file, folder)).as_posix() for file in files]
         with console.status("analysing scenes"):
-            proposal = propose(name, all_scenes, sources, terms=terms)
+            proposal = propose(name, scenes, sources, terms=terms)
     except (ConfigError, DatasetError, ValueError) as error:
         fail(error)
     folder.mkdir(parents=True, exist_ok=True)
-    for path, scenes in copies.items():
-        write_jsonl(scenes, path)
     vocabulary, examples = vocabulary_json(proposal.vocabulary), examples_json(proposal.examples)
     for path, text in zip(targets, (proposal.toml(), vocabulary, examples), strict=True):
         write_whole(path, text)
-    if report is not None:
-        write_whole(report, json.dumps(as_dict(proposal), indent=1, ensure_ascii=False) + "\n")
-    show(proposal, console)
+    _show(proposal)
     lines = [
-        f"\nwritten: {', '.join(map(str, [*targets, *copies]))}",
+        f"\nwritten: {', '.join(map(str, targets))}",
         f"next: check these files, then run  python -m training train {folder}",
     ]
     if folder.resolve().name != name:
@@ -102,12 +98,9 @@ def _check_name(name: str) -> None:
         raise ConfigError(f"{name} is the name of a shipped configuration; choose another name")
 
 
-def _read(path: Path, format_: str | None) -> list[AnnotatedScene]:
+def _read(path: Path) -> list[AnnotatedScene]:
     """Read the scenes of a file, or print all invalid lines of a JSONL file and exit."""
-    if format_ is not None and format_ not in READERS:
-        raise ConfigError(f"unknown format {format_!r}: use one of {', '.join(READERS)}")
-    format_ = format_ or guess_format(path)
-    lines = list(scan_jsonl(path) if format_ == "jsonl" else READERS[format_](path))
+    lines = list(scan_jsonl(path) if guess_format(path) == "jsonl" else read_scenes(path))
     errors = [line for line in lines if isinstance(line, DatasetError)]
     if errors:
         n = len(errors)
@@ -123,33 +116,44 @@ def _read(path: Path, format_: str | None) -> list[AnnotatedScene]:
     return [line for line in lines if isinstance(line, AnnotatedScene)]
 
 
-def _sources_and_copies(
-    folder: Path, scenes_of: dict[Path, list[AnnotatedScene]]
-) -> tuple[list[str], dict[Path, list[AnnotatedScene]]]:
-    """Return the paths of the scene files relative to the folder, and the files to copy.
+def _show(proposal: Proposal) -> None:
+    """Print the facts about the scenes, joined labels, and what the user must check."""
+    facts = proposal.facts
+    least, mean, most = facts.objects_per_scene
+    rooms = ", ".join(f"{room} {count}" for room, count in list(facts.rooms.items())[:ROWS])
+    shares = ", ".join(f"{name} {share:.0%}" for name, share in facts.shares.items())
+    lines = [
+        f"{facts.scenes} scenes in {facts.groups} groups, with {least} to {most} objects each "
+        f"({mean:.1f} on average)",
+        f"room types: {rooms or 'none'}",
+        f"scenes with: {shares}",
+        f"{len(proposal.vocabulary)} classes with at least {proposal.minimum} mentions; they cover "
+        f"{proposal.coverage:.1%} of the objects",
+    ]
+    joined = [x for x in proposal.labels if label_key(x.name) != label_key(x.spellings[0])]
+    lines += _listing(
+        "joined by built-in synonyms; vocabulary.json has the classes:",
+        [f"{label.spellings[0]} = {label.name}" for label in joined],
+    )
+    lines += _listing(
+        "labels without a class:",
+        [f"{label.name} ({label.mentions})" for label in proposal.dropped],
+    )
+    console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+    console.print("Please check:" if facts.findings else "no contradictions found")
+    for finding in facts.findings:
+        console.print(f"  [yellow]{finding.count}[/yellow] × {finding.what}")
+        console.print(f"    {finding.advice}")
+        for example in finding.examples:
+            console.print(f"    - {example}", markup=False)
+    if proposal.warning:
+        console.print(f"[yellow]warning:[/yellow] {proposal.warning}", soft_wrap=True)
 
-    A file is copied under a new name if its own name does not determine the format. The second
-    result maps the path of each copy to its scenes.
-    """
-    sources: list[str] = []
-    copies: dict[Path, list[AnnotatedScene]] = {}
-    for file, scenes in scenes_of.items():
-        try:
-            guess_format(file)
-            sources.append(Path(os.path.relpath(file, folder)).as_posix())
-        except DatasetError:
-            sources.append(f"{source_name(file.name) if is_file(file.name) else file.name}.jsonl")
-            copies[folder / sources[-1]] = scenes
-    return sources, copies
 
-
-def _require_new(paths: Sequence[Path], *, force: bool) -> None:
-    existing = [str(path) for path in paths if path.exists()]
-    if existing and not force:
-        raise ConfigError(
-            f"{' and '.join(existing)} would be overwritten: use --force, or choose another folder "
-            "with --output"
-        )
+def _listing(title: str, entries: Sequence[str]) -> list[str]:
+    """Return a title and at most `ROWS` indented entries; nothing without entries."""
+    more = [f"and {len(entries) - ROWS} more"] if len(entries) > ROWS else []
+    return [title, *(f"  {entry}" for entry in [*entries[:ROWS], *more])] if entries else []
 
 
 def fail(error: Exception) -> NoReturn:

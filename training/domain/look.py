@@ -1,24 +1,24 @@
-"""Compute statistics of scenes, and find contradictions and data that training cannot use."""
+"""Statistics of scenes, and what the user should check: labels, contradictions, unusable data."""
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
+from rapidfuzz import process
+from rapidfuzz.distance import OSA
 
 from app.scene import CANONICAL, canonicalise, label_key
 from app.scene.geometry import LARGEST, MOST_DISTANT
 from app.scene.relations import ABOVE, ON_TOP
-from training.datasets import AnnotatedScene
-from training.datasets.names import Names
+from training.datasets import AnnotatedScene, EncodedScene
+from training.datasets.vocabulary import curated_names, most_frequent
 
 # Maximum number of examples in a finding. Further cases are only counted.
 SHOWN = 5
-
-# Maximum length of a label in a request, as in `scene_client.schemas.Label`.
-LONGEST = 100
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,9 @@ class Facts:
 
     scenes: int
     groups: int  # of near-duplicates
-    objects: int
     objects_per_scene: tuple[int, float, int]  # minimum, mean and maximum
     rooms: dict[str, int]  # number of scenes of each canonical room type
     shares: dict[str, float]  # share of scenes with each kind of annotation, such as "positions"
-    relations: dict[str, int]  # number of annotated triples of each relation
     findings: tuple[Finding, ...]
 
     @property
@@ -51,18 +49,11 @@ class Facts:
         return any(self.shares[name] > 0 for name in sources)
 
 
-def look(scenes: Sequence[AnnotatedScene], names: Names) -> Facts:
-    """Compute the statistics and findings of scenes.
-
-    Raises:
-        ValueError: the list of scenes is empty.
-    """
-    if not scenes:
-        raise ValueError("there are no scenes to analyse; pass at least one scene")
+def look(scenes: Sequence[AnnotatedScene], labels: Sequence[Label]) -> Facts:
+    """Compute the statistics and findings of scenes, at least one, and of their labels."""
     sizes = [len(scene.objects) for scene in scenes]
-    canonical = [names.canonical_room(scene.room_type) for scene in scenes]
+    canonical = [curated_names().canonical_room(scene.room_type) for scene in scenes]
     rooms = Counter(room for room in canonical if room is not None)
-    relations = Counter(r for scene in scenes for _, r, _ in scene.relations or ())
 
     def share(attribute: str) -> float:
         return sum(any(getattr(t, attribute) for t in s.objects) for s in scenes) / len(scenes)
@@ -70,7 +61,6 @@ def look(scenes: Sequence[AnnotatedScene], names: Names) -> Facts:
     return Facts(
         scenes=len(scenes),
         groups=len({scene.group for scene in scenes}),
-        objects=sum(sizes),
         objects_per_scene=(min(sizes), sum(sizes) / len(sizes), max(sizes)),
         rooms=dict(rooms.most_common()),
         shares={
@@ -82,13 +72,12 @@ def look(scenes: Sequence[AnnotatedScene], names: Names) -> Facts:
             "boxes in an image": share("box2d"),
             "viewer axes": sum(scene.viewer_frame for scene in scenes) / len(scenes),
         },
-        relations=dict(relations.most_common()),
-        findings=tuple(finding for finding in _findings(scenes, rooms, names) if finding.count),
+        findings=tuple(x for x in _findings(scenes, labels, rooms) if x.count),
     )
 
 
 def _findings(
-    scenes: Sequence[AnnotatedScene], rooms: Counter[str], names: Names
+    scenes: Sequence[AnnotatedScene], labels: Sequence[Label], rooms: Counter[str]
 ) -> Iterator[Finding]:
     def finding(what: str, advice: str, cases: Iterable[str]) -> Finding:
         examples = list(cases)
@@ -123,18 +112,13 @@ def _findings(
         ),
     )
     yield finding(
-        "Objects support each other in a cycle (on-top or supported_by).",
-        "Correct the cycle: an object cannot stand on an object that it supports.",
+        "Two labels differ by one or two letters.",
+        "If one of them is a typing error, correct the scenes, or merge the classes in "
+        "vocabulary.json.",
         (
-            f"{scene.scene_id}: {', '.join(cycle)}"
-            for scene, triples in listed
-            if (cycle := _support_cycle(scene, triples))
+            f"{rare.name} ({rare.mentions}) and {frequent.name} ({frequent.mentions})"
+            for rare, frequent in similar_labels(labels)
         ),
-    )
-    yield finding(
-        f"Labels are blank, longer than {LONGEST} characters or not printable.",
-        "A request cannot contain such a label. Use other labels.",
-        _invalid_labels(scenes, names),
     )
     yield finding(
         "Scenes of different groups have the same objects in the same places or relations.",
@@ -181,35 +165,9 @@ def _beyond_metres(scene: AnnotatedScene) -> bool:
     return bool(far or max(sides, default=0) > LARGEST)
 
 
-def _invalid_labels(scenes: Sequence[AnnotatedScene], names: Names) -> Iterator[str]:
-    """Generate the labels that a request refuses, at most 100 characters of each."""
-    for label in sorted({thing.label for scene in scenes for thing in scene.objects}):
-        name = names.canonical(label)
-        if not name.strip() or len(name) > LONGEST or not name.isprintable():
-            yield repr(label) if len(label) <= LONGEST else f"{label[:40]!r} …"
-
-
 def _describe_pair(scene: AnnotatedScene, i: int, j: int) -> str:
     a, b = scene.objects[i], scene.objects[j]
     return f"{scene.scene_id}: {a.label} ({a.id}) and {b.label} ({b.id})"
-
-
-def _support_cycle(scene: AnnotatedScene, triples: set[tuple[int, int, int]]) -> list[str]:
-    """Return the labels of objects that support each other in a cycle, or an empty list."""
-    index_of = {thing.id: index for index, thing in enumerate(scene.objects)}
-    supports = [(i, thing.supported_by) for i, thing in enumerate(scene.objects)]
-    links = {(i, index_of[support]) for i, support in supports if support is not None}
-    # Skip pairs of objects that are on top of each other. Another finding reports such pairs.
-    links |= {(i, j) for a, i, j in triples if a == ON_TOP and (a, j, i) not in triples}
-    # Repeatedly remove objects without supports. Then only cycles remain.
-    while free := {j for _, j in links} - {i for i, _ in links}:
-        links = {(i, j) for i, j in links if j not in free}
-    if not links:
-        return []
-    path = [min(links)[0]]
-    while (following := min(j for i, j in links if i == path[-1])) not in path:
-        path.append(following)
-    return [scene.objects[i].label for i in path[path.index(following) :]]
 
 
 def _duplicates(scenes: Sequence[AnnotatedScene]) -> Iterator[str]:
@@ -232,3 +190,81 @@ def _duplicates(scenes: Sequence[AnnotatedScene]) -> Iterator[str]:
         earlier = first_scene.setdefault(content, scene)
         if earlier.group != scene.group:
             yield f"{earlier.scene_id} and {scene.scene_id}"
+
+
+# Maximum number of names that are compared with each other, most frequent names first.
+_COMPARED = 2000
+# Minimum number of letters of two similar names that differ by one edit, or by two edits.
+_ONE_SLIP, _TWO_SLIPS = 5, 10
+# Maximum number of labels in the text of `outside_vocabulary`. Further labels are only counted.
+_SHOWN = 8
+
+
+@dataclass(frozen=True)
+class Label:
+    """One name of objects, with all its spellings."""
+
+    name: str  # curated name, or the most frequent spelling
+    mentions: int  # number of objects with this name
+    spellings: tuple[str, ...]  # most frequent first
+
+
+def outside_vocabulary(scenes: Iterable[EncodedScene]) -> str:
+    """Return one line that names the labels outside the vocabulary, "" without any."""
+    with_labels = [scene.unknown for scene in scenes if scene.unknown]
+    spellings: dict[str, Counter[str]] = {}
+    for label, count in Counter(label for labels in with_labels for label in labels).items():
+        spellings.setdefault(label_key(label), Counter())[label] += count
+    if not spellings:
+        return ""
+    counts = [(-spelt.total(), most_frequent(spelt)) for spelt in spellings.values()]
+    listed = [f'"{label}" ({_number(-count, "scene")})' for count, label in sorted(counts)[:_SHOWN]]
+    listed += [f"{len(counts) - _SHOWN:,} more"] if len(counts) > _SHOWN else []
+    are, they = ("is", "it is") if len(counts) == 1 else ("are", "they are")
+    return (
+        f"{_number(len(counts), 'label')} in {_number(len(with_labels), 'scene')} {are} not in "
+        f"the vocabulary: {', '.join(listed)}; {they} left out"
+    )
+
+
+def _number(count: int, noun: str) -> str:
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
+def count_labels(scenes: Iterable[AnnotatedScene]) -> list[Label]:
+    """Count all names, most frequent first. Spellings with the same key count as one name."""
+    spellings: defaultdict[str, Counter[str]] = defaultdict(Counter)
+    names_of: defaultdict[str, Counter[str]] = defaultdict(Counter)
+    canonical = cache(curated_names().canonical)
+    for thing in (thing for scene in scenes for thing in scene.objects):
+        name = canonical(thing.label)
+        key = label_key(name)
+        spellings[key][thing.label] += 1
+        names_of[key][name] += 1
+    labels = []
+    for key, counts in spellings.items():
+        spelt = tuple(sorted(counts, key=lambda label: (-counts[label], label)))
+        labels.append(Label(most_frequent(names_of[key]), counts.total(), spelt))
+    return sorted(labels, key=lambda label: (-label.mentions, label.name))
+
+
+def similar_labels(labels: Sequence[Label]) -> Iterator[tuple[Label, Label]]:
+    """Generate pairs (rarer, more frequent) of names that differ by a likely typing error.
+
+    The names differ by one edit, or by two edits if long. Two curated names, or two names with
+    different digits, are different objects and form no pair.
+    """
+    compared = [label for label in labels[:_COMPARED] if len(label_key(label.name)) >= _ONE_SLIP]
+    keys = [label_key(label.name) for label in compared]
+    names = curated_names()
+    curated = {label_key(name) for name in (*names.base, *names.aliases, *names.structure)}
+    for i, key in enumerate(keys):
+        slips = 2 if len(key) >= _TWO_SLIPS else 1
+        later = keys[i + 1 :]
+        for other, _, offset in process.extract(
+            key, later, scorer=OSA.distance, limit=None, score_cutoff=slips
+        ):
+            digits = {"".join(filter(str.isdigit, text)) for text in (key, other)}
+            if len(digits) == 1 and not {key, other} <= curated:
+                # Labels are sorted by frequency.
+                yield compared[i + 1 + offset], compared[i]

@@ -14,12 +14,10 @@ from typing import Any, Final
 
 from app.registry import Example
 from app.scene import Vocabulary, label_key
-from training.datasets import AnnotatedObject, AnnotatedScene, source_vocabulary, split
-from training.datasets.names import Names, curated_names
+from training.datasets import AnnotatedScene, source_vocabulary, split
 from training.datasets.splits import FRACTIONS
 from training.datasets.vocabulary import coverage
-from training.domain.labels import Label, Lookalike, count_labels, lookalikes
-from training.domain.look import Facts, look
+from training.domain.look import Facts, Label, count_labels, look
 from training.evaluation.metrics import FEWEST_GROUPS
 from training.fit.configuration import Config, ConfigError
 from training.runs.config_files import sections_toml
@@ -27,14 +25,11 @@ from training.runs.example_scenes import choose_examples
 
 # Possible minimum numbers of objects of a class. A class with few objects is hardly trained. Few
 # scenes need a small minimum, so that the vocabulary covers enough objects.
-_MINIMA: Final = (2, 3, 5, 8)
+_MINIMA: Final = (8, 5, 3, 2)
 _COVERED: Final = 0.97
-_TABLE: Final = (*_MINIMA, 16, 30)
 # docs/decisions/own-scenes.md gives the measurement behind these two numbers of scenes.
 FEWEST_SCENES: Final = 20
 FEW_SCENES: Final = 80
-# Maximum number of classes. docs/benchmarks.md gives the cost of larger vocabularies.
-_MOST_CLASSES: Final = 2000
 _SPLIT_SEEDS: Final = 50
 # Accepted relative deviation of a part of the split from its target share of scenes.
 _TOLERANCE: Final = 0.2
@@ -49,11 +44,10 @@ class Proposal:
     name: str
     facts: Facts
     labels: tuple[Label, ...]
-    lookalikes: tuple[Lookalike, ...]
     minimum: int  # number of objects of a class
-    covered: dict[int, tuple[int, float]]  # number and coverage of the classes, for each minimum
-    vocabulary: Vocabulary  # merged similar labels are aliases
-    dropped: tuple[tuple[str, int, str], ...]  # names without a class: name, objects, reason
+    coverage: float  # share of the objects whose label has a class
+    vocabulary: Vocabulary
+    dropped: tuple[Label, ...]  # names without a class
     values: dict[str, Any]  # sections of the configuration
     config: Config
     reasons: dict[str, str]  # reason for the value of "section.entry"
@@ -91,20 +85,17 @@ def propose(
     Raises:
         ConfigError: there are fewer than `FEWEST_SCENES` scenes, no label occurs often enough, or
             the scenes cannot be split.
-        ValueError: the list of scenes is empty.
     """
-    names = curated_names()
-    facts = look(scenes, names)
     if len(scenes) < FEWEST_SCENES:
         raise ConfigError(
             f"{len(scenes)} scenes are too few: from fewer than {FEWEST_SCENES} scenes, a model "
             "may learn no more than the frequency of each class. Provide at least "
             f"{FEWEST_SCENES} scenes, better {FEW_SCENES} scenes of {FEW_SCENES // 2} places"
         )
-    labels = count_labels(scenes, names)
-    similar = lookalikes(labels, scenes, names)
-    minimum, covered = _choose_minimum(scenes, similar)
-    vocabulary = _use_frequent_names(_vocabulary(scenes, similar, minimum), scenes)
+    labels = count_labels(scenes)
+    facts = look(scenes, labels)
+    minimum, found = _choose_vocabulary(scenes)
+    vocabulary = _use_frequent_names(found, scenes)
     seed, parts, test_groups = _split(scenes)
     settings, reasons = _configuration(facts, parts)
     reasons |= {
@@ -124,11 +115,10 @@ def propose(
         name=name,
         facts=facts,
         labels=tuple(labels),
-        lookalikes=tuple(similar),
         minimum=minimum,
-        covered=covered,
+        coverage=coverage(found, scenes),
         vocabulary=vocabulary,
-        dropped=tuple(_dropped(labels, vocabulary, names, minimum)),
+        dropped=tuple(label for label in labels if vocabulary.index(label.name) is None),
         values=values,
         config=Config.model_validate(values),
         reasons=reasons,
@@ -138,51 +128,19 @@ def propose(
     )
 
 
-def _choose_minimum(
-    scenes: Sequence[AnnotatedScene], pairs: Sequence[Lookalike]
-) -> tuple[int, dict[int, tuple[int, float]]]:
-    """Choose the minimum number of objects of a class; return it and `Proposal.covered`.
+def _choose_vocabulary(scenes: Sequence[AnnotatedScene]) -> tuple[int, Vocabulary]:
+    """Return the largest of `_MINIMA` whose classes cover enough objects, and the classes.
 
-    The choice is the largest minimum whose classes cover enough objects, or the smallest minimum.
-    A choice that gives too many classes is raised.
+    Without such a minimum, the result is the smallest one.
     """
-    covered: dict[int, tuple[int, float]] = {}
-    for minimum in _TABLE:
+    for minimum in _MINIMA:
         try:
-            vocabulary = _vocabulary(scenes, pairs, minimum)
+            vocabulary = source_vocabulary(scenes, minimum=minimum)
         except ValueError:
             continue  # no label has so many mentions
-        covered[minimum] = (len(vocabulary), coverage(vocabulary, scenes))
-    if not covered:
-        raise ConfigError("every label occurs only once: training needs labels with more objects")
-    sufficient = [m for m, (_, share) in covered.items() if share >= _COVERED and m in _MINIMA]
-    chosen = max(sufficient, default=min(covered))
-    affordable = [m for m, (classes, _) in covered.items() if classes <= _MOST_CLASSES]
-    return max(chosen, min(affordable, default=chosen)), covered
-
-
-def _vocabulary(
-    scenes: Sequence[AnnotatedScene], pairs: Sequence[Lookalike], minimum: int
-) -> Vocabulary:
-    merged = {label_key(pair.name): pair for pair in pairs if pair.merged}
-
-    def renamed(thing: AnnotatedObject) -> AnnotatedObject:
-        pair = merged.get(label_key(thing.label))
-        return thing if pair is None else replace(thing, label=pair.like)
-
-    vocabulary = source_vocabulary(
-        [replace(scene, objects=tuple(map(renamed, scene.objects))) for scene in scenes],
-        minimum=minimum,
-    )
-    aliases: defaultdict[str, list[str]] = defaultdict(list)
-    for pair in merged.values():
-        if vocabulary.index(pair.name) is None:
-            aliases[label_key(pair.like)].append(pair.name)
-    objects = [
-        replace(entry, aliases=(*entry.aliases, *aliases[label_key(entry.label)]))
-        for entry in vocabulary.objects
-    ]
-    return Vocabulary(objects, vocabulary.room_types)
+        if minimum == _MINIMA[-1] or coverage(vocabulary, scenes) >= _COVERED:
+            return minimum, vocabulary
+    raise ConfigError("every label occurs only once: training needs labels with more objects")
 
 
 def _use_frequent_names(vocabulary: Vocabulary, scenes: Sequence[AnnotatedScene]) -> Vocabulary:
@@ -203,17 +161,6 @@ def _use_frequent_names(vocabulary: Vocabulary, scenes: Sequence[AnnotatedScene]
         objects.append(replace(entry, label=label, aliases=tuple(others)))
     objects = [replace(x, parent=name_of[x.parent]) if x.parent else x for x in objects]
     return Vocabulary(objects, vocabulary.room_types)
-
-
-def _dropped(
-    labels: Sequence[Label], vocabulary: Vocabulary, names: Names, minimum: int
-) -> list[tuple[str, int, str]]:
-    reasons = {label_key(name): "not an object" for name in names.not_objects}
-    return [
-        (x.name, x.mentions, reasons.get(label_key(x.name), f"under {minimum} mentions"))
-        for x in labels
-        if vocabulary.index(x.name) is None
-    ]
 
 
 def _split(scenes: Sequence[AnnotatedScene]) -> tuple[int, dict[str, int], int]:

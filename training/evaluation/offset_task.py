@@ -17,7 +17,7 @@ from scipy.stats import chi2
 
 from app.registry import Artifact
 from app.scene import CANONICAL
-from training.datasets.offsets import observed_offsets
+from training.datasets.cases import observed_offsets
 from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.setting import Outcome, Setting
 

@@ -94,15 +94,21 @@ def calibrate(
 def fit_relations(
     artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
 ) -> tuple[CountSlope, ...]:
-    """Fit the probability that a relation holds between two instances.
+    """Fit the probability that a relation holds between two instances, in whole and partial scenes.
 
-    The input is the log-odds of the relation between the two classes. The fit uses scenes without
-    observed relations.
+    The input is the log-odds of the relation between the two classes. No relation is observed.
     """
     rng = np.random.default_rng(seed)
     structure = artifact.vocabulary.structure
     parts = [_part_of(encoded, structure, rng) for encoded in scenes]
     return _fit_possible(_examples_of_pairs(artifact, [*scenes, *parts]))
+
+
+def fit_with_observed(
+    artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
+) -> tuple[CountSlope, ...]:
+    """Fit the probability of relations of half of the pairs of a scene, given the other half."""
+    return _fit_possible(_examples_of_pairs(artifact, scenes, np.random.default_rng(seed)))
 
 
 def with_lower_lateral(
@@ -153,17 +159,6 @@ def _part_of(encoded: EncodedScene, structure: Flags, rng: Rng) -> EncodedScene:
     things = rng.permutation(classes[~structure[classes]])
     count = int(rng.integers(2, _MOST_OF_A_PART + 1))
     return encoded.only(np.isin(encoded.instance_classes, things[:count]))
-
-
-def fit_with_observed(
-    artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
-) -> tuple[CountSlope, ...]:
-    """Fit the probability of relations when half of the pairs of a scene are observed.
-
-    The fit examines the other half of the pairs.
-    """
-    rng = np.random.default_rng(seed)
-    return _fit_possible(_examples_of_pairs(artifact, scenes, rng))
 
 
 def _posterior(

@@ -98,6 +98,8 @@ class _Cases(NamedTuple):
 def fit_misplaced(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0) -> Misplaced:
     """Return the judgement of each kind of entry. A kind with too few scenes gets None."""
     cases = _cases(artifact, _some(scenes, seed), seed)
+    if cases is None:
+        return Misplaced()
     return Misplaced(
         **{
             name: _fit_kind(cases.rows(cases.kind == kind), _BUDGET[name])
@@ -116,8 +118,10 @@ def _some(scenes: Sequence[EncodedScene], seed: int) -> list[EncodedScene]:
     return chosen
 
 
-def _cases(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int) -> _Cases:
-    blocks: list[_Cases] = []
+def _cases(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int) -> _Cases | None:
+    """Return the cases of the scenes, or None without any."""
+    of_scene: list[tuple[int, str, bool, bool, float]] = []
+    of_entries: list[tuple[Ints, Floats, Flags]] = []
     for number, encoded in enumerate(scenes):
         shown = _shown_kinds(encoded)
         for scene, flipped, wrong in _questions(artifact, encoded, seed):
@@ -128,29 +132,18 @@ def _cases(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int) -> _Ca
             listed_of_boxes = bare.poses is None and encoded.instance_positions is not None
             explained = listed_of_boxes | (entries.terms[:, 0] >= EXPLAINED)
             usable &= (entries.kind != OVER) | ~explained
-            size = int(usable.sum())
-            of_scene: dict[str, Any] = {
-                "scene": len(blocks),
-                "encoded": number,
-                "source": encoded.source,
-                "untouched": wrong is None,
-                "complete": STAND in shown,
-                "weight": _OF_WORDS if wrong in flipped else 1.0,
-            }
-            blocks.append(
-                _Cases(
-                    **{name: np.full(size, value) for name, value in of_scene.items()},
-                    kind=entries.kind[usable],
-                    terms=entries.terms[usable],
-                    wrong=is_wrong[usable],
-                )
-            )
-    if not blocks:
-        none = np.zeros(0, np.int64)
-        names, no = none.astype(np.str_), none > 0
-        return _Cases(none, none, names, no, no, none, np.zeros((0, TERMS)), no, np.zeros(0))
-    columns: Any = (np.concatenate(column) for column in zip(*blocks, strict=True))
-    return _Cases(*columns)
+            weight = _OF_WORDS if wrong in flipped else 1.0
+            of_scene.append((number, encoded.source, wrong is None, STAND in shown, weight))
+            of_entries.append((entries.kind[usable], entries.terms[usable], is_wrong[usable]))
+    if not of_scene:
+        return None
+    sizes = [len(kind) for kind, *_ in of_entries]
+    columns = (np.repeat(column, sizes) for column in zip(*of_scene, strict=True))
+    encoded_index, source, untouched, complete, weights = columns
+    kind, terms, wrong_entries = (np.concatenate(x) for x in zip(*of_entries, strict=True))
+    scene_index = np.repeat(np.arange(len(sizes)), sizes)
+    about = scene_index, encoded_index, source, untouched, complete
+    return _Cases(*about, kind, terms, wrong_entries, weights)
 
 
 def _shown_kinds(encoded: EncodedScene) -> list[int]:

@@ -35,7 +35,7 @@ from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.cases import RIDGE, logistic
 from training.evaluation.alarms import ALARMS
-from training.evaluation.intruders import by_popularity, by_signature, draw_intruders
+from training.evaluation.intruders import draw_intruders, intruder_weights
 from training.evaluation.parts import Parts, draw_parts, exactly, up_to_longest
 from training.fit.calibrate_rooms import calibrate_rooms, posterior_of
 
@@ -220,15 +220,12 @@ def fit_outliers(
     """Fit the calibration of outliers on random parts of scenes, with and without an intruder.
 
     Args:
-        scenes: validation scenes.
         train: training scenes. They give the distributions of the intruders.
-        structure: True for structural classes, (classes,) bool.
-        chosen: a calibration whose `popularity_weight` the fit keeps. None means that the fit
-            chooses the weight.
+        chosen: a calibration whose `popularity_weight` is kept. Without it, the fit chooses one.
 
     Returns:
-        The fields `popularity_weight`, `outlier` and `outlier_lines` of a `Calibration`. The result
-        is empty if there are too few scenes or parts.
+        The fields `popularity_weight`, `outlier` and `outlier_lines` of a `Calibration`; none if
+        there are too few scenes or parts.
     """
     if len(scenes) < _LEAST_SCENES:
         return {}
@@ -238,9 +235,8 @@ def fit_outliers(
         for n, parts in parts_by_length.items()
         if len(parts.v) >= _LEAST_SCENES
     }
-    # The intruders are drawn uniformly, by popularity, or from the typical classes of other rooms.
-    distributions = (None, by_popularity(scenes, train), by_signature(scenes, train))
-    scored = (score_intruders(artifact, scenes, structure, weights) for weights in distributions)
+    laws = intruder_weights(scenes, train).values()
+    scored = (score_intruders(artifact, scenes, structure, weights) for weights in laws)
     with_intruder = [scores for scores in scored if len(scores.size)]
     if not untouched or not with_intruder:
         return {}

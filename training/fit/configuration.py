@@ -10,6 +10,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from app.inference.variants import VARIANTS, Variant
+from training.datasets.files import position_and_problem
 from training.machines import MachineSpec, build
 
 
@@ -212,7 +213,6 @@ class Config(_Section):
 
 
 def first_error(error: ValidationError) -> str:
-    """Return the path and the message of the first invalid entry."""
-    first = error.errors()[0]
-    path = ".".join(str(part) for part in first["loc"]) or "the file"
-    return f"{path}: {first['msg']}"
+    """Return the position and the problem of the first invalid entry."""
+    position, problem = position_and_problem(error)
+    return f"{position or 'the file'}: {problem}"

@@ -1,15 +1,18 @@
-"""Models in memory, for calibration and validation."""
+"""Models in memory, for calibration and validation, and where their objects stand."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from app.registry import Artifact, Calibration, Places
-from app.scene import Vocabulary
+from app.scene import RoleCounts, Vocabulary
+from training.datasets import EncodedScene
+from training.datasets.array_types import Floats
 from training.datasets.batches import TrainingData
-from training.fit.place_statistics import fit_places
 from training.machines import BoltzmannMachine
 from training.machines.arrays import weights_of
 
@@ -41,5 +44,57 @@ def draft_artifact(
 
 def placed_draft(machine: BoltzmannMachine, data: TrainingData) -> Artifact:
     """Return a machine in half precision, with the places of the training scenes."""
-    places = data.roles and fit_places(data.train.scenes, data.roles, data.classes)
-    return draft_artifact(as_stored(machine), data.classes, places)
+    places = data.roles and fit_places(data.train.scenes, data.roles, data.vocabulary)
+    return draft_artifact(as_stored(machine), data.vocabulary, places)
+
+
+# Weight of the parent of a class, and of all classes, in objects.
+_OF_PARENT, _OF_ALL = 5.0, 5.0
+
+
+def fit_places(
+    scenes: Sequence[EncodedScene], roles: RoleCounts, vocabulary: Vocabulary
+) -> Places | None:
+    """Count the relations of the scenes. Return None if no scene has a relation.
+
+    Relations of structure, and relations between objects of one class, do not count.
+    """
+    V, is_thing = len(vocabulary), ~vocabulary.structure
+    blocks, listed = [np.zeros(0, np.int64)], np.ones(V)
+    for scene in scenes:
+        evidence = scene.evidence
+        listed[evidence.classes] += 1
+        relation, subject, anchor = np.nonzero(evidence.holds)
+        i, j = evidence.classes[subject], evidence.classes[anchor]
+        counted = is_thing[i] & is_thing[j] & (i != j)
+        blocks.append(((relation * V + i) * V + j)[counted])
+    keys, held = np.unique(np.concatenate(blocks), return_counts=True)
+    if not len(keys):
+        return None
+    return Places(
+        triple=keys.astype(np.int32),
+        held=held.astype(np.float32),
+        frequency=(listed / listed.sum()).astype(np.float32),
+        role_pair=roles.pair.astype(np.int32),
+        role_counts=roles.counts,
+        role_anchor=roles.anchor,
+        stands=_stands(scenes, vocabulary).astype(np.float32),
+    )
+
+
+def _stands(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> Floats:
+    """Return the shares of floor, wall and supporting objects for each class, (V, 3).
+
+    The counts of a class are smoothed towards those of its parent, and of all classes.
+    """
+    counts = np.zeros((len(vocabulary), 3))
+    for scene in scenes:
+        known = scene.instance_stands >= 0
+        np.add.at(counts, (scene.instance_classes[known], scene.instance_stands[known]), 1)
+    usual = counts.sum(0) + 1
+    shares = (counts + _OF_ALL * usual / usual.sum()) / (counts.sum(1, keepdims=True) + _OF_ALL)
+    parents = vocabulary.parents
+    prior = np.where((parents >= 0)[:, None], shares[parents], usual / usual.sum())
+    weight = np.where(parents >= 0, _OF_PARENT, _OF_ALL)[:, None]
+    smoothed: Floats = (counts + weight * prior) / (counts.sum(1, keepdims=True) + weight)
+    return smoothed

@@ -30,7 +30,7 @@ from app.registry import Offsets
 from app.scene import CANONICAL
 from training.datasets import EncodedScene
 from training.datasets.array_types import Floats, Ints
-from training.datasets.offsets import ObservedOffsets, observed_offsets
+from training.datasets.cases import ObservedOffsets, observed_offsets
 
 # Shrinkage of the class effects u and v. It acts like `LAMBDA` additional pairs with effect 0.
 LAMBDA: Final = 4.0

@@ -31,7 +31,7 @@ Sources: Besag, "Statistical analysis of non-lattice data" (1975); Mnih and Sala
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -39,12 +39,16 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
-from torch.nn.utils.parametrize import cached
+from torch.nn.utils.parametrize import (
+    cached,
+    is_parametrized,
+    register_parametrization,
+    remove_parametrizations,
+)
 
 from training.datasets.batches import Batch, SceneTensors, relation_units, subset
 from training.fit.configuration import RelationsConfig
 from training.fit.residuals import lower_unseen_roles, means_of_parts, with_counted_residuals
-from training.fit.sharing import bake_shared_weights
 from training.machines import BoltzmannMachine
 from training.machines.machine import OBJECT_WEIGHTS
 
@@ -54,7 +58,7 @@ _WITHOUT_PRIOR = frozenset({*OBJECT_WEIGHTS, "gamma", "B", "usual", "d"})
 _MAP_PRIOR = 0.1
 # Random change of the log of the number of classes by which scenes are sorted into batches.
 _MIXING = 0.5
-# Weights that classes share; see `training.fit.sharing`.
+# Weights that classes share; see `training.fit.relations`.
 SHARED = ("S", "O", "s", "o")
 
 
@@ -237,3 +241,48 @@ class RelationFit:
 def _nll(logits: Tensor, r: Tensor, weight: Tensor) -> Tensor:
     """Return the sum of -weight log p(r) over all relation units."""
     return ((softplus(logits) - r * logits) * weight).sum()
+
+
+class Sharing(nn.Module):
+    """Add the parent's deviation and a trained map of word vectors to the weights of each class.
+
+    Args:
+        words: scaled word vectors, (classes, dimensions), 0 where unknown.
+        parents: index of the parent of each class, (classes,) int64. -1 means no parent.
+        width: number of weights of a class.
+        columns: True if the weights have the shape (width, classes), else (classes, width).
+    """
+
+    def __init__(self, words: Tensor, parents: Tensor, width: int, *, columns: bool) -> None:
+        super().__init__()
+        self.words, self.parents, self.columns = words, parents, columns
+        self.map = nn.Parameter(torch.zeros(words.shape[1], width))
+
+    def forward(self, deviation: Tensor) -> Tensor:
+        own = deviation.T if self.columns else deviation
+        inherited = own[self.parents.clamp(min=0)] * (self.parents >= 0).unsqueeze(1)
+        total = own + inherited + self.words @ self.map
+        return total.T if self.columns else total
+
+
+def share_weights(
+    machine: BoltzmannMachine, words: Tensor, parents: Tensor, names: Iterable[str]
+) -> None:
+    """Let classes share the weights of the given names. Weights that a machine lacks are skipped.
+
+    `Sharing` describes words and parents.
+    """
+    parameters = dict(machine.named_parameters())
+    for name in names:
+        if name in parameters:
+            columns = name in ("s", "o")
+            width = parameters[name].shape[0 if columns else 1]
+            sharing = Sharing(words, parents, width, columns=columns)
+            register_parametrization(machine, name, sharing)
+
+
+def bake_shared_weights(machine: BoltzmannMachine, names: Iterable[str]) -> None:
+    """Replace each of the shared weights by the sum of its parts, for storage."""
+    for name in names:
+        if is_parametrized(machine, name):
+            remove_parametrizations(machine, name, leave_parametrized=True)

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from app.inference.variants import VARIANTS
+from app.scene import CANONICAL
 from training.datasets.batches import TrainingData, seen_triples, subset
 from training.evaluation.artifact_model import score_relations
 from training.evaluation.parts import validation_score
@@ -33,9 +34,8 @@ from training.fit.checkpoint import (
 from training.fit.configuration import Config
 from training.fit.draft import draft_artifact
 from training.fit.objects import ObjectFit, ObjectScenes, start_objects
-from training.fit.relations import SHARED, RelationFit
+from training.fit.relations import SHARED, RelationFit, bake_shared_weights, share_weights
 from training.fit.samples import fit_scene_rates, store_samples
-from training.fit.sharing import bake_shared_weights, share_weights
 from training.machines import BoltzmannMachine, MachineSpec, build
 from training.machines.edges import find_triples, triple_keys
 from training.machines.machine import OBJECT_WEIGHTS
@@ -56,9 +56,10 @@ def new_machine(config: Config, data: TrainingData, scenes: ObjectScenes) -> Bol
     V = data.train.v.shape[1]
     triples = seen_triples(data.train.scenes, V, shape.min_triple_count)
     spec = MachineSpec(
-        shape.variant, V=V, A=data.relations, units=shape.units, states=shape.states, H2=shape.H2,
-        C=data.room_types, K=shape.K if VARIANTS[shape.variant].factorised else 0, T=len(triples),
-        G=shape.G, N=shape.N, profiles=len(scenes.sources), coupled=shape.coupled,
+        shape.variant, V=V, A=len(CANONICAL), units=shape.units, states=shape.states, H2=shape.H2,
+        C=len(data.vocabulary.room_types), T=len(triples), G=shape.G, N=shape.N,
+        K=shape.K if VARIANTS[shape.variant].factorised else 0,
+        profiles=len(scenes.sources), coupled=shape.coupled,
     )  # fmt: skip
     generator = torch.Generator().manual_seed(config.training.seed)
     machine = build(spec).set_triples(triples).initialise(generator, shape.initial_scale)
@@ -260,7 +261,7 @@ def relation_score(machine: BoltzmannMachine, data: TrainingData) -> float:
     if not annotated:
         return math.nan
     chosen = annotated[:: max(1, len(annotated) // _SCORED)]
-    score = partial(score_relations, draft_artifact(machine, data.classes), given=False)
+    score = partial(score_relations, draft_artifact(machine, data.vocabulary), given=False)
     scenes = subset(data.validation, torch.tensor(chosen))
     precision = r_precision(score_scenes(scenes, data.structure, score), len(scenes))
     return 0.0 if precision is None else precision.value

@@ -252,7 +252,7 @@ class Search:
         }
 
     def _measure(self, machine: BoltzmannMachine, folder: Path) -> None:
-        data, artifact = self.data, draft_artifact(machine, self.data.classes)
+        data, artifact = self.data, draft_artifact(machine, self.data.vocabulary)
         relations = partial(score_relations, artifact, given=False)
         model = Model(missing=partial(score_missing, artifact), relations=relations)
         tasks = [task for task, _ in FIGURES.values()]

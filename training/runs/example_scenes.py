@@ -23,9 +23,9 @@ from app.registry.examples import MAX_WORD, Example, Examples
 from app.scene import Vocabulary, canonicalise
 from training.datasets import AnnotatedScene
 from training.datasets.encoding import room_viewpoint
-from training.datasets.names import curated_names
 from training.datasets.records import AnnotatedObject
 from training.datasets.sources import source_of
+from training.datasets.vocabulary import curated_names
 from training.fit.configuration import ConfigError, first_error
 
 _SHIPPED: Final = Path(__file__).parent / "examples"
@@ -105,35 +105,27 @@ def choose_examples(
     type. In a scene with more classes, `/missing` would propose few objects. Scenes with positions
     take precedence. Scenes of research-only data sets are left out.
     """
-    objects_of = {
-        scene: _usable(scene, vocabulary)
-        for scene in scenes
-        if not source_of(scene.source).research_only
-    }
+    own = [scene for scene in scenes if not source_of(scene.source).research_only]
+    objects_of = {scene: _usable(scene, vocabulary) for scene in own}
     classes = {scene: {index for index, _ in pairs} for scene, pairs in objects_of.items()}
     frequency = Counter(index for indices in classes.values() for index in indices)
-    candidates = [scene for scene in objects_of if len(classes[scene]) >= _FEWEST_CLASSES]
+    candidates = [scene for scene in own if len(classes[scene]) >= _FEWEST_CLASSES]
     sizes: defaultdict[str | None, list[int]] = defaultdict(list)
     for scene in candidates:
         sizes[scene.room_type].append(len(classes[scene]))
-    median_size = {room: np.median(counts) for room, counts in sizes.items()}
-    ranked = sorted(
-        candidates,
-        key=lambda scene: (
-            not any(thing.position for _, thing in objects_of[scene]),
-            abs(len(classes[scene]) - median_size[scene.room_type]),
-            -sum(frequency[index] for index in classes[scene]),
-        ),
-    )
-    first_of_room: dict[str | None, AnnotatedScene] = {}
-    for scene in ranked:
-        first_of_room.setdefault(scene.room_type, scene)
-    groups = {scene.group for scene in first_of_room.values()}
-    others = [scene for scene in ranked if scene.group not in groups]
-    return tuple(
-        _make_example(scene, objects_of[scene], vocabulary, frequency)
-        for scene in [*first_of_room.values(), *others][:_CHOSEN]
-    )
+
+    def rank(scene: AnnotatedScene) -> tuple[bool, float, int]:
+        distance = abs(len(classes[scene]) - np.median(sizes[scene.room_type]))
+        bare = not any(thing.position for _, thing in objects_of[scene])
+        return bare, float(distance), -sum(frequency[index] for index in classes[scene])
+
+    ranked = sorted(candidates, key=rank)
+    # The first scene of each room type, and then the others.
+    first = {scene.room_type: scene for scene in reversed(ranked)}
+    ranked.sort(key=lambda scene: first[scene.room_type] is not scene)
+    chosen = {scene.group: scene for scene in reversed(ranked)}
+    typical = [scene for scene in ranked if chosen[scene.group] is scene][:_CHOSEN]
+    return tuple(_make_example(x, objects_of[x], vocabulary, frequency) for x in typical)
 
 
 def _usable(scene: AnnotatedScene, vocabulary: Vocabulary) -> list[tuple[int, AnnotatedObject]]:
@@ -153,15 +145,11 @@ def _make_example(
     vocabulary: Vocabulary,
     frequency: Counter[int],
 ) -> Example:
-    """Build a request from a scene, with at most `_MOST_OBJECTS` objects and distinct ids."""
-    kept = _select_objects(usable, frequency)
-    labels = {thing.id: vocabulary.labels[index] for index, thing in kept}
-    label_counts = Counter(labels.values())
-    numbers: Counter[str] = Counter()
-    names: dict[str, str] = {}
-    for thing_id, label in labels.items():
-        numbers[label] += 1
-        names[thing_id] = f"{label[:90]}_{numbers[label]}" if label_counts[label] > 1 else label
+    """Build a request from a scene, with the first object of each of the most frequent classes."""
+    first = dict(reversed(usable))
+    classes = sorted(first, key=lambda index: -frequency[index])[:_MOST_OBJECTS]
+    kept = [(index, thing) for index, thing in usable if index in classes and first[index] is thing]
+    names = {thing.id: vocabulary.labels[index] for index, thing in kept}
     values: dict[str, Any] = {}
     room = curated_names().canonical_room(scene.room_type)
     if room is not None and vocabulary.room_index(room) is not None:
@@ -170,24 +158,10 @@ def _make_example(
         values |= {"frame_id": "map", "viewpoint": _viewpoint(scene)}
     elif relations := _relations(scene, names):
         values["relations"] = relations
-    values["objects"] = [
-        {"id": names[thing.id], "label": labels[thing.id], **_pose(thing)} for _, thing in kept
-    ]
+    values["objects"] = [{"label": names[thing.id]} | _pose(thing) for _, thing in kept]
     scene_id = "".join(filter(str.isprintable, scene.scene_id))
     title = f"{values.get('room_type', 'scene').capitalize()}, {scene_id}"
     return Example.model_validate({"name": title[:MAX_WORD], "scene": values})
-
-
-def _select_objects(
-    objects: Sequence[tuple[int, AnnotatedObject]], frequency: Counter[int]
-) -> list[tuple[int, AnnotatedObject]]:
-    """Return the first objects of all classes, frequent classes first, then the second ones."""
-    counts: Counter[int] = Counter()
-    ranks = []
-    for position, (index, _) in enumerate(objects):
-        ranks.append((counts[index], -frequency[index], position))
-        counts[index] += 1
-    return [objects[position] for position in sorted(p for *_, p in sorted(ranks)[:_MOST_OBJECTS])]
 
 
 def _viewpoint(scene: AnnotatedScene) -> dict[str, float]:

@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from app.registry import Example
-from app.scene import CANONICAL, RoleCounts, Vocabulary
+from app.scene import RoleCounts, Vocabulary
 from training.datasets import (
     AnnotatedScene,
     EncodedScene,
@@ -79,8 +79,6 @@ class SplitScenes:
         return TrainingData(
             **tensors,
             structure=torch.from_numpy(self.vocabulary.structure.copy()),
-            relations=len(CANONICAL),
-            room_types=len(self.vocabulary.room_types),
             digest=self.digest,
             words=self.words,
             vocabulary=self.vocabulary,

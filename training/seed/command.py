@@ -14,12 +14,13 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
-from functools import partial
+from functools import cache, partial
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any
+from statistics import fmean, median, stdev
+from typing import Annotated, Any, Final
 
 import torch
 import typer
@@ -27,9 +28,8 @@ from rich.console import Console
 
 from training.datasets import DatasetError
 from training.datasets.files import DATA
-from training.seed.learning import EPOCHS, LEARNING_RATE, train
+from training.seed.learning import EPOCHS, KINDS, LEARNING_RATE, train
 from training.seed.machines import VARIANTS
-from training.seed.page import Row, Run, markdown, plot
 from training.seed.protocol import (
     ANNEALED,
     ONE_PASS,
@@ -47,7 +47,11 @@ console = Console()
 Job = tuple[str, str, int]
 """Split, variant and training seed of a machine."""
 
-_run_job: Callable[[Job], Run]  # of a worker process
+Run = dict[str, Any]
+"""Figures of a machine, and the errors of each epoch."""
+
+Row = dict[str, float]
+"""Figures by metric."""
 
 
 class FolderError(ValueError):
@@ -74,10 +78,11 @@ def seed(
     """
     try:
         with console.status("reading scenes"):
-            materials = read_material(source, data)
+            materials = _materials(source, data)
         folder = out / Path(source).name.split(".")[0]
         settings = {"epochs": epochs, "learning_rate": learning_rate}
-        runs = _train_all(materials, folder, seeds, settings, workers)
+        run_job = partial(_run, source=source, data=data, folder=folder, settings=settings)
+        runs = _train_all(run_job, list(product(materials, VARIANTS, range(seeds))), workers)
     except (DatasetError, FolderError, FloatingPointError) as error:
         console.print(f"[red]error:[/red] {error}", soft_wrap=True)
         raise typer.Exit(1) from None
@@ -96,22 +101,20 @@ def seed(
     console.print(f"results: {folder}/results.md, results.json, errors.png", soft_wrap=True)
 
 
+@cache
+def _materials(source: str, data: Path) -> dict[str, Material]:
+    """Read the scenes once in each process."""
+    return read_material(source, data)
+
+
 def _train_all(
-    materials: Mapping[str, Material],
-    folder: Path,
-    seeds: int,
-    settings: Mapping[str, float],
-    workers: int,
+    run_job: Callable[[Job], Run], jobs: Sequence[Job], workers: int
 ) -> dict[str, dict[str, list[Run]]]:
     """Return the runs by split and variant, from files or worker processes of one thread."""
-    runs: dict[str, dict[str, list[Run]]] = {split: {} for split in materials}
-    jobs = list(product(materials, VARIANTS, range(seeds)))
-    # Each worker gets the scenes once. With them in every job, the pipe of jobs would be full when
-    # training fails, and the pool could not end.
-    run_job = partial(_run, folder=folder, materials=dict(materials), settings=dict(settings))
-    pool = multiprocessing.get_context("spawn").Pool(workers, _start_worker, (run_job,))
+    runs: dict[str, dict[str, list[Run]]] = {split: {} for split, _, _ in jobs}
+    pool = multiprocessing.get_context("spawn").Pool(workers, _start_worker)
     with console.status(f"training {len(jobs)} machines"), pool:
-        for done, run in enumerate(pool.imap(_work, jobs), 1):
+        for done, run in enumerate(pool.imap(run_job, jobs), 1):
             split, name, number = jobs[done - 1]
             runs[split].setdefault(name, []).append(run)
             last = run["history"][-1]
@@ -123,24 +126,13 @@ def _train_all(
     return runs
 
 
-def _start_worker(run_job: Callable[[Job], Run]) -> None:
+def _start_worker() -> None:
     """Use one thread, and leave Ctrl-C to the parent process."""
-    global _run_job
-    _run_job = run_job
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _work(job: Job) -> Run:
-    return _run_job(job)
-
-
-def _run(
-    job: Job,
-    folder: Path,
-    materials: Mapping[str, Material],
-    settings: Mapping[str, Any],
-) -> Run:
+def _run(job: Job, source: str, data: Path, folder: Path, settings: Mapping[str, Any]) -> Run:
     """Return the run in a file, or train and measure a machine and write the file.
 
     A job is a split, a variant and a training seed.
@@ -151,7 +143,7 @@ def _run(
     """
     split, name, number = job
     path = folder / split / f"{name}-seed-{number}.json"
-    material = materials[split]
+    material = _materials(source, data)[split]
     settings = {"scenes": material.digest, **settings}
     if path.exists():
         run: Run = json.loads(path.read_text(encoding="utf-8"))
@@ -200,3 +192,92 @@ def _write(path: Path, text: str) -> None:
     temporary = path.with_suffix(f".{os.getpid()}.tmp")
     temporary.write_text(text, encoding="utf-8")
     temporary.replace(path)
+
+
+_EPOCHS_SHOWN: Final = (1, 10, 50)
+_ANNEALED_SHOWN: Final = (
+    "T1 on",
+    "T1 precision",
+    "T2 on, relations deleted",
+    "T2 false objects, relations deleted",
+    "T3 error / objects",
+)
+_TITLES: Final = {"scenes": "Split by scenes, as in the paper", "groups": "Split by groups"}
+
+
+def markdown(source: str, materials: Mapping[str, Material], results: Mapping[str, Any]) -> str:
+    """Return the page with a table for each split. Cells are means ± standard deviations."""
+    parts = [f"# Bozcan et al. (2018) on {source}\n", "![errors E by epoch](errors.png)\n"]
+    for split, result in results.items():
+        m = materials[split]
+        parts.append(
+            f"## {_TITLES[split]}\n\nScenes: {len(m.train)} for training, {len(m.validation)} for "
+            f"validation, {len(m.test)} for tests. {len(m.vocabulary)} classes, {len(m.triples)} "
+            "triples.\n"
+        )
+        parts.append(_table(result))
+        for name, runs in result["machines"].items():
+            parts += [f"T4, {VARIANTS[name].title}, seed 0:\n"]
+            parts += [f"- {unit}: {', '.join(own)}" for unit, own in runs[0]["classes"].items()]
+            parts.append("")
+    return "\n".join(parts)
+
+
+def _table(result: Mapping[str, Any]) -> str:
+    columns: dict[str, list[Row]] = dict(result["references"])
+    columns |= {name: [_row(run) for run in runs] for name, runs in result["machines"].items()}
+    metrics = dict.fromkeys(metric for rows in columns.values() for row in rows for metric in row)
+    titles = [VARIANTS[name].title if name in VARIANTS else name for name in columns]
+    lines = [
+        ["", *titles, "paper: RBM / GBM / Triway"],
+        ["---"] * (len(columns) + 2),
+        *([metric, *_cells(metric, columns.values()), _paper(metric)] for metric in metrics),
+    ]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def _row(run: Run) -> Row:
+    """Return all figures of a run by metric, in the order of the table."""
+    history, row = run["history"], dict(run["figures"])
+    row |= {f"annealed: {name}": run["annealed"][name] for name in _ANNEALED_SHOWN if name in row}
+    for kind in KINDS:
+        shown = {f"epoch {k}": history[k - 1] for k in _EPOCHS_SHOWN if k <= len(history)}
+        for when, epoch in (shown | {"last epoch": history[-1]}).items():
+            row[f"E {kind}, {when}"] = epoch[kind]
+        left = history[min(50, len(history)) - 1][kind]
+        row[f"share of E {kind} left at epoch 50"] = left / max(history[0][kind], 1e-9)
+    row["epochs"], row["weights"] = len(history), run["weights"]
+    row["seconds an epoch"] = median(epoch["seconds"] for epoch in history)
+    return row
+
+
+def _cells(metric: str, columns: Iterable[list[Row]]) -> Iterator[str]:
+    for rows in columns:
+        values = [row[metric] for row in rows if metric in row]
+        digits = 0 if metric in ("epochs", "weights") else 1 if metric.startswith("E ") else 3
+        spread = f" ± {stdev(values):.{digits}f}" if len(values) > 1 and any(values) else ""
+        yield f"{fmean(values):,.{digits}f}{spread}" if values else ""
+
+
+def _paper(metric: str) -> str:
+    return " / ".join(f"{value:.4f}" for value in PAPER.get(metric, {}).values())
+
+
+def plot(path: Path, results: Mapping[str, Any]) -> None:
+    """Draw E of objects and relations by epoch, one line for each machine and training seed."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 4 * len(results)), layout="constrained")
+    axes = figure.subplots(len(results), len(KINDS), squeeze=False)
+    for row, (split, result) in zip(axes, results.items(), strict=True):
+        for axis, kind in zip(row, KINDS, strict=True):
+            for number, (name, runs) in enumerate(result["machines"].items()):
+                for seed, run in enumerate(runs):
+                    values = [epoch[kind] for epoch in run["history"]]
+                    label = None if seed else VARIANTS[name].title
+                    axis.plot(
+                        range(1, len(values) + 1), values, f"C{number}", linewidth=1, label=label
+                    )
+            axis.set(xlabel="epoch", ylabel="E", title=f"{_TITLES[split]}: {kind}", ylim=(0, None))
+            axis.legend()
+    figure.savefig(path, dpi=110)

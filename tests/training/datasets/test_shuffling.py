@@ -95,21 +95,6 @@ def test_shuffled_scenes_are_valid_and_keep_other_fields(scenes, seed):
             np.testing.assert_array_equal(getattr(pooled, name), getattr(e, name))
 
 
-def paired(count: int) -> list[EncodedScene]:
-    """Two kinds of scenes, {0, 1} and {2, 3}, of two sources, one in two with 4 in it as well."""
-    return [
-        made([*((0, 1) if k % 2 else (2, 3)), *([4] if k % 4 > 1 else [])], k, k % 2, "st"[k % 2])
-        for k in range(count)
-    ]
-
-
-def test_only_equal_seeds_give_equal_permutations():
-    scenes = paired(60)
-    first, again, other = (presence(shuffle_objects(scenes, STRUCTURE, s)) for s in (5, 5, 6))
-    np.testing.assert_array_equal(first, again)
-    assert (first != other).any()
-
-
 def test_every_table_of_the_margins_is_equally_likely():
     """{0}, {1, 2}: three tables have these margins, each with a third of 3,000 seeds.
 

@@ -11,17 +11,17 @@ from tests.training.scenes import scene
 from training.datasets import (
     AnnotatedObject,
     AnnotatedScene,
-    encode,
     read_scenes,
     source_vocabulary,
 )
-from training.datasets.names import Names, curated_names
 from training.datasets.vocabulary import (
     INDOOR_FILE,
     MINIMUM_MENTIONS,
+    Names,
     build_indoor_vocabulary,
     build_vocabulary,
     coverage,
+    curated_names,
     indoor_vocabulary,
     vocabulary_json,
     with_room_aliases,
@@ -110,21 +110,9 @@ def test_coverage_counts_objects() -> None:
     assert coverage(vocabulary, scenes("chairs", "chair", "wall", "sky")) == 0.75
 
 
-def test_a_phrase_belongs_to_the_class_of_its_head() -> None:
+def test_a_phrase_counts_for_its_head() -> None:
     found = build_vocabulary(scenes("bottle", "book", "jar of jam"), Names(), minimum=1)
     assert found.labels == ("book", "bottle", "jar")
-    for name, label in (
-        ("bottle of milk", "bottle"),
-        ("Bottles_of_milk", "bottle"),
-        ("pile of books", "book"),
-        ("stack-of-books", "book"),
-        ("bottle of", None),
-        ("box of books", None),
-        ("chest of drawers", None),
-        ("bottleofmilk", None),
-    ):
-        index = found.index(name)
-        assert (None if index is None else found.labels[index]) == label, name
 
 
 def test_household_classes_need_no_mention() -> None:
@@ -178,61 +166,12 @@ def test_the_committed_vocabulary_follows_the_curated_names() -> None:
     assert all(names.canonical_room(room) == room for room in vocabulary.room_types)
 
 
-@pytest.fixture(scope="module")
-def real(repository: Path) -> dict[str, list[AnnotatedScene]]:
-    folder = repository.parent / "shared" / "data"
-    paths = {path.name.removesuffix(".jsonl.gz"): path for path in folder.rglob("*.jsonl.gz")}
-    if not paths:
+def test_the_committed_vocabulary_is_what_the_data_give(repository: Path) -> None:
+    files = sorted((repository.parent / "shared" / "data").rglob("*.jsonl.gz"))
+    if not files:
         pytest.skip("the real scenes of ../shared/data are not here")
-    return {source: read_scenes(paths[source]) for source in sorted(COVERAGE)}
-
-
-def test_the_committed_vocabulary_is_what_the_data_give(
-    real: dict[str, list[AnnotatedScene]],
-) -> None:
-    everything = [scene for source in real.values() for scene in source]
-    written = build_indoor_vocabulary(everything)
+    written = build_indoor_vocabulary(scene for file in files for scene in read_scenes(file))
     assert vocabulary_json(written) == INDOOR_FILE.read_text(encoding="utf-8")
-
-
-COVERAGE = {
-    "sunrgbd": 0.955,
-    "sunrgbd_bedrooms_3d": 0.99,
-    "3dssg": 0.999,
-    "procthor": 0.999,
-    "vrd": 0.99,
-    "nr3d": 0.99,
-    "coco_captions": 0.99,
-    "reverie_text": 0.99,
-    "alfred": 0.99,
-    "bddl_goal": 0.96,
-    "behavior1k_rooms": 0.99,
-    "matterport_rooms": 0.97,
-    "virtualhome": 0.99,
-    "vsr": 0.99,
-}
-
-
-def test_coverage_of_the_real_scenes(real: dict[str, list[AnnotatedScene]]) -> None:
-    vocabulary = indoor_vocabulary()
-    assert set(COVERAGE) == set(real)
-    for source, least in COVERAGE.items():
-        assert coverage(vocabulary, real[source]) >= least, source
-
-
-def test_real_scenes_encode(real: dict[str, list[AnnotatedScene]]) -> None:
-    vocabulary = indoor_vocabulary()
-    bedrooms = encode(real["sunrgbd_bedrooms_3d"], vocabulary)
-    assert sum(scene.evidence.holds[:2].sum() for scene in bedrooms) > 1000
-    # No sizes: nothing is known of what stands on what.
-    assert not any(scene.evidence.observed[2:].any() for scene in bedrooms)
-    wall, floor = vocabulary.index("wall"), vocabulary.index("floor")
-    photographs = encode(real["vrd"], source_vocabulary(real["vrd"]))
-    on = sum(scene.evidence.holds.sum(axis=(1, 2)) for scene in photographs)
-    assert on.tolist() == [502, 2693, 3873, 1076, 438]
-    for evidence in (frame.evidence for frame in encode(real["sunrgbd"], vocabulary)):
-        assert not {wall, floor} & set(evidence.classes)
-        assert not evidence.observed.any()
 
 
 def test_the_curated_synonyms_of_rooms_are_added() -> None:

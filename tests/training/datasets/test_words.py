@@ -8,7 +8,6 @@ import pytest
 
 from app.scene import ObjectClass, Vocabulary
 from training.datasets import DatasetError, words
-from training.datasets.vocabulary import indoor_vocabulary
 from training.datasets.words import class_vectors, read_word_vectors
 from training.fit.configuration import DataConfig
 from training.runs.pipeline import read_sources, split_and_encode
@@ -111,15 +110,3 @@ def test_malformed_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(words, "MAX_BYTES", 64)
     with pytest.raises(DatasetError, match=r"vectors\.npz, words: must be at most 0 MiB"):
         read_word_vectors(save(tmp_path))
-
-
-def test_the_real_vectors(repository: Path) -> None:
-    path = repository.parent / "shared" / "data" / "extra" / "word_vectors.npz"
-    if not path.is_file():
-        pytest.skip("the vectors of ../shared/data are not here")
-    vocabulary = indoor_vocabulary()
-    vectors, found = class_vectors(read_word_vectors(path), vocabulary)
-    assert vectors.shape == (len(vocabulary), 100)
-    assert found.mean() > 0.99
-    fork, spoon, sofa = (vectors[vocabulary.labels.index(x)] for x in ("fork", "spoon", "sofa"))
-    assert fork @ spoon > fork @ sofa

@@ -1,20 +1,22 @@
+"""Two models are compared on scenes that neither has learnt from."""
+
 from __future__ import annotations
 
-import io
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
 from app.scene import Vocabulary
 from tests.training.research.baselines.furnished import STRUCTURE, furnished, tensors
-from training.domain.candidates import Candidate
-from training.domain.compare import COMPARED, compare, show, side_by_side
+from training.datasets import generate_rooms, split
+from training.datasets.records import digest_of
+from training.datasets.splits import stable_part
+from training.domain.candidates import BASELINES, Candidate, held_out
+from training.domain.compare import COMPARED, compare, side_by_side
 from training.evaluation.baselines import EASE, FREQUENCY_TABLE, POPULARITY
 from training.evaluation.model import Model
-from training.evaluation.tasks import in_words
-from training.fit.configuration import Config
+from training.fit.configuration import Config, ConfigError
 from training.fit.draft import as_stored, draft_artifact
 from training.fit.objects import ObjectScenes
 from training.fit.trainer import new_machine
@@ -48,7 +50,7 @@ def test_scenes_with_incomplete_lists_are_compared_on_relations_alone() -> None:
 
 
 @pytest.mark.parametrize("lacking", [0, 1])
-def test_a_comparison_fits_into_80_columns_and_notes_lacking_classes_alone(lacking) -> None:
+def test_a_comparison_covers_all_tasks_and_notes_lacking_classes_alone(lacking) -> None:
     """The second model has the classes in another order, all of them or all but one."""
     scenes = prepare(CONFIG, Path())
     classes = list(reversed(scenes.vocabulary.objects))
@@ -62,16 +64,78 @@ def test_a_comparison_fits_into_80_columns_and_notes_lacking_classes_alone(lacki
         Candidate(title, CONFIG, scenes.digests, draft_artifact(as_stored(machine), vocabulary))
         for title, vocabulary in (("new", scenes.vocabulary), ("old", other))
     )
-    found = compare(a, b, Path(), limit=None, examples=0, say=lambda _: None)
+    found = compare(a, b, Path(), say=lambda _: None)
     assert ["old lacks 1 of these classes" in note for note in found.notes] == [True] * lacking
     assert {row.task for row in found.results.differences} == set(COMPARED)
-    console = Console(file=io.StringIO(), width=80)
-    show(found, console)
-    lines = [line.strip() for line in console.file.getvalue().splitlines()]
-    for row in found.results.differences:
-        assert in_words(row.task) in lines
-        # The name of a metric, its values and the verdict are on one line.
-        assert any(
-            line.startswith(f"{row.metric} ") and line.endswith(f"] {row.verdict}")
-            for line in lines
-        )
+
+
+SCENES = {"rooms": generate_rooms(500, 0)}
+REFERENCE = Candidate(BASELINES, None, {}, None)
+LEARNT = {"rooms": digest_of(SCENES["rooms"])}
+
+
+def config(**data) -> Config:
+    return Config.model_validate(
+        {
+            "name": "rooms",
+            "data": {"sources": ["rooms"], "vocabulary": "rooms", "rooms": 500, **data},
+            "machine": {"variant": "rbm"},
+        }
+    )
+
+
+def candidate(title: str, learnt=LEARNT, **data) -> Candidate:
+    # Any artifact except None stands for a model, because only its split matters.
+    return Candidate(title, config(**data), learnt, artifact="a model")  # type: ignore[arg-type]
+
+
+def learnt_groups(seed: int, protocol) -> set[str]:
+    parts = split(SCENES["rooms"], seed=seed, protocol=protocol)
+    return {scene.group for part in ("train", "validation") for scene in parts[part]}
+
+
+@pytest.mark.parametrize("protocol", ["group", "stable"])
+def test_of_equal_splits_all_test_scenes_are_held_out(protocol) -> None:
+    a, b = candidate("a", split=protocol), candidate("b", split=protocol)
+    scenes, notes = held_out(a, b, SCENES)
+    assert scenes == split(SCENES["rooms"], seed=0, protocol=protocol)["test"]
+    assert not notes
+
+
+@pytest.mark.parametrize(
+    "protocols", [("stable", "stable"), ("stable", "group"), ("group", "group")]
+)
+def test_of_two_splits_scenes_that_either_model_learnt_are_left_out(protocols) -> None:
+    a, b = candidate("a", split=protocols[0]), candidate("b", split=protocols[1], split_seed=1)
+    scenes, (note,) = held_out(a, b, SCENES)
+    groups = {scene.group for scene in scenes}
+    assert groups
+    assert not groups & (learnt_groups(0, protocols[0]) | learnt_groups(1, protocols[1]))
+    assert "left out" in note
+
+
+@pytest.mark.parametrize("protocol", ["stable", "group"])
+@pytest.mark.parametrize("sources", [["rooms"], ["rooms", "3dssg"]])
+def test_after_a_change_of_the_data_only_a_stable_split_is_certain(protocol, sources) -> None:
+    """The scenes have changed since, or the older model has one more source."""
+    learnt = LEARNT if len(sources) > 1 else {"rooms": "0" * 64}
+    before = candidate("before", learnt, split=protocol, sources=sources)
+    scenes, notes = held_out(candidate("now", split="stable"), before, SCENES)
+    assert {stable_part(scene.group, 0) for scene in scenes} == {"test"}
+    uncertain = any("may have learnt from these" in note for note in notes)
+    assert uncertain == (protocol == "group")
+
+
+def test_a_model_of_other_sources_learnt_none_of_the_scenes() -> None:
+    other = candidate("b", {"kitchens": "1" * 64}, split="group")
+    _, (note,) = held_out(candidate("a", split="stable"), other, SCENES)
+    assert "other data sources (kitchens)" in note
+    assert held_out(candidate("a"), REFERENCE, SCENES)[1] == ()
+
+
+def test_the_first_model_must_record_its_split_and_have_test_scenes() -> None:
+    with pytest.raises(ConfigError, match="does not record the split of its scenes"):
+        held_out(REFERENCE, candidate("b"), SCENES)
+    final = candidate("a", split="final")
+    with pytest.raises(ConfigError, match="trained with --final"):
+        held_out(final, final, SCENES)

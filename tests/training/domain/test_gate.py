@@ -28,7 +28,7 @@ def difference(task: str, metric: str, low: float, high: float) -> Difference:
 def comparison(*rows: tuple[str, str, float, float]) -> Comparison:
     """Of rows (task, metric, low, high)."""
     results = Results("new", (), tuple(difference(*row) for row in rows))
-    return Comparison(results, "old", 40, 20, True, (), ())
+    return Comparison(results, "old", 40, 20, ())
 
 
 @pytest.mark.parametrize(
@@ -109,14 +109,13 @@ def trained(scenes: SplitScenes, **objects: float) -> Artifact:
 
 
 def usefulness(artifact: Artifact, data: TrainingData) -> Usefulness:
-    return measure_usefulness(artifact, data, limit=300, say=lambda _: None)
+    return measure_usefulness(artifact, data, say=lambda _: None)
 
 
 def test_a_trained_model_is_better_than_popularity(rooms) -> None:
     found = usefulness(trained(rooms), rooms.training_data())
     assert found.objections() == []
     assert found.differences["popularity"].low > 0.1
-    assert all(len(line) <= 80 for line in found.lines())
 
 
 @pytest.mark.parametrize("shuffled", [False, True])
@@ -142,7 +141,7 @@ def test_a_useless_model_is_refused_with_its_figures(rooms, shuffled) -> None:
 )
 def test_a_useful_model_leads_popularity_certainly_and_by_enough(popularity, reasons) -> None:
     differences = {"popularity": popularity, "EASE": Figure(0.0, -0.1, 0.1, 90)}
-    found = Usefulness(30, 9, 0.417, {"popularity": 0.4, "EASE": 0.417}, differences)
+    found = Usefulness(30, 9, {"popularity": 0.4, "EASE": 0.417}, differences)
     required = "at least +0.020, whole interval above zero"
     assert [required in text for text in found.objections()] == [True] * reasons
     assert any(required in line for line in found.lines())
@@ -153,7 +152,7 @@ def test_unusual_test_scenes(rooms) -> None:
     data, artifact = rooms.training_data(), trained(rooms, steps=1)
     flags = [replace(scene, complete=False) for scene in data.test.scenes]
     found = usefulness(artifact, replace(data, test=replace(data.test, scenes=flags)))
-    assert found.ours is not None
+    assert found.mrr
     assert found.scenes == len(flags)
     four_with_objects = torch.zeros_like(data.test.v)
     four_with_objects[:4] = data.test.v[:4]

@@ -1,23 +1,24 @@
+"""What `init` finds in scenes and labels."""
+
 from __future__ import annotations
 
 from dataclasses import replace
 
-import pytest
-from pydantic import ValidationError
-
-from scene_client.schemas import MissingRequest
+from tests.training.evaluation.scenes import scene as encoded_scene
 from tests.training.scenes import scene
 from training.datasets import generate_rooms
-from training.datasets.names import Names
 from training.datasets.rooms import DOMAINS
-from training.domain.look import LONGEST, look
+from training.domain import look as module
+from training.domain.look import Facts, count_labels, outside_vocabulary, similar_labels
 
-NAMES = Names()
+
+def look(scenes) -> Facts:
+    return module.look(scenes, count_labels(scenes))
 
 
 def finding(words: str, *scenes) -> tuple[int, list[str]]:
     """Number and examples of the finding whose sentence contains some words."""
-    findings = look(scenes, NAMES).findings
+    findings = look(scenes).findings
     return next(((f.count, f.examples) for f in findings if words in f.what), (0, []))
 
 
@@ -29,16 +30,21 @@ def test_facts_are_counted() -> None:
         [
             scene("a", "cup", "table", relations=[CUP_ON_TABLE], room="Kitchen"),
             scene("b", "cup", "table", "lamp", group="a", position=[(0.0, 0.0, 1.0)] * 3),
-        ],
-        NAMES,
+        ]
     )
-    assert (facts.scenes, facts.groups, facts.objects) == (2, 1, 5)
+    assert (facts.scenes, facts.groups) == (2, 1)
     assert facts.objects_per_scene == (2, 2.5, 3)
     assert facts.rooms == {"kitchen": 1}
     assert facts.shares["relations"] == facts.shares["positions"] == 0.5
-    assert facts.relations == {"on-top": 1}
     assert facts.related
-    assert not look([scene("a", "cup", "table"), scene("b", "lamp", "bed")], NAMES).related
+    assert not look([scene("a", "cup", "table"), scene("b", "lamp", "bed")]).related
+
+
+def test_similar_labels_are_found() -> None:
+    some = [scene(str(k), "soldering iron") for k in range(3)]
+    slip = scene("slip", "soldering irom")
+    pair = "soldering irom (1) and soldering iron (3)"
+    assert finding("one or two letters", *some, slip) == (1, [pair])
 
 
 def test_relations_in_both_directions_are_found_in_either_wording() -> None:
@@ -49,18 +55,6 @@ def test_relations_in_both_directions_are_found_in_either_wording() -> None:
     assert "cup (0) and pot (1)" in examples[0]
     agreed = scene("a", "cup", "pot", relations=[(0, "left", 1), (1, "right", 0)])
     assert finding("both directions", agreed) == (0, [])
-
-
-def test_cycles_of_supports_are_found() -> None:
-    circle = [(0, "on-top", 1), (1, "on-top", 2), (2, "on-top", 0), (3, "on-top", 0)]
-    count, (example,) = finding("cycle", scene("a", "cup", "tray", "box", "pen", relations=circle))
-    assert count == 1
-    assert "pen" not in example
-    assert finding("cycle", scene("a", "cup", "tray", "box", relations=circle[:2])) == (0, [])
-    mutual = scene("a", "cup", "tray", relations=[CUP_ON_TABLE, (1, "on-top", 0)])
-    assert finding("cycle", mutual) == (0, [])  # another finding reports it
-    supports = scene("b", "cup", "tray", supported_by=["1", "0"])
-    assert finding("cycle", supports)[0] == 1
 
 
 def test_an_object_on_top_of_an_object_above_it_is_found() -> None:
@@ -80,19 +74,6 @@ def test_copies_in_other_groups_are_found() -> None:
     assert finding("different groups", scene("a", "cup", "bed"), scene("b", "cup", "bed"))[0] == 0
 
 
-def test_labels_that_a_request_refuses_are_found() -> None:
-    with pytest.raises(ValidationError):
-        MissingRequest.model_validate({"objects": ["x" * (LONGEST + 1)]})
-    MissingRequest.model_validate({"objects": ["x" * LONGEST]})
-    named = scene("a", "x" * LONGEST, "cup", "cup")
-    assert finding("Labels", named) == (0, [])
-    # The blank in between is any.
-    assert finding("Labels", scene("b", "tea\tcup", "cup")) == (0, [])
-    count, examples = finding("Labels", scene("b", "x" * (LONGEST + 1), " ", "a\0b", "cup"))
-    assert count == 3
-    assert examples == ["' '", "'a\\x00b'", f"'{'x' * 40}' …"]
-
-
 def test_examples_are_few_and_all_are_counted() -> None:
     count, examples = finding("fewer than two", *(scene(str(k), "cup") for k in range(40)))
     assert count == 40
@@ -109,11 +90,47 @@ def test_millimetres_are_found() -> None:
 
 
 def test_generated_scenes_contradict_nothing() -> None:
-    facts = look(generate_rooms(60, 0, DOMAINS["workplaces"]), NAMES)
-    assert not facts.findings
+    facts = look(generate_rooms(60, 0, DOMAINS["workplaces"]))
+    assert [x.examples for x in facts.findings] == [["pallet jack (3) and pallet rack (31)"]]
     assert facts.shares["viewer axes"] == 1.0
 
 
-def test_an_empty_list_of_scenes_is_refused() -> None:
-    with pytest.raises(ValueError, match="no scene"):
-        look([], NAMES)
+def test_spellings_and_aliases_count_as_one_label() -> None:
+    scenes = [scene("a", "Lab Stool", "lab_stools", "couch"), scene("b", "lab stool", "sofa")]
+    found = {label.name: label for label in count_labels(scenes)}
+    assert set(found) == {"lab stool", "sofa"}
+    stool = found["lab stool"]
+    assert stool.mentions == 3
+    assert set(stool.spellings) == {"Lab Stool", "lab_stools", "lab stool"}
+    assert found["sofa"].mentions == 2
+
+
+def test_likely_typing_errors_are_found() -> None:
+    counts = {
+        "oscilloscope": 30,
+        "osciloscope": 2,
+        # Names that are short, curated or numbered are different objects.
+        "blad": 9,
+        "blat": 1,
+        "table": 9,
+        "tables top": 3,
+        "conveyor 1": 8,
+        "conveyor 2": 1,
+    }
+    scenes = [scene(f"{label} {k}", label) for label, n in counts.items() for k in range(n)]
+    (pair,) = similar_labels(count_labels(scenes))
+    assert [(label.name, label.mentions) for label in pair] == [
+        ("osciloscope", 2),
+        ("oscilloscope", 30),
+    ]
+
+
+def test_labels_outside_the_vocabulary_are_one_line() -> None:
+    unknown = [("balcony", "sofa bed"), ("Sofa_beds",), ("sofa bed",), ()]
+    scenes = [encoded_scene([0], unknown=labels) for labels in unknown]
+    line = outside_vocabulary(scenes)
+    assert "2 labels in 3 scenes" in line
+    assert '"sofa bed" (3 scenes), "balcony" (1 scene)' in line
+    assert outside_vocabulary(scenes[3:]) == ""
+    many = [encoded_scene([0], unknown=tuple(f"label {k}" for k in range(99)))]
+    assert "91 more; they are left out" in outside_vocabulary(many)

@@ -119,7 +119,7 @@ def test_training_data_is_no_outside_test(tmp_path):
     [
         ("rooms.csv", "", r"rename the file to \*.jsonl.* A placing table is named \*.tsv or"),
         ("rooms.jsonl", "", "rooms.jsonl: contains no scenes"),
-        ("rooms.jsonl", '{"label": 1}', "line 1: a scene lacks objects"),
+        ("rooms.jsonl", '{"label": 1}', "line 1: objects: Field required"),
         ("places.tsv", "", "places.tsv: no row has a room and the relation on-top or inside"),
         ("places.tsv", "thing\tplace\n", "line 1: must name the columns source, subject"),
         ("places.tsv", None, "cannot be read"),

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import log
 
 import numpy as np
 import pytest
 import torch
-from scipy.special import expit, logit
+from scipy.special import expit
 
 from app.questions import misplaced
 from app.questions.misplaced import BESIDE, STAND, SUPPORT, wrong_log_odds
@@ -24,8 +23,7 @@ from training.datasets.roles import count_roles
 from training.evaluation.alarms import ALARMS
 from training.fit import calibrate_misplaced as module
 from training.fit.calibrate_misplaced import fit_misplaced, hardest_quantile
-from training.fit.draft import draft_artifact
-from training.fit.place_statistics import fit_places
+from training.fit.draft import draft_artifact, fit_places
 from training.machines import MachineSpec, build
 
 V, SUPPORTERS = 9, 4
@@ -189,25 +187,6 @@ def test_lines_keep_the_share_at_each_length(budget):
             assert (p >= line.threshold(n)).any(1).mean() <= 1.1 * share + 4 * error
         # The quantile of each length has a standard error of .7 / sqrt(4000 share).
         assert line.log_count == pytest.approx(0.7, abs=0.03 + 1 / np.sqrt(4000 * share))
-
-
-@pytest.mark.parametrize(
-    ("values", "intercept", "slope"),
-    [
-        ((2.0, 2.5, 3.0), 2.0, 0.5),
-        ((3.0, 2.0, 1.0), 2.0, 0.0),
-        ((2.0, 5.0, 8.0), 4.0, 1.0),
-        ((-9.0, -9.0, -9.0), logit(0.3), 0.0),
-        ((2.0,), 2.0, 0.0),
-    ],
-)
-def test_a_line_rises_with_the_length_by_at_most_its_log(values, intercept, slope):
-    """The values are at lengths 1, e and e²."""
-    line = module._line(list(zip((0.0, 1.0, 2.0), values, strict=False)), least=0.3)
-    assert line.log_count == pytest.approx(slope)
-    assert line.intercept == pytest.approx(intercept)
-    assert line.threshold(10) >= line.threshold(1) >= 0.3 - 1e-9
-    assert line.threshold(10) <= expit(line.intercept + log(10)) + 1e-9
 
 
 @pytest.mark.parametrize("share", ALARMS.values())

@@ -17,7 +17,7 @@ from training.datasets.cases import MOST, counted_classes, scene_rng, some_insta
 from training.datasets.sources import SOURCES
 from training.evaluation.count_task import counts_task
 from training.evaluation.setting import Setting
-from training.fit.count_statistics import fit_counts, folds
+from training.fit.count_statistics import fit_counts
 
 CHAIR, DESK, TABLE, WALL = range(4)
 NAMES = ("chair", "desk", "table", "wall")
@@ -155,13 +155,3 @@ def test_generated_rooms_beat_the_class_mean():
     bare = replace(test, scenes=[scene([0, 1]) for _ in range(20)])
     assert counts_task(artifact, Setting(bare, None, bare)) is None
     assert counts_task(room_model(), Setting(test, None, test)) is None
-
-
-def test_cross_validation_tests_each_room_once():
-    scenes = rooms(400, 0).scenes
-    tested = []
-    for train, test in folds(scenes):
-        assert not {scene.group for scene in train} & {scene.group for scene in test}
-        assert len(train) + len(test) == len(scenes)
-        tested += [scene.scene_id for scene in test]
-    assert sorted(tested) == sorted(scene.scene_id for scene in scenes)

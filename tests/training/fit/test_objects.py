@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -16,10 +15,11 @@ from app.inference.weights import unpack_scenes
 from tests.enumeration.small_machines import binary, random_weights, unit_states, with_mean_rates
 from tests.training.evaluation.scenes import scene, tensors
 from training.evaluation.parts import ALL_BUT_ONE
-from training.fit import objects
+from training.fit import long_chains, objects
 from training.fit.configuration import ObjectsConfig
+from training.fit.long_chains import LongChains, measure_drift, populations, scene_chains
 from training.fit.objects import ObjectFit, ObjectScenes, random_parts, start_objects
-from training.fit.samples import store_samples
+from training.fit.samples import fit_scene_rates, store_samples
 from training.machines import MachineSpec, build
 from training.machines.arrays import weights_of
 from training.machines.gibbs import Chains
@@ -302,53 +302,6 @@ TARGET = torch.where(EVERY.sum(1) >= 2, TARGET, 0) / TARGET[EVERY.sum(1) >= 2].s
 """Two contexts, in scenes of at least two classes."""
 
 
-def masked_divergence(log_odds):
-    """Excess of the expected leave-one-out loss over its minimum, in nats, for log_odds(x) (V,).
-
-    Class j is present beside the list x with the mass p(x + j), as its weight is the number of
-    classes, and absent with the mass sum_{i != j} p(x + i) / n(x + i).
-    """
-    total = 0.0
-    for code, x in list(enumerate(EVERY))[1:-1]:
-        mass = {i: float(TARGET[code + 2**i]) for i in range(V) if not x[i]}
-        for j, on in mass.items():
-            off = (sum(mass.values()) - on) / (float(x.sum()) + 1)
-            total += loss(on, off, float(log_odds(x)[j]))
-            if on and off > 1e-12:
-                total -= loss(on, off, math.log(on / off))
-    return total
-
-
-def loss(on, off, log_odds):
-    return on * math.log1p(math.exp(-log_odds)) + off * math.log1p(math.exp(log_odds))
-
-
-@pytest.mark.parametrize("name", SPECS)
-def test_training_brings_the_conditional_divergence_down(name):
-    """Far below that of classes that do not depend on the list.
-
-    No machine reaches 0, because its log-odds are those of one joint: larger machines reach .33.
-    """
-    changes = {"leave_one_out": 1.0, "rate_prior": 0.0, "generative_weight": 0.0, "steps": 600}
-    config = CONFIG.model_copy(update=changes)
-
-    def trained(without):
-        machine, scenes = machine_of(name, profiles=1), target_scenes()
-        for weight in without:
-            machine.get_parameter(weight).data.zero_()
-            machine.get_parameter(weight).requires_grad_(False)
-        fit_objects(ObjectFit(machine, scenes, config, seed=0))
-        share = torch.tensor([ALL_BUT_ONE])
-        return masked_divergence(
-            lambda x: machine.object_log_odds(x[None].float(), share=share)[0].detach()
-        )
-
-    coupled = ["L"] if SPECS[name].coupled else []
-    reached, alone = trained([]), trained(["W", *coupled])
-    assert alone > 1.5
-    assert reached < 0.6
-
-
 @pytest.mark.parametrize("name", SPECS)
 def test_the_generative_share_brings_samples_near_the_scenes(name):
     """By the divergence of the enumerated p(v) from the scenes, in nats."""
@@ -488,3 +441,99 @@ def test_stored_samples_follow_the_machine_under_their_room_types(name):
         share = torch.bincount(own, minlength=16).double() / len(own)
         p = log_p(machine, room).exp()
         assert bool(((share - p).abs() <= 5 * (p * (1 - p) / len(own)).sqrt()).all())
+
+
+# -- base rates of whole scenes, and long chains ----------------------------------------------
+
+SHOWS = torch.tensor([[True] * V, [True, True, True, False]])
+SERVED = ObjectsConfig(served_sources={"sunrgbd": 2.0, "procthor": 1.0})
+LABELS = ("bed", "lamp", "desk", "chair")
+
+
+def fitted(name):
+    machine, scenes = machine_of(name, scale=0.6), scenes_of(SHOWS)
+    with torch.no_grad():
+        machine.u.zero_()
+        if machine.spec.coupled:
+            machine.L.copy_(machine.couplings)
+        fit_scene_rates(machine, scenes, SERVED, seed=0)
+    return machine.requires_grad_(False), scenes
+
+
+def exact_shares(machine, scenes, population):
+    """p(v_i = 1) in chains that keep the room types of the scenes, (V,), by enumeration."""
+    every = (torch.arange(2**V).unsqueeze(1) >> torch.arange(V) & 1).double()
+    source = -1 if population.profile is None else population.profile
+    total = torch.zeros(V).double()
+    for room in scenes.room.unique().tolist():
+        weight = float(population.weight[(scenes.room == room).numpy()].sum())
+        total += weight * (log_p(machine, room, source).double().exp() @ every)
+    return total.numpy()
+
+
+@pytest.mark.parametrize("name", SPECS)
+def test_long_chains_have_the_shares_of_the_scenes(name):
+    """Of each source and of the served mix, without classes that the source cannot show."""
+    machine, scenes = fitted(name)
+    for population in populations(scenes, SERVED):
+        exact = exact_shares(machine, scenes, population)[population.shows]
+        np.testing.assert_allclose(exact, population.p[population.shows], atol=0.02)
+    assert not machine.u[1, 3]
+
+
+def test_a_population_weighs_scenes_by_source():
+    """The served mix counts sources by their served weights, whatever their numbers of scenes."""
+    scenes = scenes_of(SHOWS)
+    *by_source, mixed = populations(scenes, SERVED)
+    expected = (2 * by_source[0].p + by_source[1].p) / 3
+    np.testing.assert_allclose(mixed.p, expected)
+    for q, population in enumerate(by_source):
+        own = scenes.v[scenes.source == q].double().mean(0)
+        np.testing.assert_allclose(population.p, own)
+
+
+def test_served_sources_without_scenes_leave_a_mix_of_all():
+    elsewhere = ObjectsConfig(served_sources={"3dssg": 1.0})
+    *_, mixed = populations(scenes_of(SHOWS), elsewhere)
+    *_, equal = populations(scenes_of(SHOWS), ObjectsConfig())
+    np.testing.assert_array_equal(mixed.p, equal.p)
+
+
+def test_chains_start_at_each_room_type_in_proportion():
+    scenes = scenes_of(SHOWS)
+    mixed = list(populations(scenes, SERVED))[-1]
+    rooms = mixed.room[mixed.draw(300, np.random.default_rng(0))]
+    for room in (-1, 0, 1):
+        assert abs((rooms == room).sum() - 300 * mixed.weight[mixed.room == room].sum()) <= 1
+
+
+def test_chains_continue_from_call_to_call():
+    """The states after two calls are those after one call, and each chain counts by itself."""
+    machine, scenes = machine_of("coupled", scale=0.6), scenes_of(SHOWS)
+    population = next(populations(scenes, SERVED))
+    chains = scene_chains(weights_of(machine))
+    once, twice = (LongChains(chains, scenes, population, 6, seed=3) for _ in range(2))
+    share = once.run(20)
+    halves = twice.run(10), twice.run(10)
+    np.testing.assert_array_equal(once.on, twice.on)
+    np.testing.assert_allclose(share, (halves[0] + halves[1]) / 2)
+    assert share.shape == (6, V)
+
+
+def test_only_a_drift_beyond_its_limit_is_an_objection(monkeypatch):
+    monkeypatch.setattr(long_chains, "_CHAINS", 64)
+    machine, scenes = fitted("coupled")
+    drifts = measure_drift(weights_of(machine), LABELS, scenes, SERVED)
+    assert [drift.source for drift in drifts] == ["sunrgbd", "procthor"]
+    assert [drift.objection() for drift in drifts] == [None, None]
+    machine.u[0] -= 3.0
+    drift, other = measure_drift(weights_of(machine), LABELS, scenes, SERVED)
+    assert drift.size < -0.5
+    assert "after 3000 sweeps, generated scenes of sunrgbd have -" in drift.objection()
+    assert other.objection() is None
+    machine.u[0] = torch.tensor([9.0, -9.0, 0.0, 0.0])
+    drift, _ = measure_drift(weights_of(machine), LABELS, scenes, SERVED)
+    assert drift.label == "lamp"
+    assert drift.share == pytest.approx(-1, abs=0.01)
+    metrics = {metric.metric: metric for metric in drift.metrics()}
+    assert metrics["largest change of a class"].value == pytest.approx(drift.share, abs=1e-4)

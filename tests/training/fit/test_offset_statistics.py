@@ -13,7 +13,7 @@ from app.scene import CANONICAL
 from app.scene.relations import LEFT, ON_TOP
 from tests.training.evaluation.scenes import scene
 from training.datasets import encode, generate_rooms, rooms_vocabulary
-from training.datasets.offsets import observed_offsets
+from training.datasets.cases import observed_offsets
 from training.fit.offset_statistics import fit_offsets, log_likelihood, posterior
 
 V = 6

@@ -12,7 +12,7 @@ from app.scene.relations import INSIDE, LEFT, ON_TOP
 from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN
 from tests.training.evaluation.scenes import scene
 from training.datasets.roles import count_roles
-from training.fit.place_statistics import fit_places
+from training.fit.draft import fit_places
 
 VOCABULARY = Vocabulary(
     [

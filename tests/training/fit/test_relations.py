@@ -16,9 +16,8 @@ from tests.enumeration.small_machines import random_weights
 from tests.training.evaluation.scenes import V, scene, tensors, toy
 from training.datasets.batches import relation_units
 from training.fit.configuration import RelationsConfig
-from training.fit.relations import SHARED, RelationFit
+from training.fit.relations import SHARED, RelationFit, bake_shared_weights, share_weights
 from training.fit.residuals import lower_unseen_roles, means_of_parts, with_counted_residuals
-from training.fit.sharing import bake_shared_weights, share_weights
 from training.machines import MachineSpec, build
 from training.machines.machine import OBJECT_WEIGHTS
 

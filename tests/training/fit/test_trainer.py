@@ -11,7 +11,7 @@ import torch
 
 from training.fit import samples, trainer
 from training.fit.checkpoint import RunError
-from training.fit.configuration import Config, ConfigError
+from training.fit.configuration import Config
 from training.fit.trainer import Trainer
 from training.machines import Triway
 from training.machines.machine import OBJECT_WEIGHTS
@@ -69,12 +69,6 @@ def whole(data):
     """An uninterrupted run, and its machine's weights."""
     result = Trainer(small_config(), data).run()
     return result, state(result.machine)
-
-
-def test_same_seed_gives_the_same_bits_and_another_seed_does_not(data, whole):
-    assert same(whole[1], state(Trainer(small_config(), data).run().machine))
-    other = small_config(**{"training.seed": 1})
-    assert not same(whole[1], state(Trainer(other, data).run().machine))
 
 
 @pytest.mark.parametrize("settings", [{}, DEEP], ids=["coupled", "two layers"])
@@ -155,15 +149,6 @@ def test_structure_changes_nothing(data, whole):
     assert machine.W[~data.structure].all()
 
 
-def test_both_losses_fall(data):
-    """The loss of relations varies by a tenth between epochs."""
-    config = small_config(**{"objects.steps": 40, "relations.epochs": 30})
-    curve = Trainer(config, data).run().curve
-    for phase in ("objects", "relations"):
-        losses = [point.loss for point in curve if point.phase == phase]
-        assert losses[-1] < 0.85 * losses[0]
-
-
 @pytest.mark.parametrize("phase", ["objects", "relations"])
 def test_a_phase_that_diverges_is_an_error(data, phase):
     config = small_config(**{f"{phase}.learning_rate": 1e30})
@@ -193,11 +178,6 @@ def test_weights_can_be_held_at_zero(data, name):
     trained = state(held.run().machine)
     assert not trained.pop(name).any()
     assert not torch.equal(trained["R"], second["R"])
-
-
-def test_weights_to_hold_must_exist():
-    with pytest.raises(ConfigError, match="a triway has no weights H, g, only b, c1"):
-        small_config(**{"machine.without": ["H", "M", "g"]})
 
 
 def test_a_finished_run_is_read_back(data, tmp_path, whole):

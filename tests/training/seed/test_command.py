@@ -75,29 +75,17 @@ def finished(tmp_path_factory):
 
 @pytest.mark.slow
 def test_the_page_has_every_row_and_the_figures_of_the_paper(finished):
-    results = json.loads((finished[1] / "results.json").read_text())
+    _, folder, output = finished
+    results = json.loads((folder / "results.json").read_text())
     assert set(results["splits"]) == set(SPLITS)
     for result in results["splits"].values():
         assert set(result["references"]) == {"frequency", "nothing"}
         assert {name: len(runs) for name, runs in result["machines"].items()} == dict.fromkeys(
             VARIANTS, 2
         )
-    text = (finished[1] / "results.md").read_text()
-    rows = {line.split(" | ")[0].strip("| ") for line in text.splitlines() if line[:1] == "|"}
-    for row in (
-        "T1 precision", "T2 false objects, relations left", "T3 error / V", "T3 error / objects",
-        "T4 objects a scene, others zero", "annealed: T1 on", "E objects, epoch 1",
-        "E relations, last epoch", "share of E objects left at epoch 50",
-    ):  # fmt: skip
-        assert row in rows
+    text = (folder / "results.md").read_text()
     assert "0.0560 / 0.1418 / 0.2335" in text
-
-
-@pytest.mark.slow
-def test_the_results_are_printed_and_drawn(finished):
-    _, folder, output = finished
-    assert output.endswith("results.json, errors.png")
-    assert " ".join((folder / "results.md").read_text().split()) in output
+    assert " ".join(text.split()) in output
     assert (folder / "errors.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -141,5 +129,5 @@ def test_errors_are_named(finished, tmp_path, monkeypatch):
     def stopped(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(command, "read_material", stopped)
+    monkeypatch.setattr(command, "_materials", stopped)
     assert "run the same command again" in invoke(*again, code=130)

@@ -241,26 +241,11 @@ class SparseParts:
     train = validation = Scenes(v, r, r.sum(1), torch.ones(16, dtype=torch.bool))
 
 
-def test_a_large_learning_rate_diverges_and_the_error_names_weight_and_rate():
-    with pytest.raises(
-        FloatingPointError,
-        match=r"epoch \d+: a weight of \w+ has the size .* Use a smaller learning rate than 500",
-    ):
-        train(many_units(Triway), SparseParts, torch.Generator().manual_seed(0), rate=500.0)
-
-
-class OnlyPositive(RBM):
-    """The gradient lacks its negative term."""
-
-    def update(self, positive: State, negative: State, rate: float) -> None:
-        self.add_products(positive, rate / len(positive.v))
-
-
-@pytest.mark.parametrize("rate", [0.5, math.nan])
-def test_a_finite_runaway_and_weights_that_are_not_finite_are_divergence(rate):
-    match = "not finite" if math.isnan(rate) else "error E of relations was above 8 for 10 epochs"
+@pytest.mark.parametrize("rate", [500.0, math.nan])
+def test_a_large_learning_rate_diverges_and_the_error_names_weight_and_rate(rate):
+    match = rf"epoch \d+: a weight of \w+ has the size .* Use a smaller learning rate than {rate:g}"
     with pytest.raises(FloatingPointError, match=match):
-        train(many_units(OnlyPositive), SparseParts, torch.Generator().manual_seed(0), rate=rate)
+        train(many_units(Triway), SparseParts, torch.Generator().manual_seed(0), rate=rate)
 
 
 def test_training_at_the_rate_of_the_paper_does_not_diverge():
