@@ -32,17 +32,6 @@ def test_holds_every_version_and_alias(store: Store) -> None:
     assert dict(models.aliases) == {"default": AliasTarget(name="tiny")}
 
 
-def test_a_snapshot_does_not_change_with_the_store(store: Store) -> None:
-    models = load_model_set(store)
-    store.publish(description(version="3.0.0"), state(), alias="newest")
-    assert models.resolve("tiny").manifest.version == "2.0.0"
-    assert "newest" not in models.aliases
-    with pytest.raises(TypeError):
-        models.entries["tiny", "3.0.0"] = models.resolve("tiny")  # type: ignore[index]
-    with pytest.raises(TypeError):
-        models.aliases["newest"] = AliasTarget(name="tiny")  # type: ignore[index]
-
-
 def test_a_name_means_the_newest_usable_version(store: Store) -> None:
     for version, wanted in (("2.0.0", "1.0.0"), ("1.0.0", None)):
         (store.root / "tiny" / version / "model.safetensors").write_bytes(b"")
@@ -99,15 +88,6 @@ def test_loaded_versions_are_verified_again(file: str, store: Store) -> None:
     assert failure.__traceback__ is failure.__context__ is None
     path.write_bytes(good)
     assert load_model_set(store, broken).resolve("tiny").digest == first.resolve("tiny").digest
-
-
-def test_a_missing_store_is_a_failure_that_is_seen(tmp_path: Path) -> None:
-    models = load_model_set(Store(tmp_path / "nowhere"))
-    assert models.failure is not None
-    assert models.failure.code == "unreadable"
-    assert str(tmp_path) not in models.failure.reason
-    with refused("unreadable"):
-        models.resolve("default")
 
 
 def test_spoilt_aliases_leave_names_usable(store: Store) -> None:

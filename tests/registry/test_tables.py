@@ -249,13 +249,6 @@ def test_offsets_are_those_of_the_pair_or_of_the_relation(
     assert offset is None or values[0].tolist() == pytest.approx(offset)
 
 
-def test_without_a_pair_there_is_still_the_relation() -> None:
-    bare = offsets(pair=EMPTY, pair_offset=full(0, 0, 6), pair_scenes=EMPTY)
-    values, scenes = bare.find(*[np.array([2])] * 3)
-    assert (values[0].tolist(), scenes.tolist()) == ([0, 0, 0.5, 0.5, 0.5, 0.25], [0])
-    assert Offsets.from_tensors(bare.tensors(), A, V).pair.shape == (0,)
-
-
 # -- places --------------------------------------------------------------------------------------
 
 
