@@ -153,11 +153,8 @@ async def test_behind_a_prefix_the_same_is_open(guarded: httpx.AsyncClient) -> N
     app: Any = guarded.app  # type: ignore[attr-defined]
     transport = httpx.ASGITransport(app, raise_app_exceptions=False, root_path="/robot")
     async with httpx.AsyncClient(transport=transport, base_url="http://service") as behind:
-        assert (await behind.get("/robot/health/live")).status_code == 200
-        problem(await behind.get("/robot/models"), 401, "unauthorized")
-        problem(await behind.get("/robot/static"), 401, "unauthorized")
-        headers = {"X-API-Key": API_KEY}
-        assert (await behind.get("/robot/models", headers=headers)).status_code == 200
+        for path, status in (("health/live", 200), ("models", 401), ("static", 401)):
+            assert (await behind.get(f"/robot/{path}")).status_code == status
 
 
 # ------------------------------------------------------------------------------------ OpenAPI

@@ -11,7 +11,6 @@ import os
 import shutil
 import threading
 import weakref
-from itertools import product
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -112,32 +111,6 @@ async def test_an_unknown_word_has_suggestions(client: httpx.AsyncClient) -> Non
     assert "class" not in answer
     assert answer["suggestions"][0] == "pillow"
     assert not answer["certain"]
-
-
-@pytest.mark.parametrize(
-    ("name", "layers"),
-    [("home", {"h1": (4, 4)}), ("deep", {"h1": (6, 2), "h2": (4, 2)})],
-)
-async def test_contexts_name_every_state_of_the_hidden_units(
-    client: httpx.AsyncClient, name: str, layers: dict[str, tuple[int, int]]
-) -> None:
-    """All states but the first, which has no weights."""
-    contexts = (await client.get(f"/models/{name}/contexts")).json()["layers"]
-    assert contexts.keys() == layers.keys()
-    for layer, units in contexts.items():
-        number, states = layers[layer]
-        pairs = [(unit["unit"], unit["state"]) for unit in units]
-        assert pairs == list(product(range(number), range(1, states)))
-        for unit in units:
-            assert unit["objects"]
-            labels = {entry["label"] for entry in unit["objects"]}
-            for entry in unit["relations"]:
-                labels |= {entry["subject"], entry["object"]}
-                assert entry["relation"] in CANONICAL
-                assert entry["weight"] > 0
-            assert labels <= set(VOCABULARY.labels)
-            assert unit["name"].startswith(unit["objects"][0]["label"])
-    assert any(unit["relations"] for units in contexts.values() for unit in units)
 
 
 @pytest.mark.parametrize(
@@ -303,14 +276,6 @@ async def test_an_alias_is_promoted_and_rolled_back(store: Path) -> None:
         assert await default(client) == "home@1.0.0"
 
 
-async def test_an_alias_may_follow_the_newest_version(own: httpx.AsyncClient, store: Path) -> None:
-    assert (await put(own, "default", model="home")).json()["model"] == "home"
-    assert await default(own) == "home@1.1.0"
-    publish(store, "home", "2.0.0", seed=2)
-    await own.post("/models/refresh")
-    assert await default(own) == "home@2.0.0"
-
-
 async def test_a_new_alias_is_made(own: httpx.AsyncClient) -> None:
     response = await put(own, "kitchen", model="plain@1.0.0", expected=None)
     assert response.status_code == 200
@@ -320,14 +285,6 @@ async def test_a_new_alias_is_made(own: httpx.AsyncClient) -> None:
     body = {"objects": ["bed"], "model": "kitchen"}
     answer = await own.post("/relations", json=body)
     assert answer.json()["model"]["name"] == "plain"
-
-
-async def test_one_of_two_conflicting_alias_moves_succeeds(own: httpx.AsyncClient) -> None:
-    responses = await asyncio.gather(
-        put(own, "default", model="home@1.1.0", expected="home@1.0.0"),
-        put(own, "default", model="plain@1.0.0", expected="home@1.0.0"),
-    )
-    assert sorted(response.status_code for response in responses) == [200, 409]
 
 
 @pytest.mark.parametrize(

@@ -56,18 +56,6 @@ def requests(found: dict[tuple[str, ...], float]) -> dict[tuple[str, ...], float
     }
 
 
-async def test_the_documented_example_is_of_this_service(shared_store: Path) -> None:
-    async with serve(shared_store) as client:
-        document = (await client.get("/openapi.json")).json()
-        (ok,) = document["paths"]["/metrics"]["get"]["responses"]["200"]["content"].values()
-        await client.post("/missing", json=SCENE)
-        await client.post("/missing", json={"objects": ["nosuchthing"]})
-        text = (await client.get("/metrics")).text
-    # The lines are the same, except the counts.
-    for line in ok["example"].splitlines():
-        assert line.rpartition(" ")[0] in text if line[0] != "#" else line in text
-
-
 async def test_requests_are_counted_by_route_method_and_outcome(
     shared_store: Path, replace: Replace
 ) -> None:
@@ -291,12 +279,3 @@ def test_a_request_is_one_line(live: LiveService) -> None:
     assert refused.pop("latency_ms") > 0
     expected = {"method": "GET", "route": "-", "status": 404, "outcome": "not-found"}
     assert refused == common | expected
-
-
-@pytest.mark.system
-def test_a_batch_over_several_models_names_none(live: LiveService) -> None:
-    for models, named in ((["default", "home@1.0.0"], "home"), (["default", "plain"], None)):
-        scenes = [{**SCENE, "model": model} for model in models]
-        entry = line(live, "POST", "/missing/batch", json={"scenes": scenes})
-        assert entry.get("model") == named
-        assert entry["compute_ms"] > 0

@@ -14,12 +14,10 @@ from typing import Any
 
 import httpx
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from app.errors import ERRORS
 from app.questions import QUESTIONS
-from scene_client.schemas import Problem, Request
+from scene_client.schemas import Problem
 from tests.services import Replace, defect, serve
 
 NAMES = [question.name for question in QUESTIONS]
@@ -421,30 +419,6 @@ async def test_bodies_over_the_limit_are_refused(shared_store: Path) -> None:
 # ------------------------------------------------------------------------------ broken bodies
 
 
-@pytest.mark.parametrize("path", ["/relations", "/generate", "/missing/batch"])
-async def test_a_body_that_breaks_off_is_no_request(client: httpx.AsyncClient, path: str) -> None:
-    messages: list[dict[str, Any]] = [
-        {"type": "http.request", "body": b'{"objects": [', "more_body": True},
-        {"type": "http.disconnect"},
-    ]
-    sent: list[Any] = []
-
-    async def receive() -> dict[str, Any]:
-        return messages.pop(0)
-
-    async def send(message: Any) -> None:
-        sent.append(message)
-
-    fields = {"host": "service", "content-type": "application/json", "content-length": "99"}
-    headers = [(name.encode(), value.encode()) for name, value in fields.items()]
-    scope = {"type": "http", "method": "POST", "path": path, "query_string": b""}
-    scope["headers"] = headers
-    await client.app(scope, receive, send)  # type: ignore[attr-defined]
-    start, end = sent
-    response = httpx.Response(start["status"], headers=start["headers"], content=end["body"])
-    problem(response, 400, "bad-request")
-
-
 # --------------------------------------------------------------------------------- request ids
 
 
@@ -508,47 +482,6 @@ async def test_every_problem_type_has_a_page(client: httpx.AsyncClient) -> None:
             assert text
             assert escape(text) in page.text
         assert f'href="problems/{slug}"' in index
-
-
-# --------------------------------------------------------------------------------- any input
-
-SCALARS = st.one_of(
-    st.none(),
-    st.booleans(),
-    st.integers(-(10**30), 10**30),
-    st.floats(),
-    st.text(max_size=8),
-    st.sampled_from(["bed", "chair", "lamp", "left", "on-top", "map", "ignore", "plain"]),
-)
-FORMS = (*Request.__subclasses__(), *(question.request for question in QUESTIONS))
-FIELDS = st.sampled_from(sorted({name for form in FORMS for name in form.model_fields}))
-ANYTHING = st.recursive(
-    SCALARS,
-    lambda inner: st.one_of(
-        st.lists(inner, max_size=4),
-        st.dictionaries(FIELDS | st.text(max_size=3), inner, max_size=6),
-    ),
-    max_leaves=20,
-)
-
-
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=150)
-@given(
-    question=st.sampled_from(NAMES),
-    body=st.one_of(
-        ANYTHING,
-        st.dictionaries(FIELDS, ANYTHING, max_size=4).map(
-            lambda extra: {"objects": ["bed", {"id": "x", "label": "chair"}], **extra}
-        ),
-    ),
-)
-async def test_no_json_breaks_the_service(
-    client: httpx.AsyncClient, question: str, body: Any
-) -> None:
-    response = await post(client, json.dumps(body), f"/{question}")
-    assert response.status_code in {200, 400, 404, 422}
-    if response.status_code != 200:
-        assert response.headers["content-type"] == "application/problem+json"
 
 
 def test_every_problem_type_is_provoked_by_a_test() -> None:

@@ -277,32 +277,6 @@ async def test_a_scene_in_three_frames_has_equal_relations(
     assert await observed(client, **in_map) == vertical
 
 
-COORDINATES = st.floats(-1e8, 1e8, allow_nan=False)
-LENGTHS = st.floats(1e-300, 1e4, allow_nan=False)
-
-
-@drawn
-@given(
-    objects=st.lists(
-        st.fixed_dictionaries(
-            {
-                "label": st.sampled_from(["bed", "lamp", "chair", "book"]),
-                "position": st.builds(at, COORDINATES, COORDINATES, COORDINATES),
-            },
-            optional={
-                "size": st.builds(at, LENGTHS, LENGTHS, LENGTHS),
-                "confidence": st.floats(0, 1, exclude_min=True),
-            },
-        ),
-        min_size=1,
-        max_size=6,
-    )
-)
-async def test_any_poses_can_be_read(client: httpx.AsyncClient, objects: list[Any]) -> None:
-    pairs = await observed(client, objects=objects)
-    assert not {(o, name, s) for s, name, o in pairs} & pairs
-
-
 # ---------------------------------------------------------------------------------- warnings
 
 

@@ -10,14 +10,11 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from rich.console import Console
 
 from app import questions
 from app.registry import Counts, Store
 from app.scene import Scene, SceneObject
 from app.scene.geometry import viewer_axes
-from scene_client import tables
-from scene_client.schemas import MissingAnswer
 from tests.http.stores import VOCABULARY, C, V, publish
 from tests.http.test_questions import ask
 from tests.questions.test_placements import offsets_of_every_pair
@@ -63,38 +60,17 @@ def computed(
 # ------------------------------------------------------------------------- further instances
 
 
-async def more(client: httpx.AsyncClient, **request: Any) -> list[dict[str, Any]]:
-    answer = await ask(client, "missing", **{"objects": LABELS, **request})
-    return list(answer["more"])
-
-
 async def test_likely_further_instances_are_listed(
     client: httpx.AsyncClient, own_store: Path
 ) -> None:
-    answer = await more(client)
+    answer = (await ask(client, "missing", objects=LABELS))["more"]
     assert answer == computed(own_store, LABELS, None)["more"]
-    unknown = [*LABELS, "flux capacitor"]
-    assert await more(client, objects=unknown, unknown_labels="ignore") == answer
     (entry,) = answer
     assert [entry[name] for name in ("label", "listed_count", "low", "high")] == ["chair", 2, 2, 4]
     assert entry["probability"] == pytest.approx(0.8 / 0.9, abs=1e-3)
     # A question about a place lists none.
-    assert await more(client, at={"relation": "on-top", "object": "bed"}) == []
-
-
-async def test_candidates_name_listed_classes_too(client: httpx.AsyncClient) -> None:
-    (entry,) = await more(client, candidates=["night stands", "lamp"])
-    assert entry["label"] == "nightstand"
-    assert entry["probability"] == pytest.approx(0.2, abs=1e-3)
-
-
-async def test_the_command_shows_further_instances(client: httpx.AsyncClient) -> None:
-    answer = MissingAnswer.model_validate(await ask(client, "missing", objects=LABELS))
-    console = Console(width=100)
-    with console.capture() as shown:
-        console.print(tables.missing(answer))
-    lines = [" ".join(line.split()) for line in shown.get().splitlines()]
-    assert "chair 2 3.7 (2 to 4) 0.889" in lines
+    place = {"relation": "on-top", "object": "bed"}
+    assert (await ask(client, "missing", objects=LABELS, at=place))["more"] == []
 
 
 # --------------------------------------------------------------------------- placements
@@ -133,11 +109,3 @@ async def test_placements_have_offsets_in_the_axes_of_the_frame(
     places = [place for entry in answer["missing"] for place in entry["placements"]]
     kinds = {"offset" in place for place in places}
     assert kinds == ({True, False} if axes is None else {True})
-
-
-async def test_an_object_without_a_position_has_no_offset(client: httpx.AsyncClient) -> None:
-    objects = [REQUEST["objects"][0], *({"id": str(k), "label": POSED[k]} for k in (1, 2))]
-    answer = await ask(client, "missing", **{**REQUEST, "objects": objects})
-    places = [place for entry in answer["missing"] for place in entry["placements"]]
-    assert {place["object"] for place in places if "offset" in place} == {"0"}
-    assert {place["object"] for place in places if "offset" not in place} == {"1", "2"}
