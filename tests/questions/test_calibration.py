@@ -63,10 +63,3 @@ def test_missing_classes_by_log_odds_and_number_of_listed_classes(classes, liste
     for entry in missing(artifact, scene_of(classes), top_k=9):
         z = 0.4 + 0.6 * entry.log_odds - 0.5 * math.log(listed)
         assert entry.probability == pytest.approx(sigmoid(z), rel=1e-5)
-
-
-def test_the_default_coverage_is_that_of_the_model():
-    artifact, scene = larger_artifact("triway", coverage=0.25), scene_of([0, 1])
-    default = missing(artifact, scene)
-    assert default == missing(artifact, scene, coverage=0.25)
-    assert default != missing(artifact, scene, coverage=0.5)

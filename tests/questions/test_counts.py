@@ -114,12 +114,6 @@ def test_a_number_beyond_the_statistics_is_left_out(index, most):
         assert {entry.label for entry in entries} == {LABELS[index] for index in expected}
 
 
-def test_structure_and_models_without_counts_have_no_entries():
-    assert more(ARTIFACT, scene_of([WALL, WALL]), candidates=EVERY) == ()
-    assert more(replace(ARTIFACT, counts=None), SCENE, candidates=EVERY) == ()
-    assert more(ARTIFACT, scene_of([]), candidates=EVERY) == ()
-
-
 @pytest.mark.parametrize("sign", [-1, 1])
 @pytest.mark.parametrize("coverage", [None, 0.0, 1.0])
 def test_the_largest_weights_of_a_store_give_finite_numbers(sign, coverage):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from importlib import import_module
 
 import numpy as np
@@ -14,7 +13,7 @@ from app.questions.posterior import Posterior
 from app.registry.description import PlaceFit
 from app.scene.relations import CANONICAL, OPPOSITES
 from tests.questions.answers import missing
-from tests.questions.artifacts import LABELS, PLACES, STRUCTURE, larger_artifact, scene_of
+from tests.questions.artifacts import LABELS, STRUCTURE, larger_artifact, scene_of
 
 module = import_module("app.questions.missing")  # the package has a function of this name
 NAMES = ["rbm", "triway", "triway-states"]
@@ -99,21 +98,3 @@ def test_classes_far_below_the_bound_are_not_scored(monkeypatch):
     (entry,) = missing(artifact, scene_of([2]), at=("on-top", 0), top_k=1)
     assert entry.label == "lamp"
     assert scored == [LABELS.index("lamp")]
-
-
-def test_candidates_are_ranked_among_themselves():
-    artifact, scene = larger_artifact("triway", at=FITS), scene_of([0, 2])
-    every = missing(artifact, scene, at=("on-top", 1), top_k=9, details=False)
-    some = missing(artifact, scene, at=("on-top", 1), top_k=2, candidates=[4, 5, 6], details=False)
-    chosen = [entry for entry in every if LABELS.index(entry.label) in (4, 5, 6)]
-    assert [entry.label for entry in some] == [entry.label for entry in chosen[:2]]
-
-
-def test_without_places_the_counts_tell_nothing():
-    with_places = larger_artifact("triway", at=(PlaceFit(counts=0.0),) * 5)
-    counted = larger_artifact("triway", at=(PlaceFit(counts=1.0),) * 5)
-    scene, options = scene_of([0, 2]), {"at": ("on-top", 1), "details": False}
-    plain = missing(with_places, scene, **options)
-    assert missing(replace(counted, places=None), scene, **options) == plain
-    assert missing(counted, scene, **options) != plain
-    assert counted.places is PLACES

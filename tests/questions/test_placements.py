@@ -166,13 +166,6 @@ def test_unknown_offsets():
     assert offset_of(LEFT, 1, 2, offsets=partial).scenes == 0
 
 
-def test_no_zero_is_negative_and_every_spread_is_positive():
-    exact = replace(OFFSETS, pair_offset=np.tile(np.float32([0, 0, 0, 1e-6, 1, 1]), (A * V * V, 1)))
-    offset = offset_of(LEFT, 1, 2, outgoing=False, offsets=exact)
-    assert [math.copysign(1, x) for x in offset.mean] == [1, 1, 1]
-    assert offset.std[0] == 0.001
-
-
 @pytest.mark.parametrize("name", ["rbm", "triway-states", "triway"])
 def test_placements_have_the_offsets_of_their_classes(name):
     artifact = larger_artifact(name)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from app.registry.description import CountSlope, PlaceFit
-from app.scene import Scene
 from tests.questions.answers import missing, outliers, relations
 from tests.questions.artifacts import LARGER, STRUCTURE, larger_artifact, lines, scene_of
 
@@ -38,13 +37,6 @@ def test_listed_structure_changes_no_answer_about_other_classes(artifact, stated
     assert (one.threshold, one.misplaced) == (two.threshold, two.misplaced)
     judged = tuple(entry for entry in one.outliers if entry.label not in STRUCTURE)
     assert judged == two.outliers
-
-
-def test_many_instances_of_structure_change_nothing(artifact):
-    walls = scene_of([8, 0, 8, 1, 8]).objects
-    scene, bare = Scene(walls), Scene((walls[1], walls[3]))
-    expected = [(entry.label, entry.probability) for entry in missing(artifact, bare)]
-    assert [(entry.label, entry.probability) for entry in missing(artifact, scene)] == expected
 
 
 def test_a_list_of_structure_alone_is_a_list_of_one_class(artifact):
