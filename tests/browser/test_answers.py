@@ -73,20 +73,6 @@ def test_missing_objects_are_listed_with_their_places(bedroom: Board, api: httpx
     assert set(bedroom.ghosts) <= {one["label"] for one in answer["missing"]}
 
 
-def test_further_instances_are_listed_among_the_missing_objects(
-    open_board: OpenBoard, api: httpx.Client
-) -> None:
-    board = open_board(
-        {"objects": ["table", "chair", "chair", "whiteboard"], "room_type": "office"}
-    )
-    (more,) = ask(api, "missing", board.scene)["more"]
-    expected = f"2 listed, about {more['expected_count']:.0f} expected"
-    rows = board.rows("missing")
-    assert f"another chair {percent(more['probability'])} {expected}" in rows
-    shown = [int(re.findall(r"(\d+) %", row)[0]) for row in rows]
-    assert shown == sorted(shown, reverse=True)
-
-
 def test_a_double_click_adds_one_object(bedroom: Board) -> None:
     before = len(bedroom.things)
     bedroom.column("missing").get_by_role("button", name="Put ").first.dblclick()
@@ -238,43 +224,6 @@ def test_unexpected_relations_show_what_is_expected(bedroom: Board) -> None:
     assert ("disagrees", "right of? 70 %") in bedroom.edges
 
 
-def test_every_symbol_is_in_the_legend(bedroom: Board) -> None:
-    page = bedroom.page
-    legend = page.locator("#legend span")
-
-    def symbols() -> set[str]:
-        return {str(one.get_attribute("class")) for one in legend.all()}
-
-    assert symbols() == {"robot", "outlier", "ghost"}
-    page.locator("#list .name").first.click()
-    page.get_by_label("Positions count as evidence").check()
-    bedroom.add("mirror")  # a class without a typical size
-    assert symbols() == {"robot", "outlier", "ghost", "guess", "selected", "loose"}
-    bedroom.tab("Relations")
-    assert {kind for kind, _ in bedroom.edges} < symbols()
-    bedroom.tab("Generate")
-    bedroom.click("Generate a scene")
-    assert symbols() == {"robot", "fresh"}
-    assert all(legend.all_text_contents())
-
-
-def test_words_on_the_board_cover_no_others(bedroom: Board) -> None:
-    for tab in ("Missing", "Wrong", "Relations"):
-        bedroom.tab(tab)
-        boxes = [
-            box
-            for text in bedroom.page.locator("#board :is(.labels, .ghosts, .edges) text").all()
-            if text.text_content() and text.text_content() != "!" and (box := text.bounding_box())
-        ]
-        assert len(boxes) > 4
-        for index, a in enumerate(boxes):
-            for b in boxes[:index]:
-                # A line's box is higher than its letters: a quarter may meet.
-                across = min(a["x"] + a["width"], b["x"] + b["width"]) - max(a["x"], b["x"])
-                down = min(a["y"] + a["height"], b["y"] + b["height"]) - max(a["y"], b["y"])
-                assert across <= 1 or down <= 0.25 * min(a["height"], b["height"]), (a, b)
-
-
 def test_room_types_are_listed_by_their_probability(bedroom: Board, api: httpx.Client) -> None:
     page, asked = bedroom.page, list[str]()
     page.on("request", lambda request: asked.append(request.url.rsplit("/", 1)[-1]))
@@ -302,35 +251,6 @@ def test_room_types_are_listed_by_their_probability(bedroom: Board, api: httpx.C
     expect(likeliest).to_have_text("")
     names = api.get("/models/default/vocabulary").json()["room_types"]
     expect(options).to_have_text(["unknown", *names])
-
-
-def test_two_models_answer_side_by_side(bedroom: Board, api: httpx.Client) -> None:
-    models = api.get("/models").json()["models"]
-    references = [f"{one['name']}@{v['version']}" for one in models for v in one["versions"]]
-    shown = bedroom.page.locator("#second option")
-    aliases = api.get("/models").json()["aliases"]
-    # A version with an alias is listed once, by its alias.
-    expected = ["", *aliases, *(one for one in references if one not in aliases.values())]
-    assert [option.get_attribute("value") for option in shown.all()] == expected
-    (second,) = [name for name in references if name.startswith("indoor-rbm@")]
-    bedroom.compare_with(second)
-    for number, model in enumerate(("default", second)):
-        answer = ask(api, "missing", bedroom.scene, top_k=5, model=model)
-        rows = bedroom.rows("missing", number)
-        listed = [(one["label"], one) for one in answer["missing"]]
-        listed += [(f"another {one['label']}", one) for one in answer["more"]]
-        listed.sort(key=lambda entry: -entry[1]["probability"])
-        assert [row.split(" %")[0] for row in rows] == [
-            f"{name} {percent(one['probability'])}".removesuffix(" %") for name, one in listed
-        ]
-        title = f"{answer['model']['name']} {answer['model']['version']}"
-        expect(bedroom.column("missing", number).locator("h3")).to_have_text(title)
-    bedroom.column("missing", 1).get_by_role("button", name="on the board").click()
-    bedroom.settle()
-    answer = ask(api, "missing", bedroom.scene, top_k=5, model=second)
-    assert set(bedroom.ghosts) <= {one["label"] for one in answer["missing"]}
-    bedroom.compare_with("")
-    expect(bedroom.column("missing", 1)).to_be_hidden()
 
 
 def test_the_calls_shown_give_the_answer_shown_and_can_be_copied(

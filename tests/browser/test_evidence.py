@@ -65,15 +65,3 @@ def test_stated_relations_are_evidence_in_place_of_positions(open_board: OpenBoa
     assert placed(board) == ["desk", "chair"]
     board.click("Undo")
     assert board.scene["relations"] == given
-
-
-def test_clear_empties_the_board_and_the_room(open_board: OpenBoard) -> None:
-    board = open_board(scene=None)
-    room = board.page.get_by_label("Room")
-    expect(room).to_have_value("bedroom")
-    board.click("Clear")
-    expect(room).to_have_value("")
-    assert board.things == []
-    board.click("Undo")
-    expect(room).to_have_value("bedroom")
-    assert len(board.things) == 5

@@ -55,21 +55,6 @@ def test_a_drawn_scene_is_the_service_s_and_can_be_kept(
     assert board.things == ["desk", "chair"]
 
 
-def test_stated_relations_do_not_hold_for_generated_objects(open_board: OpenBoard) -> None:
-    relation = {"subject": "lamp", "relation": "on-top", "object": "bed"}
-    scene = {"objects": ["bed", "lamp"], "relations": [relation], "room_type": "bedroom"}
-    board = open_board(scene)
-    assert board.scene["relations"] == [relation]
-    board.tab("Generate")
-    for _ in range(30):
-        draw(board)
-        if {"bed", "lamp"} <= set(chips(board)):
-            break
-    board.click("Keep")
-    assert {"bed", "lamp"} <= set(board.things)
-    assert "relations" not in board.scene
-
-
 @pytest.mark.slow
 def test_objects_of_the_board_stay_in_the_drawn_scene(
     open_board: OpenBoard, api: httpx.Client

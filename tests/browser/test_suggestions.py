@@ -4,29 +4,18 @@ from __future__ import annotations
 
 import math
 import re
-from random import Random
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
 
-from app.scene.geometry import Viewpoint, derive_relations, overlap_and_gap, to_viewer_frame
-from app.scene.relations import CANONICAL, OPPOSITES
+from app.scene.geometry import overlap_and_gap
 from tests.browser.driving import Board, OpenBoard
 
 pytestmark = pytest.mark.system
 
 Box = dict[str, Any]
-
-RELATIONS = (
-    *("on-top", "on-top", "above", "under", "below", "left", "right", "front", "behind"),
-    *("inside", "contains"),
-)
-ROBOT = 0.5
-"""Side of the square that stays free around the robot, in metres."""
-FLOOR, CEILING = 0.1, 2.2
-"""Suggestions may overlap lower and higher boxes, such as rugs and ceilings."""
 
 STANDING = """async (cases) => {
   const { standing } = await import('./static/board/ghosts.js');
@@ -38,44 +27,6 @@ STANDING = """async (cases) => {
 def box(name: str, x: float, y: float, z: float, size: tuple[float, float, float]) -> Box:
     extent = dict(zip("xyz", size, strict=True))
     return {"id": name, "label": name, "x": x, "y": y, "z": z, "yaw": 0.0, "size": extent}
-
-
-def room(random: Random) -> dict[str, Any]:
-    """A room with walls, furniture, objects on furniture, and answers with random placements."""
-    boxes = [box("wall", 4.5, 0, 0, (0.1, 7, 2.5)), box("rug", 2, 0, 0, (2, 2, 0.02))]
-    for number in range(random.randint(3, 9)):
-        size = (random.uniform(0.4, 2), random.uniform(0.4, 2), random.uniform(0.4, 1.2))
-        made = box(f"furniture {number}", random.uniform(0.8, 4), random.uniform(-3, 3), 0.0, size)
-        made["yaw"] = random.choice([0.0, 0.0, 90.0, 30.0, -75.0])
-        boxes.append(made)
-        if random.random() < 0.6:
-            top = made["z"] + size[2]
-            boxes.append(box(f"item {number}", made["x"], made["y"], top, (0.15, 0.2, 0.2)))
-    labels = [f"class {number}" for number in range(8)]
-    limits = {"x": 0.9, "y": 0.9, "z": 1}
-    sizes = {
-        label: {axis: random.uniform(0.1, limit) for axis, limit in limits.items()}
-        for label in labels
-    }
-    placements = [[placement(random, random.choice(boxes[2:])) for _ in range(3)] for _ in labels]
-    return {
-        "boxes": boxes,
-        "missing": [
-            {"label": label, "probability": 0.5, "placements": places}
-            for label, places in zip(labels, placements, strict=True)
-        ],
-        "viewer": {"x": 0.0, "y": 0.0, "yaw": random.choice([0.0, 0.4, -0.4])},
-        "sizes": sizes,
-        "at": None,
-    }
-
-
-def placement(random: Random, anchor: Box) -> dict[str, Any]:
-    found = {"relation": random.choice(RELATIONS), "object": anchor["id"], "probability": 0.5}
-    if random.random() < 0.5:
-        spread = {axis: random.uniform(-0.6, 0.6) for axis in "xyz"}
-        found["offset"] = {"mean": spread, "std": dict.fromkeys("xyz", 0.2), "scenes": 9}
-    return found
 
 
 def share(a: Box, b: Box) -> float:
@@ -94,87 +45,6 @@ def share(a: Box, b: Box) -> float:
 
 def top(one: Box) -> float:
     return float(one["z"] + one["size"]["z"])
-
-
-def passed(ghost: Box, anchor: Box, boxes: list[Box]) -> list[str]:
-    """The boxes that a ghost may overlap: those above which or below which it stands."""
-    relation = ghost["placement"]["relation"]
-    near = [one for one in boxes if share(one, anchor) > 0 and one is not anchor]
-    supports = [one["id"] for one in near if top(one) <= anchor["z"] + 0.03]
-    if relation in ("on-top", "above"):
-        return [anchor["id"], *supports]
-    carried = [one["id"] for one in near if one["z"] >= top(anchor) - 0.03]
-    if relation in ("under", "below"):
-        return [anchor["id"], *carried]
-    if relation in ("inside", "contains"):
-        return [anchor["id"], *supports, *carried]
-    return supports
-
-
-def wrong_with(ghost: Box, ghosts: list[Box], case: dict[str, Any]) -> list[str]:
-    """The objections to the place of a ghost, in words."""
-    boxes, viewer = case["boxes"], case["viewer"]
-    (anchor,) = [one for one in boxes if one["id"] == ghost["placement"]["object"]]
-    robot = box("robot", viewer["x"], viewer["y"], 0, (ROBOT, ROBOT, 1))
-    others = [one for one in ghosts if one is not ghost]
-    solid = [one for one in boxes if top(one) > FLOOR and one["z"] < CEILING]
-    allowed = passed(ghost, anchor, boxes)
-    found = [
-        f"{ghost['label']} overlaps {one['id']}"
-        for one in [robot, *others, *solid]
-        if share(ghost, one) > 1e-6 and one["id"] not in allowed
-    ]
-    relation = ghost["placement"]["relation"]
-    if relation not in seen(ghost, anchor, viewer):
-        found.append(f"{ghost['label']} is not {relation} {anchor['id']}")
-    if relation == "on-top" and share(ghost, anchor) < 0.6:
-        found.append(f"{ghost['label']} hangs over {anchor['id']}")
-    return found
-
-
-def seen(ghost: Box, anchor: Box, viewer: dict[str, float]) -> set[str]:
-    """The relations of a ghost to its anchor by the rules of the service.
-
-    If the boxes reach into each other, the service chooses by their classes.
-    """
-    depth = min(top(ghost) - anchor["z"], top(anchor) - ghost["z"])
-    if share(ghost, anchor) >= 0.3 and depth > 0.05:
-        inner, outer = sorted((ghost, anchor), key=lambda one: one["size"]["x"] * one["size"]["y"])
-        found = set()
-        if inner["size"]["z"] <= 1.2 * outer["size"]["z"]:
-            found.add("inside" if inner is ghost else "contains")
-        if inner is ghost and ghost["z"] <= anchor["z"] + 0.1:
-            found.add("under")
-        return found
-    pair = [ghost, anchor]
-    centres = [[one["x"], one["y"], one["z"] + one["size"]["z"] / 2] for one in pair]
-    yaws = [math.radians(one["yaw"]) for one in pair]
-    points, turns = to_viewer_frame(centres, Viewpoint(**viewer), yaws)
-    sizes = [[one["size"][axis] for axis in "xyz"] for one in pair]
-    holds = derive_relations(points, sizes, turns).holds
-    return {
-        name if subject == 0 else OPPOSITES[name]
-        for index, name in enumerate(CANONICAL)
-        for subject in (0, 1)
-        if holds[index, subject, 1 - subject]
-    }
-
-
-def test_suggestions_of_random_rooms_have_free_places(open_board: OpenBoard) -> None:
-    random = Random(11)
-    cases = [room(random) for _ in range(60)]
-    board = open_board()
-    answers = board.page.evaluate(STANDING, cases)
-    wrong = [
-        f"room {number}: {words}"
-        for number, (case, ghosts) in enumerate(zip(cases, answers, strict=True))
-        for ghost in ghosts
-        for words in wrong_with(ghost, ghosts, case)
-    ]
-    assert wrong == []
-    count = sum(map(len, answers))
-    # Most suggestions have a place; crowded rooms also have suggestions without one.
-    assert 0.6 * 8 * len(cases) < count < 8 * len(cases)
 
 
 def ghost_at(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import httpx
 import pytest
 from playwright.sync_api import Route, expect
 
@@ -12,39 +11,6 @@ from tests.browser.driving import OpenBoard
 from tests.services import launch
 
 pytestmark = pytest.mark.system
-
-
-def crowd(api: httpx.Client, count: int) -> dict[str, object]:
-    words = api.get("/models/default/vocabulary").json()["objects"]
-    labels = [entry["label"] for entry in words if not entry["structure"]]
-    return {
-        "objects": [
-            {
-                "id": f"{labels[k]} {k}",
-                "label": labels[k],
-                "position": {"x": 0.6 + 0.6 * (k // 16), "y": 0.6 * (k % 16 - 8), "z": 0.2},
-                "size": {"x": 0.4, "y": 0.4, "z": 0.4},
-            }
-            for k in range(count)
-        ]
-    }
-
-
-@pytest.mark.slow
-def test_the_largest_scene_is_drawn_and_answered(open_board: OpenBoard, api: httpx.Client) -> None:
-    board = open_board(crowd(api, 256))
-    expect(board.page.locator("#board .object")).to_have_count(256)
-    assert board.rows("missing")
-    first = board.page.locator("#board .object").first
-    before = board.scene["objects"]
-    board.drag(first.locator(".box"), 40, 20)
-    assert board.scene["objects"] != before
-    board.add("mug")
-    assert len(board.things) == 256
-    expect(board.page.locator("#search-error")).to_contain_text("at most 256 objects")
-    board.page.get_by_role("button", name="Remove", exact=False).first.click()
-    board.settle()
-    expect(board.page.locator("#search-error")).to_be_empty()
 
 
 @pytest.mark.slow

@@ -108,15 +108,6 @@ def test_a_renamed_object_keeps_its_id_and_relations(open_board: OpenBoard) -> N
     assert board.scene["relations"] == [stated]
 
 
-def test_a_model_that_is_chosen_again_at_once_answers(open_board: OpenBoard) -> None:
-    board = open_board()
-    models = board.page.locator("#model")
-    for value in (models.locator("option").last.get_attribute("value"), models.input_value()):
-        models.select_option(value)
-    board.settle()
-    assert board.rows("missing")
-
-
 def test_two_models_answer_about_their_common_classes(
     open_board: OpenBoard, own: LiveService
 ) -> None:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import shlex
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +11,10 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner, Result
 
-from scene_client import Client, __version__, tables
+from scene_client import Client, tables
 from scene_client.command import app
-from scene_client.schemas import GenerateAnswer, MissingAnswer, OutliersAnswer, RelationsAnswer
+from scene_client.schemas import MissingAnswer
 from tests.client.peers import answering, say_nothing
-from tests.conftest import run_program
 
 ANSWERED: dict[str, Any] = {
     "model": {"name": "home", "version": "1.0.0", "variant": "rbm", "digest": "0"},
@@ -122,10 +119,12 @@ def test_a_scene_may_come_from_a_file_or_a_pipe_and_options_override_it(
         ("contexts", ("layer", "unit", "state")),
         ("outliers bed toilet sink", ("toilet", "because")),
         ("rooms bed", ("room type", "probability", "bedroom")),
+        ("relations bed lamp --relations 'lamp on-top bed'", ("expected", "on-top", "observed")),
+        ("outliers bed lamp --relations 'lamp on-top bed'", ("moved", "on-top")),
     ],
 )
 def test_everything_has_a_table(scene: Any, line: str, words: tuple[str, ...]) -> None:
-    done = scene(*line.split())
+    done = scene(*shlex.split(line))
     assert done.exit_code == 0
     for word in words:
         assert word in done.stdout
@@ -134,22 +133,10 @@ def test_everything_has_a_table(scene: Any, line: str, words: tuple[str, ...]) -
 def test_scenes_are_drawn(scene: Any, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     path = tmp_path / "out.png"
-    done = scene("generate", "--room-type", "office", "--count", "2", "--plot", str(path))
-    assert done.exit_code == 0, done.stderr
+    assert scene("generate", "--count", "2", "--plot", str(path)).exit_code == 0
     assert path.read_bytes().startswith(b"\x89PNG")
     done = scene("generate", "--plot", str(tmp_path / "out.doc"))
-    assert done.exit_code == 2
-    assert "cannot draw the picture" in done.stderr
-
-
-def test_plot_without_matplotlib_names_the_package(
-    scene: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("scene_client.command.find_spec", lambda _: None)
-    done = scene("generate", "--plot", str(tmp_path / "out.png"))
-    assert done.exit_code == 2
-    assert "pip install matplotlib" in done.stderr
-    assert done.stdout == ""
+    assert (done.exit_code, "cannot draw the picture" in done.stderr) == (2, True)
 
 
 SCENES = [
@@ -227,12 +214,6 @@ def test_nan_and_infinity_are_read(scene: Any) -> None:
     found = json.loads(done.stdout)
     assert [entry["object"] for entry in found["outliers"]] == ['"NaN']
     assert found["warnings"] == []
-
-
-def test_a_large_file_is_refused(scene: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scene_client.files.MAX_FILE", 10)
-    done = scene("missing", "-", stdin=" " * 11)
-    assert (done.exit_code, done.stderr) == (2, "- is too large: it has more than 10 bytes\n")
 
 
 FILES = {
@@ -340,11 +321,6 @@ def test_exit_status_of_ready(scene: Any, peer: Any) -> None:
     assert starting.connections == 1
 
 
-def test_the_version_needs_no_service() -> None:
-    done = CliRunner().invoke(app, ["--version"])
-    assert (done.exit_code, done.stdout) == (0, f"scene {__version__}\n")
-
-
 def test_the_key_is_taken_from_the_environment(
     scene: Any, peer: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -355,11 +331,6 @@ def test_the_key_is_taken_from_the_environment(
     assert b"x-api-key: " + b"k" * 16 in heads[0].lower()
 
 
-def test_the_package_is_a_program(url: str) -> None:
-    command = (sys.executable, "-W", "error", "-m", "scene_client", "outliers", "bed", "lamp")
-    assert "log-odds" in run_program(*command, env={**os.environ, "SCENE_URL": url}).stdout
-
-
 # ------------------------------------------------------------------------------------- tables
 
 
@@ -368,10 +339,6 @@ def shown(table: Any) -> str:
     with console.capture() as capture:
         console.print(table)
     return capture.get()
-
-
-def rows(table: Any) -> list[list[str]]:
-    return [line.split() for line in shown(table).splitlines()]
 
 
 def test_places_offsets_and_reasons_of_a_missing_object() -> None:
@@ -391,46 +358,3 @@ def test_places_offsets_and_reasons_of_a_missing_object() -> None:
     assert "bed +1.50" in text
     assert "on-top desk" not in table(0.24)
     assert "on-top desk 0.240" in table(0.24, asked_place=True)
-
-
-def test_observed_and_expected_relations() -> None:
-    given = {"subject": "milk", "relation": "inside", "object": "fridge", "probability": 0.81}
-    doubt = {"subject": "lamp", "object": "desk", "observed": ["left", "above"]}
-    doubt |= {"expected": "on-top", "probability": 0.9, "observed_probability": 0.05}
-    found = RelationsAnswer(
-        **ANSWERED,
-        relations=[given | {"observed": True, "expected": 0.123}, given | {"relation": "on-top"}],
-        disagreements=[doubt],
-    )
-    lines = rows(tables.relations(found))
-    assert ["subject", "relation", "object", "probability", "expected"] in lines
-    assert ["milk", "inside", "fridge", "0.810", "observed", "0.123"] in lines
-    assert ["milk", "on-top", "fridge", "0.810"] in lines
-    assert ["disagreements"] in lines
-    assert ["lamp", "left,", "above", "desk", "0.050", "on-top", "0.900"] in lines
-
-
-def test_misplaced_relations_and_the_moved_object() -> None:
-    relations: list[Any] = [
-        {"subject": f"a_{i}", "relation": "left", "object": "b", "probability": 1 - i / 40}
-        for i in range(12)
-    ]
-    relations[0] |= {"is_misplaced": True, "moved": "b"}
-    table = tables.outliers(OutliersAnswer(**ANSWERED, outliers=[], misplaced=relations))
-    assert "the 10 likeliest to be wrong of 12" in shown(table)
-    assert ["a_0", "left", "b", "1.000", "misplaced", "b"] in rows(table)
-    assert ["a_9", "left", "b", "0.775"] in rows(table)
-    assert "a_10" not in shown(table)
-    few = OutliersAnswer(**ANSWERED, outliers=[], misplaced=relations[:10])
-    assert "likeliest" not in shown(tables.outliers(few))
-
-
-def test_long_lists_of_sampled_relations_are_cut() -> None:
-    objects = ["bed", *(f"lamp {number}" for number in range(20))]
-    sides = [{"subject": name, "relation": "left", "object": "bed"} for name in objects[1:]]
-    on = {"subject": "lamp 7", "relation": "on-top", "object": "bed"}
-    drawn = {"objects": objects, "relations": [*sides, on], "log_score": 0.0, "context": {}}
-    table = shown(tables.generate(GenerateAnswer(**ANSWERED, seed=1, scenes=[drawn])))
-    assert table.count("left bed") == tables.MOST_RELATIONS - 1
-    assert "lamp 7 on-top bed" in table
-    assert "… and 9 more" in table
