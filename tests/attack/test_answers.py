@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Awaitable, Callable
 from itertools import cycle, islice
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -14,7 +12,7 @@ import pytest
 from scene_client.schemas import MAX_BATCH
 from tests.http.stores import VOCABULARY
 from tests.http.test_problems import problem
-from tests.services import client_of_service, launch
+from tests.services import client_of_service
 
 LABELS = [entry.label for entry in VOCABULARY.objects if not entry.structure]
 LIMIT = 4 * 2**20
@@ -50,12 +48,6 @@ async def test_the_answer_to_a_batch_has_a_limit(client: httpx.AsyncClient) -> N
     assert last["type"] == "/problems/answer-too-large"
     assert last["errors"][0]["pointer"] == f"#/scenes/{MAX_BATCH - 1}/top_k"
     assert "Lower `top_k`" in last["errors"][0]["message"]
-
-
-async def test_a_batch_within_the_limit_is_answered_as_before(client: httpx.AsyncClient) -> None:
-    batch = {"scenes": [scene(23)] * MAX_BATCH}
-    answer = await client.post("/relations/batch", json=batch)
-    assert {entry["status"] for entry in answer.json()["results"]} == {200}
 
 
 async def test_the_largest_single_question_is_answered(client: httpx.AsyncClient) -> None:
@@ -127,22 +119,3 @@ async def check_the_largest(
             refused = middle
     assert largest.is_success
     assert SMALL / 8 < len(largest.content) <= SMALL
-
-
-@pytest.mark.slow
-def test_memory_stays_bounded(shared_store: Path, tmp_path: Path) -> None:
-    """It grew by 700 MB."""
-    with launch(shared_store, tmp_path / "log") as service:
-        service.client.post("/relations", json=scene(23, **LARGEST))
-        before = peak(service.process.pid)
-        body = json.dumps(BATCH).encode()
-        headers = {"Content-Type": "application/json"}
-        answer = service.client.post("/relations/batch", content=body, headers=headers)
-        assert answer.status_code == 200
-        assert peak(service.process.pid) - before < 150 * 2**20
-
-
-def peak(pid: int) -> int:
-    """The largest resident memory so far, in bytes."""
-    status = Path(f"/proc/{pid}/status").read_text()
-    return int(status.split("VmHWM:")[1].split()[0]) * 1024

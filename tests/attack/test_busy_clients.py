@@ -18,7 +18,6 @@ from typing import Any
 import httpx
 import pytest
 
-from app.server import most_connections
 from tests.http.stores import make_store
 from tests.services import LiveService, launch, live_service, wait_until
 
@@ -171,14 +170,6 @@ def test_few_files_limit_the_connections(tmp_path: Path) -> None:
         for _ in range(20):
             assert service.client.get("/health/live").status_code == 200
         assert "accepts 192 connections" in service.log.read_text()
-
-
-@pytest.mark.parametrize(("files", "most"), [(resource.RLIM_INFINITY, 1024), (1024, 960)])
-def test_connections_fit_the_limit_of_files(
-    monkeypatch: pytest.MonkeyPatch, files: int, most: int
-) -> None:
-    monkeypatch.setattr(resource, "getrlimit", lambda _: (files, files))
-    assert most_connections(1024) == most
 
 
 behind_proxy = live_service(SCENE_TRUSTED_PROXIES="127.0.0.1")

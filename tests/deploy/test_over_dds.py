@@ -19,7 +19,7 @@ from tests.services import LiveService, wait_until
 
 pytest.importorskip("cyclonedds", reason="there is no wheel for this processor")
 
-from benchmarks.dds import Robot, bridge, measure, ros
+from benchmarks.dds import Robot, bridge, ros
 from scene_client import Client
 
 over_dds = import_module("over_dds")  # benchmarks.dds adds its folder to the path
@@ -135,22 +135,6 @@ def test_detections_are_answered_as_by_the_node(robot: Robot, recorded: Any) -> 
     assert answer["missing"]["missing"]
     assert {entry["object"] for entry in answer["outliers"]["outliers"]} >= {"track_3", "toilet_1"}
     assert [note["reason"] for note in answer["notes"]] == ["no-hypothesis"]
-
-
-@pytest.mark.system
-@pytest.mark.slow
-def test_none_of_a_thousand_messages_is_lost(robot: Robot, recorded: Any) -> None:
-    for number in range(1000):
-        send(robot, recorded, number, reliable=number % 2 == 0)
-        assert hear(robot)["stamp"]["sec"] == number
-
-
-@pytest.mark.system
-def test_the_benchmark_times_every_message(robot: Robot, live: LiveService) -> None:
-    with Client(live.url, timeout=30) as client:
-        seconds = measure(robot, client, 3, objects=4)
-    assert [len(times) for times in seconds.values()] == [3, 3]
-    assert all(0 < time < 30 for times in seconds.values() for time in times)
 
 
 @pytest.mark.system

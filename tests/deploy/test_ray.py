@@ -107,17 +107,6 @@ def test_the_manifest_has_the_settings_of_the_local_start(pods: list[dict[str, A
         assert {name: settings[name] for name in shared} == {name: local[name] for name in shared}
 
 
-def test_the_network_policy_hides_the_ports_of_ray(folder: Path, config: dict[str, Any]) -> None:
-    _, policy = yaml.safe_load_all((folder / "rayservice.yaml").read_text("utf-8"))
-    assert policy["spec"]["policyTypes"] == ["Ingress"]
-    labels = {"app": "scene-ray"}
-    assert policy["spec"]["podSelector"]["matchLabels"] == labels
-    for rule in policy["spec"]["ingress"]:
-        peer = rule["from"][0]["podSelector"]["matchLabels"]
-        if peer["app" if "app" in peer else "app.kubernetes.io/name"] == "scene-proxy":
-            assert [entry["port"] for entry in rule["ports"]] == [config["http_options"]["port"]]
-
-
 # ---------------------------------------------------------------------------- running replicas
 
 
@@ -197,24 +186,6 @@ def load(service: LiveService, connections: int) -> Iterator[Counter[int]]:
             ends.set()
 
 
-@pytest.mark.slow
-def test_load_adds_a_replica_and_rest_removes_it(
-    repository: Path, tmp_path: Path, config: dict[str, Any]
-) -> None:
-    file = tmp_path / "serve.yaml"
-    config = deepcopy(config)
-    delays = {"upscale_delay_s": 1, "downscale_delay_s": 5, "look_back_period_s": 5}
-    scaling = config["applications"][0]["deployments"][0]["autoscaling_config"]
-    scaling.update(delays, max_replicas=2)
-    file.write_text(yaml.safe_dump(config), "utf-8")
-    with running(repository, tmp_path / "log", "--config", file) as service:
-        assert len(replicas(service)) == 1
-        with load(service, 24) as statuses:
-            wait_until(lambda: len(replicas(service)) == 2, seconds=90)
-        wait_until(lambda: len(replicas(service)) == 1, seconds=90)
-        assert statuses.keys() == {200}
-
-
 @pytest.fixture(scope="module")
 def service(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
     log = tmp_path_factory.mktemp("ray") / "log"
@@ -261,13 +232,6 @@ def test_headers_and_problems_equal_those_of_the_plain_service(
 
 
 @pytest.mark.slow
-def test_a_body_above_the_limit_is_refused_by_the_service(service: LiveService) -> None:
-    response = service.client.post("/missing", content=b" " * (3 * 2**20))
-    assert response.status_code == 413
-    assert response.headers["content-type"] == "application/problem+json"
-
-
-@pytest.mark.slow
 def test_a_new_configuration_replaces_all_replicas_and_loses_nothing(
     service: LiveService, config: dict[str, Any]
 ) -> None:
@@ -289,16 +253,3 @@ def test_a_new_configuration_replaces_all_replicas_and_loses_nothing(
     for _ in range(10):
         answer = service.client.post("/missing", json={"objects": ["bed"] * 10})
         assert answer.status_code == 422, answer.text
-
-
-@pytest.mark.slow
-def test_a_killed_replica_is_replaced(service: LiveService) -> None:
-    before = replicas(service)
-    connections = 4
-    with load(service, connections) as statuses:
-        wait_until(lambda: statuses[200] > 100, seconds=30)
-        os.kill(min(before), signal.SIGKILL)
-        wait_until(lambda: len(replicas(service) - before) == 1, seconds=60)
-        count = statuses[200]
-        wait_until(lambda: statuses[200] > count + 100, seconds=30)
-    assert sum(statuses.values()) - statuses[200] <= connections, statuses

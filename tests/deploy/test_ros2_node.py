@@ -6,8 +6,6 @@ import copy
 import importlib
 import json
 import math
-import tomllib
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -161,12 +159,6 @@ def test_an_unreachable_service_is_diagnosed_until_it_returns(
     assert running.status().level == 0
 
 
-def test_empty_detections_send_no_request(run: Callable[..., Running]) -> None:
-    running = run(url="http://127.0.0.1:9")
-    assert running.answer(new("Detection3DArray"))["notes"] == []
-    assert (running.status().level, running.status().message) == (1, "nothing was seen")
-
-
 def test_numbers_wait_for_their_labels(
     run: Callable[..., Running], live: LiveService, recorded: Any
 ) -> None:
@@ -239,14 +231,6 @@ def test_images_are_heard_where_the_parameters_say_so(
     assert [*entry.values()][:3] == ["bed_1", "left", "lamp_1"]
 
 
-def test_the_program_spins_one_node_and_takes_it_down(monkeypatch: pytest.MonkeyPatch) -> None:
-    ros = Ros({})
-    load_package(monkeypatch, ros)
-    importlib.import_module("scene_reasoning.node").main()
-    assert len(ros.spun) == 1
-    assert ros.destroyed
-
-
 # ----------------------------------------------------------------------------------- its parts
 
 
@@ -277,16 +261,6 @@ def test_a_ghost_stands_off_its_anchor_by_the_offset(monkeypatch: pytest.MonkeyP
     assert (pen.text, pen.position, pen.extent) == ("pen? inside desk", (1.0, 2.0, 0.4), None)
 
 
-@pytest.mark.parametrize("questions", [[], ["weather"], ["missing", "generate"]])
-def test_unknown_questions_are_refused(
-    monkeypatch: pytest.MonkeyPatch, questions: list[str]
-) -> None:
-    load_package(monkeypatch)
-    advisor = importlib.import_module("scene_reasoning.advisor")
-    with pytest.raises(ValueError, match="questions must be some of"):
-        advisor.Advisor(None, questions)
-
-
 # ------------------------------------------------------------------------------- the packaging
 
 
@@ -300,18 +274,3 @@ def test_the_parameter_file_is_the_nodes_parameters_and_its_defaults(
     defaults = run().ros.declared
     for name, value in defaults.items():
         assert str(parameters[name]) == str(value), name
-
-
-def test_the_package_names_what_it_imports(repository: Path) -> None:
-    root = ElementTree.parse(PACKAGE / "package.xml").getroot()
-    needed = {entry.text for entry in root.findall("exec_depend")}
-    node = (PACKAGE / "scene_reasoning" / "node.py").read_text()
-    imported = {
-        line.split()[1].split(".")[0]
-        for line in node.splitlines()
-        if line.startswith(("from ", "import "))
-    }
-    ros = {name for name in imported if name.endswith("_msgs")} | {"rclpy"}
-    assert ros <= needed
-    name = tomllib.loads((repository / "pyproject.toml").read_text())["project"]["name"]
-    assert name in (PACKAGE / "setup.py").read_text()

@@ -50,10 +50,3 @@ def test_settings_exist(page: Path) -> None:
     for module in (*clients.glob("*.py"), *registry.glob("*.py")):
         known |= set(re.findall(r"\"(SCENE_[A-Z_]+)\"", module.read_text(encoding="utf-8")))
     assert set(re.findall(r"\bSCENE_[A-Z_]+\b", page.read_text(encoding="utf-8"))) <= known
-
-
-def test_pages_mention_commands() -> None:
-    """The tests above read something."""
-    lines = [line for page in PAGES for line in mentioned(page)]
-    assert sum("make " in line for line in lines) > 10
-    assert sum("-m training " in line for line in lines) > 8

@@ -161,28 +161,6 @@ def test_reasons_are_differences_of_log_odds(name, seed):
     close(found, np.array(each).T[candidates])
 
 
-@pytest.mark.parametrize("scale", [0.1, 0.3])
-def test_reasons_of_two_layers_add_the_effects_through_the_second(scale):
-    """The effects of two classes through h2 are added, so the error is of second order."""
-    errors = []
-    for seed in range(20):
-        case = Case("two-layers", seed)
-        for weight in (case.machine.W, case.machine.J):
-            weight.mul_(scale)
-        weights = weights_of(case.machine.float())
-        context = context_of(weights, case.classes, case.presence, case.presence)
-        case.machine.double()
-        case.room = -1
-        rows = np.arange(len(case.classes))
-        scene = context.x, context.shares, case.classes, case.presence, case.profile
-        found = ObjectScorer(weights).reasons(*scene, rows)
-        for k in rows:
-            for j in set(rows) - {k}:
-                i = case.classes[k]
-                errors.append(abs(found[k, j] - case.log_odds(k)[i] + case.log_odds(k, j)[i]))
-    assert max(errors) < {0.1: 1e-4, 0.3: 5e-3}[scale]
-
-
 @given(coverage=st.floats(0, 1))
 def test_kappa_is_interpolated_between_the_middles_of_the_bins(coverage):
     machine = build(SPECS["binary"])

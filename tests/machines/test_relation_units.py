@@ -158,15 +158,3 @@ def test_context_weights_are_the_slopes_of_the_logits(name):
     v = torch.ones(len(h1), V).double()
     slope = machine.relation_logits(edges, v, h1) - machine.relation_logits(edges, v, 0 * h1)
     np.testing.assert_allclose(units.context_weights(*ends), slope.T, rtol=1e-4, atol=1e-5)
-
-
-def test_certain_states_have_the_logits_of_the_machine():
-    machine = machine_of("triway-states")
-    units, h1 = relation_units(weights_of(machine)), unit_states(machine.spec)[77:78].float()
-    n = np.arange(V)
-    pair = np.repeat(n, V)[None], np.tile(n, V)[None]
-    ends = ends_of(n, np.ones(V, np.float32), np.zeros(V, np.float32), *pair)
-    mean, spread = units.normal(h1.numpy(), ends, certain=True)
-    expected = machine.relation_logits(machine.edges(torch.arange(V)[None]), torch.ones(1, V), h1)
-    np.testing.assert_allclose(mean.ravel(), expected[0], rtol=1e-4, atol=1e-4)
-    assert not spread.any()

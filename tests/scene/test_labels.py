@@ -58,11 +58,6 @@ def test_compatibility_characters_fold() -> None:
     assert label_key("Straße") == label_key("STRASSE")
 
 
-@given(st.text(max_size=30))
-def test_keys_are_idempotent(label: str) -> None:
-    assert label_key(label_key(label)) == label_key(label)
-
-
 @given(st.text(max_size=30), st.sampled_from(["_", " ", "-", ".", "  "]))
 def test_keys_ignore_case_and_separators(label: str, separator: str) -> None:
     assert label_key(separator + label + separator) == label_key(label)

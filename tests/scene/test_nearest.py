@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from app.scene.vocabulary import ObjectClass, Vocabulary
-from training.datasets.vocabulary import indoor_vocabulary
 
 VOCABULARY = Vocabulary(
     [
@@ -28,14 +27,6 @@ VOCABULARY = Vocabulary(
     ],
     ("bedroom", "living room", "bathroom"),
 )
-INDOOR = indoor_vocabulary()
-
-
-def guess(vocabulary: Vocabulary, label: str) -> str | None:
-    if (index := vocabulary.index(label)) is not None:
-        return vocabulary.labels[index]
-    found = vocabulary.read(label) or vocabulary.guess(label)
-    return None if found is None else vocabulary.labels[found.entry]
 
 
 @pytest.mark.parametrize(
@@ -79,45 +70,6 @@ def test_a_name_is_guessed_by_its_spelling_or_its_last_words(
 )
 def test_an_ambiguous_name_has_no_guess(label: str) -> None:
     assert VOCABULARY.guess(label) is None
-
-
-@pytest.mark.parametrize(
-    ("label", "right"),
-    [
-        ("kitchen tools", "utensil"),
-        ("choker", "necklace"),
-        ("remote controller", "remote control"),
-        ("coffee grounds", "coffee"),
-        ("hair conditioner", None),
-        ("lamba", None),
-        ("Cello", "musical instrument"),
-        ("painter", None),
-        ("calander", "calendar"),
-        ("bottle_cap", "lid"),
-        ("musical keyboard", "piano"),
-        ("window behind shutters", "window"),
-        ("paint", None),
-        ("toilet flush", None),
-    ],
-)
-def test_a_label_that_misled_the_search_is_right_or_refused(label: str, right: str | None) -> None:
-    assert guess(INDOOR, label) in (right, None)
-
-
-@pytest.mark.parametrize(
-    ("label", "right"),
-    [
-        *(("office table", "table"), ("bedside cabinet", "nightstand"), ("celing", "ceiling")),
-        *(
-            ("Sofa_3", "sofa"),
-            ("smoke alarm", "smoke detector"),
-            ("waste container", "garbage bin"),
-        ),
-        *(("chest of drawres", "dresser"), ("certain", "curtain")),
-    ],
-)
-def test_the_indoor_vocabulary_understands_detectors(label: str, right: str) -> None:
-    assert guess(INDOOR, label) == right
 
 
 def test_only_plausible_names_are_suggested_best_first() -> None:

@@ -9,7 +9,6 @@ import pytest
 
 from app.scene import PoseRelations, Scene, SceneObject, Viewpoint, observe
 from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP, STACKED
-from tests.scene.role_counts import LABELS, role_counts
 
 DESK = SceneObject("desk", "desk", 0, position=(2.0, 0.0, 0.4), size=(0.8, 1.6, 0.8))
 MONITOR = SceneObject("monitor", "monitor", 1, position=(2.0, 0.2, 1.0), size=(0.1, 0.5, 0.4))
@@ -84,16 +83,6 @@ def test_typical_sizes_take_the_place_of_unknown_ones() -> None:
     assert observe(Scene((DESK, stranger)), typical_sizes=sizes).relations == without.relations
 
 
-def test_counts_decide_between_the_roles_of_boxes_that_reach_into_each_other() -> None:
-    bin_ = SceneObject("bin", "bin", LABELS.index("bin"), 1.0, (2.1, 0.4, 0.2), (0.3, 0.3, 0.4))
-    desk = replace(DESK, class_index=LABELS.index("desk"))
-    roles = role_counts({(bin_.class_index or 0, desk.class_index or 0): (0, 9, 0)})
-    assert observe(Scene((desk, bin_)), roles=roles).relations == ((ON_TOP, 0, 1),)
-    assert observe(Scene((desk, bin_))).relations == ()
-    # A label outside the vocabulary has no counts.
-    assert observe(Scene((desk, replace(bin_, class_index=None))), roles=roles).relations == ()
-
-
 def test_stated_relations_stay_and_poses_exclude_others() -> None:
     """The monitor stands on the desk, 20 cm to the left, and the sofa is far away."""
     sofa = SceneObject("sofa", "sofa", 3, position=(6.0, 0.0, 0.4), size=(0.9, 2.0, 0.8))
@@ -130,17 +119,3 @@ def test_boxes_of_unknown_size_are_not_stacked_from_far_apart(
     seen = observe(Scene(tuple(ends)))
     assert seen.excluded is not None
     assert seen.excluded[[*STACKED], 0, 1].all() == is_far
-
-
-def test_scenes_without_poses_stay_as_they_are() -> None:
-    for relations in (None, ((LEFT, 0, 1),)):
-        bare = Scene((SceneObject("a", "a", 0), SceneObject("b", "b", 1)), relations)
-        assert observe(bare) is bare
-
-
-def test_objects_without_a_position_have_no_observed_relations() -> None:
-    seen = observe(Scene((DESK, SceneObject("cup", "cup", 1))), viewpoint=Viewpoint(0, 0, 1.0))
-    assert seen.relations == ()
-    assert seen.poses is not None
-    assert not seen.poses.observed.any()
-    assert seen.objects[1].position is None

@@ -49,11 +49,6 @@ def test_the_floor_is_unknown_without_objects_that_stand_on_it() -> None:
     assert floor_level(np.array([NAN, 0.5]), np.array([1.0, 0.6])) == 0.5
 
 
-def test_objects_on_furniture_do_not_raise_the_floor() -> None:
-    """A chair on a table, and a table: the floor is that of the table."""
-    assert floor_level(np.array([0.74, 0.0]), np.array([0.95, 0.8])) == 0.0
-
-
 @pytest.mark.parametrize(
     ("bottom", "expected"),
     [(0.0, FLOOR), (0.09, FLOOR), (-0.4, FLOOR), (0.11, HANGS), (1.6, HANGS)],
@@ -100,18 +95,3 @@ def test_an_open_relation_leaves_the_stand_unknown() -> None:
     assert stands_of(holds, observed, heights, 0.0).tolist() == [UNKNOWN, FLOOR]
     holds[INSIDE, 0, 1] = True
     assert stands_of(holds, observed, heights, 0.0).tolist() == [SUPPORTED, FLOOR]
-
-
-def test_an_unknown_position_has_an_unknown_stand() -> None:
-    """It leaves the stands of other objects as they are."""
-    assert stands(DESK, ("lamp", (0.3, 0.3, 0.4), (NAN, NAN, NAN))) == [FLOOR, UNKNOWN]
-
-
-def test_a_larger_box_that_reaches_below_the_top_of_a_smaller_one_is_around_it() -> None:
-    heights = Heights(
-        np.array([0.0, 0.0, 0.4, NAN]), np.array([0.75, 0.4, 0.6, NAN]), np.array([1.3, 0.1, 2, 1])
-    )
-    expected = np.zeros((4, 4), np.bool_)
-    expected[0, 1] = expected[2, 0] = True
-    around = heights.around & ~np.eye(4, dtype=np.bool_)
-    assert np.array_equal(around, expected)

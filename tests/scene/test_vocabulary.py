@@ -46,12 +46,6 @@ def test_unknown_labels_are_not_found(label: str) -> None:
     assert VOCABULARY.index(label) is None
 
 
-def test_room_types_are_found_under_any_spelling() -> None:
-    assert [VOCABULARY.room_index(name) for name in ("bedroom", "bed room", "Bed_Room")] == [0] * 3
-    assert VOCABULARY.room_index("Living-Room") == 1
-    assert VOCABULARY.room_index("garage") is None
-
-
 def test_rooms_have_synonyms() -> None:
     aliases = {"storage room": ["pantry", "storeroom"]}
     words = Vocabulary([ObjectClass("box")], ["bedroom", "storage room"], aliases)

@@ -71,30 +71,6 @@ async def test_one_client_holds_a_quarter_of_a_lane() -> None:
     assert (lane.weight, lane.is_full("flood", 10)) == (0, False)
 
 
-async def test_refusals_wait_for_a_turn_without_weight() -> None:
-    lane, holder = Lane(1, 4), ticket("flood")
-    await holder.enter(lane, 1)
-    refusals = [ticket("flood") for _ in range(3)]
-    turns = [asyncio.ensure_future(place.enter(lane, 0)) for place in refusals]
-    await asyncio.sleep(0)
-    assert not any(turn.done() for turn in turns)
-    holder.leave()
-    for place, turn in zip(refusals, turns, strict=True):
-        await turn
-        place.leave()
-    assert (lane.weight, lane.is_full("flood", 1)) == (0, False)
-
-
-async def test_a_request_in_a_lane_can_change_to_another() -> None:
-    first, second, place = Lane(1, 4), Lane(1, 4), ticket()
-    await place.enter(first, 1)
-    await place.enter(second, 1)
-    assert (first.weight, second.weight) == (0, 1)
-    place.leave()
-    place.leave()
-    assert second.weight == 0
-
-
 async def test_a_request_that_waits_past_its_deadline_leaves_its_place() -> None:
     lane, holder = Lane(1, 40), ticket("holder")
     await holder.enter(lane, 1)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from scripts import audit
-from scripts.audit import Outcome, Verdict, exit_status, judge
+from scripts.audit import Outcome, Verdict, judge
 
 pytestmark = pytest.mark.system
 
@@ -92,22 +92,6 @@ def test_a_database_without_the_canary_is_not_used(
     monkeypatch.setattr(audit, "BILLS", tmp_path)
     assert audit.advisories().verdict is verdict
     assert asked == locks_asked
-
-
-@pytest.mark.parametrize(
-    ("verdicts", "strict", "lenient"),
-    [
-        ([Verdict.OK, Verdict.OK], 0, 0),
-        ([Verdict.OK, Verdict.NOT_RUN], 3, 0),
-        ([Verdict.FOUND, Verdict.NOT_RUN], 1, 1),
-        ([Verdict.FOUND, Verdict.OK], 1, 1),
-    ],
-)
-def test_exit_status_of_findings_and_of_skipped_checks(
-    verdicts: list[Verdict], strict: int, lenient: int
-) -> None:
-    assert exit_status(verdicts, may_be_unreachable=False) == strict
-    assert exit_status(verdicts, may_be_unreachable=True) == lenient
 
 
 @pytest.mark.slow

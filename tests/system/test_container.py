@@ -119,18 +119,6 @@ def test_services_are_confined(compose: dict[str, Any], name: str) -> None:
     assert re.search(r"\bsize=\d+m\b", temporary)
 
 
-def test_the_service_is_watched_and_owns_only_its_store(
-    stages: dict[str, list[Instruction]], compose: dict[str, Any]
-) -> None:
-    scene = compose["services"]["scene"]
-    assert {"interval", "timeout", "retries"} <= scene["healthcheck"].keys()
-    owned = [i.argument for i in stages["runtime"] if "chown" in i.flags]
-    assert owned == ["model_store ./model_store"]
-    for key in ("SCENE_ADMIN_KEY", "SCENE_API_KEY"):
-        assert scene["environment"].get(key, "missing") is None, "the caller gives the keys"
-        assert not any(key in i.argument for stage in stages.values() for i in stage)
-
-
 def test_ports_are_published_on_this_machine_only(compose: dict[str, Any]) -> None:
     ports = {name: service.get("ports", []) for name, service in compose["services"].items()}
     assert ports["scene"] == ports["train"] == []
@@ -141,16 +129,6 @@ def test_ports_are_published_on_this_machine_only(compose: dict[str, Any]) -> No
     ):
         (port,) = ports[name]
         assert port.startswith(start)
-
-
-def test_the_store_is_one_volume_where_the_image_keeps_its_models(
-    stages: dict[str, list[Instruction]], compose: dict[str, Any]
-) -> None:
-    store = compose["services"]["scene"]["environment"]["SCENE_STORE"]
-    store = store.removeprefix("${SCENE_STORE:-").removesuffix("}")
-    assert f"SCENE_STORE={store}" in " ".join(arguments(stages["runtime"], "ENV"))
-    for service in built(compose):
-        assert f"models:{store}" in service["volumes"]
 
 
 def pins(repository: Path, lock: str) -> set[str]:
@@ -176,14 +154,6 @@ def test_only_torch_may_come_from_another_index(repository: Path) -> None:
         for line in text.splitlines():
             if "install" in line and "--index-url" in line:
                 assert "--no-deps" in line
-
-
-def test_smaller_locks_are_subsets_of_the_larger(repository: Path) -> None:
-    service, ray, training, development = (
-        pins(repository, lock) for lock in ("", "-ray", "-training", "-dev")
-    )
-    assert service < training < development
-    assert service < ray
 
 
 def test_the_base_image_may_have_a_digest() -> None:

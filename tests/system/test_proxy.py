@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import signal
 import socket
-import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -19,7 +17,7 @@ import pytest
 
 from app.settings import Settings
 from scene_client import Client
-from tests.chaos.wire import BODY, LIVE, Wire, exchange, wires
+from tests.chaos.wire import LIVE, Wire, exchange, wires
 from tests.services import (
     ADMIN_KEY,
     LiveService,
@@ -97,33 +95,7 @@ def test_questions_and_pages_are_answered(proxy: Proxy) -> None:
         assert other_host.json()["type"] == "/problems/host-refused"
 
 
-@pytest.mark.slow
-def test_an_answer_may_take_longer_than_a_client_may_pause(
-    proxy: Proxy, service: LiveService
-) -> None:
-    process = service.process
-    process.send_signal(signal.SIGSTOP)
-    try:
-        resume = threading.Timer(2.5, process.send_signal, [signal.SIGCONT])
-        resume.start()
-        response = httpx.post(f"{proxy.address}/outliers", json=SCENE, timeout=60)
-    finally:
-        resume.join()
-    assert response.status_code == 200
-    assert response.elapsed.total_seconds() > 2
-
-
 # ---------------------------------------------------------------------------------- attacks
-
-
-def test_a_head_that_trickles_in_is_not_waited_for(proxy: Proxy) -> None:
-    began = time.monotonic()
-    with socket.create_connection(("127.0.0.1", proxy.port)) as connection, suppress(OSError):
-        connection.sendall(HEAD)
-        while time.monotonic() - began < 10:
-            connection.sendall(b"A")
-            time.sleep(0.1)
-    assert time.monotonic() - began < 3
 
 
 @pytest.mark.parametrize(("part", "statuses"), [(b"", [[], [408]]), (LIVE[:-2], [[408]])])
@@ -280,14 +252,6 @@ def test_administration_and_metrics_are_hidden_by_the_proxy(
     assert json.loads(answer.body)["type"] == "/problems/not-found"
     added = service.log.read_text().splitlines()[before:]
     assert all("/health/" in line for line in added)
-
-
-def test_invalid_escapes_and_old_chunks_are_refused(proxy: Proxy) -> None:
-    request = "PUT /models/aliases/%zz HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
-    answers, _ = send(proxy, request.encode())
-    assert answers[0].status in {400, 404}
-    head = HEAD.replace(b"HTTP/1.1", b"HTTP/1.0") + b"Transfer-Encoding: chunked\r\n\r\n"
-    refused(proxy, head + b"%x\r\n%s\r\n0\r\n\r\n" % (len(BODY), BODY), 400)
 
 
 @pytest.mark.slow
