@@ -19,7 +19,6 @@ from tests.http.test_problems import problem
 from tests.services import Hold, LiveService, Replace, serve
 
 LABELS = [entry.label for entry in VOCABULARY.objects if not entry.structure]
-DEEP = {"objects": LABELS[:4], "model": "deep"}
 HOME = {"objects": LABELS[:4]}
 
 

@@ -12,10 +12,8 @@ import pytest
 
 from app.questions import names
 from app.scene.labels import readings
-from app.scene.nearest import LONGEST
 from app.scene.vocabulary import Vocabulary
 from scene_client.validation import MAX_ERRORS
-from tests.http.stores import VOCABULARY
 
 # Labels of one request that are looked up: to suggest some like them, and to take them for others.
 MAX_SUGGESTED, MAX_MAPPED = 32, 256
@@ -104,20 +102,3 @@ async def test_a_scene_of_unknown_labels_stops_early(
 def test_a_label_has_few_readings() -> None:
     worst = ["a/" * 50, "the a_1/" * 12, "x_(" * 33, "a photo of " * 9, "a 1 " * 25, "1|" * 50]
     assert max(len(list(readings(label))) for label in worst) <= 100
-
-
-async def test_a_label_that_many_scenes_share_is_mapped_in_all(client: httpx.AsyncClient) -> None:
-    scene = {"objects": ["bed", "nigthstand"], "unknown_labels": "nearest"}
-    answer = await client.post("/missing/batch", json={"scenes": [scene] * 256})
-    mapped = [entry["result"]["mapped"][0]["class"] for entry in answer.json()["results"]]
-    assert mapped == ["nightstand"] * 256
-
-
-def test_spellings_of_ordinary_length_are_compared_and_longer_ones_are_not() -> None:
-    known = "a" * (LONGEST - 1)
-    vocabulary = Vocabulary([*VOCABULARY.objects, type(VOCABULARY.objects[0])(known)])
-    assert [vocabulary.labels[match.entry] for match in vocabulary.nearest(known + "b")] == [known]
-    assert vocabulary.nearest(known + "bc") == ()
-    # Words are compared whatever the length: they cost little.
-    (match,) = vocabulary.nearest("very " * 15 + "special lamp")
-    assert vocabulary.labels[match.entry] == "lamp"

@@ -20,7 +20,6 @@ from benchmarks.log_odds import log_odds
 from benchmarks.report import Result, describe_machine, document
 from benchmarks.scaling import scaling
 from benchmarks.service import MISSING, service
-from benchmarks.timing import interleave
 from benchmarks.training import training_step
 from tests.http.stores import make_store
 
@@ -108,11 +107,3 @@ def test_command_says_what_it_skips_and_writes_the_rest(tmp_path):
     written = json.loads(path.read_text())
     assert written["results"] == []
     assert written["machine"]["cores"] >= 1
-
-
-def test_contenders_take_turns_and_start_in_turns():
-    calls: list[str] = []
-    contenders = {name: lambda name=name: calls.append(name) for name in "abc"}
-    interleave(contenders, rounds=4, slice_seconds=0.0)
-    warm_up = ["a", "a", "b", "b", "c", "c"]
-    assert calls == warm_up + list("abc") + list("bca") + list("cab") + list("abc")

@@ -144,12 +144,3 @@ def test_answers_and_movements_are_announced(open_board: OpenBoard, api: httpx.C
     expect(board.page.locator("#live")).to_contain_text("chair: x 1.10, y 0.00")
     board.page.keyboard.press("r")
     expect(board.page.locator("#live")).to_contain_text("rotated to 15 degrees")
-
-
-def test_the_dialog_keeps_the_focus_and_gives_it_back(open_board: OpenBoard) -> None:
-    board = open_board()
-    board.click("Import, export")
-    assert board.page.evaluate("document.activeElement.id") == "json"
-    board.page.keyboard.press("Escape")
-    expect(board.page.locator("#file")).to_be_hidden()
-    assert focus(board) == "Import, export"

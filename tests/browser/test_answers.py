@@ -73,16 +73,6 @@ def test_missing_objects_are_listed_with_their_places(bedroom: Board, api: httpx
     assert set(bedroom.ghosts) <= {one["label"] for one in answer["missing"]}
 
 
-def test_a_double_click_adds_one_object(bedroom: Board) -> None:
-    before = len(bedroom.things)
-    bedroom.column("missing").get_by_role("button", name="Put ").first.dblclick()
-    bedroom.settle()
-    assert len(bedroom.things) == before + 1
-    bedroom.page.locator("#board .ghost rect").first.dblclick(force=True)
-    bedroom.settle()
-    assert len(bedroom.things) == before + 2
-
-
 def test_a_ghost_becomes_an_object_where_it_was_drawn(bedroom: Board) -> None:
     ghost = bedroom.page.locator("#board .ghost").first
     label = ghost.locator("text").text_content() or ""

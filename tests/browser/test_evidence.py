@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import httpx
 import pytest
 from playwright.sync_api import expect
@@ -51,17 +49,3 @@ def test_positions_that_the_page_chose_do_not_count(open_board: OpenBoard) -> No
     expect(board.page.locator("#list li").nth(2)).to_contain_text("position not given")
     board.press("monitor", "ArrowUp")
     assert placed(board) == ["desk", "chair", "monitor"]
-
-
-def test_stated_relations_are_evidence_in_place_of_positions(open_board: OpenBoard) -> None:
-    board = open_board()
-    given = [{"subject": "chair", "relation": "left", "object": "desk"}]
-    board.put(json.dumps(board.exported() | {"relations": given}))
-    assert not board.page.get_by_label(SWITCH).is_checked()
-    assert board.scene["relations"] == given
-    expect(board.page.locator("#evidence")).to_contain_text("labels and 1 stated relation only")
-    board.use_positions()
-    assert "relations" not in board.scene
-    assert placed(board) == ["desk", "chair"]
-    board.click("Undo")
-    assert board.scene["relations"] == given

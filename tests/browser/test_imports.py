@@ -12,7 +12,6 @@ from playwright.sync_api import expect
 
 from scene_client.vision_msgs import from_message
 from tests.browser.driving import OpenBoard
-from tests.client.test_command import NOT_FINITE
 
 pytestmark = pytest.mark.system
 
@@ -43,27 +42,6 @@ def test_detections_are_read_as_the_client_reads_them(
         if "size" in thing:
             assert rounded(shown[thing["id"]]["size"]) == rounded(thing["size"])
     assert page.get_by_label("Positions count as evidence").is_checked()
-
-
-def test_flat_boxes_and_numbers_that_json_lacks_are_read(open_board: OpenBoard) -> None:
-    board = open_board()
-    board.put(NOT_FINITE)
-    (thing,) = board.scene["objects"]
-    assert (thing["id"], thing["size"]) == ('"NaN', {"x": 2, "y": 3, "z": 0})
-    board.put(NOT_FINITE.replace('"x": 2, "y": 3', '"x": 0.0001, "y": 0'))
-    (thing,) = board.scene["objects"]
-    assert thing["size"]["x"] > 0.1
-
-
-def test_objects_with_foreign_ids_are_named_by_their_class(open_board: OpenBoard) -> None:
-    board = open_board()
-    things = {"track_3": "desk", "track_4": "bathtub", "desk_2": "desk"}
-    board.put(
-        json.dumps({"objects": [{"id": name, "label": label} for name, label in things.items()]})
-    )
-    assert board.things == ["desk (track_3)", "bathtub (track_4)", "desk_2"]
-    board.tab("Wrong")
-    assert any(row.startswith("bathtub (track_4) ") for row in board.rows("outliers"))
 
 
 def test_labels_supports_and_flat_detections_are_read(open_board: OpenBoard) -> None:

@@ -71,20 +71,6 @@ def test_objects_on_a_support_move_with_it(open_board: OpenBoard) -> None:
     assert place(board, "lamp") == pytest.approx((before[0], before[1] - 0.5, before[2]))
 
 
-@pytest.mark.slow
-def test_dragging_moves_and_snaps_and_can_be_undone(open_board: OpenBoard) -> None:
-    board = open_board()
-    board.tab("Wrong")  # where no suggestion lies over the chair
-    before = place(board, "chair", "outliers")
-    board.drag(board.thing("chair").locator(".box"), 61, 37)
-    snapped = place(board, "chair", "outliers")
-    assert snapped[0] < before[0]
-    assert snapped[1] < before[1]
-    assert all(round(20 * value) == pytest.approx(20 * value) for value in snapped[:2])
-    board.click("Undo")
-    assert place(board, "chair", "outliers") == before
-
-
 def test_numbers_can_be_typed(open_board: OpenBoard) -> None:
     board = open_board()
     board.page.get_by_role("button", name="chair", exact=False).first.click()
@@ -109,18 +95,6 @@ def test_numbers_can_be_typed(open_board: OpenBoard) -> None:
     assert field.get_attribute("aria-invalid") == "true"
     board.settle()
     assert board.body("missing")["objects"][1]["size"]["z"] == 1.1
-
-
-def test_missing_sizes_are_the_models(open_board: OpenBoard, api: httpx.Client) -> None:
-    board = open_board()
-    board.add("laptop")
-    words = api.get("/models/default/vocabulary").json()["objects"]
-    (typical,) = [entry["size"] for entry in words if entry["label"] == "laptop"]
-    board.press("laptop", "ArrowUp")
-    assert board.body("missing")["objects"][-1]["size"] == typical
-    expect(board.page.locator("#size-source")).to_have_text("(typical)")
-    shown = board.page.locator("#properties").get_by_label("along x").input_value()
-    assert float(shown) == pytest.approx(typical["x"], abs=1e-3)
 
 
 NO_SCENES: list[tuple[Any, str]] = [
@@ -180,13 +154,3 @@ def test_a_link_that_cannot_be_read_says_so(
     board = open_board(scene=None, url=f"{api.base_url}/#scene={link}")
     expect(board.page.get_by_role("alert").first).to_contain_text(words, timeout=5_000)
     assert board.things
-
-
-def test_labels_that_javascript_knows_are_labels_like_others(open_board: OpenBoard) -> None:
-    scene = {"objects": [{"label": name} for name in ("constructor", "__proto__", "bed")]}
-    board = open_board(scene, allow=("422",))
-    assert board.things == ["constructor", "__proto__", "bed"]
-    errors = board.page.locator("#list .error").all_text_contents()
-    assert errors[0] == "constructor not known, left out"
-    assert errors[1].startswith("__proto__ ")
-    assert errors[2] == ""

@@ -66,24 +66,6 @@ def ghost_at(
     return dict(ghost)
 
 
-def test_contents_and_low_objects_stand_in_a_footprint(open_board: OpenBoard) -> None:
-    fridge = box("fridge", 3, 1, 0, (0.7, 0.8, 1.8))
-    milk = box("milk", 3, 1, 0.5, (0.1, 0.1, 0.25))
-    board = open_board()
-    ghost = ghost_at(board, "inside", fridge, (0.1, 0.1, 0.25), offset=(0.2, -0.1, 0.3))
-    assert (ghost["x"], ghost["y"], ghost["z"]) == pytest.approx((3.2, 0.9, 1.075))
-    ghost = ghost_at(board, "inside", fridge, (0.1, 0.1, 0.25), offset=(0.6, 0, 0))
-    assert ghost["x"] == pytest.approx(3.3), "the wall of the fridge"
-    ghost = ghost_at(board, "contains", milk, (0.7, 0.8, 1.8), offset=(0.2, -0.1, -0.1))
-    assert (ghost["x"], ghost["y"]) == pytest.approx((3.2, 0.9))
-    assert ghost["z"] == 0
-    assert top(ghost) > top(milk)
-    # A low object stands between the legs of a desk.
-    desk = box("desk", 3, 0, 0, (0.8, 1.6, 0.74))
-    ghost = ghost_at(board, "under", desk, (0.3, 0.3, 0.4), offset=(0.2, -0.5, -0.17))
-    assert (ghost["x"], ghost["y"], ghost["z"]) == pytest.approx((3.2, -0.5, 0))
-
-
 def test_a_ghost_stands_where_the_answer_says(open_board: OpenBoard) -> None:
     bed, size, board = box("bed", 3, 0, 0, (2, 1.6, 0.5)), (0.4, 0.4, 0.2), open_board()
     for relation, offset in (
@@ -135,12 +117,6 @@ LAY_OUT = """async ([boxes, relations]) => {
 }"""
 
 
-MOVED = """async (things) => {
-  const { moved } = await import('./static/board/geometry.js');
-  return moved(things, 'fridge', 5, 5, (thing) => thing);
-}"""
-
-
 def test_a_layout_keeps_contents_in_their_container(open_board: OpenBoard) -> None:
     boxes = [
         box("milk", 0, 0, 0, (0.1, 0.1, 0.25)),
@@ -163,32 +139,6 @@ def test_a_layout_keeps_contents_in_their_container(open_board: OpenBoard) -> No
         assert one["z"] == fridge["z"]
     assert (milk["x"], milk["y"]) != (juice["x"], juice["y"])
     assert magnet["z"] == top(fridge)
-    # Contents move with their container.
-    boxes = [
-        box("fridge", 1, 1, 0, (0.7, 0.8, 1.8)),
-        box("milk", 1.1, 1, 0.5, (0.1, 0.1, 0.25)),
-        box("chair", 1.4, 1, 0, (0.5, 0.5, 0.9)),
-    ]
-    after = page.evaluate(MOVED, boxes)
-    places = [(one["x"], one["y"], one["z"]) for one in after]
-    assert places == [(5, 5, 0), (5.1, 5, 0.5), (1.4, 1, 0)]
-
-
-def test_improbable_objects_and_places_are_left_out(open_board: OpenBoard) -> None:
-    def improbable(answer: Any) -> Any:
-        first, second, *_ = answer["missing"]
-        for place in first["placements"]:
-            place["probability"] = 0.24
-        second["probability"] = 0.009
-        return answer | {"missing": [first, second], "more": []}
-
-    board = open_board()
-    board.alter("missing", improbable)
-    board.add("laptop")
-    (row,) = board.rows("missing")
-    assert row.count("%") == 1, "the probability of the object, and no place"
-    assert "no likely place" in row
-    assert board.ghosts == []
 
 
 def test_no_suggestion_stands_at_an_outlier(open_board: OpenBoard, api: httpx.Client) -> None:

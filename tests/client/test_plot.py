@@ -73,18 +73,6 @@ def test_every_object_is_drawn_once_and_only_contents_overlap_their_container(
             assert apart or nested, (one, other)
 
 
-def test_an_object_on_a_support_is_drawn_on_it() -> None:
-    found = boxes(
-        ["desk", "lamp", "book", "x"], ("lamp", "on-top", "desk"), ("desk", "under", "book")
-    )
-    desk = found["desk"]
-    for name in ("lamp", "book"):
-        assert found[name].y == desk.y + plot.HEIGHT
-        assert desk.x <= found[name].x
-        assert found[name].x + found[name].width <= desk.x + desk.width
-    assert boxes(["desk", "lamp"], ("lamp", "above", "desk"))["lamp"].y > desk.y + plot.HEIGHT
-
-
 def answer(*scenes: GeneratedScene) -> GenerateAnswer:
     model = ModelReference(name="home", version="1.0.0", variant="rbm", digest="0")
     return GenerateAnswer(model=model, request_id="r", seed=7, scenes=list(scenes))

@@ -112,31 +112,6 @@ def test_a_thing_in_the_wrong_place_does_not_belong(
     ]
 
 
-@pytest.mark.parametrize(
-    ("ports", "because"),
-    [
-        ({}, "there is no scene"),
-        ({"scene": "bed"}, "the scene is no JSON object"),
-        ({"scene": "[]"}, "the scene is no JSON object"),
-        ({"scene": "{}"}, "nothing was seen"),
-        ({"scene": '{"objects": []}'}, "nothing was seen"),
-    ],
-)
-def test_an_invalid_scene_fails_at_once(program: Path, ports: Any, because: str) -> None:
-    (found,) = tick(program, "http://127.0.0.1:9", "SceneComplete", ports)
-    assert (found["status"], found["because"]) == ("FAILURE", because)
-    assert not found["waited"]
-
-
-def test_after_a_halt_the_next_scene_is_asked_about(program: Path, url: str) -> None:
-    unknown = {"scene": '{"objects": ["unheard of"]}', "halt": True}
-    halted, found = tick(
-        program, url, "ObjectBelongs", unknown, {"scene": '{"objects": ["bed"]}', "object": "bed"}
-    )
-    assert halted == {"status": "HALTED"}
-    assert found["because"].startswith("bed ")
-
-
 def test_a_service_that_does_not_answer_fails_the_condition(program: Path) -> None:
     scene = {"scene": '{"objects": ["bed"]}'}
     with socket.create_server(("127.0.0.1", 0)) as server:  # accepts and never answers

@@ -6,12 +6,8 @@ import os
 import re
 import signal
 import subprocess
-import threading
-from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -147,45 +143,6 @@ def replicas(service: LiveService) -> set[int]:
     return {pid for pid, command in found if command.startswith("ray::ServeReplica")}
 
 
-def deploy(service: LiveService, config: dict[str, Any]) -> None:
-    """Send a configuration to the cluster, as `serve deploy` does."""
-    found = descendants(service.process.pid).items()
-    pid, command = next((pid, text) for pid, text in found if "--dashboard-port=" in text)
-    (port,) = re.findall(r"--dashboard-port=(\d+)", command)
-    (token,) = re.findall(rb"\0RAY_AUTH_TOKEN=(\w+)", Path(f"/proc/{pid}/environ").read_bytes())
-    response = httpx.put(
-        f"http://127.0.0.1:{port}/api/serve/applications/",
-        json=config,
-        headers={"Authorization": f"Bearer {token.decode()}"},
-        timeout=60,
-    )
-    assert response.is_success, response.text
-
-
-@contextmanager
-def load(service: LiveService, connections: int) -> Iterator[Counter[int]]:
-    """Ask on several connections without pauses; count the answers by status, 0 without one."""
-    statuses: Counter[int] = Counter()
-    ends = threading.Event()
-
-    def ask() -> None:
-        with httpx.Client(base_url=service.url, timeout=30) as client:
-            while not ends.is_set():
-                try:
-                    status = client.post("/missing", json=SCENE).status_code
-                except httpx.TransportError:
-                    status = 0
-                statuses[status] += 1
-
-    with ThreadPoolExecutor(connections) as threads:
-        for _ in range(connections):
-            threads.submit(ask)
-        try:
-            yield statuses
-        finally:
-            ends.set()
-
-
 @pytest.fixture(scope="module")
 def service(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
     log = tmp_path_factory.mktemp("ray") / "log"
@@ -229,27 +186,3 @@ def test_headers_and_problems_equal_those_of_the_plain_service(
     assert ours.json()["request_id"] == ours.headers["x-request-id"]
     different = {"request_id": "", "instance": ""}
     assert ours.json() | different == plain.json() | different
-
-
-@pytest.mark.slow
-def test_a_new_configuration_replaces_all_replicas_and_loses_nothing(
-    service: LiveService, config: dict[str, Any]
-) -> None:
-    before = replicas(service)
-    new = deepcopy(config)
-    new["http_options"]["port"] = service.port
-    deployment = new["applications"][0]["deployments"][0] | {"num_replicas": 2}
-    deployment.pop("autoscaling_config")
-    deployment["ray_actor_options"]["runtime_env"] = {"env_vars": {"SCENE_MAX_OBJECTS": "9"}}
-    new["applications"][0]["deployments"] = [deployment]
-    with load(service, 4) as statuses:
-        wait_until(lambda: statuses[200] > 100, seconds=30)
-        deploy(service, new)
-        wait_until(lambda: not replicas(service) & before, seconds=180)
-        count = statuses[200]
-        wait_until(lambda: statuses[200] > count + 100, seconds=30)
-    assert statuses.keys() == {200}
-    wait_until(lambda: len(replicas(service)) == 2, seconds=60)
-    for _ in range(10):
-        answer = service.client.post("/missing", json={"objects": ["bed"] * 10})
-        assert answer.status_code == 422, answer.text

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import importlib
 import json
-import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -178,15 +177,6 @@ def test_numbers_wait_for_their_labels(
     running.hear("label_info", new("LabelInfo", class_map=classes))
     answer = running.answer(recorded)
     assert {entry["label"] for entry in answer["outliers"]["outliers"]} == {"desk", "chair"}
-
-
-def test_labels_and_a_viewpoint_may_stand_in_the_parameters(run: Callable[..., Running]) -> None:
-    assert run(viewpoint=[1.0, 2.0, 0.5]).node.viewpoint == (1.0, 2.0, 0.5)
-    assert run(viewpoint=[math.nan] * 3).node.viewpoint is None
-    assert run(class_names=["desk", "chair"]).node.advisor.label_map == ["desk", "chair"]
-    assert run(label_map="coco").node.advisor.label_map == "coco"
-    with pytest.raises(ValueError, match="imagenet"):
-        run(label_map="imagenet")
 
 
 def test_a_pose_in_the_frame_of_the_detections_is_their_viewpoint(

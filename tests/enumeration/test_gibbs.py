@@ -18,7 +18,7 @@ from tests.enumeration.small_machines import (
     enumerate_joint,
     small_machine,
 )
-from training.machines.gibbs import Chains, draw_states, start_chains, sweep
+from training.machines.gibbs import Chains, draw_states, sweep
 
 CHAINS = 60_000
 
@@ -72,22 +72,3 @@ def test_states_are_drawn_with_their_probabilities(states):
     check_frequencies(drawn, np.arange(states), odds / odds.sum())
     assert bool((h1[:, -1] == 1).all())
     assert float(h1[:, states - 1 : -1].sum()) == 0
-
-
-def test_chains_start_at_scenes_without_impossible_classes():
-    machine = small_machine("gbm-states")
-    v = torch.ones(4000, 2).double()
-    chains = start_chains(
-        machine,
-        v,
-        torch.Generator().manual_seed(0),
-        room=torch.ones(4000, dtype=torch.int64),
-        possible=torch.tensor([True, False]).expand(4000, -1),
-    )
-    assert chains.v[:, 0].all()
-    assert not chains.v[:, 1].any()
-    assert set(chains.source.tolist()) == {-1}
-    # Five standard errors; fails by chance with probability < 2e-6.
-    _, m2 = machine.context(v[:1], torch.tensor([1]))
-    error = 5 * (m2 * (1 - m2) / 4000).sqrt()
-    assert bool(((chains.h2.mean(0) - m2).abs() <= error).all())

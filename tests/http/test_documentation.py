@@ -93,14 +93,6 @@ def operations(document: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]
     ]
 
 
-async def test_operations_have_stable_distinct_ids(document: dict[str, Any]) -> None:
-    names = [operation["operationId"] for _, _, operation in operations(document)]
-    assert len(set(names)) == len(names)
-    assert {"relations", "missing", "outliers", "rooms", "generate", "rooms_batch"} <= set(names)
-    assert {"refresh_models", "move_alias", "health_ready", "show_vocabulary"} <= set(names)
-    assert all(re.fullmatch(r"[a-z_]+", name) for name in names)
-
-
 async def test_errors_are_problems_and_nothing_else(document: dict[str, Any]) -> None:
     documented = set()
     assert not {"HTTPValidationError", "ValidationError"} & set(document["components"]["schemas"])

@@ -82,15 +82,6 @@ async def test_an_unreadable_alias_file_changes_nothing(store: Path) -> None:
         assert await ready(client) == 200
 
 
-async def test_a_service_without_a_usable_default_becomes_ready(store: Path) -> None:
-    aliases = (store / "aliases.json").read_bytes()
-    (store / "aliases.json").write_text("{")
-    async with serve(store, store_poll=POLL) as client:
-        assert await ready(client) == 503
-        (store / "aliases.json").write_bytes(aliases)
-        await until(client, ready, 200)
-
-
 async def test_without_polling_nothing_is_followed(store: Path, admin: dict[str, str]) -> None:
     async with serve(store, store_poll=0) as client:
         publish(store, "home", "2.0.0", seed=2, alias="default")

@@ -175,11 +175,3 @@ async def test_the_document_tells_where_a_key_is_needed(document: dict[str, Any]
         assert named == {kind, f"{kind}-as-bearer-token"}, path
         (content,) = operation["responses"]["401"]["content"].values()
         assert "unauthorized" in content["examples"]
-
-
-async def test_without_a_key_the_document_asks_for_none(client: httpx.AsyncClient) -> None:
-    document = (await client.get("/openapi.json")).json()
-    schemes = document["components"]["securitySchemes"]
-    assert set(schemes) == {"admin-key", "admin-key-as-bearer-token"}
-    for _, _, operation in operations(document):
-        assert ("security" in operation) == ("administration" in operation["tags"])

@@ -50,19 +50,6 @@ async def test_models_versions_and_aliases_are_listed(client: httpx.AsyncClient)
         assert model == {"name": "home", "versions": models["home"]}
 
 
-async def test_a_version_tells_everything(client: httpx.AsyncClient) -> None:
-    version = (await client.get("/models/home/versions/1.0.0")).json()
-    assert version["status"] == "ready"
-    assert version["aliases"] == ["default"]
-    assert version["metrics"][0] | {"low": 0.4, "high": 0.6} == version["metrics"][0]
-    assert version["data"][0]["source"] == "generated"
-    assert version["terms"] == "Apache-2.0"
-    assert version["card"].startswith("#")
-    assert version["parameters"] > 0
-    answer = await client.post("/relations", json={"objects": ["bed"], "model": "home@1.0.0"})
-    assert answer.json()["model"]["digest"] == version["digest"]
-
-
 async def test_the_vocabulary_tells_every_word(client: httpx.AsyncClient) -> None:
     words = (await client.get("/models/default/vocabulary")).json()
     assert [entry["label"] for entry in words["objects"]] == list(VOCABULARY.labels)
@@ -104,13 +91,6 @@ async def test_a_word_becomes_a_class(
     mapped = (await client.post("/missing", json=body)).json()["mapped"]
     expected = [] if rule in ("label", "alias", "phrase") else [(label, rule)]
     assert [(entry["class"], entry["rule"]) for entry in mapped] == expected
-
-
-async def test_an_unknown_word_has_suggestions(client: httpx.AsyncClient) -> None:
-    answer = (await client.get("/models/default/vocabulary/pillar")).json()
-    assert "class" not in answer
-    assert answer["suggestions"][0] == "pillow"
-    assert not answer["certain"]
 
 
 @pytest.mark.parametrize(

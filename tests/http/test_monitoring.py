@@ -15,7 +15,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from tests.conftest import REPOSITORY
-from tests.http.stores import corrupt, publish
+from tests.http.stores import publish
 from tests.http.test_problems import problem
 from tests.services import Hold, LiveService, Replace, defect, serve, wait_until
 
@@ -110,54 +110,6 @@ async def test_unknown_paths_and_methods_add_no_metrics(client: httpx.AsyncClien
     assert set(await samples(client)) == before
 
 
-async def test_work_is_measured_by_model_and_question(shared_store: Path) -> None:
-    async with serve(shared_store) as client:
-        for path in QUESTIONS:
-            body = {**SCENE, "model": "plain", "seed": 1}
-            body |= {"steps": 1} if path == "generate" else {}
-            assert (await client.post(f"/{path}", json=body)).status_code == 200
-        batch = {"scenes": [SCENE, {"objects": ["nosuchthing"]}, SCENE]}
-        assert (await client.post("/missing/batch", json=batch)).status_code == 200
-        found = await samples(client)
-    for question in QUESTIONS:
-        label = ("plain", question, "1.0.0")
-        assert found["scene_compute_duration_seconds_count", *label] == 1
-        assert found["scene_compute_duration_seconds_sum", *label] > 0
-        assert found["scene_batch_rows_sum", *label] == 1
-    assert found["scene_compute_duration_seconds_count", "home", "missing", "1.0.0"] == 2
-    assert found["scene_batch_entries_total", "success", "missing"] == 2
-    assert found["scene_batch_entries_total", "unknown-labels", "missing"] == 1
-    assert found["scene_serialisation_duration_seconds_count",] == 6
-    assert found["scene_serialisation_duration_seconds_sum",] > 0
-
-
-async def test_reloads_are_counted_by_outcome(own: httpx.AsyncClient, store: Path) -> None:
-
-    async def refresh() -> int:
-        return (await own.post("/models/refresh")).status_code
-
-    async def move(model: str) -> int:
-        url = "/models/aliases/default"
-        return (await own.put(url, json={"model": model})).status_code
-
-    assert await refresh() == 200
-    assert await move("home@1.1.0") == 200
-    assert await move("home@7.0.0") == 404
-    publish(store, "home", "2.0.0", seed=2)
-    corrupt(store, "home", "2.0.0")
-    assert await refresh() == 409
-    found = await samples(own)
-    led = [key[5] for key in found if key[:2] == ("scene_model_info", "default")]
-    assert led == ["1.1.0"]
-    reloads = {key[1:]: n for key, n in found.items() if key[0] == "scene_reloads_total"}
-    assert reloads == {
-        (change, outcome): float(change != "poll" and outcome != "failed")
-        for change in ("poll", "refresh", "alias")
-        for outcome in ("success", "refused", "failed")
-    }
-    assert found["scene_ready_time_seconds",] >= found["scene_start_time_seconds",] > 0
-
-
 async def test_metrics_can_be_switched_off(shared_store: Path) -> None:
     async with serve(shared_store, metrics=False) as client:
         assert (await client.post("/missing", json=SCENE)).status_code == 200
@@ -214,21 +166,6 @@ async def test_metrics_of_a_removed_model_disappear(
     await own.post("/models/refresh")
     assert await ask("plain") == 200
     assert (await samples(own))["scene_batch_rows_count", "plain", "missing", "1.0.0"] == 1
-
-
-async def test_a_process_without_a_default_is_not_ready(
-    tmp_path: Path, admin: dict[str, str]
-) -> None:
-    async with serve(tmp_path) as client:
-        found = await samples(client)
-        assert found["scene_start_time_seconds",] > 1.7e9
-        assert found["scene_ready_time_seconds",] == 0
-        publish(tmp_path, "home", "1.0.0", alias="default")
-        times = []
-        for _ in range(2):
-            assert (await client.post("/models/refresh", headers=admin)).status_code == 200
-            times.append((await samples(client))["scene_ready_time_seconds",])
-    assert times[0] == times[1] >= found["scene_start_time_seconds",]
 
 
 @pytest.mark.system

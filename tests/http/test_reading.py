@@ -63,20 +63,6 @@ async def test_objects_without_an_id_are_named_by_their_label(
     assert (await read(client, objects=objects))[0] == expected
 
 
-@drawn
-@given(
-    objects=st.lists(st.sampled_from(["chair", "lamp", {"label": "chair"}]), min_size=1),
-    own=st.sets(st.sampled_from(["chair", "chair_1", "chair_2", "lamp_1"])),
-)
-async def test_ids_are_always_distinct_and_given_ones_are_kept(
-    client: httpx.AsyncClient, objects: list[Any], own: set[str]
-) -> None:
-    named = [{"id": name, "label": "sofa"} for name in sorted(own)]
-    found, _ = await read(client, objects=[*objects, *named])
-    assert len(found) == len(objects) + len(own)
-    assert {name for name, label in found.items() if label == "sofa"} == own
-
-
 async def test_ids_win_over_labels_and_labels_are_read_in_any_spelling(
     client: httpx.AsyncClient,
 ) -> None:

@@ -8,7 +8,7 @@ import torch
 
 from app.inference.objects import ObjectScorer
 from app.inference.posterior import ScenePosterior, context_of
-from app.inference.relations import NEVER, NO_UNIT, ends_of, relation_units, to_log_odds
+from app.inference.relations import NEVER, NO_UNIT, relation_units, to_log_odds
 from tests.enumeration.small_machines import random_weights, unit_states
 from training.machines import MachineSpec, build
 from training.machines.arrays import weights_of
@@ -128,33 +128,3 @@ def test_probabilities_are_close_to_the_sum_over_all_states(name):
     # No relation is observed.
     np.testing.assert_array_equal(scene.alone_log_odds(), found)
     assert not scene.relation_change().any()
-
-
-def test_the_neglected_directions_have_little_variance():
-    """At most .016, as a mean over all units, where all states are equally likely."""
-    spec = MachineSpec("triway", V=30, A=2, units=8, states=6, K=12)
-    machine = random_weights(build(spec), torch.Generator().manual_seed(0), 0.3)
-    machine.c1.zero_()
-    units, n = relation_units(weights_of(machine)), np.arange(30)
-    pair = np.repeat(n, 30)[None], np.tile(n, 30)[None]
-    ends = ends_of(n, np.ones(30, np.float32), np.zeros(30, np.float32), *pair)
-    _, spread = units.normal(np.full((1, spec.H1), 1 / 6, np.float32), ends)
-    a = np.repeat(np.arange(2), 900)
-    U = units.context_weights(a, np.tile(pair[0][0], 2), np.tile(pair[1][0], 2))
-    by_unit = U.reshape(len(U), 8, 5).astype(float)
-    variance = ((by_unit**2).sum(2) / 6 - (by_unit.sum(2) / 6) ** 2).sum(1)
-    neglected = (variance - spread.ravel() ** 2 / 3).reshape(2, -1).mean(1)
-    assert (neglected > 1e-4).all()
-    assert (neglected < 0.016).all()
-
-
-@pytest.mark.parametrize("name", SPECS)
-def test_context_weights_are_the_slopes_of_the_logits(name):
-    machine = machine_of(name)
-    units = relation_units(weights_of(machine))
-    edges = machine.double().edges(torch.arange(V)[None])
-    ends = [part[0].numpy() for part in (edges.relation, edges.subject, edges.object)]
-    h1 = torch.eye(machine.spec.H1).double()
-    v = torch.ones(len(h1), V).double()
-    slope = machine.relation_logits(edges, v, h1) - machine.relation_logits(edges, v, 0 * h1)
-    np.testing.assert_allclose(units.context_weights(*ends), slope.T, rtol=1e-4, atol=1e-5)

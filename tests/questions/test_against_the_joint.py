@@ -274,31 +274,3 @@ def test_misplaced(case, classes, stated):
         triple = (CANONICAL.index(entry.relation), classes[entry.subject], classes[entry.object])
         p = exact.relation(triple, classes, [other for other in observed if other != triple])
         assert entry.probability == pytest.approx(1 - p, abs=TOLERANCE)
-
-
-@pytest.mark.parametrize("name", EXACT)
-@pytest.mark.parametrize("threshold", [0.0, 1.0])
-def test_reasons(name, threshold):
-    """The change of an object's log-odds by each other object."""
-    artifact, exact = exact_case(name)
-    classes = [0, 1, 2]
-    for entry in outliers(artifact, scene_of(classes), threshold=threshold).outliers:
-        changes = exact.changes(classes[entry.object], classes)
-        sign = -1 if entry.is_outlier else 1
-        expected = {j: change for j, change in changes.items() if sign * change > 0}
-        reasons = {reason.object: reason.log_odds_change for reason in entry.because}
-        assert reasons == close(expected)
-        sizes = [abs(reason.log_odds_change) for reason in entry.because]
-        assert sizes == sorted(sizes, reverse=True)
-
-
-@pytest.mark.parametrize("name", EXACT)
-@pytest.mark.parametrize("classes", [[0], [2, 0], [1, 2], [1, 1, 2]])
-def test_reasons_for_missing_objects(name, classes):
-    """The change by each listed class. The first object of the class stands for it."""
-    artifact, exact = exact_case(name)
-    for entry in missing(artifact, scene_of(classes)):
-        changes = exact.changes(LABELS.index(entry.label), classes)
-        expected = {classes.index(j): change for j, change in changes.items()}
-        reasons = {reason.object: reason.log_odds_change for reason in entry.because}
-        assert reasons == close(expected)

@@ -61,9 +61,3 @@ def test_the_evidence_stays_and_excludes_other_relations(drawn, evidence):
         assert all({*ends} != {*other[1:]} for other in evidence)
     if is_possible(evidence):
         assert is_possible(stay | evidence)
-
-
-@given(DRAWN, st.lists(st.booleans(), min_size=V, max_size=V))
-def test_structure_has_no_relations(drawn, structure):
-    others = {t: z for t, z in drawn.items() if not (structure[t[1]] or structure[t[2]])}
-    assert kept(drawn, structure=structure) == kept(others)

@@ -88,13 +88,3 @@ def test_an_early_stop_leaves_the_likeliest_classes_as_they_are(monkeypatch, mac
     for entry, other in zip(some, every, strict=False):
         assert entry[1:] == pytest.approx(other[1:], rel=1e-5)
     assert top_k <= len(scored) == len(set(scored)) <= len(every)
-
-
-def test_classes_far_below_the_bound_are_not_scored(monkeypatch):
-    """The counts alone decide."""
-    fits = (PlaceFit(relation=0.01, counts=100.0),) * 5
-    artifact = larger_artifact("triway", at=fits)
-    scored = count_scored(monkeypatch)
-    (entry,) = missing(artifact, scene_of([2]), at=("on-top", 0), top_k=1)
-    assert entry.label == "lamp"
-    assert scored == [LABELS.index("lamp")]

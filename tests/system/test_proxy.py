@@ -302,19 +302,6 @@ def test_the_proxy_answers_503_without_a_ready_service(
 # ---------------------------------------------------------------------------- configuration
 
 
-def test_the_compose_file_puts_the_proxy_in_front(
-    repository: Path, compose: dict[str, Any], configuration: Path
-) -> None:
-    proxy, scene = compose["services"]["proxy"], compose["services"]["scene"]
-    (mounted,) = proxy["volumes"]
-    source, _, target = mounted.removesuffix(":ro").partition(":")
-    assert (repository / source).samefile(configuration.parent)
-    assert target == "/usr/local/etc/haproxy"
-    assert mounted.endswith(":ro")
-    listening = configuration.read_text("utf-8")
-    assert f"${{PROXY_BACKEND-scene:{scene['environment']['SCENE_PORT']}}}" in listening
-
-
 def test_the_proxy_leaves_the_service_room_for_health_checks(configuration: Path) -> None:
     text = configuration.read_text("utf-8")
     (most,) = [int(line.split(" maxconn ")[1].split()[0])
