@@ -50,13 +50,6 @@ async def test_the_answer_to_a_batch_has_a_limit(client: httpx.AsyncClient) -> N
     assert "Lower `top_k`" in last["errors"][0]["message"]
 
 
-async def test_the_largest_single_question_is_answered(client: httpx.AsyncClient) -> None:
-    answer = await client.post("/relations", json=scene(256, **LARGEST))
-    assert answer.status_code == 200
-    assert len(answer.json()["relations"]) == 4096
-    assert len(answer.content) < LIMIT
-
-
 def crowd(objects: int, letter: str = "😀") -> dict[str, Any]:
     """Objects that all stand beside each other."""
     found = scene(objects, letter)
@@ -75,20 +68,17 @@ def crowd(objects: int, letter: str = "😀") -> dict[str, Any]:
         ("outliers", "x", {"frame_id": "f" * 256}, "objects"),
     ],
 )
-@pytest.mark.parametrize("model", ["home", "plain", "deep"])
 async def test_single_answers_have_the_same_limit(
     limited: httpx.AsyncClient,
     question: str,
     letter: str,
     options: dict[str, Any],
     parameter: str,
-    model: str,
 ) -> None:
     """Whatever it is made of: the largest scene that is answered has an answer within the limit."""
 
     async def ask(objects: int) -> httpx.Response:
-        body = {**crowd(objects, letter), **options, "model": model}
-        return await limited.post(f"/{question}", json=body)
+        return await limited.post(f"/{question}", json=crowd(objects, letter) | options)
 
     await check_the_largest(ask, 128, parameter)
 

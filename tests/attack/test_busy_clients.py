@@ -24,18 +24,8 @@ from tests.services import LiveService, launch, live_service, wait_until
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 
 LABELS = [
-    "bed",
-    "nightstand",
-    "lamp",
-    "pillow",
-    "window",
-    "curtain",
-    "dresser",
-    "mirror",
-    "picture",
-    "rug",
-    "chair",
-    "book",
+    *("bed", "nightstand", "lamp", "pillow", "window", "curtain"),
+    *("dresser", "mirror", "picture", "rug", "chair", "book"),
 ]
 SCENE = {"objects": LABELS}
 SECONDS = 3.0

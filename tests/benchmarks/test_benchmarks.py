@@ -18,10 +18,7 @@ from benchmarks.__main__ import main
 from benchmarks.gibbs import gibbs
 from benchmarks.log_odds import log_odds
 from benchmarks.report import Result, describe_machine, document
-from benchmarks.scaling import scaling
-from benchmarks.service import MISSING, service
 from benchmarks.training import training_step
-from tests.http.stores import make_store
 
 
 def check_complete(result: Result, rounds: int) -> None:
@@ -67,33 +64,6 @@ def test_log_odds_agree_with_those_of_the_yardstick():
     result = log_odds(V=30, H=12, objects=5, rounds=2)
     check_complete(result, 2)
     assert result.facts["largest difference from scikit-learn"] < 1e-4
-
-
-@pytest.mark.slow
-@pytest.mark.system
-def test_scaling():
-    results = scaling(classes=(20, 45), units=3, states=4, K=3, N=8, objects=4, rounds=2)
-    for result in results:
-        check_complete(result, 2)
-    assert [result.name.split()[1] for result in results] == [
-        "relations",
-        "missing",
-        "outliers",
-        "rooms",
-        "generate",
-    ]
-    sizes = [value for name, value in results[0].facts.items() if name.endswith("artifact in MB")]
-    assert sizes[0] < sizes[1]
-
-
-@pytest.mark.slow
-@pytest.mark.system
-def test_service(tmp_path):
-    started, asked = service(store=make_store(tmp_path), objects=3, requests=5, rounds=1)
-    check_complete(started, 1)
-    check_complete(asked, 5)
-    assert asked.subject == MISSING
-    assert asked.facts["model"] == "home 1.0.0 (triway)"
 
 
 def test_command_says_what_it_skips_and_writes_the_rest(tmp_path):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -64,29 +63,3 @@ def test_labels_supports_and_flat_detections_are_read(open_board: OpenBoard) -> 
     assert board.scene["objects"] == [
         {"id": f"mug_{number}", "label": "mug", "confidence": 0.5} for number in (1, 2)
     ]
-
-
-def test_one_of_several_scenes_is_chosen(open_board: OpenBoard) -> None:
-    request = {"objects": ["desk", "monitor"], "room_type": "office"}
-    annotated = {
-        "scene_id": "bench-3",
-        "objects": [
-            {"id": 0, "label": "table", "position": [2.0, 0.5, 0.4], "size": [1.6, 0.8, 0.8]},
-            {"id": 1, "label": "mug"},
-        ],
-        "relations": [[1, "on-top", 0]],
-    }
-    lines = "\n".join(json.dumps(scene) for scene in (request, annotated))
-    board = open_board()
-    board.put(lines)
-    assert board.things == ["desk", "monitor"]
-    board.click("Import, export")
-    board.page.get_by_label("Scene, JSON").fill(lines)
-    expect(board.page.locator("#scenes")).to_have_text("of 2")
-    board.page.locator("#which").fill("2")
-    board.click("Put on the board")
-    # The mug has no position, so the relations count and the positions only place the table.
-    assert board.scene["objects"] == [{"id": label, "label": label} for label in ("table", "mug")]
-    assert board.scene["relations"] == [{"subject": "mug", "relation": "on-top", "object": "table"}]
-    expect(board.thing("table")).to_have_accessible_name(re.compile("2.0 m ahead, 0.5 m left"))
-    expect(board.thing("mug")).to_have_accessible_name(re.compile("on table"))

@@ -94,20 +94,6 @@ def test_unknown_names_are_mapped_or_left_out_visibly(open_board: OpenBoard) -> 
     assert board.rows("missing")
 
 
-def test_a_renamed_object_keeps_its_id_and_relations(open_board: OpenBoard) -> None:
-    scene = {
-        "objects": ["fridgee", {"id": "7", "label": "tabel"}, "fridge"],
-        "relations": [["fridgee", "left", "7"]],
-    }
-    board = open_board(scene, allow=("422",))
-    board.click("Rename fridgee to fridge")
-    board.click("Rename tabel to table")
-    found = [(one["id"], one["label"]) for one in board.scene["objects"]]
-    assert found == [("fridge_2", "fridge"), ("7", "table"), ("fridge", "fridge")]
-    stated = {"subject": "fridge_2", "relation": "left", "object": "7"}
-    assert board.scene["relations"] == [stated]
-
-
 def test_two_models_answer_about_their_common_classes(
     open_board: OpenBoard, own: LiveService
 ) -> None:

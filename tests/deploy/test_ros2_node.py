@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 
-from scene_client import Client, UnreachableError
+from scene_client import UnreachableError
 from scene_client.vision_msgs import SceneFields
 from tests.client.peers import Peer, answering
 from tests.client.ros_messages import blank
@@ -142,20 +142,6 @@ def test_no_callback_waits_and_only_the_newest_detections_are_asked_about(
     assert first.message == "UnreachableError: gone"
     assert [entry.value for entry in first.values] == ["2"]
     assert running.published("~/answers") == []
-
-
-def test_an_unreachable_service_is_diagnosed_until_it_returns(
-    run: Callable[..., Running], live: LiveService, recorded: Any
-) -> None:
-    running = run(url="http://127.0.0.1:9", timeout=0.5)
-    running.hear("detections", recorded)
-    running.wait_for("/diagnostics")
-    assert running.status().level == 2
-    assert running.status().message.startswith(("UnreachableError", "DeadlineError"))
-    with Client(live.url, timeout=20.0) as client:
-        running.node.advisor.client = client
-        running.answer(recorded)
-    assert running.status().level == 0
 
 
 def test_numbers_wait_for_their_labels(

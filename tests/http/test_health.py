@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
 
 from app import __version__
 from app.main import create_app
-from app.registry import AliasTarget, Store
 from app.settings import Settings
 from tests.http.stores import corrupt
 from tests.http.test_problems import problem
-from tests.services import NAMED, LiveService, Replace, defect, serve
+from tests.services import NAMED, LiveService, serve
 
 READY = ["/health/ready", "/v2/health/ready", "/v2/models/default/ready"]
 
@@ -102,33 +100,6 @@ async def test_another_broken_version_is_listed_as_refused(store: Path) -> None:
         problem(await client.post("/relations", json=body), 503, "model-unavailable")
         for path in ("models/plain/vocabulary", "models/plain/contexts", "v2/models/plain/ready"):
             problem(await client.get(f"/{path}"), 503, "model-unavailable")
-
-
-async def test_a_name_means_the_newest_usable_version(store: Path, replace: Replace) -> None:
-    """An alias of a name too. Health and the list of models tell which version is refused."""
-
-    def fails(outliers: Any, artifact: Any, scene: Any, **parameters: Any) -> Any:
-        if artifact.manifest.version == "1.1.0":
-            defect()
-        return outliers(artifact, scene, **parameters)
-
-    Store(store).set_alias("newest", AliasTarget(name="home"))
-    replace("outliers", fails)
-    async with serve(store) as client:
-        for model, status in (("home", 200), ("newest", 200), ("home@1.1.0", 503)):
-            answer = await client.post("/relations", json={"objects": ["bed"], "model": model})
-            assert answer.status_code == status
-            assert status == 503 or answer.json()["model"]["version"] == "1.0.0"
-        listed = (await client.get("/models")).json()
-        ready = await client.get("/health/ready")
-        assert ready.status_code == 200
-        for failures in (listed["failures"], ready.json()["failures"]):
-            reasons = {failure["subject"]: failure["reason"] for failure in failures}
-            # The alias `candidate` names this very version.
-            assert reasons == dict.fromkeys(("home@1.1.0", "candidate"), "warm_up_failed")
-        newest, other = (await client.get("/models/home")).json()["versions"]
-        assert (newest["status"], newest["reason"]) == ("refused", "warm_up_failed")
-        assert other["aliases"] == ["default", "newest"]
 
 
 async def test_an_empty_store_is_not_ready(tmp_path: Path, admin: dict[str, str]) -> None:

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from app.inference.objects import ObjectScorer
-from app.inference.posterior import ScenePosterior, context_of
-from app.inference.relations import NEVER, NO_UNIT, relation_units, to_log_odds
+from app.inference.posterior import context_of
+from app.inference.relations import NEVER, relation_units, to_log_odds
 from tests.enumeration.small_machines import random_weights, unit_states
 from training.machines import MachineSpec, build
 from training.machines.arrays import weights_of
@@ -110,21 +109,3 @@ def test_mean_and_variance_are_those_over_all_states_of_h1(name, room):
         np.testing.assert_allclose(back[0], expected[:, CLASSES, candidate], atol=2e-3)
         one, _ = units.placement_log_odds(context, np.array([candidate]), np.arange(3), only=1)
         np.testing.assert_allclose(one[0, 0], out[0, 1], rtol=1e-6)
-
-
-@pytest.mark.parametrize("name", SPECS)
-def test_probabilities_are_close_to_the_sum_over_all_states(name):
-    """The logit of a few units is not normal: the probability has an error of at most .02."""
-    machine = machine_of(name, scale=0.6)
-    v, weights, context = scene_of(machine, 0)
-    scene = ScenePosterior(ObjectScorer(weights), relation_units(weights), context)
-    found = scene.relation_log_odds()
-    grid, p = exact_logits(machine.double(), v, 0)
-    exact = torch.einsum("s,saij->aij", p, grid.sigmoid())[np.ix_(range(A), CLASSES, CLASSES)]
-    assert float(np.abs(sigmoid(found.astype(float)) - exact.numpy()).max()) < 0.02
-    assert (found >= NO_UNIT).all()
-    if name in ("rbm", "gbm"):
-        assert (found == NO_UNIT).any()
-    # No relation is observed.
-    np.testing.assert_array_equal(scene.alone_log_odds(), found)
-    assert not scene.relation_change().any()

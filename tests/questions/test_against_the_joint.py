@@ -197,19 +197,6 @@ def test_placements(case, classes, stated):
             assert place.probability == pytest.approx(p, abs=TOLERANCE)
 
 
-@pytest.mark.parametrize("relation", ["left", "right"])
-@pytest.mark.parametrize("anchor", [0, 1, 2])
-def test_missing_at_a_place(case, relation, anchor):
-    """With the neutral calibration: the log-odds of the class and the log of p(r_e = 1)."""
-    artifact, exact = case
-    for entry in missing(artifact, scene_of([anchor]), at=(relation, 0)):
-        i = LABELS.index(entry.label)
-        triple = (0, i, anchor) if relation == "left" else (0, anchor, i)
-        p = max(exact.relation(triple, [anchor, i]), math.exp(-30))
-        z = exact.object(i, [anchor]) + exact.kappa(i, 0.5)
-        assert entry.probability == pytest.approx(sigmoid(z + math.log(p)), abs=TOLERANCE)
-
-
 @pytest.mark.parametrize(("classes", "stated"), SCENES[2:])
 def test_relations(case, classes, stated):
     """The probability of each relation, made exclusive. A stated relation holds."""

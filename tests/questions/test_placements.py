@@ -14,7 +14,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import logit
 
-from app.questions import placements
 from app.questions.placements import held_objects, offsets_of
 from app.questions.posterior import Posterior
 from app.registry import CountSlope, Offsets
@@ -214,34 +213,6 @@ def test_relations_that_training_never_shows_are_lowered_by_the_stand_of_the_sub
 
 
 # ------------------------------------------------------------------------------- what fits inside
-
-
-def test_a_box_fits_into_a_box_with_larger_extents_in_order_of_size():
-    """20 % of tolerance. The size of an object replaces the typical size of its class."""
-    sizes = {"bed": (2.0, 1.5, 0.5), "lamp": (0.2, 0.2, 0.5), "shelf": (0.3, 1.0, 2.0)}
-    vocabulary = Vocabulary([ObjectClass(label, size=sizes.get(label)) for label in LABELS[:V]])
-    artifact = replace(ARTIFACT, vocabulary=vocabulary)
-    bed, lamp, shelf, vase = 0, 1, 6, 5
-    objects = (
-        SceneObject("shelf", "shelf", shelf),
-        SceneObject("box", "shelf", shelf, size=(0.45, 0.18, 0.18)),
-        SceneObject("narrow", "shelf", shelf, size=(3.0, 3.0, 0.16)),
-        SceneObject("unknown", "vase", vase),
-    )
-    candidates = np.array([bed, lamp, vase])
-    classes = np.array([thing.class_index for thing in objects])
-    too_large = placements._too_large(artifact, objects, candidates, classes)
-    into, around = (~mask for mask in too_large)
-    assert into.tolist() == [
-        [False, False, False, True],
-        [True, True, False, True],
-        [True, True, True, True],
-    ]
-    assert around.tolist() == [
-        [True, True, False, True],
-        [False, True, False, True],
-        [True, True, True, True],
-    ]
 
 
 @pytest.mark.usefixtures("without_minimums")

@@ -146,17 +146,6 @@ def test_refuses_a_missing_field() -> None:
             Manifest.from_bytes(resign(json.dumps(members).encode()))
 
 
-def test_examples_are_read_back() -> None:
-    example = {"name": "A room", "scene": {"objects": ["bed", {"label": "desk lamp", "id": "a"}]}}
-    described = manifest(examples=[example])
-    read = Manifest.from_bytes(described.to_bytes())
-    assert read == described
-    assert read.examples[0].request() == {
-        "objects": [{"label": "bed"}, {"label": "desk lamp", "id": "a"}]
-    }
-    assert Manifest.from_bytes(manifest().to_bytes()).examples == ()
-
-
 @pytest.mark.parametrize(
     "change",
     [
