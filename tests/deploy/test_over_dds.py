@@ -7,13 +7,13 @@ import json
 import os
 from collections.abc import Iterator
 from importlib import import_module
+from itertools import count
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from tests.client.ros_messages import blank, to_json
+from tests.client.ros_messages import blank, filled, to_json
 from tests.deploy.ros import STORE
 from tests.services import LiveService, wait_until
 
@@ -40,26 +40,9 @@ def test_the_definitions_are_those_of_ros() -> None:
     assert {kind: STORE.hash_rihs01(name) for kind, name in names.items()} == ros.TYPE_HASHES
 
 
-def filled(name: str, numbers: Iterator[int], length: int) -> Any:
-    """A message in which every field has another value, and every list this length."""
-    fields: dict[str, Any] = {}
-    for field, (kind, detail) in STORE.fielddefs[name][1]:
-        if int(kind) == 2:
-            fields[field] = filled(detail, numbers, length)
-        elif int(kind) == 3:
-            fields[field] = np.array([next(numbers) / 8 for _ in range(detail[1])])
-        elif int(kind) == 4:
-            fields[field] = [filled(detail[0][1], numbers, length) for _ in range(length)]
-        else:
-            number = next(numbers)
-            values = {"string": "é" * (number % 7), "float64": number / 8}
-            fields[field] = values.get(detail[0], number)
-    return STORE.types[name](**fields)
-
-
 @pytest.mark.parametrize("length", [0, 1, 3])
 def test_every_field_has_the_bytes_of_ros(length: int) -> None:
-    message = filled(ARRAY, iter(range(1, 10_000)), length)
+    message = filled(STORE, ARRAY, (number / 8 for number in count()), length)
     read = ros.Detection3DArray.deserialize(written(message))
     assert dataclasses.asdict(read) == to_json(message)
     assert read.serialize() == written(message)
