@@ -9,6 +9,7 @@ import io
 import json
 import math
 
+import httpx
 import pytest
 import typer
 from rich.console import Console
@@ -16,7 +17,10 @@ from typer.testing import CliRunner
 
 from benchmarks.__main__ import main
 from benchmarks.gibbs import gibbs
+from benchmarks.load import plain
+from benchmarks.load.questions import KINDS, bodies
 from benchmarks.log_odds import log_odds
+from benchmarks.queueing import erlang_c, mean_wait, replicas_for
 from benchmarks.report import Result, describe_machine, document
 from benchmarks.training import training_step
 
@@ -77,3 +81,37 @@ def test_command_says_what_it_skips_and_writes_the_rest(tmp_path):
     written = json.loads(path.read_text())
     assert written["results"] == []
     assert written["machine"]["cores"] >= 1
+
+
+LABELS = [f"thing {number}" for number in range(40)]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+async def test_the_yardstick_validates_and_sends_the_prepared_answer(kind: str) -> None:
+    transport = httpx.ASGITransport(plain.app)
+    async with httpx.AsyncClient(transport=transport, base_url="http://plain") as client:
+        scene = bodies(kind, LABELS)[0]
+        for question in ("missing", "relations", "outliers", "rooms"):
+            answer = f'{{"{question}":[]}}'.encode()
+            await client.put(f"/answers/{question}", content=answer)
+            found = await client.post(f"/{question}", json=scene)
+            assert (found.status_code, found.content) == (200, answer)
+            refused = await client.post(f"/{question}", json={"objects": 1})
+            assert refused.status_code == 422
+
+
+def test_one_and_two_servers_are_the_textbook_formulas() -> None:
+    for load in (0.1, 0.5, 0.9):
+        assert erlang_c(1, load) == pytest.approx(load)
+        assert mean_wait(load, 1.0, 1) == pytest.approx(load / (1 - load))
+    assert erlang_c(2, 1.0) == pytest.approx(1 / 3)
+    assert erlang_c(2, 1.5) == pytest.approx(9 / 14)
+
+
+def test_many_servers_are_sized() -> None:
+    replicas = replicas_for(100_000, 1e-3, 1e-3, share=0.8)
+    assert replicas == 125
+    assert mean_wait(100_000, 1e-3, replicas) < 1e-6
+    assert replicas_for(900, 1e-3, 3e-4) == 2
+    with pytest.raises(ValueError, match="servers"):
+        erlang_c(2, 2.0)

@@ -13,7 +13,7 @@ import httpx
 import pytest
 from playwright.sync_api import expect
 
-from tests.browser.driving import Board, OpenBoard, percent
+from tests.browser.driving import Board, OpenBoard, body_of, percent
 from tests.conftest import run_program
 
 pytestmark = pytest.mark.system
@@ -262,3 +262,87 @@ def test_the_calls_shown_give_the_answer_shown_and_can_be_copied(
     board.column("missing").get_by_role("button", name="Copy the curl call").click()
     expect(board.column("missing").get_by_text("copied")).to_be_visible()
     assert board.page.evaluate("navigator.clipboard.readText()") == board.curl("missing")
+
+
+# ------------------------------------------------------------------------------------- drawn scenes
+
+
+def draw(board: Board) -> None:
+    board.click("Generate a scene")
+    expect(board.page.locator("#draft")).to_be_visible()
+    board.settle()
+
+
+def request(board: Board) -> dict[str, Any]:
+    return body_of(board.page.locator("#drawn pre").first.text_content() or "")
+
+
+@pytest.mark.slow
+def test_a_drawn_scene_is_the_service_s_and_can_be_kept(
+    open_board: OpenBoard, api: httpx.Client
+) -> None:
+    board = open_board()
+    board.page.locator("#room").select_option("kitchen")
+    board.tab("Generate")
+    seen = []
+    for seed in (1, 2):
+        draw(board)
+        body = request(board)
+        assert (body["seed"], body["room_type"], body["objects"]) == (seed, "kitchen", [])
+        (scene,) = api.post("/generate", json=body).json()["scenes"]
+        assert board.page.locator("#drawn .chips li").all_text_contents() == scene["objects"]
+        shown = board.page.locator("#board .object").all()
+        names = {str(one.get_attribute("aria-label")).split(",")[0] for one in shown}
+        assert names == set(scene["objects"]) == set(board.things)
+        seen.append(board.page.locator("#drawn .chips li").all_text_contents())
+    assert seen[0] != seen[1]
+    board.click("Keep")
+    assert board.things == seen[1]
+    assert board.scene["room_type"] == "kitchen"
+    # The page placed these objects, so their positions do not count.
+    assert not any("position" in thing for thing in board.scene["objects"])
+    board.click("Undo")
+    assert board.things == ["desk", "chair"]
+
+
+# -------------------------------------------------------------------------------------- suggestions
+
+
+def test_a_suggestion_at_another_place_or_none_says_so(open_board: OpenBoard) -> None:
+    far = {"mean": {"x": 9.0, "y": 0.0, "z": 0.5}, "std": dict.fromkeys("xyz", 0.2), "scenes": 9}
+    place = {"relation": "on-top", "object": "desk", "probability": 0.9, "offset": far}
+    board = open_board()
+    board.alter(
+        "missing",
+        lambda answer: (
+            answer | {"missing": [answer["missing"][0] | {"label": "cup", "placements": [place]}]}
+        ),
+    )
+    board.add("laptop")
+    assert "drawn at the nearest free place" in board.rows("missing")[0]
+    ghost = board.page.locator("#board .ghost").first
+    assert "drawn at the nearest free place" in str(ghost.get_attribute("aria-label"))
+    far["mean"]["x"] = 0.0
+    board.add("lamp")
+    assert board.ghosts == ["cup"]
+    assert "nearest free place" not in board.rows("missing")[0]
+    # Below the desk, there is no free place.
+    place["relation"] = "below"
+    del place["offset"]
+    board.add("mug")
+    assert board.ghosts == []
+    assert "no free place on the board" in board.rows("missing")[0]
+    assert board.column("missing").get_by_role("button", name="Put ").count() == 0
+
+
+def test_no_suggestion_stands_at_an_outlier(open_board: OpenBoard, api: httpx.Client) -> None:
+    board = open_board({"objects": ["bed", "nightstand", "lamp", "toilet"]})
+    (toilet,) = [
+        one["object"]
+        for one in api.post("/outliers", json=board.scene).json()["outliers"]
+        if one["is_outlier"]
+    ]
+    missing = api.post("/missing", json=board.scene | {"top_k": 5}).json()["missing"]
+    places = [place for one in missing for place in one["placements"]]
+    assert any(place["object"] == toilet and place["probability"] >= 0.25 for place in places)
+    assert not any(re.search(rf"{toilet} \d+ %", row) for row in board.rows("missing"))

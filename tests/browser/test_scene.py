@@ -5,12 +5,14 @@ from __future__ import annotations
 import base64
 import json
 import zlib
+from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 from playwright.sync_api import expect
 
+from scene_client.vision_msgs import from_message
 from tests.browser.driving import Board, OpenBoard
 
 pytestmark = pytest.mark.system
@@ -154,3 +156,100 @@ def test_a_link_that_cannot_be_read_says_so(
     board = open_board(scene=None, url=f"{api.base_url}/#scene={link}")
     expect(board.page.get_by_role("alert").first).to_contain_text(words, timeout=5_000)
     assert board.things
+
+
+# ----------------------------------------------------------------------------------------- evidence
+
+
+SWITCH = "Positions count as evidence"
+
+
+def placed(board: Board) -> list[str]:
+    """Objects whose position the request contains."""
+    return [thing["id"] for thing in board.scene["objects"] if "position" in thing]
+
+
+def test_positions_count_only_when_switched_on(open_board: OpenBoard, api: httpx.Client) -> None:
+    board = open_board(scene=None)
+    says = board.page.locator("#evidence")
+    expect(says).to_contain_text("The answers use labels only.")
+    assert placed(board) == []
+    labels = {"objects": [thing["label"] for thing in board.scene["objects"]]}
+    alone = api.post("/missing", json=labels | {"room_type": "bedroom", "top_k": 5}).json()
+    rows = [row for row in board.rows("missing") if not row.startswith("another ")]
+    assert len(rows) == len(alone["missing"])
+    for row, one in zip(rows, alone["missing"], strict=True):
+        assert row.startswith(one["label"])
+    board.use_positions()
+    assert placed(board) == board.things
+    expect(says).to_contain_text("positions of 5 of 5 objects")
+    assert api.post("/relations", json=board.scene).json()["observed_relations"]
+
+
+def test_positions_that_the_page_chose_do_not_count(open_board: OpenBoard) -> None:
+    board = open_board()
+    assert board.page.get_by_label(SWITCH).is_checked()
+    board.add("monitor")
+    board.page.locator("#board .ghost").first.press("Enter")
+    board.settle()
+    expect(board.page.locator("#board .object.loose")).to_have_count(2)
+    assert placed(board) == ["desk", "chair"]
+    board.page.locator("#list .name", has_text="monitor").click()
+    expect(board.page.locator("#properties")).to_contain_text("Centre, metres (not given)")
+    expect(board.page.locator("#evidence")).to_contain_text("positions of 2 of 4 objects")
+    expect(board.page.locator("#list li").nth(2)).to_contain_text("position not given")
+    board.press("monitor", "ArrowUp")
+    assert placed(board) == ["desk", "chair", "monitor"]
+
+
+# ------------------------------------------------------------------------- imported scenes
+
+
+def rounded(value: Any) -> Any:
+    """A scene with numbers rounded to centimetres."""
+    if isinstance(value, dict):
+        return {name: rounded(part) for name, part in value.items()}
+    return round(value, 2) if isinstance(value, float) else value
+
+
+def test_detections_are_read_as_the_client_reads_them(
+    open_board: OpenBoard, repository: Path
+) -> None:
+    file = repository / "clients" / "ros2" / "detections.json"
+    fields = from_message(json.loads(file.read_text("utf-8")))
+    board = open_board()
+    page = board.page
+    page.get_by_role("button", name="Import, export").click()
+    page.get_by_label("Open a file").set_input_files(file)
+    expect(page.get_by_label("Scene, JSON")).to_have_value(file.read_text("utf-8"))
+    board.click("Put on the board")
+    shown = {thing["id"]: thing for thing in board.scene["objects"]}
+    assert list(shown) == [thing["id"] for thing in fields["objects"]]
+    for thing in fields["objects"]:
+        for name in ("label", "confidence", "position"):
+            assert rounded(shown[thing["id"]].get(name)) == rounded(thing.get(name))
+        if "size" in thing:
+            assert rounded(shown[thing["id"]]["size"]) == rounded(thing["size"])
+    assert page.get_by_label("Positions count as evidence").is_checked()
+
+
+def test_labels_supports_and_flat_detections_are_read(open_board: OpenBoard) -> None:
+    board = open_board()
+    for text in ("bed, lamp, mug", "bed\nlamp\nmug\n"):
+        board.put(text)
+        assert board.things == ["bed", "lamp", "mug"]
+    board.put('["bed", "lamp", "lamp"]')
+    assert board.things == ["bed", "lamp_1", "lamp_2"]
+    board.put('{"objects": ["desk", "lamp"], "relations": [["lamp", "on-top", "desk"]]}')
+    assert board.scene["relations"] == [{"subject": "lamp", "relation": "on-top", "object": "desk"}]
+    # Supports are relations.
+    objects = [{"id": 0, "label": "table"}, {"id": 1, "label": "mug", "supported_by": 0}]
+    for relations in ([], [[1, "on-top", 0]]):
+        board.put(json.dumps({"scene_id": "one", "objects": objects, "relations": relations}))
+        stated = {"subject": "mug", "relation": "on-top", "object": "table"}
+        assert board.scene["relations"] == [stated]
+    seen = {"results": [{"hypothesis": {"class_id": "mug", "score": 0.5}}], "bbox": {"size_x": 9}}
+    board.put(json.dumps({"detections": [seen, seen]}))
+    assert board.scene["objects"] == [
+        {"id": f"mug_{number}", "label": "mug", "confidence": 0.5} for number in (1, 2)
+    ]
