@@ -149,25 +149,6 @@ def test_outliers_are_marked_with_reasons_in_words(bedroom: Board, api: httpx.Cl
     expect(outliers).to_have_count(sum(one["is_outlier"] for one in answer["outliers"]))
 
 
-def test_only_misplaced_relations_are_in_the_wrong_place(bedroom: Board) -> None:
-    said = {"subject": "lamp", "relation": "on-top", "object": "bed"}
-    amiss = {**said, "probability": 0.75, "is_misplaced": True, "moved": "lamp"}
-    fine = {**said, "object": "nightstand", "probability": 0.1, "is_misplaced": False}
-    answer = {"outliers": [], "misplaced": [amiss, amiss | {"object": "floor"}, fine]}
-    bedroom.alter("outliers", lambda other: other | answer)
-    bedroom.use_positions()
-    bedroom.tab("Wrong")
-    assert bedroom.rows("outliers") == [
-        f"lamp on top of {place} in the wrong place 75 % moved: lamp" for place in ("bed", "floor")
-    ]
-    assert bedroom.edges == [("misplaced", "on top of?")], "the floor is not on the board"
-    expect(bedroom.page.locator("#legend .misplaced")).to_have_text("probably in the wrong place")
-    expect(bedroom.page.locator("#alarms")).to_have_text("2")
-    words = "lamp on top of bed (moved: lamp), lamp on top of floor (moved: lamp)."
-    assert f"In the wrong place: {words}" in bedroom.announced
-    assert "Nothing looks wrong" not in bedroom.announced
-
-
 def test_relations_are_edges_and_those_that_hold_are_told_apart(
     bedroom: Board, api: httpx.Client
 ) -> None:

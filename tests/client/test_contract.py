@@ -13,7 +13,6 @@ from app import questions
 from app.api.examples import REQUESTS
 from scene_client import (
     Client,
-    DeadlineError,
     OfflineClient,
     ProblemError,
 )
@@ -85,15 +84,6 @@ def test_unknown_labels_are_a_problem_with_suggestions_and_the_first_errors_as_t
     assert "#/objects/9: " in text
     assert "#/objects/10: " not in text
     assert text.endswith("\n  and 2 more errors")
-
-
-@every_client
-def test_a_client_is_usable_after_a_deadline_error(caller: Caller) -> None:
-    long = {"objects": [], "count": 64, "steps": 200, "temperature": 1.5}
-    for timeout in (0.001, 0.02):
-        with pytest.raises(DeadlineError, match=f"within {timeout:g} s"):
-            caller("generate", long, timeout=timeout)
-    assert caller("missing", {"objects": ["bed"]})["missing"]
 
 
 def test_offline_and_online_clients_list_models_alike(url: str, shared_store: Path) -> None:

@@ -132,8 +132,6 @@ def test_the_client_s_model_is_asked_where_a_request_names_none(recorder: Record
         (lambda scene: scene.missing_batch([["bed"], []]), "#/scenes/1/objects", "empty"),
         (lambda scene: scene.missing_batch([]), "#/scenes", "256"),
         (lambda scene: scene.missing(["bed"], timeout=0.0), "#", "timeout"),
-        (lambda scene: scene.missing(["bed"], timeout=float("nan")), "#", "timeout"),
-        (lambda scene: scene.missing(["bed"], timeout=601), "#", "timeout"),
         (lambda scene: scene.vocabulary(".."), "#", "name"),
         (lambda scene: scene.model("home", ""), "#", "name"),
         (lambda scene: scene.promote("default", ""), "#/model", "empty"),

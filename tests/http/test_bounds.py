@@ -55,14 +55,6 @@ async def test_generate_past_its_deadline_gets_504_and_delays_no_request(
         assert 'scene_pending{lane="draws"} 0.0' in (await client.get("/metrics")).text
 
 
-async def test_the_default_deadline_applies_without_a_header(
-    shared_store: Path, hold: Hold
-) -> None:
-    async with serve(shared_store, request_timeout_ms=200) as client:
-        hold("generate")
-        problem(await client.post("/generate", json=SCENE), 504, "deadline-passed")
-
-
 async def test_a_client_with_a_quarter_of_a_queue_gets_429(shared_store: Path, hold: Hold) -> None:
     async with serve(shared_store) as client:
         release = hold("generate").release

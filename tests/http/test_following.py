@@ -33,11 +33,6 @@ async def until(client: httpx.AsyncClient, ask: Ask, expected: Any) -> None:
             await asyncio.sleep(POLL)
 
 
-async def was_refused(client: httpx.AsyncClient) -> bool:
-    name = 'scene_reloads_total{change="poll",outcome="refused"}'
-    return f"\n{name} 0.0\n" not in (await client.get("/metrics")).text
-
-
 async def test_replicas_converge_on_what_is_published(store: Path, admin: dict[str, str]) -> None:
     async with serve(store, store_poll=POLL) as one, serve(store, store_poll=POLL) as other:
         before = (await listed(one))["generation"]
@@ -70,16 +65,6 @@ async def test_a_broken_new_version_keeps_nothing_else_back(store: Path) -> None
         assert failures == {"plain@2.0.0"}
         answer = await client.post("/missing", json={"objects": ["bed"], "model": "plain"})
         assert answer.json()["model"]["version"] == "1.0.0"
-
-
-async def test_an_unreadable_alias_file_changes_nothing(store: Path) -> None:
-    async with serve(store, store_poll=POLL) as client:
-        before = await listed(client)
-        (store / "aliases.json").write_text("{")
-        await until(client, was_refused, True)
-        assert await listed(client) == before
-        assert await default(client) == "home@1.0.0"
-        assert await ready(client) == 200
 
 
 async def test_without_polling_nothing_is_followed(store: Path, admin: dict[str, str]) -> None:

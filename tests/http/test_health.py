@@ -6,14 +6,13 @@ import shutil
 from pathlib import Path
 
 import httpx
-import pytest
 
 from app import __version__
 from app.main import create_app
 from app.settings import Settings
 from tests.http.stores import corrupt
 from tests.http.test_problems import problem
-from tests.services import NAMED, LiveService, serve
+from tests.services import NAMED, serve
 
 READY = ["/health/ready", "/v2/health/ready", "/v2/models/default/ready"]
 
@@ -29,17 +28,6 @@ async def test_health_of_a_ready_service(client: httpx.AsyncClient) -> None:
     for path, expected in answers.items():
         response = await client.get(path)
         assert (response.status_code, response.json()) == (200, expected)
-
-
-@pytest.mark.system
-@pytest.mark.parametrize(
-    "path", ["/health/live", "/v2/health/live", *READY, "/v2/models/none/ready"]
-)
-def test_head_answers_like_get_without_a_body(live: LiveService, path: str) -> None:
-    get, head = live.client.get(path), live.client.head(path)
-    assert head.status_code == get.status_code == (404 if "none" in path else 200)
-    assert (head.content, head.headers["content-length"]) == (b"", str(len(get.content)))
-    assert head.headers.keys() == get.headers.keys()
 
 
 async def test_protocol_metadata(client: httpx.AsyncClient) -> None:

@@ -125,19 +125,6 @@ async def test_a_refresh_takes_over_new_versions(own: httpx.AsyncClient, store: 
     assert (again["added"], again["removed"]) == ([], [])
 
 
-async def test_a_broken_new_version_changes_nothing(own: httpx.AsyncClient, store: Path) -> None:
-    before = (await own.get("/models")).json()
-    publish(store, "home", "2.0.0", seed=2, alias="default")
-    corrupt(store, "home", "2.0.0")
-    document = problem(await own.post("/models/refresh"), 409, "refresh-refused")
-    failures = {failure["subject"]: failure["reason"] for failure in document["failures"]}
-    assert failures["home@2.0.0"] == "checksum_mismatch"
-    assert failures["default"] == "checksum_mismatch"
-    assert (await own.get("/models")).json() == before
-    assert await default(own) == "home@1.0.0"
-    assert (await own.get("/health/ready")).status_code == 200
-
-
 @pytest.mark.parametrize("log_odds", [None, math.inf], ids=["raises", "not finite"])
 async def test_a_version_that_cannot_answer_is_refused(
     own: httpx.AsyncClient,
@@ -254,17 +241,6 @@ async def test_an_alias_is_promoted_and_rolled_back(store: Path) -> None:
         assert await default(client) == "home@1.0.0"
     async with serve(store) as client:
         assert await default(client) == "home@1.0.0"
-
-
-async def test_a_new_alias_is_made(own: httpx.AsyncClient) -> None:
-    response = await put(own, "kitchen", model="plain@1.0.0", expected=None)
-    assert response.status_code == 200
-    assert "previous" not in response.json()
-    # An alias given as the model is followed once.
-    assert (await put(own, "hall", model="candidate")).json()["model"] == "home@1.1.0"
-    body = {"objects": ["bed"], "model": "kitchen"}
-    answer = await own.post("/relations", json=body)
-    assert answer.json()["model"]["name"] == "plain"
 
 
 @pytest.mark.parametrize(

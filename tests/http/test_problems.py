@@ -6,7 +6,6 @@ import json
 import math
 import re
 import uuid
-from collections.abc import AsyncIterator
 from html import escape
 from itertools import pairwise
 from pathlib import Path
@@ -18,7 +17,7 @@ import pytest
 from app.errors import ERRORS
 from app.questions import QUESTIONS
 from scene_client.schemas import Problem
-from tests.services import Replace, defect, serve
+from tests.services import Replace, defect
 
 NAMES = [question.name for question in QUESTIONS]
 MARKER = "Zq7-marker"
@@ -397,23 +396,6 @@ async def test_other_methods_are_not_allowed(
 
 
 # ---------------------------------------------------------------------------------- too large
-
-
-async def test_bodies_over_the_limit_are_refused(shared_store: Path) -> None:
-    async def chunks(size: int) -> AsyncIterator[bytes]:
-        yield b'{"objects": ["bed"]}'
-        for _ in range(size - 20):
-            yield b" "
-
-    headers = {"Content-Type": "application/json"}
-    async with serve(shared_store, max_body_bytes=2048) as client:
-        problem(await post(client, b" " * 2049), 413, "body-too-large")
-        assert (await post(client, b'{"objects": ["bed"]}'.ljust(2048))).status_code == 200
-        for path in ("/relations", "/generate", "/missing/batch"):
-            response = await client.post(path, content=chunks(2049), headers=headers)
-            problem(response, 413, "body-too-large")
-        response = await client.post("/relations", content=chunks(2048), headers=headers)
-        assert response.status_code == 200
 
 
 # ------------------------------------------------------------------------------ broken bodies

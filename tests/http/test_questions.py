@@ -109,17 +109,6 @@ async def test_scores_are_the_answer_without_details(
 # ------------------------------------------------------------------------------------- rooms
 
 
-async def test_candidates_are_read_like_room_types(client: httpx.AsyncClient) -> None:
-    request = {"objects": ["bed"], "candidates": ["Office", "bedrooom", "engine room"]}
-    document = problem(await client.post("/rooms", json=request), 422, "unknown-labels")
-    located = [(one["pointer"], one["suggestions"]) for one in document["errors"]]
-    assert located == [("#/candidates/1", ["bedroom"]), ("#/candidates/2", [])]
-    answer = await ask(client, "rooms", **request, unknown_labels="nearest-or-ignore")
-    assert {one["room_type"] for one in answer["room_types"]} == {"office", "bedroom"}
-    assert [(one["label"], one["class"]) for one in answer["mapped"]] == [("bedrooom", "bedroom")]
-    assert answer["ignored"] == ["engine room"]
-
-
 async def test_a_model_without_room_types_names_none(tmp_path: Path) -> None:
     publish(tmp_path, "new", "1.0.0", classes=5, room_types=0, alias="default")
     async with serve(tmp_path) as client:

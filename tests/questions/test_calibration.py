@@ -97,15 +97,3 @@ def test_listed_structure_changes_no_answer_about_other_classes(artifact, stated
     assert (one.threshold, one.misplaced) == (two.threshold, two.misplaced)
     judged = tuple(entry for entry in one.outliers if entry.label not in STRUCTURE)
     assert judged == two.outliers
-
-
-def test_a_list_of_structure_alone_is_a_list_of_one_class(artifact):
-    """The logarithm of the number needs at least 1."""
-    assert (
-        outliers(artifact, scene_of([8])).threshold == outliers(artifact, scene_of([0])).threshold
-    )
-    of_wall, of_nothing = (
-        {entry.label: entry.probability for entry in missing(artifact, scene_of(classes), top_k=9)}
-        for classes in ([8], [])
-    )
-    assert of_wall == pytest.approx(of_nothing, rel=1e-5)

@@ -17,9 +17,8 @@ from hypothesis import strategies as st
 
 from app.inference.weights import pack_scenes
 from app.questions.generate import staying
-from app.scene import CANONICAL, contradiction, derive_relations
+from app.scene import CANONICAL, contradiction
 from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP
-from app.scene.scene import Scene
 from tests.enumeration.small_machines import enumerate_joint, with_mean_rates
 from tests.questions.answers import generate, outliers
 from tests.questions.artifacts import (
@@ -116,16 +115,6 @@ def test_generation_stops_at_the_end_of_the_request(artifact):
     assert generate(artifact, scene, count=32, seed=5, stop=lambda: True) == ()
 
 
-def test_relations_observed_as_off_stay_off():
-    """Of two boxes side by side, only left holds."""
-    poses = derive_relations([[1, 0, 0], [1, 1, 0]], [[0.5, 0.5, 0.5]] * 2)
-    scene = Scene(scene_of([0, 1]).objects, ((0, 1, 0),), poses=poses)
-    for name in ("triway", "triway-states"):
-        for drawn in generate(ARTIFACTS[name], scene, count=16, seed=1, steps=6):
-            between = [r for r in drawn.relations if {r[0], r[2]} == {"bed", "lamp"}]
-            assert between == [("lamp", "left", "bed")]
-
-
 def test_a_unit_of_the_second_layer_keeps_the_state_of_the_request():
     free = generate(ARTIFACTS["gbm"], scene_of([]), count=16, seed=2, steps=5)
     context = {"h2": [(0, 1)]}
@@ -219,13 +208,6 @@ def test_the_last_attempt_is_accepted(name):
     assert all("bed" in scene.objects for scene in scenes)
     assert scenes == draw(name, scene_of([0]), outlier_lines=ALL)
     assert scenes != draw(name, scene_of([0]), outlier_lines=NONE)
-
-
-def test_listed_objects_are_never_intruders():
-    """The evidence contains all classes, so no scene is drawn again."""
-    scene = scene_of(list(range(len(LABELS))))
-    one, other = (draw("triway", scene, outlier_lines=limits) for limits in (ALL, NONE))
-    assert one == other
 
 
 def test_scenes_with_intruders_are_drawn_again():

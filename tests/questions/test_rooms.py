@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -72,12 +71,6 @@ def test_reasons_are_changes_of_log_odds(artifact):
         changes = {cause.object: cause.log_odds_change for cause in entry.because}
         assert changes == pytest.approx(expected, rel=1e-3, abs=1e-3)
         assert list(changes) == sorted(changes, key=lambda k: -abs(changes[k]))
-
-
-def test_the_room_type_and_relations_of_the_request_are_not_used(artifact):
-    plain = scene_of(CLASSES)
-    stated = replace(plain, room_type=1, relations=((0, 0, 1),))
-    assert rooms(artifact, stated) == rooms(artifact, plain)
 
 
 def test_top_k_and_scores_shorten_the_answer(artifact):

@@ -77,7 +77,7 @@ def box(x: float, y: float, z: float, *size: float) -> Thing:
     return (x, y, z), size or (0.05, 0.05, 0.5)
 
 
-BOOK, SHELF = box(0.0, 0.0, 0.025, 0.2, 0.3, 0.03), box(0.0, 0.0, 0.95, 0.4, 0.8, 1.9)
+BOOK, SHELVES = box(0.0, 0.0, 0.025, 0.2, 0.3, 0.03), box(0.0, 0.0, 0.95, 0.4, 0.8, 1.9)
 UNSIZED = (NAN, NAN, NAN)
 CUBE = (1.0, 1.0, 1.0)
 SHEET = (0.2, 0.3, 0.01)
@@ -122,8 +122,8 @@ STACKS = ALL - HORIZONTAL
         (box(0.0, 0.0, 0.81, *SHEET), box(0.0, 0.0, 0.82, *SHEET), NOTHING, ALL),
         (box(0.0, 0.0, 0.8, *SHEET), box(0.0, 0.05, 0.8, *SHEET), NOTHING, ALL),
         # A tall box is around a smaller one, and no box is around a wider one.
-        (BOOK, SHELF, NOTHING, ALL - {"inside"}),
-        (SHELF, BOOK, NOTHING, ALL - {"on-top"}),
+        (BOOK, SHELVES, NOTHING, ALL - {"inside"}),
+        (SHELVES, BOOK, NOTHING, ALL - {"on-top"}),
         (box(0.0, 0.0, 0.04, 0.3, 0.4, 0.08), BOOK, {"on-top"}, ALL),
         (box(0.0, 0.0, 0.95, 0.1, 0.1, 1.9), BOOK, {"on-top"}, ALL),
         # A rug of no height carries a table.
