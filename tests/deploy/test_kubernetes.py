@@ -125,9 +125,8 @@ def test_probes_ask_routes_of_the_service(overlay: Overlay) -> None:
 
 def test_ports_are_those_of_the_image(repository: Path, overlay: Overlay) -> None:
     stage = split_stages((repository / "Dockerfile").read_text("utf-8"))["runtime"]
-    (exposed,) = [int(i.argument) for i in stage if i.keyword == "EXPOSE"]
-    environment = " ".join(i.argument for i in stage if i.keyword == "ENV")
-    assert f"SCENE_PORT={exposed}" in environment
+    (exposed,) = map(int, re.findall(r"^EXPOSE (\d+)$", stage, re.MULTILINE))
+    assert f"SCENE_PORT={exposed}" in stage
     assert overlay.config["SCENE_PORT"] == str(exposed)
     (opened,) = overlay.container["ports"]
     assert opened["containerPort"] == exposed

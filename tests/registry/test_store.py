@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.registry import AliasTarget, Store, StoreError
+from app.registry import AliasTarget, ArtifactError, Store, StoreError
 from app.registry.__main__ import main
 from app.registry.durable import exclusive
 from app.registry.references import MAX_ALIASES_BYTES, aliases_to_bytes
