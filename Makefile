@@ -33,7 +33,7 @@ define compile
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: checks help run ray test test-fast test-slow docs chaos image audit setup format bench lock clean
+.PHONY: checks help run ray test test-fast test-slow docs image audit setup format bench lock clean
 .DELETE_ON_ERROR:
 
 help:  ## show this help
@@ -70,10 +70,6 @@ docs: $(EVERYTHING)  ## build the documentation as a site that works without int
 
 audit: $(EVERYTHING)  ## report known vulnerabilities and risky code, write bills of materials (build/)
 	$(BIN)/python scripts/audit.py $(ARGS)
-
-chaos: $(EVERYTHING)  ## attack a running service: hostile requests, overload, model changes (minutes)
-	$(BIN)/python -m app.compile
-	$(BIN)/python -m pytest tests/chaos tests/http/test_contract.py tests/http/test_hostile.py $(ARGS)
 
 image: $(BIN)/python  ## build the image, ask its service the five questions, remove it (Docker or buildah)
 	$(BIN)/python deploy/image.py $(ARGS)

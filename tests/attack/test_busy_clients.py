@@ -18,6 +18,7 @@ from typing import Any
 import httpx
 import pytest
 
+from benchmarks.load.windows import at_concurrency, at_rate
 from tests.http.stores import make_store
 from tests.services import LiveService, launch, live_service, wait_until
 
@@ -108,6 +109,22 @@ async def test_others_keep_half_of_their_rate(
     assert beside[200] > least * alone[200]
     median = len(delays) // 2
     assert delays[median] < usual[median] + 0.05
+
+
+def test_overload_is_refused_and_leaves_nothing_behind(service: LiveService) -> None:
+    """Ten times the rate that the service reaches, over 512 connections."""
+    requests = [request("missing", {"objects": LABELS[:3] * size}) for size in range(1, 20)]
+    before, rate = service.control(), asyncio.run(at_concurrency(service.port, requests, 8, 2)).rate
+    # A first overload allocates what every later one uses again.
+    asyncio.run(at_rate(service.port, requests, 10 * rate, 1, connections=512))
+    resident = service.memory
+    with ThreadPoolExecutor() as pool:
+        checks = pool.submit(asyncio.run, at_rate(service.port, [HEALTH], 50, SECONDS, 1))
+        window = asyncio.run(at_rate(service.port, requests, 10 * rate, SECONDS, connections=512))
+    assert {200, 429} <= window.statuses.keys() <= {200, 429, 504}
+    assert checks.result().statuses.keys() == {200}
+    assert service.control() == before
+    assert service.memory - resident < 16 * 2**20
 
 
 def test_memory_stays_bounded_when_answers_are_not_read(service: LiveService) -> None:

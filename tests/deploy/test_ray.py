@@ -157,32 +157,3 @@ def test_answers_equal_those_of_the_plain_service(
 ) -> None:
     for _ in range(4):
         assert service.control() == shipped.control()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("path", "headers"),
-    [
-        ("/missing", {}),
-        ("/missing", {"X-Request-Id": "mine"}),
-        ("/missing", {"X-Request-Id": "not valid"}),
-        ("/missing", {"X-Request-Timeout-Seconds": "0.000001"}),
-        ("/missing", {"X-Request-Timeout-Ms": "soon"}),
-        ("/missing", {"Content-Type": "text/plain"}),
-        ("/missing", {"Host": "evil.example"}),
-        ("/nothing", {}),
-    ],
-)
-def test_headers_and_problems_equal_those_of_the_plain_service(
-    service: LiveService, shipped: LiveService, path: str, headers: dict[str, str]
-) -> None:
-    ours, plain = (one.client.post(path, json=SCENE, headers=headers) for one in (service, shipped))
-    assert ours.status_code == plain.status_code
-    # HAProxy closes connections after a change of its configuration.
-    names = ours.headers.keys() - {"server", "connection"}
-    assert names == plain.headers.keys()
-    for name in names - {"date", "x-request-id", "content-length"}:
-        assert ours.headers[name] == plain.headers[name]
-    assert ours.json()["request_id"] == ours.headers["x-request-id"]
-    different = {"request_id": "", "instance": ""}
-    assert ours.json() | different == plain.json() | different

@@ -11,8 +11,7 @@ import pytest
 
 from app.registry import AliasTarget, Store
 from scene_client import Client
-from tests.chaos.load import ConstantLoad
-from tests.chaos.test_swaps import REQUESTS, Judge
+from tests.chaos.load import REQUESTS, ConstantLoad, Judge
 from tests.http.stores import make_store
 from tests.services import LiveService, is_ready, launch, wait_until
 from tests.system.conftest import StartProxy
