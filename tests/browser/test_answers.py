@@ -177,24 +177,6 @@ def test_relations_are_edges_and_those_that_hold_are_told_apart(
     assert words <= said
 
 
-def test_unexpected_relations_show_what_is_expected(bedroom: Board) -> None:
-    milk = {"subject": "milk", "relation": "inside", "object": "bed", "probability": 1.0}
-    seen = milk | {"observed": True, "expected": 0.004}
-    unseen = milk | {"relation": "contains", "observed": False, "expected": None}
-    odd = {"subject": "nightstand", "object": "bed", "observed": ["left"], "expected": "right"}
-    odd |= {"probability": 0.7, "observed_probability": 0.1}
-    answer = {"relations": [seen, unseen], "disagreements": [odd]}
-    bedroom.alter("relations", lambda other: other | answer)
-    bedroom.tab("Relations")
-    bedroom.use_positions()
-    assert bedroom.rows("relations") == [
-        "nightstand left of bed 10 % expected: right of, 70 %",
-        "milk in bed observed 100 % expected: < 1 %",
-        "milk containing bed 100 %",
-    ]
-    assert ("disagrees", "right of? 70 %") in bedroom.edges
-
-
 def test_room_types_are_listed_by_their_probability(bedroom: Board, api: httpx.Client) -> None:
     page, asked = bedroom.page, list[str]()
     page.on("request", lambda request: asked.append(request.url.rsplit("/", 1)[-1]))

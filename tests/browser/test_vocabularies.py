@@ -52,19 +52,6 @@ def test_a_model_of_one_s_own_opens_without_errors(
     expect(board.page.locator(".problem:visible, .error:visible")).to_have_count(0)
 
 
-def test_the_page_opens_with_the_first_example_of_the_model(
-    open_board: OpenBoard, own: LiveService
-) -> None:
-    promote(own, "lab")
-    board = open_board(scene=None, home=own.url, examples=None)
-    examples = own.client.get("/models/lab/vocabulary").json()["examples"]
-    first = examples[0]["scene"]["objects"]
-    assert board.things == [one.get("id", one["label"]) for one in first]
-    names = board.page.locator("#example option").all_text_contents()
-    assert names == ["Examples…", *(one["name"] for one in examples)]
-    expect(board.page.locator("#note")).to_be_hidden()
-
-
 def test_unknown_names_are_mapped_or_left_out_visibly(open_board: OpenBoard) -> None:
     scene = {"objects": ["bed", "fridgee", "flux capacitor"], "room_type": "bedrom"}
     board = open_board(scene, allow=("422",))

@@ -20,7 +20,6 @@ ANSWERED: dict[str, Any] = {
     "model": {"name": "home", "version": "1.0.0", "variant": "rbm", "digest": "0"},
     "request_id": "r",
 }
-SCENE = {"objects": ["bed", "lamp"], "relations": [], "top_k": 2}
 
 
 @pytest.fixture
@@ -93,22 +92,6 @@ def test_json_is_the_service_s_answer(
         **json.loads(expected.model_dump_json(exclude_unset=True)),
         "request_id": found["request_id"],
     }
-
-
-def test_a_scene_may_come_from_a_file_or_a_pipe_and_options_override_it(
-    scene: Any, tmp_path: Path
-) -> None:
-    # A path is known by its slashes, whatever the file is called.
-    path = tmp_path / "scene"
-    path.write_text(json.dumps(SCENE))
-    from_file = json.loads(scene("--json", "missing", str(path)).stdout)
-    piped = json.loads(scene("--json", "missing", "-", stdin=json.dumps(SCENE)).stdout)
-    assert len(from_file["missing"]) == 2
-    assert from_file["missing"] == piped["missing"]
-    one = json.loads(scene("missing", str(path), "--top-k", "1", "--json").stdout)
-    assert [entry["label"] for entry in one["missing"]] == [piped["missing"][0]["label"]]
-    listed = json.loads(scene("outliers", "-", "--json", stdin='["bed", "lamp"]').stdout)
-    assert {entry["object"] for entry in listed["outliers"]} == {"bed", "lamp"}
 
 
 @pytest.mark.parametrize(

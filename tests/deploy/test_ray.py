@@ -19,8 +19,6 @@ from app.settings import Settings
 from deploy.ray.run import descendants, environment
 from tests.services import LiveService, free_port, wait_until
 
-SCENE = {"objects": ["bed", "lamp"]}
-
 
 @pytest.fixture(scope="module")
 def folder(repository: Path) -> Path:

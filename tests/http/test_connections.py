@@ -12,7 +12,7 @@ import pytest
 
 from tests.chaos.wire import BODY, LIVE, Wire, exchange
 from tests.http.test_problems import problem
-from tests.services import LiveService, launch, live_service, wait_until
+from tests.services import LiveService, launch, live_service
 
 pytestmark = pytest.mark.system
 
@@ -20,10 +20,6 @@ HEAD = (
     b"POST /outliers HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
     b"Content-Length: %d\r\n\r\n"
 )
-
-
-BATCH_BODY = json.dumps({"scenes": [json.loads(BODY)] * 256}).encode()
-BATCH = HEAD.replace(b"outliers", b"missing/batch") % len(BATCH_BODY) + BATCH_BODY
 
 
 service = live_service(SCENE_CLIENT_TIMEOUT="1", logs_errors=True)
@@ -63,25 +59,6 @@ def test_an_upgrade_request_gets_a_plain_answer(
     assert "upgrade" not in answer.headers
     assert answer.headers["content-type"].startswith("application/")
     assert "WebSocket" not in service.log.read_text()
-
-
-def test_a_client_that_does_not_read_is_disconnected(service: LiveService) -> None:
-    """The system ends the connection, some retransmissions after SCENE_CLIENT_TIMEOUT."""
-    before = service.control()
-    files = service.descriptors
-    unread = []
-    for _ in range(3):
-        connection = socket.socket()
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        connection.settimeout(0.5)
-        connection.connect(("127.0.0.1", service.port))
-        with suppress(OSError):
-            connection.sendall(BATCH * 20)
-        unread.append(connection)
-    assert service.control() == before
-    wait_until(lambda: service.descriptors <= files + 2)
-    for connection in unread:
-        connection.close()
 
 
 @pytest.mark.slow

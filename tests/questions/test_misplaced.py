@@ -196,17 +196,6 @@ def test_a_monitor_under_the_desk_has_moved():
     assert len(table) == 3
 
 
-def test_a_pot_below_the_floor_under_a_stove_has_moved():
-    """The stove stands on the floor, so it is not the object that is above."""
-    below = (ABOVE, 0, 1)
-    table = entries(posed((STOVE, (0, 0, 0)), (POT, (0, 0, -0.6))), {below: -4.0})
-    assert table[below] == (BELOW, pytest.approx([-4.0, 0, math.log(0.02), 0], rel=1e-5), 1)
-    # "Below" may mean under.
-    alone = {below: -4.0, (ON_TOP, 0, 1): -1.0}
-    table = entries(posed((STOVE, (0, 0, 0)), (POT, (0, 0, -0.6))), alone)
-    assert table[below][1][0] == -1.0
-
-
 def test_an_object_above_another_is_explained_by_its_support_or_by_an_unknown_stand():
     """The monitor stands on the desk, above the rug. The pot is closely above the stove."""
     desk = entries(posed((DESK, (0, 0, 0.01)), (MONITOR, (0, 0, 0.76)), (RUG, (0, 0, 0))))

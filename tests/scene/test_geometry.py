@@ -4,15 +4,10 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
 from app.scene.geometry import (
     PoseRelations,
-    Viewpoint,
     derive_relations,
-    to_viewer_frame,
 )
 from app.scene.relations import CANONICAL, canonicalise
 from app.scene.roles import IN, ON, UNDER, is_smaller, likely_role, possible_roles
@@ -41,31 +36,6 @@ def names(found: PoseRelations, i: int = 0, j: int = 1) -> tuple[set[str], set[s
         {name for a, name in enumerate(CANONICAL) if found.holds[a, i, j]},
         {name for a, name in enumerate(CANONICAL) if found.observed[a, i, j]},
     )
-
-
-@given(
-    hnp.arrays(float, (3, 3), elements=st.floats(-5, 5)),
-    st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.floats(-7, 7)),
-)
-def test_the_viewer_frame_is_a_rigid_motion(
-    positions: np.ndarray, viewpoint: tuple[float, float, float]
-) -> None:
-    moved, yaws = to_viewer_frame(positions, Viewpoint(*viewpoint), [0.0, 1.0, 2.0])
-    assert moved[:, 2] == pytest.approx(positions[:, 2])
-    assert yaws == pytest.approx(np.array([0.0, 1.0, 2.0]) - viewpoint[2])
-    for i in range(3):
-        assert moved[i] - moved[0] == pytest.approx(
-            _turn(positions[i] - positions[0], -viewpoint[2]), abs=1e-9
-        )
-    ahead = [viewpoint[0] + math.cos(viewpoint[2]), viewpoint[1] + math.sin(viewpoint[2]), 0.0]
-    assert to_viewer_frame([ahead], Viewpoint(*viewpoint))[0][0] == pytest.approx(
-        [1.0, 0.0, 0.0], abs=1e-9
-    )
-
-
-def _turn(point: np.ndarray, yaw: float) -> np.ndarray:
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    return np.array([cos * point[0] - sin * point[1], sin * point[0] + cos * point[1], point[2]])
 
 
 def cup(bottom: float) -> Thing:
@@ -220,17 +190,6 @@ def test_scenes_of_no_and_of_one_box() -> None:
 def test_bad_poses_are_refused(positions: list, sizes: list, yaws: list, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         derive_relations(positions, sizes, yaws)
-
-
-@pytest.mark.parametrize("classes", [[0], [0, len(LABELS)]])
-def test_classes_must_have_counts(classes: list[int]) -> None:
-    with pytest.raises(ValueError, match="classes must be 2 indices below 17"):
-        derive_relations([[0, 0, 0]] * 2, [CUBE] * 2, classes=np.array(classes), roles=COUNTS)
-
-
-def test_a_viewpoint_must_be_finite() -> None:
-    with pytest.raises(ValueError, match="viewpoint must be finite"):
-        to_viewer_frame([[0, 0, 0]], Viewpoint(0.0, NAN, 0.0))
 
 
 # -------------------------------------------------------------------------------------------- roles

@@ -49,40 +49,32 @@ def test_the_floor_is_unknown_without_objects_that_stand_on_it() -> None:
     assert floor_level(np.array([NAN, 0.5]), np.array([1.0, 0.6])) == 0.5
 
 
+def lamp(x: float, bottom: float) -> Box:
+    return "lamp", (0.3, 0.3, 0.4), (x, 0, bottom)
+
+
 @pytest.mark.parametrize(
-    ("bottom", "expected"),
-    [(0.0, FLOOR), (0.09, FLOOR), (-0.4, FLOOR), (0.11, HANGS), (1.6, HANGS)],
+    ("box", "other", "expected"),
+    [
+        *((lamp(3, bottom), DESK, FLOOR) for bottom in (0.0, 0.09, -0.4)),
+        *((lamp(3, bottom), DESK, HANGS) for bottom in (0.11, 1.6)),
+        (lamp(0, 0.75), DESK, SUPPORTED),
+        # The relation is on-top of the desk to the bin.
+        (("bin", (0.3, 0.3, 0.4), (0.3, 0, 0)), DESK, FLOOR),
+        # The bottom of the milk is near the floor, but the milk is inside.
+        (
+            ("milk", (0.1, 0.1, 0.2), (0, 0, 0.05)),
+            ("fridge", (0.6, 0.6, 0.4), (0, 0, 0)),
+            SUPPORTED,
+        ),
+        # A chair on a rug.
+        (("chair", (0.5, 0.5, 0.9), (0, 0, 0.01)), ("towel", (2.0, 1.5, 0.01), (0, 0, 0)), FLOOR),
+        (lamp(0, 0.75 + 0.13), DESK, UNKNOWN),
+        (lamp(0, 0.75 + 0.17), DESK, HANGS),
+    ],
 )
-def test_a_free_object_stands_on_the_floor_or_hangs(bottom: float, expected: int) -> None:
-    assert stands(("lamp", (0.3, 0.3, 0.4), (3, 0, bottom)), DESK) == [expected, FLOOR]
-
-
-def test_an_object_on_another_is_supported() -> None:
-    assert stands(("lamp", (0.3, 0.3, 0.4), (0, 0, 0.75)), DESK) == [SUPPORTED, FLOOR]
-
-
-def test_a_desk_over_a_bin_stands_on_the_floor() -> None:
-    """The relation is on-top of the desk to the bin."""
-    bin_: Box = ("bin", (0.3, 0.3, 0.4), (0.3, 0, 0))
-    assert stands(bin_, DESK) == [FLOOR, FLOOR]
-
-
-def test_an_object_in_a_low_box_is_supported() -> None:
-    """Its bottom is near the floor, but it is inside."""
-    milk: Box = ("milk", (0.1, 0.1, 0.2), (0, 0, 0.05))
-    fridge: Box = ("fridge", (0.6, 0.6, 0.4), (0, 0, 0))
-    assert stands(milk, fridge) == [SUPPORTED, FLOOR]
-
-
-def test_a_chair_on_a_rug_stands_on_the_floor() -> None:
-    chair: Box = ("chair", (0.5, 0.5, 0.9), (0, 0, 0.01))
-    rug: Box = ("towel", (2.0, 1.5, 0.01), (0, 0, 0))
-    assert stands(chair, rug) == [FLOOR, FLOOR]
-
-
-@pytest.mark.parametrize(("gap", "expected"), [(0.13, UNKNOWN), (0.17, HANGS)])
-def test_an_object_closely_above_another_has_an_unknown_stand(gap: float, expected: int) -> None:
-    assert stands(("monitor", (0.6, 0.2, 0.4), (0, 0, 0.75 + gap)), DESK) == [expected, FLOOR]
+def test_what_holds_a_box_beside_another_on_the_floor(box: Box, other: Box, expected: int) -> None:
+    assert stands(box, other) == [expected, FLOOR]
 
 
 def test_an_open_relation_leaves_the_stand_unknown() -> None:
