@@ -16,13 +16,13 @@ import torch
 from app.inference.chains import OTHER_ROOM, ChainState, Conditions, SceneChains, random_stream
 from app.inference.relations import ObservedRelations
 from app.inference.weights import pack_scenes
-from tests.enumeration.implied import implied_by_hand
 from tests.enumeration.small_machines import (
     SMALL,
     binary,
     check_frequencies,
     code,
     enumerate_joint,
+    implied_by_hand,
     random_weights,
     same,
     small_machine,

@@ -6,13 +6,14 @@ import shutil
 from pathlib import Path
 
 import httpx
+import pytest
 
 from app import __version__
 from app.main import create_app
 from app.settings import Settings
 from tests.http.stores import corrupt
 from tests.http.test_problems import problem
-from tests.services import NAMED, serve
+from tests.services import NAMED, LiveService, serve
 
 READY = ["/health/ready", "/v2/health/ready", "/v2/models/default/ready"]
 
@@ -95,3 +96,23 @@ async def test_an_empty_store_is_not_ready(tmp_path: Path, admin: dict[str, str]
         problem(await client.get("/health/ready"), 503, "not-ready")
         assert (await client.get("/models")).json()["models"] == []
         problem(await client.post("/models/refresh", headers=admin), 409, "refresh-refused")
+
+
+@pytest.mark.system
+def test_every_variant_answers_without_torch(live: LiveService) -> None:
+    """In the process of `live`, the import of torch, training and OpenTelemetry fails."""
+    client = live.client
+    listed = client.get("/models").json()
+    assert not listed["failures"]
+    variants = {entry["versions"][0]["variant"] for entry in listed["models"]}
+    assert variants == {"triway", "gbm", "rbm"}
+    for entry in listed["models"]:
+        body = {
+            "objects": ["bed", "lamp", "desk"],
+            "relations": [{"subject": "lamp", "relation": "on-top", "object": "desk"}],
+            "model": entry["name"],
+        }
+        for question in ("relations", "missing", "outliers", "rooms", "generate"):
+            answer = client.post(f"/{question}", json=body)
+            assert answer.status_code == 200, answer.text
+        assert client.get(f"/models/{entry['name']}/contexts").status_code == 200

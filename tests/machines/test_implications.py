@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from app.inference.posterior import context_of
 from app.inference.relations import ObservedRelations, relation_units
-from tests.enumeration.implied import implied_by_hand
-from tests.enumeration.small_machines import random_weights
+from tests.enumeration.small_machines import implied_by_hand, random_weights
 from training.machines import MachineSpec, build
 from training.machines.arrays import weights_of
 from training.machines.triway import implied

@@ -13,8 +13,12 @@ import pytest
 import torch
 
 from app.scene import CANONICAL, OPPOSITES
-from tests.enumeration.implied import relation_by_definition
-from tests.enumeration.small_machines import Joint, enumerate_joint, mean_rates
+from tests.enumeration.small_machines import (
+    Joint,
+    enumerate_joint,
+    mean_rates,
+    relation_by_definition,
+)
 from tests.questions.answers import disagreements, missing, outliers, relations
 from tests.questions.artifacts import EXACT, LABELS, artifact_of, random_machine, scene_of
 
