@@ -22,7 +22,6 @@ from benchmarks.load.questions import KINDS, bodies
 from benchmarks.log_odds import log_odds
 from benchmarks.queueing import erlang_c, mean_wait, replicas_for
 from benchmarks.report import Result, describe_machine, document
-from benchmarks.training import training_step
 
 
 def check_complete(result: Result, rounds: int) -> None:
@@ -54,14 +53,6 @@ def test_gibbs_yardsticks_sample_the_same_machine():
     assert ours == pytest.approx(sklearn, abs=error)
     assert ours == pytest.approx(other, abs=error)
     assert ours == pytest.approx(4, abs=1)
-
-
-@pytest.mark.slow
-def test_training_step():
-    """The yardstick has the same log-odds."""
-    result = training_step(V=12, units=3, states=4, scenes=3, objects=4, rounds=2)
-    check_complete(result, 2)
-    assert result.facts["largest difference of log-odds"] < 1e-4
 
 
 def test_log_odds_agree_with_those_of_the_yardstick():

@@ -59,11 +59,6 @@ class Board:
         self.page.get_by_label("Positions count as evidence").check()
         self.settle()
 
-    def compare_with(self, model: str) -> None:
-        """Ask a second model too."""
-        self.page.get_by_label("compare with").select_option(model)
-        self.settle()
-
     def alter(self, question: str, change: Callable[[Any], Any]) -> None:
         """Let the page receive changed answers to a question."""
 
@@ -83,18 +78,6 @@ class Board:
     def tab(self, name: str) -> None:
         """Go to a question."""
         self.page.get_by_role("tab", name=name).click()
-        self.settle()
-
-    def drag(self, what: Locator, right: float, down: float) -> None:
-        """Drag something by so many pixels, in several movements."""
-        box = what.bounding_box()
-        assert box is not None
-        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-        self.page.mouse.move(x, y)
-        self.page.mouse.down()
-        for part in (0.2, 0.6, 1.0):
-            self.page.mouse.move(x + right * part, y + down * part)
-        self.page.mouse.up()
         self.settle()
 
     # ---------------------------------------------------------------------------- seeing

@@ -79,29 +79,3 @@ def test_unknown_names_are_mapped_or_left_out_visibly(open_board: OpenBoard) -> 
     expect(board.page.locator("#room-error")).to_contain_text("submarine not known, left out")
     assert "room_type" not in board.scene
     assert board.rows("missing")
-
-
-def test_two_models_answer_about_their_common_classes(
-    open_board: OpenBoard, own: LiveService
-) -> None:
-    promote(own, "lab")
-    scene = {"objects": ["bed", "lamp", "pillow"], "room_type": "bedroom"}
-    board = open_board(scene, home=own.url, examples=None, allow=("422",))
-    board.compare_with("my-small")
-    assert notes(board, 2) == "my-small: pillow not known, left out"
-    labels = [[thing["label"] for thing in board.body("missing", n)["objects"]] for n in (0, 1)]
-    assert labels == [["bed", "lamp", "pillow"], ["bed", "lamp"]]
-    known = [
-        {one["label"] for one in own.client.get(f"/models/{name}/vocabulary").json()["objects"]}
-        for name in ("default", "small")
-    ]
-    shared = board.body("missing")["candidates"]
-    said = f"Both models answer about their {len(shared)} common classes."
-    expect(board.column("missing")).to_contain_text(said)
-    for number in (0, 1):
-        rows = [row for row in board.rows("missing", number) if not row.startswith("another ")]
-        assert len(rows) == 5
-        answer = own.client.post("/missing", json=board.body("missing", number)).json()
-        found = [one["label"] for one in answer["missing"]]
-        assert set(found) <= known[0] & known[1]
-        assert all(row.startswith(label) for row, label in zip(rows, found, strict=True))

@@ -3,11 +3,7 @@
 `sh` blocks run through bash in a copy of the repository beside a live service, which stands where
 the pages say 127.0.0.1:8000 or nothing; `python` blocks run one after the other in one namespace,
 held to the house's lint; `json`, `yaml` and `toml` are read. See `tests.docs.blocks` for how a page
-says what is output and what is only shown. After a change of the shipped models,
-
-    pytest tests/docs/test_blocks.py --update-examples
-
-writes outputs anew that have changed, but for those with elisions.
+says what is output and what is only shown.
 """
 
 from __future__ import annotations
@@ -26,7 +22,7 @@ import yaml
 from pytest_examples import CodeExample, EvalExample
 
 from tests.conftest import REPOSITORY
-from tests.docs.blocks import EXECUTED, Block, blocks, check_output, filled, rewrite
+from tests.docs.blocks import EXECUTED, Block, blocks, check_output
 from tests.docs.conftest import Workplace
 
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
@@ -85,7 +81,6 @@ def test_the_code_of_a_page_runs(
         target_version="py310", ruff_line_length=100, ruff_ignore=["D", "F401", "F821", "S", "T20"]
     )
     names: dict[str, object] = {}
-    outputs: list[tuple[Block, str]] = []
     for block in BLOCKS[page]:
         if block.mark or block.language not in EXECUTED:
             continue
@@ -93,14 +88,7 @@ def test_the_code_of_a_page_runs(
             printed = run_python(block, workplace, eval_example, names)
         else:
             printed = run_shell(block, workplace)
-        try:
-            check_output(block, printed)
-        except AssertionError:
-            if not eval_example.update_examples or (text := filled(block, printed)) is None:
-                raise
-            outputs.append((block, text))
-    if outputs:
-        rewrite(REPOSITORY / page, outputs)
+        check_output(block, printed)
 
 
 def run_shell(block: Block, workplace: Workplace) -> str:

@@ -196,17 +196,6 @@ def test_a_monitor_under_the_desk_has_moved():
     assert len(table) == 3
 
 
-def test_an_object_above_another_is_explained_by_its_support_or_by_an_unknown_stand():
-    """The monitor stands on the desk, above the rug. The pot is closely above the stove."""
-    desk = entries(posed((DESK, (0, 0, 0.01)), (MONITOR, (0, 0, 0.76)), (RUG, (0, 0, 0))))
-    assert desk[ABOVE, 1, 2] == (OVER, [EXPLAINED, 0.0, pytest.approx(0.0), 0.0], 1)
-    assert desk[ON_TOP, 1, 0][0] == SUPPORT
-    assert desk[ON_TOP, 1, 0][1][2] == pytest.approx(math.log(0.8))
-    stove = entries(posed((STOVE, (0, 0, 0)), (POT, (0, 0, 1.0))))
-    assert stove[ABOVE, 1, 0] == (OVER, [EXPLAINED, 0.0, 0.0, 0.0], 1)
-    assert (ABOVE, 1, STANDING) not in stove
-
-
 def test_the_support_of_a_class_never_on_the_floor_is_finite():
     """A share of 0 counts as 1e-6."""
     stands = PLACES.stands.copy()

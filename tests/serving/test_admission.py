@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import gc
 import math
 import threading
-import weakref
 from collections.abc import Callable, Iterator
 from time import monotonic, sleep
 from typing import Any
@@ -129,35 +127,6 @@ def admission() -> Iterator[Admission]:
     admission = Admission(1024, 4096)
     yield admission
     admission.stop()
-
-
-async def test_a_failure_in_a_thread_keeps_nothing_of_its_request(admission: Admission) -> None:
-    """No cycle does: bodies of megabytes would wait for the collector."""
-
-    class Body:
-        pass
-
-    async def fail() -> weakref.ref[Body]:
-        body = Body()
-
-        def broken(_: Callable[[], bool]) -> None:
-            raise ZeroDivisionError(id(body))
-
-        with pytest.raises(ZeroDivisionError):
-            await in_thread(broken, ticket(), admission.worker)
-        return weakref.ref(body)
-
-    gc.disable()
-    try:
-        kept = await fail()
-        # A worker thread lets go of its last call a moment later.
-        for _ in range(100):
-            await asyncio.sleep(0.01)
-            if kept() is None:
-                break
-        assert kept() is None
-    finally:
-        gc.enable()
 
 
 async def test_work_in_a_thread_ends_the_wait_at_the_deadline(admission: Admission) -> None:

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import re
-from functools import partial
 from pathlib import Path
 
 import pytest
 
-from app.questions import missing
 from app.registry import Artifact, Store, load_model_set
-from app.scene import Scene, SceneObject
 from training.runs.config_files import load_config
 
 STORE = Store(Path(__file__).resolve().parents[2] / "model_store")
@@ -76,23 +73,3 @@ def test_the_examples_of_its_configuration_fit_its_vocabulary(artifact):
     examples = read_examples(load_config(artifact.manifest.name).examples, Path())
     assert examples
     assert known_examples(examples, artifact.vocabulary) == (examples, [])
-
-
-@pytest.mark.parametrize("name", ["indoor-triway", "indoor-rbm"])
-@pytest.mark.parametrize("relation", ["on-top", "above", "behind"])
-def test_the_best_at_a_place_are_the_first_of_all(models, name, relation):
-    """Candidates that cannot be among the best are not asked."""
-    artifact = models.resolve(name)
-    assert isinstance(artifact, Artifact)
-    labels = ["table", "chair", "lamp", "laptop"]
-    things = [SceneObject(label, label, artifact.vocabulary.index(label)) for label in labels]
-    for scene in (Scene(tuple(things)), Scene(tuple(things[:1]))):
-        ask = partial(missing, artifact, scene, at=(relation, 0), details=False)
-        every = ask(top_k=1000)["missing"]
-        assert len(every) > 80
-        for few in (1, 5, 40):
-            best = ask(top_k=few)["missing"]
-            assert [one["label"] for one in best] == [one["label"] for one in every[:few]]
-            assert [one["probability"] for one in best] == pytest.approx(
-                [one["probability"] for one in every[:few]], rel=1e-5
-            )
