@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
 from typer.testing import CliRunner, Result
 
-from scene_client import Client, tables
+from scene_client import Client
 from scene_client.command import app
-from scene_client.schemas import MissingAnswer
+from scene_client.schemas import GenerateAnswer
 from tests.client.peers import answering, say_nothing
 
 ANSWERED: dict[str, Any] = {
@@ -118,6 +117,25 @@ def test_scenes_are_drawn(scene: Any, tmp_path: Path) -> None:
     assert path.read_bytes().startswith(b"\x89PNG")
     done = scene("generate", "--plot", str(tmp_path / "out.doc"))
     assert (done.exit_code, "cannot draw the picture" in done.stderr) == (2, True)
+
+
+@pytest.mark.parametrize("count", [1, 3, 16])
+def test_every_scene_is_in_the_picture(tmp_path: Path, count: int) -> None:
+    plot = pytest.importorskip("scene_client.plot", exc_type=ImportError)
+    triples = [("lamp", "on-top", "desk"), ("$chair$", "inside", "desk"), ("lamp", "left", "bed")]
+    room = {  # without a bed
+        "objects": ["desk", "lamp", "$chair$"],
+        "relations": [
+            dict(zip(("subject", "relation", "object"), t, strict=True)) for t in triples
+        ],
+        "log_score": -1.0,
+        "context": {},
+    }
+    path = tmp_path / "scenes.svg"
+    plot.draw(GenerateAnswer(**ANSWERED, seed=7, scenes=[room] * count), path)
+    text = path.read_text()
+    assert text.count("<!-- desk -->") == count
+    assert f"scene {count} of seed 7" in text
 
 
 SCENES = [
@@ -302,32 +320,3 @@ def test_the_key_is_taken_from_the_environment(
     started = peer(answering(b'{"models":[],"aliases":{}}', heads=heads))
     assert scene("models", "--url", started.url).exit_code == 0
     assert b"x-api-key: " + b"k" * 16 in heads[0].lower()
-
-
-# ------------------------------------------------------------------------------------- tables
-
-
-def shown(table: Any) -> str:
-    console = Console(width=200, markup=False)
-    with console.capture() as capture:
-        console.print(table)
-    return capture.get()
-
-
-def test_places_offsets_and_reasons_of_a_missing_object() -> None:
-    vectors = {"mean": {"x": 0.1, "y": -0.2, "z": 0.3}, "std": {"x": 0.01, "y": 0.02, "z": 0.03}}
-    place = {"relation": "on-top", "object": "desk"}
-
-    def table(probability: float, asked_place: bool = False, **offset: Any) -> str:
-        places = [place | {"probability": probability, **offset}]
-        because = [{"object": "bed", "log_odds_change": 1.5}]
-        lamp = {"label": "lamp", "probability": 0.25, "log_odds": -1.0}
-        lamp |= {"placements": places, "because": because}
-        found = MissingAnswer(**ANSWERED, missing=[lamp])
-        return shown(tables.missing(found, asked_place=asked_place))
-
-    text = table(0.5, offset={**vectors, "scenes": 9})
-    assert "on-top desk 0.500 (x +0.10±0.01, y -0.20±0.02, z +0.30±0.03 m)" in text
-    assert "bed +1.50" in text
-    assert "on-top desk" not in table(0.24)
-    assert "on-top desk 0.240" in table(0.24, asked_place=True)

