@@ -6,7 +6,6 @@ No test here looks at speed: that is what the benchmarks are for.
 from __future__ import annotations
 
 import io
-import json
 import math
 
 import httpx
@@ -21,21 +20,17 @@ from benchmarks.load import plain
 from benchmarks.load.questions import KINDS, bodies
 from benchmarks.log_odds import log_odds
 from benchmarks.queueing import erlang_c, mean_wait, replicas_for
-from benchmarks.report import Result, describe_machine, document
+from benchmarks.report import Result
 
 
 def check_complete(result: Result, rounds: int) -> None:
-    """Every contender in every round, a positive finite ratio to each, and all of it printable."""
+    """Every contender in every round, and all of it printable."""
     seconds = result.timings.seconds
     assert result.subject in seconds
     assert set(result.targets) <= set(seconds) - {result.subject}
     for values in seconds.values():
         assert len(values) == rounds
         assert all(0 < value < math.inf for value in values)
-    parsed = json.loads(json.dumps(document([result], describe_machine()), allow_nan=False))
-    assert set(parsed["results"][0]["ratios"]) == set(seconds) - {result.subject}
-    for ratio in parsed["results"][0]["ratios"].values():
-        assert 0 < ratio["low"] <= ratio["median"] <= ratio["high"] < math.inf
     console = Console(width=200, file=io.StringIO())
     with console.capture() as capture:
         console.print(result.table())
@@ -61,17 +56,12 @@ def test_log_odds_agree_with_those_of_the_yardstick():
     assert result.facts["largest difference from scikit-learn"] < 1e-4
 
 
-def test_command_says_what_it_skips_and_writes_the_rest(tmp_path):
-    path = tmp_path / "results.json"
-    arguments = ["service", "--store", str(tmp_path / "none"), "--json", str(path)]
+def test_command_says_what_it_skips(tmp_path):
     app = typer.Typer()
     app.command()(main)
-    result = CliRunner().invoke(app, arguments)
+    result = CliRunner().invoke(app, ["service", "--store", str(tmp_path / "none")])
     assert result.exit_code == 0, result.output
     assert "service: skipped" in result.output
-    written = json.loads(path.read_text())
-    assert written["results"] == []
-    assert written["machine"]["cores"] >= 1
 
 
 LABELS = [f"thing {number}" for number in range(40)]
