@@ -15,15 +15,24 @@ from app.scene import (
     PoseRelations,
     Scene,
     SceneObject,
-    Viewpoint,
     instance_evidence,
     observe,
     pool_instances,
+)
+from app.scene.geometry import (
+    Viewpoint,
+    body_pose,
+    derive_relations,
+    is_optical,
+    is_world_fixed,
+    to_viewer_frame,
+    viewer_axes,
 )
 from app.scene.relations import (
     ABOVE,
     CANONICAL,
     FRONT,
+    INSIDE,
     LEFT,
     ON_TOP,
     RELATIONS,
@@ -33,7 +42,10 @@ from app.scene.relations import (
     opposite,
     support_cycle,
 )
+from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN, Heights, floor_level, stands_of
 from scene_client.schemas import RelationName
+from tests.scene.role_counts import LABELS, role_counts
+from tests.scene.turns import about, after
 
 DESK = SceneObject("desk", "desk", 0, position=(2.0, 0.0, 0.4), size=(0.8, 1.6, 0.8))
 MONITOR = SceneObject("monitor", "monitor", 1, position=(2.0, 0.2, 1.0), size=(0.1, 0.5, 0.4))
@@ -242,3 +254,165 @@ def test_supports_in_a_circle_are_found() -> None:
     assert {*pairwise(circle)} == {
         ("book", "bag"), ("bag", "desk"), ("desk", "book"),
     }  # fmt: skip
+
+
+# ------------------------------------------------------------------------------------------- stands
+
+
+NAN = math.nan
+WORDS = {("bin", "desk"): (0, 9, 0), ("milk", "fridge"): (0, 0, 5), ("pillow", "bed"): (9, 0, 0)}
+ROLES = role_counts({tuple(map(LABELS.index, pair)): n for pair, n in WORDS.items()})
+
+Box = tuple[str, tuple[float, float, float], tuple[float, float, float]]
+"""Label, extents, and position of the bottom."""
+
+DESK_BOX: Box = ("desk", (1.6, 0.8, 0.75), (0, 0, 0))
+
+
+def stands(*boxes: Box, floor: float = 0.0) -> list[int]:
+    """The stands of boxes, with the relations that their poses show."""
+    sizes = np.array([size for _, size, _ in boxes])
+    centres = np.array([bottom for _, _, bottom in boxes], float)
+    centres[:, 2] += sizes[:, 2] / 2
+    classes = np.array([LABELS.index(label) for label, _, _ in boxes])
+    poses = derive_relations(centres, sizes, np.zeros(len(boxes)), classes=classes, roles=ROLES)
+    heights = Heights.of(centres, sizes)
+    return stands_of(poses.holds, poses.observed, heights, floor).tolist()
+
+
+def test_the_floor_is_where_most_objects_on_the_floor_stand() -> None:
+    """One object far below, such as an error of the camera, does not move the floor."""
+    bottoms = np.array([0.02, -3.0, 0.0, 0.75, 0.01, 1.8])
+    weights = np.array([0.9, 0.9, 0.9, 0.1, 0.8, 0.0])
+    assert floor_level(bottoms, weights) == pytest.approx(0.0, abs=0.03)
+    assert floor_level(bottoms + 7, weights) == pytest.approx(7.0, abs=0.03)
+
+
+def test_the_floor_is_unknown_without_objects_that_stand_on_it() -> None:
+    assert math.isnan(floor_level(np.array([NAN, 0.5]), np.array([1.0, 0.0])))
+    assert math.isnan(floor_level(np.zeros(0), np.zeros(0)))
+    # A cup tells nothing about the floor.
+    assert math.isnan(floor_level(np.array([NAN, 0.5]), np.array([1.0, 0.2])))
+    assert floor_level(np.array([NAN, 0.5]), np.array([1.0, 0.6])) == 0.5
+
+
+def lamp(x: float, bottom: float) -> Box:
+    return "lamp", (0.3, 0.3, 0.4), (x, 0, bottom)
+
+
+@pytest.mark.parametrize(
+    ("box", "other", "expected"),
+    [
+        *((lamp(3, bottom), DESK_BOX, FLOOR) for bottom in (0.0, 0.09, -0.4)),
+        *((lamp(3, bottom), DESK_BOX, HANGS) for bottom in (0.11, 1.6)),
+        (lamp(0, 0.75), DESK_BOX, SUPPORTED),
+        # The relation is on-top of the desk to the bin.
+        (("bin", (0.3, 0.3, 0.4), (0.3, 0, 0)), DESK_BOX, FLOOR),
+        # The bottom of the milk is near the floor, but the milk is inside.
+        (
+            ("milk", (0.1, 0.1, 0.2), (0, 0, 0.05)),
+            ("fridge", (0.6, 0.6, 0.4), (0, 0, 0)),
+            SUPPORTED,
+        ),
+        # A chair on a rug.
+        (("chair", (0.5, 0.5, 0.9), (0, 0, 0.01)), ("towel", (2.0, 1.5, 0.01), (0, 0, 0)), FLOOR),
+        (lamp(0, 0.75 + 0.13), DESK_BOX, UNKNOWN),
+        (lamp(0, 0.75 + 0.17), DESK_BOX, HANGS),
+    ],
+)
+def test_what_holds_a_box_beside_another_on_the_floor(box: Box, other: Box, expected: int) -> None:
+    assert stands(box, other) == [expected, FLOOR]
+
+
+def test_an_open_relation_leaves_the_stand_unknown() -> None:
+    """The counts do not tell whether a book that reaches into a sofa is on or in it."""
+    n = 2
+    holds, observed = np.zeros((5, n, n), np.bool_), np.ones((5, n, n), np.bool_)
+    heights = Heights(np.array([0.3, 0.0]), np.array([0.5, 0.8]), np.array([0.1, 2.0]))
+    assert stands_of(holds, observed, heights, 0.0).tolist() == [HANGS, FLOOR]
+    observed[[ON_TOP, INSIDE], 0, 1] = False
+    assert stands_of(holds, observed, heights, 0.0).tolist() == [UNKNOWN, FLOOR]
+    holds[INSIDE, 0, 1] = True
+    assert stands_of(holds, observed, heights, 0.0).tolist() == [SUPPORTED, FLOOR]
+
+
+# ------------------------------------------------------------------------------------------- frames
+
+
+def same_turn(a: float, b: float, period: float = 2 * math.pi) -> bool:
+    return abs(math.remainder(a - b, period)) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("frame", "optical", "fixed"),
+    [
+        ("base_link", False, False),
+        ("camera_optical", True, False),
+        ("robot/camera_color_optical_frame", True, False),
+        ("optical_table", False, False),
+        ("map", False, True),
+        ("MAP", False, True),
+        (" Odom ", False, True),
+        ("Camera_Optical", True, False),
+        ("robot_1/odom", False, True),
+        ("/world", False, True),
+        ("map_server", False, False),
+        ("", False, False),
+    ],
+)
+def test_frames_by_name(frame: str, optical: bool, fixed: bool) -> None:
+    assert is_optical(frame) is optical
+    assert is_world_fixed(frame) is fixed
+
+
+def test_optical_axes() -> None:
+    # 3 m ahead, 1 m to the right, 2 m below the camera.
+    position, size, yaw = body_pose((1.0, 2.0, 3.0), (0.1, 0.2, 0.3), optical=True)
+    assert position == (3.0, -1.0, -2.0)
+    # Unturned in optical axes: x is its width, y its height, z its depth.
+    assert size == (0.3, 0.1, 0.2)
+    assert same_turn(yaw, 0.0)
+
+
+@given(st.floats(-3, 3), st.floats(-0.6, 0.6))
+def test_a_box_on_its_side(angle: float, tilt: float) -> None:
+    """Tipped about x the box heads along its z axis, tipped about y along its y axis."""
+    for axis, size, heading in (
+        ((1, 0, 0), (3.0, 1.0, 2.0), angle - math.pi / 2),
+        ((0, 1, 0), (2.0, 3.0, 1.0), angle + math.pi / 2),
+    ):
+        # A tilt about the heading leaves it level.
+        lean = after(about((0, 0, 1), heading), about((1, 0, 0), tilt))
+        lean = after(lean, about((0, 0, 1), -heading))
+        tipped = after(about((0, 0, 1), angle), about(axis, math.pi / 2))
+        _, upright, yaw = body_pose((0.0, 0.0, 0.0), (1.0, 2.0, 3.0), after(lean, tipped))
+        assert upright == size
+        assert same_turn(yaw, heading)
+
+
+@given(st.floats(-0.6, 0.6), st.floats(-3, 3))
+def test_a_tilt_is_dropped(tilt: float, angle: float) -> None:
+    # Yaw after a tilt about the box's own x axis leaves that axis horizontal.
+    both = after(about((0, 0, 1), angle), about((1, 0, 0), tilt))
+    _, size, yaw = body_pose((0.0, 0.0, 0.0), (1.0, 2.0, 3.0), both)
+    assert size == (1.0, 2.0, 3.0)
+    assert same_turn(yaw, angle)
+
+
+@pytest.mark.parametrize("quaternion", [(0, 0, 0, 0), (0, 0, 0, 2), (0, 0, 0, math.nan)])
+def test_quaternions_must_have_length_one(quaternion: tuple[float, float, float, float]) -> None:
+    with pytest.raises(ValueError, match="quaternion of length 1"):
+        body_pose((0.0, 0.0, 0.0), None, quaternion)
+
+
+@given(st.floats(-7, 7), st.booleans(), st.tuples(*[st.floats(-5, 5)] * 3))
+def test_viewer_axes_invert_the_conversion_to_the_viewer(
+    yaw: float, optical: bool, point: tuple[float, float, float]
+) -> None:
+    """A point read into body axes, seen by the viewer, and told in the frame again."""
+    body, _, _ = body_pose(point, optical=optical)
+    (seen,), _ = to_viewer_frame([body], Viewpoint(0.0, 0.0, yaw))
+    axes = viewer_axes("camera_optical_frame" if optical else "map", yaw)
+    assert axes is not None
+    told = [sum(seen[k] * axes[k][n] for k in range(3)) for n in range(3)]
+    assert told == pytest.approx(point, abs=1e-9)
