@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
 
@@ -106,11 +107,10 @@ ASKED = (43, 43, 43, 20, 10, 67, 67, 10, 320, 320, 320)
 
 
 @pytest.fixture(scope="module")
-def found() -> dict[str, tuple[int, int]]:
+def found(models) -> dict[str, tuple[int, int]]:
     if facts_file(FOLDER) is None:
         pytest.skip("the facts are not here")
-    artifact = load_model_set(Store(REPOSITORY / "model_store")).resolve("default")
-    lines = ask_everyday(artifact, FOLDER)
+    lines = ask_everyday(models.resolve("default"), FOLDER)
     return {line: tuple(map(sum, zip(*each, strict=True))) for line, each in lines.items()}
 
 
