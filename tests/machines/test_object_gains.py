@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app.inference.objects import LARGEST_WEIGHT, Gains, ObjectScorer
@@ -143,6 +143,7 @@ def test_log_odds_equal_the_tensors(name, seed):
         close(case.scorer.room_log_p(*scene)[0], expected[0])
 
 
+@settings(max_examples=40)
 @given(name=st.sampled_from(ONE_LAYER), seed=SEEDS)
 def test_reasons_are_differences_of_log_odds(name, seed):
     """With class j minus without class j, recomputed; of class i itself, 0."""

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.errors import DeadlinePassedError, DisconnectedError, QueueFullError
+from app.errors import DeadlinePassedError, DisconnectedError
 from app.serving.admission import Admission, Lane, Ticket, in_thread
 
 pytestmark = pytest.mark.anyio
@@ -50,23 +50,6 @@ async def test_clients_take_turns() -> None:
     await asyncio.gather(*(work(lane, client, log) for client in clients))
     # The first request found the lane free. Behind it, every client has its turn in a round.
     assert set(log[1:4]) == {"flood", "a", "b"}
-
-
-async def test_one_client_holds_a_quarter_of_a_lane() -> None:
-    lane, places = Lane(1, 40), [ticket("flood") for _ in range(11)]
-    await places[0].enter(lane, 4)
-    with pytest.raises(QueueFullError):
-        await places[1].enter(lane, 7)
-    waiting = [asyncio.ensure_future(place.enter(lane, 1)) for place in places[2:8]]
-    await asyncio.sleep(0)
-    assert lane.is_full("flood", 1)
-    assert not lane.is_full("other", 10)
-    assert lane.is_full("other", 11)
-    places[0].leave()
-    for place, turn in zip(places[2:8], waiting, strict=True):
-        await turn
-        place.leave()
-    assert (lane.weight, lane.is_full("flood", 10)) == (0, False)
 
 
 async def test_a_request_that_waits_past_its_deadline_leaves_its_place() -> None:
