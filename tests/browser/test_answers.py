@@ -227,9 +227,6 @@ def test_the_calls_shown_give_the_answer_shown_and_can_be_copied(
     assert board.page.evaluate("navigator.clipboard.readText()") == board.curl("missing")
 
 
-# ------------------------------------------------------------------------------------- drawn scenes
-
-
 def draw(board: Board) -> None:
     board.click("Generate a scene")
     expect(board.page.locator("#draft")).to_be_visible()

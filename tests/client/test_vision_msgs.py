@@ -397,9 +397,6 @@ def test_any_message_is_a_request_or_an_error_of_this_module(text: bytes) -> Non
                     SceneRequest(**convert(changed, "coco"))
 
 
-# --------------------------------------------------------------------------------- the example
-
-
 def test_the_command_takes_a_recorded_message_for_a_scene(repository: Path, url: str) -> None:
     path = str(repository / "clients/ros2/detections.json")
     recorded = json.loads(Path(path).read_text())

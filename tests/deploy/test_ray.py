@@ -101,9 +101,6 @@ def test_the_manifest_has_the_settings_of_the_local_start(pods: list[dict[str, A
         assert {name: settings[name] for name in shared} == {name: local[name] for name in shared}
 
 
-# ---------------------------------------------------------------------------- running replicas
-
-
 @contextmanager
 def running(repository: Path, log: Path, *arguments: str | Path) -> Iterator[LiveService]:
     """Run `deploy/ray/run.py` on a free port, and check that no process remains after it."""

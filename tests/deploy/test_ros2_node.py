@@ -207,9 +207,6 @@ def test_images_are_heard_where_the_parameters_say_so(
     assert [*entry.values()][:3] == ["bed_1", "left", "lamp_1"]
 
 
-# ----------------------------------------------------------------------------------- its parts
-
-
 def test_a_ghost_stands_off_its_anchor_by_the_offset(monkeypatch: pytest.MonkeyPatch) -> None:
     load_package(monkeypatch)
     advisor = importlib.import_module("scene_reasoning.advisor")
@@ -235,9 +232,6 @@ def test_a_ghost_stands_off_its_anchor_by_the_offset(monkeypatch: pytest.MonkeyP
     assert lamp.extent == (0.4, 0.05, 1.5)
     assert (cup.text, cup.position, cup.extent) == ("cup? on-top desk", (1.0, 2.0, 0.4), None)
     assert (pen.text, pen.position, pen.extent) == ("pen? inside desk", (1.0, 2.0, 0.4), None)
-
-
-# ------------------------------------------------------------------------------- the packaging
 
 
 def test_the_parameter_file_is_the_nodes_parameters_and_its_defaults(

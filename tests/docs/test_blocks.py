@@ -127,9 +127,6 @@ def run_python(
     return printed.getvalue().replace(workplace.address, "127.0.0.1:8000")
 
 
-# ------------------------------------------------------------------------- the tests of the tests
-
-
 def test_another_answer_is_noticed(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text('```sh\necho\n```\n```json\n{"p": [1.0, "..."], "...": "..."}\n```\n')

@@ -157,9 +157,6 @@ async def test_behind_a_prefix_the_same_is_open(guarded: httpx.AsyncClient) -> N
             assert (await behind.get(f"/robot/{path}")).status_code == status
 
 
-# ------------------------------------------------------------------------------------ OpenAPI
-
-
 async def test_the_document_tells_where_a_key_is_needed(document: dict[str, Any]) -> None:
     schemes = document["components"]["securitySchemes"]
     assert schemes["api-key"] == {"type": "apiKey", "in": "header", "name": "X-API-Key"}

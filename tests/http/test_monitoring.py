@@ -201,9 +201,6 @@ def test_the_documentation_lists_every_metric(live: LiveService) -> None:
     )
 
 
-# ------------------------------------------------------------------------------------ logs
-
-
 def line(service: LiveService, method: str, path: str, **arguments: Any) -> dict[str, Any]:
     """Send a request, and return its line of the log."""
     identity = uuid.uuid4().hex

@@ -377,9 +377,6 @@ async def test_other_methods_are_not_allowed(
     assert set(response.headers["allow"].split(", ")) == allowed
 
 
-# --------------------------------------------------------------------------------- request ids
-
-
 @pytest.mark.parametrize(
     ("given", "is_kept"),
     [
@@ -425,9 +422,6 @@ async def test_an_answer_that_is_not_finite_is_a_defect(
     response = await client.post("/missing", json={"objects": ["bed"]})
     problem(response, 500, "internal-error")
     assert "not finite" in caplog.text
-
-
-# ------------------------------------------------------------------------------------- pages
 
 
 async def test_every_problem_type_has_a_page(client: httpx.AsyncClient) -> None:

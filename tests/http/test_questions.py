@@ -82,12 +82,6 @@ async def test_observed_relations_are_returned(client: httpx.AsyncClient, questi
     assert (warning["code"], warning["objects"]) == ("implausible-size", ["lamp"])
 
 
-# --------------------------------------------------------------------------------- relations
-
-
-# ----------------------------------------------------------------------------------- missing
-
-
 @pytest.mark.parametrize(
     ("question", "details"),
     [
@@ -112,9 +106,6 @@ async def test_scores_are_the_answer_without_details(
         for entry in entries["full"]
     ]
     assert all(details <= entry.keys() for entry in entries["full"])
-
-
-# ------------------------------------------------------------------------------------- rooms
 
 
 async def test_a_model_without_room_types_names_none(tmp_path: Path) -> None:

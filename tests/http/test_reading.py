@@ -224,9 +224,6 @@ async def test_a_scene_in_three_frames_has_equal_relations(client: httpx.AsyncCl
     assert await observed(client, **scene) == vertical
 
 
-# ---------------------------------------------------------------------------------- warnings
-
-
 def boxes(count: int, **size: float) -> list[dict[str, Any]]:
     """Books in a row, in the plane z = 0."""
     return [

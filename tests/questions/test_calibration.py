@@ -65,9 +65,6 @@ def test_missing_classes_by_log_odds_and_number_of_listed_classes(classes, liste
         assert entry.probability == pytest.approx(sigmoid(z), rel=1e-5)
 
 
-# ---------------------------------------------------------------------------------------- structure
-
-
 # Every calibration depends on the number of classes.
 COUNTED = CountSlope(intercept=-0.3, slope=0.8, log_count=-0.2)
 COUNTS = {

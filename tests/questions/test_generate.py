@@ -221,9 +221,6 @@ def test_scenes_with_intruders_are_drawn_again():
     assert counts[1] < counts[0]
 
 
-# -- room types --------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("rare", [(), (0,)])
 def test_a_scene_has_the_room_type_of_its_start_but_rarely_a_rare_one(rare):
     """Half of the stored scenes are of each type. A rare type starts e^-6 times as often."""
@@ -236,9 +233,6 @@ def test_a_scene_has_the_room_type_of_its_start_but_rarely_a_rare_one(rare):
     assert types.count("bedroom") == 0 if rare else 5 < types.count("bedroom") < 35
     (asked,) = generate(artifact, scene_of([], room=0), seed=4, steps=1)
     assert asked.room_type == "bedroom"
-
-
-# ---------------------------------------------------------------- contradictions of drawn relations
 
 
 V = 6

@@ -181,8 +181,6 @@ def test_placements_have_the_offsets_of_their_classes(name):
             assert place.offset == offset_of(relation, index, anchor, subject == "missing")
 
 
-# ---------------------------------------------------------------------- what training never shows
-
 SHOWN = {(ON_TOP, 1, 2): 2.0, (ON_TOP, 5, 2): 1.0, (INSIDE, 5, 6): 4.0}
 
 
@@ -206,9 +204,6 @@ def test_relations_that_training_never_shows_are_lowered_by_the_stand_of_the_sub
             is_shown = SHOWN.get((a, i, j), 0) >= 2
             change = 0.0 if is_shown else min(math.log(share / 0.5), 0.0)
             assert after - before[missed] == pytest.approx(change, abs=1e-4)
-
-
-# ------------------------------------------------------------------------------- what fits inside
 
 
 @pytest.mark.usefixtures("without_minimums")

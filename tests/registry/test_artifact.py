@@ -122,9 +122,6 @@ def test_the_same_content_is_the_same_bytes(tmp_path: Path) -> None:
     assert load_artifact(tmp_path / "a").digest == load_artifact(tmp_path / "b").digest
 
 
-# -- invalid weights ----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 70_000.0])
 def test_refuses_to_write_numbers_that_the_file_cannot_hold(value: float, tmp_path: Path) -> None:
     weights = state()

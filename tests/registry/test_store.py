@@ -319,9 +319,6 @@ def test_a_missing_store_is_an_error_and_an_empty_one_is_not(store: Store) -> No
     assert store.published() == store.aliases() == {}
 
 
-# -- the command --------------------------------------------------------------------------------
-
-
 def test_the_command_changes_the_store_of_the_service_and_creates_none(
     store: Store,
     tmp_path: Path,

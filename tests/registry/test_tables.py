@@ -213,9 +213,6 @@ def test_counts_at_their_limits_are_accepted() -> None:
     assert Counts.from_tensors(at_limits.tensors(), V, C).weights.max() == 64
 
 
-# -- offsets -------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("triple", "offset", "scenes"),
     [

@@ -74,9 +74,6 @@ def refused(proxy: Proxy, request: bytes, status: int) -> Any:
     return answers[0]
 
 
-# ---------------------------------------------------------------------------------- as usual
-
-
 def test_questions_and_pages_are_answered(proxy: Proxy) -> None:
     with Client(proxy.address) as scene:
         assert scene.missing(SCENE["objects"]).missing
@@ -281,9 +278,6 @@ def test_the_proxy_answers_503_without_a_ready_service(
         assert answer.status_code == 503
         assert answer.json()["type"] == "/problems/not-ready"
         assert int(answer.headers["retry-after"]) > 0
-
-
-# ---------------------------------------------------------------------------- configuration
 
 
 def test_the_proxy_leaves_the_service_room_for_health_checks(configuration: Path) -> None:
