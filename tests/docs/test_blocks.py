@@ -127,16 +127,6 @@ def run_python(
     return printed.getvalue().replace(workplace.address, "127.0.0.1:8000")
 
 
-def test_another_answer_is_noticed(tmp_path: Path) -> None:
-    page = tmp_path / "page.md"
-    page.write_text('```sh\necho\n```\n```json\n{"p": [1.0, "..."], "...": "..."}\n```\n')
-    (block,) = blocks(page)
-    check_output(block, '{"p": [1.0, 2.0], "q": 3, "request_id": "a"}')
-    for other in ('{"p": [2.0]}', '{"p": []}', '{"q": 1.0}'):
-        with pytest.raises(AssertionError, match=r"page\.md:2 answers"):
-            check_output(block, other)
-
-
 # --------------------------------------------------- what the pages only mention, and no test runs
 
 
