@@ -178,23 +178,6 @@ def test_scenes_of_no_and_of_one_box() -> None:
     assert not derive_relations([[0, 0, 0]], [[1, 1, 1]]).observed.any()
 
 
-@pytest.mark.parametrize(
-    ("positions", "sizes", "yaws", "message"),
-    [
-        ([[0, 0]], [[1, 1, 1]], None, r"positions must have the shape \(1, 3\), not \(1, 2\)"),
-        ([[0, 0, 0]], [[1, 1, 1]] * 2, None, r"sizes must have the shape \(1, 3\), not \(2, 3\)"),
-        ([[0, 0, 0]], [[1, 1, 1]], [0, 0], r"yaws must have the shape \(1,\), not \(2,\)"),
-        ([[0, 0, math.inf]], [[1, 1, 1]], None, "infinite"),
-        ([[0, 0, 0]], [[1, 1, math.inf]], None, "infinite"),
-        ([[0, 0, 0]], [[1, 1, 1]], [NAN], "infinite"),
-        ([[0, 0, 0]], [[1, -1, 1]], None, "negative"),
-    ],
-)
-def test_bad_poses_are_refused(positions: list, sizes: list, yaws: list, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        derive_relations(positions, sizes, yaws)
-
-
 # -------------------------------------------------------------------------------------------- roles
 
 
