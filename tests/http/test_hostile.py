@@ -8,7 +8,7 @@ from app.questions import QUESTIONS
 from scene_client import schemas
 from tests.chaos import corpus
 from tests.chaos.attack import attack, faults_of_answer
-from tests.chaos.wire import exchange, framing, wires
+from tests.chaos.wire import exchange, framing
 from tests.services import LiveService, live_service
 
 pytestmark = pytest.mark.system
@@ -48,17 +48,6 @@ def test_bodies_are_read_without_a_proxy_too(service: LiveService) -> None:
                 assert not faults_of_answer(answer.status, answer.headers, answer.body), wire.name
         assert wire.expected in (None, tuple(answer.status for answer in answers)), wire.name
         assert closed or not wire.closes, wire.name
-
-
-@pytest.mark.slow
-def test_requests_below_http_break_nothing(service: LiveService) -> None:
-    """Without a proxy; tests/system/test_proxy.py says what the proxy refuses."""
-    before = service.control()
-    for wire in wires():
-        answers, _ = exchange(service.port, wire, patience=6)
-        assert all(answer.status < 500 for answer in answers), wire.name
-    assert service.control() == before
-    assert '"smuggled"' not in service.log.read_text()
 
 
 def test_every_field_of_every_request_is_attacked() -> None:
