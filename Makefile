@@ -7,8 +7,6 @@ PYTHON ?= python3
 TORCH_INDEX_URL ?=
 # Further arguments of pytest, image, audit, bench or lock, such as make test ARGS="-k geometry".
 ARGS ?=
-# Duration of `make soak` in minutes.
-MINUTES ?= 10
 
 VENV := .venv
 # Environment of the service with Ray.
@@ -35,7 +33,7 @@ define compile
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: checks help run ray test test-fast test-slow coverage docs chaos soak image audit setup format bench lock clean
+.PHONY: checks help run ray test test-fast test-slow coverage docs image audit setup format bench lock clean
 .DELETE_ON_ERROR:
 
 help:  ## show this help
@@ -76,15 +74,6 @@ docs: $(EVERYTHING)  ## build the documentation as a site that works without int
 
 audit: $(EVERYTHING)  ## report known vulnerabilities and risky code, write bills of materials (build/)
 	$(BIN)/python scripts/audit.py $(ARGS)
-
-chaos: $(EVERYTHING)  ## attack a running service: hostile requests, overload, model changes (minutes)
-	$(BIN)/python -m app.compile
-	$(BIN)/python -m pytest tests/chaos tests/http/test_contract.py tests/http/test_hostile.py $(ARGS)
-
-soak: $(EVERYTHING)  ## check that memory does not grow in ten minutes of mixed use (MINUTES=10)
-	@# Compile in another process, so that the compiler's memory does not count.
-	$(BIN)/python -m app.compile
-	CHAOS_SOAK_MINUTES=$(MINUTES) $(BIN)/python -m pytest tests/chaos/test_soak.py $(ARGS)
 
 image: $(BIN)/python  ## build the image, ask its service the five questions, remove it (Docker or buildah)
 	$(BIN)/python deploy/image.py $(ARGS)

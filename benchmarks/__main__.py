@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -11,10 +10,11 @@ import typer
 from rich.console import Console
 
 from benchmarks.gibbs import gibbs
+from benchmarks.load.servers import ServerError
 from benchmarks.log_odds import log_odds
-from benchmarks.report import Result, describe_machine, document
+from benchmarks.report import Result, describe_machine
 from benchmarks.scaling import scaling
-from benchmarks.service import NoModelError, service
+from benchmarks.service import service
 from benchmarks.training import training_step
 
 
@@ -30,9 +30,6 @@ class Name(StrEnum):
 
 def main(
     names: Annotated[list[Name] | None, typer.Argument(help="benchmarks; default: all")] = None,
-    json_path: Annotated[
-        Path | None, typer.Option("--json", help="also write all timings to this JSON file")
-    ] = None,
     store: Annotated[Path, typer.Option(help="the model store to serve")] = Path("model_store"),
 ) -> None:
     """Measure the speed of our code relative to other implementations.
@@ -40,23 +37,17 @@ def main(
     Our code and the other implementations run alternately.
     """
     console = Console()
-    machine = describe_machine()
-    for key, value in machine.items():
+    for key, value in describe_machine().items():
         console.print(f"{key}: {value}", highlight=False)
-    results: list[Result] = []
     for name in names or list(Name):
         console.print()
         try:
             outcome = _run(name, store)
-        except NoModelError as error:
+        except ServerError as error:
             console.print(f"{name}: skipped, {error}", highlight=False)
             continue
         for result in outcome:
             console.print(result.table())
-        results += outcome
-    if json_path is not None:
-        text = json.dumps(document(results, machine), indent=2, ensure_ascii=False)
-        json_path.write_text(text + "\n", encoding="utf-8")
 
 
 def _run(name: Name, store: Path) -> list[Result]:

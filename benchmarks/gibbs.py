@@ -50,7 +50,6 @@ def gibbs(
         rounds=rounds,
     )
     return Result(
-        name="gibbs",
         title=f"Gibbs sweeps of a {V} × {H} RBM, {chains} chains, one thread",
         subject=OURS,
         timings=timings,

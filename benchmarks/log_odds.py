@@ -64,7 +64,6 @@ def log_odds(*, V: int = 417, H: int = 200, objects: int = 12, rounds: int = 31)
     absent = v[0].numpy() == 0
     difference = prepared()[absent] - two_copies()[absent]
     return Result(
-        name="log-odds",
         title=f"Log-odds of {V} objects for one scene, {H} hidden units, one thread",
         subject=OURS,
         timings=timings,

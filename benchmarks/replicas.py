@@ -8,10 +8,7 @@ so the capacity contains the cost of the client.
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -20,22 +17,19 @@ from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Annotated
 
-import httpx
 import numpy as np
 import typer
 import uvloop
 
-from benchmarks.load.questions import requests
-from benchmarks.load.servers import ServerError, free_port
+from benchmarks.load.questions import labels_of, requests
+from benchmarks.load.servers import free_port, running
 from benchmarks.load.windows import Window, at_concurrency, at_times
 from benchmarks.queueing import mean_wait
 
 SHARES = (0.3, 0.5, 0.7)
 """Offered rates as fractions of the capacity."""
 
-_ROOT = Path(__file__).resolve().parents[1]
 _ROUTE, _KIND, _MANY = "/missing", "12 labels", 32
-_PATIENCE = 180.0
 _PROXY = """
 global
     nbthread 1
@@ -64,7 +58,7 @@ def main(
     print("replicas  share  requests/s  mean  model  mean / model      p99  other status")
     for count in replicas or (1, 2):
         with plain_processes(count) as port:
-            bodies = requests(_KIND, _ROUTE, _labels(port))
+            bodies = requests(_KIND, _ROUTE, labels_of(port))
             uvloop.run(at_concurrency(port, bodies, _MANY, 2))
             points = [_round(port, bodies, count, seconds, number) for number in range(rounds)]
         for share, same in zip(SHARES, zip(*points, strict=True), strict=True):
@@ -125,12 +119,6 @@ def _line(count: int, share: float, points: Sequence[Point]) -> str:
     )
 
 
-def _labels(port: int) -> list[str]:
-    url = f"http://127.0.0.1:{port}/models/default/vocabulary"
-    entries = httpx.get(url).raise_for_status().json()["objects"]
-    return [entry["label"] for entry in entries if not entry["structure"]]
-
-
 @contextmanager
 def plain_processes(replicas: int) -> Iterator[int]:
     """Start plain processes behind HAProxy, and yield the proxy's port."""
@@ -139,42 +127,12 @@ def plain_processes(replicas: int) -> Iterator[int]:
         for number in range(replicas):
             service = free_port()
             environment = {"SCENE_PORT": str(service)}
-            stack.enter_context(_running([sys.executable, "-m", "app"], service, environment))
+            stack.enter_context(running([sys.executable, "-m", "app"], service, environment))
             text += f"    server replica{number} 127.0.0.1:{service} check\n"
         config = Path(stack.enter_context(TemporaryDirectory())) / "haproxy.cfg"
         config.write_text(text, "utf-8")
-        stack.enter_context(_running(["haproxy", "-db", "-f", str(config)], port))
+        stack.enter_context(running(["haproxy", "-db", "-f", str(config)], port, {}))
         yield port
-
-
-@contextmanager
-def _running(
-    command: list[str], port: int, variables: dict[str, str] | None = None
-) -> Iterator[None]:
-    process = subprocess.Popen(
-        command,
-        cwd=_ROOT,
-        env=os.environ | (variables or {}),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    try:
-        deadline = time.monotonic() + _PATIENCE
-        while not _is_ready(port):
-            if process.poll() is not None or time.monotonic() > deadline:
-                raise ServerError(f"{command[0]} is not ready")
-            time.sleep(0.2)
-        yield
-    finally:
-        process.terminate()
-        process.wait(_PATIENCE)
-
-
-def _is_ready(port: int) -> bool:
-    try:
-        return httpx.get(f"http://127.0.0.1:{port}/health/ready").is_success
-    except httpx.TransportError:
-        return False
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""Benchmark results as tables and as JSON, and a description of the computer."""
+"""Benchmark results as tables, and a description of the computer."""
 
 from __future__ import annotations
 
 import os
 import platform
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -27,7 +27,6 @@ class Result:
     """Result of one benchmark.
 
     Attributes:
-        name: name of the benchmark.
         title: description of the measurement.
         subject: name of our implementation in `timings`.
         timings: timings of all implementations.
@@ -38,7 +37,6 @@ class Result:
         facts: further results, by name.
     """
 
-    name: str
     title: str
     subject: str
     timings: Timings
@@ -46,24 +44,6 @@ class Result:
     unit: str | None = None
     targets: Mapping[str, float] = field(default_factory=dict)
     facts: Mapping[str, Fact] = field(default_factory=dict)
-
-    def to_dict(self) -> dict[str, object]:
-        """Return a dictionary for JSON, with all timings and the speed ratios."""
-        return {
-            "name": self.name,
-            "title": self.title,
-            "subject": self.subject,
-            "work": self.work,
-            "unit": self.unit,
-            "seconds": dict(self.timings.seconds),
-            "ratios": {
-                name: asdict(self.timings.ratio(self.subject, name))
-                for name in self.timings.seconds
-                if name != self.subject
-            },
-            "targets": dict(self.targets),
-            "facts": dict(self.facts),
-        }
 
     def table(self) -> Group:
         """Return a table with one line per implementation.
@@ -97,11 +77,6 @@ def duration(seconds: float) -> str:
         if seconds >= size:
             return f"{seconds / size:.3g} {unit}"
     return f"{seconds / 1e-9:.3g} ns"
-
-
-def document(results: Sequence[Result], machine: Mapping[str, object]) -> dict[str, object]:
-    """Return the JSON document with all results and the description of the computer."""
-    return {"machine": dict(machine), "results": [result.to_dict() for result in results]}
 
 
 def describe_machine() -> dict[str, object]:

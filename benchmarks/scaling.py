@@ -87,7 +87,6 @@ def scaling(
         calls = {names[V]: partial(ask, artifact, scene) for V, artifact in artifacts.items()}
         results.append(
             Result(
-                name=f"scaling {question}",
                 title=f"/{question}: latency relative to {names[classes[0]]}",
                 subject=names[classes[0]],
                 timings=interleave(calls, rounds=rounds),

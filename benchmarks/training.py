@@ -63,7 +63,6 @@ def training_step(
         slice_seconds=0.3,
     )
     return Result(
-        name="training",
         title=f"One step of the object fit, {scenes} scenes of {objects} objects, {V} classes, "
         "one thread",
         subject=OURS,

@@ -97,6 +97,14 @@ async def client(shared_store: Path, anyio_backend: str) -> AsyncIterator[httpx.
 
 
 @pytest.fixture
+async def own(store: Path) -> AsyncIterator[httpx.AsyncClient]:
+    """An administrator's client of a service with the store of this test."""
+    async with serve(store) as client:
+        client.headers["X-Admin-Key"] = ADMIN_KEY
+        yield client
+
+
+@pytest.fixture
 def admin() -> dict[str, str]:
     """Request headers with the administrator's key."""
     return {"X-Admin-Key": ADMIN_KEY}

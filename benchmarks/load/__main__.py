@@ -5,15 +5,13 @@ The minimal ("plain") app validates the same requests and returns prepared answe
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import httpx
-import matplotlib as mpl
 import typer
 import uvloop
 from rich.console import Console
@@ -48,8 +46,6 @@ def main(
     store: Annotated[Path, typer.Option(help="the model store to serve")] = Path("model_store"),
     seconds: Annotated[float, typer.Option(min=0.1, help="seconds per measurement")] = 1.5,
     kind: Annotated[list[str] | None, typer.Option(help="only these kinds of request")] = None,
-    json_path: Annotated[Path | None, typer.Option("--json", help="JSON file of results")] = None,
-    plot: Annotated[Path | None, typer.Option(help="image file of latency distributions")] = None,
 ) -> None:
     """Send the same requests to the service and to a plain FastAPI app, and compare their speed.
 
@@ -79,15 +75,6 @@ def main(
     console.print(_table(comparisons))
     for name, value in facts.items():
         console.print(f"{name}: {value:.3g}", highlight=False)
-    if json_path is not None:
-        document = {
-            "machine": describe_machine(),
-            "facts": facts,
-            "results": [_record(comparison) for comparison in comparisons],
-        }
-        json_path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    if plot is not None:
-        _plot(comparisons, plot)
 
 
 def _all(
@@ -159,45 +146,6 @@ def _verdict(c: Comparison) -> str:
     if aim is None or c.load != f"{_MANY} connections":
         return ""
     return f"{'met' if c.rate_ratio >= aim else 'MISSED'}: ≥ {aim} of the rate"
-
-
-def _record(c: Comparison) -> dict[str, Any]:
-    record: dict[str, Any] = {
-        "kind": c.kind,
-        "route": c.route,
-        "load": c.load,
-        "steady": c.steady,
-        "ratios": list(c.ratios),
-    }
-    for name, window in (("service", c.service), ("plain", c.plain)):
-        record[name] = {
-            "rate": window.rate,
-            "errors": window.errors,
-            **{f"p{100 * q:g}": window.quantile(q) for q in _QUANTILES},
-        }
-    return record
-
-
-def _plot(comparisons: Sequence[Comparison], path: Path) -> None:
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    shown = [c for c in comparisons if c.load == f"{_MANY} connections"]
-    figure, axes = plt.subplots(
-        len(shown) // len(ROUTES) or 1, len(ROUTES), figsize=(12, 9), squeeze=False, sharey=True
-    )
-    for c, axis in zip(shown, axes.flat, strict=False):
-        for name, window in (("service", c.service), ("plain", c.plain)):
-            times = sorted(window.latency * 1e3)
-            share = [(k + 1) / len(times) for k in range(len(times))]
-            axis.step(times, share, label=name)
-        axis.set_title(f"{c.route}, {c.kind}")
-        axis.set_xscale("log")
-        axis.set_xlabel("ms")
-    axes[0, 0].set_ylabel(f"share of answers, {_MANY} connections")
-    axes[0, 0].legend()
-    figure.tight_layout()
-    figure.savefig(path, dpi=100)
 
 
 if __name__ == "__main__":

@@ -53,12 +53,15 @@ def cores() -> tuple[set[int], set[int]]:
 
 
 @contextmanager
-def service(store: Path, *, root: Path = ROOT, **settings: str) -> Iterator[Server]:
+def service(
+    store: Path, *, root: Path = ROOT, pinned: bool = True, **settings: str
+) -> Iterator[Server]:
     """Run the service (``python -m app``).
 
     Args:
         store: folder of the model store.
         root: folder of the sources.
+        pinned: whether the service stays on the servers' core, see `cores`.
         settings: further settings of the service. `name` sets the variable SCENE_NAME.
     """
     port = free_port()
@@ -66,7 +69,8 @@ def service(store: Path, *, root: Path = ROOT, **settings: str) -> Iterator[Serv
     variables |= {f"SCENE_{name.upper()}": value for name, value in settings.items()}
     if root != ROOT:
         variables["PYTHONPATH"] = os.pathsep.join((str(root), str(root / "clients" / "python")))
-    with _running(["-m", "app"], port, variables, root) as server:
+    command = [sys.executable, "-m", "app"]
+    with running(command, port, variables, root=root, pinned=pinned) as server:
         yield server
 
 
@@ -74,7 +78,8 @@ def service(store: Path, *, root: Path = ROOT, **settings: str) -> Iterator[Serv
 def plain() -> Iterator[Server]:
     """Run the plain app (``python -m benchmarks.load.plain``)."""
     port = free_port()
-    with _running(["-m", "benchmarks.load.plain", str(port)], port, {}, ROOT) as server:
+    command = [sys.executable, "-m", "benchmarks.load.plain", str(port)]
+    with running(command, port, {}, pinned=True) as server:
         yield server
 
 
@@ -87,19 +92,38 @@ def free_port() -> int:
 
 
 @contextmanager
-def _running(
-    arguments: list[str], port: int, variables: dict[str, str], root: Path
+def running(
+    command: list[str],
+    port: int,
+    variables: dict[str, str],
+    *,
+    root: Path = ROOT,
+    pinned: bool = False,
 ) -> Iterator[Server]:
+    """Run a server as a process until the end of the context.
+
+    Args:
+        command: the program and its arguments.
+        port: port of the server on 127.0.0.1.
+        variables: its environment, in addition to this process's.
+        root: its working directory.
+        pinned: whether the server stays on the servers' core, see `cores`.
+
+    Raises:
+        ServerError: the process ended, or the server was not ready in time.
+    """
     # SCENE_* settings of this machine must not affect the benchmark.
     environment = {name: value for name, value in os.environ.items() if name[:6] != "SCENE_"}
     start = time.perf_counter()
     process = subprocess.Popen(
-        [sys.executable, *arguments],
+        command,
         cwd=root,
         env=environment | variables,
+        stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
-    os.sched_setaffinity(process.pid, cores()[0])
+    if pinned:
+        os.sched_setaffinity(process.pid, cores()[0])
     try:
         _wait(process, port, start)
         yield Server(port, process.pid, time.perf_counter() - start)

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-import json
+import string
+from collections import Counter
 from collections.abc import Awaitable, Callable
 from itertools import cycle, islice
-from pathlib import Path
+from random import Random
 from typing import Any
 
 import httpx
 import pytest
 
+from app.questions import names
+from app.scene.labels import readings
+from app.scene.vocabulary import Vocabulary
 from scene_client.schemas import MAX_BATCH
+from scene_client.validation import MAX_ERRORS
 from tests.http.stores import VOCABULARY
 from tests.http.test_problems import problem
-from tests.services import client_of_service, launch
+from tests.services import client_of_service
 
 LABELS = [entry.label for entry in VOCABULARY.objects if not entry.structure]
 LIMIT = 4 * 2**20
@@ -52,19 +57,6 @@ async def test_the_answer_to_a_batch_has_a_limit(client: httpx.AsyncClient) -> N
     assert "Lower `top_k`" in last["errors"][0]["message"]
 
 
-async def test_a_batch_within_the_limit_is_answered_as_before(client: httpx.AsyncClient) -> None:
-    batch = {"scenes": [scene(23)] * MAX_BATCH}
-    answer = await client.post("/relations/batch", json=batch)
-    assert {entry["status"] for entry in answer.json()["results"]} == {200}
-
-
-async def test_the_largest_single_question_is_answered(client: httpx.AsyncClient) -> None:
-    answer = await client.post("/relations", json=scene(256, **LARGEST))
-    assert answer.status_code == 200
-    assert len(answer.json()["relations"]) == 4096
-    assert len(answer.content) < LIMIT
-
-
 def crowd(objects: int, letter: str = "😀") -> dict[str, Any]:
     """Objects that all stand beside each other."""
     found = scene(objects, letter)
@@ -83,20 +75,17 @@ def crowd(objects: int, letter: str = "😀") -> dict[str, Any]:
         ("outliers", "x", {"frame_id": "f" * 256}, "objects"),
     ],
 )
-@pytest.mark.parametrize("model", ["home", "plain", "deep"])
 async def test_single_answers_have_the_same_limit(
     limited: httpx.AsyncClient,
     question: str,
     letter: str,
     options: dict[str, Any],
     parameter: str,
-    model: str,
 ) -> None:
     """Whatever it is made of: the largest scene that is answered has an answer within the limit."""
 
     async def ask(objects: int) -> httpx.Response:
-        body = {**crowd(objects, letter), **options, "model": model}
-        return await limited.post(f"/{question}", json=body)
+        return await limited.post(f"/{question}", json=crowd(objects, letter) | options)
 
     await check_the_largest(ask, 128, parameter)
 
@@ -129,20 +118,93 @@ async def check_the_largest(
     assert SMALL / 8 < len(largest.content) <= SMALL
 
 
-@pytest.mark.slow
-def test_memory_stays_bounded(shared_store: Path, tmp_path: Path) -> None:
-    """It grew by 700 MB."""
-    with launch(shared_store, tmp_path / "log") as service:
-        service.client.post("/relations", json=scene(23, **LARGEST))
-        before = peak(service.process.pid)
-        body = json.dumps(BATCH).encode()
-        headers = {"Content-Type": "application/json"}
-        answer = service.client.post("/relations/batch", content=body, headers=headers)
-        assert answer.status_code == 200
-        assert peak(service.process.pid) - before < 150 * 2**20
+# ----------------------------------------------------------------------------------- unknown labels
 
 
-def peak(pid: int) -> int:
-    """The largest resident memory so far, in bytes."""
-    status = Path(f"/proc/{pid}/status").read_text()
-    return int(status.split("VmHWM:")[1].split()[0]) * 1024
+# Labels of one request that are looked up: to suggest some like them, and to take them for others.
+MAX_SUGGESTED, MAX_MAPPED = 32, 256
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """The number of calls of each search."""
+    found: Counter[str] = Counter()
+
+    def count(owner: Any, name: str) -> None:
+        original = getattr(owner, name)
+
+        def counted(*values: Any, **named: Any) -> Any:
+            found[name] += 1
+            return original(*values, **named)
+
+        monkeypatch.setattr(owner, name, counted)
+
+    for name in ("index", "read", "guess", "nearest"):
+        count(Vocabulary, name)
+    count(names, "spelt_alike")
+    return found
+
+
+def words(count: int, length: int) -> list[str]:
+    rng = Random(0)
+    return ["".join(rng.choices(string.ascii_lowercase, k=length)) for _ in range(count)]
+
+
+def suggestions(answer: httpx.Response) -> int:
+    problems = [entry["problem"] for entry in answer.json()["results"] if "problem" in entry]
+    errors = [error for problem in problems for error in problem["errors"]]
+    return sum("suggestions" in error and bool(error["suggestions"]) for error in errors)
+
+
+async def test_a_batch_has_few_suggestions(client: httpx.AsyncClient) -> None:
+    misspelt = [f"lammp{letter}" for letter in string.ascii_lowercase]
+    batch = {"scenes": [{"objects": misspelt}] * 64}
+    assert suggestions(await client.post("/missing/batch", json=batch)) == MAX_SUGGESTED
+    # The next request has its own.
+    assert suggestions(await client.post("/missing/batch", json={"scenes": [batch["scenes"][0]]}))
+
+
+@pytest.mark.parametrize(
+    ("treatment", "guesses"),
+    [("error", 0), ("nearest", MAX_MAPPED), ("nearest-or-ignore", MAX_MAPPED)],
+)
+async def test_a_batch_looks_few_labels_up(
+    client: httpx.AsyncClient, calls: Counter[str], treatment: str, guesses: int
+) -> None:
+    labels = iter(words(64 * 20, 12))
+    scenes = [
+        {"objects": ["bed", *(next(labels) for _ in range(20))], "unknown_labels": treatment}
+        for _ in range(64)
+    ]
+    answer = await client.post("/missing/batch", json={"scenes": scenes})
+    ignores = treatment == "nearest-or-ignore"
+    assert {entry["status"] for entry in answer.json()["results"]} == {200 if ignores else 422}
+    assert calls["guess"] == guesses
+    assert calls["nearest"] == (0 if ignores else MAX_SUGGESTED)
+
+
+async def test_relations_of_unknown_objects_cost_little(
+    client: httpx.AsyncClient, calls: Counter[str]
+) -> None:
+    """4,096 relations named 8,192 unknown objects: 74 ms, or 2 s with names of U+FDFA."""
+    names = ["\ufdfa" * 3 + str(number) for number in range(8_192)]
+    relations = [[names[2 * k], "left", names[2 * k + 1]] for k in range(4_096)]
+    answer = await client.post("/missing", json={"objects": ["bed"], "relations": relations})
+    assert answer.status_code == 422
+    assert MAX_ERRORS <= len(answer.json()["errors"]) <= MAX_ERRORS + 1
+    assert calls["index"] <= 1 + len(answer.json()["errors"])
+    assert calls["spelt_alike"] <= MAX_SUGGESTED
+
+
+async def test_a_scene_of_unknown_labels_stops_early(
+    client: httpx.AsyncClient, calls: Counter[str]
+) -> None:
+    objects = [f"a/{'b/' * 40}{number}" for number in range(256)]
+    answer = await client.post("/missing", json={"objects": objects})
+    assert len(answer.json()["errors"]) == MAX_ERRORS
+    assert calls["read"] == MAX_ERRORS
+
+
+def test_a_label_has_few_readings() -> None:
+    worst = ["a/" * 50, "the a_1/" * 12, "x_(" * 33, "a photo of " * 9, "a 1 " * 25, "1|" * 50]
+    assert max(len(list(readings(label))) for label in worst) <= 100

@@ -46,9 +46,10 @@ async def test_entries_are_counted_before_they_are_validated(
 
 async def test_the_body_of_one_scene_has_a_limit_of_its_own(client: httpx.AsyncClient) -> None:
     scene = b'{"objects":["bed"]}'
-    for size, status in ((2**18, 200), (2**18 + 1, 413)):
-        response = await client.post("/missing", content=scene.ljust(size), headers=JSON)
-        assert response.status_code == status
+    response = await client.post("/missing", content=scene.ljust(2**18), headers=JSON)
+    assert response.status_code == 200
+    response = await client.post("/missing", content=scene.ljust(2**18 + 1), headers=JSON)
+    problem(response, 413, "body-too-large")
     batch = b'{"scenes":[%b]}' % scene
     response = await client.post("/missing/batch", content=batch.ljust(2**21), headers=JSON)
     assert response.status_code == 200

@@ -18,25 +18,15 @@ from typing import Any
 import httpx
 import pytest
 
-from app.server import most_connections
+from benchmarks.load.windows import at_concurrency, at_rate
 from tests.http.stores import make_store
 from tests.services import LiveService, launch, live_service, wait_until
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 
 LABELS = [
-    "bed",
-    "nightstand",
-    "lamp",
-    "pillow",
-    "window",
-    "curtain",
-    "dresser",
-    "mirror",
-    "picture",
-    "rug",
-    "chair",
-    "book",
+    *("bed", "nightstand", "lamp", "pillow", "window", "curtain"),
+    *("dresser", "mirror", "picture", "rug", "chair", "book"),
 ]
 SCENE = {"objects": LABELS}
 SECONDS = 3.0
@@ -121,6 +111,22 @@ async def test_others_keep_half_of_their_rate(
     assert delays[median] < usual[median] + 0.05
 
 
+def test_overload_is_refused_and_leaves_nothing_behind(service: LiveService) -> None:
+    """Ten times the rate that the service reaches, over 512 connections."""
+    requests = [request("missing", {"objects": LABELS[:3] * size}) for size in range(1, 20)]
+    before, rate = service.control(), asyncio.run(at_concurrency(service.port, requests, 8, 2)).rate
+    # A first overload allocates what every later one uses again.
+    asyncio.run(at_rate(service.port, requests, 10 * rate, 1, connections=512))
+    resident = service.memory
+    with ThreadPoolExecutor() as pool:
+        checks = pool.submit(asyncio.run, at_rate(service.port, [HEALTH], 50, SECONDS, 1))
+        window = asyncio.run(at_rate(service.port, requests, 10 * rate, SECONDS, connections=512))
+    assert {200, 429} <= window.statuses.keys() <= {200, 429, 504}
+    assert checks.result().statuses.keys() == {200}
+    assert service.control() == before
+    assert service.memory - resident < 16 * 2**20
+
+
 def test_memory_stays_bounded_when_answers_are_not_read(service: LiveService) -> None:
     """Twenty clients ask for the largest batch, and read a byte a second of the answer."""
     before, answers = service.memory, service.control()
@@ -171,14 +177,6 @@ def test_few_files_limit_the_connections(tmp_path: Path) -> None:
         for _ in range(20):
             assert service.client.get("/health/live").status_code == 200
         assert "accepts 192 connections" in service.log.read_text()
-
-
-@pytest.mark.parametrize(("files", "most"), [(resource.RLIM_INFINITY, 1024), (1024, 960)])
-def test_connections_fit_the_limit_of_files(
-    monkeypatch: pytest.MonkeyPatch, files: int, most: int
-) -> None:
-    monkeypatch.setattr(resource, "getrlimit", lambda _: (files, files))
-    assert most_connections(1024) == most
 
 
 behind_proxy = live_service(SCENE_TRUSTED_PROXIES="127.0.0.1")

@@ -100,16 +100,6 @@ def test_a_folder_of_another_user_is_refused(package: Path, tmp_path: Path) -> N
     assert f"{folder} or its parent belongs to another user" in log
 
 
-def test_without_a_folder_beside_the_package_the_users_own_is_used(
-    package: Path, tmp_path: Path
-) -> None:
-    (package.parent / ".numba_cache").write_text("in the way")
-    _, stored, log = start(package)
-    assert stored is not None
-    assert Path(stored).is_relative_to(tmp_path / "home" / "cache" / "scene-boltzmann")
-    assert "compiled loops are stored in" in log
-
-
 @pytest.mark.slow
 def test_two_processes_that_start_together_compile_once(package: Path) -> None:
     logs = [end(process)[2] for process in [begin(package), begin(package)]]

@@ -90,18 +90,23 @@ def nested(depth: int) -> bytes:
 @pytest.mark.parametrize(
     ("variable", "problem"),
     [
-        (lambda: array(4, 2**28, element(1, bytes(2**28))), "is larger than 256 MiB after"),
-        (lambda: array(1, 2**29), "is larger than 256 MiB after"),  # 180 bytes took 4.1 GB
-        (lambda: array(2, 2**27, FIELDS), "is larger than 256 MiB after"),
-        (lambda: array(1, 1, array(2, 2**27, FIELDS)), "is larger than 256 MiB after"),
+        (lambda: array(4, 2**24, element(1, bytes(2**24))), "is larger than 16 MiB after"),
+        (lambda: array(1, 2**25), "is larger than 16 MiB after"),  # 180 bytes took 4.1 GB
+        (lambda: array(2, 2**23, FIELDS), "is larger than 16 MiB after"),
+        (lambda: array(1, 1, array(2, 2**23, FIELDS)), "is larger than 16 MiB after"),
         (lambda: nested(2000), "the arrays are nested too deeply"),
         (lambda: b"\x0e\0\0\0\x08\0\0\0\x06\0\0\0\0\0\0\0", "is not a MATLAB 5 file"),
     ],
     ids=["text", "cells", "structs", "nested structs", "deep", "torn"],
 )
 def test_a_mat_file_is_measured_before_it_is_unpacked(
-    tmp_path: Path, variable: Callable[[], bytes], problem: str, packed: bool
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    variable: Callable[[], bytes],
+    problem: str,
+    packed: bool,
 ) -> None:
+    monkeypatch.setattr(sunrgbd_mat, "MAX_BYTES", 2**24)
     content = variable()
     if packed:
         content = zlib.compress(content)

@@ -6,9 +6,9 @@ No test here looks at speed: that is what the benchmarks are for.
 from __future__ import annotations
 
 import io
-import json
 import math
 
+import httpx
 import pytest
 import typer
 from rich.console import Console
@@ -16,27 +16,21 @@ from typer.testing import CliRunner
 
 from benchmarks.__main__ import main
 from benchmarks.gibbs import gibbs
+from benchmarks.load import plain
+from benchmarks.load.questions import KINDS, bodies
 from benchmarks.log_odds import log_odds
-from benchmarks.report import Result, describe_machine, document
-from benchmarks.scaling import scaling
-from benchmarks.service import MISSING, NoModelError, service
-from benchmarks.timing import Timings, interleave
-from benchmarks.training import training_step
-from tests.http.stores import make_store, publish
+from benchmarks.queueing import erlang_c, mean_wait, replicas_for
+from benchmarks.report import Result
 
 
 def check_complete(result: Result, rounds: int) -> None:
-    """Every contender in every round, a positive finite ratio to each, and all of it printable."""
+    """Every contender in every round, and all of it printable."""
     seconds = result.timings.seconds
     assert result.subject in seconds
     assert set(result.targets) <= set(seconds) - {result.subject}
     for values in seconds.values():
         assert len(values) == rounds
         assert all(0 < value < math.inf for value in values)
-    parsed = json.loads(json.dumps(document([result], describe_machine()), allow_nan=False))
-    assert set(parsed["results"][0]["ratios"]) == set(seconds) - {result.subject}
-    for ratio in parsed["results"][0]["ratios"].values():
-        assert 0 < ratio["low"] <= ratio["median"] <= ratio["high"] < math.inf
     console = Console(width=200, file=io.StringIO())
     with console.capture() as capture:
         console.print(result.table())
@@ -56,86 +50,49 @@ def test_gibbs_yardsticks_sample_the_same_machine():
     assert ours == pytest.approx(4, abs=1)
 
 
-@pytest.mark.slow
-def test_training_step():
-    """The yardstick has the same log-odds."""
-    result = training_step(V=12, units=3, states=4, scenes=3, objects=4, rounds=2)
-    check_complete(result, 2)
-    assert result.facts["largest difference of log-odds"] < 1e-4
-
-
 def test_log_odds_agree_with_those_of_the_yardstick():
     result = log_odds(V=30, H=12, objects=5, rounds=2)
     check_complete(result, 2)
     assert result.facts["largest difference from scikit-learn"] < 1e-4
 
 
-@pytest.mark.slow
-@pytest.mark.system
-def test_scaling():
-    results = scaling(classes=(20, 45), units=3, states=4, K=3, N=8, objects=4, rounds=2)
-    for result in results:
-        check_complete(result, 2)
-    assert [result.name.split()[1] for result in results] == [
-        "relations",
-        "missing",
-        "outliers",
-        "rooms",
-        "generate",
-    ]
-    sizes = [value for name, value in results[0].facts.items() if name.endswith("artifact in MB")]
-    assert sizes[0] < sizes[1]
-
-
-@pytest.mark.slow
-@pytest.mark.system
-def test_service(tmp_path):
-    started, asked = service(store=make_store(tmp_path), objects=3, requests=5, rounds=1)
-    check_complete(started, 1)
-    check_complete(asked, 5)
-    assert asked.subject == MISSING
-    assert asked.facts["model"] == "home 1.0.0 (triway)"
-
-
-@pytest.mark.system
-def test_service_without_a_store_is_refused(tmp_path):
-    with pytest.raises(NoModelError, match="does not exist"):
-        service(store=tmp_path / "none")
-
-
-@pytest.mark.slow
-@pytest.mark.system
-def test_service_without_a_default_model_is_refused(tmp_path):
-    publish(tmp_path, "one", "1.0.0")
-    publish(tmp_path, "two", "1.0.0")
-    with pytest.raises(NoModelError, match="not ready"):
-        service(store=tmp_path, rounds=1)
-
-
-def test_command_says_what_it_skips_and_writes_the_rest(tmp_path):
-    path = tmp_path / "results.json"
-    arguments = ["service", "--store", str(tmp_path / "none"), "--json", str(path)]
+def test_command_says_what_it_skips(tmp_path):
     app = typer.Typer()
     app.command()(main)
-    result = CliRunner().invoke(app, arguments)
+    result = CliRunner().invoke(app, ["service", "--store", str(tmp_path / "none")])
     assert result.exit_code == 0, result.output
     assert "service: skipped" in result.output
-    written = json.loads(path.read_text())
-    assert written["results"] == []
-    assert written["machine"]["cores"] >= 1
 
 
-def test_contenders_take_turns_and_start_in_turns():
-    calls: list[str] = []
-    contenders = {name: lambda name=name: calls.append(name) for name in "abc"}
-    interleave(contenders, rounds=4, slice_seconds=0.0)
-    warm_up = ["a", "a", "b", "b", "c", "c"]
-    assert calls == warm_up + list("abc") + list("bca") + list("cab") + list("abc")
+LABELS = [f"thing {number}" for number in range(40)]
 
 
-def test_a_ratio_is_taken_within_each_round():
-    """The machine slows down tenfold in the last two rounds; the ratio does not notice."""
-    timings = Timings({"ours": [1.0, 1.0, 10.0, 10.0], "other": [3.0, 3.0, 30.0, 30.0]})
-    ratio = timings.ratio("ours", "other")
-    assert (ratio.low, ratio.median, ratio.high) == (3, 3, 3)
-    assert timings.ratio("other", "ours").median == pytest.approx(1 / 3)
+@pytest.mark.parametrize("kind", KINDS)
+async def test_the_yardstick_validates_and_sends_the_prepared_answer(kind: str) -> None:
+    transport = httpx.ASGITransport(plain.app)
+    async with httpx.AsyncClient(transport=transport, base_url="http://plain") as client:
+        scene = bodies(kind, LABELS)[0]
+        for question in ("missing", "relations", "outliers", "rooms"):
+            answer = f'{{"{question}":[]}}'.encode()
+            await client.put(f"/answers/{question}", content=answer)
+            found = await client.post(f"/{question}", json=scene)
+            assert (found.status_code, found.content) == (200, answer)
+            refused = await client.post(f"/{question}", json={"objects": 1})
+            assert refused.status_code == 422
+
+
+def test_one_and_two_servers_are_the_textbook_formulas() -> None:
+    for load in (0.1, 0.5, 0.9):
+        assert erlang_c(1, load) == pytest.approx(load)
+        assert mean_wait(load, 1.0, 1) == pytest.approx(load / (1 - load))
+    assert erlang_c(2, 1.0) == pytest.approx(1 / 3)
+    assert erlang_c(2, 1.5) == pytest.approx(9 / 14)
+
+
+def test_many_servers_are_sized() -> None:
+    replicas = replicas_for(100_000, 1e-3, 1e-3, share=0.8)
+    assert replicas == 125
+    assert mean_wait(100_000, 1e-3, replicas) < 1e-6
+    assert replicas_for(900, 1e-3, 3e-4) == 2
+    with pytest.raises(ValueError, match="servers"):
+        erlang_c(2, 2.0)

@@ -9,7 +9,7 @@ from typing import Any
 
 import httpx
 import pytest
-from playwright.sync_api import Browser, Page, Route, ViewportSize, sync_playwright
+from playwright.sync_api import Browser, Page, Route, sync_playwright
 
 from tests.browser.driving import Board, link_to
 from tests.services import LiveService
@@ -85,16 +85,13 @@ def open_board(chromium: Browser, shipped: LiveService) -> Iterator[Callable[...
     def open_page(
         scene: dict[str, Any] | None = DESK,
         *,
-        width: int = 1300,
-        height: int = 900,
         examples: list[dict[str, Any]] | None = EXAMPLES,
         allow: tuple[str, ...] = (),
         home: str | None = None,
         url: str | None = None,
         **options: Any,
     ) -> Board:
-        size: ViewportSize = {"width": width, "height": height}
-        context = chromium.new_context(viewport=size, **options)
+        context = chromium.new_context(viewport={"width": 1300, "height": 900}, **options)
         context.set_default_timeout(15_000)
         context.add_init_script(_WITNESS)
         root = home or str(shipped.client.base_url)

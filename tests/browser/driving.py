@@ -59,11 +59,6 @@ class Board:
         self.page.get_by_label("Positions count as evidence").check()
         self.settle()
 
-    def compare_with(self, model: str) -> None:
-        """Ask a second model too."""
-        self.page.get_by_label("compare with").select_option(model)
-        self.settle()
-
     def alter(self, question: str, change: Callable[[Any], Any]) -> None:
         """Let the page receive changed answers to a question."""
 
@@ -83,18 +78,6 @@ class Board:
     def tab(self, name: str) -> None:
         """Go to a question."""
         self.page.get_by_role("tab", name=name).click()
-        self.settle()
-
-    def drag(self, what: Locator, right: float, down: float) -> None:
-        """Drag something by so many pixels, in several movements."""
-        box = what.bounding_box()
-        assert box is not None
-        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-        self.page.mouse.move(x, y)
-        self.page.mouse.down()
-        for part in (0.2, 0.6, 1.0):
-            self.page.mouse.move(x + right * part, y + down * part)
-        self.page.mouse.up()
         self.settle()
 
     # ---------------------------------------------------------------------------- seeing
@@ -128,22 +111,22 @@ class Board:
         """What a screen reader was told last."""
         return plain(self.page.locator("#live").text_content())
 
-    def column(self, question: str, number: int = 0) -> Locator:
-        """The answers of one model to a question."""
-        return self.page.locator(f"[data-question={question}] article").nth(number)
+    def column(self, question: str) -> Locator:
+        """The answers of the first model to a question."""
+        return self.page.locator(f"[data-question={question}] article").first
 
-    def rows(self, question: str, number: int = 0) -> list[str]:
+    def rows(self, question: str) -> list[str]:
         """The entries of an answer, each in one line."""
-        texts = self.column(question, number).locator("ol > li").all_inner_texts()
+        texts = self.column(question).locator("ol > li").all_inner_texts()
         return [plain(text) for text in texts]
 
-    def curl(self, question: str, number: int = 0) -> str:
+    def curl(self, question: str) -> str:
         """The command that the page shows."""
-        return self.column(question, number).locator("pre").first.text_content() or ""
+        return self.column(question).locator("pre").first.text_content() or ""
 
-    def python(self, question: str, number: int = 0) -> str:
+    def python(self, question: str) -> str:
         """The program that the page shows."""
-        return self.column(question, number).locator("pre").nth(1).text_content() or ""
+        return self.column(question).locator("pre").nth(1).text_content() or ""
 
     @property
     def scene(self) -> dict[str, Any]:
@@ -152,9 +135,9 @@ class Board:
         fields = ("objects", "relations", "room_type", "frame_id", "viewpoint")
         return {name: value for name, value in body_of(shown).items() if name in fields}
 
-    def body(self, question: str, number: int = 0) -> dict[str, Any]:
+    def body(self, question: str) -> dict[str, Any]:
         """The request of that command."""
-        return body_of(self.curl(question, number))
+        return body_of(self.curl(question))
 
 
 OpenBoard = Callable[..., Board]

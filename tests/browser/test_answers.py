@@ -13,7 +13,7 @@ import httpx
 import pytest
 from playwright.sync_api import expect
 
-from tests.browser.driving import Board, OpenBoard, percent
+from tests.browser.driving import Board, OpenBoard, body_of, percent
 from tests.conftest import run_program
 
 pytestmark = pytest.mark.system
@@ -71,30 +71,6 @@ def test_missing_objects_are_listed_with_their_places(bedroom: Board, api: httpx
         assert (likely and not placed) == ("no free place on the board" in row)
         assert reasons(missing["because"]) in row
     assert set(bedroom.ghosts) <= {one["label"] for one in answer["missing"]}
-
-
-def test_further_instances_are_listed_among_the_missing_objects(
-    open_board: OpenBoard, api: httpx.Client
-) -> None:
-    board = open_board(
-        {"objects": ["table", "chair", "chair", "whiteboard"], "room_type": "office"}
-    )
-    (more,) = ask(api, "missing", board.scene)["more"]
-    expected = f"2 listed, about {more['expected_count']:.0f} expected"
-    rows = board.rows("missing")
-    assert f"another chair {percent(more['probability'])} {expected}" in rows
-    shown = [int(re.findall(r"(\d+) %", row)[0]) for row in rows]
-    assert shown == sorted(shown, reverse=True)
-
-
-def test_a_double_click_adds_one_object(bedroom: Board) -> None:
-    before = len(bedroom.things)
-    bedroom.column("missing").get_by_role("button", name="Put ").first.dblclick()
-    bedroom.settle()
-    assert len(bedroom.things) == before + 1
-    bedroom.page.locator("#board .ghost rect").first.dblclick(force=True)
-    bedroom.settle()
-    assert len(bedroom.things) == before + 2
 
 
 def test_a_ghost_becomes_an_object_where_it_was_drawn(bedroom: Board) -> None:
@@ -173,25 +149,6 @@ def test_outliers_are_marked_with_reasons_in_words(bedroom: Board, api: httpx.Cl
     expect(outliers).to_have_count(sum(one["is_outlier"] for one in answer["outliers"]))
 
 
-def test_only_misplaced_relations_are_in_the_wrong_place(bedroom: Board) -> None:
-    said = {"subject": "lamp", "relation": "on-top", "object": "bed"}
-    amiss = {**said, "probability": 0.75, "is_misplaced": True, "moved": "lamp"}
-    fine = {**said, "object": "nightstand", "probability": 0.1, "is_misplaced": False}
-    answer = {"outliers": [], "misplaced": [amiss, amiss | {"object": "floor"}, fine]}
-    bedroom.alter("outliers", lambda other: other | answer)
-    bedroom.use_positions()
-    bedroom.tab("Wrong")
-    assert bedroom.rows("outliers") == [
-        f"lamp on top of {place} in the wrong place 75 % moved: lamp" for place in ("bed", "floor")
-    ]
-    assert bedroom.edges == [("misplaced", "on top of?")], "the floor is not on the board"
-    expect(bedroom.page.locator("#legend .misplaced")).to_have_text("probably in the wrong place")
-    expect(bedroom.page.locator("#alarms")).to_have_text("2")
-    words = "lamp on top of bed (moved: lamp), lamp on top of floor (moved: lamp)."
-    assert f"In the wrong place: {words}" in bedroom.announced
-    assert "Nothing looks wrong" not in bedroom.announced
-
-
 def test_relations_are_edges_and_those_that_hold_are_told_apart(
     bedroom: Board, api: httpx.Client
 ) -> None:
@@ -218,61 +175,6 @@ def test_relations_are_edges_and_those_that_hold_are_told_apart(
     words = {text for kind, text in bedroom.edges if text and kind != "disagrees"}
     assert words
     assert words <= said
-
-
-def test_unexpected_relations_show_what_is_expected(bedroom: Board) -> None:
-    milk = {"subject": "milk", "relation": "inside", "object": "bed", "probability": 1.0}
-    seen = milk | {"observed": True, "expected": 0.004}
-    unseen = milk | {"relation": "contains", "observed": False, "expected": None}
-    odd = {"subject": "nightstand", "object": "bed", "observed": ["left"], "expected": "right"}
-    odd |= {"probability": 0.7, "observed_probability": 0.1}
-    answer = {"relations": [seen, unseen], "disagreements": [odd]}
-    bedroom.alter("relations", lambda other: other | answer)
-    bedroom.tab("Relations")
-    bedroom.use_positions()
-    assert bedroom.rows("relations") == [
-        "nightstand left of bed 10 % expected: right of, 70 %",
-        "milk in bed observed 100 % expected: < 1 %",
-        "milk containing bed 100 %",
-    ]
-    assert ("disagrees", "right of? 70 %") in bedroom.edges
-
-
-def test_every_symbol_is_in_the_legend(bedroom: Board) -> None:
-    page = bedroom.page
-    legend = page.locator("#legend span")
-
-    def symbols() -> set[str]:
-        return {str(one.get_attribute("class")) for one in legend.all()}
-
-    assert symbols() == {"robot", "outlier", "ghost"}
-    page.locator("#list .name").first.click()
-    page.get_by_label("Positions count as evidence").check()
-    bedroom.add("mirror")  # a class without a typical size
-    assert symbols() == {"robot", "outlier", "ghost", "guess", "selected", "loose"}
-    bedroom.tab("Relations")
-    assert {kind for kind, _ in bedroom.edges} < symbols()
-    bedroom.tab("Generate")
-    bedroom.click("Generate a scene")
-    assert symbols() == {"robot", "fresh"}
-    assert all(legend.all_text_contents())
-
-
-def test_words_on_the_board_cover_no_others(bedroom: Board) -> None:
-    for tab in ("Missing", "Wrong", "Relations"):
-        bedroom.tab(tab)
-        boxes = [
-            box
-            for text in bedroom.page.locator("#board :is(.labels, .ghosts, .edges) text").all()
-            if text.text_content() and text.text_content() != "!" and (box := text.bounding_box())
-        ]
-        assert len(boxes) > 4
-        for index, a in enumerate(boxes):
-            for b in boxes[:index]:
-                # A line's box is higher than its letters: a quarter may meet.
-                across = min(a["x"] + a["width"], b["x"] + b["width"]) - max(a["x"], b["x"])
-                down = min(a["y"] + a["height"], b["y"] + b["height"]) - max(a["y"], b["y"])
-                assert across <= 1 or down <= 0.25 * min(a["height"], b["height"]), (a, b)
 
 
 def test_room_types_are_listed_by_their_probability(bedroom: Board, api: httpx.Client) -> None:
@@ -304,35 +206,6 @@ def test_room_types_are_listed_by_their_probability(bedroom: Board, api: httpx.C
     expect(options).to_have_text(["unknown", *names])
 
 
-def test_two_models_answer_side_by_side(bedroom: Board, api: httpx.Client) -> None:
-    models = api.get("/models").json()["models"]
-    references = [f"{one['name']}@{v['version']}" for one in models for v in one["versions"]]
-    shown = bedroom.page.locator("#second option")
-    aliases = api.get("/models").json()["aliases"]
-    # A version with an alias is listed once, by its alias.
-    expected = ["", *aliases, *(one for one in references if one not in aliases.values())]
-    assert [option.get_attribute("value") for option in shown.all()] == expected
-    (second,) = [name for name in references if name.startswith("indoor-rbm@")]
-    bedroom.compare_with(second)
-    for number, model in enumerate(("default", second)):
-        answer = ask(api, "missing", bedroom.scene, top_k=5, model=model)
-        rows = bedroom.rows("missing", number)
-        listed = [(one["label"], one) for one in answer["missing"]]
-        listed += [(f"another {one['label']}", one) for one in answer["more"]]
-        listed.sort(key=lambda entry: -entry[1]["probability"])
-        assert [row.split(" %")[0] for row in rows] == [
-            f"{name} {percent(one['probability'])}".removesuffix(" %") for name, one in listed
-        ]
-        title = f"{answer['model']['name']} {answer['model']['version']}"
-        expect(bedroom.column("missing", number).locator("h3")).to_have_text(title)
-    bedroom.column("missing", 1).get_by_role("button", name="on the board").click()
-    bedroom.settle()
-    answer = ask(api, "missing", bedroom.scene, top_k=5, model=second)
-    assert set(bedroom.ghosts) <= {one["label"] for one in answer["missing"]}
-    bedroom.compare_with("")
-    expect(bedroom.column("missing", 1)).to_be_hidden()
-
-
 def test_the_calls_shown_give_the_answer_shown_and_can_be_copied(
     open_board: OpenBoard, api: httpx.Client, require_system_tool: Callable[[str], Path]
 ) -> None:
@@ -352,3 +225,84 @@ def test_the_calls_shown_give_the_answer_shown_and_can_be_copied(
     board.column("missing").get_by_role("button", name="Copy the curl call").click()
     expect(board.column("missing").get_by_text("copied")).to_be_visible()
     assert board.page.evaluate("navigator.clipboard.readText()") == board.curl("missing")
+
+
+def draw(board: Board) -> None:
+    board.click("Generate a scene")
+    expect(board.page.locator("#draft")).to_be_visible()
+    board.settle()
+
+
+def request(board: Board) -> dict[str, Any]:
+    return body_of(board.page.locator("#drawn pre").first.text_content() or "")
+
+
+@pytest.mark.slow
+def test_a_drawn_scene_is_the_service_s_and_can_be_kept(
+    open_board: OpenBoard, api: httpx.Client
+) -> None:
+    board = open_board()
+    board.page.locator("#room").select_option("kitchen")
+    board.tab("Generate")
+    seen = []
+    for seed in (1, 2):
+        draw(board)
+        body = request(board)
+        assert (body["seed"], body["room_type"], body["objects"]) == (seed, "kitchen", [])
+        (scene,) = api.post("/generate", json=body).json()["scenes"]
+        assert board.page.locator("#drawn .chips li").all_text_contents() == scene["objects"]
+        shown = board.page.locator("#board .object").all()
+        names = {str(one.get_attribute("aria-label")).split(",")[0] for one in shown}
+        assert names == set(scene["objects"]) == set(board.things)
+        seen.append(board.page.locator("#drawn .chips li").all_text_contents())
+    assert seen[0] != seen[1]
+    board.click("Keep")
+    assert board.things == seen[1]
+    assert board.scene["room_type"] == "kitchen"
+    # The page placed these objects, so their positions do not count.
+    assert not any("position" in thing for thing in board.scene["objects"])
+    board.click("Undo")
+    assert board.things == ["desk", "chair"]
+
+
+# -------------------------------------------------------------------------------------- suggestions
+
+
+def test_a_suggestion_at_another_place_or_none_says_so(open_board: OpenBoard) -> None:
+    far = {"mean": {"x": 9.0, "y": 0.0, "z": 0.5}, "std": dict.fromkeys("xyz", 0.2), "scenes": 9}
+    place = {"relation": "on-top", "object": "desk", "probability": 0.9, "offset": far}
+    board = open_board()
+    board.alter(
+        "missing",
+        lambda answer: (
+            answer | {"missing": [answer["missing"][0] | {"label": "cup", "placements": [place]}]}
+        ),
+    )
+    board.add("laptop")
+    assert "drawn at the nearest free place" in board.rows("missing")[0]
+    ghost = board.page.locator("#board .ghost").first
+    assert "drawn at the nearest free place" in str(ghost.get_attribute("aria-label"))
+    far["mean"]["x"] = 0.0
+    board.add("lamp")
+    assert board.ghosts == ["cup"]
+    assert "nearest free place" not in board.rows("missing")[0]
+    # Below the desk, there is no free place.
+    place["relation"] = "below"
+    del place["offset"]
+    board.add("mug")
+    assert board.ghosts == []
+    assert "no free place on the board" in board.rows("missing")[0]
+    assert board.column("missing").get_by_role("button", name="Put ").count() == 0
+
+
+def test_no_suggestion_stands_at_an_outlier(open_board: OpenBoard, api: httpx.Client) -> None:
+    board = open_board({"objects": ["bed", "nightstand", "lamp", "toilet"]})
+    (toilet,) = [
+        one["object"]
+        for one in api.post("/outliers", json=board.scene).json()["outliers"]
+        if one["is_outlier"]
+    ]
+    missing = api.post("/missing", json=board.scene | {"top_k": 5}).json()["missing"]
+    places = [place for one in missing for place in one["placements"]]
+    assert any(place["object"] == toilet and place["probability"] >= 0.25 for place in places)
+    assert not any(re.search(rf"{toilet} \d+ %", row) for row in board.rows("missing"))

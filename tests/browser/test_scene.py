@@ -5,12 +5,14 @@ from __future__ import annotations
 import base64
 import json
 import zlib
+from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 from playwright.sync_api import expect
 
+from scene_client.vision_msgs import from_message
 from tests.browser.driving import Board, OpenBoard
 
 pytestmark = pytest.mark.system
@@ -71,20 +73,6 @@ def test_objects_on_a_support_move_with_it(open_board: OpenBoard) -> None:
     assert place(board, "lamp") == pytest.approx((before[0], before[1] - 0.5, before[2]))
 
 
-@pytest.mark.slow
-def test_dragging_moves_and_snaps_and_can_be_undone(open_board: OpenBoard) -> None:
-    board = open_board()
-    board.tab("Wrong")  # where no suggestion lies over the chair
-    before = place(board, "chair", "outliers")
-    board.drag(board.thing("chair").locator(".box"), 61, 37)
-    snapped = place(board, "chair", "outliers")
-    assert snapped[0] < before[0]
-    assert snapped[1] < before[1]
-    assert all(round(20 * value) == pytest.approx(20 * value) for value in snapped[:2])
-    board.click("Undo")
-    assert place(board, "chair", "outliers") == before
-
-
 def test_numbers_can_be_typed(open_board: OpenBoard) -> None:
     board = open_board()
     board.page.get_by_role("button", name="chair", exact=False).first.click()
@@ -109,60 +97,6 @@ def test_numbers_can_be_typed(open_board: OpenBoard) -> None:
     assert field.get_attribute("aria-invalid") == "true"
     board.settle()
     assert board.body("missing")["objects"][1]["size"]["z"] == 1.1
-
-
-def test_missing_sizes_are_the_models(open_board: OpenBoard, api: httpx.Client) -> None:
-    board = open_board()
-    board.add("laptop")
-    words = api.get("/models/default/vocabulary").json()["objects"]
-    (typical,) = [entry["size"] for entry in words if entry["label"] == "laptop"]
-    board.press("laptop", "ArrowUp")
-    assert board.body("missing")["objects"][-1]["size"] == typical
-    expect(board.page.locator("#size-source")).to_have_text("(typical)")
-    shown = board.page.locator("#properties").get_by_label("along x").input_value()
-    assert float(shown) == pytest.approx(typical["x"], abs=1e-3)
-
-
-def test_an_object_of_unknown_size_is_round(open_board: OpenBoard, api: httpx.Client) -> None:
-    words = api.get("/models/default/vocabulary").json()["objects"]
-    (tv,) = [entry for entry in words if entry["label"] == "tv"]
-    place = {"x": 2, "y": 0, "z": 0.5}
-    names = (str(tv["aliases"][0]), next(e["label"] for e in words if not e["size"]))
-    board = open_board({"objects": [{"label": name, "position": place} for name in names]})
-    assert board.scene["objects"][0]["size"] == tv["size"]
-    boxes = [board.thing(name).locator("rect") for name in names]
-    round_corners = [float(box.get_attribute("rx") or 0) > 100 for box in boxes]
-    assert round_corners == [False, True]
-    expect(board.page.locator("#legend .guess")).to_have_text("size not known")
-
-
-def test_the_robot_can_stand_elsewhere(open_board: OpenBoard) -> None:
-    board = open_board()
-    board.page.get_by_role("button", name="Robot at x 0").focus()
-    for key in ("Shift+ArrowLeft", "r", "r"):
-        board.page.keyboard.press(key)
-    board.settle()
-    viewpoint = board.scene["viewpoint"]
-    assert viewpoint["y"] == 0.5
-    assert viewpoint["yaw"] == pytest.approx(0.5236, abs=1e-3)
-
-
-def test_labels_and_relations_alone_are_laid_out(open_board: OpenBoard) -> None:
-    board = open_board()
-    given = [
-        {"subject": "lamp", "relation": "on-top", "object": "nightstand"},
-        {"subject": "nightstand", "relation": "left", "object": "bed"},
-        {"subject": "rug", "relation": "front", "object": "bed"},
-    ]
-    objects = ["bed", "nightstand", "lamp", "rug"]
-    board.put(json.dumps({"objects": objects, "relations": given}))
-    boxes = {name: board.thing(name).locator(".box").bounding_box() for name in objects}
-    x = {name: box["x"] + box["width"] / 2 for name, box in boxes.items() if box}
-    y = {name: box["y"] + box["height"] / 2 for name, box in boxes.items() if box}
-    assert abs(x["lamp"] - x["nightstand"]) < 2
-    assert abs(y["lamp"] - y["nightstand"]) < 2
-    assert x["nightstand"] < x["bed"]
-    assert y["rug"] > y["bed"]
 
 
 NO_SCENES: list[tuple[Any, str]] = [
@@ -224,42 +158,98 @@ def test_a_link_that_cannot_be_read_says_so(
     assert board.things
 
 
-def test_a_huge_room_is_drawn_with_few_lines(open_board: OpenBoard) -> None:
+# ----------------------------------------------------------------------------------------- evidence
+
+
+SWITCH = "Positions count as evidence"
+
+
+def placed(board: Board) -> list[str]:
+    """Objects whose position the request contains."""
+    return [thing["id"] for thing in board.scene["objects"] if "position" in thing]
+
+
+def test_positions_count_only_when_switched_on(open_board: OpenBoard, api: httpx.Client) -> None:
+    board = open_board(scene=None)
+    says = board.page.locator("#evidence")
+    expect(says).to_contain_text("The answers use labels only.")
+    assert placed(board) == []
+    labels = {"objects": [thing["label"] for thing in board.scene["objects"]]}
+    alone = api.post("/missing", json=labels | {"room_type": "bedroom", "top_k": 5}).json()
+    rows = [row for row in board.rows("missing") if not row.startswith("another ")]
+    assert len(rows) == len(alone["missing"])
+    for row, one in zip(rows, alone["missing"], strict=True):
+        assert row.startswith(one["label"])
+    board.use_positions()
+    assert placed(board) == board.things
+    expect(says).to_contain_text("positions of 5 of 5 objects")
+    assert api.post("/relations", json=board.scene).json()["observed_relations"]
+
+
+def test_positions_that_the_page_chose_do_not_count(open_board: OpenBoard) -> None:
     board = open_board()
-    far = {"label": "bed", "position": {"x": 9e7, "y": -9e7, "z": 0.3}}
-    board.put(json.dumps({"objects": ["desk", far]}))
-    assert board.things == ["desk", "bed"]
-    assert 4 < board.page.locator("#board .grid line").count() <= 82
+    assert board.page.get_by_label(SWITCH).is_checked()
+    board.add("monitor")
+    board.page.locator("#board .ghost").first.press("Enter")
+    board.settle()
+    expect(board.page.locator("#board .object.loose")).to_have_count(2)
+    assert placed(board) == ["desk", "chair"]
+    board.page.locator("#list .name", has_text="monitor").click()
+    expect(board.page.locator("#properties")).to_contain_text("Centre, metres (not given)")
+    expect(board.page.locator("#evidence")).to_contain_text("positions of 2 of 4 objects")
+    expect(board.page.locator("#list li").nth(2)).to_contain_text("position not given")
+    board.press("monitor", "ArrowUp")
+    assert placed(board) == ["desk", "chair", "monitor"]
 
 
-def test_labels_that_javascript_knows_are_labels_like_others(open_board: OpenBoard) -> None:
-    scene = {"objects": [{"label": name} for name in ("constructor", "__proto__", "bed")]}
-    board = open_board(scene, allow=("422",))
-    assert board.things == ["constructor", "__proto__", "bed"]
-    errors = board.page.locator("#list .error").all_text_contents()
-    assert errors[0] == "constructor not known, left out"
-    assert errors[1].startswith("__proto__ ")
-    assert errors[2] == ""
+# ------------------------------------------------------------------------- imported scenes
 
 
-@pytest.mark.slow
-def test_new_objects_leave_room_for_the_robot(open_board: OpenBoard) -> None:
+def rounded(value: Any) -> Any:
+    """A scene with numbers rounded to centimetres."""
+    if isinstance(value, dict):
+        return {name: rounded(part) for name, part in value.items()}
+    return round(value, 2) if isinstance(value, float) else value
+
+
+def test_detections_are_read_as_the_client_reads_them(
+    open_board: OpenBoard, repository: Path
+) -> None:
+    file = repository / "clients" / "ros2" / "detections.json"
+    fields = from_message(json.loads(file.read_text("utf-8")))
     board = open_board()
-    for _ in range(12):
-        board.add("table")
-    robot = board.page.locator("#board .robot .body").bounding_box()
-    assert robot is not None
-    for found in board.page.locator("#board .object .box").all():
-        box = found.bounding_box()
-        assert box is not None
-        across = max(box["x"] - robot["x"] - robot["width"], robot["x"] - box["x"] - box["width"])
-        assert across > 0 or box["y"] + box["height"] < robot["y"]
+    page = board.page
+    page.get_by_role("button", name="Import, export").click()
+    page.get_by_label("Open a file").set_input_files(file)
+    expect(page.get_by_label("Scene, JSON")).to_have_value(file.read_text("utf-8"))
+    board.click("Put on the board")
+    shown = {thing["id"]: thing for thing in board.scene["objects"]}
+    assert list(shown) == [thing["id"] for thing in fields["objects"]]
+    for thing in fields["objects"]:
+        for name in ("label", "confidence", "position"):
+            assert rounded(shown[thing["id"]].get(name)) == rounded(thing.get(name))
+        if "size" in thing:
+            assert rounded(shown[thing["id"]]["size"]) == rounded(thing["size"])
+    assert page.get_by_label("Positions count as evidence").is_checked()
 
 
-def test_long_names_leave_room_for_the_buttons(open_board: OpenBoard) -> None:
-    board = open_board({"objects": [{"id": "b" * 120, "label": "bed"}]}, width=600)
-    section = board.page.locator("#listing").bounding_box()
-    remove = board.page.locator("#list").get_by_role("button", name="Remove").bounding_box()
-    assert section is not None
-    assert remove is not None
-    assert remove["x"] + remove["width"] <= section["x"] + section["width"]
+def test_labels_supports_and_flat_detections_are_read(open_board: OpenBoard) -> None:
+    board = open_board()
+    for text in ("bed, lamp, mug", "bed\nlamp\nmug\n"):
+        board.put(text)
+        assert board.things == ["bed", "lamp", "mug"]
+    board.put('["bed", "lamp", "lamp"]')
+    assert board.things == ["bed", "lamp_1", "lamp_2"]
+    board.put('{"objects": ["desk", "lamp"], "relations": [["lamp", "on-top", "desk"]]}')
+    assert board.scene["relations"] == [{"subject": "lamp", "relation": "on-top", "object": "desk"}]
+    # Supports are relations.
+    objects = [{"id": 0, "label": "table"}, {"id": 1, "label": "mug", "supported_by": 0}]
+    for relations in ([], [[1, "on-top", 0]]):
+        board.put(json.dumps({"scene_id": "one", "objects": objects, "relations": relations}))
+        stated = {"subject": "mug", "relation": "on-top", "object": "table"}
+        assert board.scene["relations"] == [stated]
+    seen = {"results": [{"hypothesis": {"class_id": "mug", "score": 0.5}}], "bbox": {"size_x": 9}}
+    board.put(json.dumps({"detections": [seen, seen]}))
+    assert board.scene["objects"] == [
+        {"id": f"mug_{number}", "label": "mug", "confidence": 0.5} for number in (1, 2)
+    ]

@@ -28,11 +28,6 @@ class Report:
     statuses: Counter[int] = field(default_factory=Counter)
     faults: list[str] = field(default_factory=list)
 
-    @property
-    def total(self) -> int:
-        """Number of answered requests."""
-        return self.statuses.total()
-
 
 def faults_of_problem(document: Any, status: int) -> list[str]:
     """Return what is wrong with a problem document."""

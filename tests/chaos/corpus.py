@@ -45,8 +45,6 @@ class Hostile:
     expected: frozenset[int] = _REFUSED | {200}
 
 
-# ------------------------------------------------------------------------------ valid requests
-
 SCENE: Final[dict[str, Any]] = {
     "objects": [
         "bed",
@@ -102,8 +100,6 @@ VALID: Final[dict[str, dict[str, Any]]] = {
 }
 """One request of each kind with every field that it may have."""
 
-
-# -------------------------------------------------------------------------------- wrong values
 
 _NESTED: Final = b"[" * 300 + b"]" * 300
 _TEXT: Final = MARKER.encode()

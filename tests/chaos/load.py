@@ -6,15 +6,14 @@ import asyncio
 import json
 import threading
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
 
-import numpy as np
-from scipy.stats import linregress
+import httpx
 
-from benchmarks.load.connections import Connection, connect
+from benchmarks.load.connections import Connection, connect, prepared
 
 
 @dataclass
@@ -98,7 +97,37 @@ class ConstantLoad:
             connection.close()
 
 
-def check_growth(readings: Sequence[int]) -> None:
-    """Assert that memory grows by less than 4 MiB or twice the standard error of the growth."""
-    line = linregress(np.linspace(0, 1, len(readings)), readings)
-    assert line.slope < max(4 * 2**20, 2 * line.stderr), line
+SCENES: list[dict[str, Any]] = [
+    {"objects": ["bed", "lamp"], "top_k": 4},
+    {"objects": ["desk", "chair", "keyboard"], "top_k": 4},
+    {"objects": ["sink", {"label": "toilet", "confidence": 0.5}], "top_k": 4},
+    {"objects": ["sofa", "television"], "room_type": "office", "top_k": 4},
+]
+REQUESTS = [prepared("/missing", body) for body in SCENES]
+
+
+class Judge:
+    """Compares each answer with that of the version that it names, asked before the load.
+
+    Attributes:
+        expected: the answers of each version by its digest.
+        seen: digests of the versions that answered.
+    """
+
+    def __init__(self, client: httpx.Client, versions: Iterable[str]) -> None:
+        self.expected: dict[str, list[Any]] = {}
+        self.seen: set[str] = set()
+        for version in versions:
+            for scene in SCENES:
+                body = scene | {"model": f"home@{version}"}
+                answer = client.post("/missing", json=body).json()
+                assert answer["model"]["version"] == version
+                self.expected.setdefault(answer["model"]["digest"], []).append(answer["missing"])
+
+    def __call__(self, number: int, status: int, answer: Any) -> str | None:
+        if status != 200:
+            return f"status {status}: {answer}"
+        digest = answer["model"]["digest"]
+        self.seen.add(digest)
+        missing, expected = answer["missing"], self.expected[digest][number]
+        return None if missing == expected else f"{answer['model']}: {missing}, not {expected}"

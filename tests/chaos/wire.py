@@ -193,40 +193,24 @@ def _heads() -> Iterator[Wire]:
         "two hosts", [LIVE.replace(b"Host: localhost", b"Host: localhost\r\nHost: y")], (400,)
     )
     yield Wire("absolute form", [LIVE.replace(b"GET /", b"GET http://elsewhere/")], (400,))
-    yield Wire("asterisk", [b"OPTIONS * HTTP/1.1\r\nHost: localhost\r\n\r\n"], (400,))
-    yield Wire("empty lines first", [b"\r\n" * 20 + LIVE], (200,))
     upgrade = (
         b"Host: localhost\r\nConnection: upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13"
     )
     socket_wanted = LIVE.replace(b"Host: localhost", upgrade)
     yield Wire("WebSocket without a key", [socket_wanted], (400,))
     for name, text in {
-        "null bytes": b"\x00" * 100,
         "TLS": b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + b"\x07" * 500,
-        "HTTP/9.9": b"GET / HTTP/9.9\r\n\r\n",
-        "no version": b"GET / \r\n\r\n",
         "connect": b"CONNECT elsewhere:443 HTTP/1.1\r\nHost: localhost\r\n\r\n",
-        "raw bytes in the path": b"GET /\xff\xfe HTTP/1.1\r\nHost: localhost\r\n\r\n",
         "space in the path": b"GET /a b HTTP/1.1\r\nHost: localhost\r\n\r\n",
         "no colon": LIVE.replace(b"Host: localhost", b"Host localhost"),
         "control in a value": LIVE.replace(b"Host: localhost", b"Host: localhost\r\nA: \x01\x02"),
-        "method in small letters": LIVE.replace(b"GET", b"get"),
-        "long method": b"A" * 5_000 + b" / HTTP/1.1\r\n\r\n",
-    }.items():
-        yield Wire(f"head: {name}", [text], (400,), closes=True)
-    for name, text in {
         "long path": b"GET /" + b"a" * 20_000 + b" HTTP/1.1\r\nHost: localhost\r\n\r\n",
         "long value": LIVE.replace(b"Host: localhost", b"Host: localhost\r\nA: " + b"a" * 20_000),
-        "long name": LIVE.replace(
-            b"Host: localhost", b"Host: localhost\r\n" + b"a" * 20_000 + b": b"
-        ),
         "many fields": LIVE[:-2] + b"A: b\r\n" * 3_000 + b"\r\n",
-        "a hundred fields": LIVE[:-2] + b"A: b\r\n" * 100 + b"\r\n",
     }.items():
         yield Wire(f"head: {name}", [text], (400,), closes=True)
     yield Wire("HTTP/2", [b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"], None, closes=True)
     yield Wire("line feeds alone", [LIVE.replace(b"\r", b"")], (200,))
-    yield Wire("HTTP/0.9", [b"GET /\r\n"], (400,), closes=True)
     # Closing with bytes unread resets the connection, which may overtake the answer.
     yield Wire(
         "head without end", [b"GET / HTTP/1.1\r\n"] + [b"A: b\r\n" * 10_000] * 50, None, True

@@ -8,7 +8,9 @@ do, and `to_json` writes one as rosbridge does.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -71,6 +73,9 @@ class Layout:
     former = _store(_FORMER)
 
 
+_NUMBERS = count(1)
+
+
 def blank(store: Typestore, name: str, /, **values: Any) -> Any:
     """A message with ROS's defaults, and the fields given."""
     made = {}
@@ -90,6 +95,28 @@ def _blank_field(store: Typestore, kind: int, detail: Any) -> Any:
     if int(inner) == 2 or inner_detail[0] == "string":
         return []
     return np.zeros(length if kind == 3 else 0, dtype=inner_detail[0])
+
+
+def filled(store: Typestore, name: str, numbers: Iterator[float], length: int) -> Any:
+    """A message with these floating-point numbers, and lists of this length.
+
+    Its integers and texts differ from each other.
+    """
+    made = {}
+    for field, (kind, detail) in store.fielddefs[name][1]:
+        made[field] = _blank_field(store, int(kind), detail)
+        if int(kind) == 2:
+            made[field] = filled(store, detail, numbers, length)
+        elif int(kind) == 3:
+            made[field] = np.array([next(numbers) for _ in range(detail[1])])
+        elif int(kind) == 4 and int(detail[0][0]) == 2:
+            made[field] = [filled(store, detail[0][1], numbers, length) for _ in range(length)]
+        elif detail[0] in {"float32", "float64"}:
+            made[field] = next(numbers)
+        elif detail[0] in {"string", "int32", "uint32"}:
+            number = next(_NUMBERS)
+            made[field] = "é" * (number % 7) if detail[0] == "string" else number
+    return store.types[name](**made)
 
 
 def through_cdr(store: Typestore, message: Any) -> Any:

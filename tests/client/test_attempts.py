@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
@@ -19,16 +18,14 @@ from scene_client import (
     AnswerError,
     Client,
     DeadlineError,
-    InvalidRequestError,
     ProblemError,
     UnreachableError,
     calls,
     sync,
 )
-from scene_client.calls import LONGEST_PAUSE, Call
+from scene_client.calls import LONGEST_PAUSE
 from scene_client.connection import RETRIES
 from scene_client.errors import problem_of
-from scene_client.schemas import FieldError
 
 Received = tuple[int, dict[str, str], bytes]
 Outcome = Received | Exception
@@ -153,14 +150,6 @@ def test_permanent_errors_are_not_retried(status: int) -> None:
     assert len(world.told) == 1
 
 
-def test_errors_can_be_pickled() -> None:
-    invalid = InvalidRequestError([FieldError(pointer="#/a", message="b")])
-    for error in (problem_of(*refusal(422, "3")), invalid, DeadlineError("late", "r1")):
-        other = pickle.loads(pickle.dumps(error))
-        assert (type(other), str(other)) == (type(error), str(error))
-        assert vars(other) == vars(error)
-
-
 def test_other_error_answers_become_problems() -> None:
     with pytest.raises(ProblemError) as raised:
         World((502, {"x-request-id": "p7"}, b"<html>Bad Gateway</html>")).run()
@@ -193,19 +182,6 @@ def test_a_promotion_is_retried_only_if_it_was_not_sent(error: Exception, attemp
     with pytest.raises(UnreachableError):
         world.run(lambda client: client.promote("default", "home"))
     assert len(world.told) == attempts
-
-
-def test_a_late_answer_is_a_deadline_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = World(FINE)
-    read = Call.read
-
-    def read_for_long(*arguments: Any) -> Any:
-        world.clock += 0.5  # as if the process had been stopped while the answer arrived
-        return read(*arguments)
-
-    monkeypatch.setattr(Call, "read", read_for_long)
-    with pytest.raises(DeadlineError, match=r"0\.5 s"):
-        world.run(timeout=0.5)
 
 
 failures = [refusal(429, "1"), refusal(503), refusal(503, "0"), REFUSED, BROKEN]

@@ -13,7 +13,6 @@ from app import questions
 from app.api.examples import REQUESTS
 from scene_client import (
     Client,
-    DeadlineError,
     OfflineClient,
     ProblemError,
 )
@@ -68,11 +67,6 @@ def test_each_scene_of_a_batch_has_its_answer_or_problem(caller: Caller, live: L
 
 
 @every_client
-def test_models_are_listed(caller: Caller, live: LiveService) -> None:
-    assert caller("models") == live.client.get("/models").json()
-
-
-@every_client
 def test_unknown_labels_are_a_problem_with_suggestions_and_the_first_errors_as_text(
     caller: Caller,
 ) -> None:
@@ -90,15 +84,6 @@ def test_unknown_labels_are_a_problem_with_suggestions_and_the_first_errors_as_t
     assert "#/objects/9: " in text
     assert "#/objects/10: " not in text
     assert text.endswith("\n  and 2 more errors")
-
-
-@every_client
-def test_a_client_is_usable_after_a_deadline_error(caller: Caller) -> None:
-    long = {"objects": [], "count": 64, "steps": 200, "temperature": 1.5}
-    for timeout in (0.001, 0.02):
-        with pytest.raises(DeadlineError, match=f"within {timeout:g} s"):
-            caller("generate", long, timeout=timeout)
-    assert caller("missing", {"objects": ["bed"]})["missing"]
 
 
 def test_offline_and_online_clients_list_models_alike(url: str, shared_store: Path) -> None:
@@ -132,16 +117,6 @@ def test_an_unclosed_offline_client_does_not_block_the_exit(shared_store: Path) 
     command = (sys.executable, "-W", "error", "-c", UNCLOSED, shared_store)
     done = run_program(*command, env=environment)
     assert (done.stdout, done.stderr) == ("late\n", "")
-
-
-def test_a_store_without_a_usable_default_is_not_ready(tmp_path: Path) -> None:
-    with OfflineClient(tmp_path, timeout=1.0) as scene:
-        assert scene.is_live()
-        assert not scene.is_ready()
-        for ask in (lambda: scene.missing(["bed"]), scene.check_ready):
-            with pytest.raises(ProblemError) as raised:
-                ask()
-            assert raised.value.type == "/problems/not-ready"
 
 
 @pytest.mark.slow

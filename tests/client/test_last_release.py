@@ -16,7 +16,7 @@ from tests.conftest import run_program
 from tests.services import LiveService
 
 (WHEEL,) = (Path(__file__).parent / "last_release").glob("*.whl")
-PROGRAM = """
+RELEASED = """
 import json, sys
 import scene_client
 
@@ -66,7 +66,7 @@ def test_the_client_of_the_last_release_reads_the_answers(
     asked = [*QUESTIONS, *(entry[:2] for entry in UNREADABLE)]
     calls = [(path[1:].replace("/", "_"), [request]) for path, request in asked]
     done = run_program(
-        *(sys.executable, "-c", PROGRAM, shipped.url),
+        *(sys.executable, "-c", RELEASED, shipped.url),
         env=os.environ | {"PYTHONPATH": str(WHEEL)},
         input=json.dumps([("models", []), *calls]),
     )

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import json
+import os
+import re
 import shutil
 import subprocess
 import sys
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
 from scripts import sync_client
-from tests.conftest import run_program
+from tests.client import callers
+from tests.conftest import REPOSITORY, run_program
+from tests.services import LiveService
 
 
 def test_the_blocking_client_is_up_to_date():
@@ -57,3 +65,89 @@ def test_the_client_works_where_nothing_of_the_service_is_installed() -> None:
     done = run_program(sys.executable, "-W", "error", "-c", PROGRAM)
     # An offline client says which packages it needs.
     assert "pip install '.[service]' in the repository" in done.stdout
+
+
+GENERATED = """
+import json, sys
+from generated import Client, models
+from generated.api import questions
+import generated.api.questions.generate, generated.api.questions.missing
+import generated.api.questions.outliers, generated.api.questions.relations
+import generated.api.questions.rooms
+
+client = Client(sys.argv[1])
+for name, fields in json.loads(sys.argv[2]).items():
+    request = getattr(models, name.title() + "Request").from_dict(fields)
+    answer = getattr(questions, name).sync(client=client, body=request)
+    print(json.dumps([name, answer.to_dict()]))
+"""
+
+
+@pytest.mark.slow
+def test_a_generated_client_asks_all_five_questions(live: LiveService, tmp_path: Path) -> None:
+    pytest.importorskip("openapi_python_client")
+    (tmp_path / "openapi.json").write_bytes(live.client.get("/openapi.json").content)
+    # The generator formats its code with ruff.
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    run_program(
+        *(sys.executable, "-m", "openapi_python_client", "generate", "--path", "openapi.json"),
+        *("--output-path", "generated", "--meta", "none", "--fail-on-warning"),
+        cwd=tmp_path,
+        env=os.environ | {"PATH": path},
+    )
+    run_program(sys.executable, "-m", "compileall", "-q", "generated", cwd=tmp_path)
+    lamp = {"label": "lamp", "id": "l", "position": {"x": 1.0, "y": 0.0, "z": 0.5}}
+    scene = {"objects": ["bed", lamp], "relations": [["l", "left", "bed"]], "seed": 7}
+    requests = dict.fromkeys(("relations", "missing", "outliers", "rooms", "generate"), scene)
+    done = run_program(
+        *(sys.executable, "-c", GENERATED, live.url, json.dumps(requests)), cwd=tmp_path
+    )
+    answers = dict(map(json.loads, done.stdout.splitlines()))
+    assert answers.keys() == requests.keys()
+    for question, answer in answers.items():
+        expected = live.client.post(f"/{question}", json=scene).json()
+        assert answer == expected | {"request_id": answer["request_id"]}
+
+
+GUIDE = (REPOSITORY / "docs" / "clients.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+@pytest.mark.system
+def test_the_cpp_block_compiles_and_runs(
+    url: str, tmp_path: Path, require_system_tool: Callable[[str], Path]
+) -> None:
+    (program,) = re.findall(r"^```cpp\n(.*?)^```$", GUIDE, flags=re.MULTILINE | re.DOTALL)
+    source = tmp_path / "block.cpp"
+    source.write_text(program)
+    block = callers.compiled(require_system_tool, source, tmp_path / "block")
+    assert run_program(block, url).stdout.strip().strip('"')
+    done = run_program(block, "robot:8000", status=2)
+    assert (done.stdout, bool(done.stderr)) == ("", True)
+
+
+@pytest.mark.slow
+@pytest.mark.system
+def test_the_cpp_example_is_made_and_asks_all_five_questions(
+    url: str,
+    tmp_path: Path,
+    bridge: Path,
+    require_system_tool: Callable[[str], Path],
+) -> None:
+    # Asking for `bridge` leaves this test out where the libraries are missing.
+    folder = shutil.copytree(REPOSITORY / "clients" / "cpp", tmp_path / "cpp")
+    make = require_system_tool("make")
+    run_program(make, "-C", folder, "CXXFLAGS=-O0")
+    example = folder / "example"
+    answered = run_program(example, url, "30").stdout
+    headings = re.findall(r"^\w.*:$", answered, re.MULTILINE)
+    assert headings == [
+        *("Missing:", "How they stand:", "Least fitting first:", "Which room it is:"),
+        "A scene like it:",
+    ]
+    for arguments, error in (
+        (["http://127.0.0.1:9"], "cannot reach http://127.0.0.1:9: connection refused"),
+        (["robot:8000"], "the URL must begin with http://\n"),
+        ([url, "soon"], "SECONDS must be a number, not 'soon'\n"),
+    ):
+        assert run_program(example, *arguments, status=2).stderr.startswith(error)

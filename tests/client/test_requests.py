@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
+from typer.testing import CliRunner
 
 from scene_client import AsyncClient, Client, InvalidRequestError, ProblemError
+from scene_client.command import app
 from scene_client.schemas import (
     Anchor,
     Detection,
@@ -18,6 +23,7 @@ from scene_client.schemas import (
     Relation,
     SceneRequest,
 )
+from tests.conftest import run_program
 
 EVERYTHING: dict[str, Any] = {
     "model": {"name": "a", "version": "1.0.0", "variant": "rbm", "digest": "0"},
@@ -132,8 +138,6 @@ def test_the_client_s_model_is_asked_where_a_request_names_none(recorder: Record
         (lambda scene: scene.missing_batch([["bed"], []]), "#/scenes/1/objects", "empty"),
         (lambda scene: scene.missing_batch([]), "#/scenes", "256"),
         (lambda scene: scene.missing(["bed"], timeout=0.0), "#", "timeout"),
-        (lambda scene: scene.missing(["bed"], timeout=float("nan")), "#", "timeout"),
-        (lambda scene: scene.missing(["bed"], timeout=601), "#", "timeout"),
         (lambda scene: scene.vocabulary(".."), "#", "name"),
         (lambda scene: scene.model("home", ""), "#", "name"),
         (lambda scene: scene.promote("default", ""), "#/model", "empty"),
@@ -185,3 +189,35 @@ def test_names_are_quoted_in_addresses() -> None:
         with pytest.raises(ProblemError):
             scene.vocabulary(name)
         assert recorder.requests[-1].url.raw_path == b"/models/%b/vocabulary" % text
+
+
+# ------------------------------------------------------------- keys that a header cannot carry
+
+
+KEYS = ["secret-key\n", "secret-\rkey", "sécret-key", "secret key", "secret\x7f", "secret\udcff"]
+each_key = pytest.mark.parametrize("key", KEYS)
+MESSAGE = "a key must have only ASCII characters, without spaces or line breaks"
+
+
+@each_key
+@pytest.mark.parametrize("argument", ["api_key", "admin_key"])
+@pytest.mark.parametrize("kind", [Client, AsyncClient])
+def test_an_argument_is_refused(kind: type[Client], argument: str, key: str) -> None:
+    with pytest.raises(InvalidRequestError, match="ASCII") as raised:
+        kind("http://robot", **{argument: key})
+    assert str(raised.value) == MESSAGE
+
+
+@each_key
+def test_the_command_refuses_its_environment(monkeypatch: pytest.MonkeyPatch, key: str) -> None:
+    monkeypatch.setenv("SCENE_API_KEY", key)
+    result = CliRunner().invoke(app, ["missing", "bed"])
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr == MESSAGE + "\n"
+
+
+def test_a_bridge_refuses_its_environment(repository: Path) -> None:
+    program = (sys.executable, repository / "clients/ros2/over_rosbridge.py", "ws://robot", "/x")
+    done = run_program(*program, env=os.environ | {"SCENE_API_KEY": KEYS[0]}, status=2)
+    assert done.stderr.endswith(f"error: {MESSAGE}\n")
+    assert "cret" not in done.stderr

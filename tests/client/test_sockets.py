@@ -7,13 +7,10 @@ import ssl
 import subprocess
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-import httpcore
 import pytest
 
 from scene_client import (
@@ -23,7 +20,6 @@ from scene_client import (
     DeadlineError,
     UnreachableError,
     asynchronous,
-    connection,
     sync,
 )
 from tests.client.conftest import OVER_HTTP
@@ -98,29 +94,6 @@ def test_no_service_holds_a_call_beyond_the_deadline(
             with pytest.raises(DeadlineError):
                 call("models")
         assert call("is_ready") is False
-
-
-def test_nothing_is_sent_after_the_deadline(peer: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    heads: list[bytes] = []
-    clock = SimpleNamespace(stands=0.0)
-    connect = httpcore.SyncBackend.connect_tcp
-
-    def connect_for_long(*arguments: Any, **named: Any) -> Any:
-        stream = connect(*arguments, **named)
-        clock.stands += 3600.0  # the process was stopped between connecting and sending
-        return stream
-
-    monkeypatch.setattr(connection, "monotonic", lambda: clock.stands)
-    monkeypatch.setattr(httpcore.SyncBackend, "connect_tcp", connect_for_long)
-    started = peer(partial(serve, heads=heads))
-    with Client(started.url, timeout=5.0) as scene:
-        with pytest.raises(DeadlineError):
-            scene.models()
-        # What is sent in time is, over a connection of its own: the late one was closed.
-        monkeypatch.setattr(httpcore.SyncBackend, "connect_tcp", connect)
-        assert scene.is_ready()
-    assert started.connections == 2
-    assert len(heads) == 1
 
 
 @every_client
@@ -204,13 +177,6 @@ async def test_an_answer_without_end_is_not_kept(
     async with AsyncClient(started.url) as scene_async:
         with pytest.raises(AnswerError, match="more than"):
             await scene_async.models()
-
-
-def test_one_client_serves_many_threads(peer: Any) -> None:
-    started = peer(serve)
-    with Client(started.url) as scene, ThreadPoolExecutor(8) as threads:
-        assert all(threads.map(lambda _: scene.is_ready(), range(80)))
-    assert started.connections <= 8
 
 
 @pytest.mark.system

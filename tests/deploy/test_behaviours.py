@@ -13,7 +13,6 @@ import pytest
 from py_trees.common import Status
 
 from scene_client import Client
-from scene_client.schemas import OutliersAnswer
 from scene_client.vision_msgs import SceneFields
 from tests.deploy.ros import Slow, load_package
 from tests.services import LiveService, wait_until
@@ -81,34 +80,6 @@ def test_an_object_belongs_unless_it_is_an_outlier(
         condition = make("ObjectBelongs", client, scene, thing, threshold=threshold)
         assert settle(condition) is expected
         assert condition.feedback_message.startswith("toilet_1: an outlier with probability 0.")
-
-
-@pytest.mark.parametrize(
-    ("thing", "moved", "is_misplaced", "is_wrong"),
-    [
-        ("pillow_1", "pillow_1", True, True),
-        ("pillow", "pillow_1", True, True),
-        ("pillow_1", "bed", True, False),
-        ("pillow_1", None, False, False),
-    ],
-)
-def test_an_object_in_the_wrong_place_does_not_belong(
-    make: Make, thing: str, moved: str | None, is_misplaced: bool, is_wrong: bool
-) -> None:
-    outlier = {"object": "pillow_1", "label": "pillow", "probability": 0.01, "log_odds": 2.0}
-    place = {"subject": "pillow_1", "relation": "on-top", "object": "floor", "probability": 0.9}
-    answer = OutliersAnswer(
-        model={"name": "home", "version": "1.0.0", "variant": "rbm", "digest": "0"},
-        request_id="r",
-        outliers=[outlier | {"is_outlier": False}],
-        misplaced=[place | {"is_misplaced": is_misplaced, "moved": moved}],
-    )
-    client = SimpleNamespace(outliers=lambda **fields: answer)
-    condition = make("ObjectBelongs", client, BED, thing)
-    assert settle(condition) is (Status.FAILURE if is_wrong else Status.SUCCESS)
-    wrong = "pillow_1: in the wrong place, pillow_1 on-top floor"
-    likely = "pillow_1: an outlier with probability 0.01"
-    assert condition.feedback_message == (wrong if is_wrong else likely)
 
 
 LAMP = {"candidates": ["lamp"], "at": {"relation": "on-top", "object": "desk"}, "log_odds": -1e3}

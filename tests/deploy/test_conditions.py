@@ -13,7 +13,6 @@ import pytest
 from scene_client import Client
 from scene_client.vision_msgs import SceneFields
 from tests.client import callers
-from tests.client.peers import Peer, answering
 from tests.conftest import run_program
 from tests.services import LiveService
 
@@ -85,56 +84,6 @@ def test_a_thing_belongs_unless_it_is_an_outlier(
         ("FAILURE", "no sofa was seen"),
         ("FAILURE", "no object was named"),
     ]
-
-
-@pytest.mark.parametrize(
-    ("moved", "status", "because"),
-    [
-        ("pillow_1", "FAILURE", "pillow_1 is in the wrong place: pillow_1 on-top floor"),
-        ("bed", "SUCCESS", "pillow_1 belongs"),
-        (None, "SUCCESS", "pillow_1 belongs"),
-    ],
-)
-def test_a_thing_in_the_wrong_place_does_not_belong(
-    program: Path, moved: str | None, status: str, because: str
-) -> None:
-    place = {"subject": "pillow_1", "relation": "on-top", "object": "floor", "probability": 0.9}
-    told = {
-        "outliers": [{"object": "pillow_1", "label": "pillow", "is_outlier": False}],
-        "misplaced": [place | {"is_misplaced": moved is not None, "moved": moved}],
-    }
-    ports = [{"scene": '{"objects": ["bed"]}', "object": name} for name in ("pillow_1", "pillow")]
-    with Peer(answering(json.dumps(told).encode())) as peer:
-        results = [tick(program, peer.url, "ObjectBelongs", entry) for entry in ports]
-    assert [(result["status"], result["because"]) for (result,) in results] == [
-        (status, because),
-        (status, because),
-    ]
-
-
-@pytest.mark.parametrize(
-    ("ports", "because"),
-    [
-        ({}, "there is no scene"),
-        ({"scene": "bed"}, "the scene is no JSON object"),
-        ({"scene": "[]"}, "the scene is no JSON object"),
-        ({"scene": "{}"}, "nothing was seen"),
-        ({"scene": '{"objects": []}'}, "nothing was seen"),
-    ],
-)
-def test_an_invalid_scene_fails_at_once(program: Path, ports: Any, because: str) -> None:
-    (found,) = tick(program, "http://127.0.0.1:9", "SceneComplete", ports)
-    assert (found["status"], found["because"]) == ("FAILURE", because)
-    assert not found["waited"]
-
-
-def test_after_a_halt_the_next_scene_is_asked_about(program: Path, url: str) -> None:
-    unknown = {"scene": '{"objects": ["unheard of"]}', "halt": True}
-    halted, found = tick(
-        program, url, "ObjectBelongs", unknown, {"scene": '{"objects": ["bed"]}', "object": "bed"}
-    )
-    assert halted == {"status": "HALTED"}
-    assert found["because"].startswith("bed ")
 
 
 def test_a_service_that_does_not_answer_fails_the_condition(program: Path) -> None:

@@ -20,6 +20,9 @@ pytestmark = pytest.mark.system
         "promtool check config --syntax-only deploy/monitoring/prometheus.yml",
         "promtool check config --syntax-only deploy/kubernetes/monitoring/scrape.yaml",
         "haproxy -c -dW -f deploy/haproxy/haproxy.cfg",  # -dW: a warning is an error
+        "hadolint --failure-threshold=style Dockerfile",
+        "shellcheck .ci/run",
+        "check-jsonschema --builtin-schema=vendor.compose-spec docker-compose.yml",
     ],
 )
 def test_a_configuration_has_no_lint(

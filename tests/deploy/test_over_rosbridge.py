@@ -95,10 +95,3 @@ def test_frames_that_say_nothing_are_left_out_and_complaints_are_handed_on(
         "bridge: warning: slow",
         "MessageError: the message must have a list of detections",
     ]
-
-
-@pytest.mark.parametrize("where", ["ws://127.0.0.1:9", "robot:9090", "ws://127.0.0.1:99999"])
-def test_without_a_bridge_it_ends_with_a_line_for_whoever_restarts_it(
-    repository: Path, where: str
-) -> None:
-    assert run(repository, where, "/x") == ([], [])

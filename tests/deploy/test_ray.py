@@ -6,12 +6,8 @@ import os
 import re
 import signal
 import subprocess
-import threading
-from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +18,6 @@ import yaml
 from app.settings import Settings
 from deploy.ray.run import descendants, environment
 from tests.services import LiveService, free_port, wait_until
-
-SCENE = {"objects": ["bed", "lamp"]}
 
 
 @pytest.fixture(scope="module")
@@ -107,20 +101,6 @@ def test_the_manifest_has_the_settings_of_the_local_start(pods: list[dict[str, A
         assert {name: settings[name] for name in shared} == {name: local[name] for name in shared}
 
 
-def test_the_network_policy_hides_the_ports_of_ray(folder: Path, config: dict[str, Any]) -> None:
-    _, policy = yaml.safe_load_all((folder / "rayservice.yaml").read_text("utf-8"))
-    assert policy["spec"]["policyTypes"] == ["Ingress"]
-    labels = {"app": "scene-ray"}
-    assert policy["spec"]["podSelector"]["matchLabels"] == labels
-    for rule in policy["spec"]["ingress"]:
-        peer = rule["from"][0]["podSelector"]["matchLabels"]
-        if peer["app" if "app" in peer else "app.kubernetes.io/name"] == "scene-proxy":
-            assert [entry["port"] for entry in rule["ports"]] == [config["http_options"]["port"]]
-
-
-# ---------------------------------------------------------------------------- running replicas
-
-
 @contextmanager
 def running(repository: Path, log: Path, *arguments: str | Path) -> Iterator[LiveService]:
     """Run `deploy/ray/run.py` on a free port, and check that no process remains after it."""
@@ -158,63 +138,6 @@ def replicas(service: LiveService) -> set[int]:
     return {pid for pid, command in found if command.startswith("ray::ServeReplica")}
 
 
-def deploy(service: LiveService, config: dict[str, Any]) -> None:
-    """Send a configuration to the cluster, as `serve deploy` does."""
-    found = descendants(service.process.pid).items()
-    pid, command = next((pid, text) for pid, text in found if "--dashboard-port=" in text)
-    (port,) = re.findall(r"--dashboard-port=(\d+)", command)
-    (token,) = re.findall(rb"\0RAY_AUTH_TOKEN=(\w+)", Path(f"/proc/{pid}/environ").read_bytes())
-    response = httpx.put(
-        f"http://127.0.0.1:{port}/api/serve/applications/",
-        json=config,
-        headers={"Authorization": f"Bearer {token.decode()}"},
-        timeout=60,
-    )
-    assert response.is_success, response.text
-
-
-@contextmanager
-def load(service: LiveService, connections: int) -> Iterator[Counter[int]]:
-    """Ask on several connections without pauses; count the answers by status, 0 without one."""
-    statuses: Counter[int] = Counter()
-    ends = threading.Event()
-
-    def ask() -> None:
-        with httpx.Client(base_url=service.url, timeout=30) as client:
-            while not ends.is_set():
-                try:
-                    status = client.post("/missing", json=SCENE).status_code
-                except httpx.TransportError:
-                    status = 0
-                statuses[status] += 1
-
-    with ThreadPoolExecutor(connections) as threads:
-        for _ in range(connections):
-            threads.submit(ask)
-        try:
-            yield statuses
-        finally:
-            ends.set()
-
-
-@pytest.mark.slow
-def test_load_adds_a_replica_and_rest_removes_it(
-    repository: Path, tmp_path: Path, config: dict[str, Any]
-) -> None:
-    file = tmp_path / "serve.yaml"
-    config = deepcopy(config)
-    delays = {"upscale_delay_s": 1, "downscale_delay_s": 5, "look_back_period_s": 5}
-    scaling = config["applications"][0]["deployments"][0]["autoscaling_config"]
-    scaling.update(delays, max_replicas=2)
-    file.write_text(yaml.safe_dump(config), "utf-8")
-    with running(repository, tmp_path / "log", "--config", file) as service:
-        assert len(replicas(service)) == 1
-        with load(service, 24) as statuses:
-            wait_until(lambda: len(replicas(service)) == 2, seconds=90)
-        wait_until(lambda: len(replicas(service)) == 1, seconds=90)
-        assert statuses.keys() == {200}
-
-
 @pytest.fixture(scope="module")
 def service(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
     log = tmp_path_factory.mktemp("ray") / "log"
@@ -229,76 +152,3 @@ def test_answers_equal_those_of_the_plain_service(
 ) -> None:
     for _ in range(4):
         assert service.control() == shipped.control()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("path", "headers"),
-    [
-        ("/missing", {}),
-        ("/missing", {"X-Request-Id": "mine"}),
-        ("/missing", {"X-Request-Id": "not valid"}),
-        ("/missing", {"X-Request-Timeout-Seconds": "0.000001"}),
-        ("/missing", {"X-Request-Timeout-Ms": "soon"}),
-        ("/missing", {"Content-Type": "text/plain"}),
-        ("/missing", {"Host": "evil.example"}),
-        ("/nothing", {}),
-    ],
-)
-def test_headers_and_problems_equal_those_of_the_plain_service(
-    service: LiveService, shipped: LiveService, path: str, headers: dict[str, str]
-) -> None:
-    ours, plain = (one.client.post(path, json=SCENE, headers=headers) for one in (service, shipped))
-    assert ours.status_code == plain.status_code
-    # HAProxy closes connections after a change of its configuration.
-    names = ours.headers.keys() - {"server", "connection"}
-    assert names == plain.headers.keys()
-    for name in names - {"date", "x-request-id", "content-length"}:
-        assert ours.headers[name] == plain.headers[name]
-    assert ours.json()["request_id"] == ours.headers["x-request-id"]
-    different = {"request_id": "", "instance": ""}
-    assert ours.json() | different == plain.json() | different
-
-
-@pytest.mark.slow
-def test_a_body_above_the_limit_is_refused_by_the_service(service: LiveService) -> None:
-    response = service.client.post("/missing", content=b" " * (3 * 2**20))
-    assert response.status_code == 413
-    assert response.headers["content-type"] == "application/problem+json"
-
-
-@pytest.mark.slow
-def test_a_new_configuration_replaces_all_replicas_and_loses_nothing(
-    service: LiveService, config: dict[str, Any]
-) -> None:
-    before = replicas(service)
-    new = deepcopy(config)
-    new["http_options"]["port"] = service.port
-    deployment = new["applications"][0]["deployments"][0] | {"num_replicas": 2}
-    deployment.pop("autoscaling_config")
-    deployment["ray_actor_options"]["runtime_env"] = {"env_vars": {"SCENE_MAX_OBJECTS": "9"}}
-    new["applications"][0]["deployments"] = [deployment]
-    with load(service, 4) as statuses:
-        wait_until(lambda: statuses[200] > 100, seconds=30)
-        deploy(service, new)
-        wait_until(lambda: not replicas(service) & before, seconds=180)
-        count = statuses[200]
-        wait_until(lambda: statuses[200] > count + 100, seconds=30)
-    assert statuses.keys() == {200}
-    wait_until(lambda: len(replicas(service)) == 2, seconds=60)
-    for _ in range(10):
-        answer = service.client.post("/missing", json={"objects": ["bed"] * 10})
-        assert answer.status_code == 422, answer.text
-
-
-@pytest.mark.slow
-def test_a_killed_replica_is_replaced(service: LiveService) -> None:
-    before = replicas(service)
-    connections = 4
-    with load(service, connections) as statuses:
-        wait_until(lambda: statuses[200] > 100, seconds=30)
-        os.kill(min(before), signal.SIGKILL)
-        wait_until(lambda: len(replicas(service) - before) == 1, seconds=60)
-        count = statuses[200]
-        wait_until(lambda: statuses[200] > count + 100, seconds=30)
-    assert sum(statuses.values()) - statuses[200] <= connections, statuses

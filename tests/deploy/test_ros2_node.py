@@ -5,9 +5,6 @@ from __future__ import annotations
 import copy
 import importlib
 import json
-import math
-import tomllib
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 
-from scene_client import Client, UnreachableError
+from scene_client import UnreachableError
 from scene_client.vision_msgs import SceneFields
 from tests.client.peers import Peer, answering
 from tests.client.ros_messages import blank
@@ -147,26 +144,6 @@ def test_no_callback_waits_and_only_the_newest_detections_are_asked_about(
     assert running.published("~/answers") == []
 
 
-def test_an_unreachable_service_is_diagnosed_until_it_returns(
-    run: Callable[..., Running], live: LiveService, recorded: Any
-) -> None:
-    running = run(url="http://127.0.0.1:9", timeout=0.5)
-    running.hear("detections", recorded)
-    running.wait_for("/diagnostics")
-    assert running.status().level == 2
-    assert running.status().message.startswith(("UnreachableError", "DeadlineError"))
-    with Client(live.url, timeout=20.0) as client:
-        running.node.advisor.client = client
-        running.answer(recorded)
-    assert running.status().level == 0
-
-
-def test_empty_detections_send_no_request(run: Callable[..., Running]) -> None:
-    running = run(url="http://127.0.0.1:9")
-    assert running.answer(new("Detection3DArray"))["notes"] == []
-    assert (running.status().level, running.status().message) == (1, "nothing was seen")
-
-
 def test_numbers_wait_for_their_labels(
     run: Callable[..., Running], live: LiveService, recorded: Any
 ) -> None:
@@ -186,15 +163,6 @@ def test_numbers_wait_for_their_labels(
     running.hear("label_info", new("LabelInfo", class_map=classes))
     answer = running.answer(recorded)
     assert {entry["label"] for entry in answer["outliers"]["outliers"]} == {"desk", "chair"}
-
-
-def test_labels_and_a_viewpoint_may_stand_in_the_parameters(run: Callable[..., Running]) -> None:
-    assert run(viewpoint=[1.0, 2.0, 0.5]).node.viewpoint == (1.0, 2.0, 0.5)
-    assert run(viewpoint=[math.nan] * 3).node.viewpoint is None
-    assert run(class_names=["desk", "chair"]).node.advisor.label_map == ["desk", "chair"]
-    assert run(label_map="coco").node.advisor.label_map == "coco"
-    with pytest.raises(ValueError, match="imagenet"):
-        run(label_map="imagenet")
 
 
 def test_a_pose_in_the_frame_of_the_detections_is_their_viewpoint(
@@ -239,17 +207,6 @@ def test_images_are_heard_where_the_parameters_say_so(
     assert [*entry.values()][:3] == ["bed_1", "left", "lamp_1"]
 
 
-def test_the_program_spins_one_node_and_takes_it_down(monkeypatch: pytest.MonkeyPatch) -> None:
-    ros = Ros({})
-    load_package(monkeypatch, ros)
-    importlib.import_module("scene_reasoning.node").main()
-    assert len(ros.spun) == 1
-    assert ros.destroyed
-
-
-# ----------------------------------------------------------------------------------- its parts
-
-
 def test_a_ghost_stands_off_its_anchor_by_the_offset(monkeypatch: pytest.MonkeyPatch) -> None:
     load_package(monkeypatch)
     advisor = importlib.import_module("scene_reasoning.advisor")
@@ -277,19 +234,6 @@ def test_a_ghost_stands_off_its_anchor_by_the_offset(monkeypatch: pytest.MonkeyP
     assert (pen.text, pen.position, pen.extent) == ("pen? inside desk", (1.0, 2.0, 0.4), None)
 
 
-@pytest.mark.parametrize("questions", [[], ["weather"], ["missing", "generate"]])
-def test_unknown_questions_are_refused(
-    monkeypatch: pytest.MonkeyPatch, questions: list[str]
-) -> None:
-    load_package(monkeypatch)
-    advisor = importlib.import_module("scene_reasoning.advisor")
-    with pytest.raises(ValueError, match="questions must be some of"):
-        advisor.Advisor(None, questions)
-
-
-# ------------------------------------------------------------------------------- the packaging
-
-
 def test_the_parameter_file_is_the_nodes_parameters_and_its_defaults(
     run: Callable[..., Running],
 ) -> None:
@@ -300,18 +244,3 @@ def test_the_parameter_file_is_the_nodes_parameters_and_its_defaults(
     defaults = run().ros.declared
     for name, value in defaults.items():
         assert str(parameters[name]) == str(value), name
-
-
-def test_the_package_names_what_it_imports(repository: Path) -> None:
-    root = ElementTree.parse(PACKAGE / "package.xml").getroot()
-    needed = {entry.text for entry in root.findall("exec_depend")}
-    node = (PACKAGE / "scene_reasoning" / "node.py").read_text()
-    imported = {
-        line.split()[1].split(".")[0]
-        for line in node.splitlines()
-        if line.startswith(("from ", "import "))
-    }
-    ros = {name for name in imported if name.endswith("_msgs")} | {"rclpy"}
-    assert ros <= needed
-    name = tomllib.loads((repository / "pyproject.toml").read_text())["project"]["name"]
-    assert name in (PACKAGE / "setup.py").read_text()

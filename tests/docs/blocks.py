@@ -111,41 +111,6 @@ def text_agrees(expected: str, actual: str) -> bool:
     return re.fullmatch(pattern, found, re.DOTALL) is not None
 
 
-def filled(block: Block, printed: str) -> str | None:
-    """The text that the block below should have; None where it has elisions of its own.
-
-    JSON with one entry of a list a line, so that an answer reads as a table.
-    """
-    if block.output is None or ELISION in block.output.source:
-        return None
-    if block.output.language == "text":
-        return printed.rstrip() + "\n"
-    lines = []
-    for name, value in json.loads(printed).items():
-        if name == "request_id":
-            continue
-        if isinstance(value, list) and value:
-            entries = ",\n  ".join(json.dumps(entry, ensure_ascii=False) for entry in value)
-            lines.append(f'"{name}": [\n  {entries}]')
-        else:
-            lines.append(f'"{name}": {json.dumps(value, ensure_ascii=False)}')
-    return "{" + ",\n ".join(lines) + "}\n"
-
-
-def rewrite(page: Path, outputs: list[tuple[Block, str]]) -> None:
-    """Put other outputs into a page.
-
-    Args:
-        outputs: blocks of the page in order, with the text of each one's output.
-    """
-    lines = page.read_text(encoding="utf-8").splitlines(keepends=True)
-    for block, text in reversed(outputs):
-        assert block.output is not None
-        first = block.output.line - 1
-        lines[first : first + block.output.source.count("\n")] = [text]
-    page.write_text("".join(lines), encoding="utf-8")
-
-
 def check_output(block: Block, printed: str) -> None:
     """Compare what a block printed with the block below it.
 

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
-import subprocess
 import sys
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from tests.services import free_port, is_ready, wait_until
+from tests.services import LiveService
 
 _LEFT_OUT = shutil.ignore_patterns(
     ".git", ".venv", "build", "dist", "runs", ".hypothesis", ".*_cache"
@@ -23,7 +21,7 @@ _LEFT_OUT = shutil.ignore_patterns(
 
 @dataclass(frozen=True)
 class Workplace:
-    """A copy of the repository, and the service that `make run` started."""
+    """A copy of the repository, and the address of a service with the shipped models."""
 
     folder: Path
     address: str
@@ -32,45 +30,27 @@ class Workplace:
     def environment(self) -> dict[str, str]:
         """Of a shell there: programs of the environment are on the path."""
         programs = os.pathsep.join([str(self.folder / ".venv" / "bin"), os.environ["PATH"]])
-        return _without_settings() | {"PATH": programs, "PYTHONPATH": str(self.folder)}
+        plain = {name: value for name, value in os.environ.items() if name[:6] != "SCENE_"}
+        return plain | {"PATH": programs, "PYTHONPATH": str(self.folder)}
 
 
 @pytest.fixture(scope="session")
 def workplace(
     repository: Path,
+    shipped: LiveService,
     tmp_path_factory: pytest.TempPathFactory,
     require_system_tool: Callable[[str], Path],
-) -> Iterator[Workplace]:
-    """`make run`, and a fresh copy of the repository for the commands of the pages.
+) -> Workplace:
+    """The shipped models as a service, and a fresh copy of the repository for the pages' commands.
 
-    All in the copy is as in a checkout but for `.venv`, see `install`. The service runs from the
-    repository itself: numba's cache belongs to a path, and a copy would compile for a minute.
+    All in the copy is as in a checkout but for `.venv`, see `install`.
     """
     for tool in ("make", "curl", "bash"):
         require_system_tool(tool)
     folder = tmp_path_factory.mktemp("checkout") / "scene"
     shutil.copytree(repository, folder, ignore=_LEFT_OUT, symlinks=True)
     install(folder)
-    port = free_port()
-    place = Workplace(folder, f"127.0.0.1:{port}")
-    log = folder.parent / "log"
-    with log.open("w") as stream:
-        process = subprocess.Popen(
-            ["make", "run", f"PORT={port}", f"VENV={folder / '.venv'}"],
-            cwd=repository,
-            env=place.environment,
-            stdout=stream,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )
-    try:
-        # Loops that are compiled anew take a minute or two.
-        wait_until(lambda: is_ready(port) or process.poll() is not None, log, seconds=400)
-        assert process.poll() is None, log.read_text()
-        yield place
-    finally:
-        os.killpg(process.pid, signal.SIGTERM)
-        process.wait(timeout=60)
+    return Workplace(folder, f"127.0.0.1:{shipped.port}")
 
 
 def install(folder: Path) -> None:
@@ -97,7 +77,3 @@ def install(folder: Path) -> None:
         (programs / name).chmod(0o755)
     for stamp in ("service", "everything"):
         (environment / f".installed-{stamp}").touch()
-
-
-def _without_settings() -> dict[str, str]:
-    return {name: value for name, value in os.environ.items() if not name.startswith("SCENE_")}

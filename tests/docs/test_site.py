@@ -9,21 +9,18 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from http.server import SimpleHTTPRequestHandler
 from pathlib import Path
-from urllib.parse import urlsplit
 
 import pytest
 from playwright.sync_api import sync_playwright
 
 from scripts.site import DIRECTIVE, checks
 from tests.conftest import REPOSITORY, run_program
-from tests.docs.conftest import Workplace
 from tests.services import http_server
 
 pytestmark = pytest.mark.slow
 
 DOCS = REPOSITORY / "docs"
 MODELS = DOCS / "models.md"
-ASSET = re.compile(r'<(?:script|img|iframe|source|link)\b[^>]*?\s(?:src|href)="([^"]+)"')
 CODE = re.compile(r"<(code|pre|script|style|math)\b.*?</\1>", re.DOTALL)
 
 
@@ -42,21 +39,6 @@ def pages(site: Path) -> dict[str, str]:
     """The HTML of every page by its address in the site."""
     paths = sorted(site.rglob("*.html"))
     return {path.relative_to(site).as_posix(): path.read_text(encoding="utf-8") for path in paths}
-
-
-def test_nothing_is_loaded_from_elsewhere(site: Path, pages: dict[str, str]) -> None:
-    assert len(pages) > 20
-    for name, page in pages.items():
-        assets = ASSET.findall(page)
-        assert assets, name
-        for asset in assets:
-            parts = urlsplit(asset)
-            assert not parts.netloc, (name, asset)
-            if name != "404.html":  # its paths begin at the root, since any address may show it
-                assert (site / name).parent.joinpath(parts.path).is_file(), (name, asset)
-    for style in site.rglob("*.css"):
-        text = style.read_text(encoding="utf-8")
-        assert not re.search(r"(url\(|@import)\s*['\"]?(https?:)?//", text), style
 
 
 def test_every_formula_is_drawn(pages: dict[str, str]) -> None:
@@ -89,12 +71,6 @@ def test_every_test_that_a_formula_names_exists() -> None:
     for path, test in named:
         source = (REPOSITORY / path).read_text(encoding="utf-8")
         assert re.search(rf"^(async )?def {test}\(", source, re.MULTILINE), f"{path}::{test}"
-
-
-@pytest.mark.system
-def test_one_command_builds_it(workplace: Workplace) -> None:
-    run_program("make", "docs", cwd=workplace.folder, env=workplace.environment)
-    assert (workplace.folder / "build" / "site" / "index.html").is_file()
 
 
 @pytest.fixture

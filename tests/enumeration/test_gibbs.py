@@ -19,6 +19,7 @@ from tests.enumeration.small_machines import (
     small_machine,
 )
 from training.machines.gibbs import Chains, draw_states, start_chains, sweep
+from training.machines.partition import ais, base_log_partition, reverse_ais
 
 CHAINS = 60_000
 
@@ -74,20 +75,40 @@ def test_states_are_drawn_with_their_probabilities(states):
     assert float(h1[:, states - 1 : -1].sum()) == 0
 
 
-def test_chains_start_at_scenes_without_impossible_classes():
-    machine = small_machine("gbm-states")
-    v = torch.ones(4000, 2).double()
-    chains = start_chains(
-        machine,
-        v,
-        torch.Generator().manual_seed(0),
-        room=torch.ones(4000, dtype=torch.int64),
-        possible=torch.tensor([True, False]).expand(4000, -1),
-    )
-    assert chains.v[:, 0].all()
-    assert not chains.v[:, 1].any()
-    assert set(chains.source.tolist()) == {-1}
-    # Five standard errors; fails by chance with probability < 2e-6.
-    _, m2 = machine.context(v[:1], torch.tensor([1]))
-    error = 5 * (m2 * (1 - m2) / 4000).sqrt()
-    assert bool(((chains.h2.mean(0) - m2).abs() <= error).all())
+# --------------------------------------------------------------------------- the partition function
+
+
+BETAS = torch.linspace(0, 1, 41).tolist()
+AIS_CHAINS = 2000
+BASE = torch.tensor([0.3, -0.7, 0.2]).double()
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_the_base_has_an_exact_partition_function(name):
+    machine = small_machine(name, scale=0)
+    base = BASE[: machine.spec.V]
+    machine.b.copy_(base)
+    exact = enumerate_joint(machine).log_z
+    assert base_log_partition(machine, base) == pytest.approx(exact, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_forward_and_reverse_bracket_log_z(name):
+    """Both means of log w are bounds in expectation; 5 standard errors of slack each."""
+    machine = small_machine(name)
+    joint = enumerate_joint(machine)
+    generator = torch.Generator().manual_seed(9)
+    base = BASE[: machine.spec.V]
+    forward = ais(machine, BETAS, AIS_CHAINS, generator, base)
+    pick = joint.draw(AIS_CHAINS, generator)
+    state = start_chains(machine, joint.v[pick], generator)
+    state.h2 = joint.h2[pick]
+    reverse = reverse_ais(machine, BETAS, state, generator, base)
+    slack = 5 * max(forward.standard_error, reverse.standard_error)
+    assert forward.bound <= joint.log_z + slack
+    assert reverse.bound >= joint.log_z - slack
+    assert forward.bound <= forward.log_z
+    assert reverse.log_z <= reverse.bound
+    assert forward.log_z == pytest.approx(joint.log_z, abs=slack)
+    assert reverse.log_z == pytest.approx(joint.log_z, abs=slack)
+    assert slack < 0.3

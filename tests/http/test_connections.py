@@ -12,7 +12,7 @@ import pytest
 
 from tests.chaos.wire import BODY, LIVE, Wire, exchange
 from tests.http.test_problems import problem
-from tests.services import LiveService, launch, live_service, wait_until
+from tests.services import LiveService, launch, live_service
 
 pytestmark = pytest.mark.system
 
@@ -20,10 +20,6 @@ HEAD = (
     b"POST /outliers HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
     b"Content-Length: %d\r\n\r\n"
 )
-
-
-BATCH_BODY = json.dumps({"scenes": [json.loads(BODY)] * 256}).encode()
-BATCH = HEAD.replace(b"outliers", b"missing/batch") % len(BATCH_BODY) + BATCH_BODY
 
 
 service = live_service(SCENE_CLIENT_TIMEOUT="1", logs_errors=True)
@@ -63,70 +59,6 @@ def test_an_upgrade_request_gets_a_plain_answer(
     assert "upgrade" not in answer.headers
     assert answer.headers["content-type"].startswith("application/")
     assert "WebSocket" not in service.log.read_text()
-
-
-def test_slow_bodies_are_disconnected(service: LiveService) -> None:
-    """Sixty bodies at once; others are answered meanwhile, and all sixty are ended."""
-    before = service.control()
-    files = service.descriptors
-    slow = [connect(service) for _ in range(60)]
-    for connection in slow:
-        connection.sendall(HEAD % 1000)
-    for _ in range(100):
-        if not slow:
-            break
-        for connection in list(slow):
-            try:
-                connection.sendall(b" ")
-                connection.settimeout(0.001)
-                # An answer is on its way to the end of the connection; the end itself is b"".
-                while connection.recv(4096):
-                    pass
-            except TimeoutError:
-                continue
-            except OSError:
-                pass
-            connection.close()
-            slow.remove(connection)
-        assert service.control() == before
-        time.sleep(0.1)
-    assert slow == []
-    assert service.descriptors <= files + 2
-
-
-def test_closed_connections_free_their_sockets(service: LiveService) -> None:
-    before = service.control()
-    files = service.descriptors
-    request = HEAD % len(BODY) + BODY
-    for end in range(0, len(request) + 1, 7):
-        with connect(service) as connection:
-            connection.sendall(request[:end])
-    for _ in range(5):
-        with connect(service) as connection:
-            connection.sendall(BATCH)
-            connection.recv(1)  # in the middle of the answer
-    assert service.control() == before
-    assert "Traceback" not in service.log.read_text()
-    wait_until(lambda: service.descriptors <= files + 2)
-
-
-def test_a_client_that_does_not_read_is_disconnected(service: LiveService) -> None:
-    """The system ends the connection, some retransmissions after SCENE_CLIENT_TIMEOUT."""
-    before = service.control()
-    files = service.descriptors
-    unread = []
-    for _ in range(3):
-        connection = socket.socket()
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        connection.settimeout(0.5)
-        connection.connect(("127.0.0.1", service.port))
-        with suppress(OSError):
-            connection.sendall(BATCH * 20)
-        unread.append(connection)
-    assert service.control() == before
-    wait_until(lambda: service.descriptors <= files + 2)
-    for connection in unread:
-        connection.close()
 
 
 @pytest.mark.slow

@@ -32,6 +32,8 @@ POSITIVE = ["2xx", "3xx", "401", "403", "404", "409", "429", "5xx"]
 NEGATIVE = ["400", "401", "404", "405", "413", "415", "422"]
 CONFIGURATION: dict[str, Any] = {
     "seed": 1,
+    # Random requests, in addition to systematic ones for each part of an operation's schema.
+    "generation": {"deterministic": True, "database": "none", "max-examples": 5},
     # The schema does not contain a model's vocabulary or the ids of a scene. So a request that fits
     # the schema may get 422; `form_is_as_documented` checks the reason. 504 is valid too, since a
     # request may have a deadline of 2 ms.
@@ -49,18 +51,12 @@ CONFIGURATION: dict[str, Any] = {
         },
     ],
 }
-# The document does not depend on the store, so it exists before the service starts.
-DOCUMENT = create_app(Settings(store=REPOSITORY)).openapi()
-
-
-def documented(examples: int) -> Any:
-    """The document as a schemathesis schema, with some random requests of each kind.
-
-    Systematic requests for each part of the schema of an operation come in addition.
-    """
-    generation = {"deterministic": True, "database": "none", "max-examples": examples}
-    config = schemathesis.Config.from_dict(CONFIGURATION | {"generation": generation})
-    return schemathesis.openapi.from_dict(DOCUMENT, config=config)
+# The document does not depend on the store, so it exists before the service starts. Batches differ
+# only in their scenes, which have the forms of single requests.
+DOCUMENT = schemathesis.openapi.from_dict(
+    create_app(Settings(store=REPOSITORY)).openapi(),
+    config=schemathesis.Config.from_dict(CONFIGURATION),
+).exclude(path=["/relations/batch", "/outliers/batch", "/rooms/batch"])
 
 
 def form_is_as_documented(_: Any, response: Any, case: Any) -> None:
@@ -114,19 +110,6 @@ def call(service: LiveService) -> Iterator[Any]:
         yield call
 
 
-# Batches differ only in their scenes, which have the forms of single requests.
-quick = documented(5).exclude(path=["/relations/batch", "/outliers/batch", "/rooms/batch"])
-full = documented(15)
-
-
-@quick.parametrize()
+@DOCUMENT.parametrize()
 def test_every_operation_matches_the_document(case: schemathesis.Case, call: Any) -> None:
-    call(case)
-
-
-@pytest.mark.slow
-@full.parametrize()
-def test_many_requests_of_every_operation_match_the_document(
-    case: schemathesis.Case, call: Any
-) -> None:
     call(case)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from benchmarks.load.connections import prepared
 from tests.chaos.load import ConstantLoad
-from tests.services import LiveService, launch
+from tests.services import LiveService
 
 pytestmark = pytest.mark.system
 
@@ -70,11 +69,3 @@ def test_answers_under_load_are_the_same(live: LiveService, alone: dict[str, byt
         for _ in range(3):
             assert {path: ask(live, path) for path in REQUESTS} == alone
     load.tally.check()
-
-
-def test_answers_after_a_restart_are_the_same(
-    shared_store: Path, tmp_path: Path, alone: dict[str, bytes]
-) -> None:
-    with launch(shared_store, tmp_path / "log") as restarted:
-        # In another order, so that no answer depends on those before.
-        assert {path: ask(restarted, path) for path in reversed(REQUESTS)} == alone

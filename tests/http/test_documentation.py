@@ -13,12 +13,11 @@ import httpx
 import pytest
 
 from app.api.examples import REQUESTS
-from app.api.openapi import described
 from app.errors import ERRORS
 from scene_client import schemas
 from scene_client.schemas import Problem
 from tests.http.test_problems import problem
-from tests.services import serve
+from tests.services import LiveService, Replace, defect, serve
 
 PAGES = ["/", "/docs", "/redoc", "/problems", "/problems/not-json"]
 # Digest of app/static/vendor, so that a change of a library's file is seen.
@@ -41,15 +40,6 @@ async def test_pages_load_from_the_service_alone(client: httpx.AsyncClient, page
         address = urljoin(f"http://service{page}", link)
         assert urlsplit(address).netloc == "service"
         assert (await client.get(address)).status_code == 200, link
-
-
-async def test_scripts_load_nothing_from_elsewhere(client: httpx.AsyncClient) -> None:
-    # Redoc's bundle shows a logo: from beside it, not from the network of its maker.
-    bundle = (await client.get("/redoc/redoc.standalone.js")).text
-    assert not re.search(r"src:\s*\"https?://", bundle)
-    assert (await client.get("/redoc/logo-mini.svg")).status_code == 200
-    for script in ("/static/docs.js", "/static/redoc.js"):
-        assert "http" not in (await client.get(script)).text
 
 
 async def test_pages_can_be_switched_off(shared_store: Path) -> None:
@@ -103,25 +93,6 @@ def operations(document: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]
     ]
 
 
-async def test_operations_have_stable_distinct_ids(document: dict[str, Any]) -> None:
-    names = [operation["operationId"] for _, _, operation in operations(document)]
-    assert len(set(names)) == len(names)
-    assert {"relations", "missing", "outliers", "rooms", "generate", "rooms_batch"} <= set(names)
-    assert {"refresh_models", "move_alias", "health_ready", "show_vocabulary"} <= set(names)
-    assert all(re.fullmatch(r"[a-z_]+", name) for name in names)
-
-
-async def test_every_operation_is_described(document: dict[str, Any]) -> None:
-    tags = {tag["name"] for tag in document["tags"]}
-    for _, path, operation in operations(document):
-        assert operation["summary"], path
-        assert operation["description"], path
-        assert set(operation["tags"]) <= tags
-        assert len(operation["tags"]) == 1
-        for parameter in operation.get("parameters", []):
-            assert parameter.get("description"), (path, parameter["name"])
-
-
 async def test_errors_are_problems_and_nothing_else(document: dict[str, Any]) -> None:
     documented = set()
     assert not {"HTTPValidationError", "ValidationError"} & set(document["components"]["schemas"])
@@ -142,17 +113,6 @@ async def test_errors_are_problems_and_nothing_else(document: dict[str, Any]) ->
                 documented.add(slug)
     # A route lists each error, unless only Starlette or the check of the origin raises it.
     assert documented == {slug for slug, kind in ERRORS.items() if {*kind.steps} - {"http"}}
-
-
-async def test_every_body_has_worked_examples(document: dict[str, Any]) -> None:
-    for _, path, operation in operations(document):
-        (ok,) = operation["responses"]["200"]["content"].values()
-        assert "example" in ok, path
-        if "requestBody" not in operation:
-            continue
-        assert operation["requestBody"]["content"]["application/json"]["examples"] == {
-            name: described(case) for name, case in REQUESTS[operation["operationId"]].items()
-        }
 
 
 def model_of(content: dict[str, Any]) -> Any:
@@ -217,3 +177,64 @@ async def test_example_answers_have_the_fields_of_real_ones(document: dict[str, 
         validated = model_of(ok).model_validate(ok["example"], extra="forbid")
         dumped = json.loads(validated.model_dump_json(exclude_none=True))
         assert dumped == ok["example"], path
+
+
+# ------------------------------------------------------------------------------------------ headers
+
+
+NOTHING = "default-src 'none'; frame-ancestors 'none'"
+COMPUTED = [
+    ("POST", "/relations", {"objects": ["bed"]}),
+    ("POST", "/missing/batch", {"scenes": [{"objects": ["bed"]}]}),
+    ("POST", "/missing", {"objects": ["bed"]}),  # status 500
+    ("GET", "/models", None),
+    ("GET", "/models/default/vocabulary", None),
+    ("GET", "/health/live", None),
+    ("GET", "/openapi.json", None),
+    ("POST", "/relations", {"objects": []}),
+    ("POST", "/models/refresh", None),
+    ("GET", "/nowhere", None),
+    ("GET", "/static/nowhere", None),
+    ("DELETE", "/relations", None),
+]
+
+
+def check(response: httpx.Response) -> None:
+    """What holds for every answer."""
+    assert response.headers["x-content-type-options"] == "nosniff"
+    assert response.headers["referrer-policy"] == "no-referrer"
+    assert "frame-ancestors 'none'" in response.headers["content-security-policy"]
+    assert "server" not in response.headers
+    assert "x-powered-by" not in response.headers
+    # One of each: a browser joins two policies, and two cache rules contradict each other.
+    names = [name for name, _ in response.headers.raw]
+    assert len(names) == len(set(names))
+
+
+@pytest.mark.parametrize(("method", "path", "body"), COMPUTED)
+async def test_computed_answers_are_not_cached_and_load_nothing(
+    client: httpx.AsyncClient, replace: Replace, method: str, path: str, body: Any
+) -> None:
+    replace("missing", defect)
+    response = await client.request(method, path, json=body)
+    check(response)
+    assert response.headers["cache-control"] == "no-store"
+    assert response.headers["content-security-policy"] == NOTHING
+
+
+@pytest.mark.parametrize("path", ["/", "/docs", "/redoc", "/problems", "/problems/not-json"])
+async def test_pages_keep_their_own_policy(client: httpx.AsyncClient, path: str) -> None:
+    response = await client.get(path)
+    check(response)
+    policy = response.headers["content-security-policy"]
+    directives = dict(part.strip().split(" ", 1) for part in policy.split(";"))
+    assert directives["default-src"] == "'none'"
+    assert directives["script-src"] == "'self'"
+    assert not re.search(r"https?:|\*", policy)
+    assert path != "/" or "unsafe" not in policy
+
+
+@pytest.mark.system
+def test_the_server_does_not_name_itself(live: LiveService) -> None:
+    for path in ("health/live", "docs", "nowhere", "static/pages.css", "docs/swagger-ui-bundle.js"):
+        check(live.client.get(f"/{path}"))

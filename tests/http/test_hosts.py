@@ -5,15 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from app.settings import Settings
 from tests.http.test_problems import problem
-from tests.services import serve
+from tests.services import Replace, client_of_service, defect, serve
 
 SCENE = {"objects": ["bed"]}
 LOCAL = {"127.0.0.1", "localhost", "[::1]"}
-KEY = "incorrect-zebra-capacitor-nail"
 
 
 @pytest.fixture(autouse=True)
@@ -61,29 +61,110 @@ async def test_requests_for_another_host_are_refused(shared_store: Path) -> None
         problem(await client.get("/models", headers=twice), 421, "host-refused")
 
 
-@pytest.mark.parametrize("names", [["service"], ["service", "*"]])
-async def test_the_document_says_which_routes_refuse_names(
-    shared_store: Path, names: list[str]
-) -> None:
-    async with serve(shared_store, allowed_hosts=names) as client:
-        response = await client.get("/models", headers={"Host": "evil.example"})
-        paths = (await client.get("/openapi.json")).json()["paths"]
-    assert response.status_code == (200 if "*" in names else 421)
-    for path, operations in paths.items():
-        refuses = "*" not in names and "/health/" not in path
-        for operation in operations.values():
-            assert ("421" in operation["responses"]) == refuses, path
+# ------------------------------------------------------------------------------------------ origins
+
+
+LISTED, SECOND, OTHER = "https://panel.example", "http://10.0.0.7:8080", "https://other.example"
+API_KEY = "incorrect-zebra-capacitor-nail"
+
+
+shared = client_of_service(cors_origins=[LISTED, SECOND], max_body_bytes=2048)
+
+
+async def preflight(
+    client: httpx.AsyncClient, origin: str, method: str = "POST", headers: str = "content-type"
+) -> httpx.Response:
+    asked = {
+        "Origin": origin,
+        "Access-Control-Request-Method": method,
+        "Access-Control-Request-Headers": headers,
+    }
+    return await client.options("/relations", headers=asked)
+
+
+def allowed(response: httpx.Response, origin: str) -> None:
+    assert response.headers["access-control-allow-origin"] == origin
+    assert "access-control-allow-credentials" not in response.headers
+    assert "Origin" in response.headers["vary"]
+
+
+async def test_by_default_no_origin_is_allowed(client: httpx.AsyncClient) -> None:
+    problem(await preflight(client, LISTED), 405, "method-not-allowed")
+    response = await client.post("/relations", json=SCENE, headers={"Origin": LISTED})
+    assert response.status_code == 200
+    assert not [name for name in response.headers if name.startswith("access-control")]
+
+
+async def test_only_listed_origins_read_answers(shared: httpx.AsyncClient) -> None:
+    for origin in (LISTED, SECOND):
+        response = await shared.post("/relations", json=SCENE, headers={"Origin": origin})
+        assert response.status_code == 200
+        allowed(response, origin)
+        exposed = response.headers["access-control-expose-headers"].split(", ")
+        assert set(exposed) == {"X-Request-Id", "Retry-After"}
+    response = await shared.post("/relations", json=SCENE, headers={"Origin": OTHER})
+    assert "access-control-allow-origin" not in response.headers
+    assert "Origin" in response.headers["vary"]
+
+
+async def test_a_listed_origin_may_ask(shared: httpx.AsyncClient) -> None:
+    for headers in ("content-type", "content-type, x-api-key", "authorization, x-request-id"):
+        response = await preflight(shared, LISTED, headers=headers)
+        assert response.status_code == 200
+        allowed(response, LISTED)
+        assert response.headers["x-request-id"]
+        assert response.headers["cache-control"] == "no-store"
 
 
 @pytest.mark.parametrize(
-    ("host", "is_open"),
+    ("origin", "method", "headers"),
     [
-        *((host, False) for host in ("127.0.0.1", "127.0.0.2", "::1", "localhost")),
-        *((host, True) for host in ("0.0.0.0", "::", "10.0.0.7")),
+        (OTHER, "POST", "content-type"),
+        ("null", "POST", "content-type"),
+        (LISTED + ".other.example", "POST", "content-type"),
+        (LISTED, "PUT", "content-type"),
+        (LISTED, "DELETE", "content-type"),
+        (LISTED, "POST", "x-admin-key"),
+        (LISTED, "POST", "x-anything"),
     ],
 )
-def test_a_service_without_a_key_is_open_beyond_this_machine(
-    tmp_path: Path, host: str, is_open: bool
+async def test_preflight_requests_of_other_origins_are_refused(
+    shared: httpx.AsyncClient, origin: str, method: str, headers: str
 ) -> None:
-    assert Settings(store=tmp_path, host=host).is_open == is_open
-    assert not Settings(store=tmp_path, host=host, api_key=KEY).is_open
+    response = await preflight(shared, origin, method, headers)
+    problem(response, 403, "origin-refused")
+    # Without this header a browser goes no further, and with another's it must not either.
+    assert response.headers.get("access-control-allow-origin") != origin
+    assert "Origin" in response.headers["vary"]
+
+
+async def test_errors_can_be_read_too(shared: httpx.AsyncClient, replace: Replace) -> None:
+    replace("missing", defect)
+    origin = {"Origin": LISTED}
+    media = origin | {"Content-Type": "application/json"}
+    for status, response in (
+        (400, await shared.post("/relations", content=b"{", headers=media)),
+        (401, await shared.post("/models/refresh", headers=origin)),
+        (404, await shared.get("/nowhere", headers=origin)),
+        (405, await shared.get("/relations", headers=origin)),
+        (413, await shared.post("/relations", content=b" " * 4096, headers=media)),
+        (415, await shared.post("/relations", content=b"{}", headers=origin)),
+        (422, await shared.post("/relations", json={}, headers=origin)),
+        (500, await shared.post("/missing", json=SCENE, headers=origin)),
+    ):
+        assert response.status_code == status
+        allowed(response, LISTED)
+        assert response.json()["request_id"] == response.headers["x-request-id"]
+
+
+async def test_browsers_ask_beforehand_without_a_key(shared_store: Path) -> None:
+    async with serve(shared_store, cors_origins=[LISTED], api_key=API_KEY) as client:
+        response = await preflight(client, LISTED, headers="content-type, x-api-key")
+        assert response.status_code == 200
+        response = await client.post("/relations", json=SCENE, headers={"Origin": LISTED})
+        problem(response, 401, "unauthorized")
+        allowed(response, LISTED)
+        headers = {"Origin": LISTED, "X-API-Key": API_KEY}
+        response = await client.post("/relations", json=SCENE, headers=headers)
+        assert response.status_code == 200
+        allowed(response, LISTED)

@@ -11,7 +11,7 @@ import os
 import shutil
 import threading
 import weakref
-from itertools import product
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -49,19 +49,6 @@ async def test_models_versions_and_aliases_are_listed(client: httpx.AsyncClient)
     for name in ("home", "default", "candidate"):
         model = (await client.get(f"/models/{name}")).json()
         assert model == {"name": "home", "versions": models["home"]}
-
-
-async def test_a_version_tells_everything(client: httpx.AsyncClient) -> None:
-    version = (await client.get("/models/home/versions/1.0.0")).json()
-    assert version["status"] == "ready"
-    assert version["aliases"] == ["default"]
-    assert version["metrics"][0] | {"low": 0.4, "high": 0.6} == version["metrics"][0]
-    assert version["data"][0]["source"] == "generated"
-    assert version["terms"] == "Apache-2.0"
-    assert version["card"].startswith("#")
-    assert version["parameters"] > 0
-    answer = await client.post("/relations", json={"objects": ["bed"], "model": "home@1.0.0"})
-    assert answer.json()["model"]["digest"] == version["digest"]
 
 
 async def test_the_vocabulary_tells_every_word(client: httpx.AsyncClient) -> None:
@@ -107,39 +94,6 @@ async def test_a_word_becomes_a_class(
     assert [(entry["class"], entry["rule"]) for entry in mapped] == expected
 
 
-async def test_an_unknown_word_has_suggestions(client: httpx.AsyncClient) -> None:
-    answer = (await client.get("/models/default/vocabulary/pillar")).json()
-    assert "class" not in answer
-    assert answer["suggestions"][0] == "pillow"
-    assert not answer["certain"]
-
-
-@pytest.mark.parametrize(
-    ("name", "layers"),
-    [("home", {"h1": (4, 4)}), ("deep", {"h1": (6, 2), "h2": (4, 2)})],
-)
-async def test_contexts_name_every_state_of_the_hidden_units(
-    client: httpx.AsyncClient, name: str, layers: dict[str, tuple[int, int]]
-) -> None:
-    """All states but the first, which has no weights."""
-    contexts = (await client.get(f"/models/{name}/contexts")).json()["layers"]
-    assert contexts.keys() == layers.keys()
-    for layer, units in contexts.items():
-        number, states = layers[layer]
-        pairs = [(unit["unit"], unit["state"]) for unit in units]
-        assert pairs == list(product(range(number), range(1, states)))
-        for unit in units:
-            assert unit["objects"]
-            labels = {entry["label"] for entry in unit["objects"]}
-            for entry in unit["relations"]:
-                labels |= {entry["subject"], entry["object"]}
-                assert entry["relation"] in CANONICAL
-                assert entry["weight"] > 0
-            assert labels <= set(VOCABULARY.labels)
-            assert unit["name"].startswith(unit["objects"][0]["label"])
-    assert any(unit["relations"] for units in contexts.values() for unit in units)
-
-
 @pytest.mark.parametrize(
     "path",
     [
@@ -170,19 +124,6 @@ async def test_a_refresh_takes_over_new_versions(own: httpx.AsyncClient, store: 
     problem(await own.get("/models/deep"), 404, "model-not-found")
     again = (await own.post("/models/refresh")).json()
     assert (again["added"], again["removed"]) == ([], [])
-
-
-async def test_a_broken_new_version_changes_nothing(own: httpx.AsyncClient, store: Path) -> None:
-    before = (await own.get("/models")).json()
-    publish(store, "home", "2.0.0", seed=2, alias="default")
-    corrupt(store, "home", "2.0.0")
-    document = problem(await own.post("/models/refresh"), 409, "refresh-refused")
-    failures = {failure["subject"]: failure["reason"] for failure in document["failures"]}
-    assert failures["home@2.0.0"] == "checksum_mismatch"
-    assert failures["default"] == "checksum_mismatch"
-    assert (await own.get("/models")).json() == before
-    assert await default(own) == "home@1.0.0"
-    assert (await own.get("/health/ready")).status_code == 200
 
 
 @pytest.mark.parametrize("log_odds", [None, math.inf], ids=["raises", "not finite"])
@@ -303,33 +244,6 @@ async def test_an_alias_is_promoted_and_rolled_back(store: Path) -> None:
         assert await default(client) == "home@1.0.0"
 
 
-async def test_an_alias_may_follow_the_newest_version(own: httpx.AsyncClient, store: Path) -> None:
-    assert (await put(own, "default", model="home")).json()["model"] == "home"
-    assert await default(own) == "home@1.1.0"
-    publish(store, "home", "2.0.0", seed=2)
-    await own.post("/models/refresh")
-    assert await default(own) == "home@2.0.0"
-
-
-async def test_a_new_alias_is_made(own: httpx.AsyncClient) -> None:
-    response = await put(own, "kitchen", model="plain@1.0.0", expected=None)
-    assert response.status_code == 200
-    assert "previous" not in response.json()
-    # An alias given as the model is followed once.
-    assert (await put(own, "hall", model="candidate")).json()["model"] == "home@1.1.0"
-    body = {"objects": ["bed"], "model": "kitchen"}
-    answer = await own.post("/relations", json=body)
-    assert answer.json()["model"]["name"] == "plain"
-
-
-async def test_one_of_two_conflicting_alias_moves_succeeds(own: httpx.AsyncClient) -> None:
-    responses = await asyncio.gather(
-        put(own, "default", model="home@1.1.0", expected="home@1.0.0"),
-        put(own, "default", model="plain@1.0.0", expected="home@1.0.0"),
-    )
-    assert sorted(response.status_code for response in responses) == [200, 409]
-
-
 @pytest.mark.parametrize(
     ("alias", "body", "status", "slug"),
     [
@@ -376,3 +290,68 @@ async def test_a_read_only_or_locked_store_is_refused(
     monkeypatch.setattr(Store, "set_alias", busy)
     problem(await put(own, "default", model="plain@1.0.0"), 503, "store-busy")
     assert await default(own) == "home@1.0.0"
+
+
+# ------------------------------------------------------------------------------------------ polling
+
+
+POLL = 0.05
+Ask = Callable[[httpx.AsyncClient], Awaitable[Any]]
+
+
+async def listed(client: httpx.AsyncClient) -> dict[str, Any]:
+    answer: dict[str, Any] = (await client.get("/models")).json()
+    return answer
+
+
+async def ready(client: httpx.AsyncClient) -> int:
+    return (await client.get("/health/ready")).status_code
+
+
+async def until(client: httpx.AsyncClient, ask: Ask, expected: Any) -> None:
+    async with asyncio.timeout(60):
+        while await ask(client) != expected:  # noqa: ASYNC110 - a service has no event to wait for
+            await asyncio.sleep(POLL)
+
+
+async def test_replicas_converge_on_what_is_published(store: Path, admin: dict[str, str]) -> None:
+    async with serve(store, store_poll=POLL) as one, serve(store, store_poll=POLL) as other:
+        before = (await listed(one))["generation"]
+        assert (await listed(other))["generation"] == before
+        publish(store, "home", "2.0.0", seed=2, alias="default")
+        shutil.rmtree(store / "deep")
+        for client in (one, other):
+            await until(client, default, "home@2.0.0")
+            assert (await client.get("/models/deep")).status_code == 404
+        after = (await listed(one))["generation"]
+        assert (await listed(other))["generation"] == after != before
+
+        # An alias that one of them moves reaches the other.
+        response = await one.put(
+            "/models/aliases/default", json={"model": "home@1.0.0"}, headers=admin
+        )
+        assert response.status_code == 200
+        assert await default(one) == "home@1.0.0"
+        await until(other, default, "home@1.0.0")
+        assert (await listed(other))["generation"] == (await listed(one))["generation"]
+
+
+async def test_a_broken_new_version_keeps_nothing_else_back(store: Path) -> None:
+    async with serve(store, store_poll=POLL) as client:
+        publish(store, "plain", "2.0.0", seed=3)
+        corrupt(store, "plain", "2.0.0")
+        publish(store, "home", "2.0.0", seed=2, alias="default")
+        await until(client, default, "home@2.0.0")
+        failures = {entry["subject"] for entry in (await listed(client))["failures"]}
+        assert failures == {"plain@2.0.0"}
+        answer = await client.post("/missing", json={"objects": ["bed"], "model": "plain"})
+        assert answer.json()["model"]["version"] == "1.0.0"
+
+
+async def test_without_polling_nothing_is_followed(store: Path, admin: dict[str, str]) -> None:
+    async with serve(store, store_poll=0) as client:
+        publish(store, "home", "2.0.0", seed=2, alias="default")
+        await asyncio.sleep(5 * POLL)
+        assert await default(client) == "home@1.0.0"
+        assert (await client.post("/models/refresh", headers=admin)).status_code == 200
+        assert await default(client) == "home@2.0.0"

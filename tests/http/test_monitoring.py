@@ -6,18 +6,34 @@ import asyncio
 import json
 import re
 import shutil
+import sys
 import uuid
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
+from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTraceServiceRequest
+from opentelemetry.proto.trace.v1.trace_pb2 import Span
 from prometheus_client.parser import text_string_to_metric_families
+from pydantic import ValidationError
 
+from app.settings import Settings
 from tests.conftest import REPOSITORY
-from tests.http.stores import corrupt, publish
+from tests.http.stores import publish
 from tests.http.test_problems import problem
-from tests.services import Hold, LiveService, Replace, defect, serve, wait_until
+from tests.services import (
+    Hold,
+    LiveService,
+    Replace,
+    defect,
+    http_server,
+    launch,
+    serve,
+    wait_until,
+)
 
 SCENE = {"objects": ["bed", "lamp"]}
 QUESTIONS = ("relations", "missing", "outliers", "rooms", "generate")
@@ -54,18 +70,6 @@ def requests(found: dict[tuple[str, ...], float]) -> dict[tuple[str, ...], float
         for key, value in found.items()
         if key[0] == "scene_requests_total" and key[3] != "/metrics"
     }
-
-
-async def test_the_documented_example_is_of_this_service(shared_store: Path) -> None:
-    async with serve(shared_store) as client:
-        document = (await client.get("/openapi.json")).json()
-        (ok,) = document["paths"]["/metrics"]["get"]["responses"]["200"]["content"].values()
-        await client.post("/missing", json=SCENE)
-        await client.post("/missing", json={"objects": ["nosuchthing"]})
-        text = (await client.get("/metrics")).text
-    # The lines are the same, except the counts.
-    for line in ok["example"].splitlines():
-        assert line.rpartition(" ")[0] in text if line[0] != "#" else line in text
 
 
 async def test_requests_are_counted_by_route_method_and_outcome(
@@ -120,54 +124,6 @@ async def test_unknown_paths_and_methods_add_no_metrics(client: httpx.AsyncClien
     for number in range(1, 20):
         await ask(number)
     assert set(await samples(client)) == before
-
-
-async def test_work_is_measured_by_model_and_question(shared_store: Path) -> None:
-    async with serve(shared_store) as client:
-        for path in QUESTIONS:
-            body = {**SCENE, "model": "plain", "seed": 1}
-            body |= {"steps": 1} if path == "generate" else {}
-            assert (await client.post(f"/{path}", json=body)).status_code == 200
-        batch = {"scenes": [SCENE, {"objects": ["nosuchthing"]}, SCENE]}
-        assert (await client.post("/missing/batch", json=batch)).status_code == 200
-        found = await samples(client)
-    for question in QUESTIONS:
-        label = ("plain", question, "1.0.0")
-        assert found["scene_compute_duration_seconds_count", *label] == 1
-        assert found["scene_compute_duration_seconds_sum", *label] > 0
-        assert found["scene_batch_rows_sum", *label] == 1
-    assert found["scene_compute_duration_seconds_count", "home", "missing", "1.0.0"] == 2
-    assert found["scene_batch_entries_total", "success", "missing"] == 2
-    assert found["scene_batch_entries_total", "unknown-labels", "missing"] == 1
-    assert found["scene_serialisation_duration_seconds_count",] == 6
-    assert found["scene_serialisation_duration_seconds_sum",] > 0
-
-
-async def test_reloads_are_counted_by_outcome(own: httpx.AsyncClient, store: Path) -> None:
-
-    async def refresh() -> int:
-        return (await own.post("/models/refresh")).status_code
-
-    async def move(model: str) -> int:
-        url = "/models/aliases/default"
-        return (await own.put(url, json={"model": model})).status_code
-
-    assert await refresh() == 200
-    assert await move("home@1.1.0") == 200
-    assert await move("home@7.0.0") == 404
-    publish(store, "home", "2.0.0", seed=2)
-    corrupt(store, "home", "2.0.0")
-    assert await refresh() == 409
-    found = await samples(own)
-    led = [key[5] for key in found if key[:2] == ("scene_model_info", "default")]
-    assert led == ["1.1.0"]
-    reloads = {key[1:]: n for key, n in found.items() if key[0] == "scene_reloads_total"}
-    assert reloads == {
-        (change, outcome): float(change != "poll" and outcome != "failed")
-        for change in ("poll", "refresh", "alias")
-        for outcome in ("success", "refused", "failed")
-    }
-    assert found["scene_ready_time_seconds",] >= found["scene_start_time_seconds",] > 0
 
 
 async def test_metrics_can_be_switched_off(shared_store: Path) -> None:
@@ -228,21 +184,6 @@ async def test_metrics_of_a_removed_model_disappear(
     assert (await samples(own))["scene_batch_rows_count", "plain", "missing", "1.0.0"] == 1
 
 
-async def test_a_process_without_a_default_is_not_ready(
-    tmp_path: Path, admin: dict[str, str]
-) -> None:
-    async with serve(tmp_path) as client:
-        found = await samples(client)
-        assert found["scene_start_time_seconds",] > 1.7e9
-        assert found["scene_ready_time_seconds",] == 0
-        publish(tmp_path, "home", "1.0.0", alias="default")
-        times = []
-        for _ in range(2):
-            assert (await client.post("/models/refresh", headers=admin)).status_code == 200
-            times.append((await samples(client))["scene_ready_time_seconds",])
-    assert times[0] == times[1] >= found["scene_start_time_seconds",]
-
-
 @pytest.mark.system
 def test_the_documentation_lists_every_metric(live: LiveService) -> None:
     live.client.post("/missing/batch", json={"scenes": [SCENE]})
@@ -258,9 +199,6 @@ def test_the_documentation_lists_every_metric(live: LiveService) -> None:
     assert {label for _, labels, _ in metrics.values() for label in labels} <= set(
         re.findall(r"`(\w+)`", " ".join(explained))
     )
-
-
-# ------------------------------------------------------------------------------------ logs
 
 
 def line(service: LiveService, method: str, path: str, **arguments: Any) -> dict[str, Any]:
@@ -293,10 +231,67 @@ def test_a_request_is_one_line(live: LiveService) -> None:
     assert refused == common | expected
 
 
+# ------------------------------------------------------------------------------------------- traces
+
+
+MARKER = "xyzzy"
+UNTRACED = ("/health/live", "/health/ready", "/v2/health/ready", "/metrics", "/static/icon.svg")
+
+
+@pytest.fixture
+def taken(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[ExportTraceServiceRequest]]:
+    """What a collector of traces has taken, which the environment names."""
+    taken: list[ExportTraceServiceRequest] = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            body = self.rfile.read(int(self.headers["Content-Length"]))
+            assert self.path == "/v1/traces"
+            taken.append(ExportTraceServiceRequest.FromString(body))
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, *_: Any) -> None:
+            """Nothing."""
+
+    with http_server(Handler) as url:
+        monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", url)
+        monkeypatch.setenv("OTEL_EXPORTER_OTLP_COMPRESSION", "none")
+        yield taken
+
+
 @pytest.mark.system
-def test_a_batch_over_several_models_names_none(live: LiveService) -> None:
-    for models, named in ((["default", "home@1.0.0"], "home"), (["default", "plain"], None)):
-        scenes = [{**SCENE, "model": model} for model in models]
-        entry = line(live, "POST", "/missing/batch", json={"scenes": scenes})
-        assert entry.get("model") == named
-        assert entry["compute_ms"] > 0
+def test_a_request_is_a_span_named_by_its_route(
+    shared_store: Path, tmp_path: Path, taken: list[ExportTraceServiceRequest]
+) -> None:
+    """Probes and scrapes are none, and what a client made up is in none."""
+    with launch(shared_store, tmp_path / "log", SCENE_OPENTELEMETRY="true") as service:
+        service.client.post("/missing", json=SCENE)
+        for path in UNTRACED:
+            service.client.get(path)
+        service.client.get(f"/models/{MARKER}?key={MARKER}")
+    # What has not been sent yet is sent before the service ends.
+    assert "opentelemetry" not in service.log.read_text()
+    resources = [part for request in taken for part in request.resource_spans]
+    spans = [span for part in resources for scope in part.scope_spans for span in scope.spans]
+    spans = [span for span in spans if span.kind == Span.SPAN_KIND_SERVER]
+    assert [span.name for span in spans] == ["POST /missing", "GET /models/{name}"]
+    attributes = {entry.key: entry.value for entry in spans[1].attributes}
+    assert attributes["http.response.status_code"].int_value == 404
+    resource = {entry.key: entry.value for entry in resources[0].resource.attributes}
+    assert resource["service.name"].string_value == "scene-boltzmann"
+    assert MARKER not in str(taken)
+
+
+@pytest.mark.parametrize(
+    "module", ["opentelemetry.sdk.trace", "opentelemetry.exporter.otlp.proto.http"]
+)
+def test_missing_packages_are_named(
+    shared_store: Path, monkeypatch: pytest.MonkeyPatch, module: str
+) -> None:
+    monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", "http://127.0.0.1:4318")
+    assert Settings(store=shared_store, opentelemetry=True).opentelemetry
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ValidationError, match=r"SCENE_OPENTELEMETRY needs .*\.\[telemetry\]"):
+        Settings(store=shared_store, opentelemetry=True)
+    assert not Settings(store=shared_store).opentelemetry

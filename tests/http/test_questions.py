@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 
 from app import questions
 from app.questions import QUESTIONS
-from app.registry import Store
+from app.registry import Counts, Store
 from app.scene import Scene, SceneObject
-from app.scene.relations import CANONICAL, opposite
-from tests.http.stores import PROFILES, VOCABULARY, publish
-from tests.http.test_problems import pointers, problem
-from tests.services import serve
+from app.scene.geometry import viewer_axes
+from tests.http.stores import PROFILES, VOCABULARY, C, V, publish
+from tests.http.test_problems import problem
+from tests.questions.test_placements import offsets_of_every_pair
+from tests.services import Replace, defect, serve
 
 
 def at(x: float, y: float, z: float) -> dict[str, float]:
@@ -78,38 +82,6 @@ async def test_observed_relations_are_returned(client: httpx.AsyncClient, questi
     assert (warning["code"], warning["objects"]) == ("implausible-size", ["lamp"])
 
 
-# --------------------------------------------------------------------------------- relations
-
-
-async def test_relations_of_chosen_pairs(client: httpx.AsyncClient) -> None:
-    pairs = [{"subject": "chair_2", "object": "lamp"}, {"subject": "bed", "object": "chair_1"}]
-    found = (await ask(client, "relations", **SCENE, pairs=pairs, top_k=4096))["relations"]
-    ends = {(entry["subject"], entry["object"]) for entry in found}
-    assert ends == {("chair_2", "l"), ("bed", "chair_1")}
-
-
-async def test_disagreements_name_the_pairs_as_stated(client: httpx.AsyncClient) -> None:
-    """Whatever is stated of a pair, the same is expected of it."""
-    objects = ["bed", "chair", {"id": "l", "label": "nightstand"}]
-    expected: list[str] = []
-    for relation in (*CANONICAL, *map(opposite, CANONICAL)):
-        stated = [{"subject": "l", "relation": relation, "object": "bed"}]
-        answer = await ask(client, "relations", objects=objects, relations=stated)
-        for entry in answer["disagreements"]:
-            assert [entry["subject"], entry["object"]] == ["l", "bed"]
-            assert entry["observed"] == [relation]
-            assert entry["probability"] > entry["observed_probability"]
-            expected.append(entry["expected"])
-            assert expected[-1] != relation
-    # All but the likeliest relation itself.
-    assert len(expected) == 9
-    assert len(set(expected)) == 1
-    assert (await ask(client, "relations", objects=objects))["disagreements"] == []
-
-
-# ----------------------------------------------------------------------------------- missing
-
-
 @pytest.mark.parametrize(
     ("question", "details"),
     [
@@ -134,20 +106,6 @@ async def test_scores_are_the_answer_without_details(
         for entry in entries["full"]
     ]
     assert all(details <= entry.keys() for entry in entries["full"])
-
-
-# ------------------------------------------------------------------------------------- rooms
-
-
-async def test_candidates_are_read_like_room_types(client: httpx.AsyncClient) -> None:
-    request = {"objects": ["bed"], "candidates": ["Office", "bedrooom", "engine room"]}
-    document = problem(await client.post("/rooms", json=request), 422, "unknown-labels")
-    located = [(one["pointer"], one["suggestions"]) for one in document["errors"]]
-    assert located == [("#/candidates/1", ["bedroom"]), ("#/candidates/2", [])]
-    answer = await ask(client, "rooms", **request, unknown_labels="nearest-or-ignore")
-    assert {one["room_type"] for one in answer["room_types"]} == {"office", "bedroom"}
-    assert [(one["label"], one["class"]) for one in answer["mapped"]] == [("bedrooom", "bedroom")]
-    assert answer["ignored"] == ["engine room"]
 
 
 async def test_a_model_without_room_types_names_none(tmp_path: Path) -> None:
@@ -218,21 +176,6 @@ async def test_a_model_of_too_few_scenes_gives_no_judgement(tmp_path: Path) -> N
         assert (await ask(client, "generate", objects=["bed"]))["scenes"]
 
 
-async def test_the_place_that_was_asked_about_comes_first(client: httpx.AsyncClient) -> None:
-    """Of the very object, though another of its class comes before it; others stay as they were."""
-    objects = ["bed", {"id": "a", "label": "desk"}, {"id": "b", "label": "desk"}]
-    for relation in (*CANONICAL, *map(opposite, CANONICAL)):
-        place = {"relation": relation, "object": "b"}
-        answer = await ask(client, "missing", objects=objects, at=place)
-        for entry in answer["missing"]:
-            first, *others = entry["placements"]
-            assert {name: first[name] for name in ("relation", "object")} == place
-            listed = [(other["relation"], other["object"]) for other in others]
-            assert (relation, "b") not in listed
-            values = [other["probability"] for other in others]
-            assert values == sorted(values, reverse=True)
-
-
 # -------------------------------------------------------------------------- defaults, notes
 
 
@@ -242,39 +185,19 @@ async def test_coverage_is_the_models_unless_given(client: httpx.AsyncClient) ->
 
 
 async def test_a_profile_changes_base_rates_only(client: httpx.AsyncClient) -> None:
-    """Each class by the same amount in every scene. Relations stay as they are."""
-    changes: dict[str, list[float]] = {}
-    for objects in (["bed"], ["bed", "lamp", "desk"], ["toilet", "sink"]):
-        entries = [
-            (await ask(client, "missing", objects=objects, top_k=16, profile=profile))["missing"]
-            for profile in PROFILES
-        ]
-        homes, shops = ({entry["label"]: entry["log_odds"] for entry in one} for one in entries)
-        for label, log_odds in homes.items():
-            changes.setdefault(label, []).append(log_odds - shops[label])
-    for values in changes.values():
-        assert values == pytest.approx([values[0]] * len(values), abs=1e-4)
-    assert len({round(values[0], 3) for values in changes.values()}) == len(changes)
-    for question, part in (("outliers", "outliers"), ("relations", "relations")):
+    for question, changes in (("missing", True), ("outliers", True), ("relations", False)):
         answers = [
-            (await ask(client, question, **SCENE, profile=profile))[part]
+            (await ask(client, question, **SCENE, profile=profile))[question]
             for profile in (None, *PROFILES)
         ]
-        assert (answers[0] == answers[1] == answers[2]) == (question == "relations")
-    drawn = [
-        (await ask(client, "generate", count=4, seed=1, profile=profile))["scenes"]
-        for profile in (None, *PROFILES)
-    ]
-    assert drawn[0] != drawn[1] != drawn[2]
+        assert (answers[0] != answers[1] != answers[2]) == changes
 
 
-async def test_sensitivity_is_medium_unless_given(client: httpx.AsyncClient) -> None:
-    plain = await ask(client, "outliers", **SCENE)
-    assert plain["threshold"] == 0.5
-    medium = await ask(client, "outliers", **SCENE, sensitivity="medium")
-    assert medium | {"request_id": ""} == plain | {"request_id": ""}
-    own = await ask(client, "outliers", **SCENE, sensitivity="low", threshold=0.25)
-    assert own["threshold"] == 0.25
+async def test_relations_of_chosen_pairs(client: httpx.AsyncClient) -> None:
+    pairs = [{"subject": "chair_2", "object": "lamp"}, {"subject": "bed", "object": "chair_1"}]
+    found = (await ask(client, "relations", **SCENE, pairs=pairs, top_k=4096))["relations"]
+    ends = {(entry["subject"], entry["object"]) for entry in found}
+    assert ends == {("chair_2", "l"), ("bed", "chair_1")}
 
 
 async def test_misplaced_relations_are_spelled_as_stated(client: httpx.AsyncClient) -> None:
@@ -285,29 +208,6 @@ async def test_misplaced_relations_are_spelled_as_stated(client: httpx.AsyncClie
     assert all(type(one["is_misplaced"]) is bool for one in answer["misplaced"])
 
 
-async def test_observed_relations_are_marked_from_either_end(client: httpx.AsyncClient) -> None:
-    scene = {"objects": ["bed", "lamp", "desk"], "relations": [("bed", "right", "lamp")]}
-    answer = await ask(client, "relations", **scene, include_opposites=True, top_k=4096)
-    marked = triples([one for one in answer["relations"] if one["observed"]])
-    assert marked == {("bed", "right", "lamp"), ("lamp", "left", "bed")}
-
-
-async def test_mapped_labels_are_reported_with_their_class(client: httpx.AsyncClient) -> None:
-    answer = await ask(
-        client,
-        "missing",
-        objects=["bed", "nigthstand"],
-        candidates=["TV", "big lamp"],
-        unknown_labels="nearest",
-    )
-    mapped = [(one["label"], one["class"]) for one in answer["mapped"]]
-    assert mapped == [("nigthstand", "nightstand"), ("big lamp", "lamp")]
-    assert {one["label"] for one in answer["missing"]} == {"television", "lamp"}
-    body = {"objects": ["bed"], "candidates": ["droid"], "unknown_labels": "nearest"}
-    response = await client.post("/missing", json=body)
-    assert pointers(response, "unknown-labels") == ["#/candidates/0"]
-
-
 def _numbers(value: Any) -> list[float]:
     if isinstance(value, dict):
         value = list(value.values())
@@ -316,12 +216,154 @@ def _numbers(value: Any) -> list[float]:
     return [value] if isinstance(value, float) else []
 
 
-async def test_an_answer_has_the_fields_of_the_question(
-    client: httpx.AsyncClient, shared_store: Path
+# ------------------------------------------------------------------------------- counts and offsets
+
+
+LABELS = ("bed", "nightstand", "chair", "chair")
+CHAIR, NIGHTSTAND = VOCABULARY.index("chair"), VOCABULARY.index("nightstand")
+
+
+@pytest.fixture(scope="module")
+def own_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A model whose scenes usually have one nightstand and four chairs."""
+    root, share = tmp_path_factory.mktemp("store"), [[0.8, 0.1, 0.05, 0.05], [0.1, 0.1, 0.1, 0.7]]
+    log_share, weights = np.log(share).astype("f4"), np.zeros((2, 2, 3 + C + V), np.float32)
+    counts = Counts(np.array([NIGHTSTAND, CHAIR]), np.array([3, 3]), log_share, weights)
+    offsets = offsets_of_every_pair(V)
+    publish(root, "measured", "1.0.0", alias="default", counts=counts, offsets=offsets)
+    return root
+
+
+@pytest.fixture(scope="module")
+async def measured(own_store: Path, anyio_backend: str) -> AsyncIterator[httpx.AsyncClient]:
+    async with serve(own_store) as client:
+        yield client
+
+
+def computed(
+    store: Path, labels: tuple[str, ...], position: Any, *scene: Any, **options: Any
+) -> Any:
+    """The answer of the question itself."""
+    artifact = Store(store).load("measured", "1.0.0")
+    things = (
+        SceneObject(str(k), label, VOCABULARY.index(label), position=position)
+        for k, label in enumerate(labels)
+    )
+    return questions.missing(artifact, Scene(tuple(things), *scene), **options)
+
+
+async def test_likely_further_instances_are_listed(
+    measured: httpx.AsyncClient, own_store: Path
 ) -> None:
-    objects = [SceneObject(str(k), VOCABULARY.labels[k], k) for k in range(14)]
-    artifact = Store(shared_store).load("home", "1.0.0")
-    expected = questions.outliers(artifact, Scene(tuple(objects)))
-    request = [{"id": thing.id, "label": thing.label} for thing in objects]
-    answer = await ask(client, "outliers", objects=request)
-    assert {name: answer[name] for name in expected} == expected
+    answer = (await ask(measured, "missing", objects=LABELS))["more"]
+    assert answer == computed(own_store, LABELS, None)["more"]
+    (entry,) = answer
+    assert [entry[name] for name in ("label", "listed_count", "low", "high")] == ["chair", 2, 2, 4]
+    assert entry["probability"] == pytest.approx(0.8 / 0.9, abs=1e-3)
+    # A question about a place lists none.
+    place = {"relation": "on-top", "object": "bed"}
+    assert (await ask(measured, "missing", objects=LABELS, at=place))["more"] == []
+
+
+# Nothing is derived or stated, so that every request asks the same question of the model.
+POSED = ("bed", "chair", "desk")
+PLACE = {"x": 1.0, "y": 0.0, "z": 0.5}
+REQUEST: dict[str, Any] = {
+    "objects": [{"id": str(k), "label": POSED[k], "position": PLACE} for k in range(3)],
+    "relations": [],
+    "top_k": 11,
+}
+
+
+@pytest.mark.parametrize(
+    ("frame", "viewpoint"),
+    [
+        (None, None),
+        ("base_link", None),
+        ("map", {"x": 4.0, "y": -3.0, "yaw": math.pi / 2}),
+        ("camera_optical_frame", None),
+        ("robot_1/map", None),
+    ],
+)
+async def test_placements_have_offsets_in_the_axes_of_the_frame(
+    measured: httpx.AsyncClient, own_store: Path, frame: str | None, viewpoint: Any
+) -> None:
+    """In a map without a viewpoint, the relations left and front have no offset."""
+    options = {"frame_id": frame, "viewpoint": viewpoint}
+    options = {name: value for name, value in options.items() if value is not None}
+    axes = viewer_axes(frame or "", None if viewpoint is None else viewpoint["yaw"])
+    answer = await ask(measured, "missing", **REQUEST, **options)
+    position = tuple(PLACE.values())
+    expected = computed(own_store, POSED, position, (), top_k=11, axes=axes)
+    assert answer["missing"] == expected["missing"]
+    places = [place for entry in answer["missing"] for place in entry["placements"]]
+    kinds = {"offset" in place for place in places}
+    assert kinds == ({True, False} if axes is None else {True})
+
+
+# ------------------------------------------------------------------------------------------ batches
+
+
+ENTRIES: list[Any] = [
+    {"objects": ["bed", "lamp"]},
+    {"objects": ["bed", "droid"]},
+    "no scene at all",
+    {"objects": ["bed", {"label": "lamp", "confidence": 3}]},
+    {"objects": ["bed", "lamp"], "model": "nobody"},
+    {"objects": []},
+    {"objects": ["bed", "chair"], "model": "plain"},
+]
+NAMES = [question.name for question in QUESTIONS if not question.samples]
+
+
+@pytest.mark.parametrize("question", NAMES)
+async def test_every_entry_gets_the_result_or_problem_of_a_single_request(
+    client: httpx.AsyncClient, question: str
+) -> None:
+    headers = {"X-Request-Id": "one"}
+    response = await client.post(f"/{question}/batch", json={"scenes": ENTRIES}, headers=headers)
+    assert response.status_code == 200
+    answer = response.json()
+    assert answer["request_id"] == "one"
+    assert [entry["status"] for entry in answer["results"]] == [200, 422, 422, 422, 404, 422, 200]
+    for number, (entry, scene) in enumerate(zip(answer["results"], ENTRIES, strict=True)):
+        alone = await client.post(f"/{question}", json=scene, headers=headers)
+        expected = alone.json()
+        for error in expected.get("errors", []):
+            error["pointer"] = error["pointer"].replace("#", f"#/scenes/{number}")
+        part = "result" if alone.is_success else "problem"
+        assert entry == {"status": alone.status_code, part: expected}
+
+
+@pytest.mark.parametrize("scenes", [[], [{"objects": ["bed"]}] * 257, {}, None])
+async def test_a_batch_holds_1_to_256_scenes(client: httpx.AsyncClient, scenes: Any) -> None:
+    response = await client.post("/relations/batch", json={"scenes": scenes})
+    assert response.status_code == 422
+    assert response.json()["errors"][0]["pointer"] == "#/scenes"
+
+
+@pytest.mark.parametrize("fault", ["raised", math.nan])
+async def test_a_defect_affects_one_entry(
+    client: httpx.AsyncClient, replace: Replace, fault: Any
+) -> None:
+    def fail_on_sofas(outliers: Any, artifact: Any, scene: Any, **parameters: Any) -> Any:
+        answer = outliers(artifact, scene, **parameters)
+        if any(thing.label == "sofa" for thing in scene.objects):
+            if fault == "raised":
+                defect()
+            answer["outliers"][0]["log_odds"] = fault
+        return answer
+
+    replace("outliers", fail_on_sofas)
+    scenes = [{"objects": ["bed"]}, {"objects": ["sofa"]}, {"objects": ["lamp"]}]
+    response = await client.post("/outliers/batch", json={"scenes": scenes})
+    assert [entry["status"] for entry in response.json()["results"]] == [200, 500, 200]
+    assert response.json()["results"][1]["problem"]["type"] == "/problems/internal-error"
+    assert "secret" not in response.text
+    assert (await client.post("/outliers", json=scenes[1])).status_code == 500
+
+
+async def test_an_id_may_be_the_text_nan(client: httpx.AsyncClient) -> None:
+    objects = [{"id": "NaN", "label": "bed"}, {"id": "-Infinity", "label": "lamp"}]
+    answer = (await client.post("/outliers", json={"objects": objects})).json()
+    assert {entry["object"] for entry in answer["outliers"]} == {"NaN", "-Infinity"}

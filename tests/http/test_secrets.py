@@ -68,32 +68,19 @@ def test_keys_and_payloads_are_not_in_the_log(defective: LiveService) -> None:
             statuses.add(client.request(method, path, json=body, headers=headers).status_code)
     assert {200, 401, 404, 405, 422, 500} <= statuses
 
-    # The server itself logs handshakes, broken HTTP and clients that leave.
-    handshake = (
-        "GET /{key}?key={key} HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\n"
-        "Upgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
-        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n{header}{key}\r\n\r\n"
-    )
-    broken = "GET /{key} HTTP/1.1\r\nHost x\r\n{header}{key}\r\n\r\n"
+    # The server itself logs broken HTTP and clients that leave.
+    broken = "GET /{key} HTTP/1.1\r\nHost x\r\n{field}: {key}\r\n\r\n"
     left = (
         "POST /relations HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
-        "{header}{key}\r\nContent-Length: 99\r\n\r\n{key}"
+        "{field}: {key}\r\nContent-Length: 99\r\n\r\n{key}"
     )
-    fields = [
-        ("X-API-Key: ", API_KEY),
-        ("X-Admin-Key: ", ADMIN_KEY),
-        ("X-API-Key: ", MISTAKEN),
-        ("Authorization: Bearer ", MISTAKEN),
-    ]
-    for text, (header, key) in product((handshake, broken, left), fields):
+    for text, field, key in product((broken, left), ("X-API-Key", "X-Admin-Key"), SECRETS):
         with socket.create_connection(("127.0.0.1", defective.port), timeout=10) as connection:
-            connection.sendall(text.format(key=key, header=header).encode())
-            if text is not broken:
-                connection.shutdown(socket.SHUT_WR)
+            connection.sendall(text.format(key=key, field=field).encode())
+            connection.shutdown(socket.SHUT_WR)
             with suppress(ConnectionError):
                 while connection.recv(65536):
                     pass
-    assert client.get("/health/live").status_code == 200
 
     log = defective.stop()
     # The log has the defect and the requests.

@@ -69,18 +69,6 @@ def test_a_used_port_ends_the_start_before_models_are_loaded(
     assert log.read_text() == IN_USE.format(port)
 
 
-def test_a_port_taken_during_the_start_ends_the_start(
-    starting: Start, log: Path, taken: socket.socket
-) -> None:
-    port = taken.getsockname()[1]
-    process = starting(PORT=port)
-    wait_for("Waiting for application startup", log, process)
-    taken.listen()
-    assert process.wait(timeout=60) == 3
-    assert log.read_text().endswith(IN_USE.format(port))
-    assert "Traceback" not in log.read_text()
-
-
 @pytest.mark.parametrize("host", ["203.0.113.1", "no-such-host.invalid"])
 def test_an_address_that_the_machine_does_not_have(starting: Start, log: Path, host: str) -> None:
     assert starting(HOST=host, PORT=0).wait(timeout=60) == 3

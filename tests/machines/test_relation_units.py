@@ -1,17 +1,21 @@
-"""Relations in the service: moments of logits by enumeration of h1, and the quadrature."""
+"""Relations in the service: moments of logits, the quadrature, and implications by hand."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from app.inference.objects import ObjectScorer
-from app.inference.posterior import ScenePosterior, context_of
-from app.inference.relations import NEVER, NO_UNIT, ends_of, relation_units, to_log_odds
-from tests.enumeration.small_machines import random_weights, unit_states
+from app.inference.posterior import context_of
+from app.inference.relations import NEVER, ObservedRelations, relation_units, to_log_odds
+from tests.enumeration.small_machines import implied_by_hand, random_weights, unit_states
 from training.machines import MachineSpec, build
 from training.machines.arrays import weights_of
+from training.machines.triway import implied
 
 V, A = 6, 2
 
@@ -112,61 +116,78 @@ def test_mean_and_variance_are_those_over_all_states_of_h1(name, room):
         np.testing.assert_allclose(one[0, 0], out[0, 1], rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", SPECS)
-def test_probabilities_are_close_to_the_sum_over_all_states(name):
-    """The logit of a few units is not normal: the probability has an error of at most .02."""
-    machine = machine_of(name, scale=0.6)
-    v, weights, context = scene_of(machine, 0)
-    scene = ScenePosterior(ObjectScorer(weights), relation_units(weights), context)
-    found = scene.relation_log_odds()
-    grid, p = exact_logits(machine.double(), v, 0)
-    exact = torch.einsum("s,saij->aij", p, grid.sigmoid())[np.ix_(range(A), CLASSES, CLASSES)]
-    assert float(np.abs(sigmoid(found.astype(float)) - exact.numpy()).max()) < 0.02
-    assert (found >= NO_UNIT).all()
-    if name in ("rbm", "gbm"):
-        assert (found == NO_UNIT).any()
-    # No relation is observed.
-    np.testing.assert_array_equal(scene.alone_log_odds(), found)
-    assert not scene.relation_change().any()
+# ------------------------------------------------------------------------------------- implications
 
 
-def test_the_neglected_directions_have_little_variance():
-    """At most .016, as a mean over all units, where all states are equally likely."""
-    spec = MachineSpec("triway", V=30, A=2, units=8, states=6, K=12)
-    machine = random_weights(build(spec), torch.Generator().manual_seed(0), 0.3)
-    machine.c1.zero_()
-    units, n = relation_units(weights_of(machine)), np.arange(30)
-    pair = np.repeat(n, 30)[None], np.tile(n, 30)[None]
-    ends = ends_of(n, np.ones(30, np.float32), np.zeros(30, np.float32), *pair)
-    _, spread = units.normal(np.full((1, spec.H1), 1 / 6, np.float32), ends)
-    a = np.repeat(np.arange(2), 900)
-    U = units.context_weights(a, np.tile(pair[0][0], 2), np.tile(pair[1][0], 2))
-    by_unit = U.reshape(len(U), 8, 5).astype(float)
-    variance = ((by_unit**2).sum(2) / 6 - (by_unit.sum(2) / 6) ** 2).sum(1)
-    neglected = (variance - spread.ravel() ** 2 / 3).reshape(2, -1).mean(1)
-    assert (neglected > 1e-4).all()
-    assert (neglected < 0.016).all()
+@st.composite
+def relations(draw):
+    """(A, n, n) of one or two relations between up to 6 classes, from few to all of them."""
+    A, n = draw(st.integers(1, 2)), draw(st.integers(0, V))
+    density = draw(st.sampled_from([0.1, 0.4, 0.8, 1.0]))
+    generator = torch.Generator().manual_seed(draw(st.integers(0, 2**32)))
+    return (torch.rand(A, n, n, generator=generator) < density).double()
 
 
-@pytest.mark.parametrize("name", SPECS)
-def test_context_weights_are_the_slopes_of_the_logits(name):
-    machine = machine_of(name)
-    units = relation_units(weights_of(machine))
-    edges = machine.double().edges(torch.arange(V)[None])
-    ends = [part[0].numpy() for part in (edges.relation, edges.subject, edges.object)]
-    h1 = torch.eye(machine.spec.H1).double()
-    v = torch.ones(len(h1), V).double()
-    slope = machine.relation_logits(edges, v, h1) - machine.relation_logits(edges, v, 0 * h1)
-    np.testing.assert_allclose(units.context_weights(*ends), slope.T, rtol=1e-4, atol=1e-5)
+def coupled_machine(A=1, states=2):
+    """A Triway with every weight from N(0, 1)."""
+    machine = build(MachineSpec("triway", V=V, A=A, units=3, states=states, K=2, C=2, G=2))
+    return random_weights(machine, torch.Generator().manual_seed(0))
 
 
-def test_certain_states_have_the_logits_of_the_machine():
-    machine = machine_of("triway-states")
-    units, h1 = relation_units(weights_of(machine)), unit_states(machine.spec)[77:78].float()
-    n = np.arange(V)
-    pair = np.repeat(n, V)[None], np.tile(n, V)[None]
-    ends = ends_of(n, np.ones(V, np.float32), np.zeros(V, np.float32), *pair)
-    mean, spread = units.normal(h1.numpy(), ends, certain=True)
-    expected = machine.relation_logits(machine.edges(torch.arange(V)[None]), torch.ones(1, V), h1)
-    np.testing.assert_allclose(mean.ravel(), expected[0], rtol=1e-4, atol=1e-4)
-    assert not spread.any()
+def in_service(machine, observed, n=V, room=None):
+    """The relations between the first n classes in the service, given observed relations."""
+    weights, ones = weights_of(machine), np.ones(n, np.float32)
+    context = context_of(weights, np.arange(n), ones, 0 * ones, room, observed)
+    return relation_units(weights).between(context)
+
+
+@settings(max_examples=50)
+@given(relations(), st.sampled_from([-1, 0, 1]), st.sampled_from([2, 4]))
+def test_implications_equal_the_formula_by_hand(grid, room, states):
+    """The tensors and the service, which lists only relations that hold.
+
+    Also without the effects between relations of the same pair (`apart`).
+    """
+    A, n, _ = grid.shape
+    machine = coupled_machine(A, states)
+    v = torch.zeros(1, V).double()
+    v[0, :n] = 1
+    padded = torch.zeros(A, V, V).double()
+    padded[:, :n, :n] = grid
+    a, i, j = (index.numpy() for index in grid.nonzero(as_tuple=True))
+    observed = ObservedRelations(a, i, j, np.ones(len(a), np.float32))
+    found = in_service(machine, observed, n, None if room < 0 else room)
+    machine.double()
+    h1 = machine.state_means(machine.context(v, torch.tensor([room]))[0])
+    expected = implied_by_hand(machine, v[0], padded, room)
+    edges = machine.edges(torch.arange(V).unsqueeze(0))
+    ours = machine.implied(edges, padded.reshape(1, -1), h1)
+    torch.testing.assert_close(ours.reshape(padded.shape), expected)
+    alone = implied_by_hand(machine, v[0], padded, room, apart=True)
+    ours = implied(machine.gamma, machine.B, padded[None], h1, apart=True)[0]
+    torch.testing.assert_close(ours, alone)
+    between = ~np.eye(n, dtype=bool)
+    for shift, law in ((found.shift, expected), (found.apart, alone)):
+        law = law[:, :n, :n].numpy()[:, between]
+        np.testing.assert_allclose(shift[:, between], law, rtol=1e-4, atol=1e-4)
+
+
+def test_without_observed_relations_nothing_changes():
+    machine = coupled_machine(2)
+    edges = machine.edges(torch.arange(V).unsqueeze(0))
+    none = torch.zeros(1, 2 * V * V)
+    assert not machine.implied(edges, none, torch.full((1, 3), 0.3)).any()
+    plain = build(replace(machine.spec, G=0))
+    assert not plain.implied(edges, none + 1, torch.full((1, 3), 0.3)).any()
+    off = ObservedRelations(*(np.array([k]) for k in (0, 1, 2)), np.zeros(1, np.float32))
+    for observed, shape in ((None, (0, 0, 0)), (off, (2, V, V))):
+        shift = in_service(machine, observed).shift
+        assert shift.shape == shape
+        assert not shift.any()
+
+
+def test_relations_in_another_layout_are_refused():
+    machine = coupled_machine()
+    table = build(MachineSpec("rbm", V=V, A=1, units=1, T=0)).edges(torch.arange(V)[None])
+    with pytest.raises(TypeError, match="PairEdges"):
+        machine.relation_logits(table, torch.ones(1, V), torch.zeros(1, 3))

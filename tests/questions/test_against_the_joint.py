@@ -13,8 +13,12 @@ import pytest
 import torch
 
 from app.scene import CANONICAL, OPPOSITES
-from tests.enumeration.implied import relation_by_definition
-from tests.enumeration.small_machines import Joint, enumerate_joint, mean_rates
+from tests.enumeration.small_machines import (
+    Joint,
+    enumerate_joint,
+    mean_rates,
+    relation_by_definition,
+)
 from tests.questions.answers import disagreements, missing, outliers, relations
 from tests.questions.artifacts import EXACT, LABELS, artifact_of, random_machine, scene_of
 
@@ -175,17 +179,6 @@ def test_outliers(name, room, profile):
             assert entry.probability == close(sigmoid(-log_odds))
 
 
-def test_room_types_and_profiles_count():
-    """The tests above need machines whose answers depend on both."""
-    answers = [
-        tuple(entry.log_odds for entry in missing(artifact, scene_of([0], room=t, profile=q)))
-        for name, t, q in CASES
-        if name == "rbm-states"
-        for artifact, _ in [exact_case(name)]
-    ]
-    assert len(set(answers)) == len(answers) == 6
-
-
 @pytest.mark.parametrize(("classes", "stated"), SCENES[:5])
 def test_placements(case, classes, stated):
     """The best three of p(r_e = 1 | the candidate is present), made exclusive.
@@ -206,19 +199,6 @@ def test_placements(case, classes, stated):
         for place in entry.placements:
             p = expected[place.relation, place.object]
             assert place.probability == pytest.approx(p, abs=TOLERANCE)
-
-
-@pytest.mark.parametrize("relation", ["left", "right"])
-@pytest.mark.parametrize("anchor", [0, 1, 2])
-def test_missing_at_a_place(case, relation, anchor):
-    """With the neutral calibration: the log-odds of the class and the log of p(r_e = 1)."""
-    artifact, exact = case
-    for entry in missing(artifact, scene_of([anchor]), at=(relation, 0)):
-        i = LABELS.index(entry.label)
-        triple = (0, i, anchor) if relation == "left" else (0, anchor, i)
-        p = max(exact.relation(triple, [anchor, i]), math.exp(-30))
-        z = exact.object(i, [anchor]) + exact.kappa(i, 0.5)
-        assert entry.probability == pytest.approx(sigmoid(z + math.log(p)), abs=TOLERANCE)
 
 
 @pytest.mark.parametrize(("classes", "stated"), SCENES[2:])
@@ -274,15 +254,6 @@ def test_disagreements(case, classes, stated, complete):
     assert not entries
 
 
-def test_small_machines_disagree_with_some_scenes_and_agree_with_others():
-    """The test above needs both."""
-    cases = [(name, scene) for name in EXACT for scene in SCENES[3:]]
-    disagree = {
-        bool(disagreements(exact_case(name, scale=0.6)[0], scene_of(*s))) for name, s in cases
-    }
-    assert disagree == {True, False}
-
-
 @pytest.mark.parametrize(("classes", "stated"), SCENES[3:])
 def test_misplaced(case, classes, stated):
     """An observed relation is no evidence for itself."""
@@ -294,31 +265,3 @@ def test_misplaced(case, classes, stated):
         triple = (CANONICAL.index(entry.relation), classes[entry.subject], classes[entry.object])
         p = exact.relation(triple, classes, [other for other in observed if other != triple])
         assert entry.probability == pytest.approx(1 - p, abs=TOLERANCE)
-
-
-@pytest.mark.parametrize("name", EXACT)
-@pytest.mark.parametrize("threshold", [0.0, 1.0])
-def test_reasons(name, threshold):
-    """The change of an object's log-odds by each other object."""
-    artifact, exact = exact_case(name)
-    classes = [0, 1, 2]
-    for entry in outliers(artifact, scene_of(classes), threshold=threshold).outliers:
-        changes = exact.changes(classes[entry.object], classes)
-        sign = -1 if entry.is_outlier else 1
-        expected = {j: change for j, change in changes.items() if sign * change > 0}
-        reasons = {reason.object: reason.log_odds_change for reason in entry.because}
-        assert reasons == close(expected)
-        sizes = [abs(reason.log_odds_change) for reason in entry.because]
-        assert sizes == sorted(sizes, reverse=True)
-
-
-@pytest.mark.parametrize("name", EXACT)
-@pytest.mark.parametrize("classes", [[0], [2, 0], [1, 2], [1, 1, 2]])
-def test_reasons_for_missing_objects(name, classes):
-    """The change by each listed class. The first object of the class stands for it."""
-    artifact, exact = exact_case(name)
-    for entry in missing(artifact, scene_of(classes)):
-        changes = exact.changes(LABELS.index(entry.label), classes)
-        expected = {classes.index(j): change for j, change in changes.items()}
-        reasons = {reason.object: reason.log_odds_change for reason in entry.because}
-        assert reasons == close(expected)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from app.scene import Scene, SceneObject, observe
@@ -113,16 +112,3 @@ def test_boxes_exclude_stacked_relations_in_both_directions(stated):
         assert answer["above", 2, 3].observed
         assert answer["above", 2, 3].probability == 1
         assert answer["above", 3, 2].probability <= 0.0100001
-
-
-def test_unknown_positions_exclude_nothing():
-    scene = observe(scene_of([0, 1]))
-    assert scene.excluded is None
-    assert entries(scene) == entries(scene_of([0, 1]))
-
-
-def test_least_probabilities_count_the_evidence():
-    scene = scene_of([0, 1, 2], [(ON_TOP, 1, 2)])
-    answer = entries(scene, min_probability=0.999)
-    assert np.all([entry.probability >= 0.999 for entry in answer.values()])
-    assert ("on-top", 1, 2) in answer

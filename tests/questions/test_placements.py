@@ -6,6 +6,7 @@ import itertools
 import math
 from collections import namedtuple
 from dataclasses import replace
+from importlib import import_module
 from itertools import compress
 
 import numpy as np
@@ -14,17 +15,33 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import logit
 
-from app.questions import placements
-from app.questions.placements import held_objects, offsets_of
+from app.questions.placements import Place, offsets_of, place_log_p
 from app.questions.posterior import Posterior
 from app.registry import CountSlope, Offsets
+from app.registry.description import PlaceFit
 from app.registry.offsets import UNOBSERVED
-from app.scene import CANONICAL, RELATIONS, ObjectClass, Scene, SceneObject, Vocabulary
+from app.scene import RELATIONS, ObjectClass, Scene, SceneObject, Vocabulary
 from app.scene.geometry import viewer_axes
-from app.scene.relations import ABOVE, FRONT, INSIDE, LEFT, ON_TOP, canonicalise
+from app.scene.relations import (
+    ABOVE,
+    CANONICAL,
+    FRONT,
+    INSIDE,
+    LEFT,
+    ON_TOP,
+    OPPOSITES,
+    canonicalise,
+)
 from app.scene.stands import HANGS, SUPPORTED
 from tests.questions.answers import missing, without_minimums
-from tests.questions.artifacts import LABELS, LARGER, larger_artifact, places_of, scene_of
+from tests.questions.artifacts import (
+    LABELS,
+    LARGER,
+    STRUCTURE,
+    larger_artifact,
+    places_of,
+    scene_of,
+)
 
 V = LARGER["triway"].V
 A = len(CANONICAL)
@@ -82,17 +99,6 @@ def test_no_place_is_under_an_object_on_top_of_another():
     assert 1 in under((ON_TOP, 0, 1))
 
 
-def test_a_desk_with_a_bin_under_it_has_room_for_more():
-    """On-top also means under: class 1 is under class 0 in three scenes."""
-    roles = {
-        "role_pair": np.array([1 * V + 0], np.int32),
-        "role_counts": np.array([(0, 3, 0)], np.float32),
-    }
-    artifact = replace(ARTIFACT, places=places_of(V, {(ON_TOP, 2, 0): 5.0}, **roles))
-    scene = scene_of([0, 1, 2], [(ON_TOP, 0, 1), (ON_TOP, 2, 0)])
-    assert held_objects(artifact, Posterior(artifact, scene), scene) == [2]
-
-
 def offsets_of_every_pair(V: int = V) -> Offsets:
     """Random offsets, different for each pair of classes."""
     rng = np.random.default_rng(0)
@@ -144,17 +150,6 @@ def test_the_offset_turns_with_the_viewer(yaw, optical):
     assert offset.std == pytest.approx((samples @ turn.T).std(axis=0), rel=0.03)
 
 
-@pytest.mark.parametrize("relation", [ON_TOP, ABOVE])
-def test_vertical_relations_have_a_vertical_offset_without_a_viewer(relation):
-    """The spread is that of samples, turned by random angles."""
-    plain, offset = offset_of(relation, 1, 2), offset_of(relation, 1, 2, axes=None)
-    rng = np.random.default_rng(1)
-    samples, angle = rng.normal(plain.mean, plain.std, (100_000, 3)), rng.uniform(0, 7e3, 100_000)
-    x = np.cos(angle) * samples[:, 0] - np.sin(angle) * samples[:, 1]
-    assert offset.mean == (0.0, 0.0, plain.mean[2])
-    assert offset.std == pytest.approx((x.std(), x.std(), plain.std[2]), rel=0.02)
-
-
 def test_unknown_offsets():
     """Left and front without a viewer, and relations without poses in training."""
     assert offset_of(LEFT, 1, 2, axes=None) is None
@@ -164,13 +159,6 @@ def test_unknown_offsets():
     partial = replace(OFFSETS, **counts, **none)
     assert offset_of(FRONT, 1, 2, offsets=partial) is None
     assert offset_of(LEFT, 1, 2, offsets=partial).scenes == 0
-
-
-def test_no_zero_is_negative_and_every_spread_is_positive():
-    exact = replace(OFFSETS, pair_offset=np.tile(np.float32([0, 0, 0, 1e-6, 1, 1]), (A * V * V, 1)))
-    offset = offset_of(LEFT, 1, 2, outgoing=False, offsets=exact)
-    assert [math.copysign(1, x) for x in offset.mean] == [1, 1, 1]
-    assert offset.std[0] == 0.001
 
 
 @pytest.mark.parametrize("name", ["rbm", "triway-states", "triway"])
@@ -192,8 +180,6 @@ def test_placements_have_the_offsets_of_their_classes(name):
             anchor = scene.objects[place.object].class_index
             assert place.offset == offset_of(relation, index, anchor, subject == "missing")
 
-
-# ---------------------------------------------------------------------- what training never shows
 
 SHOWN = {(ON_TOP, 1, 2): 2.0, (ON_TOP, 5, 2): 1.0, (INSIDE, 5, 6): 4.0}
 
@@ -220,37 +206,6 @@ def test_relations_that_training_never_shows_are_lowered_by_the_stand_of_the_sub
             assert after - before[missed] == pytest.approx(change, abs=1e-4)
 
 
-# ------------------------------------------------------------------------------- what fits inside
-
-
-def test_a_box_fits_into_a_box_with_larger_extents_in_order_of_size():
-    """20 % of tolerance. The size of an object replaces the typical size of its class."""
-    sizes = {"bed": (2.0, 1.5, 0.5), "lamp": (0.2, 0.2, 0.5), "shelf": (0.3, 1.0, 2.0)}
-    vocabulary = Vocabulary([ObjectClass(label, size=sizes.get(label)) for label in LABELS[:V]])
-    artifact = replace(ARTIFACT, vocabulary=vocabulary)
-    bed, lamp, shelf, vase = 0, 1, 6, 5
-    objects = (
-        SceneObject("shelf", "shelf", shelf),
-        SceneObject("box", "shelf", shelf, size=(0.45, 0.18, 0.18)),
-        SceneObject("narrow", "shelf", shelf, size=(3.0, 3.0, 0.16)),
-        SceneObject("unknown", "vase", vase),
-    )
-    candidates = np.array([bed, lamp, vase])
-    classes = np.array([thing.class_index for thing in objects])
-    too_large = placements._too_large(artifact, objects, candidates, classes)
-    into, around = (~mask for mask in too_large)
-    assert into.tolist() == [
-        [False, False, False, True],
-        [True, True, False, True],
-        [True, True, True, True],
-    ]
-    assert around.tolist() == [
-        [True, True, False, True],
-        [False, True, False, True],
-        [True, True, True, True],
-    ]
-
-
 @pytest.mark.usefixtures("without_minimums")
 def test_no_place_is_inside_an_object_that_is_too_small():
     sizes = {"sofa": (2.0, 0.9, 0.8), "vase": (0.1, 0.1, 0.3)}
@@ -268,3 +223,81 @@ def test_no_place_is_inside_an_object_that_is_too_small():
     assert first(sofa, vase).get("inside", 0) < 1e-6
     assert first(vase, sofa).get("contains", 0) < 1e-6
     assert first(sofa, chair)["inside"] > 1e-3
+
+
+# ------------------------------------------------------------------- the place that a request names
+
+
+module = import_module("app.questions.missing")  # the package has a function of this name
+NAMES = ["rbm", "triway", "triway-states"]
+FITS = tuple(
+    PlaceFit(relation=0.3 + 0.2 * a, counts=0.1 * a, intercept=0.5 - a, slope=0.6 + 0.1 * a)
+    for a in range(5)
+)
+STATED = [(2, 1, 0), (0, 0, 3)]
+
+
+def by_hand(artifact, scene, name, anchor, coverage):
+    """A dictionary from the label of every unlisted class to its probability."""
+    relation = CANONICAL.index(name if name in CANONICAL else OPPOSITES_OF[name])
+    fit, is_subject = artifact.calibration.at[relation], name in CANONICAL
+    listed = {thing.label for thing in scene.objects}
+    classes = [
+        k for k, label in enumerate(LABELS) if label not in STRUCTURE and label not in listed
+    ]
+    posterior = Posterior(artifact, scene)
+    z = posterior.absent_log_odds(np.array(classes), coverage)
+    place = Place(relation, anchor, is_subject)
+    log_p = place_log_p(posterior, np.array(classes), place)
+    of_anchor = scene.objects[anchor].class_index
+    ratio = artifact.places.log_ratio(relation, of_anchor, outgoing=is_subject)
+    probabilities = {}
+    for k, odds, p in zip(classes, z.tolist(), log_p.tolist(), strict=True):
+        value = odds + fit.relation * p + fit.counts * float(ratio[k])
+        probabilities[LABELS[k]] = 1 / (1 + math.exp(-(fit.intercept + fit.slope * value)))
+    return probabilities
+
+
+OPPOSITES_OF = {opposite: name for name, opposite in OPPOSITES.items()}
+
+
+@pytest.mark.parametrize("machine", NAMES)
+@pytest.mark.parametrize("name", [*OPPOSITES, *OPPOSITES_OF])
+@pytest.mark.parametrize("block", [32, 2])
+def test_all_classes_have_the_probability_of_the_formula(monkeypatch, machine, name, block):
+    monkeypatch.setattr(module, "_BLOCK", block)
+    artifact, scene = larger_artifact(machine, at=FITS), scene_of([0, 1, 2, 3], STATED)
+    expected = by_hand(artifact, scene, name, 2, 0.5)
+    answer = {entry.label: entry for entry in missing(artifact, scene, at=(name, 2), top_k=9)}
+    assert answer.keys() == expected.keys()
+    for label, entry in answer.items():
+        assert entry.probability == pytest.approx(expected[label], rel=1e-4)
+    assert [*answer] == sorted(expected, key=expected.__getitem__, reverse=True)
+
+
+def count_scored(monkeypatch):
+    """Return a list that gets the classes whose relation is scored, in blocks of a single class."""
+    scored = []
+
+    def counted(posterior, candidates, place):
+        scored.extend(candidates.tolist())
+        return place_log_p(posterior, candidates, place)
+
+    monkeypatch.setattr(module, "_BLOCK", 1)
+    monkeypatch.setattr(module, "place_log_p", counted)
+    return scored
+
+
+@pytest.mark.parametrize("machine", NAMES)
+@pytest.mark.parametrize("name", ["on-top", "under", "left", "contains"])
+@pytest.mark.parametrize("top_k", [1, 2, 4])
+def test_an_early_stop_leaves_the_likeliest_classes_as_they_are(monkeypatch, machine, name, top_k):
+    """With blocks of a single class, the function scores as few classes as possible."""
+    artifact, scene = larger_artifact(machine, at=FITS), scene_of([0, 2], None)
+    every = missing(artifact, scene, at=(name, 1), top_k=9, details=False)
+    scored = count_scored(monkeypatch)
+    some = missing(artifact, scene, at=(name, 1), top_k=top_k, details=False)
+    assert [entry.label for entry in some] == [entry.label for entry in every[:top_k]]
+    for entry, other in zip(some, every, strict=False):
+        assert entry[1:] == pytest.approx(other[1:], rel=1e-5)
+    assert top_k <= len(scored) == len(set(scored)) <= len(every)

@@ -16,10 +16,8 @@ from app.scene import (
     OPPOSITES,
     RELATIONS,
     Scene,
-    SceneObject,
-    canonicalise,
 )
-from tests.questions.answers import disagreements, generate, misplaced, missing, outliers, relations
+from tests.questions.answers import disagreements, misplaced, missing, outliers, relations
 from tests.questions.artifacts import LABELS, LARGER, STRUCTURE, larger_artifact, scene_of
 
 pytestmark = pytest.mark.usefixtures("without_minimums")
@@ -117,29 +115,6 @@ def test_top_k_and_the_least_probability_cut_both_lists(artifact, scene, least, 
         assert some == tuple(entry for entry in every if entry.probability >= least)[:top_k]
 
 
-@few
-@given(artifacts, scenes(minimum=2))
-def test_disagreements(artifact, scene):
-    """Each pair once, in a stated direction. Another relation is likelier than all relations that
-    are stated of any instances of the two classes."""
-    entries = disagreements(artifact, scene, top_k=ALL)
-    stated = {(CANONICAL[a], x, y) for a, x, y in scene.relations or ()}
-    stated |= {(OPPOSITES[a], y, x) for a, x, y in stated}
-    of_classes = {(a, scene.objects[x].label, scene.objects[y].label) for a, x, y in stated}
-    for d in entries:
-        subject, object_ = (scene.objects[k].label for k in (d.subject, d.object))
-        assert set(d.observed) == {a for a, x, y in stated if (x, y) == (d.subject, d.object)}
-        assert len(set(d.observed)) == len(d.observed) > 0
-        # A stated relation has this direction.
-        assert d.observed[0] in CANONICAL
-        assert (d.expected, subject, object_) not in of_classes
-        assert 1 >= d.probability > d.observed_probability > 0
-        assert not {subject, object_} & STRUCTURE
-    assert len({frozenset((d.subject, d.object)) for d in entries}) == len(entries)
-    ratios = [d.probability / d.observed_probability for d in entries]
-    assert ratios == pytest.approx(sorted(ratios, reverse=True), rel=1e-5)
-
-
 def test_disagreements_of_selected_pairs_in_either_direction():
     """Pairs may contain structure."""
     artifact = ARTIFACTS["triway-states"]
@@ -148,30 +123,7 @@ def test_disagreements_of_selected_pairs_in_either_direction():
     every = disagreements(artifact, scene, pairs=pairs, top_k=ALL)
     reverse = [(y, x) for x, y in pairs]
     assert disagreements(artifact, scene, pairs=reverse, top_k=ALL) == every
-    assert len(every) > 3
-    alone = [disagreements(artifact, scene, pairs=[(d.object, d.subject)])[0] for d in every]
-    objects = [d for d in every if 5 not in (d.subject, d.object)]
-    assert len(objects) < len(every)
-    pairs_of_objects = disagreements(artifact, scene, top_k=ALL)
-    for entry, expected in zip((*alone, *pairs_of_objects), (*every, *objects), strict=True):
-        # The number of selected pairs changes the order of sums in float32.
-        assert entry[:4] == expected[:4]
-        assert entry[4:] == pytest.approx(expected[4:], rel=1e-5)
-
-
-def test_a_relation_of_one_instance_explains_the_others():
-    """If both chairs disagree, one chair with the expected relation explains the other chair."""
-    artifact, disagreeing = ARTIFACTS["triway-states"], 0
-    for name in RELATIONS:
-        chairs = [canonicalise(0, name, chair) for chair in (1, 2)]
-        both = disagreements(artifact, scene_of([0, 3, 3], chairs))
-        if both:
-            assert [d.expected for d in both] == [both[0].expected] * 2
-            subject, object_ = (0, 2) if both[0].subject == 0 else (2, 0)
-            as_expected = canonicalise(subject, both[0].expected, object_)
-            assert not disagreements(artifact, scene_of([0, 3, 3], [chairs[0], as_expected]))
-            disagreeing += 1
-    assert disagreeing > 3
+    assert any(5 in (d.subject, d.object) for d in every)
 
 
 @few
@@ -290,57 +242,6 @@ def test_a_doubtful_object_weighs_less(name):
     assert present != pytest.approx(absent, abs=1e-2)
 
 
-@pytest.mark.parametrize(
-    ("question", "options", "message"),
-    [
-        (relations, {"top_k": 0}, "top_k"),
-        (relations, {"min_probability": 1.5}, "min_probability"),
-        (relations, {"min_probability": math.nan}, "min_probability"),
-        (relations, {"pairs": [(0, 0)]}, "pair"),
-        (relations, {"pairs": [(0, 2)]}, "pair"),
-        (relations, {"pairs": [(-1, 0)]}, "pair"),
-        (missing, {"top_k": 0}, "top_k"),
-        (missing, {"coverage": -0.1}, "coverage"),
-        (missing, {"coverage": 1.1}, "coverage"),
-        (missing, {"coverage": math.nan}, "coverage"),
-        (missing, {"candidates": [9]}, "candidate 9"),
-        (missing, {"candidates": [-1]}, "candidate -1"),
-        (missing, {"at": ("left", 2)}, "anchor 2"),
-        (missing, {"at": ("near", 0)}, "near"),
-        (outliers, {"threshold": -0.1}, "threshold"),
-        (outliers, {"threshold": math.nan}, "threshold"),
-        (generate, {"seed": 0, "count": 0}, "count"),
-        (generate, {"seed": -1}, "seed"),
-        (generate, {"seed": 0, "steps": 0}, "steps"),
-        (generate, {"seed": 0, "temperature": 0.0}, "temperature"),
-        (generate, {"seed": 0, "temperature": math.nan}, "temperature"),
-        (generate, {"seed": 0, "context": {"h3": [(0, 1)]}}, "h3"),
-        (generate, {"seed": 0, "context": {"h1": [(6, 1)]}}, "units 0 to 5"),
-        (generate, {"seed": 0, "context": {"h1": [(-1, 1)]}}, "units 0 to 5"),
-        (generate, {"seed": 0, "context": {"h1": [(0, 2)]}}, "states 0 to 1"),
-        (generate, {"seed": 0, "context": {"h2": [(0, 0)]}}, "state 1"),
-        (generate, {"seed": 0, "context": {"h1": [(2, 1), (2, 0)]}}, "another state"),
-    ],
-)
-def test_bad_input_is_refused(question, options, message):
-    with pytest.raises(ValueError, match=message):
-        question(ARTIFACTS["triway"], scene_of([0, 1]), **options)
-
-
-@pytest.mark.parametrize("question", [relations, missing, outliers])
-def test_classes_rooms_and_profiles_must_be_known_to_the_machine(question):
-    objects = scene_of([0]).objects
-    for index in (None, 9):
-        scene = Scene((*objects, SceneObject("x", "x", index)))
-        with pytest.raises(ValueError, match="class_index"):
-            question(ARTIFACTS["triway"], scene)
-    with pytest.raises(ValueError, match="room_type"):
-        question(ARTIFACTS["triway"], Scene(objects, room_type=2))
-    for profile in (-1, 2):
-        with pytest.raises(ValueError, match="profile"):
-            question(ARTIFACTS["triway"], Scene(objects, profile=profile))
-
-
 def test_numbers_have_six_significant_digits():
     """Also numbers without an exact power of ten."""
     numbers = [0.1 + 0.2, 123456.7, 999999.96, 1e300, -1e-300, 5e-324, 0.0]
@@ -348,14 +249,3 @@ def test_numbers_have_six_significant_digits():
     rng = np.random.default_rng(0)
     numbers = rng.normal(size=4096) * 10.0 ** rng.integers(-12, 4, 4096)
     assert significant(numbers) == [float(f"{x:.6g}") for x in numbers]
-
-
-@few
-@given(artifacts, scenes(minimum=2))
-def test_details_do_not_change_other_fields(artifact, scene):
-    """The details are the last two fields of an entry."""
-    full, scores = (missing(artifact, scene, details=details) for details in (True, False))
-    assert scores == tuple(entry[:-2] for entry in full)
-    full, scores = (outliers(artifact, scene, details=details) for details in (True, False))
-    assert scores.outliers == tuple(entry[:-2] for entry in full.outliers)
-    assert scores.misplaced == full.misplaced

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -74,20 +73,8 @@ def test_reasons_are_changes_of_log_odds(artifact):
         assert list(changes) == sorted(changes, key=lambda k: -abs(changes[k]))
 
 
-def test_the_room_type_and_relations_of_the_request_are_not_used(artifact):
-    plain = scene_of(CLASSES)
-    stated = replace(plain, room_type=1, relations=((0, 0, 1),))
-    assert rooms(artifact, stated) == rooms(artifact, plain)
-
-
 def test_top_k_and_scores_shorten_the_answer(artifact):
     full = rooms(artifact, scene_of(CLASSES))
     (first,) = rooms(artifact, scene_of(CLASSES), top_k=1, details=False)
     assert first._fields == ("room_type", "probability")
     assert first == (full[0].room_type, full[0].probability)
-
-
-@pytest.mark.parametrize("wrong", [{"top_k": 0}, {"candidates": [2]}, {"candidates": [-1]}])
-def test_numbers_out_of_range_are_refused(artifact, wrong):
-    with pytest.raises(ValueError, match=r"top_k must be at least 1|indices are below C = 2"):
-        rooms(artifact, scene_of(CLASSES), **wrong)

@@ -21,7 +21,6 @@ from app.registry import (
     CountSlope,
     Description,
     Judgement,
-    Manifest,
     Misplaced,
     Store,
     StoreError,
@@ -136,11 +135,6 @@ def replace_file(directory: Path, name: str, data: bytes) -> None:
     (directory / name).write_bytes(data)
     entry = {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data)}
     rewrite_manifest(directory, lambda members: members["files"].update({name: entry}))
-
-
-def read_manifest(directory: Path) -> Manifest:
-    """The manifest of a directory."""
-    return Manifest.from_bytes((directory / MANIFEST).read_bytes())
 
 
 def refused(code: str) -> pytest.RaisesExc[ArtifactError | StoreError]:

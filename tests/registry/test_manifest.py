@@ -7,25 +7,13 @@ import math
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from app.registry import (
-    AlarmLine,
-    AlarmLines,
     ArtifactError,
-    Calibration,
-    CountSlope,
-    Judgement,
     Manifest,
-    Misplaced,
-    PlaceFit,
 )
-from app.registry.description import KINDS, PAIR_CALIBRATIONS, VocabularyEntry
-from app.registry.manifest import TensorEntry
-from app.scene.relations import CANONICAL
-from tests.registry.small_artifacts import VOCABULARY, description, refused, resign
+from tests.registry.small_artifacts import description, refused, resign
 
 DIGEST = "ab" * 32
 FILES = {
@@ -46,67 +34,6 @@ def stored() -> dict[str, Any]:
     members: dict[str, Any] = json.loads(manifest().to_bytes())
     del members["checksum"]
     return members
-
-
-text = st.text(st.characters(exclude_categories=("Cs",)), min_size=1, max_size=20)
-number = st.floats(allow_nan=False, allow_infinity=False)
-count = st.integers(0, 10**12)
-json_values = st.recursive(
-    st.none() | st.booleans() | st.integers(-(10**20), 10**20) | number | text,
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(text, inner, max_size=3),
-    max_leaves=8,
-)
-share = st.floats(0, 1)
-shapes = st.lists(count, max_size=3).map(tuple)
-alarm_line = st.builds(AlarmLine, intercept=number, log_count=number)
-alarm_lines = st.builds(AlarmLines, low=alarm_line, medium=alarm_line, high=alarm_line)
-count_slopes = st.builds(CountSlope, **dict.fromkeys(CountSlope.model_fields, number))
-weight = st.floats(0, 1e9)
-place_fits = st.builds(
-    PlaceFit, relation=weight, counts=weight, intercept=number, slope=st.floats(1e-9, 1e9)
-)
-judgements = st.builds(
-    Judgement, **dict.fromkeys({*Judgement.model_fields} - {"lines"}, number), lines=alarm_lines
-)
-changes = st.fixed_dictionaries(
-    {},
-    optional={
-        "version": st.tuples(count.filter(lambda n: n < 10**9), st.just(0), st.just(7)).map(
-            lambda v: ".".join(map(str, v))
-        ),
-        "created": st.datetimes(timezones=st.timezones()),
-        "training": st.dictionaries(text, json_values, max_size=4),
-        "terms": text,
-        "libraries": st.dictionaries(text, text, max_size=3),
-        "calibration": st.builds(
-            Calibration,
-            coverage=share,
-            missing=count_slopes,
-            popularity=st.just(()) | st.tuples(number, number, number),
-            popularity_weight=share,
-            outlier=count_slopes,
-            outlier_lines=alarm_lines,
-            misplaced=st.builds(Misplaced, **dict.fromkeys(KINDS, st.none() | judgements)),
-            at=st.tuples(*[place_fits] * 5),
-            **dict.fromkeys(PAIR_CALIBRATIONS, st.tuples(*[count_slopes] * 5)),
-        ),
-        "tensors": st.dictionaries(
-            text,
-            st.builds(TensorEntry, dtype=st.sampled_from(["float16", "int64"]), shape=shapes),
-            max_size=3,
-        ),
-    },
-)
-
-
-@given(changes)
-def test_reads_back_as_written(change: dict[str, Any]) -> None:
-    written = manifest(**change)
-    data = written.to_bytes()
-    read = Manifest.from_bytes(data)
-    assert read == written
-    assert read.to_bytes() == data
-    assert json.loads(data)["format"] == 8
 
 
 @pytest.mark.parametrize("value", [7, 9, 8.0, "8", None, True])
@@ -141,10 +68,7 @@ def test_refuses_malformed_manifests(data: bytes, code: str) -> None:
     ("path", "value"),
     [
         ("surplus", 1),
-        ("vocabulary.surplus", 1),
-        ("vocabulary.objects.0.surplus", 1),
         ("calibration.outlier.surplus", 1),
-        ("tensors.b.surplus", 1),
         ("name", "../up"),
         ("name", "Upper"),
         ("name", "a\n"),
@@ -153,7 +77,6 @@ def test_refuses_malformed_manifests(data: bytes, code: str) -> None:
         ("version", "1.0.0\n"),
         ("created", "2020-02-02T20:20:20"),  # no time zone
         ("created", "yesterday"),
-        ("spec", None),
         ("spec.V", 4),
         ("spec.A", 2),
         ("spec.C", 5),
@@ -166,32 +89,13 @@ def test_refuses_malformed_manifests(data: bytes, code: str) -> None:
         ("calibration.relation", []),
         ("calibration.at", []),
         ("calibration.at.0.slope", 0),
-        ("calibration.at.0.relation", -1),
-        ("calibration.at.0.counts", math.nan),
-        ("calibration.asked_place", []),  # of an older format
-        ("calibration.placed", {}),
-        ("calibration.coverage", 1.5),
-        ("calibration.popularity", [math.inf]),
-        ("calibration.evidence", {"poses_on_objects": 1.0}),  # of an older format
         ("calibration.misplaced.under.lines", None),
-        ("calibration.misplaced.stand.stand", math.inf),
-        ("calibration.misplaced.beside", None),
-        ("calibration.outlier_lines.low.intercept", math.inf),
         ("calibration.outlier_lines", None),  # the fit needs its lines
-        ("calibration.outlier.slope", math.nan),
         ("calibration.outlier", None),  # without a fit, there are no lines
         ("training.rate", math.nan),
-        ("data.0.digest", "xyz"),
-        ("data.0.scenes", -1),
-        ("data.0.research_only", None),
         ("metrics.0.low", 0.7),  # above high
-        ("metrics.0.n", 0),
-        ("metrics.0.value", math.nan),
-        ("terms", ""),
         ("examples", [{"name": "a", "scene": {"objects": ["bed"], "model": "other"}}]),
         ("examples", [{"name": "a", "scene": {"objects": ["bed"]}}] * 9),
-        ("tensors.b.dtype", "object"),
-        ("tensors.b.shape", [-1]),
         ("files", {}),
         ("files", {**FILES, "model.pkl": FILES["card.md"]}),
         ("files", {**FILES, "../card.md": FILES["card.md"]}),
@@ -216,17 +120,6 @@ def test_refuses_a_missing_field() -> None:
             Manifest.from_bytes(resign(json.dumps(members).encode()))
 
 
-def test_examples_are_read_back() -> None:
-    example = {"name": "A room", "scene": {"objects": ["bed", {"label": "desk lamp", "id": "a"}]}}
-    described = manifest(examples=[example])
-    read = Manifest.from_bytes(described.to_bytes())
-    assert read == described
-    assert read.examples[0].request() == {
-        "objects": [{"label": "bed"}, {"label": "desk lamp", "id": "a"}]
-    }
-    assert Manifest.from_bytes(manifest().to_bytes()).examples == ()
-
-
 @pytest.mark.parametrize(
     "change",
     [
@@ -240,21 +133,3 @@ def test_examples_are_read_back() -> None:
 def test_a_description_can_always_be_written(change: dict[str, Any]) -> None:
     with pytest.raises(ValidationError):
         description(**change)
-
-
-def test_neutral_calibration_changes_nothing() -> None:
-    neutral = Calibration.neutral(5)
-    assert neutral.relation == (CountSlope(intercept=0, slope=1, log_count=0),) * 5
-    assert neutral.missing == CountSlope(intercept=0, slope=1, log_count=0)
-    assert (neutral.popularity, neutral.popularity_weight) == ((), 0)
-    assert neutral.at == (PlaceFit(relation=1, counts=0, intercept=0, slope=1),) * 5
-    assert neutral.outlier is None
-    assert not neutral.misplaced.judges_relations
-
-
-def test_a_vocabulary_is_kept_whole() -> None:
-    entry = VocabularyEntry.of(VOCABULARY)
-    assert entry.vocabulary() == VOCABULARY
-    assert entry.relations == CANONICAL
-    assert VocabularyEntry.of(VOCABULARY, 2).relations == CANONICAL[:2]
-    assert VocabularyEntry.of(VOCABULARY, 2, ("homes",)).profiles == ("homes",)

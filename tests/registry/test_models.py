@@ -7,9 +7,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from app.registry import AliasTarget, ArtifactError, Store, load_model_set
-from tests.registry.small_artifacts import description, publish_as, refused, rewrite_manifest, state
+from app.registry.references import is_version, resolve_reference, version_key
+from tests.registry.small_artifacts import description, publish_as, refused, state
 
 
 @pytest.fixture
@@ -30,17 +33,6 @@ def test_holds_every_version_and_alias(store: Store) -> None:
     assert models.resolve("default") is models.resolve("tiny@2.0.0") is models.resolve("tiny")
     assert models.resolve("tiny@1.0.0").manifest.version == "1.0.0"
     assert dict(models.aliases) == {"default": AliasTarget(name="tiny")}
-
-
-def test_a_snapshot_does_not_change_with_the_store(store: Store) -> None:
-    models = load_model_set(store)
-    publish_as(store, "newest", description(version="3.0.0"), state())
-    assert models.resolve("tiny").manifest.version == "2.0.0"
-    assert "newest" not in models.aliases
-    with pytest.raises(TypeError):
-        models.entries["tiny", "3.0.0"] = models.resolve("tiny")  # type: ignore[index]
-    with pytest.raises(TypeError):
-        models.aliases["newest"] = AliasTarget(name="tiny")  # type: ignore[index]
 
 
 def test_a_name_means_the_newest_usable_version(store: Store) -> None:
@@ -74,18 +66,6 @@ def test_other_files_in_place_of_a_version_are_reported(store: Store) -> None:
     }
 
 
-def test_reuses_what_did_not_change(store: Store) -> None:
-    first = load_model_set(store)
-    store.publish(description(version="3.0.0"), state(seed=3))
-    rewrite_manifest(store.root / "other" / "1.0.0", lambda members: members.update(terms="new"))
-    second = load_model_set(store, first)
-    for reference in ("tiny@1.0.0", "tiny@2.0.0"):
-        assert second.resolve(reference) is first.resolve(reference)
-    assert second.resolve("other") is not first.resolve("other")
-    assert second.resolve("other").manifest.terms == "new"
-    assert second.resolve("tiny").manifest.version == "3.0.0"
-
-
 @pytest.mark.parametrize("file", ["model.safetensors", "card.md"])
 def test_loaded_versions_are_verified_again(file: str, store: Store) -> None:
     first = load_model_set(store)
@@ -99,15 +79,6 @@ def test_loaded_versions_are_verified_again(file: str, store: Store) -> None:
     assert failure.__traceback__ is failure.__context__ is None
     path.write_bytes(good)
     assert load_model_set(store, broken).resolve("tiny").digest == first.resolve("tiny").digest
-
-
-def test_a_missing_store_is_a_failure_that_is_seen(tmp_path: Path) -> None:
-    models = load_model_set(Store(tmp_path / "nowhere"))
-    assert models.failure is not None
-    assert models.failure.code == "unreadable"
-    assert str(tmp_path) not in models.failure.reason
-    with refused("unreadable"):
-        models.resolve("default")
 
 
 def test_spoilt_aliases_leave_names_usable(store: Store) -> None:
@@ -164,3 +135,67 @@ def test_one_unreadable_folder_does_not_take_the_others_down(
     assert models.resolve("default").manifest.name == "tiny"
     with refused("unreadable"):
         models.resolve("other")
+
+
+# --------------------------------------------------------------------------------------- references
+
+
+VERSIONS = {"rooms": ("1.0.0", "1.9.0", "1.10.0"), "halls": ("0.1.0",)}
+ALIASES = {
+    "default": AliasTarget(name="rooms"),
+    "stable": AliasTarget(name="rooms", version="1.9.0"),
+    "gone": AliasTarget(name="rooms", version="7.0.0"),
+    "lost": AliasTarget(name="attic"),
+    "halls": AliasTarget(name="rooms", version="1.0.0"),
+}
+
+
+INVALID = [
+    *("", "@1.0.0", "rooms@", "rooms@latest", "rooms@1.0.0@1.0.0", "rooms@1.0.0\n"),
+    *("../rooms", "Rooms", "a" * 65, "<script>"),
+]
+
+
+def resolve(reference: str) -> tuple[str, str]:
+    return resolve_reference(reference, ALIASES, lambda name: VERSIONS.get(name, ()))
+
+
+@pytest.mark.parametrize(
+    ("reference", "version"),
+    [
+        ("rooms", "1.10.0"),
+        ("rooms@1.9.0", "1.9.0"),
+        ("default", "1.10.0"),
+        ("stable", "1.9.0"),
+        ("halls", "1.0.0"),  # an alias goes before a model of its name
+    ],
+)
+def test_resolves(reference: str, version: str) -> None:
+    assert resolve(reference) == ("rooms", version)
+
+
+@pytest.mark.parametrize(
+    ("reference", "code"),
+    [
+        ("attic", "unknown_model"),
+        ("attic@1.0.0", "unknown_model"),
+        ("rooms@1.0.1", "unknown_version"),
+        ("gone", "dangling_alias"),
+        ("lost", "dangling_alias"),
+        *((reference, "invalid_reference") for reference in INVALID),
+    ],
+)
+def test_refuses(reference: str, code: str) -> None:
+    with refused(code) as raised:
+        resolve(reference)
+    assert "script" not in str(raised.value), "a reason does not repeat an invalid reference"
+
+
+parts = st.tuples(*[st.integers(0, 10**9 - 1)] * 3)
+
+
+@given(parts, parts)
+def test_versions_are_ordered_as_numbers(one: tuple[int, ...], other: tuple[int, ...]) -> None:
+    first, second = (".".join(map(str, version)) for version in (one, other))
+    assert is_version(first)
+    assert (version_key(first) < version_key(second)) == (one < other)

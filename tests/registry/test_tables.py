@@ -121,8 +121,6 @@ INVALID: list[tuple[Any, str, list[dict[str, Any]]]] = [
         "wrong_shape",
         [
             {"weights": full(0, 2, 2, 2 + C + V)},
-            {"log_share": np.float32(-1)},
-            {"classes": np.int64(0)},
         ],
     ),
     (
@@ -131,14 +129,10 @@ INVALID: list[tuple[Any, str, list[dict[str, Any]]]] = [
         [
             *({"classes": np.array(c)} for c in ([1, 0], [0, 0], [-1, 1], [0, V], [0, -(2**63)])),
             NO_CLASS | {"weights": full(0, 0, 2, 3 + C + V)},
-            {"classes": np.array([0, 1], "f4")},
-            {"most": np.array([1, 2], "f4")},
             {"most": np.array([0, 1])},
             {"most": np.array([1, M])},
-            {"log_share": np.full((2, M), -1, "i4")},
             *({"log_share": full(-1, 2, columns)} for columns in (1, 300)),
             *({"log_share": full(value, 2, M)} for value in (0.5, -1e4)),
-            {"weights": np.zeros((2, 2, 3 + C + V), "i4")},
             {"weights": counts().weights * 1e5},
             {"weights": full(0.5, 2, 2, 3 + C + V)},  # of a class on itself
         ],
@@ -151,7 +145,6 @@ INVALID: list[tuple[Any, str, list[dict[str, Any]]]] = [
         [
             *({"pair": np.array([3, key])} for key in (2, 3, -(2**63), A * V * V)),
             {"pair": np.array([-1, 3])},
-            {"pair": np.array([3, 21], "f4")},
             {"pair_scenes": np.array([0, 12], "i4")},
             {"relation_scenes": np.array([-1, 0, 0, 0, 0], "i4")},
             {"pair_offset": with_zero(offsets().pair_offset)},
@@ -160,7 +153,6 @@ INVALID: list[tuple[Any, str, list[dict[str, Any]]]] = [
                 "relation_scenes": np.array([1, 0, 9, 0, 0]),
             },
             {"relation": full(0, A, 6)},
-            {"subject": full(-1, A, V, 6)},
         ],
     ),
     (offsets, "not_finite", [{"relation": full(np.nan, A, 6)}]),
@@ -173,7 +165,6 @@ INVALID: list[tuple[Any, str, list[dict[str, Any]]]] = [
             {"role_counts": full(0, 2, 2)},
             {"role_anchor": full(0, 2, 3)},
             {"stands": full(0, V, 2)},
-            {"triple": np.int32(3)},
         ],
     ),
     (
@@ -183,10 +174,8 @@ INVALID: list[tuple[Any, str, list[dict[str, Any]]]] = [
             *({"triple": np.array([1, *keys, 4], "i4")} for keys in ((3, 2), (2, 2))),
             {"triple": np.array([-1, 2, 3, 4], "i4")},
             {"triple": np.array([1, 2, 3, A * V * V], "i4")},
-            {"triple": np.array([1, 2, 3, 4], "f4")},
             {"triple": EMPTY, "held": full(0, 0)},
             *({"role_pair": np.array([2, key], "i4")} for key in (V * V, 1)),
-            {"role_pair": np.array([1, 2], "f4")},
             {"held": np.array([4, -1, 1, 2], "f4")},
             {"frequency": np.array([0.5, 0, 0.1], "f4")},
             {"role_counts": np.array([(7, 1, 0), (0, -3, 0)], "f4")},
@@ -224,9 +213,6 @@ def test_counts_at_their_limits_are_accepted() -> None:
     assert Counts.from_tensors(at_limits.tensors(), V, C).weights.max() == 64
 
 
-# -- offsets -------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("triple", "offset", "scenes"),
     [
@@ -247,13 +233,6 @@ def test_offsets_are_those_of_the_pair_or_of_the_relation(
     values, numbers = offsets().find(*(np.array([index]) for index in triple))
     assert numbers.tolist() == [scenes]
     assert offset is None or values[0].tolist() == pytest.approx(offset)
-
-
-def test_without_a_pair_there_is_still_the_relation() -> None:
-    bare = offsets(pair=EMPTY, pair_offset=full(0, 0, 6), pair_scenes=EMPTY)
-    values, scenes = bare.find(*[np.array([2])] * 3)
-    assert (values[0].tolist(), scenes.tolist()) == ([0, 0, 0.5, 0.5, 0.5, 0.25], [0])
-    assert Offsets.from_tensors(bare.tensors(), A, V).pair.shape == (0,)
 
 
 # -- places --------------------------------------------------------------------------------------

@@ -2,13 +2,50 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
+from typing import get_args
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
-from app.scene import Scene, SceneObject, Viewpoint, observe
-from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP, STACKED
+from app.scene import (
+    PoseRelations,
+    Scene,
+    SceneObject,
+    instance_evidence,
+    observe,
+    pool_instances,
+)
+from app.scene.geometry import (
+    Viewpoint,
+    body_pose,
+    derive_relations,
+    is_optical,
+    is_world_fixed,
+    to_viewer_frame,
+    viewer_axes,
+)
+from app.scene.relations import (
+    ABOVE,
+    CANONICAL,
+    FRONT,
+    INSIDE,
+    LEFT,
+    ON_TOP,
+    RELATIONS,
+    STACKED,
+    canonicalise,
+    contradiction,
+    opposite,
+    support_cycle,
+)
+from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN, Heights, floor_level, stands_of
+from scene_client.schemas import RelationName
 from tests.scene.role_counts import LABELS, role_counts
+from tests.scene.turns import about, after
 
 DESK = SceneObject("desk", "desk", 0, position=(2.0, 0.0, 0.4), size=(0.8, 1.6, 0.8))
 MONITOR = SceneObject("monitor", "monitor", 1, position=(2.0, 0.2, 1.0), size=(0.1, 0.5, 0.4))
@@ -40,16 +77,6 @@ def test_typical_sizes_take_the_place_of_unknown_ones() -> None:
     # A label outside the vocabulary has no typical size.
     stranger = SceneObject("cup", "goblet", None, position=(2.0, -0.5, 0.85))
     assert observe(Scene((DESK, stranger)), typical_sizes=sizes).relations == without.relations
-
-
-def test_counts_decide_between_the_roles_of_boxes_that_reach_into_each_other() -> None:
-    bin_ = SceneObject("bin", "bin", LABELS.index("bin"), 1.0, (2.1, 0.4, 0.2), (0.3, 0.3, 0.4))
-    desk = replace(DESK, class_index=LABELS.index("desk"))
-    roles = role_counts({(bin_.class_index or 0, desk.class_index or 0): (0, 9, 0)})
-    assert observe(Scene((desk, bin_)), roles=roles).relations == ((ON_TOP, 0, 1),)
-    assert observe(Scene((desk, bin_))).relations == ()
-    # A label outside the vocabulary has no counts.
-    assert observe(Scene((desk, replace(bin_, class_index=None))), roles=roles).relations == ()
 
 
 def test_stated_relations_stay_and_poses_exclude_others() -> None:
@@ -90,15 +117,257 @@ def test_boxes_of_unknown_size_are_not_stacked_from_far_apart(
     assert seen.excluded[[*STACKED], 0, 1].all() == is_far
 
 
-def test_scenes_without_poses_stay_as_they_are() -> None:
-    for relations in (None, ((LEFT, 0, 1),)):
-        bare = Scene((SceneObject("a", "a", 0), SceneObject("b", "b", 1)), relations)
-        assert observe(bare) is bare
+# --------------------------------------------------------------------------- evidence about classes
 
 
-def test_objects_without_a_position_have_no_observed_relations() -> None:
-    seen = observe(Scene((DESK, SceneObject("cup", "cup", 1))), viewpoint=Viewpoint(0, 0, 1.0))
-    assert seen.relations == ()
-    assert seen.poses is not None
-    assert not seen.poses.observed.any()
-    assert seen.objects[1].position is None
+A = len(CANONICAL)
+
+
+@st.composite
+def instances(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    size = draw(st.integers(0, 6))
+    classes = draw(hnp.arrays(np.int64, size, elements=st.integers(0, 3)))
+    confidence = draw(hnp.arrays(float, size, elements=st.floats(0.01, 1)))
+    holds = draw(hnp.arrays(bool, (A, size, size)))
+    return classes, confidence, holds, draw(hnp.arrays(bool, (A, size, size)))
+
+
+@given(instances())
+def test_classes_are_the_or_over_instance_pairs(
+    drawn: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+) -> None:
+    classes, confidence, holds, observed = drawn
+    evidence = pool_instances(*drawn, room_type=3)
+    assert evidence.room_type == 3
+    assert evidence.classes.tolist() == sorted(set(classes.tolist()))
+    assert evidence.counts.tolist() == [(classes == c).sum() for c in evidence.classes]
+    for x, c in enumerate(evidence.classes):
+        members = np.flatnonzero(classes == c)
+        assert evidence.confidence[x] == pytest.approx(1 - np.prod(1 - confidence[members]))
+        for y, d in enumerate(evidence.classes):
+            pairs = [(i, j) for i in members for j in np.flatnonzero(classes == d) if i != j]
+            for a in range(A):
+                on = any(holds[a, i, j] for i, j in pairs)
+                assert evidence.holds[a, x, y] == on
+                observes = on or any(observed[a, i, j] for i, j in pairs)
+                assert evidence.observed[a, x, y] == observes
+
+
+def test_the_evidence_about_instances_is_stated_complete_or_from_poses() -> None:
+    things = tuple(SceneObject(str(k), "x", 0) for k in range(3))
+    triples = ((ON_TOP, 1, 0), (LEFT, 1, 2))
+    holds, observed = instance_evidence(Scene(things, relations=triples))
+    assert np.argwhere(holds).tolist() == [[LEFT, 1, 2], [ON_TOP, 1, 0]]
+    assert not observed.any()
+    stated, observed = instance_evidence(Scene(things, relations=triples, relations_complete=True))
+    assert (stated == holds).all()
+    assert observed.all()
+    poses = PoseRelations(holds, np.roll(holds, 1))
+    of_poses = instance_evidence(Scene(things, relations=((LEFT, 0, 1),), poses=poses))
+    assert of_poses == (poses.holds, poses.observed)
+
+
+# ---------------------------------------------------------------------------------------- relations
+
+
+relations = st.sampled_from(RELATIONS)
+
+
+def test_the_schema_has_the_same_relations() -> None:
+    assert {*get_args(RelationName)} == {*RELATIONS}
+
+
+@given(relations, st.integers(0, 9), st.integers(0, 9))
+def test_a_relation_and_its_opposite_are_one_statement(relation: str, i: int, j: int) -> None:
+    assert canonicalise(i, relation, j) == canonicalise(j, opposite(relation), i)
+    index, subject, anchor = canonicalise(i, relation, j)
+    assert {subject, anchor} == {i, j}
+    assert CANONICAL[index] in (relation, opposite(relation))
+
+
+@pytest.mark.parametrize("name", ["", "Left", "on top", "near", "on_top"])
+def test_unknown_relations_are_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=rf"unknown relation '{name}'.*on-top"):
+        canonicalise(0, name, 1)
+    with pytest.raises(ValueError, match=rf"unknown relation '{name}'"):
+        opposite(name)
+
+
+def test_contradictions() -> None:
+    assert contradiction([(0, 1, 2), (1, 2, 1), (0, 1, 2)]) is None
+    assert contradiction([(0, 1, 2), (3, 0, 1), (0, 2, 1)]) == ((0, 1, 2), (0, 2, 1))
+
+
+def test_supports_in_a_circle_are_found() -> None:
+    """Only on-top (2) and inside (4) hold an object."""
+    tower = [(2, "box", "book"), (4, "book", "bag"), (2, "bag", "desk")]
+    assert support_cycle(tower) is None
+    assert support_cycle([*tower, (3, "desk", "box"), (0, "desk", "box")]) is None
+    circle = support_cycle([*tower, (2, "desk", "book")])
+    assert circle is not None
+    assert circle[0] == circle[-1]
+    assert {*pairwise(circle)} == {
+        ("book", "bag"), ("bag", "desk"), ("desk", "book"),
+    }  # fmt: skip
+
+
+# ------------------------------------------------------------------------------------------- stands
+
+
+NAN = math.nan
+WORDS = {("bin", "desk"): (0, 9, 0), ("milk", "fridge"): (0, 0, 5), ("pillow", "bed"): (9, 0, 0)}
+ROLES = role_counts({tuple(map(LABELS.index, pair)): n for pair, n in WORDS.items()})
+
+Box = tuple[str, tuple[float, float, float], tuple[float, float, float]]
+"""Label, extents, and position of the bottom."""
+
+DESK_BOX: Box = ("desk", (1.6, 0.8, 0.75), (0, 0, 0))
+
+
+def stands(*boxes: Box, floor: float = 0.0) -> list[int]:
+    """The stands of boxes, with the relations that their poses show."""
+    sizes = np.array([size for _, size, _ in boxes])
+    centres = np.array([bottom for _, _, bottom in boxes], float)
+    centres[:, 2] += sizes[:, 2] / 2
+    classes = np.array([LABELS.index(label) for label, _, _ in boxes])
+    poses = derive_relations(centres, sizes, np.zeros(len(boxes)), classes=classes, roles=ROLES)
+    heights = Heights.of(centres, sizes)
+    return stands_of(poses.holds, poses.observed, heights, floor).tolist()
+
+
+def test_the_floor_is_where_most_objects_on_the_floor_stand() -> None:
+    """One object far below, such as an error of the camera, does not move the floor."""
+    bottoms = np.array([0.02, -3.0, 0.0, 0.75, 0.01, 1.8])
+    weights = np.array([0.9, 0.9, 0.9, 0.1, 0.8, 0.0])
+    assert floor_level(bottoms, weights) == pytest.approx(0.0, abs=0.03)
+    assert floor_level(bottoms + 7, weights) == pytest.approx(7.0, abs=0.03)
+
+
+def test_the_floor_is_unknown_without_objects_that_stand_on_it() -> None:
+    assert math.isnan(floor_level(np.array([NAN, 0.5]), np.array([1.0, 0.0])))
+    assert math.isnan(floor_level(np.zeros(0), np.zeros(0)))
+    # A cup tells nothing about the floor.
+    assert math.isnan(floor_level(np.array([NAN, 0.5]), np.array([1.0, 0.2])))
+    assert floor_level(np.array([NAN, 0.5]), np.array([1.0, 0.6])) == 0.5
+
+
+def lamp(x: float, bottom: float) -> Box:
+    return "lamp", (0.3, 0.3, 0.4), (x, 0, bottom)
+
+
+@pytest.mark.parametrize(
+    ("box", "other", "expected"),
+    [
+        *((lamp(3, bottom), DESK_BOX, FLOOR) for bottom in (0.0, 0.09, -0.4)),
+        *((lamp(3, bottom), DESK_BOX, HANGS) for bottom in (0.11, 1.6)),
+        (lamp(0, 0.75), DESK_BOX, SUPPORTED),
+        # The relation is on-top of the desk to the bin.
+        (("bin", (0.3, 0.3, 0.4), (0.3, 0, 0)), DESK_BOX, FLOOR),
+        # The bottom of the milk is near the floor, but the milk is inside.
+        (
+            ("milk", (0.1, 0.1, 0.2), (0, 0, 0.05)),
+            ("fridge", (0.6, 0.6, 0.4), (0, 0, 0)),
+            SUPPORTED,
+        ),
+        # A chair on a rug.
+        (("chair", (0.5, 0.5, 0.9), (0, 0, 0.01)), ("towel", (2.0, 1.5, 0.01), (0, 0, 0)), FLOOR),
+        (lamp(0, 0.75 + 0.13), DESK_BOX, UNKNOWN),
+        (lamp(0, 0.75 + 0.17), DESK_BOX, HANGS),
+    ],
+)
+def test_what_holds_a_box_beside_another_on_the_floor(box: Box, other: Box, expected: int) -> None:
+    assert stands(box, other) == [expected, FLOOR]
+
+
+def test_an_open_relation_leaves_the_stand_unknown() -> None:
+    """The counts do not tell whether a book that reaches into a sofa is on or in it."""
+    n = 2
+    holds, observed = np.zeros((5, n, n), np.bool_), np.ones((5, n, n), np.bool_)
+    heights = Heights(np.array([0.3, 0.0]), np.array([0.5, 0.8]), np.array([0.1, 2.0]))
+    assert stands_of(holds, observed, heights, 0.0).tolist() == [HANGS, FLOOR]
+    observed[[ON_TOP, INSIDE], 0, 1] = False
+    assert stands_of(holds, observed, heights, 0.0).tolist() == [UNKNOWN, FLOOR]
+    holds[INSIDE, 0, 1] = True
+    assert stands_of(holds, observed, heights, 0.0).tolist() == [SUPPORTED, FLOOR]
+
+
+# ------------------------------------------------------------------------------------------- frames
+
+
+def same_turn(a: float, b: float, period: float = 2 * math.pi) -> bool:
+    return abs(math.remainder(a - b, period)) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("frame", "optical", "fixed"),
+    [
+        ("base_link", False, False),
+        ("camera_optical", True, False),
+        ("robot/camera_color_optical_frame", True, False),
+        ("optical_table", False, False),
+        ("map", False, True),
+        ("MAP", False, True),
+        (" Odom ", False, True),
+        ("Camera_Optical", True, False),
+        ("robot_1/odom", False, True),
+        ("/world", False, True),
+        ("map_server", False, False),
+        ("", False, False),
+    ],
+)
+def test_frames_by_name(frame: str, optical: bool, fixed: bool) -> None:
+    assert is_optical(frame) is optical
+    assert is_world_fixed(frame) is fixed
+
+
+def test_optical_axes() -> None:
+    # 3 m ahead, 1 m to the right, 2 m below the camera.
+    position, size, yaw = body_pose((1.0, 2.0, 3.0), (0.1, 0.2, 0.3), optical=True)
+    assert position == (3.0, -1.0, -2.0)
+    # Unturned in optical axes: x is its width, y its height, z its depth.
+    assert size == (0.3, 0.1, 0.2)
+    assert same_turn(yaw, 0.0)
+
+
+@given(st.floats(-3, 3), st.floats(-0.6, 0.6))
+def test_a_box_on_its_side(angle: float, tilt: float) -> None:
+    """Tipped about x the box heads along its z axis, tipped about y along its y axis."""
+    for axis, size, heading in (
+        ((1, 0, 0), (3.0, 1.0, 2.0), angle - math.pi / 2),
+        ((0, 1, 0), (2.0, 3.0, 1.0), angle + math.pi / 2),
+    ):
+        # A tilt about the heading leaves it level.
+        lean = after(about((0, 0, 1), heading), about((1, 0, 0), tilt))
+        lean = after(lean, about((0, 0, 1), -heading))
+        tipped = after(about((0, 0, 1), angle), about(axis, math.pi / 2))
+        _, upright, yaw = body_pose((0.0, 0.0, 0.0), (1.0, 2.0, 3.0), after(lean, tipped))
+        assert upright == size
+        assert same_turn(yaw, heading)
+
+
+@given(st.floats(-0.6, 0.6), st.floats(-3, 3))
+def test_a_tilt_is_dropped(tilt: float, angle: float) -> None:
+    # Yaw after a tilt about the box's own x axis leaves that axis horizontal.
+    both = after(about((0, 0, 1), angle), about((1, 0, 0), tilt))
+    _, size, yaw = body_pose((0.0, 0.0, 0.0), (1.0, 2.0, 3.0), both)
+    assert size == (1.0, 2.0, 3.0)
+    assert same_turn(yaw, angle)
+
+
+@pytest.mark.parametrize("quaternion", [(0, 0, 0, 0), (0, 0, 0, 2), (0, 0, 0, math.nan)])
+def test_quaternions_must_have_length_one(quaternion: tuple[float, float, float, float]) -> None:
+    with pytest.raises(ValueError, match="quaternion of length 1"):
+        body_pose((0.0, 0.0, 0.0), None, quaternion)
+
+
+@given(st.floats(-7, 7), st.booleans(), st.tuples(*[st.floats(-5, 5)] * 3))
+def test_viewer_axes_invert_the_conversion_to_the_viewer(
+    yaw: float, optical: bool, point: tuple[float, float, float]
+) -> None:
+    """A point read into body axes, seen by the viewer, and told in the frame again."""
+    body, _, _ = body_pose(point, optical=optical)
+    (seen,), _ = to_viewer_frame([body], Viewpoint(0.0, 0.0, yaw))
+    axes = viewer_axes("camera_optical_frame" if optical else "map", yaw)
+    assert axes is not None
+    told = [sum(seen[k] * axes[k][n] for k in range(3)) for n in range(3)]
+    assert told == pytest.approx(point, abs=1e-9)

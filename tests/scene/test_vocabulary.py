@@ -4,7 +4,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from app.scene.labels import label_key, singular
 from app.scene.vocabulary import ObjectClass, Vocabulary
 
 VOCABULARY = Vocabulary(
@@ -43,12 +46,6 @@ def test_labels_are_found_under_any_spelling(label: str, expected: str) -> None:
 @pytest.mark.parametrize("label", ["", "  ", "sofa", "trash", "can", "curtain rod"])
 def test_unknown_labels_are_not_found(label: str) -> None:
     assert VOCABULARY.index(label) is None
-
-
-def test_room_types_are_found_under_any_spelling() -> None:
-    assert [VOCABULARY.room_index(name) for name in ("bedroom", "bed room", "Bed_Room")] == [0] * 3
-    assert VOCABULARY.room_index("Living-Room") == 1
-    assert VOCABULARY.room_index("garage") is None
 
 
 def test_rooms_have_synonyms() -> None:
@@ -105,3 +102,134 @@ def test_malformed_vocabularies_are_refused() -> None:
         Vocabulary([])
     with pytest.raises(ValueError, match="room type has an empty name"):
         Vocabulary([ObjectClass("bed")], [""])
+
+
+# ------------------------------------------------------------------------------------------- labels
+
+
+PLURALS = """
+chairs/chair curtains/curtain sofas/sofa photos/photo tvs/tv boxes/box dishes/dish benches/bench
+dresses/dress buses/bus batteries/battery shelves/shelf bookshelves/bookshelf knives/knife
+gloves/glove vases/vase cases/case potatoes/potato shoes/shoe ties/tie wineglasses/wineglass
+stairs/stair people/person women/woman mice/mouse
+"""
+
+
+@pytest.mark.parametrize("pair", PLURALS.split())
+def test_plurals(pair: str) -> None:
+    plural, single = pair.split("/")
+    assert singular(plural) == singular(single) == single
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        *("glass", "glasses", "sunglasses", "clothes", "scissors", "pants", "jeans", "shorts"),
+        *("bus", "mattress", "grass", "dress", "cactus", "tennis", "gas", "canvas", "lens"),
+        *("thermos", "chess", "as", "s", ""),
+    ],
+)
+def test_words_that_are_not_plural_stay(word: str) -> None:
+    assert singular(word) == word
+
+
+def test_compatibility_characters_fold() -> None:
+    assert label_key("TV") == label_key("ＴＶ") == "tv"
+    assert label_key("Straße") == label_key("STRASSE")
+
+
+@given(st.text(max_size=30), st.sampled_from(["_", " ", "-", ".", "  "]))
+def test_keys_ignore_case_and_separators(label: str, separator: str) -> None:
+    assert label_key(separator + label + separator) == label_key(label)
+    assert label_key(label.casefold()) == label_key(label)
+
+
+# ------------------------------------------------------------------------------------ similar names
+
+
+SIMILAR = Vocabulary(
+    [
+        ObjectClass("fridge", ("refrigerator",)),
+        ObjectClass("magnet", ("fridge magnet",)),
+        ObjectClass("tree"),
+        ObjectClass("bridge"),
+        ObjectClass("mug"),
+        ObjectClass("chair", ("wooden chair",)),
+        ObjectClass("computer chair", ("office chair", "desk chair")),
+        ObjectClass("toilet paper", ("toilet paper roll",)),
+        ObjectClass("nightstand"),
+        ObjectClass("door", structure=True),
+        ObjectClass("wall", ("moulding",)),
+        ObjectClass("flower", ("vase flower",)),
+        ObjectClass("floor"),
+        ObjectClass("vase"),
+        ObjectClass("cell phone", ("cell",)),
+        ObjectClass("toy"),
+    ],
+    ("bedroom", "living room", "bathroom"),
+)
+
+
+@pytest.mark.parametrize(
+    ("label", "expected", "rule"),
+    [
+        ("fridgee", "fridge", "spelling"),
+        ("Refridgerator", "fridge", "spelling"),
+        ("nigthstand", "nightstand", "spelling"),
+        ("fridge magnett", "magnet", "spelling"),
+        ("toiled paper", "toilet paper", "spelling"),  # the other word confirms it
+        ("walll", "wall", "spelling"),
+        ("the refridgerator_3", "fridge", "spelling"),
+        ("coffee mugs", "mug", "head"),
+        ("swivel chair", "chair", "head"),
+        ("red office chair", "computer chair", "head"),
+        ("chair on wheels", "chair", "head"),
+        ("vase with sand", "vase", "head"),
+        ("a photo of a big chair", "chair", "head"),
+        ("toy mug", "toy", "head"),
+    ],
+)
+def test_a_name_is_guessed_by_its_spelling_or_its_last_words(
+    label: str, expected: str, rule: str
+) -> None:
+    found = SIMILAR.guess(label)
+    assert found is not None
+    assert (SIMILAR.labels[found.entry], found.rule) == (expected, rule)
+    assert 0.7 < found.similarity <= 1
+
+
+@pytest.mark.parametrize(
+    "label",
+    [
+        *("droid", "asdf", "x" * 100, "∞", "mug rack", "chair leg", "tres", "tagnet"),
+        "floer",  # two classes are near
+        "jail cell",  # another meaning
+        "wal",  # a short word can be anything
+        *("mug and chair", "vase with flowers"),  # two objects
+        " ".join(["refrigeratr", "nigthstand", "wodden", "chairr"] * 2),
+    ],
+)
+def test_an_ambiguous_name_has_no_guess(label: str) -> None:
+    assert SIMILAR.guess(label) is None
+
+
+def test_only_plausible_names_are_suggested_best_first() -> None:
+    def suggest(label: str) -> list[str]:
+        return [SIMILAR.labels[match.entry] for match in SIMILAR.nearest(label)]
+
+    assert suggest("fridgee") == ["fridge"]
+    assert suggest("swivel chair")[0] == "chair"
+    assert suggest("droid") == []
+    assert len(SIMILAR.nearest("chair of fridge", limit=1)) <= 1
+    similarities = [match.similarity for match in SIMILAR.nearest("desk chairs x", limit=9)]
+    assert similarities == sorted(similarities, reverse=True)
+    assert all(0 <= similarity <= 1 for similarity in similarities)
+
+
+def test_similar_room_types_are_found() -> None:
+    assert [match.entry for match in SIMILAR.nearest("bedrom", is_room=True)] == [0]
+    assert SIMILAR.nearest("garage", is_room=True) == ()
+    found = SIMILAR.guess("bedrom", is_room=True)
+    assert found is not None
+    assert found.entry == 0
+    assert SIMILAR.guess("garage", is_room=True) is None

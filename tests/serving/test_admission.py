@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import gc
 import math
 import threading
-import weakref
 from collections.abc import Callable, Iterator
 from time import monotonic, sleep
 from typing import Any
@@ -15,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.errors import DeadlinePassedError, DisconnectedError, QueueFullError
+from app.errors import DeadlinePassedError, DisconnectedError
 from app.serving.admission import Admission, Lane, Ticket, in_thread
 
 pytestmark = pytest.mark.anyio
@@ -52,47 +50,6 @@ async def test_clients_take_turns() -> None:
     await asyncio.gather(*(work(lane, client, log) for client in clients))
     # The first request found the lane free. Behind it, every client has its turn in a round.
     assert set(log[1:4]) == {"flood", "a", "b"}
-
-
-async def test_one_client_holds_a_quarter_of_a_lane() -> None:
-    lane, places = Lane(1, 40), [ticket("flood") for _ in range(11)]
-    await places[0].enter(lane, 4)
-    with pytest.raises(QueueFullError):
-        await places[1].enter(lane, 7)
-    waiting = [asyncio.ensure_future(place.enter(lane, 1)) for place in places[2:8]]
-    await asyncio.sleep(0)
-    assert lane.is_full("flood", 1)
-    assert not lane.is_full("other", 10)
-    assert lane.is_full("other", 11)
-    places[0].leave()
-    for place, turn in zip(places[2:8], waiting, strict=True):
-        await turn
-        place.leave()
-    assert (lane.weight, lane.is_full("flood", 10)) == (0, False)
-
-
-async def test_refusals_wait_for_a_turn_without_weight() -> None:
-    lane, holder = Lane(1, 4), ticket("flood")
-    await holder.enter(lane, 1)
-    refusals = [ticket("flood") for _ in range(3)]
-    turns = [asyncio.ensure_future(place.enter(lane, 0)) for place in refusals]
-    await asyncio.sleep(0)
-    assert not any(turn.done() for turn in turns)
-    holder.leave()
-    for place, turn in zip(refusals, turns, strict=True):
-        await turn
-        place.leave()
-    assert (lane.weight, lane.is_full("flood", 1)) == (0, False)
-
-
-async def test_a_request_in_a_lane_can_change_to_another() -> None:
-    first, second, place = Lane(1, 4), Lane(1, 4), ticket()
-    await place.enter(first, 1)
-    await place.enter(second, 1)
-    assert (first.weight, second.weight) == (0, 1)
-    place.leave()
-    place.leave()
-    assert second.weight == 0
 
 
 async def test_a_request_that_waits_past_its_deadline_leaves_its_place() -> None:
@@ -153,35 +110,6 @@ def admission() -> Iterator[Admission]:
     admission = Admission(1024, 4096)
     yield admission
     admission.stop()
-
-
-async def test_a_failure_in_a_thread_keeps_nothing_of_its_request(admission: Admission) -> None:
-    """No cycle does: bodies of megabytes would wait for the collector."""
-
-    class Body:
-        pass
-
-    async def fail() -> weakref.ref[Body]:
-        body = Body()
-
-        def broken(_: Callable[[], bool]) -> None:
-            raise ZeroDivisionError(id(body))
-
-        with pytest.raises(ZeroDivisionError):
-            await in_thread(broken, ticket(), admission.worker)
-        return weakref.ref(body)
-
-    gc.disable()
-    try:
-        kept = await fail()
-        # A worker thread lets go of its last call a moment later.
-        for _ in range(100):
-            await asyncio.sleep(0.01)
-            if kept() is None:
-                break
-        assert kept() is None
-    finally:
-        gc.enable()
 
 
 async def test_work_in_a_thread_ends_the_wait_at_the_deadline(admission: Admission) -> None:

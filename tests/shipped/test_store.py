@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import re
-import time
-from functools import partial
 from pathlib import Path
 
 import pytest
 
-from app.questions import missing
 from app.registry import Artifact, Store, load_model_set
-from app.scene import CANONICAL, Scene, SceneObject
+from tests.conftest import REPOSITORY
+from training.evaluation.everyday_task import EVERYDAY, LINES, ask_everyday, facts_file
 from training.runs.config_files import load_config
 
-STORE = Store(Path(__file__).resolve().parents[2] / "model_store")
+STORE = Store(REPOSITORY / "model_store")
 SHIPPED = [
     "indoor-gbm",
     "indoor-rbm",
@@ -41,10 +39,6 @@ def test_every_shipped_model_verifies(models):
     assert sorted({name for name, _ in models.entries}) == SHIPPED
 
 
-def test_the_default_is_the_indoor_triway(models):
-    assert models.resolve("default").manifest.name == "indoor-triway"
-
-
 def test_the_terms_of_each_model_are_those_of_its_data(artifact):
     text = (STORE.root / "TERMS.md").read_text()
     rows = dict(re.findall(r"^\| `([\w-]+)` \| ([^|]+) \|", text, re.MULTILINE))
@@ -58,24 +52,6 @@ def test_an_artifact_is_small(artifact):
     assert size <= 12_000_000
 
 
-def test_an_artifact_loads_in_under_a_second(artifact):
-    """Of processor time. A bound with a margin of ten on what was measured, not a measurement."""
-    began = time.process_time()
-    STORE.load(artifact.manifest.name, artifact.manifest.version)
-    assert time.process_time() - began < 1.0
-
-
-def test_the_hidden_layers_are_the_seed_paper_s_but_for_the_default(artifact):
-    """The default and `open-triway` have couplings, and few units of many states."""
-    spec, name = artifact.spec, artifact.manifest.name
-    coupled = name in ("indoor-triway", "open-triway")
-    sizes = (8, 32, True) if coupled else (200, 2, False)
-    assert (spec.units, spec.states, spec.coupled) == sizes
-    deep = spec.variant == "gbm" or name.endswith("deep")
-    assert (100 if deep else 0) == spec.H2
-    assert len(CANONICAL) == spec.A
-
-
 def test_structure_has_no_object_weights(artifact):
     """So listing it changes no answer about other classes."""
     structure = artifact.vocabulary.structure
@@ -83,14 +59,6 @@ def test_structure_has_no_object_weights(artifact):
     assert not artifact.weights["W"][structure].any()
     if artifact.spec.coupled:
         assert not artifact.weights["L"][structure].any()
-
-
-def test_the_card_names_the_data_and_its_terms(artifact):
-    for source in artifact.manifest.data:
-        assert source.source in artifact.card
-        assert source.terms in artifact.card
-    commercial = all(not source.research_only for source in artifact.manifest.data)
-    assert commercial == (artifact.manifest.name == "open-triway")
 
 
 def test_the_indoor_vocabulary_is_large_enough(artifact):
@@ -101,14 +69,6 @@ def test_the_indoor_vocabulary_is_large_enough(artifact):
         assert artifact.vocabulary.index(words) is not None
 
 
-def test_the_training_configuration_is_stored(artifact):
-    from training.fit.configuration import Config
-    from training.runs.config_files import shipped_configs
-
-    config = Config.model_validate(artifact.manifest.training["config"])
-    assert config.name in shipped_configs()
-
-
 def test_the_examples_of_its_configuration_fit_its_vocabulary(artifact):
     from training.runs.example_scenes import known_examples, read_examples
 
@@ -117,21 +77,51 @@ def test_the_examples_of_its_configuration_fit_its_vocabulary(artifact):
     assert known_examples(examples, artifact.vocabulary) == (examples, [])
 
 
-@pytest.mark.parametrize("name", ["indoor-triway", "indoor-rbm"])
-@pytest.mark.parametrize("relation", ["on-top", "above", "behind"])
-def test_the_best_at_a_place_are_the_first_of_all(models, name, relation):
-    """Candidates that cannot be among the best are not asked."""
-    artifact = models.resolve(name)
-    assert isinstance(artifact, Artifact)
-    labels = ["table", "chair", "lamp", "laptop"]
-    things = [SceneObject(label, label, artifact.vocabulary.index(label)) for label in labels]
-    for scene in (Scene(tuple(things)), Scene(tuple(things[:1]))):
-        ask = partial(missing, artifact, scene, at=(relation, 0), details=False)
-        every = ask(top_k=1000)["missing"]
-        assert len(every) > 80
-        for few in (1, 5, 40):
-            best = ask(top_k=few)["missing"]
-            assert [one["label"] for one in best] == [one["label"] for one in every[:few]]
-            assert [one["probability"] for one in best] == pytest.approx(
-                [one["probability"] for one in every[:few]], rel=1e-5
-            )
+# ---------------------------------------------------------------------------------- everyday facts
+# Scenes are drawn with fixed seeds, so the counts of a version of numpy and numba are always the
+# same. Another order of the draws gives other counts: over 16,000 scenes of other seeds .976 are
+# typical, .005 have what never belongs and .011 have fewer than three classes. The bounds of the
+# three lines are the project's aims for 320 scenes, less one standard deviation of the typical
+# ones. The probability of a relation means that it holds in a home with both objects. By this
+# measure, true facts such as a laptop on a coffee table seldom reach one half.
+
+
+FOLDER = REPOSITORY / EVERYDAY
+
+AT_LEAST = {
+    "relations: the fact is the likeliest of eight": 39,
+    "relations: the fact is the likeliest vertical one": 39,
+    "relations: the fact has p of at least .5": 15,
+    "missing: an expected object is among five": 20,
+    "missing_at: an expected object is among five": 10,
+    "outliers: the intruder comes first": 67,
+    "outliers: the intruder is flagged at the default": 60,
+    "generate: the scene has what makes the room": 305,
+}
+AT_MOST = {
+    "outliers: plain scenes with an alarm at the default": 0,
+    "generate: the scene has what never belongs": 5,
+    "generate: scenes of fewer than three classes": 3,
+}
+ASKED = (43, 43, 43, 20, 10, 67, 67, 10, 320, 320, 320)
+
+
+@pytest.fixture(scope="module")
+def found(models) -> dict[str, tuple[int, int]]:
+    if facts_file(FOLDER) is None:
+        pytest.skip("the facts are not here")
+    lines = ask_everyday(models.resolve("default"), FOLDER)
+    return {line: tuple(map(sum, zip(*each, strict=True))) for line, each in lines.items()}
+
+
+def test_every_fact_is_asked(found):
+    assert tuple(asked for _, asked in found.values()) == ASKED
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_no_line_falls_back(found, line):
+    hits, _ = found[line]
+    if line in AT_LEAST:
+        assert hits >= AT_LEAST[line]
+    else:
+        assert hits <= AT_MOST[line]

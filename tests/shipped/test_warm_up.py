@@ -30,15 +30,11 @@ def scenes(labels):
     for size in (1, 2, 3, 12):
         bare = {"objects": [{"label": label, "confidence": 0.9} for label in labels[:size]]}
         poses = [
-            {
-                **thing,
-                "position": {"x": 1.0, "y": 0.4 * k, "z": 0.2 * (k % 3)},
-                "size": {"x": 0.3, "y": 0.3, "z": 0.2},
-            }
+            {**thing, "position": [1.0, 0.4 * k, 0.2 * (k % 3)], "size": [0.3, 0.3, 0.2]}
             for k, thing in enumerate(bare["objects"])
         ]
         stated = [
-            {"subject": labels[k + 1], "relation": name, "object": labels[k]}
+            (labels[k + 1], name, labels[k])
             for k, name in zip(range(size - 1), 3 * ("left", "front", "on-top", "above"))
         ]
         yield bare
@@ -62,13 +58,11 @@ async def main(store):
             vocabulary = Store(store).load(*Store(store).resolve(model)).vocabulary
             labels, rooms = vocabulary.labels, vocabulary.room_types
             for scene in scenes(labels):
-                pairs = [{"subject": labels[0], "object": labels[1]}]
-                some = {"pairs": pairs} if len(scene["objects"]) > 1 else {}
+                some = {"pairs": [labels[:2]]} if len(scene["objects"]) > 1 else {}
                 await ask("relations", scene, top_k=50, include_opposites=True)
                 await ask("relations", scene, **some)
                 await ask("missing", scene, coverage=1.0, candidates=labels[40:42])
-                place = {"relation": "right", "object": labels[0]}
-                await ask("missing", scene, at=place, coverage=0.3)
+                await ask("missing", scene, at=("right", labels[0]), coverage=0.3)
                 await ask("outliers", scene)
                 await ask("outliers", scene, sensitivity="high", threshold=0.0)
                 await ask("rooms", scene, candidates=rooms[:2])

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from scripts import audit
-from scripts.audit import Outcome, Verdict, exit_status, judge
+from scripts.audit import Outcome, Verdict, judge
 
 pytestmark = pytest.mark.system
 
@@ -92,42 +92,3 @@ def test_a_database_without_the_canary_is_not_used(
     monkeypatch.setattr(audit, "BILLS", tmp_path)
     assert audit.advisories().verdict is verdict
     assert asked == locks_asked
-
-
-@pytest.mark.parametrize(
-    ("verdicts", "strict", "lenient"),
-    [
-        ([Verdict.OK, Verdict.OK], 0, 0),
-        ([Verdict.OK, Verdict.NOT_RUN], 3, 0),
-        ([Verdict.FOUND, Verdict.NOT_RUN], 1, 1),
-        ([Verdict.FOUND, Verdict.OK], 1, 1),
-    ],
-)
-def test_exit_status_of_findings_and_of_skipped_checks(
-    verdicts: list[Verdict], strict: int, lenient: int
-) -> None:
-    assert exit_status(verdicts, may_be_unreachable=False) == strict
-    assert exit_status(verdicts, may_be_unreachable=True) == lenient
-
-
-@pytest.mark.slow
-def test_the_bills_name_every_locked_package(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(audit, "BILLS", tmp_path)
-    outcome = audit.bills_of_materials()
-    assert outcome.verdict is Verdict.OK, outcome.lines
-    bill = json.loads((tmp_path / "sbom-service.cdx.json").read_text())
-    assert bill["bomFormat"] == "CycloneDX"
-    assert bill["metadata"]["component"]["name"] == "scene-boltzmann"
-    purls = {component["purl"] for component in bill["components"]}
-    assert "pkg:pypi/numba@0.68.1" in purls
-    assert len(purls) == len(audit.names("requirements.lock"))
-
-
-def test_risky_code_is_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    (tmp_path / "risky.py").write_text("import pickle\npickle.loads(input())\n")
-    monkeypatch.setattr(audit, "SOURCES", (str(tmp_path),))
-    outcome = audit.risky_code()
-    assert outcome.verdict is Verdict.FOUND
-    assert "B301" in "".join(outcome.lines)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from configparser import ConfigParser
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,91 +11,45 @@ import pytest
 
 from app.settings import Settings
 from deploy.image import first_base, pip_settings
-from tests.conftest import run_program
 
 pytestmark = pytest.mark.system
 
 
-@dataclass(frozen=True, slots=True)
-class Instruction:
-    """One instruction: `COPY --from=a b c` has the fields COPY, {"from": "a"} and "b c"."""
-
-    keyword: str
-    flags: dict[str, str]
-    argument: str
-
-
-def split_stages(dockerfile: str) -> dict[str, list[Instruction]]:
-    """Return the instructions of each stage by stage name, in the order of the file."""
-    text = re.sub(r"^\s*#.*\n", "", dockerfile, flags=re.MULTILINE)
-    stages: dict[str, list[Instruction]] = {}
-    for line in filter(str.strip, re.sub(r"\\[ \t]*\n", " ", text).splitlines()):
-        keyword, rest = line.split(maxsplit=1)
-        flags, argument = re.fullmatch(r"((?:--\S+ +)*)(.*)", rest).groups()
-        if keyword == "FROM":
-            current = stages.setdefault(argument.split(" AS ")[1], [])
-        pairs = re.findall(r"--([\w-]+)=(\S+)", flags)
-        current.append(Instruction(keyword, dict(pairs), argument.strip()))
-    return stages
+def split_stages(dockerfile: str) -> dict[str, str]:
+    """Return the instructions of each stage by its name, in the order of the file."""
+    text = re.sub(r"^ *#.*\n", "", dockerfile, flags=re.MULTILINE)
+    parts = re.split(r"^FROM .* AS (\S+)\n", text, flags=re.MULTILINE)
+    return dict(zip(parts[1::2], parts[2::2], strict=True))
 
 
 @pytest.fixture(scope="module")
-def stages(repository: Path) -> dict[str, list[Instruction]]:
+def stages(repository: Path) -> dict[str, str]:
     return split_stages((repository / "Dockerfile").read_text("utf-8"))
-
-
-def built(compose: dict[str, Any]) -> list[dict[str, Any]]:
-    """The services that run an image of this repository."""
-    services = [service for service in compose["services"].values() if "build" in service]
-    assert len(services) == 2
-    return services
-
-
-def arguments(stage: list[Instruction], keyword: str) -> list[str]:
-    return [i.argument for i in stage if i.keyword == keyword]
-
-
-@pytest.mark.parametrize(
-    ("tool", "arguments"),
-    [
-        ("hadolint", ["--failure-threshold=style", "Dockerfile"]),
-        ("shellcheck", [".ci/run"]),
-        ("check-jsonschema", ["--builtin-schema=vendor.compose-spec", "docker-compose.yml"]),
-    ],
-)
-def test_files_have_no_lint(
-    require_system_tool: Callable[[str], Path], tool: str, arguments: list[str]
-) -> None:
-    run_program(require_system_tool(tool), *arguments)
 
 
 @pytest.mark.parametrize("name", ["runtime", "ray", "train"])
 def test_final_stages_run_as_a_fixed_unprivileged_user(
-    stages: dict[str, list[Instruction]], compose: dict[str, Any], name: str
+    stages: dict[str, str], compose: dict[str, Any], name: str
 ) -> None:
-    (user,) = arguments(stages[name], "USER")
-    assert re.fullmatch(r"[1-9]\d{3,}:[1-9]\d{3,}", user)
-    assert {service["user"] for service in built(compose)} == {user}
+    (user,) = re.findall(r"^USER ([1-9]\d{3,}:[1-9]\d{3,})$", stages[name], re.MULTILINE)
+    built = [service for service in compose["services"].values() if "build" in service]
+    assert [service["user"] for service in built] == [user] * 2
 
 
-def test_the_default_stage_serves_and_knows_nothing_of_training(
-    stages: dict[str, list[Instruction]],
-) -> None:
+def test_the_default_stage_serves_and_knows_nothing_of_training(stages: dict[str, str]) -> None:
     assert list(stages)[-1] == "runtime"
-    (command,) = arguments(stages["runtime"], "CMD")
-    assert command.endswith('&& exec python -m app"]')
-    assert "/health/ready" in arguments(stages["runtime"], "HEALTHCHECK")[0]
-    assert not any("training" in i.argument + str(i.flags) for i in stages["runtime"])
+    assert '&& exec python -m app"]' in stages["runtime"]
+    assert "/health/ready" in stages["runtime"].split("HEALTHCHECK")[1]
+    assert "training" not in stages["runtime"]
 
 
 def test_every_variable_given_to_the_service_is_one_it_reads(
-    stages: dict[str, list[Instruction]], compose: dict[str, Any]
+    stages: dict[str, str], compose: dict[str, Any]
 ) -> None:
     known = {f"SCENE_{field.upper()}" for field in Settings.model_fields}
-    in_image = set(re.findall(r"\bSCENE_\w+(?==)", " ".join(arguments(stages["runtime"], "ENV"))))
-    in_compose = set(compose["services"]["scene"]["environment"])
+    in_image = set(re.findall(r"\bSCENE_\w+(?==)", stages["runtime"]))
     assert {"SCENE_HOST", "SCENE_PORT", "SCENE_STORE"} <= in_image <= known
-    assert in_compose <= known
+    assert compose["services"]["scene"]["environment"].keys() <= known
 
 
 @pytest.mark.parametrize("name", ["proxy", "scene", "train", "prometheus", "grafana"])
@@ -110,47 +62,13 @@ def test_services_are_confined(compose: dict[str, Any], name: str) -> None:
     assert {"memory", "pids"} <= service["deploy"]["resources"]["limits"].keys()
     assert not {"privileged", "cap_add", "devices", "pid", "ipc", "network_mode"} & service.keys()
     assert all("/var/run" not in volume for volume in service["volumes"])
-    if name in ("prometheus", "grafana"):
-        return
-    assert service["logging"]["driver"] == "json-file"
-    assert {"max-size", "max-file"} <= service["logging"]["options"].keys()
-    (temporary,) = service["tmpfs"]
-    assert {"noexec", "nosuid", "nodev"} <= set(temporary.partition(":")[2].split(","))
-    assert re.search(r"\bsize=\d+m\b", temporary)
-
-
-def test_the_service_is_watched_and_owns_only_its_store(
-    stages: dict[str, list[Instruction]], compose: dict[str, Any]
-) -> None:
-    scene = compose["services"]["scene"]
-    assert {"interval", "timeout", "retries"} <= scene["healthcheck"].keys()
-    owned = [i.argument for i in stages["runtime"] if "chown" in i.flags]
-    assert owned == ["model_store ./model_store"]
-    for key in ("SCENE_ADMIN_KEY", "SCENE_API_KEY"):
-        assert scene["environment"].get(key, "missing") is None, "the caller gives the keys"
-        assert not any(key in i.argument for stage in stages.values() for i in stage)
 
 
 def test_ports_are_published_on_this_machine_only(compose: dict[str, Any]) -> None:
     ports = {name: service.get("ports", []) for name, service in compose["services"].items()}
     assert ports["scene"] == ports["train"] == []
-    for name, start in (
-        ("proxy", "${PUBLISH_ADDRESS:-127.0.0.1}:"),
-        ("prometheus", "127.0.0.1:"),
-        ("grafana", "127.0.0.1:"),
-    ):
-        (port,) = ports[name]
-        assert port.startswith(start)
-
-
-def test_the_store_is_one_volume_where_the_image_keeps_its_models(
-    stages: dict[str, list[Instruction]], compose: dict[str, Any]
-) -> None:
-    store = compose["services"]["scene"]["environment"]["SCENE_STORE"]
-    store = store.removeprefix("${SCENE_STORE:-").removesuffix("}")
-    assert f"SCENE_STORE={store}" in " ".join(arguments(stages["runtime"], "ENV"))
-    for service in built(compose):
-        assert f"models:{store}" in service["volumes"]
+    assert ports["proxy"][0].startswith("${PUBLISH_ADDRESS:-127.0.0.1}:")
+    assert all(ports[name][0].startswith("127.0.0.1:") for name in ("prometheus", "grafana"))
 
 
 def pins(repository: Path, lock: str) -> set[str]:
@@ -176,14 +94,6 @@ def test_only_torch_may_come_from_another_index(repository: Path) -> None:
         for line in text.splitlines():
             if "install" in line and "--index-url" in line:
                 assert "--no-deps" in line
-
-
-def test_smaller_locks_are_subsets_of_the_larger(repository: Path) -> None:
-    service, ray, training, development = (
-        pins(repository, lock) for lock in ("", "-ray", "-training", "-dev")
-    )
-    assert service < training < development
-    assert service < ray
 
 
 def test_the_base_image_may_have_a_digest() -> None:

@@ -11,8 +11,7 @@ import pytest
 
 from app.registry import AliasTarget, Store
 from scene_client import Client
-from tests.chaos.load import ConstantLoad
-from tests.chaos.test_swaps import REQUESTS, Judge
+from tests.chaos.load import REQUESTS, ConstantLoad, Judge
 from tests.http.stores import make_store
 from tests.services import LiveService, is_ready, launch, wait_until
 from tests.system.conftest import StartProxy
@@ -95,24 +94,6 @@ def test_promotions_under_load_lose_and_mix_nothing(fleet: Fleet, load: Constant
     load.tally.check()
     # A poll, and half a second for the two loads beside the requests.
     assert max(seconds) < POLL + 0.5, sorted(seconds)[-5:]
-
-
-def test_a_killed_replica_costs_at_most_its_requests(fleet: Fleet, load: ConstantLoad) -> None:
-    killed = fleet.replicas[0]
-    killed.client.close()
-    with load:
-        wait_until(lambda: load.tally.statuses[200] > 100)
-        killed.process.kill()
-        killed.process.wait()
-        time.sleep(5)  # until the proxy has noticed it
-        fleet.replicas[0] = fleet.start(0, killed.port)
-        wait_until(lambda: is_ready(killed.port))
-        time.sleep(NOTICED)
-    # The replica writes the head of an answer before the body. If it dies in between, the proxy
-    # has already sent the head, and it can only close the connection: status 0.
-    assert load.tally.statuses.keys() <= {200, 502, 0}
-    assert load.tally.statuses[502] + load.tally.statuses[0] <= 4  # one for each connection
-    assert load.tally.statuses[200] > 100
 
 
 def test_a_rolling_update_of_the_settings_loses_and_mixes_nothing(

