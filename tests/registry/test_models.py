@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.registry import AliasTarget, ArtifactError, Store, load_model_set
-from app.registry.references import is_version, resolve_reference, version_key
+from app.registry.references import VERSION, resolve_reference, version_key
 from tests.registry.small_artifacts import description, publish_as, refused, state
 
 
@@ -197,5 +197,5 @@ parts = st.tuples(*[st.integers(0, 10**9 - 1)] * 3)
 @given(parts, parts)
 def test_versions_are_ordered_as_numbers(one: tuple[int, ...], other: tuple[int, ...]) -> None:
     first, second = (".".join(map(str, version)) for version in (one, other))
-    assert is_version(first)
+    assert VERSION.fits(first)
     assert (version_key(first) < version_key(second)) == (one < other)

@@ -17,7 +17,6 @@ from app.scene import (
     SceneObject,
     instance_evidence,
     observe,
-    pool_instances,
 )
 from app.scene.geometry import (
     Viewpoint,
@@ -38,14 +37,15 @@ from app.scene.relations import (
     RELATIONS,
     STACKED,
     canonicalise,
-    contradiction,
     opposite,
     support_cycle,
 )
+from app.scene.scene import pool_classes
 from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN, Heights, floor_level, stands_of
 from scene_client.schemas import RelationName
 from tests.scene.role_counts import LABELS, role_counts
 from tests.scene.turns import about, after
+from training.datasets.encoding import pool_instances
 
 DESK = SceneObject("desk", "desk", 0, position=(2.0, 0.0, 0.4), size=(0.8, 1.6, 0.8))
 MONITOR = SceneObject("monitor", "monitor", 1, position=(2.0, 0.2, 1.0), size=(0.1, 0.5, 0.4))
@@ -137,13 +137,14 @@ def test_classes_are_the_or_over_instance_pairs(
     drawn: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
 ) -> None:
     classes, confidence, holds, observed = drawn
-    evidence = pool_instances(*drawn, room_type=3)
+    evidence = pool_instances(classes, holds, observed, room_type=3)
+    *_, presence = pool_classes(classes, confidence)
     assert evidence.room_type == 3
     assert evidence.classes.tolist() == sorted(set(classes.tolist()))
     assert evidence.counts.tolist() == [(classes == c).sum() for c in evidence.classes]
     for x, c in enumerate(evidence.classes):
         members = np.flatnonzero(classes == c)
-        assert evidence.confidence[x] == pytest.approx(1 - np.prod(1 - confidence[members]))
+        assert presence[x] == pytest.approx(1 - np.prod(1 - confidence[members]))
         for y, d in enumerate(evidence.classes):
             pairs = [(i, j) for i in members for j in np.flatnonzero(classes == d) if i != j]
             for a in range(A):
@@ -191,11 +192,6 @@ def test_unknown_relations_are_refused(name: str) -> None:
         canonicalise(0, name, 1)
     with pytest.raises(ValueError, match=rf"unknown relation '{name}'"):
         opposite(name)
-
-
-def test_contradictions() -> None:
-    assert contradiction([(0, 1, 2), (1, 2, 1), (0, 1, 2)]) is None
-    assert contradiction([(0, 1, 2), (3, 0, 1), (0, 2, 1)]) == ((0, 1, 2), (0, 2, 1))
 
 
 def test_supports_in_a_circle_are_found() -> None:
