@@ -360,19 +360,6 @@ def log_sums(x):
 
 
 @compiled
-def _mean(logits, a, i):
-    """Return the mean of a[q, i] with probabilities softmax(logits) of q, or 0 without sources."""
-    top, total, weighted = np.float32(-np.inf), np.float32(0.0), np.float32(0.0)
-    for q in range(len(logits)):
-        top = max(top, logits[q])
-    for q in range(len(logits)):
-        p = exp(logits[q] - top)
-        total += p
-        weighted += p * a[q, i]
-    return weighted / total if len(logits) else np.float32(0.0)
-
-
-@compiled
 def explained_log_odds(
     x, shares, W, bias, L, f, a, states, classes, presence, rows, targets, explained
 ):

@@ -286,7 +286,7 @@ def test_a_suggestion_at_another_place_or_none_says_so(open_board: OpenBoard) ->
     board.add("lamp")
     assert board.ghosts == ["cup"]
     assert "nearest free place" not in board.rows("missing")[0]
-    # Below the desk, there is no free place.
+    # The place below the desk is taken.
     place["relation"] = "below"
     del place["offset"]
     board.add("mug")

@@ -551,7 +551,7 @@ def test_rows_become_scenes_of_two_objects(tmp_path: Path) -> None:
 
 
 def test_placings_are_rows_of_rooms_on_or_inside_a_receptacle(tmp_path: Path) -> None:
-    """Votes of people are no training scenes."""
+    """Training ignores votes of people."""
     path = table(
         tmp_path,
         "housekeep_votes\tcup\tinside\tcabinet\t3\tkitchen",

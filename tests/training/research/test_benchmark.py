@@ -1,4 +1,4 @@
-"""The commands benchmark and ablate end to end on generated rooms, and what they resume."""
+"""The commands benchmark and ablate end to end on generated rooms, and their resumption."""
 
 from __future__ import annotations
 
