@@ -311,7 +311,7 @@ def test_overlap_and_gap_agree_with_polygon_clipping(a: Rectangle, b: Rectangle)
 
 
 def test_a_footprint_too_small_for_its_area_is_a_point() -> None:
-    """1e-300 m squared underflows to 0: so its overlap with a table is 1 if both touch, and 0 otherwise."""
+    """1e-300 m squared underflows to 0. The overlap is 1 with what it touches, and otherwise 0."""
     tiny, table = np.full((2, 2), 1e-300), np.ones((2, 2))
     centres = np.array([[0.0, 0.0], [3.0, 0.0]])
     share, gap = overlap_and_gap(
