@@ -108,7 +108,8 @@ async def test_others_keep_half_of_their_rate(
     assert not {500, 502} & set(attacker)
     assert beside[200] > least * alone[200]
     median = len(delays) // 2
-    assert delays[median] < usual[median] + 0.05
+    # Without admission control, one client delays health by .5 s. A busy machine delays it by .07 s.
+    assert delays[median] < usual[median] + 0.2
 
 
 def test_overload_is_refused_and_leaves_nothing_behind(service: LiveService) -> None:
@@ -160,7 +161,7 @@ def test_silent_connections_do_not_keep_health_checks_out(tmp_path: Path) -> Non
     ):
         wait_until(lambda: service.descriptors > 64)
         for _ in range(20):
-            assert service.client.get("/health/live").status_code == 200
+            assert httpx.get(f"{service.url}/health/live").status_code == 200
         # After ten seconds without a request, the service closes them.
         wait_until(lambda: service.descriptors < 32)
 
@@ -175,7 +176,7 @@ def test_few_files_limit_the_connections(tmp_path: Path) -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     with service, silent(300, service.port):
         for _ in range(20):
-            assert service.client.get("/health/live").status_code == 200
+            assert httpx.get(f"{service.url}/health/live").status_code == 200
         assert "accepts 192 connections" in service.log.read_text()
 
 
