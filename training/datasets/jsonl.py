@@ -25,6 +25,7 @@ from pydantic import (
 )
 
 from app.scene.geometry import SMALLEST
+from scene_client.schemas import Stamp
 from training.datasets.files import position_and_problem, read_lines
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError, Id, Text
 from training.datasets.sources import relations_of, supported_subjects
@@ -67,6 +68,8 @@ class _Line(BaseModel):
     false_relations: list[_Triple] | None = None
     counts: dict[str, StrictInt] | None = None
     viewer_frame: StrictBool | None = None
+    stamp: Stamp | None = None
+    confirmed: StrictBool = False
 
 
 def read_jsonl(path: Path) -> list[AnnotatedScene]:
@@ -121,7 +124,10 @@ def _fields_of(scene: AnnotatedScene) -> dict[str, Any]:
             values[name] = [[ids[s], r, ids[o]] for s, r, o in triples]
     if counts := {thing.label: thing.count for thing in scene.objects if thing.count > 1}:
         values["counts"] = counts
-    return values | ({"viewer_frame": True} if scene.viewer_frame else {})
+    if scene.stamp is not None:
+        values["stamp"] = dict(zip(("sec", "nanosec"), scene.stamp, strict=True))
+    flags = ("viewer_frame", "confirmed")
+    return values | {name: True for name in flags if getattr(scene, name)}
 
 
 def _parse_scene(line: bytes, default_id: str) -> AnnotatedScene:
@@ -142,6 +148,8 @@ def _parse_scene(line: bytes, default_id: str) -> AnnotatedScene:
         viewer_frame=source in _VIEWER_SOURCES if frame is None else frame,
         false_relations=relations_of(source, denied),
         supported=supported_subjects(source, stated),
+        stamp=None if values.stamp is None else (values.stamp.sec, values.stamp.nanosec),
+        confirmed=values.confirmed,
     )
 
 

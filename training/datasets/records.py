@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -95,6 +95,10 @@ class AnnotatedScene:
     # Indices of the objects whose support is listed, also by other relations than the ten of the
     # service, such as "attached to".
     supported: tuple[int, ...] = ()
+    # Of scenes recorded by a robot: seconds and nanoseconds since 1970, and whether a person has
+    # confirmed the scene. The digest of a data source does not depend on them.
+    stamp: tuple[int, int] | None = field(default=None, repr=False)
+    confirmed: bool = field(default=False, repr=False)
 
     def __post_init__(self) -> None:
         ids = {thing.id for thing in self.objects}
