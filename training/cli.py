@@ -1,4 +1,4 @@
-"""The command line of training, with commands such as init, train, compare, publish and evaluate.
+"""The command line of training, with commands such as init, train, compare, publish and adapt.
 
 If Ctrl-C stops a training run, the checkpoint of the last finished epoch remains on disk. The same
 command then continues the run.
@@ -18,6 +18,7 @@ from app.registry import Artifact, RegistryError, Store
 from app.registry.references import AliasTarget
 from training.datasets import DatasetError
 from training.datasets.files import DATA
+from training.domain.adapt_command import adapt_command
 from training.domain.candidates import Candidate
 from training.domain.compare import compare, compare_command, show
 from training.domain.evaluate_command import evaluate_command
@@ -44,6 +45,7 @@ app = typer.Typer(
 )
 app.command()(example)
 app.command()(init)
+app.command(name="adapt")(adapt_command)
 app.command()(tune)
 app.command(name="compare")(compare_command)
 app.command()(benchmark)

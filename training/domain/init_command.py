@@ -61,7 +61,7 @@ def init(
     try:
         _check_name(name)
         with console.status("reading scenes"):
-            scenes = [scene for file in files for scene in _read(file)]
+            scenes = [scene for file in files for scene in read_or_exit(file)]
         existing = [str(path) for path in targets if path.exists()]
         if existing and not force:
             raise ConfigError(
@@ -98,9 +98,13 @@ def _check_name(name: str) -> None:
         raise ConfigError(f"{name} is the name of a shipped configuration; choose another name")
 
 
-def _read(path: Path) -> list[AnnotatedScene]:
-    """Read the scenes of a file, or print all invalid lines of a JSONL file and exit."""
-    lines = list(scan_jsonl(path) if guess_format(path) == "jsonl" else read_scenes(path))
+def read_or_exit(path: Path, *, recorded: bool = False) -> list[AnnotatedScene]:
+    """Read the scenes of a file, or print all invalid lines of a JSONL file and exit.
+
+    A recorded file is JSONL, whatever its name.
+    """
+    is_jsonl = recorded or guess_format(path) == "jsonl"
+    lines = list(scan_jsonl(path) if is_jsonl else read_scenes(path))
     errors = [line for line in lines if isinstance(line, DatasetError)]
     if errors:
         n = len(errors)

@@ -120,7 +120,7 @@ def publish_run(
         libraries={name: importlib.metadata.version(name) for name in _LIBRARIES},
         examples=scenes.examples,
     )
-    return _publish_rounded(store, description, calibrated)
+    return publish_rounded(store, description, calibrated)
 
 
 def refit(
@@ -176,7 +176,7 @@ def refit(
     fields = {name: getattr(manifest, name) for name in Description.model_fields}
     fields |= {"version": version, "created": _now(), "examples": examples}
     description = Description(**fields | {"metrics": (*kept, *rows), "vocabulary": vocabulary})
-    return _publish_rounded(store, description, with_statistics(artifact, scenes))
+    return publish_rounded(store, description, with_statistics(artifact, scenes))
 
 
 def with_statistics(artifact: Artifact, scenes: SplitScenes) -> Artifact:
@@ -189,7 +189,7 @@ def with_statistics(artifact: Artifact, scenes: SplitScenes) -> Artifact:
     )
 
 
-def _publish_rounded(store: Store, description: Description, artifact: Artifact) -> Artifact:
+def publish_rounded(store: Store, description: Description, artifact: Artifact) -> Artifact:
     """Publish weights and statistics in half precision."""
     state = dict(artifact.weights.arrays)
     for statistics in (artifact.offsets, artifact.counts, artifact.places):

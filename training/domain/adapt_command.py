@@ -1,0 +1,263 @@
+"""`python -m training adapt`: a version of a model for one home, from the scenes of its robot."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import shlex
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import typer
+from pydantic import JsonValue
+
+from app.registry import (
+    Artifact,
+    DataSource,
+    Description,
+    Metric,
+    RegistryError,
+    Store,
+    VocabularyEntry,
+)
+from app.registry.references import AliasTarget
+from training.datasets import AnnotatedScene, DatasetError
+from training.datasets.records import digest_of
+from training.domain.adaptation import FEWEST, Adapted, Measured, adapted
+from training.domain.home import JUDGED, Home
+from training.domain.init_command import ROWS, STORE, StorePath, console, fail, read_or_exit
+from training.evaluation.metrics import Ratio
+from training.fit.configuration import ConfigError
+from training.runs.example_scenes import choose_examples
+from training.runs.publish import publish_rounded
+
+_TASK = "Home"
+_NOTHING = (
+    "nothing was published: the weights stay, and no confirmed scene has an object that the model "
+    f"reports. Record at least {FEWEST} scenes, or confirm scenes on the page"
+)
+_LIBRARIES = ("numpy", "torch")
+
+
+def adapt_command(
+    model: Annotated[str, typer.Argument(help="model to adapt: an alias, name or name@version")],
+    files: Annotated[
+        list[Path],
+        typer.Argument(help="recorded scenes of one home; a later file corrects earlier scenes"),
+    ],
+    name: Annotated[str, typer.Option("--name", help="name of the home's model")] = "home",
+    store: StorePath = STORE,
+    promote: Annotated[
+        bool, typer.Option("--promote", help="point the alias `default` at the new version")
+    ] = False,
+    alias: Annotated[
+        str | None, typer.Option(help="with --promote: move this alias instead of `default`")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="random seed")] = 0,
+) -> None:
+    """Adapt a model to the home where the scenes were recorded, and publish it as NAME.
+
+    A robot records scenes with `Client(record=...)`, and a person confirms scenes on the web page
+    (docs/own-home.md). An unconfirmed scene does not teach the objects that the model reports as
+    outliers there.
+
+    From 20 scenes on, the weights change. The command compares old and new weights on scenes that
+    the fit did not see, and refuses weights that are not certainly better. With fewer scenes, the
+    new version only stops to report the objects of confirmed scenes. If nothing can be learnt, no
+    version is published, and the exit code is 3.
+    """
+    torch.set_num_threads(1)
+    try:
+        if alias is not None and not promote:
+            raise ConfigError("--alias belongs to --promote")
+        models = Store(store)
+        parent = _parent(models, model, name)
+        version = _next_version(models, name)
+        models.require_new(name, version)
+        recorded = _corrected(read_or_exit(file, recorded=True) for file in files)
+        with console.status("reading the scenes") as status:
+            home = Home.of(parent, recorded)
+            _print_home(home, parent)
+            result = adapted(home, seed=seed, progress=status.update)
+        _print_result(result)
+        if result.artifact is None:
+            console.print(_NOTHING, soft_wrap=True)
+            raise typer.Exit(3)
+        artifact, measured = result.artifact, result.measured
+        description = _describe(parent, home, artifact, measured, recorded, name, version, seed)
+        published = publish_rounded(models, description, artifact)
+        _print_next(models, store, published, alias or "default" if promote else None)
+    except (ConfigError, DatasetError, RegistryError, ValueError) as error:
+        fail(error)
+
+
+def _parent(store: Store, reference: str, name: str) -> Artifact:
+    """Load the model to adapt. An adapted model stands for the model that it was adapted from."""
+    artifact = store.load(*store.resolve(reference))
+    origin = artifact.manifest.training.get("parent")
+    if isinstance(origin, dict):
+        artifact = store.load(str(origin["name"]), str(origin["version"]))
+        console.print(
+            f"{reference} is itself adapted; adapting its parent {_reference(artifact)} again"
+        )
+    if artifact.manifest.name == name:
+        raise ConfigError(f"--name {name} is the name of the model itself: choose another name")
+    return artifact
+
+
+def _reference(artifact: Artifact) -> str:
+    return "@".join(artifact.key)
+
+
+def _next_version(store: Store, name: str) -> str:
+    """Return the version after the newest one: 1.0.0, 1.1.0, 1.2.0 ..."""
+    versions = store.versions(name)
+    if not versions:
+        return "1.0.0"
+    major, minor, _ = versions[-1].split(".")
+    return f"{major}.{int(minor) + 1}.0"
+
+
+def _corrected(files: Iterable[Sequence[AnnotatedScene]]) -> list[AnnotatedScene]:
+    """Join the scenes of files. A later scene replaces an earlier one with its id.
+
+    Raises:
+        ConfigError: the scenes come from several homes.
+    """
+    scenes = {scene.scene_id: scene for file in files for scene in file}
+    homes = sorted({scene.source for scene in scenes.values()})
+    if len(homes) > 1:
+        raise ConfigError(f"the scenes come from several homes ({', '.join(homes)}): adapt each")
+    return list(scenes.values())
+
+
+def _print_home(home: Home, parent: Artifact) -> None:
+    lines = [
+        f"{home.recorded} recorded scenes, {len(home.scenes)} of them distinct, {home.confirmed} "
+        f"confirmed; model {_reference(parent)}"
+    ]
+    if home.new_classes:
+        lines.append(
+            f"new classes, judged after {JUDGED} scenes: {', '.join(home.new_classes[:ROWS])}"
+        )
+    if home.new_rooms:
+        lines.append(f"new room types: {', '.join(home.new_rooms[:ROWS])}")
+    if home.left_out:
+        lines.append(
+            f"left out, because no person has confirmed them: {_counted(home.left_out)}. Confirm "
+            "their scenes on the page if they belong there"
+        )
+    for line in lines:
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def _counted(counts: Counter[str]) -> str:
+    return ", ".join(f"{label} ({n})" for label, n in counts.most_common(ROWS))
+
+
+def _print_result(result: Adapted) -> None:
+    lines = []
+    if (measured := result.measured) is None:
+        lines.append(
+            f"the weights stay: fewer than {FEWEST} distinct scenes with two known objects"
+        )
+    else:
+        alarms, rank = measured.alarms.mean(0), measured.rank.mean(0)
+        lines += [
+            f"on {len(measured.alarms)} scenes of folds that the fit did not see:",
+            f"  scenes with an alarm      {alarms[0]:6.1%} → {alarms[1]:6.1%}",
+            f"  MRR of a missing object   {rank[0]:6.3f} → {rank[1]:6.3f}",
+            f"  t of the gain             {measured.t:6.1f}",
+        ]
+    if result.objections:
+        lines.append(f"the weights stay: {'; '.join(result.objections)}")
+    if result.exceptions:
+        lines.append(
+            f"exceptions, never reported from now on: {_counted(result.exceptions)} (confirmed "
+            "scenes)"
+        )
+    for line in lines:
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def _describe(
+    parent: Artifact,
+    home: Home,
+    artifact: Artifact,
+    measured: Measured | None,
+    recorded: Sequence[AnnotatedScene],
+    name: str,
+    version: str,
+    seed: int,
+) -> Description:
+    """Return the description of the adapted model. Its terms are those of the parent."""
+    manifest = parent.manifest
+    own = DataSource(
+        source=recorded[0].source if recorded[0].source != "jsonl" else name,
+        scenes=len(recorded),
+        digest=digest_of(recorded),
+        terms="recorded in the home",
+        research_only=False,
+    )
+    origin: JsonValue = {"name": parent.key[0], "version": parent.key[1], "digest": parent.digest}
+    return Description(
+        name=name,
+        version=version,
+        created=datetime.now(UTC).replace(microsecond=0),
+        spec=artifact.spec.to_dict(),
+        vocabulary=VocabularyEntry.of(
+            artifact.vocabulary, artifact.spec.A, manifest.vocabulary.profiles
+        ),
+        calibration=_calibration(home, artifact),
+        training={"parent": origin, "seed": seed, "confirmed": home.confirmed},
+        data=(*manifest.data, own),
+        metrics=tuple(_metrics(measured, own.source)),
+        terms=manifest.terms,
+        libraries={library: importlib.metadata.version(library) for library in _LIBRARIES},
+        examples=choose_examples(recorded, artifact.vocabulary) or manifest.examples,
+    )
+
+
+def _calibration(home: Home, artifact: Artifact) -> Any:
+    """Return the calibration, with the popularity of the new classes in the home."""
+    calibration, V = artifact.calibration, home.known[0]
+    if not calibration.popularity:
+        return calibration
+    count, n = home.tensors.v.sum(0)[V:].double().numpy(), len(home.scenes)
+    odds = np.log((count + 0.5) / (n - count + 0.5))
+    popularity = (*calibration.popularity[:V], *np.round(odds, 4).tolist())
+    return calibration.model_copy(update={"popularity": popularity})
+
+
+def _metrics(measured: Measured | None, source: str) -> Iterable[Metric]:
+    """Yield what the folds measured, for the parent and for the adapted weights."""
+    if measured is None:
+        return
+    tables = {"scenes with an alarm": measured.alarms, "MRR, one removed": measured.rank}
+    for name, table in tables.items():
+        for column, side in enumerate(("parent", "adapted")):
+            figure = Ratio.of_scenes(table[:, column]).figure()
+            yield Metric(
+                task=_TASK, source=source, metric=f"{name}, {side}",
+                value=figure.value, low=figure.low, high=figure.high, n=len(table),
+            )  # fmt: skip
+
+
+def _print_next(store: Store, root: str, artifact: Artifact, alias: str | None) -> None:
+    reference = _reference(artifact)
+    console.print(f"published {reference}, digest {artifact.digest[:12]}")
+    if alias is None:
+        command = f"python -m app.registry alias default {reference} --store {shlex.quote(root)}"
+        line = f"ask it by its name ({artifact.key[0]}), or serve it as default: {command}"
+    else:
+        before = store.aliases().get(alias)
+        store.set_alias(alias, AliasTarget.of(reference), expected=before)
+        line = f"promoted: {alias} → {reference}"
+        if before is not None:
+            command = f"python -m app.registry alias {alias} {before} --store {shlex.quote(root)}"
+            line += f"; to roll back: {command}"
+    console.print(line, soft_wrap=True, markup=False, highlight=False)

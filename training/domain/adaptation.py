@@ -1,0 +1,202 @@
+"""Adapt a model to a home, and admit the result only if folds of the recordings show a gain.
+
+- With at least `FEWEST` scenes, the weights adapt (`training.fit.adapt`). Five folds of the groups
+  of scenes measure the gain on scenes that the fit did not see. The gate refuses the new weights if
+  the log loss of hidden objects is not certainly lower (t > 2), if they raise more alarms, or if
+  rooms that the home never showed change.
+- With fewer scenes, or if the gate refuses, the weights stay.
+- Classes of confirmed scenes that the model still reports as outliers become exceptions: the new
+  version never reports them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from app.inference import Weights
+from app.questions.outliers import intruders
+from app.registry import Artifact
+from training.datasets.array_types import Flags, Floats, Ints
+from training.domain.home import Home, with_exceptions
+from training.fit.adapt import adapt, home_loss
+from training.fit.objects import random_parts
+from training.machines.arrays import machine_of
+
+FEWEST = 20
+"""Number of distinct scenes from which the weights adapt."""
+
+_FOLDS = 5
+_LEAST_T = 2.0
+_LARGEST_CHANGE = 0.02
+_PARTS = 8  # random parts of each scene in a measurement
+_LEAVE_ONE_OUT = 0.0
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The parent and the adapted weights on N scenes of the folds that their fit did not see.
+
+    Attributes:
+        loss: (N, 2) log loss of hidden objects: of the parent, and of the adapted weights.
+        rank: (M, 2) reciprocal rank of a hidden object.
+        alarms: (N, 2) True if the scene has an alarm that is false or not yet confirmed.
+        change: mean change of the probability of unrecorded classes in rooms of the parent.
+    """
+
+    loss: Floats
+    rank: Floats
+    alarms: Flags
+    change: float
+
+    @property
+    def t(self) -> float:
+        """t statistic of the gain in log loss; inf if all scenes gain equally."""
+        gain = self.loss[:, 0] - self.loss[:, 1]
+        error = float(gain.std(ddof=1)) / math.sqrt(len(gain))
+        return float(gain.mean()) / error if error else math.copysign(math.inf, gain.mean())
+
+    def objections(self) -> Iterator[str]:
+        """Yield the reasons against the adapted weights."""
+        before, after = self.alarms.sum(0).astype(int).tolist()
+        if not self.t > _LEAST_T:
+            yield f"hidden objects are not certainly predicted better (t = {self.t:.1f})"
+        if after > before:
+            yield f"alarms rise from {before} to {after} of {len(self.alarms)} scenes"
+        if self.change > _LARGEST_CHANGE:
+            yield f"rooms that were never recorded change (by {self.change:.3f} on average)"
+
+
+@dataclass(frozen=True)
+class Adapted:
+    """The result.
+
+    Attributes:
+        artifact: the new model in memory, or None if the recordings teach nothing.
+        measured: comparison in folds; None with fewer than `FEWEST` scenes.
+        objections: reasons of the gate against new weights.
+        exceptions: classes that the new model never reports, and in how many confirmed scenes it
+            would report them.
+    """
+
+    artifact: Artifact | None
+    measured: Measured | None
+    objections: tuple[str, ...]
+    exceptions: Counter[str]
+
+
+def adapted(
+    home: Home, *, seed: int = 0, progress: Callable[[str], None] = lambda _: None
+) -> Adapted:
+    """Adapt a model to a home."""
+    measured: Measured | None = None
+    objections: tuple[str, ...] = ()
+    usable = home.tensors.v.sum(1) >= 2
+    if int(usable.sum()) >= FEWEST:
+        measured = measure(home, seed, progress)
+        objections = tuple(measured.objections())
+        if not objections:
+            progress("adapting to all scenes")
+            weights = adapt(home.parent.weights, home.tensors, known=home.known, seed=seed)
+            artifact = replace(home.parent, weights=weights)
+            exceptions = home.confirmed_alarms(artifact)
+            return Adapted(with_exceptions(artifact, exceptions), measured, (), exceptions)
+    exceptions = home.confirmed_alarms(home.parent)
+    if not exceptions and not home.new_classes and not home.new_rooms:
+        return Adapted(None, measured, objections, exceptions)
+    artifact = with_exceptions(home.parent, exceptions)
+    return Adapted(artifact, measured, objections, exceptions)
+
+
+def measure(home: Home, seed: int, progress: Callable[[str], None]) -> Measured:
+    """Compare the parent with adapted weights in folds of groups.
+
+    If the scenes have fewer than five groups, the folds are made of scenes.
+    """
+    groups = [scene.group for scene in home.scenes]
+    names = sorted(set(groups))
+    few = len(names) < _FOLDS
+    units = np.arange(len(groups)) if few else np.searchsorted(names, groups)
+    fold_of = np.random.default_rng(seed).permutation(units.max() + 1)[units] % _FOLDS
+    loss, rank, alarms, change = [], [], [], []
+    for fold in range(_FOLDS):
+        progress(f"comparing in folds: {fold + 1} of {_FOLDS}")
+        held_out, seen = np.flatnonzero(fold_of == fold), np.flatnonzero(fold_of != fold)
+        scenes = home.tensors.rows(torch.from_numpy(seen))
+        weights = adapt(home.parent.weights, scenes, known=home.known, seed=seed)
+        sides = home.parent, replace(home.parent, weights=weights)
+        loss.append(_losses(home, held_out, sides, seed))
+        rank.append(_ranks(home, held_out, sides, seed))
+        alarms.append(_alarms(home, held_out, sides))
+        change.append(_change(home, weights, scenes.v.sum(0) > 0, seed))
+    return Measured(
+        np.concatenate(loss), np.concatenate(rank), np.concatenate(alarms), float(np.mean(change))
+    )
+
+
+Sides = tuple[Artifact, Artifact]
+
+
+@torch.no_grad()
+def _losses(home: Home, index: Ints, sides: Sides, seed: int) -> Floats:
+    """Return the mean log loss of random parts of each scene, (N, 2)."""
+    scenes = home.tensors.rows(torch.from_numpy(index))
+    scenes = scenes.rows(scenes.v.sum(1) >= 2)
+    generator = torch.Generator().manual_seed(seed)
+    table = torch.zeros(len(scenes), 2)
+    for _ in range(_PARTS):
+        parts = random_parts(scenes.v, _LEAVE_ONE_OUT, generator)
+        for column, side in enumerate(sides):
+            machine = machine_of(side.weights)
+            table[:, column] += home_loss(machine, scenes, parts, scenes.room) / _PARTS
+    return table.numpy()
+
+
+@torch.no_grad()
+def _ranks(home: Home, index: Ints, sides: Sides, seed: int) -> Floats:
+    """Return the reciprocal rank of one hidden class of each scene, (N, 2)."""
+    scenes = home.tensors.rows(torch.from_numpy(index))
+    scenes = scenes.rows(scenes.v.sum(1) >= 2)
+    parts = random_parts(scenes.v, 1.0, torch.Generator().manual_seed(seed))
+    hidden = (scenes.v - parts.listed).argmax(1, keepdim=True)
+    table = torch.zeros(len(scenes), 2)
+    for column, side in enumerate(sides):
+        machine = machine_of(side.weights)
+        log_odds = machine.object_log_odds(parts.listed, room=scenes.room, share=parts.share)
+        log_odds[(parts.listed > 0) | ~scenes.asked] = -torch.inf
+        table[:, column] = 1 / (1 + (log_odds > log_odds.gather(1, hidden)).sum(1))
+    return table.numpy()
+
+
+def _alarms(home: Home, index: Ints, sides: Sides) -> Flags:
+    """Return whether each scene has an alarm about an object that is not left out, (N, 2)."""
+    table = np.zeros((len(index), 2), bool)
+    for row, number in enumerate(index.tolist()):
+        scene = home.scenes[number]
+        if len(scene.classes):
+            for column, side in enumerate(sides):
+                alarms = intruders(side, scene.question(side))
+                table[row, column] = bool(np.setdiff1d(alarms, scene.left_out).size)
+    return table
+
+
+@torch.no_grad()
+def _change(home: Home, weights: Weights, recorded: torch.Tensor, seed: int) -> float:
+    """Return the mean change of the probability of unrecorded classes in stored samples."""
+    samples = torch.from_numpy(home.parent.weights.scenes)
+    samples = samples[samples.sum(1) >= 2][:256]
+    parts = random_parts(samples, _LEAVE_ONE_OUT, torch.Generator().manual_seed(seed))
+    before, after = (
+        machine_of(side).object_log_odds(parts.listed, share=parts.share).sigmoid()
+        for side in (home.parent.weights, weights)
+    )
+    other = ~recorded & torch.from_numpy(~home.parent.vocabulary.structure)
+    other[home.known[0] :] = False
+    counted = (other & (parts.listed == 0) & (torch.maximum(before, after) > 0.01)).float()
+    change = ((after - before).abs() * counted).sum() / counted.sum().clamp(min=1)
+    return float(change)

@@ -1,0 +1,176 @@
+"""The recorded scenes of a home, in the classes of the model that adapts to it.
+
+A robot records what it sees, also an object that does not belong there. A habit of the home cannot
+be told from a fault without a person. So an unconfirmed scene does not teach the objects that the
+model reports as outliers: they are neither present nor absent there. A confirmed scene teaches all
+its objects.
+
+A label that the model cannot read becomes a new class. It is judged once `JUDGED` scenes show it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+
+from app.questions.outliers import intruders
+from app.registry import Artifact
+from app.scene import ObjectClass, Scene, SceneObject, label_key
+from training.datasets import AnnotatedScene
+from training.datasets.array_types import Ints
+from training.datasets.vocabulary import curated_names
+from training.fit.adapt import HomeScenes
+from training.fit.extend import extended
+
+JUDGED = 3
+"""Number of scenes with a new class from which its objects are judged."""
+
+
+@dataclass(frozen=True)
+class HomeScene:
+    """One recorded scene.
+
+    Attributes:
+        classes: distinct classes without structure, ascending.
+        left_out: those of the classes that teach nothing.
+        room: index of the room type, or None.
+        group: name that near-duplicates share.
+        confirmed: whether a person has confirmed the scene.
+    """
+
+    classes: Ints
+    left_out: Ints
+    room: int | None
+    group: str
+    confirmed: bool
+
+    def question(self, artifact: Artifact) -> Scene:
+        """Return the scene as a request of labels."""
+        return _of_classes(artifact, self.classes, self.room)
+
+
+@dataclass(frozen=True)
+class Home:
+    """The recorded scenes of a home.
+
+    Attributes:
+        parent: the model before it knows the home, with the new classes and room types.
+        known: number of classes and of room types of the model itself.
+        scenes: distinct recorded scenes.
+        recorded: number of recorded scenes, with the repeated ones.
+        left_out: number of unconfirmed scenes in which each label is left out.
+    """
+
+    parent: Artifact
+    known: tuple[int, int]
+    scenes: tuple[HomeScene, ...]
+    recorded: int
+    left_out: Counter[str]
+
+    @classmethod
+    def of(cls, model: Artifact, recorded: Sequence[AnnotatedScene]) -> Home:
+        """Read recorded scenes in the classes of a model. Repeated scenes count once."""
+        parent = _with_new_words(model, recorded)
+        scenes: dict[tuple[object, ...], HomeScene] = {}
+        for scene in recorded:
+            read = _read(parent, scene)
+            key = (read.group, read.room, read.classes.tobytes())
+            if key not in scenes or read.confirmed:
+                scenes[key] = read
+        distinct = tuple(scenes.values())
+        labels = parent.vocabulary.labels
+        left_out = Counter(labels[c] for scene in distinct for c in scene.left_out.tolist())
+        known = len(model.vocabulary), model.spec.C
+        return cls(parent, known, distinct, len(recorded), left_out)
+
+    @property
+    def new_classes(self) -> tuple[str, ...]:
+        """Labels of the classes that the model did not know."""
+        return self.parent.vocabulary.labels[self.known[0] :]
+
+    @property
+    def new_rooms(self) -> tuple[str, ...]:
+        """Room types that the model did not know."""
+        return tuple(self.parent.vocabulary.room_types[self.known[1] :])
+
+    @property
+    def confirmed(self) -> int:
+        """Number of distinct scenes that a person has confirmed."""
+        return sum(scene.confirmed for scene in self.scenes)
+
+    @cached_property
+    def tensors(self) -> HomeScenes:
+        """The scenes for the fit."""
+        shape = len(self.scenes), len(self.parent.vocabulary)
+        v, asked = torch.zeros(shape), torch.ones(shape, dtype=torch.bool)
+        asked &= torch.from_numpy(~self.parent.vocabulary.structure)
+        for row, scene in enumerate(self.scenes):
+            v[row, scene.classes] = 1
+            v[row, scene.left_out] = 0
+            asked[row, scene.left_out] = False
+        rooms = [-1 if scene.room is None else scene.room for scene in self.scenes]
+        return HomeScenes(v, asked, torch.tensor(rooms))
+
+    def confirmed_alarms(self, artifact: Artifact) -> Counter[str]:
+        """Return the classes that a model reports, with the number of their confirmed scenes."""
+        labels, counts = artifact.vocabulary.labels, Counter[str]()
+        for scene in self.scenes:
+            if scene.confirmed and len(scene.classes):
+                alarms = intruders(artifact, scene.question(artifact))
+                counts.update(labels[c] for c in alarms.tolist())
+        return counts
+
+
+def with_exceptions(artifact: Artifact, labels: Iterable[str]) -> Artifact:
+    """Return the model, which never reports objects of these classes."""
+    excused, vocabulary = set(labels), artifact.vocabulary
+    objects = [
+        replace(entry, anywhere=entry.anywhere or entry.label in excused)
+        for entry in vocabulary.objects
+    ]
+    return replace(artifact, vocabulary=replace(vocabulary, objects=objects))
+
+
+def _with_new_words(model: Artifact, recorded: Sequence[AnnotatedScene]) -> Artifact:
+    """Return the model with the labels and room types that it cannot read."""
+    names, vocabulary = curated_names(), model.vocabulary
+    scenes_of: Counter[str] = Counter()
+    rooms: dict[str, str] = {}
+    for scene in recorded:
+        labels = {label_key(thing.label): thing.label for thing in scene.objects}
+        scenes_of.update(
+            {names.canonical(x) for x in labels.values() if vocabulary.look_up(x) is None}
+        )
+        if (room := names.canonical_room(scene.room_type)) and vocabulary.room_index(room) is None:
+            rooms.setdefault(label_key(room), room)
+    excluded = set(map(label_key, (*names.not_objects, *names.structure)))
+    classes = [
+        ObjectClass(label, anywhere=count < JUDGED)
+        for label, count in sorted(scenes_of.items())
+        if label_key(label) and label_key(label) not in excluded
+    ]
+    return extended(model, classes, sorted(rooms.values()) if model.spec.C else ())
+
+
+def _read(parent: Artifact, scene: AnnotatedScene) -> HomeScene:
+    names, vocabulary = curated_names(), parent.vocabulary
+    found = [vocabulary.look_up(thing.label) for thing in scene.objects]
+    classes = np.unique([entry.entry for entry in found if entry is not None]).astype(np.int64)
+    classes = classes[~vocabulary.structure[classes]]
+    name = names.canonical_room(scene.room_type)
+    room = None if name is None or not parent.spec.C else vocabulary.room_index(name)
+    left_out = classes[:0]
+    if not scene.confirmed and len(classes):
+        left_out = intruders(parent, _of_classes(parent, classes, room))
+    return HomeScene(classes, left_out, room, scene.group, scene.confirmed)
+
+
+def _of_classes(artifact: Artifact, classes: Ints, room: int | None) -> Scene:
+    labels = artifact.vocabulary.labels
+    things = tuple(SceneObject(labels[c], labels[c], c) for c in classes.tolist())
+    return Scene(things, room_type=room)

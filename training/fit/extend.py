@@ -1,0 +1,130 @@
+"""Add classes and room types to a model, before the fit to the home where they occur.
+
+New classes follow the known classes, and new room types the known ones. Their weights are 0: such
+a class says nothing about others, and its relations are those of an average pair. The biases make
+it rare. `training.fit.adapt` fits biases and weights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.inference import Weights
+from app.inference.weights import layout, pack_scenes
+from app.registry import Artifact, Calibration, Counts, Offsets, Places
+from app.registry.counts import ROOM
+from app.scene import CANONICAL, ObjectClass, Vocabulary
+
+_RARE: Final = 0.1  # quantile of the known biases that a new class or room type gets
+# Arrays whose new entries are the mean of the known ones.
+_AVERAGED: Final = ("kappa", "u", "usual")
+
+
+def extended(artifact: Artifact, classes: Sequence[ObjectClass], rooms: Sequence[str]) -> Artifact:
+    """Return the model in memory with further classes and room types at the end.
+
+    Raises:
+        ValueError: a name is that of a known class or room type.
+    """
+    if not classes and not rooms:
+        return artifact
+    known = artifact.vocabulary
+    vocabulary = Vocabulary(
+        (*known.objects, *classes), (*known.room_types, *rooms), known.room_aliases
+    )
+    V, C = len(known), len(known.room_types)
+    return replace(
+        artifact,
+        vocabulary=vocabulary,
+        weights=_weights(artifact.weights, len(vocabulary), len(vocabulary.room_types)),
+        calibration=_calibration(artifact.calibration, len(classes), C, len(rooms)),
+        offsets=artifact.offsets and _offsets(artifact.offsets, V, len(vocabulary)),
+        counts=artifact.counts and _counts(artifact.counts, C, len(rooms), len(classes)),
+        places=artifact.places and _places(artifact.places, V, len(vocabulary)),
+    )
+
+
+def _weights(weights: Weights, V: int, C: int) -> Weights:
+    old, spec = weights.spec, replace(weights.spec, V=V, C=C if weights.spec.C else 0)
+    arrays = {
+        name: _padded(weights[name], shape)
+        for name, (_, shape) in layout(spec).items()
+        if name != "fantasies"
+    }
+    arrays["b"][old.V :] = np.quantile(weights["b"], _RARE)
+    if old.C:
+        arrays["e"][old.C :] = np.quantile(weights["e"], _RARE)
+    for name in _AVERAGED:
+        if name in arrays:
+            arrays[name][..., old.V :] = weights[name].mean(-1, keepdims=True)
+    if spec.N:
+        arrays["fantasies"] = pack_scenes(_padded(weights.scenes, (spec.N, V)))
+    return Weights(spec, arrays)
+
+
+def _padded(array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """Return a copy of an array with zeros behind the end of its axes."""
+    return np.pad(array, [(0, new - old) for old, new in zip(array.shape, shape, strict=True)])
+
+
+def _calibration(calibration: Calibration, classes: int, C: int, rooms: int) -> Calibration:
+    update: Mapping[str, Any] = {
+        "popularity": (*calibration.popularity, *[None] * classes),
+        "rare_rooms": (*calibration.rare_rooms, *range(C, C + rooms)),
+    }
+    if calibration.smallest:
+        of_rooms, unknown = calibration.smallest[:-1], calibration.smallest[-1]
+        update = {**update, "smallest": (*of_rooms, *[unknown] * rooms, unknown)}
+    if calibration.room_fit:
+        update = {**update, "room_fit": (*calibration.room_fit, *[0.0] * rooms)}
+    if not calibration.popularity:
+        update = {**update, "popularity": ()}
+    return calibration.model_copy(update=update)
+
+
+def _offsets(offsets: Offsets, old: int, new: int) -> Offsets:
+    A, more = len(offsets.relation), ((0, 0), (0, new - old), (0, 0))
+    return replace(
+        offsets,
+        subject=np.pad(offsets.subject, more),
+        object=np.pad(offsets.object, more),
+        pair=_triple_keys(offsets.pair, old, new, A),
+    )
+
+
+def _triple_keys(keys: NDArray[Any], old: int, new: int, A: int) -> NDArray[Any]:
+    """Return the keys (a V + i) V + j for another number of classes."""
+    a, i, j = np.unravel_index(keys.astype(np.int64), (A, old, old))
+    rekeyed: NDArray[Any] = ((a * new + i) * new + j).astype(keys.dtype)
+    return rekeyed
+
+
+def _counts(counts: Counts, C: int, rooms: int, classes: int) -> Counts:
+    # The columns are the fixed features, the room types and the classes.
+    fixed, of_classes = np.split(counts.weights, [ROOM + C], axis=-1)
+    fixed, of_classes = (
+        np.pad(part, ((0, 0), (0, 0), (0, more)))
+        for part, more in ((fixed, rooms), (of_classes, classes))
+    )
+    return replace(counts, weights=np.concatenate([fixed, of_classes], axis=-1))
+
+
+def _places(places: Places, old: int, new: int) -> Places:
+    def averaged(table: NDArray[Any]) -> NDArray[Any]:
+        mean = table.mean(0, keepdims=True).repeat(new - old, 0)
+        return np.concatenate([table, mean.astype(table.dtype)])
+
+    frequency = np.pad(places.frequency, (0, new - old), constant_values=places.frequency.min())
+    return replace(
+        places,
+        triple=_triple_keys(places.triple, old, new, len(CANONICAL)),
+        role_pair=_triple_keys(places.role_pair, old, new, 1),
+        frequency=frequency,
+        role_anchor=averaged(places.role_anchor),
+        stands=averaged(places.stands),
+    )
