@@ -108,7 +108,7 @@ async def test_others_keep_half_of_their_rate(
     assert not {500, 502} & set(attacker)
     assert beside[200] > least * alone[200]
     median = len(delays) // 2
-    # Without admission control, one client delays health by .5 s. A busy machine delays it by .07 s.
+    # Without admission control, one client delays health by .5 s; a busy machine, by .07 s.
     assert delays[median] < usual[median] + 0.2
 
 

@@ -4,14 +4,14 @@ The weights change little where the home says little. δ is the change of the bi
 Δ is the change of the rows of W of the recorded classes. The fit minimises
 
     sum over recorded scenes of [BCE(hidden classes | listed) - log p(t | listed)]
-    + n · mean over stored samples of BCE(parent's p, p) of the unlisted classes
+    + 2 n · mean over stored samples of the cross-entropy of the parent's answers and the new ones
     + ρ_δ |δ|² + ρ_Δ |Δ|²
 
 - Random parts of the n recorded scenes ask for the rest, as in training (`training.fit.objects`).
-- The second line is distillation: random parts of the samples that the artifact stores ask the
-  parent and the home. Without this line, the machine forgets all other rooms.
-- The parent does not know the new classes and room types (`training.fit.extend`). So they have no
-  part in the distillation, and the prior of their biases is weak.
+- The second line is distillation: random parts of the samples that the artifact stores ask both
+  machines for unlisted classes and room types. Without this line, the machine forgets other rooms.
+- The parent does not know the new classes (`training.fit.extend`). So they have no part in the
+  distillation, and the prior of their biases is weak.
 
 Source of the distillation: Li and Hoiem, "Learning without forgetting" (2016).
 """
@@ -33,6 +33,7 @@ _STEPS = 80
 _RATE = 0.03
 _BATCH, _DISTILLED = 128, 64  # parts in a step: of recorded scenes, and of stored samples
 _LEAVE_ONE_OUT = 0.3
+_DISTILLATION = 2.0  # weight of a part of a stored sample, in parts of recorded scenes
 _ROOM_SHARE = 0.5  # share of the parts that list their room type
 # Precisions of the normal priors: of biases, of biases of new classes, and of other weights.
 _BIAS, _NEW_BIAS, _WEIGHT = 3.0, 0.03, 0.3
@@ -135,7 +136,8 @@ class _Fit:
 
     def step(self) -> None:
         """Update the weights by one batch."""
-        loss = len(self.scenes) * (self._home_loss() + self._distillation()) + self._prior()
+        loss = self._home_loss() + _DISTILLATION * self._distillation()
+        loss = len(self.scenes) * loss + self._prior()
         self._optimiser.zero_grad()
         loss.backward()
         for weight, precision in self._changes.items():
@@ -158,14 +160,18 @@ class _Fit:
     def _distillation(self) -> Tensor:
         index = torch.randint(len(self._samples), (_DISTILLED,), generator=self._generator)
         parts = random_parts(self._samples[index], _LEAVE_ONE_OUT, self._generator)
-        asked = {"room": self._some_rooms(self._sample_rooms[index]), "share": parts.share}
+        room = self._some_rooms(self._sample_rooms[index])
         V = self.known[0]
         p, log_odds = (
-            machine.object_log_odds(parts.listed, **asked)[:, :V]
+            machine.object_log_odds(parts.listed, room=room, share=parts.share)[:, :V]
             for machine in (self.parent, self.machine)
         )
         weight = 1 - parts.listed[:, :V]
         loss = binary_cross_entropy_with_logits(log_odds, p.sigmoid(), weight, reduction="sum")
+        if self.machine.spec.C:
+            listed = parts.listed[room < 0]
+            of_parent, log_p = (side.room_log_p(listed) for side in (self.parent, self.machine))
+            loss = loss - (of_parent.exp() * log_p).sum()
         return loss / _DISTILLED
 
     def _prior(self) -> Tensor:

@@ -1,0 +1,179 @@
+"""New classes and room types of a home, and the fit to it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from app import questions
+from app.inference import MachineSpec, Weights
+from app.registry import Artifact, Store
+from app.scene import ObjectClass, Scene, SceneObject
+from training.fit.adapt import HomeScenes, adapt
+from training.fit.extend import extended
+from training.fit.objects import random_parts
+from training.machines import build
+from training.machines.arrays import machine_of, weights_of
+
+V, C = 12, 3
+
+
+def small(variant: str = "triway", **sizes: int) -> Weights:
+    """A small machine with random weights and stored samples."""
+    sizes = {"K": 2 if variant == "triway" else 0, "coupled": variant == "triway"} | sizes
+    spec = MachineSpec(variant, V=V, A=5, units=3, states=3, C=C, N=40, profiles=2, **sizes)
+    generator = torch.Generator().manual_seed(0)
+    machine = build(spec).initialise(generator, 0.5)
+    with torch.no_grad():
+        machine.b.fill_(-1.0)
+        machine.fantasies.copy_(torch.randint(1, 2**V, (40, 1), generator=generator).int())
+    return weights_of(machine)
+
+
+def scenes_of(*classes: list[int], rooms: list[int] | None = None, size: int = V) -> HomeScenes:
+    v = torch.zeros(len(classes), size)
+    for row, present in zip(v, classes, strict=True):
+        row[present] = 1
+    asked = torch.ones(len(classes), size, dtype=torch.bool)
+    return HomeScenes(v, asked, torch.tensor(rooms or [-1] * len(classes)))
+
+
+HOME = [[0, 1, 2], [0, 1, 3], [0, 1, 2, 3], [0, 1]] * 6
+
+
+@pytest.mark.parametrize("variant", ["rbm", "gbm", "triway"])
+def test_the_home_becomes_likelier_and_other_classes_keep_their_weights(variant):
+    parent, home = small(variant, H2=2 if variant == "gbm" else 0), scenes_of(*HOME)
+    weights = adapt(parent, home)
+    recorded = [0, 1, 2, 3]
+    rest = np.setdiff1d(np.arange(V), recorded)
+    np.testing.assert_array_equal(weights["W"][rest], parent["W"][rest])
+    changed = [name for name in parent.arrays if not np.array_equal(weights[name], parent[name])]
+    assert sorted(changed) == ["W", "b"]
+    listed = torch.zeros(1, V)
+    listed[0, 0] = 1
+    before, after = (
+        machine_of(side).object_log_odds(listed).sigmoid()[0] for side in (parent, weights)
+    )
+    assert after[1] > before[1] + 0.2
+    assert (after[rest] < before[rest] + 0.02).all()
+
+
+def test_the_same_seed_gives_the_same_weights():
+    parent, home = small(), scenes_of(*HOME)
+    first, again, other = (adapt(parent, home, seed=seed) for seed in (3, 3, 4))
+    np.testing.assert_array_equal(first["W"], again["W"])
+    assert not np.array_equal(first["W"], other["W"])
+
+
+def test_a_class_that_is_left_out_keeps_its_log_odds():
+    """Class 5 is neither present nor absent in the scenes, so its bias has no reason to fall."""
+    parent, home = small(), scenes_of(*HOME)
+    asked = home.asked.clone()
+    asked[:, 5] = False
+    shift = [
+        float(adapt(parent, replace(home, asked=mask))["b"][5] - parent["b"][5])
+        for mask in (home.asked, asked)
+    ]
+    assert shift[0] < -0.1
+    assert abs(shift[1]) < 0.5 * abs(shift[0])
+
+
+def test_distillation_keeps_the_answers_about_stored_samples(monkeypatch):
+    """Without it, the rooms of the parent change several times more."""
+    parent, home = small(), scenes_of(*HOME)
+    samples = torch.from_numpy(parent.scenes)
+    samples = samples[samples.sum(1) > 1]
+    parts = random_parts(samples, 0.3, torch.Generator().manual_seed(1))
+
+    def change() -> float:
+        sides = parent, adapt(parent, home)
+        p, q = (machine_of(x).object_log_odds(parts.listed).sigmoid() for x in sides)
+        return float((p - q).abs()[parts.listed == 0].mean())
+
+    kept = change()
+    monkeypatch.setattr("training.fit.adapt._Fit._distillation", lambda _: torch.zeros(()))
+    assert change() > 1.5 * kept
+
+
+def test_a_home_without_pairs_or_a_model_without_samples_is_refused():
+    with pytest.raises(ValueError, match="two known objects"):
+        adapt(small(), scenes_of([0], [1]))
+    spec = replace(small().spec, N=0)
+    arrays = {k: x for k, x in small().arrays.items() if not k.startswith("fantas")}
+    with pytest.raises(ValueError, match="no samples"):
+        adapt(Weights(spec, arrays), scenes_of([0, 1]))
+
+
+# ------------------------------------------------------------------------- new words
+
+
+@pytest.fixture(scope="module", params=["indoor-rbm", "indoor-gbm", "indoor-triway"])
+def model(request, repository) -> Artifact:
+    store = Store(repository / "model_store")
+    return store.load(*store.resolve(request.param))
+
+
+NEW = [ObjectClass("stairlift"), ObjectClass("oxygen concentrator")]
+
+
+def scene(artifact: Artifact, *labels: str, room: str | None = None) -> Scene:
+    words = artifact.vocabulary
+    things = [SceneObject(label, label, words.index(label)) for label in labels]
+    return Scene(tuple(things), room_type=None if room is None else words.room_index(room))
+
+
+def test_known_objects_get_the_same_answers_beside_new_classes(model):
+    larger = extended(model, NEW, ["balcony"])
+    labels = ["bed", "nightstand", "lamp", "pillow", "oven"]
+    for room in (None, "bedroom"):
+        asked = [(side, scene(side, *labels, room=room)) for side in (model, larger)]
+        for question, options, key in (
+            (questions.relations, {"top_k": 50}, "relations"),
+            (questions.outliers, {}, "outliers"),
+            (questions.missing, {"top_k": 20}, "missing"),
+        ):
+            before, after = (question(*each, **options)[key] for each in asked)
+            assert [_close(x) for x in before] == [_close(x) for x in after]
+    before, after = (questions.rooms(s, scene(s, *labels), top_k=3) for s in (model, larger))
+    assert [x["room_type"] for x in before["room_types"]] == [
+        x["room_type"] for x in after["room_types"]
+    ]
+
+
+def _close(value: object) -> object:
+    if isinstance(value, float):
+        return round(value, 3)
+    if isinstance(value, dict):
+        return {key: _close(entry) for key, entry in value.items()}
+    return [_close(entry) for entry in value] if isinstance(value, list) else value
+
+
+def test_a_new_class_is_rare_and_has_relations(model):
+    larger = extended(model, NEW, ["balcony"])
+    seen = scene(larger, "stairlift", "lamp", room="balcony")
+    found = questions.relations(larger, seen, top_k=10)["relations"]
+    assert {entry["subject"] for entry in found} == {"stairlift", "lamp"}
+    ranked = questions.missing(larger, scene(larger, "bed"), top_k=len(larger.vocabulary))
+    p = {entry["label"]: entry["probability"] for entry in ranked["missing"]}
+    assert p["stairlift"] < np.median(list(p.values()))
+
+
+def test_a_new_room_is_recognised_by_its_objects(repository):
+    store = Store(repository / "model_store")
+    model = store.load(*store.resolve("default"))
+    larger = extended(model, (), ["balcony"])
+    words = larger.vocabulary
+    room = words.room_index("balcony")
+    lists = [["deck chair", "flower pot", "watering can"], ["deck chair", "clothespin", "plant"]]
+    classes = [[words.index(label) for label in labels] for labels in lists * 10]
+    home = scenes_of(*classes, rooms=[room] * 20, size=len(words))
+    known = len(words), len(model.vocabulary.room_types)
+    adapted = replace(larger, weights=adapt(larger.weights, home, known=known))
+    answer = questions.rooms(adapted, scene(adapted, "deck chair", "flower pot"), top_k=1)
+    assert answer["room_types"][0]["room_type"] == "balcony"
+    answer = questions.rooms(adapted, scene(adapted, "bed", "nightstand"), top_k=1)
+    assert answer["room_types"][0]["room_type"] == "bedroom"
