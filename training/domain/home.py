@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -51,7 +51,7 @@ class HomeScene:
 
     def question(self, artifact: Artifact) -> Scene:
         """Return the scene as a request of labels."""
-        return _of_classes(artifact, self.classes, self.room)
+        return of_classes(artifact, self.classes, self.room)
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Home:
     known: tuple[int, int]
     scenes: tuple[HomeScene, ...]
     recorded: int
-    left_out: Counter[str]
+    left_out: Counter[str] = field(default_factory=Counter)
 
     @classmethod
     def of(cls, model: Artifact, recorded: Sequence[AnnotatedScene]) -> Home:
@@ -166,11 +166,12 @@ def _read(parent: Artifact, scene: AnnotatedScene) -> HomeScene:
     room = None if name is None or not parent.spec.C else vocabulary.room_index(name)
     left_out = classes[:0]
     if not scene.confirmed and len(classes):
-        left_out = intruders(parent, _of_classes(parent, classes, room))
+        left_out = intruders(parent, of_classes(parent, classes, room))
     return HomeScene(classes, left_out, room, scene.group, scene.confirmed)
 
 
-def _of_classes(artifact: Artifact, classes: Ints, room: int | None) -> Scene:
+def of_classes(artifact: Artifact, classes: Ints, room: int | None) -> Scene:
+    """Return a request with one object of each class, and the index of a room type or None."""
     labels = artifact.vocabulary.labels
     things = tuple(SceneObject(labels[c], labels[c], c) for c in classes.tolist())
     return Scene(things, room_type=room)

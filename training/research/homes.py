@@ -1,0 +1,253 @@
+"""`python -m training homes`: adapt a model to houses that its training never saw.
+
+Each house of `matterport_rooms` with ten or more rooms is a home. Five folds of houses train five
+parents, each without the houses of its fold. A robot visits 70 % of the rooms of a home. Each visit
+sees a random part of a room, 40 to 100 % of its classes. A person confirms the scenes in which the
+parent raises an alarm, because all alarms are false. The command measures, for parent and home:
+
+- the share of later visits with an alarm,
+- the MRR of a class that a later visit does not list,
+- the share of visits to the other rooms with an alarm,
+- the share of alarms about an intruder that was recorded twice without a confirmation.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+import typer
+
+from app.questions.outliers import intruders
+from app.registry import Artifact
+from training.datasets import EncodedScene
+from training.datasets.array_types import Ints, Rng
+from training.domain.adaptation import adapted
+from training.domain.home import Home, HomeScene, of_classes
+from training.evaluation.parts import ALL_BUT_ONE
+from training.evaluation.report import write_whole
+from training.fit.adapt import adapt
+from training.fit.calibrate_objects import calibrate_objects
+from training.fit.draft import placed_draft
+from training.fit.objects import ObjectScenes, served_popularity
+from training.fit.trainer import Trainer
+from training.machines.arrays import machine_of
+from training.research.benchmark import Data, Workers, console
+from training.research.measure import resumable
+from training.runs.config_files import data_folder, load_config
+from training.runs.folder import load_run, save_run
+from training.runs.pipeline import SplitScenes, prepare
+
+_SOURCE = "matterport_rooms"
+_ROOMS = 10  # minimum number of rooms of a home
+_FOLDS = 5
+_VISITED = 0.7
+_LEAST_SHARE = 0.4
+_LATER, _OTHER = 60, 6  # later visits of a home; visits of each other room
+_INTRUDERS, _LOOKS = 2, 15  # intruders of a home, and later visits with each of them
+
+
+@dataclass(frozen=True)
+class Row:
+    """The figures of one home; pairs are (parent, home)."""
+
+    home: str
+    scenes: int
+    alarms: tuple[float, float]
+    mrr: tuple[float, float]
+    other_rooms: tuple[float, float]
+    intruder: tuple[float, float]
+    refused: bool
+
+
+def homes(
+    configuration: Annotated[str, typer.Argument(help="configuration")] = "indoor-triway",
+    scenes: Annotated[list[int] | None, typer.Option(help="recorded scenes of a home")] = None,
+    data: Data = None,
+    folder: Annotated[Path, typer.Option("--folder", help="folder for runs and results")] = Path(
+        "runs/homes"
+    ),
+    workers: Workers = 2,
+) -> None:
+    """Measure `adapt` on houses that the training of the model never saw.
+
+    The command writes results.json into the folder. It trains five models, which takes half an
+    hour on two cores. A second call uses the finished trainings again.
+    """
+    with resumable(console):
+        config = load_config(configuration)
+        root = data_folder(configuration, config, data)
+        measure = partial(measure_fold, configuration, root, folder, scenes or [20])
+        with ProcessPoolExecutor(workers) as pool:
+            rows = [row for part in pool.map(measure, range(_FOLDS)) for row in part]
+        write_whole(folder / "results.json", json.dumps([asdict(row) for row in rows], indent=1))
+        for line in summary(rows):
+            console.print(line, highlight=False)
+
+
+def summary(rows: Sequence[Row]) -> Iterator[str]:
+    """Yield the means over homes, for each number of recorded scenes."""
+    for count in sorted({row.scenes for row in rows}):
+        part = [row for row in rows if row.scenes == count]
+        worse = sum(row.alarms[1] > row.alarms[0] or row.mrr[1] < row.mrr[0] for row in part)
+        yield (
+            f"{count} scenes, {len(part)} homes; refused: {sum(row.refused for row in part)}, "
+            f"worse: {worse}"
+        )
+        for name in ("alarms", "mrr", "other_rooms", "intruder"):
+            before, after = np.mean([getattr(row, name) for row in part], axis=0)
+            yield f"  {name:12} {before:.3f} → {after:.3f}"
+
+
+def measure_fold(
+    configuration: str, root: Path, folder: Path, counts: Sequence[int], fold: int
+) -> list[Row]:
+    """Train the parent of a fold, unless it is trained, and adapt it to each home of the fold."""
+    torch.set_num_threads(1)
+    scenes = prepare(load_config(configuration), root)
+    rooms: dict[str, list[EncodedScene]] = {}
+    for part in scenes.parts.values():
+        for scene in part:
+            if scene.source == _SOURCE:
+                rooms.setdefault(scene.group, []).append(scene)
+    names = sorted(name for name, own in rooms.items() if len(own) >= _ROOMS)[fold::_FOLDS]
+    parent = _parent(configuration, scenes, names, folder / f"fold-{fold}")
+    return [_measure(parent, name, rooms[name], count) for name in names for count in counts]
+
+
+def _parent(
+    configuration: str, scenes: SplitScenes, homes: Sequence[str], folder: Path
+) -> Artifact:
+    """Return the model that is trained without the homes, with calibrated answers about objects."""
+    parts = {
+        name: [scene for scene in part if scene.group not in homes]
+        for name, part in scenes.parts.items()
+    }
+    rest = replace(scenes, parts=parts)
+    config, data = load_config(configuration), rest.training_data()
+    if not (folder / "result.json").is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        trainer = Trainer(config, data, folder)
+        trainer.resume()
+        save_run(folder, config, trainer.run())
+    draft = placed_draft(load_run(folder).machine, data)
+    learnt = ObjectScenes.of(data.train, data.structure, config.objects)
+    popularity = served_popularity(learnt, config.objects)
+    served = config.objects.served_sources
+    calibration = calibrate_objects(draft, data.validation, data.train, popularity, served)
+    return replace(draft, calibration=calibration)
+
+
+def _measure(parent: Artifact, name: str, rooms: Sequence[EncodedScene], count: int) -> Row:
+    structure = parent.vocabulary.structure
+    rng = np.random.default_rng([zlib.crc32(name.encode()), count])
+    classes = [(s.evidence.classes[~structure[s.evidence.classes]], s.room_type) for s in rooms]
+    classes = [entry for entry in classes if len(entry[0]) >= 3]
+    order = rng.permutation(len(classes))
+    visited = [classes[k] for k in order[: max(1, round(_VISITED * len(order)))]]
+    others = [classes[k][0] for k in order[len(visited) :]]
+
+    def visit() -> tuple[Ints, Ints, int]:
+        room, kind = visited[rng.integers(len(visited))]
+        return _part(room, rng), room, kind
+
+    recorded = [visit() for _ in range(count)]
+    later = [visit()[:2] for _ in range(_LATER)]
+    seen_elsewhere = [_part(room, rng) for room in others for _ in range(_OTHER)]
+    home = _home(parent, [(part, kind) for part, _, kind in recorded])
+    result = adapted(home)
+    sides = parent, result.artifact or parent
+    lists = [part for part, _ in later]
+    return Row(
+        home=name,
+        scenes=count,
+        alarms=_pair(sides, partial(_alarm_share, lists=lists)),
+        mrr=_pair(sides, partial(_mrr, visits=later)),
+        other_rooms=_pair(sides, partial(_alarm_share, lists=seen_elsewhere)),
+        intruder=_intruder(home, lists, np.unique(np.concatenate([c for c, _ in classes])), rng),
+        refused=bool(result.objections),
+    )
+
+
+def _part(room: Ints, rng: Rng) -> Ints:
+    """Return a random part of the classes of a room, ascending."""
+    count = max(2, round(len(room) * rng.uniform(_LEAST_SHARE, 1)))
+    return np.sort(rng.permutation(room)[:count])
+
+
+def _home(
+    parent: Artifact, visits: Sequence[tuple[Ints, int]], unconfirmed: Sequence[Ints] = ()
+) -> Home:
+    """Return the recordings. A person has confirmed the visits that raise an alarm."""
+    scenes = []
+    for number, (classes, room) in enumerate([*visits, *((part, -1) for part in unconfirmed)]):
+        kind = None if room < 0 else room
+        alarms = intruders(parent, of_classes(parent, classes, kind))
+        confirmed = number < len(visits) and len(alarms) > 0
+        left_out = alarms[:0] if confirmed else alarms
+        scenes.append(HomeScene(classes, left_out, kind, f"visit-{number}", confirmed))
+    return Home(parent, (parent.spec.V, parent.spec.C), tuple(scenes), len(scenes))
+
+
+Sides = tuple[Artifact, Artifact]
+
+
+def _pair(sides: Sides, figure: Callable[[Artifact], float]) -> tuple[float, float]:
+    return figure(sides[0]), figure(sides[1])
+
+
+def _alarm_share(side: Artifact, lists: Sequence[Ints], about: int | None = None) -> float:
+    """Return the share of lists with an alarm, or with an alarm about a class."""
+    alarms = [intruders(side, of_classes(side, part, None)) for part in lists]
+    return float(np.mean([len(one) > 0 if about is None else about in one for one in alarms]))
+
+
+@torch.no_grad()
+def _mrr(side: Artifact, visits: Sequence[tuple[Ints, Ints]]) -> float:
+    """Return the MRR of the last class of each visit, given its other classes."""
+    machine, structure = (
+        machine_of(side.weights),
+        torch.from_numpy(side.vocabulary.structure.copy()),
+    )
+    ranks = []
+    for part, room in visits:
+        listed = torch.zeros(1, side.spec.V)
+        listed[0, part[:-1]] = 1
+        log_odds = machine.object_log_odds(listed, share=torch.tensor([ALL_BUT_ONE]))[0]
+        others = np.setdiff1d(room, part[-1:])  # other classes of the room are no errors
+        log_odds[others] = log_odds[structure] = -torch.inf
+        ranks.append(1 / (1 + int((log_odds > log_odds[int(part[-1])]).sum())))
+    return float(np.mean(ranks))
+
+
+def _intruder(home: Home, lists: Sequence[Ints], own: Ints, rng: Rng) -> tuple[float, float]:
+    """Return the mean share of alarms about classes that the home does not have.
+
+    Each class is recorded twice, without a confirmation. The parent reports the class in at least
+    one of the visits.
+    """
+    parent = home.parent
+    shares: list[tuple[float, float]] = []
+    strange = np.setdiff1d(np.flatnonzero(parent.vocabulary.judged), own)
+    while len(shares) < _INTRUDERS:
+        intruder = int(rng.choice(strange))
+        seen = [np.union1d(part, [intruder]) for part in lists[:_LOOKS]]
+        if not (before := _alarm_share(parent, seen, intruder)):
+            continue
+        twice = [np.union1d(part, [intruder]) for part in lists[-2:]]
+        confirmed = [
+            (scene.classes, -1 if scene.room is None else scene.room) for scene in home.scenes
+        ]
+        tensors = _home(parent, confirmed, twice).tensors
+        after = replace(parent, weights=adapt(parent.weights, tensors))
+        shares.append((before, _alarm_share(after, seen, intruder)))
+    before, after = np.mean(shares, axis=0).tolist()
+    return before, after
