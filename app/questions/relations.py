@@ -291,7 +291,7 @@ def _pairs(request: RelationsRequest, reading: Reading) -> list[tuple[int, int]]
 
 _NO_RELATIONS: Final = SceneWarning(
     code="not-judged",
-    message="The training scenes of this model have no relations.",
+    message="the training scenes of this model have no relations",
     objects=[],
 )
 
