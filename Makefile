@@ -62,6 +62,7 @@ checks: $(EVERYTHING)
 	$(BIN)/python -m ruff check --quiet .; \
 	$(BIN)/python -m ruff format --quiet --check .; \
 	$(BIN)/python -m mypy --no-error-summary; \
+	$(BIN)/python -m mypy --no-error-summary --python-version 3.10 --follow-imports silent clients/python/scene_client; \
 	$(BIN)/lint-imports --no-logo; \
 	wait $$compiling
 

@@ -116,6 +116,11 @@ class MachineSpec:
     profiles: int = 0
     coupled: bool = False
 
+    @property
+    def judges_relations(self) -> bool:
+        """Whether the machine has weights of relations."""
+        return self.K > 0 or self.T > 0
+
     def __post_init__(self) -> None:
         if self.variant not in VARIANTS:
             raise ValueError(f"variant must be one of {get_args(Variant)}, not {self.variant!r}")

@@ -31,7 +31,7 @@ from app.questions.reading import Reading, Triple
 from app.registry.artifact import Artifact
 from app.scene.relations import ON_TOP, SUPPORTS, canonicalise, opposite, relation_names
 from app.scene.scene import Scene, instance_evidence
-from scene_client.schemas import RelationsAnswer, RelationsRequest
+from scene_client.schemas import RelationsAnswer, RelationsRequest, SceneWarning
 
 EXPECTED = 0.5
 """Minimum probability of the expected relation of a disagreement.
@@ -76,6 +76,8 @@ def relations(
         The fields `relations` and `disagreements` of `scene_client.schemas.RelationsAnswer`. The
         likeliest relation comes first. The disagreement with the largest ratio of `probability` to
         `observed_probability` comes first. Entries with equal values are ordered by their indices.
+        If the training scenes of the model have no relations, the answer lists observed relations
+        only. Then the field `warnings` says so.
 
     Raises:
         ValueError: top_k is below 1, the probability is outside [0, 1], or a pair does not consist
@@ -109,12 +111,13 @@ def relations(
         count = len(p) + 2 * len(disagreements)
         size_limit.check("top_k", (count, RELATION_BYTES, 2))
     names, observed, things = relation_names(A), set(scene.relations or ()), scene.objects
+    judges = artifact.spec.judges_relations
     entries: list[Fields] = []
     for subject, object_, kind, probability, own in zip(*columns, expected, strict=True):
-        if probability < min_probability:
-            continue
         ends = (subject, object_) if kind < A else (object_, subject)
         is_observed = (kind % A, *ends) in observed
+        if probability < min_probability or not (judges or is_observed):
+            continue
         entry: Fields = {
             "subject": things[subject].id,
             "relation": names[kind],
@@ -122,10 +125,11 @@ def relations(
             "probability": probability,
             "observed": is_observed,
         }
-        if is_observed:
+        if is_observed and judges:
             entry["expected"] = own
         entries.append(entry)
-    return {"relations": entries, "disagreements": disagreements}
+    warnings = [] if judges else [_NO_RELATIONS]
+    return {"relations": entries, "disagreements": disagreements, "warnings": warnings}
 
 
 def _evidence(artifact: Artifact, posterior: Posterior, scene: Scene) -> NDArray[np.float32]:
@@ -284,6 +288,12 @@ def _pairs(request: RelationsRequest, reading: Reading) -> list[tuple[int, int]]
     errors.raise_any()
     return list(pairs)
 
+
+_NO_RELATIONS: Final = SceneWarning(
+    code="not-judged",
+    message="the training scenes of this model have no relations",
+    objects=[],
+)
 
 _EXAMPLES: Final = {
     **SCENES,

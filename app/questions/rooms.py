@@ -105,7 +105,7 @@ def _read(request: RoomsRequest, _: Artifact, reading: Reading) -> Options:
 
 _NO_ROOM_TYPES: Final = SceneWarning(
     code="not-judged",
-    message="The training scenes of this model have no room types.",
+    message="the training scenes of this model have no room types",
     objects=[],
 )
 

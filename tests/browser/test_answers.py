@@ -119,6 +119,37 @@ def test_the_menu_of_an_object_asks_what_is_missing_there(
     assert all("no likely place" in row for row in bedroom.rows("missing"))
 
 
+def test_a_model_of_labels_alone_shows_a_scene_and_says_what_it_does_not_judge(
+    open_board: OpenBoard,
+) -> None:
+    objects = ["bed", "lamp", "desk"]
+    board = open_board(scene=None, examples=[{"name": "A room", "scene": {"objects": objects}}])
+    board.settle()
+    places = [tuple((board.thing(name).bounding_box() or {}).values()) for name in objects]
+    assert len(set(places)) == 3
+    note = {"code": "not-judged", "message": "the model does not judge it", "objects": []}
+
+    def of_labels(answer: Any) -> Any:
+        """The answer of a model whose few training scenes have no relations."""
+        lists = {key: [] for key in answer.keys() & {"relations", "outliers", "misplaced"}}
+        missing = [one | {"placements": []} for one in answer.get("missing", [])]
+        kept = {name: value for name, value in answer.items() if name != "threshold"}
+        return kept | lists | ({"missing": missing} if missing else {"warnings": [note]})
+
+    for question in ("missing", "outliers", "relations"):
+        board.alter(question, of_labels)
+    board.add("chair")
+    rows = board.rows("missing")
+    assert rows
+    assert not any("place" in row for row in rows)
+    for tab in ("Wrong", "Relations"):
+        board.tab(tab)
+        words = board.page.get_by_role("tabpanel", name=tab).inner_text()
+        assert "Note: the model does not judge it." in words
+        assert "NaN" not in words
+        assert "is likely" not in words
+
+
 def test_outliers_are_marked_with_reasons_in_words(bedroom: Board, api: httpx.Client) -> None:
     bedroom.tab("Wrong")
     answer = ask(api, "outliers", bedroom.scene)

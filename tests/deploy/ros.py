@@ -62,6 +62,7 @@ class Ros:
         publishers: publisher of each topic.
         timers: (period in seconds, callback).
         spun: nodes that the program has run.
+        warned: warnings that the node logs.
     """
 
     given: dict[str, Any]
@@ -70,6 +71,7 @@ class Ros:
     publishers: dict[str, Publisher] = field(default_factory=dict)
     timers: list[tuple[float, Callable[[], None]]] = field(default_factory=list)
     spun: list[Any] = field(default_factory=list)
+    warned: list[str] = field(default_factory=list)
     destroyed: bool = False
 
     def node_type(self) -> type:
@@ -93,6 +95,9 @@ class Ros:
 
             def create_timer(self, period: float, callback: Callable[[], None]) -> None:
                 ros.timers.append((period, callback))
+
+            def get_logger(self) -> Any:
+                return SimpleNamespace(warning=ros.warned.append)
 
             def get_clock(self) -> Any:
                 stamp = blank(STORE, "builtin_interfaces/msg/Time", sec=77)

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.system
         "promtool check config --syntax-only deploy/kubernetes/monitoring/scrape.yaml",
         "haproxy -c -dW -f deploy/haproxy/haproxy.cfg",  # -dW: a warning is an error
         "hadolint --failure-threshold=style Dockerfile",
-        "shellcheck .ci/run",
+        "shellcheck .ci/run examples/adapt.sh examples/curl.sh",
         "check-jsonschema --builtin-schema=vendor.compose-spec docker-compose.yml",
     ],
 )

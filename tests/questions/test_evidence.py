@@ -6,10 +6,18 @@ from dataclasses import replace
 
 import pytest
 
+from app import questions
 from app.scene import Scene, SceneObject, observe
 from app.scene.relations import ABOVE, CANONICAL, INSIDE, LEFT, ON_TOP
 from tests.questions.answers import relations
-from tests.questions.artifacts import LABELS, larger_artifact, scene_of
+from tests.questions.artifacts import (
+    LABELS,
+    LARGER,
+    artifact_of,
+    larger_artifact,
+    random_machine,
+    scene_of,
+)
 
 ARTIFACT = larger_artifact("triway-states", scale=1.5)
 A = len(CANONICAL)
@@ -112,3 +120,17 @@ def test_boxes_exclude_stacked_relations_in_both_directions(stated):
         assert answer["above", 2, 3].observed
         assert answer["above", 2, 3].probability == 1
         assert answer["above", 3, 2].probability <= 0.0100001
+
+
+def test_a_model_without_relations_states_the_observed_ones_only():
+    spec = replace(LARGER["rbm"], T=0)
+    artifact = artifact_of(random_machine(spec, 0.7))
+    for stated, expected in ((None, []), ([(2, 1, 0)], [("on-top", True)])):
+        answer = questions.relations(artifact, scene_of([2, 1, 3], stated))
+        found = [(entry["relation"], entry["observed"]) for entry in answer["relations"]]
+        assert found == expected
+        assert all("expected" not in entry for entry in answer["relations"])
+        assert answer["disagreements"] == []
+        (warning,) = answer["warnings"]
+        assert warning.code == "not-judged"
+    assert questions.relations(larger_artifact("rbm"), scene_of([2, 1]))["warnings"] == []

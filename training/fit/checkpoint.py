@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import csv
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import torch
 
@@ -85,20 +86,35 @@ def write_csv(path: Path, curve: Sequence[CurvePoint]) -> None:
         writer.writerows(map(astuple, curve))
 
 
+SCORES: Final = {"objects": "MRR of hidden classes", "relations": "R-precision of relations"}
+"""Name of the validation score of each phase."""
+
+
 def write_plot(path: Path, curve: Sequence[CurvePoint], title: str) -> None:
-    """Plot loss and validation score of both phases."""
+    """Plot the loss and the validation score of each phase.
+
+    No score chooses a point: a phase has a fixed length, and the model keeps average weights. The
+    last score is that of the kept weights, and has a mark.
+    """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9, 3.2), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    scores = {"objects": "MRR of hidden classes", "relations": "R-precision of relations"}
-    for phase, score in scores.items():
+    phases = [phase for phase in SCORES if any(point.phase == phase for point in curve)]
+    figure = Figure(figsize=(4.5 * len(phases), 4.8), layout="constrained")
+    for (above, below), phase in zip(
+        figure.subplots(2, len(phases), squeeze=False, sharex=True).T, phases, strict=True
+    ):
         points = [point for point in curve if point.phase == phase]
-        done = [point.done for point in points]
-        left.plot(done, [point.loss for point in points], marker=".", label=phase)
-        right.plot(done, [point.score for point in points], marker=".", label=score)
-    for axis, title in ((left, "loss"), (right, "validation score")):
-        axis.set(xlabel="finished share of the phase", title=title)
-        axis.legend()
-    figure.suptitle(title)
+        done, scores = [point.done for point in points], [point.score for point in points]
+        above.plot(done, [point.loss for point in points], marker=".")
+        above.set(title=phase, ylabel="training loss")
+        below.set(xlabel="finished share of the phase", ylabel=SCORES[phase])
+        below.set(xlim=(0, 1.04), ylim=(0, 1.04))
+        if math.isnan(scores[-1]):
+            below.text(0.5, 0.5, "no validation scenes", ha="center", transform=below.transAxes)
+            continue
+        below.plot(done, scores, marker=".", color="C1", label="validation score")
+        kept = f"kept weights (average): {scores[-1]:.3f}"
+        below.plot(done[-1:], scores[-1:], "*", color="C3", markersize=13, label=kept)
+        below.legend(loc="best")
+    figure.suptitle(f"{title}: fixed length, no score chooses a point")
     figure.savefig(path, dpi=120)

@@ -36,6 +36,9 @@ function notes({ warnings = [] }, state, column, name) {
   ].join(' ');
 }
 
+/** Whether the model answers a question: the training scenes of a model may have no relations. */
+const judges = (answer) => !answer?.warnings?.some(({ code }) => code === 'not-judged');
+
 const row = (kind, words, probability, flag, ...more) =>
   el('li', { class: flag.kind ?? '' },
     el('div', { class: 'headline' }, words, flag.words ? el('span', { class: 'flag' }, flag.words) : null,
@@ -45,6 +48,7 @@ const row = (kind, words, probability, flag, ...more) =>
 const ROWS = {
   missing(answer, name, state, store, column) {
     const ghosts = new Map(column === state.shown ? ghostsOf(state).map((ghost) => [ghost.label, ghost]) : []);
+    const nowhere = judges(state.answers[column].relations?.answer) ? 'no likely place' : '';
     const rows = likely(state.answers[column], state.at).map(({ label, probability, placements, because = [] }) => {
       const ghost = ghosts.get(label);
       const first = placements.slice(0, PLACES);
@@ -60,7 +64,7 @@ const ROWS = {
         onclick: ({ detail }) => detail < 2 && accept(store, ghost),
       }, '+');
       return [probability, row('missing', el('b', {}, label), probability, { button },
-        el('p', { class: 'quiet' }, places.join(' · ') || 'no likely place'), reasons(because, name))];
+        el('p', { class: 'quiet' }, places.join(' · ') || nowhere), reasons(because, name))];
     });
     // An answer about chosen classes also has improbable instances.
     const further = answer.more.filter((one) => one.probability >= 0.5).map((one) =>
@@ -184,9 +188,9 @@ export function createColumns(store, parents, askKey) {
     const waiting = status === 'down' ? 'Waiting for the service.' : whyNot(state, question, model);
     const shared = question === 'missing' && column === 0 && common(state);
     own.note.textContent = [
-      question === 'outliers' && answer ? `An object raises an alarm from ${percent(answer.threshold)}.` : '',
+      question === 'outliers' && answer?.threshold !== undefined ? `An object raises an alarm from ${percent(answer.threshold)}.` : '',
       shared ? `Both models answer about their ${shared.length} common classes.` : '',
-      notes(answer ?? {}, state, column, name), rows.length ? '' : answer ? NOTHING[question] : waiting,
+      notes(answer ?? {}, state, column, name), rows.length || !judges(answer) ? '' : answer ? NOTHING[question] : waiting,
     ].filter(Boolean).join(' ');
     own.calls.show(question, entry.body);
   }

@@ -59,7 +59,7 @@ export function createGeneration(form, drawn, store, say) {
     const relations = scene.relations.map((one) => el('li', {}, `${one.subject} ${SPOKEN[one.relation]} ${one.object}`));
     shown.detail.replaceChildren(
       el('ul', { class: 'chips' }, ...scene.objects.map((label) => el('li', {}, label))),
-      el('details', {}, el('summary', {}, `${relations.length} relations`), el('ul', {}, ...relations)));
+      relations.length ? el('details', {}, el('summary', {}, `${relations.length} relations`), el('ul', {}, ...relations)) : '');
     shown.calls.show('generate', body);
     store.set({ draft: draftOf(state, scene, state.things.filter(({ id }) => ids.has(id))), selected: null });
     say(`Generated: ${scene.objects.length} objects. ${scene.objects.join(', ')}.`);

@@ -5,12 +5,13 @@ from __future__ import annotations
 import copyreg
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from email.utils import parsedate_to_datetime
 from http.client import responses
-from typing import Any, Final, Self
+from typing import Any, Final
 
 from pydantic import ValidationError
+from typing_extensions import Self
 
 from scene_client.schemas import Failure, FieldError, Problem
 
@@ -150,8 +151,8 @@ def _seconds(retry_after: str) -> float | None:
     with suppress(ValueError):
         moment = parsedate_to_datetime(retry_after)
         if moment.tzinfo is None:
-            moment = moment.replace(tzinfo=UTC)
-        return max(0.0, (moment - datetime.now(UTC)).total_seconds())
+            moment = moment.replace(tzinfo=timezone.utc)
+        return max(0.0, (moment - datetime.now(timezone.utc)).total_seconds())
     return None
 
 

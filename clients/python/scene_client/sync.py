@@ -6,9 +6,10 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable
 from time import monotonic
-from typing import Self, Unpack, overload
+from typing import overload
 
 import httpx
+from typing_extensions import Self, Unpack
 
 from scene_client import calls, schemas
 from scene_client.calls import Call, Scene, T

@@ -12,7 +12,7 @@ setup(
         (f"share/{NAME}/launch", ["launch/scene.launch.py"]),
         (f"share/{NAME}/config", ["config/scene.yaml"]),
     ],
-    install_requires=["setuptools", "scene-boltzmann"],
+    install_requires=["setuptools", "scene-client"],
     zip_safe=True,
     description="Asks a scene-reasoning service about a robot's detections",
     entry_points={"console_scripts": [f"scene = {NAME}.node:main"]},

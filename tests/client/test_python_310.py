@@ -1,0 +1,121 @@
+"""The client on Python 3.10, the Python of ROS 2 Humble.
+
+`make checks` types the client for Python 3.10 everywhere. These tests need an interpreter, and
+install the client as a robot does.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from app.questions import QUESTIONS
+from tests.conftest import REPOSITORY, run_program
+from tests.services import LiveService
+
+pytestmark = [pytest.mark.slow, pytest.mark.system]
+
+PROGRAM = """
+import asyncio, importlib, json, pkgutil, sys
+import scene_client
+from scene_client import AsyncClient, Client, ClientError
+
+assert sys.version_info[:2] == (3, 10)
+for module in pkgutil.walk_packages(scene_client.__path__, "scene_client."):
+    if not module.name.endswith("__main__"):
+        importlib.import_module(module.name)
+
+
+async def ask(url, question, request):
+    async with AsyncClient(url, timeout=30) as client:
+        return await getattr(client, question)(**request)
+
+
+with Client(sys.argv[1], timeout=30) as client:
+    for question, request in json.load(sys.stdin):
+        try:
+            answer = getattr(client, question)(**request)
+            assert answer.model_dump(exclude={"request_id"}) == asyncio.run(
+                ask(sys.argv[1], question, request)
+            ).model_dump(exclude={"request_id"})
+            print(answer.model_dump_json(exclude_unset=True))
+        except ClientError as error:
+            print(json.dumps(str(error)))
+"""
+NODE = """
+import json, sys
+from pathlib import Path
+from scene_client import Client
+
+package = Path("clients/ros2/scene_reasoning/scene_reasoning")
+for module in package.glob("*.py"):
+    compile(module.read_text("utf-8"), str(module), "exec")
+sys.path.insert(0, str(package.parent))
+from scene_reasoning.advisor import Advisor
+from scene_reasoning.ghosts import ghosts
+from scene_reasoning.latest import Latest
+
+message = json.loads(Path("clients/ros2/detections.json").read_text("utf-8"))
+with Client(sys.argv[1], timeout=30) as client:
+    latest = Latest(Advisor(client).advise)
+    latest.see(message)
+    while (outcome := latest.tick()) is None:
+        pass
+    latest.close()
+advice = outcome.future.result()
+print(json.dumps([sorted(advice.answers), len(ghosts(advice, 3))]))
+"""
+
+
+@pytest.fixture(scope="module")
+def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Python 3.10 with the client and its packages, in an environment of its own."""
+    pyenv = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv")
+    installed = sorted(pyenv.glob("versions/3.10.*/bin/python3.10"))
+    found = installed[0] if installed else shutil.which("python3.10")
+    if found is None:
+        pytest.skip("Python 3.10 is not installed")
+    folder = tmp_path_factory.mktemp("python310")
+    # A copy: pip leaves its build folder in the source.
+    ignored = shutil.ignore_patterns("build", "*.egg-info")
+    source = shutil.copytree(REPOSITORY / "clients/python", folder / "source", ignore=ignored)
+    run_program(found, "-m", "venv", folder / "venv")
+    program = folder / "venv/bin/python"
+    pip = ("-m", "pip", "--disable-pip-version-check", "install", "-qq")
+    run_program(program, *pip, source, timeout=300)
+    return program
+
+
+def run(python: Path, *arguments: str, **options: Any) -> list[Any]:
+    """The lines of JSON that a program prints."""
+    plain = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    done = run_program(python, "-W", "error", *arguments, env=plain, **options)
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def test_the_answers_are_those_of_the_service(python: Path, live: LiveService) -> None:
+    requests = [
+        (question.name, case.value | ({"seed": 7} if question.name == "generate" else {}))
+        for question in QUESTIONS
+        for case in question.examples.values()
+        if case.problem is None
+    ]
+    refused = ("missing", {"objects": ["bed", "nightstnad"]})
+    *answers, problem = run(python, "-c", PROGRAM, live.url, input=json.dumps([*requests, refused]))
+    assert {question for question, _ in requests} == {question.name for question in QUESTIONS}
+    for (question, request), answer in zip(requests, answers, strict=True):
+        expected = live.client.post(f"/{question}", json=request).json()
+        assert answer == expected | {"request_id": answer["request_id"]}
+    assert "nightstand" in problem
+
+
+def test_the_command_and_the_parts_of_the_node_work(python: Path, live: LiveService) -> None:
+    scene = ("-m", "scene_client", "missing", "bed", "lamp", "--json", "--url", live.url)
+    done = run_program(python, *scene)
+    assert json.loads(done.stdout)["missing"]
+    assert run(python, "-c", NODE, live.url) == [[["missing", "outliers"], 3]]

@@ -1,0 +1,111 @@
+"""The programs of `examples/`, each with the shipped models."""
+
+from __future__ import annotations
+
+import json
+import os
+import runpy
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.conftest import REPOSITORY, run_program
+from tests.deploy.ros import Ros, from_json
+from tests.services import LiveService, wait_until
+
+pytestmark = pytest.mark.system
+
+EXAMPLES = REPOSITORY / "examples"
+
+
+def run(*command: str | Path, url: str, **options: Any) -> Any:
+    """Run a program of the folder with the address of a service."""
+    return run_program(*command, cwd=EXAMPLES, env=os.environ | {"SCENE_URL": url}, **options)
+
+
+def test_the_readme_lists_every_program() -> None:
+    listed = (EXAMPLES / "README.md").read_text("utf-8")
+    for path in EXAMPLES.iterdir():
+        if path.is_file() and path.name != "README.md":
+            assert f"]({path.name})" in listed
+            assert path.suffix == ".ipynb" or len(path.read_text("utf-8").splitlines()) <= 60
+
+
+def test_curl_asks_the_five_questions(
+    shipped: LiveService, require_system_tool: Callable[[str], Path]
+) -> None:
+    require_system_tool("curl")
+    done = run(require_system_tool("bash"), "curl.sh", url=shipped.url)
+    lines = done.stdout.splitlines()
+    answers = dict(zip(lines[::2], map(json.loads, lines[1::2]), strict=True))
+    assert list(answers) == ["relations", "missing", "outliers", "rooms", "generate"]
+    assert answers["relations"]["relations"][0]["relation"] == "on-top"
+    assert "lamp" in {thing["label"] for thing in answers["missing"]["missing"]}
+    wrong = [thing["object"] for thing in answers["outliers"]["outliers"] if thing["is_outlier"]]
+    assert wrong == ["toilet"]
+    assert answers["rooms"]["room_types"][0]["room_type"] == "bathroom"
+    assert {"desk", "bed"} <= set(answers["generate"]["scenes"][0]["objects"])
+
+
+def test_curl_ends_with_the_error_of_the_service(
+    require_system_tool: Callable[[str], Path],
+) -> None:
+    require_system_tool("curl")
+    done = run(require_system_tool("bash"), "curl.sh", url="http://127.0.0.1:9", status=7)
+    assert "127.0.0.1" in done.stderr
+
+
+def test_the_python_program_asks_and_branches_on_errors(shipped: LiveService) -> None:
+    printed = run(sys.executable, "ask.py", url=shipped.url).stdout.splitlines()
+    said = dict(line.split(": ", 1) for line in printed)
+    assert said["read as"] == "{'moniter': 'monitor'}"
+    assert said["left out"] == "['qwzx']"
+    assert said["relations"] == "[('lamp_1', 'on-top', 'desk_1')]"
+    assert "mouse" in said["missing on the desk"]
+    assert said["outliers"] == "['toilet']"
+    assert said["room"] == "office"
+    assert "desk" in said["a whole room"]
+    assert "nightstand" in said["unknown label at #/objects/1"]
+
+
+def test_the_python_program_reports_a_missing_service() -> None:
+    done = run(sys.executable, "ask.py", url="http://127.0.0.1:9", status=1)
+    assert done.stderr.startswith("no answer: ")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_the_behaviour_tree_says_why_its_conditions_fail(shipped: LiveService) -> None:
+    printed = run(sys.executable, "behaviour_tree.py", url=shipped.url).stdout.splitlines()
+    assert printed[0].startswith("fits: toilet_1: an outlier with probability 0.9")
+    assert printed[1].startswith("complete: missing: computer")
+
+
+def test_the_ros_node_publishes_outliers_and_logs_errors(
+    shipped: LiveService, repository: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorded = json.loads((repository / "clients/ros2/detections.json").read_text("utf-8"))
+    message = from_json("vision_msgs/msg/Detection3DArray", recorded["msg"])
+    for url in (shipped.url, "http://127.0.0.1:9"):
+        ros = Ros({})
+        for name, module in ros.modules().items():
+            monkeypatch.setitem(sys.modules, name, module)
+        monkeypatch.setenv("SCENE_URL", url)
+        runpy.run_path(str(EXAMPLES / "ros2_node.py"), run_name="__main__")
+        (node,) = ros.spun
+        kind, callback = ros.subscriptions["detections"]
+        assert kind.ros_name == message.__msgtype__
+        node.scene.options = replace(node.scene.options, timeout=30.0)  # the machine is busy
+        callback(message)
+        sent = ros.publishers["~/outliers"].sent
+        wait_until(lambda sent=sent, ros=ros: sent or ros.warned)
+        node.thread.shutdown()
+        node.scene.close()
+        if url == shipped.url:
+            assert [published.data for published in sent] == ["toilet_1"]
+        else:
+            assert not sent
+            assert ros.warned[0].startswith("UnreachableError: ")
