@@ -1,32 +1,51 @@
 /** The dialog with the scene as text, to copy it, store it in a file or share it as a link. */
 
+import { labelsOf } from './class_ids.js';
 import { copy } from './dom.js';
-import { scenesIn } from './importing.js';
+import { MOST_BYTES, scenesIn } from './importing.js';
 import { sizesOf } from './questions.js';
 import { SceneError, toScene } from './scene.js';
 import { toHash } from './share.js';
 
-/** @param {(scene: object) => void} put puts a scene on the board; throws SceneError */
+const SOME = 3; // notes that the page shows
+
+/** @param {(scene: object, notes: string) => void} put puts a scene on the board; throws SceneError */
 export function fileDialog(store, put, say) {
   const get = (id) => document.getElementById(id);
-  const [dialog, area, error, done, which] = ['file', 'json', 'json-error', 'share-done', 'which'].map(get);
+  const [dialog, area, error, done, which, map, names] =
+    ['file', 'json', 'json-error', 'share-done', 'which', 'label-map', 'label-names'].map(get);
   const scene = () => toScene(store.get(), sizesOf(store.get(), store.get().models[0]));
+  const chosen = (count) => Math.min(count, Math.max(1, Number(which.value))) - 1;
+  let found = [];
 
-  /** Lets the user choose a scene if the text has several, one a line. */
+  /** Lets the user choose a scene if the text has several: lines, images, frames or rooms. */
   function count() {
-    let scenes = [];
+    found = [];
     try {
-      scenes = scenesIn(area.value);
-    } catch {
+      found = scenesIn(area.value).names;
+    } catch (problem) {
       // The button “Put on the board” shows the error.
+      if (!(problem instanceof SceneError)) throw problem;
     }
-    which.max = scenes.length;
+    which.max = found.length;
     which.value = 1;
-    which.parentElement.hidden = scenes.length < 2;
-    get('scenes').textContent = `of ${scenes.length}`;
+    which.parentElement.hidden = found.length < 2;
+    name();
+  }
+
+  function name() {
+    get('scenes').textContent = `of ${found.length}: ${found[chosen(found.length)] ?? ''}`;
+  }
+
+  /** The text of the notes on values that the scene leaves out. */
+  function inWords(notes) {
+    const words = notes.slice(0, SOME).map(([index, , reason]) => (index === null ? reason : `detection ${index}: ${reason}`));
+    return words.length ? `The file was read with notes: ${words.join('; ')}${notes.length > SOME ? `; and ${notes.length - SOME} more` : ''}.` : '';
   }
 
   area.addEventListener('input', count);
+  which.addEventListener('input', name);
+  map.addEventListener('change', () => (names.parentElement.hidden = map.value !== 'own'));
   get('open-file').addEventListener('click', () => {
     area.value = JSON.stringify(scene(), null, 1);
     error.textContent = '';
@@ -39,12 +58,16 @@ export function fileDialog(store, put, say) {
   get('import').addEventListener('click', () => {
     try {
       const scenes = scenesIn(area.value);
-      put(scenes[Math.min(scenes.length, Math.max(1, Number(which.value))) - 1]);
+      const { scene: read, notes } = scenes.read(chosen(scenes.names.length), labelsOf(map.value, names.value));
+      if (notes && !read.objects.length) {
+        throw new SceneError(`The file has no object for a scene: ${notes[0]?.[2] ?? 'it lists no detection with a class'}.`);
+      }
+      put(read, inWords(notes ?? []));
       dialog.close();
       say('The scene is on the board.');
     } catch (problem) {
-      if (!(problem instanceof SceneError || problem instanceof SyntaxError)) throw problem;
-      error.textContent = problem instanceof SyntaxError ? `This is neither JSON nor a list of labels: ${problem.message}.` : problem.message;
+      if (!(problem instanceof SceneError)) throw problem;
+      error.textContent = problem.message;
     }
   });
   get('download').addEventListener('click', () => {
@@ -55,7 +78,9 @@ export function fileDialog(store, put, say) {
     URL.revokeObjectURL(link.href);
   });
   get('upload').addEventListener('change', async ({ target }) => {
-    if (target.files[0]) area.value = await target.files[0].text();
+    const [file] = target.files;
+    error.textContent = file && file.size > MOST_BYTES ? `The file is too large: it has more than ${MOST_BYTES / 2 ** 20} MiB.` : '';
+    if (file && !error.textContent) area.value = await file.text();
     target.value = '';
     count();
   });

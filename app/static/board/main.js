@@ -144,8 +144,9 @@ store.subscribe((state, previous) => {
 
 combobox(get('search'), get('found'), () => store.get().words[store.get().models[0]]?.objects ?? [],
   (label) => actions.add(label));
-fileDialog(store, (scene) => {
+fileDialog(store, (scene, notes) => {
   put(scene);
+  if (notes) note(`${get('note').textContent} ${notes}`.trim());
   if (!store.get().down) get('banner').hidden = true; // such as that of a broken link
 }, say);
 watchService(store, get('banner'), () => void reload());

@@ -141,8 +141,8 @@ def _json_lines(name: str, text: str) -> list[str] | None:
     try:
         json.loads(first)
     except (ValueError, RecursionError):
-        return text.splitlines() if name.endswith(".jsonl") else None
-    return text.splitlines()
+        return text.split("\n") if name.endswith(".jsonl") else None
+    return text.split("\n")
 
 
 def _line(name: str, lines: list[str], scene: object) -> str:
@@ -165,8 +165,8 @@ def _parsed(text: str) -> Any:
     start = text.lstrip()[:1]
     if start == "<":
         return _xml(text)
-    if start not in '{["':
-        lines = [line for line in text.splitlines() if line.strip()]
+    if start not in "{[":
+        lines = [line for line in re.split(r"\r?\n", text) if line.strip()]
         if (table := _table(lines)) is not None:
             return table
         words = [line.split() for line in lines]

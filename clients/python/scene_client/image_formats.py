@@ -240,7 +240,7 @@ def _percent_box(result: Mapping[str, Any], value: Mapping[str, Any]) -> dict[st
     if "width" not in value and "radiusX" not in value:  # brush strokes or a key point
         return {}
     x, y = value["x"] * across, value["y"] * down
-    theta = math.radians(value.get("rotation", 0))
+    theta = math.radians(value.get("rotation") or 0)
     if "radiusX" in value:
         return image_box(x, y, 2 * value["radiusX"] * across, 2 * value["radiusY"] * down, theta)
     width, height = value["width"] * across, value["height"] * down

@@ -204,7 +204,7 @@ def read_scannet(data: Any) -> Message:
             detection(
                 group["label"],
                 1.0,
-                f"{group['label']}_{group.get('objectId', group['id'])}",
+                f"{group['label']}_{group['objectId' if 'objectId' in group else 'id']}",
                 **(_upright(**group["obb"]) if group.get("obb") else {}),
             )
             for group in data["segGroups"]
