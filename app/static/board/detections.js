@@ -21,7 +21,7 @@ export const REMEDY = 'Choose “Labels of numeric class ids” below.';
 export const number = (value) => (typeof value === 'number' && Number.isFinite(value) ? value : null);
 
 /** A text, or a whole number as text. */
-export const text = (value) => (typeof value === 'string' ? value.trim() : Number.isSafeInteger(value) ? String(value) : '');
+export const text = (value) => (typeof value === 'string' ? value.trim() : Number.isInteger(value) ? String(BigInt(value)) : '');
 
 /** The numbers in fields with one-letter names, or null if one is not finite. */
 export function numbers(value, names) {

@@ -1,8 +1,9 @@
 /** Readers of formats with boxes in images, as in the Python module `scene_client.image_formats`. */
 
-import { isObject, number } from './detections.js';
+import { isObject, number, text } from './detections.js';
 import { SceneError } from './scene.js';
 import { boxBetween, detection, excluded, imageBox, must, radians } from './sightings.js';
+import { XmlElement } from './xml.js';
 
 /** Whether a value is a non-empty list of objects that have all these names. */
 export const areObjects = (data, ...names) =>
@@ -29,7 +30,7 @@ const COCO = {
     if (!entries.every((entry) => 'category_id' in entry)) {
       throw new SceneError('COCO captions and panoptic segments have no boxes: use the file instances_….json.');
     }
-    const single = entries.filter(({ iscrowd }) => !iscrowd);
+    const single = entries.filter(({ iscrowd }) => iscrowd !== 1 && iscrowd !== true);
     return {
       detections: single.map(({ category_id: kind, score = 1, bbox }) =>
         detection(names.get(String(kind)) ?? kind, score, '', cornerBox(bbox ?? [null, null, null, null]))),
@@ -45,13 +46,18 @@ function cornerBox(values) {
   return imageBox(x + width / 2, y + height / 2, width, height);
 }
 
-const tracked = (name, track) => (track === undefined ? '' : `${name}_${track}`);
+/** @throws {TypeError} */
+export function fail() {
+  throw new TypeError('a value has another type');
+}
+
+const tracked = (name, track) => (text(track) ? `${text(name)}_${text(track)}` : '');
 
 const ULTRALYTICS = {
   name: 'Ultralytics',
   matches(data) {
-    if (!Array.isArray(data) || !data.every(Array.isArray)) return areObjects(data, 'name', 'class', 'confidence');
-    const results = data.filter((one) => one.length);
+    const isBatch = Array.isArray(data) && data.every(Array.isArray);
+    const results = isBatch ? data.filter((one) => one.length) : [data];
     return results.length > 0 && results.every((one) => areObjects(one, 'name', 'class', 'confidence'));
   },
   parts: (data) => (isObject(data[0]) ? new Map([['1', data]]) : numbered(data)),
@@ -59,7 +65,7 @@ const ULTRALYTICS = {
     if (results.some((entry) => !('box' in entry))) {
       throw new SceneError('The results of a classifier list no objects: use a detection model.');
     }
-    const along = (box, axis) => Object.keys(box).filter((name) => name[0] === axis).map((name) => box[name]);
+    const along = (box, axis) => Object.keys(isObject(box) ? box : fail()).filter((name) => name[0] === axis).map((name) => box[name]);
     return {
       detections: results.map(({ name, class: kind, confidence, box, track_id: track }) =>
         detection(name || kind, confidence, tracked(name, track), boxBetween(along(box, 'x'), along(box, 'y')))),
@@ -69,14 +75,17 @@ const ULTRALYTICS = {
 
 const numbered = (list) => new Map(list.map((one, index) => [String(index + 1), one]));
 
+const listed = (data) => (Array.isArray(data) ? data : [data]);
+
+function isRoboflowAnswer(data) {
+  const found = isObject(data?.predictions) ? data.predictions.predictions : data?.predictions;
+  return areObjects(found, 'x', 'width', 'class') || (Array.isArray(found) && !found.length && 'image' in data);
+}
+
 const ROBOFLOW = {
   name: 'Roboflow',
-  matches(data) {
-    if (Array.isArray(data)) return data.length > 0 && data.every(ROBOFLOW.matches);
-    const found = isObject(data?.predictions) ? data.predictions.predictions : data?.predictions;
-    return areObjects(found, 'x', 'width', 'class') || (Array.isArray(found) && !found.length && 'image' in data);
-  },
-  parts: (data) => numbered((Array.isArray(data) ? data : [data]).map(({ predictions }) => predictions.predictions ?? predictions)),
+  matches: (data) => listed(data).length > 0 && listed(data).every(isRoboflowAnswer),
+  parts: (data) => numbered(listed(data).map(({ predictions }) => predictions.predictions ?? predictions)),
   read: (predictions) => ({
     detections: predictions.map(({ class: label, confidence = 1, tracker_id: track, x, y, width, height }) =>
       detection(label, confidence, tracked(label, track), imageBox(x, y, width, height))),
@@ -120,18 +129,19 @@ function percentBox({ original_width: width = 100, original_height: height = 100
   return imageBox(x + cos * wide - sin * high, y + sin * wide + cos * high, wide, high, theta);
 }
 
+function isTask(data) {
+  if (!isObject(data)) return false;
+  const isWhole = 'data' in data && ('annotations' in data || 'predictions' in data);
+  const isAnnotation = hasList(data, 'result') && 'task' in data;
+  return isWhole || isAnnotation || shortResults(data).some((one) => isObject(one) && labelsOf(one).length > 0);
+}
+
 const LABEL_STUDIO = {
   name: 'Label Studio',
-  matches(data) {
-    if (Array.isArray(data)) return data.length > 0 && data.every(LABEL_STUDIO.matches);
-    if (!isObject(data)) return false;
-    const isTask = 'data' in data && ('annotations' in data || 'predictions' in data);
-    const isAnnotation = hasList(data, 'result') && 'task' in data;
-    return isTask || isAnnotation || shortResults(data).some((one) => isObject(one) && labelsOf(one).length > 0);
-  },
-  parts: (data) => new Map((Array.isArray(data) ? data : [data]).map((task, index) => [String(task.id ?? index + 1), task])),
+  matches: (data) => listed(data).length > 0 && listed(data).every(isTask),
+  parts: (data) => new Map(listed(data).map((task, index) => [String(task.id ?? index + 1), task])),
   read(task) {
-    const choices = [...(task.annotations ?? []).filter((one) => !one.was_cancelled), ...(task.predictions ?? [])];
+    const choices = [...(task.annotations ?? []).filter((one) => one.was_cancelled !== true), ...(task.predictions ?? [])];
     const results = task.result ?? choices[0]?.result ?? shortResults(task);
     return {
       detections: results.map((result) => [result, result.value ?? result]).filter(([, value]) => labelsOf(value).length)
@@ -146,45 +156,45 @@ const SHAPES = ['box', 'polygon', 'polyline', 'ellipse', 'mask', 'cuboid'];
 
 function shapeBox(shape) {
   const value = (name) => {
-    const found = shape.getAttribute(name)?.trim();
+    const found = shape.attributes.get(name)?.trim();
     return must(found ? Number(found) : null);
   };
-  const theta = radians(shape.hasAttribute('rotation') ? value('rotation') : 0);
-  if (shape.tagName === 'box' || shape.tagName === 'cuboid') {
-    const names = shape.getAttributeNames().filter((name) => /^[xy][tb][lr]/.test(name));
+  const theta = radians(shape.attributes.has('rotation') ? value('rotation') : 0);
+  if (shape.tag === 'box' || shape.tag === 'cuboid') {
+    const names = [...shape.attributes.keys()].filter((name) => /^[xy][tb][lr]/.test(name));
     return boxBetween(...['x', 'y'].map((axis) => names.filter((name) => name[0] === axis).map(value)), theta);
   }
-  if (shape.tagName === 'mask') {
+  if (shape.tag === 'mask') {
     const [left, top, width, height] = ['left', 'top', 'width', 'height'].map(value);
     return imageBox(left + width / 2, top + height / 2, width, height);
   }
-  if (shape.tagName === 'ellipse') return imageBox(value('cx'), value('cy'), 2 * value('rx'), 2 * value('ry'), theta);
-  const points = shape.getAttribute('points').split(';').map((point) => point.split(',').map(Number));
+  if (shape.tag === 'ellipse') return imageBox(value('cx'), value('cy'), 2 * value('rx'), 2 * value('ry'), theta);
+  const points = shape.attributes.get('points').split(';').map((point) => point.split(',').map(Number));
   return boxBetween(points.map(([x]) => x), points.map(([, y]) => y));
 }
 
 const CVAT = {
   name: 'CVAT',
-  matches: (data) => data instanceof Element,
+  matches: (data) => data instanceof XmlElement,
   parts(data) {
     const parts = new Map();
-    for (const image of data.getElementsByTagName('image')) {
-      parts.set(image.getAttribute('id') ?? '', [...image.children].map((shape) => ({ name: '', owner: image, shape })));
+    for (const image of data.all('image')) {
+      parts.set(image.attributes.get('id') ?? '', image.children.map((shape) => ({ name: '', owner: image, shape })));
     }
-    for (const track of data.getElementsByTagName('track')) {
-      const name = `${track.getAttribute('label')}_${track.getAttribute('id')}`;
+    for (const track of data.all('track')) {
+      const name = `${track.attributes.get('label')}_${track.attributes.get('id')}`;
       for (const shape of track.children) {
-        if (shape.getAttribute('frame') === null || shape.getAttribute('outside') === '1') continue;
-        collect(parts, shape.getAttribute('frame'), { name, owner: track, shape });
+        const frame = shape.attributes.get('frame');
+        if (frame !== undefined && shape.attributes.get('outside') !== '1') collect(parts, frame, { name, owner: track, shape });
       }
     }
     return parts;
   },
   read(entries) {
-    const shapes = entries.filter(({ shape }) => SHAPES.includes(shape.tagName));
+    const shapes = entries.filter(({ shape }) => SHAPES.includes(shape.tag));
     return {
       detections: shapes.map(({ name, owner, shape }) =>
-        detection(shape.getAttribute('label') || owner.getAttribute('label'), 1, name, shapeBox(shape))),
+        detection(shape.attributes.get('label') || owner.attributes.get('label'), 1, name, shapeBox(shape))),
       notes: excluded(entries.length - shapes.length, 'tags, points and skeletons'),
     };
   },

@@ -9,6 +9,7 @@ import { IMAGE_FORMATS, Lines } from './image_formats.js';
 import { leftPairs } from './image_plane.js';
 import { SceneError } from './scene.js';
 import { LABEL_COLUMNS, Table, WORLD_FORMATS } from './world_formats.js';
+import { parseXml } from './xml.js';
 
 const FORMATS = [...WORLD_FORMATS, ...IMAGE_FORMATS];
 
@@ -56,7 +57,7 @@ function json(text) {
   try {
     return JSON.parse(text.replace(SPECIAL, (part) => (part[0] === '"' ? part : /\d/.test(part) ? `"${part}"` : 'null')));
   } catch (error) {
-    throw new SceneError(`This is neither JSON nor a list of labels, and no other known format: ${error.message}.`);
+    throw new SceneError(`This is neither JSON nor a list of labels, and no other known format: ${error.message.replace(/\s+/g, ' ')}.`);
   }
 }
 
@@ -105,10 +106,18 @@ function cellsOf(line, delimiter) {
 
 function xml(text) {
   if (/<!DOCTYPE|<!ENTITY/.test(text)) throw new SceneError('This is XML with a document type, which the page does not read.');
-  const root = new DOMParser().parseFromString(text, 'text/xml').documentElement;
-  if (root.getElementsByTagName('parsererror').length || root.tagName === 'parsererror') throw new SceneError('This is not XML that can be read.');
-  if (root.tagName !== 'annotations') throw new SceneError(`This is XML with the root <${root.tagName.slice(0, 40)}>. Only exports of CVAT are read.`);
+  const root = xmlRoot(text);
+  if (root.tag !== 'annotations') throw new SceneError(`This is XML with the root <${root.tag.slice(0, 40)}>. Only exports of CVAT are read.`);
   return root;
+}
+
+function xmlRoot(text) {
+  try {
+    return parseXml(text.trimStart());
+  } catch (error) {
+    if (!(error instanceof SyntaxError)) throw error;
+    throw new SceneError(`This is not XML that can be read: ${error.message}.`);
+  }
 }
 
 // ------------------------------------------------------------------------------------ formats
@@ -132,7 +141,7 @@ function guarded(name, read) {
   try {
     return read();
   } catch (error) {
-    if (!(error instanceof TypeError)) throw error;
+    if (!(error instanceof TypeError || error instanceof RangeError)) throw error;
     throw new SceneError(`The file looks like ${name}, but a field is missing or has a wrong type.`);
   }
 }
@@ -149,7 +158,7 @@ function request(data) {
   if (!isObject(data) || !Array.isArray(data.objects)) {
     throw new SceneError(`${kindOf(data)} is neither a scene with a list of objects nor a known format.`);
   }
-  const isNumbered = (thing) => isObject(thing) && (Number.isInteger(thing.id) || TRAINING_OBJECT.some((name) => name in thing));
+  const isNumbered = (thing) => isObject(thing) && (Number.isSafeInteger(thing.id) || TRAINING_OBJECT.some((name) => name in thing));
   if (!TRAINING.some((name) => name in data) && !data.objects.some(isNumbered)) return data;
   try {
     return ofTraining(data);
@@ -176,7 +185,7 @@ function ofTraining(scene) {
     if (typeof label !== 'string') throw new TypeError('an object has no label');
     counts.set(label, (counts.get(label) ?? 0) + 1);
   }
-  const numbered = things.filter(({ id }) => Number.isInteger(id));
+  const numbered = things.filter(({ id }) => Number.isSafeInteger(id));
   const names = new Map(numbered.map(({ id, label }) => [id, counts.get(label) > 1 ? `${label}_${id}` : label]));
   if (new Set(names.values()).size < numbered.length) throw new TypeError('two objects have the same id');
   const named = (id) => names.get(id) ?? id;

@@ -1,7 +1,7 @@
 /** Readers of formats with poses, as in the Python module `scene_client.world_formats`. */
 
-import { isObject, numbers } from './detections.js';
-import { areObjects, collect, hasList } from './image_formats.js';
+import { isObject, numbers, text } from './detections.js';
+import { areObjects, collect, fail, hasList } from './image_formats.js';
 import { SceneError } from './scene.js';
 import { boxBetween, detection, excluded, must, NO_TURN, radians, solidBox, turnOf, vector } from './sightings.js';
 
@@ -65,10 +65,6 @@ function fromUnity(point) {
   return [z, -x, y];
 }
 
-function fail() {
-  throw new TypeError('a value has another type');
-}
-
 function thorBox({ position, rotation, axisAlignedBoundingBox: box }) {
   if (!box?.size) return solidBox(fromUnity(position), null, turnOf(-radians(rotation?.y ?? 0)));
   return solidBox(fromUnity(box.center), fromUnity(box.size).map(Math.abs));
@@ -79,7 +75,7 @@ const AI2_THOR = {
   matches: (data) => areObjects(metadata(data).objects, 'objectType', 'position'),
   read(data) {
     const { objects, agent } = metadata(data);
-    const visible = objects.filter((thing) => thing.visible ?? true);
+    const visible = objects.filter(({ visible }) => visible !== false);
     const [x, y] = agent?.position && agent.rotation ? fromUnity(agent.position) : [];
     return {
       detections: visible.map((thing) => detection(thing.objectType, 1, thing.objectId ?? '', thorBox(thing))),
@@ -114,7 +110,7 @@ const HYDRA = {
     for (const { source, target } of data.edges) {
       const ends = [nodes.get(source), nodes.get(target)];
       if (!ends[0] || !ends[1] || ends[0].layer === ends[1].layer) continue;
-      const [low, high] = ends.sort((a, b) => a.layer - b.layer);
+      const [low, high] = ends.sort((a, b) => must(a.layer) - must(b.layer));
       parents.set(low, high);
     }
     const parts = new Map();
@@ -143,6 +139,7 @@ function hydraObject({ bounding_box: given, semantic_label: label = fail(), posi
 
 /** A box that stands on the side whose axis is nearest to the vertical. */
 function upright({ centroid, axesLengths: lengths, normalizedAxes: flat }) {
+  if (!Array.isArray(lengths) || lengths.length < 3) fail();
   const axes = [0, 3, 6].map((first) => flat.slice(first, first + 3));
   const up = [0, 1, 2].reduce((best, axis) => (Math.abs(must(axes[axis][2])) > Math.abs(axes[best][2]) ? axis : best), 0);
   const [across, along] = [0, 1, 2].filter((axis) => axis !== up);
@@ -154,7 +151,7 @@ const SCANNET = {
   matches: (data) => hasList(data, 'segGroups'),
   read: ({ segGroups }) => ({
     detections: segGroups.map(({ label = fail(), objectId, id, obb }) =>
-      detection(label, 1, `${label}_${objectId ?? id ?? fail()}`, obb ? upright(obb) : {})),
+      detection(label, 1, `${text(label)}_${text(objectId === undefined ? id : objectId)}`, obb == null ? {} : upright(obb))),
     header: FIXED,
   }),
 };
@@ -182,7 +179,7 @@ const MOVEIT = {
   matches: (data) => collisionObjects(data) !== null,
   read(data) {
     const held = (data.scene || data).robot_state?.attached_collision_objects ?? [];
-    const objects = [...collisionObjects(data), ...held.map(({ object }) => object)];
+    const objects = [...collisionObjects(data), ...held.map((one) => one?.object)].map((thing) => (isObject(thing) ? thing : {}));
     const kept = objects.filter((thing) => thing.operation !== REMOVE);
     return {
       detections: kept.map((thing) =>

@@ -162,7 +162,7 @@ def _request(data: Any) -> dict[str, Any]:
         return data
     try:
         return _of_training(data, things)
-    except (AttributeError, KeyError, TypeError, ValueError):
+    except (LookupError, AttributeError, TypeError, ValueError):
         raise MessageError("this is not a scene of the training format") from None
 
 
@@ -193,7 +193,7 @@ def _of_training(scene: Mapping[str, Any], things: list[dict[str, Any]]) -> dict
     for thing in scene["objects"]:
         if isinstance(thing, dict):
             thing = {
-                name: names.get(value, value) if name in ("id", "supported_by") else value
+                name: _named(value, names) if name in ("id", "supported_by") else value
                 for name, value in thing.items()
                 if name not in _TRAINING_OBJECT and value is not None
             }
@@ -220,7 +220,12 @@ def _relation(relation: Any, names: Mapping[Any, str]) -> list[Any]:
     if isinstance(relation, dict):
         relation = [relation[end] for end in ("subject", "relation", "object")]
     subject, kind, other = relation
-    return [names.get(subject, subject), kind, names.get(other, other)]
+    return [_named(subject, names), kind, _named(other, names)]
+
+
+def _named(value: Any, names: Mapping[Any, str]) -> Any:
+    """Return the name of an object's number; other values unchanged."""
+    return names.get(value, value) if type(value) is int else value
 
 
 def _image_relations(annotated: list[Any], objects: list[Any]) -> list[list[str]]:

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 from xml.etree.ElementTree import Element
 
-from scene_client.ros_fields import MessageError, number
+from scene_client.ros_fields import MessageError, number, text
 from scene_client.sightings import Message, box_between, detection, excluded, image_box
 
 Parts = dict[str, Any]
@@ -63,7 +63,7 @@ def read_coco(part: Any) -> Message:
         raise MessageError(
             "COCO captions and panoptic segments have no boxes: use the file instances_….json"
         )
-    single = [entry for entry in entries if not entry.get("iscrowd")]
+    single = [entry for entry in entries if entry.get("iscrowd") not in (1, True)]
     return Message(
         [
             detection(
@@ -90,11 +90,9 @@ def _corner_box(x: Any, y: Any, width: Any, height: Any) -> dict[str, Any]:
 
 def is_ultralytics(data: Any) -> bool:
     """Return whether the data is a list from `tojson()`, or a list of such lists, one an image."""
-    if isinstance(data, list) and data and all(isinstance(one, list) for one in data):
-        return any(map(is_ultralytics, data)) and all(
-            not one or is_ultralytics(one) for one in data
-        )
-    return are_dicts(data, "name", "class", "confidence")
+    is_batch = isinstance(data, list) and all(isinstance(one, list) for one in data)
+    results = [one for one in data if one] if is_batch else [data]
+    return bool(results) and all(are_dicts(one, "name", "class", "confidence") for one in results)
 
 
 def ultralytics_parts(data: Any) -> Parts:
@@ -113,12 +111,17 @@ def read_ultralytics(part: Any) -> Message:
             detection(
                 entry["name"] or entry["class"],
                 entry["confidence"],
-                f"{entry['name']}_{entry['track_id']}" if "track_id" in entry else "",
+                _tracked(entry["name"], entry.get("track_id")),
                 **box_between(*_corners(entry["box"])),
             )
             for entry in part
         ]
     )
+
+
+def _tracked(label: Any, track: Any) -> str:
+    """Return an id with the number of a tracker, or "" without a tracker."""
+    return f"{text(label)}_{text(track)}" if text(track) else ""
 
 
 def _corners(box: Mapping[str, Any]) -> tuple[list[Any], list[Any]]:
@@ -129,8 +132,11 @@ def _corners(box: Mapping[str, Any]) -> tuple[list[Any], list[Any]]:
 
 def is_roboflow(data: Any) -> bool:
     """Return whether the data is an answer of Roboflow, or a list of answers."""
-    if isinstance(data, list):
-        return bool(data) and all(map(is_roboflow, data))
+    answers = data if isinstance(data, list) else [data]
+    return bool(answers) and all(map(_is_roboflow_answer, answers))
+
+
+def _is_roboflow_answer(data: Any) -> bool:
     found = data.get("predictions") if isinstance(data, dict) else None
     if isinstance(found, dict):  # the output of a workflow
         found = found.get("predictions")
@@ -154,7 +160,7 @@ def read_roboflow(part: Any) -> Message:
             detection(
                 entry["class"],
                 entry.get("confidence", 1.0),
-                f"{entry['class']}_{entry['tracker_id']}" if "tracker_id" in entry else "",
+                _tracked(entry["class"], entry.get("tracker_id")),
                 **image_box(*(entry.get(name) for name in ("x", "y", "width", "height"))),
             )
             for entry in part
@@ -183,8 +189,11 @@ def _yolo_line(line: list[str]) -> dict[str, Any]:
 
 def is_label_studio(data: Any) -> bool:
     """Return whether the data is an export of Label Studio: one task, or a list of tasks."""
-    if isinstance(data, list):
-        return bool(data) and all(map(is_label_studio, data))
+    tasks = data if isinstance(data, list) else [data]
+    return bool(tasks) and all(map(_is_task, tasks))
+
+
+def _is_task(data: Any) -> bool:
     if not isinstance(data, dict):
         return False
     is_task = "data" in data and ("annotations" in data or "predictions" in data)
@@ -203,7 +212,7 @@ def read_label_studio(task: Any) -> Message:
     results = task.get("result")
     if results is None:
         choices = [
-            *(one for one in task.get("annotations") or () if not one.get("was_cancelled")),
+            *(one for one in task.get("annotations") or () if one.get("was_cancelled") is not True),
             *(task.get("predictions") or ()),
         ]
         results = choices[0]["result"] if choices else _short_results(task)

@@ -12,7 +12,7 @@ from itertools import product
 from typing import Any, Final
 
 from scene_client.image_formats import Parts, are_dicts, has_list
-from scene_client.ros_fields import MessageError, items, numbers, take
+from scene_client.ros_fields import MessageError, items, numbers, take, text
 from scene_client.sightings import (
     NO_TURN,
     Message,
@@ -87,7 +87,7 @@ def is_ai2thor(data: Any) -> bool:
 def read_ai2thor(data: Any) -> Message:
     """Convert the visible objects. The world of Unity is left-handed, and its y axis points up."""
     scene = _thor(data)
-    visible = [thing for thing in scene["objects"] if thing.get("visible", True)]
+    visible = [thing for thing in scene["objects"] if thing.get("visible") is not False]
     agent = scene.get("agent") or {}
     viewpoint = None
     if "position" in agent and "rotation" in agent:
@@ -133,7 +133,7 @@ def is_hydra(data: Any) -> bool:
     return (
         has_list(data, "edges")
         and has_list(data, "nodes")
-        and any("attributes" in node for node in data["nodes"][:1])
+        and are_dicts(data["nodes"][:1], "attributes")
     )
 
 
@@ -204,8 +204,8 @@ def read_scannet(data: Any) -> Message:
             detection(
                 group["label"],
                 1.0,
-                f"{group['label']}_{group['objectId' if 'objectId' in group else 'id']}",
-                **(_upright(**group["obb"]) if group.get("obb") else {}),
+                f"{text(group['label'])}_{text(group.get('objectId', group.get('id')))}",
+                **({} if group.get("obb") is None else _upright(**group["obb"])),
             )
             for group in data["segGroups"]
         ],
