@@ -127,6 +127,23 @@ def test_a_scene_of_a_file_and_the_labels_of_its_class_ids_are_chosen(
     assert board.things == ["stool_1"]
 
 
+def test_a_large_file_is_read_without_showing_it(open_board: OpenBoard, tmp_path: Path) -> None:
+    page = (board := open_board()).page
+    path = tmp_path / "large.json"
+    path.write_text(json.dumps(["bed", "lamp"]) + " " * 2**21)
+    page.get_by_role("button", name="Import, export").click()
+    page.get_by_label("Open a file").set_input_files(path)
+    expect(page.locator("#share-done")).to_contain_text("large.json is open")
+    expect(page.get_by_label("Scene, JSON")).to_have_value("")
+    with path.open("r+b") as file:
+        file.truncate(64 * 2**20 + 1)
+    board.click("Put on the board")
+    assert board.things == ["bed", "lamp"]
+    page.get_by_role("button", name="Import, export").click()
+    page.get_by_label("Open a file").set_input_files(path)
+    expect(page.locator("#json-error")).to_contain_text("more than 64 MiB")
+
+
 def test_a_table_stands_on_the_board_where_the_file_says(
     open_board: OpenBoard, tmp_path: Path
 ) -> None:

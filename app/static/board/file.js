@@ -8,6 +8,7 @@ import { SceneError, toScene } from './scene.js';
 import { toHash } from './share.js';
 
 const SOME = 3; // notes that the page shows
+const MOST_SHOWN = 2 ** 20; // bytes; a browser needs a minute to show a text of 50 MB
 
 /** @param {(scene: object, notes: string) => void} put puts a scene on the board; throws SceneError */
 export function fileDialog(store, put, say) {
@@ -17,12 +18,14 @@ export function fileDialog(store, put, say) {
   const scene = () => toScene(store.get(), sizesOf(store.get(), store.get().models[0]));
   const chosen = (count) => Math.min(count, Math.max(1, Number(which.value))) - 1;
   let found = [];
+  let hidden = ''; // text of a large file, which the text area does not show
+  const source = () => hidden || area.value;
 
   /** Lets the user choose a scene if the text has several: lines, images, frames or rooms. */
   function count() {
     found = [];
     try {
-      found = scenesIn(area.value).names;
+      found = scenesIn(source()).names;
     } catch (problem) {
       // The button “Put on the board” shows the error.
       if (!(problem instanceof SceneError)) throw problem;
@@ -43,21 +46,31 @@ export function fileDialog(store, put, say) {
     return words.length ? `The file was read with notes: ${words.join('; ')}${notes.length > SOME ? `; and ${notes.length - SOME} more` : ''}.` : '';
   }
 
-  area.addEventListener('input', count);
+  function show(text, file = null) {
+    const isLarge = file && file.size > MOST_SHOWN;
+    hidden = isLarge ? text : '';
+    area.value = isLarge ? '' : text;
+    error.textContent = '';
+    done.textContent = isLarge ? `${file.name} is open. It is too large to be shown here.` : '';
+    count();
+  }
+
+  area.addEventListener('input', () => {
+    hidden = '';
+    done.textContent = '';
+    count();
+  });
   which.addEventListener('input', name);
   map.addEventListener('change', () => (names.parentElement.hidden = map.value !== 'own'));
   get('open-file').addEventListener('click', () => {
-    area.value = JSON.stringify(scene(), null, 1);
-    error.textContent = '';
-    done.textContent = '';
-    count();
+    show(JSON.stringify(scene(), null, 1));
     dialog.showModal();
     area.focus();
   });
   get('close-file').addEventListener('click', () => dialog.close());
   get('import').addEventListener('click', () => {
     try {
-      const scenes = scenesIn(area.value);
+      const scenes = scenesIn(source());
       const { scene: read, notes } = scenes.read(chosen(scenes.names.length), labelsOf(map.value, names.value));
       if (notes && !read.objects.length) {
         throw new SceneError(`The file has no object for a scene: ${notes[0]?.[2] ?? 'it lists no detection with a class'}.`);
@@ -72,17 +85,16 @@ export function fileDialog(store, put, say) {
   });
   get('download').addEventListener('click', () => {
     const link = document.createElement('a');
-    link.href = URL.createObjectURL(new Blob([area.value], { type: 'application/json' }));
+    link.href = URL.createObjectURL(new Blob([source()], { type: 'application/json' }));
     link.download = 'scene.json';
     link.click();
     URL.revokeObjectURL(link.href);
   });
   get('upload').addEventListener('change', async ({ target }) => {
     const [file] = target.files;
-    error.textContent = file && file.size > MOST_BYTES ? `The file is too large: it has more than ${MOST_BYTES / 2 ** 20} MiB.` : '';
-    if (file && !error.textContent) area.value = await file.text();
+    if (file && file.size <= MOST_BYTES) show(await file.text(), file);
+    else if (file) error.textContent = `The file is too large: it has more than ${MOST_BYTES / 2 ** 20} MiB.`;
     target.value = '';
-    count();
   });
   get('share').addEventListener('click', async () => {
     history.replaceState(null, '', await toHash(scene()));
