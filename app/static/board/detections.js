@@ -16,7 +16,7 @@ const [LONGEST_LABEL, LONGEST_ID, LONGEST_FRAME] = [100, 128, 256];
 const [FARTHEST, LARGEST] = [1e8, 1e4]; // metres
 const SHORTEST = 1e-6; // a shorter quaternion is unset
 
-export const REMEDY = 'Choose “Labels of numeric class ids” below.';
+export const REMEDY = 'Choose “Labels of numeric class ids”.';
 
 export const number = (value) => (typeof value === 'number' && Number.isFinite(value) ? value : null);
 
