@@ -387,6 +387,15 @@ _REQUEST = {
     "relations": [["lamp", "on-top", "bed"]],
     "top_k": 3,
 }
+_RECORDED = {
+    "scene_id": "2026-11-27T02-1f", "group": "2026-11-27T02", "viewer_frame": True,
+    "objects": [
+        {"id": "track_1", "label": "desk", "position": [2.0, 0.1, 0.37], "size": [0.8, 1.6, 0.74]},
+        {"id": "mug", "label": "mug", "supported_by": "track_1"},
+    ],
+    "stamp": {"sec": 3, "nanosec": 4},
+    "confirmed": True,
+}  # fmt: skip
 _BOXES2D = {
     "objects": [
         {"id": 0, "label": "bed", "box2d": [0, 0, 40, 40]},
@@ -606,6 +615,10 @@ EXAMPLES: dict[str, Example] = {
     "bare_training.json": Example(
         _json({k: v for k, v in _TRAINING.items() if k not in ("scene_id", "confirmed")}),
         raw={k: v for k, v in _TRAINING_FIELDS.items() if k != "frame_id"},
+    ),
+    "recorded.jsonl": Example(
+        _json(_RECORDED) + "\n",
+        raw={"objects": _RECORDED["objects"], "stamp": {"sec": 3, "nanosec": 4}},
     ),
     "boxes2d.json": Example(
         _json(_BOXES2D),

@@ -20,15 +20,17 @@ from scene_client.world_formats import LABEL_COLUMNS, Table
 MAX_FILE: Final = 64 * 2**20
 """Maximum size of a scene file in bytes. The service has the same upper limit for a body."""
 
-# A file, and the name of one of its scenes.
-_FILE: Final = re.compile(r"(?P<file>.+\.(json|jsonl|csv|txt|xml))(:(?P<scene>.+))?", re.DOTALL)
+# A file, and the name of one of its scenes. Some of these kinds of files are refused with a reason.
+_FILE: Final = re.compile(
+    r"(?P<file>.+\.(json|jsonl|csv|txt|xml|ya?ml|zip|gz))(:(?P<scene>.+))?", re.DOTALL
+)
 _PATH_STARTS: Final = (".", "~", os.sep)
 
 _YAML: Final = (
     "is YAML, as `ros2 topic echo` prints it: convert it to JSON, for example by "
     "python -c 'import json, sys, yaml; print(json.dumps(next(yaml.safe_load_all(sys.stdin))))'"
 )
-_ZIP: Final = "is a ZIP archive: extract it, and choose one of its .json, .xml, .csv or .txt files"
+_PACKED: Final = "is compressed: extract it, and choose one of its .json, .xml, .csv or .txt files"
 
 
 def is_file(argument: str) -> bool:
@@ -125,8 +127,8 @@ def _bytes(name: str) -> bytes:
 
 
 def _text(name: str, content: bytes) -> str:
-    if content.startswith(b"PK\x03\x04"):
-        raise MessageError(f"{name} {_ZIP}")
+    if content.startswith((b"PK\x03\x04", b"\x1f\x8b")):  # ZIP and gzip
+        raise MessageError(f"{name} {_PACKED}")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:

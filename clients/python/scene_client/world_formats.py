@@ -234,7 +234,7 @@ _SIDES: Final[
     3: lambda cylinder: [2 * cylinder[1], 2 * cylinder[1], cylinder[0]],
     4: lambda cone: [2 * cone[1], 2 * cone[1], cone[0]],
 }
-_REMOVE: Final = 1  # operation of a CollisionObject
+_REMOVE: Final = (1, b"\x01")  # operation of a CollisionObject, also as rclpy represents a byte
 _ORIGIN: Final[Vector] = (0.0, 0.0, 0.0)
 
 
@@ -248,7 +248,7 @@ def read_moveit(data: Any) -> Message:
     objects = list(_collision_objects(data) or ())
     state = take(take(data, "scene") or data, "robot_state", "attached_collision_objects")
     objects += [take(held, "object") for held in items(state, "attached_collision_objects")]
-    kept = [thing for thing in objects if take(thing, "operation") != _REMOVE]
+    kept = [thing for thing in objects if take(thing, "operation") not in _REMOVE]
     return Message(
         [
             detection(
