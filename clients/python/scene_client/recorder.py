@@ -135,6 +135,8 @@ class Recorder:
     def _recall(self) -> None:
         """Remember the last scenes of the file, so that another run does not repeat them."""
         try:
+            if not self.path.is_file():  # opening a named pipe would block
+                return
             with self.path.open("rb") as file:
                 file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL))
                 lines = file.read().split(b"\n")
