@@ -8,10 +8,11 @@ from typing import Any
 
 import httpx
 import pytest
-from axe_playwright_python.sync_playwright import Axe
+from axe_playwright_python.sync_playwright import Axe  # type: ignore[import-untyped]
 from playwright.sync_api import expect
 
 from scene_client import Client
+from tests.browser.conftest import DESK
 from tests.browser.driving import Board, OpenBoard
 from training.datasets.jsonl import read_jsonl
 
@@ -118,10 +119,17 @@ def test_missing_objects_are_added(open_board: OpenBoard, recorded: Path, tmp_pa
 def test_confirmed_scenes_of_the_page_stay_in_the_browser(
     open_board: OpenBoard, tmp_path: Path
 ) -> None:
-    desk = {"objects": [
-        {"label": "desk", "position": {"x": 2, "y": 0, "z": 0.37}, "size": {"x": 0.8, "y": 1.6, "z": 0.74}},
-        {"label": "lamp", "position": {"x": 2, "y": 0.5, "z": 0.94}, "size": {"x": 0.2, "y": 0.2, "z": 0.4}},
-    ], "frame_id": "map", "viewpoint": {"x": 1, "y": 0, "yaw": 0}, "room_type": "office"}  # fmt: skip
+    lamp = {
+        "label": "lamp",
+        "position": {"x": 2, "y": 0.5, "z": 0.94},
+        "size": {"x": 0.2, "y": 0.2, "z": 0.4},
+    }
+    desk = {
+        "objects": [DESK["objects"][0], lamp],
+        "frame_id": "map",
+        "viewpoint": {"x": 1, "y": 0, "yaw": 0},
+        "room_type": "office",
+    }
     board = open_board(desk)
     wrong = {"subject": "lamp", "relation": "on-top", "object": "desk", "log_odds": -3.0}
     board.alter("outliers", lambda found: found | {"misplaced": [
