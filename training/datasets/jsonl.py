@@ -67,6 +67,8 @@ class _Line(BaseModel):
     false_relations: list[_Triple] | None = None
     counts: dict[str, StrictInt] | None = None
     viewer_frame: StrictBool | None = None
+    stamp: dict[str, StrictInt] | None = None
+    confirmed: StrictBool | None = None
 
 
 def read_jsonl(path: Path) -> list[AnnotatedScene]:

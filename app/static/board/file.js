@@ -3,6 +3,7 @@
 import { labelsOf } from './class_ids.js';
 import { copy } from './dom.js';
 import { MOST_BYTES, scenesIn } from './importing.js';
+import { linesIn } from './records.js';
 import { sizesOf } from './questions.js';
 import { SceneError, toScene } from './scene.js';
 import { toHash } from './share.js';
@@ -10,8 +11,8 @@ import { toHash } from './share.js';
 const SOME = 3; // notes that the page shows
 const MOST_SHOWN = 2 ** 20; // bytes; a browser needs a minute to show a text of 50 MB
 
-/** @param {(scene: object, notes: string) => void} put puts a scene on the board; throws SceneError */
-export function fileDialog(store, put, say) {
+/** @param {(scene: object, notes: string, line: object | undefined) => void} put puts a scene on the board; throws SceneError */
+export function fileDialog(store, records, put, say) {
   const get = (id) => document.getElementById(id);
   const [dialog, area, error, done, which, map, names] =
     ['file', 'json', 'json-error', 'share-done', 'which', 'label-map', 'label-names'].map(get);
@@ -46,6 +47,14 @@ export function fileDialog(store, put, say) {
     return words.length ? `The file was read with notes: ${words.join('; ')}${notes.length > SOME ? `; and ${notes.length - SOME} more` : ''}.` : '';
   }
 
+  /** Shows the buttons of the confirmed scenes if there are any. */
+  function listRecords() {
+    get('download-scenes').hidden = !records.count();
+    get('download-scenes').textContent = `Download scenes.jsonl (${records.count()} confirmed)`;
+    get('forget-scenes').hidden = !records.kept();
+    get('forget-scenes').textContent = `Remove ${records.kept()} confirmed from this browser`;
+  }
+
   function show(text, file = null) {
     const isLarge = file && file.size > MOST_SHOWN;
     hidden = isLarge ? text : '';
@@ -64,6 +73,7 @@ export function fileDialog(store, put, say) {
   map.addEventListener('change', () => (names.parentElement.hidden = map.value !== 'own'));
   get('open-file').addEventListener('click', () => {
     show(JSON.stringify(scene(), null, 1));
+    listRecords();
     dialog.showModal();
     area.focus();
   });
@@ -71,11 +81,17 @@ export function fileDialog(store, put, say) {
   get('import').addEventListener('click', () => {
     try {
       const scenes = scenesIn(source());
-      const { scene: read, notes } = scenes.read(chosen(scenes.names.length), labelsOf(map.value, names.value));
-      if (notes && !read.objects.length) {
-        throw new SceneError(`The file has no object for a scene: ${notes[0]?.[2] ?? 'it lists no detection with a class'}.`);
+      const index = chosen(scenes.names.length);
+      const labels = labelsOf(map.value, names.value);
+      const given = scenes.read(index, labels);
+      if (given.notes && !given.scene.objects.length) {
+        throw new SceneError(`The file has no object for a scene: ${given.notes[0]?.[2] ?? 'it lists no detection with a class'}.`);
       }
-      put(read, inWords(notes ?? []));
+      // Only requests and training scenes have no notes.
+      const lines = given.notes ? [] : linesIn(source());
+      const line = lines.length ? records.open(lines)[index] : undefined;
+      const { scene: read } = line ? scenesIn(JSON.stringify(line)).read(0, labels) : given;
+      put(read, inWords(given.notes ?? []), line);
       dialog.close();
       say('The scene is on the board.');
     } catch (problem) {
@@ -83,12 +99,13 @@ export function fileDialog(store, put, say) {
       error.textContent = problem.message;
     }
   });
-  get('download').addEventListener('click', () => {
-    const link = document.createElement('a');
-    link.href = URL.createObjectURL(new Blob([source()], { type: 'application/json' }));
-    link.download = 'scene.json';
-    link.click();
-    URL.revokeObjectURL(link.href);
+  get('download').addEventListener('click', () => save(source(), 'scene.json'));
+  get('download-scenes').addEventListener('click', () => save(records.text(), 'scenes.jsonl'));
+  get('forget-scenes').addEventListener('click', () => {
+    records.clear();
+    listRecords();
+    done.textContent = 'This browser keeps no confirmed scene.';
+    get('download').focus();
   });
   get('upload').addEventListener('change', async ({ target }) => {
     const [file] = target.files;
@@ -101,4 +118,13 @@ export function fileDialog(store, put, say) {
     await copy(location.href);
     done.textContent = 'The link is copied. It contains the whole scene, and browsers do not send this part to a server.';
   });
+}
+
+/** Saves a text as a file. */
+function save(text, name) {
+  const link = document.createElement('a');
+  link.href = URL.createObjectURL(new Blob([text], { type: 'application/json' }));
+  link.download = name;
+  link.click();
+  URL.revokeObjectURL(link.href);
 }

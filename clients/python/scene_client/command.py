@@ -39,7 +39,7 @@ from scene_client.sync import Client
 REFUSED, MEANINGLESS, UNREACHABLE, LATE, BUSY, FAILED = range(1, 7)
 
 _FLAGS: Final = ("--json",)
-_VALUED: Final = ("--url", "--model", "--offline", "--timeout")
+_VALUED: Final = ("--url", "--model", "--offline", "--timeout", "--record")
 _RELATIONS: Final = get_args(RelationName)
 _MAX_NOTES: Final = 10  # maximum number of printed notes on a file
 
@@ -88,15 +88,20 @@ class Options:
     store: Path | None
     timeout: float
     as_json: bool
+    record: Path | None
 
     def client(self) -> Client:
         """Return the client that sends the question."""
         if self.store is not None:
-            return OfflineClient(self.store, timeout=self.timeout, model=self.model)
+            return OfflineClient(
+                self.store, timeout=self.timeout, model=self.model, record=self.record
+            )
         # An environment variable sets the API key, because other users of the machine can read the
         # options of a process.
         key = os.environ.get("SCENE_API_KEY") or None
-        return Client(self.url, timeout=self.timeout, model=self.model, api_key=key)
+        return Client(
+            self.url, timeout=self.timeout, model=self.model, api_key=key, record=self.record
+        )
 
 
 def _show(
@@ -155,13 +160,19 @@ def main(
         float, typer.Option(help="Maximum time of the whole call in seconds.")
     ] = 10.0,
     json: Annotated[bool, typer.Option("--json", help="Print the answer as JSON.")] = False,
+    record: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="SCENES.jsonl", help="Append the scene to this file, in the training format."
+        ),
+    ] = None,
     version: Annotated[  # noqa: ARG001 — the callback prints the version
         bool,
         typer.Option("--version", help="Print the version.", callback=_version, is_eager=True),
     ] = False,
 ) -> None:
     """Store the general options for the subcommand."""
-    context.obj = Options(url, model, offline, timeout, json)
+    context.obj = Options(url, model, offline, timeout, json, record)
 
 
 # ---------------------------------------------------------------------------------- questions
