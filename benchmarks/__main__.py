@@ -12,6 +12,7 @@ from rich.console import Console
 from benchmarks.gibbs import gibbs
 from benchmarks.load.servers import ServerError
 from benchmarks.log_odds import log_odds
+from benchmarks.recording import recording
 from benchmarks.report import Result, describe_machine
 from benchmarks.scaling import scaling
 from benchmarks.service import service
@@ -26,6 +27,7 @@ class Name(StrEnum):
     LOG_ODDS = "log-odds"
     SCALING = "scaling"
     SERVICE = "service"
+    RECORDING = "recording"
 
 
 def main(
@@ -62,6 +64,8 @@ def _run(name: Name, store: Path) -> list[Result]:
             return scaling()
         case Name.SERVICE:
             return service(store=store)
+        case Name.RECORDING:
+            return recording(store=store)
 
 
 if __name__ == "__main__":

@@ -34,9 +34,9 @@ from app.questions.posterior import LEAST_CHANGE, Posterior, calibrated
 from app.questions.question import LABELS, REFUSED, SCENES, Example, Options, Question
 from app.questions.reading import Reading
 from app.registry.artifact import Artifact
-from app.scene.geometry import Axes, viewer_axes
 from app.scene.relations import opposite
 from app.scene.scene import Scene
+from scene_client.frames import Axes, viewer_axes
 from scene_client.schemas import Anchor, MissingAnswer, MissingRequest
 
 VIEWER = viewer_axes()

@@ -18,7 +18,6 @@ from app.questions.answer import Fields, significant
 from app.questions.posterior import Posterior
 from app.registry.artifact import Artifact
 from app.registry.offsets import Offsets
-from app.scene.geometry import Axes
 from app.scene.relations import (
     CANONICAL,
     INSIDE,
@@ -30,6 +29,7 @@ from app.scene.relations import (
 )
 from app.scene.scene import Scene, SceneObject, boxes_of
 from app.scene.vocabulary import do_not_fit
+from scene_client.frames import Axes
 
 Mask = NDArray[np.bool_]
 

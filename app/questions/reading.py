@@ -19,11 +19,12 @@ from pydantic_core import to_json
 from app.errors import ContradictionError, InvalidRequestError, Location
 from app.questions.names import ErrorList, LookUps, Names, Unknown
 from app.questions.scene_warnings import scene_warnings
-from app.scene.geometry import Viewpoint, body_pose, is_optical
+from app.scene.geometry import Viewpoint
 from app.scene.relations import CANONICAL, canonicalise, support_cycle
 from app.scene.roles import RoleCounts
 from app.scene.scene import Scene, SceneObject, observe
 from app.scene.vocabulary import Vocabulary
+from scene_client.frames import body_pose, is_optical, is_world_fixed
 from scene_client.schemas import (
     Detection,
     ObservedRelation,
@@ -134,8 +135,8 @@ def read_scene(
         in_frame, view = reading.scene, request.viewpoint
         reading.scene = observe(
             in_frame,
-            frame_id=request.frame_id,
             viewpoint=None if view is None else Viewpoint(view.x, view.y, view.yaw),
+            has_viewer=view is not None or not is_world_fixed(request.frame_id),
             typical_sizes=vocabulary.sizes,
             roles=roles,
         )
@@ -162,7 +163,7 @@ def _objects(
 
     The function adds the ignored objects to ``left_out``.
     """
-    optical = request.frame_id is not None and is_optical(request.frame_id)
+    optical = is_optical(request.frame_id)
     objects: list[SceneObject] = []
     detections: dict[int, Detection] = {}
     for number, (name, entry) in enumerate(zip(ids, request.objects, strict=True)):

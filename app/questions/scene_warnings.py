@@ -12,9 +12,10 @@ from itertools import compress
 from statistics import median
 from typing import Final
 
-from app.scene.geometry import LARGEST, MOST_DISTANT, SMALLEST, is_optical, is_world_fixed
+from app.scene.geometry import LARGEST, MOST_DISTANT, SMALLEST
 from app.scene.scene import Point, Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
+from scene_client.frames import is_optical, is_world_fixed
 from scene_client.schemas import Detection, SceneRequest, SceneWarning
 from scene_client.schemas.answers import WarningCode
 
@@ -82,7 +83,7 @@ def scene_warnings(
         if one.size is not None and not SMALLEST <= max(one.size) <= LARGEST and one not in scaled
     ]
     rolled = _rolled(fits, detections)
-    optical = request.frame_id is not None and is_optical(request.frame_id)
+    optical = is_optical(request.frame_id)
     y_up = () if optical else _y_up([fit for fit in fits if fit[0] not in rolled])
     unsized = _unsized(placed, vocabulary) if derived and len(placed) > 1 else ()
     kinds: list[tuple[WarningCode, str, Sequence[SceneObject]]] = [
@@ -111,7 +112,7 @@ def _distant(placed: Sequence[SceneObject], request: SceneRequest) -> list[Scene
     centre = _ORIGIN
     if request.viewpoint is not None:
         centre = (request.viewpoint.x, request.viewpoint.y, 0.0)
-    elif placed and request.frame_id is not None and is_world_fixed(request.frame_id):
+    elif placed and is_world_fixed(request.frame_id):
         x, y, z = map(median, zip(*positions, strict=True))
         centre = (x, y, z)
     far = [math.dist(position, centre) > MOST_DISTANT for position in positions]

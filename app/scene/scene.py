@@ -26,7 +26,6 @@ from app.scene.geometry import (
     Viewpoint,
     derive_relations,
     excluded_by_centres,
-    is_world_fixed,
     to_viewer_frame,
 )
 from app.scene.relations import CANONICAL
@@ -103,27 +102,27 @@ _UNKNOWN = (math.nan, math.nan, math.nan)
 def observe(
     scene: Scene,
     *,
-    frame_id: str | None = None,
     viewpoint: Viewpoint | None = None,
+    has_viewer: bool = True,
     typical_sizes: NDArray[np.float64] | None = None,
     roles: RoleCounts | None = None,
 ) -> Scene:
     """Derive the relations of a scene from the poses of its objects.
 
-    Positions and yaws must be in body axes (`app.scene.geometry.body_pose`). If ``viewpoint`` is
+    Positions and yaws must be in body axes (x forward, y left, z up). If ``viewpoint`` is
     given, the returned scene has positions and yaws in viewer axes. The field ``relations`` of the
     result lists the relations that hold. The field ``poses`` also contains relations observed not
     to hold.
 
     Stated relations take the place of derived relations. If the scene states relations, the
-    function only sets the field ``excluded``. It returns a scene without positions unchanged. In a
-    world-fixed frame (map, odom, world) without a viewpoint, left and front are undefined. The
-    function then derives only on-top, above and inside.
+    function only sets the field ``excluded``. It returns a scene without positions unchanged.
+    Without a viewer, left and front are undefined. The function then derives only on-top, above and
+    inside.
 
     Args:
-        frame_id: name of the frame of the positions.
         viewpoint: position and heading of the viewer in this frame. By default, the viewer is at
             the origin and looks along x.
+        has_viewer: whether the viewer's pose is known.
         typical_sizes: (V, 3) typical extents of each class in metres (`Vocabulary.sizes`). They
             replace missing sizes of objects, and sizes below `SMALLEST`. NaN means an unknown size.
         roles: counts that decide between on-top, under and inside; see `derive_relations`.
@@ -131,18 +130,17 @@ def observe(
     if all(thing.position is None for thing in scene.objects):
         return scene
     objects = scene.objects if viewpoint is None else _in_viewer_frame(scene.objects, viewpoint)
-    has_no_viewer = viewpoint is None and frame_id is not None and is_world_fixed(frame_id)
     points, sizes = boxes_of(objects, typical_sizes)
     poses = derive_relations(
         points,
         sizes,
         [thing.yaw for thing in objects],
-        horizontal=not has_no_viewer,
+        horizontal=has_viewer,
         classes=np.array([-1 if one.class_index is None else one.class_index for one in objects]),
         roles=roles,
     )
     excluded = poses.observed & ~poses.holds
-    excluded |= excluded_by_centres(points, sizes, horizontal=not has_no_viewer)
+    excluded |= excluded_by_centres(points, sizes, horizontal=has_viewer)
     if scene.relations is not None:
         for triple in scene.relations:
             excluded[triple] = False

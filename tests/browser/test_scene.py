@@ -101,10 +101,10 @@ def test_numbers_can_be_typed(open_board: OpenBoard) -> None:
 
 NO_SCENES: list[tuple[Any, str]] = [
     ("{", "neither JSON nor a list"),
-    ('{"objects": ["bed"]}\n{"objects": ', "neither JSON nor a list"),
-    ({"detections": [None]}, "neither a scene nor a message"),
+    ('{"objects": ["bed"]\n{"objects": ', "neither JSON nor a list"),
+    ({"detections": [None]}, "no hypothesis with a score"),
     ({"detections": []}, "no detection with a class"),
-    (3, "A scene must be a JSON object"),
+    (3, "A JSON value is neither a scene"),
     ({"objects": [{"label": "bed", "size": [-1, 1, 1]}]}, "numbers x, y, z from 0"),
     ({"objects": [{"id": "a", "label": "bed"}] * 2}, "another object"),
     ({"objects": [{"label": "bed", "position": [1e9, 0, 0]}]}, "100 000 km"),

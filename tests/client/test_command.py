@@ -189,7 +189,6 @@ def test_nan_and_infinity_are_read(scene: Any) -> None:
 FILES = {
     "two.jsonl": b"{}\n{}",
     "bare.jsonl": b'{"scene_id": "a"}',
-    "labels.jsonl": b'{"scene_id": "a", "objects": ["bed"]}',
     "twice.jsonl": b'{"scene_id": "a", "objects": [%b, %b]}'
     % ((b'{"id": 0, "label": "bed"}',) * 2),
     "images.json": b'[{"category_id": 59, "image_id": 1}, {"category_id": 59, "image_id": 2}]',
@@ -215,12 +214,11 @@ FILES = {
         ("missing bed --offline nowhere", 2, ["directory"]),
         ("missing ./two.jsonl", 2, ["has 2 lines: choose one, such as"]),
         ("missing ./two.jsonl:3", 2, ["has no line 3"]),
-        *[
-            (f"missing ./{name}.jsonl:1", 2, ["not a scene of the training format"])
-            for name in ("bare", "labels", "twice")
-        ],
+        ("missing ./bare.jsonl:1", 2, ["neither a request with a list of objects"]),
+        ("missing ./twice.jsonl:1", 2, ["not a scene of the training format"]),
         *[(f"missing 59 --label-map ./names{k}", 2, ["--label-map"]) for k in range(5)],
-        ("missing ./images.json", 2, ["several images"]),
+        ("missing ./images.json", 2, ["2 scenes (1, 2): choose one, such as ./images.json:1"]),
+        ("missing ./images.json:3", 2, ["no scene 3; it has 2 scenes (1, 2)"]),
         (
             "missing bed nightstnad",
             1,

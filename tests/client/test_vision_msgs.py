@@ -7,6 +7,7 @@ import math
 from contextlib import suppress
 from itertools import count, repeat
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ from rosbags.typesys.store import Typestore
 from typer.testing import CliRunner
 
 from app.registry import Store
+from scene_client import from_data
 from scene_client.command import app
 from scene_client.ros_fields import COCO, MessageError
 from scene_client.schemas import SceneRequest
@@ -26,6 +28,7 @@ from scene_client.vision_msgs import (
 )
 from tests.chaos.corpus import places, replaced
 from tests.client.ros_messages import Layout, blank, filled, through_cdr, to_json
+from tests.client.scene_files import EXAMPLES
 
 UNTURNED = (0.0, 0.0, 0.0, 1.0)
 
@@ -76,6 +79,26 @@ def only(fields: SceneFields) -> dict[str, Any]:
 
 def reasons(fields: SceneFields) -> list[tuple[int | None, str]]:
     return [(note.detection, note.reason) for note in fields.notes]
+
+
+def as_objects(value: Any) -> Any:
+    """A message with attributes, as rclpy returns it."""
+    if isinstance(value, dict):
+        return SimpleNamespace(**{name: as_objects(part) for name, part in value.items()})
+    return [as_objects(part) for part in value] if isinstance(value, list) else value
+
+
+@pytest.mark.parametrize("name", ["yolo_ros_3d.json", "yolo_ros_2d.json", "moveit.json"])
+def test_messages_of_other_packages_may_be_objects(name: str) -> None:
+    message = json.loads(EXAMPLES[name].text)
+    expected = from_data(message)
+    if name == "moveit.json":
+        message["world"]["collision_objects"][4]["operation"] = b"\x01"
+    else:
+        assert from_message(as_objects(message)) == from_message(message) == expected
+    fields = from_data(as_objects(message))
+    assert fields == expected
+    assert fields.notes == expected.notes
 
 
 # ---------------------------------------------------------------------------------- 3D, by hand

@@ -16,7 +16,7 @@ from app import questions
 from app.questions import QUESTIONS
 from app.registry import Counts, Store
 from app.scene import Scene, SceneObject
-from app.scene.geometry import viewer_axes
+from scene_client.frames import viewer_axes
 from tests.http.stores import PROFILES, VOCABULARY, C, V, publish
 from tests.http.test_problems import problem
 from tests.questions.test_placements import offsets_of_every_pair

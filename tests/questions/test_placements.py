@@ -21,7 +21,6 @@ from app.registry import CountSlope, Offsets
 from app.registry.description import PlaceFit
 from app.registry.offsets import UNOBSERVED
 from app.scene import RELATIONS, ObjectClass, Scene, SceneObject, Vocabulary
-from app.scene.geometry import viewer_axes
 from app.scene.relations import (
     ABOVE,
     CANONICAL,
@@ -33,6 +32,7 @@ from app.scene.relations import (
     canonicalise,
 )
 from app.scene.stands import HANGS, SUPPORTED
+from scene_client.frames import viewer_axes
 from tests.questions.answers import missing, without_minimums
 from tests.questions.artifacts import (
     LABELS,

@@ -20,12 +20,8 @@ from app.scene import (
 )
 from app.scene.geometry import (
     Viewpoint,
-    body_pose,
     derive_relations,
-    is_optical,
-    is_world_fixed,
     to_viewer_frame,
-    viewer_axes,
 )
 from app.scene.relations import (
     ABOVE,
@@ -42,6 +38,7 @@ from app.scene.relations import (
 )
 from app.scene.scene import pool_classes
 from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN, Heights, floor_level, stands_of
+from scene_client.frames import body_pose, is_optical, is_world_fixed, viewer_axes
 from scene_client.schemas import RelationName
 from tests.scene.role_counts import LABELS, role_counts
 from tests.scene.turns import about, after
@@ -99,7 +96,7 @@ def test_stated_relations_stay_and_poses_exclude_others() -> None:
 
 def test_in_a_map_without_a_viewer_no_direction_is_excluded() -> None:
     sofa = SceneObject("sofa", "sofa", 3, position=(6.0, 0.0, 0.4), size=(0.9, 2.0, 0.8))
-    seen = observe(Scene((DESK, sofa)), frame_id="map")
+    seen = observe(Scene((DESK, sofa)), has_viewer=False)
     assert seen.excluded is not None
     assert not seen.excluded[[LEFT, FRONT]].any()
 

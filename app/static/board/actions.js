@@ -29,12 +29,15 @@ export function createActions(store, say, menu) {
     if (store.get().selected !== id) store.set({ selected: id });
   }
 
-  /** @param {{x: number, y: number}} [at] position of the drop; without it, a free place */
+  /**
+   * @param {{x: number, y: number}} [at] position of the drop; without it, a free place
+   * @returns {string | undefined} the id; undefined if the scene is full
+   */
   function add(label, at) {
     const { things, viewer } = store.get();
     if (things.length >= MOST_OBJECTS) {
       store.set({ complaint: FULL });
-      return;
+      return undefined;
     }
     const id = freshId(things, label);
     const thing = { id, label, x: 0, y: 0, z: 0, size: null, yaw: 0, confidence: 1, placed: Boolean(at) };
@@ -44,6 +47,7 @@ export function createActions(store, say, menu) {
     const z = round(floorUnder(boxes, { ...box, ...place }));
     store.edit({ things: [...things, { ...thing, ...place, z }], selected: id });
     say(`${id} added, ${whereabouts(place.x, place.y, viewer)}.`);
+    return id;
   }
 
   function remove(id) {

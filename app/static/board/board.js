@@ -2,7 +2,7 @@
 
 import { ROBOT, whereabouts } from './actions.js';
 import { drawEdges } from './edge_drawing.js';
-import { edgesOf } from './edges.js';
+import { edgesOf, judgedBy } from './edges.js';
 import { drawGhosts } from './ghost_drawing.js';
 import { UNKNOWN_SIZE } from './geometry.js';
 import { ghostsOf, ROBOT_SIDE } from './ghosts.js';
@@ -17,11 +17,12 @@ const MARK = 9; // radius of the mark of an outlier, in pixels
 const FONT = '500 13px system-ui, sans-serif';
 const SEEN = [
   'things', 'viewer', 'answers', 'shown', 'tab', 'selected', 'draft', 'words', 'at', 'models', 'posed', 'refused',
+  'right',
 ];
 
 /** Outlier entries of the shown model, by object id. */
 export function outliersOf(state) {
-  const answer = state.answers[state.shown].outliers?.answer;
+  const answer = judgedBy(state.answers[state.shown], state);
   return new Map((answer?.outliers ?? []).map((one) => [one.object, one]));
 }
 

@@ -2,13 +2,13 @@
 
 import { curl, python } from './calls.js';
 import { bar, copy, el, redraw } from './dom.js';
-import { wrongIn } from './edges.js';
+import { judgedBy } from './edges.js';
 import { accept, ghostsOf, likely, SHIFTED } from './ghosts.js';
 import { common, inWords, QUESTIONS, reading, whyNot } from './questions.js';
 import { changed } from './store.js';
 import { namesOf, percent, SPOKEN } from './words.js';
 
-const SEEN = ['answers', 'shown', 'models', 'things', 'tab', 'draft', 'words', 'at', 'refused', 'posed', 'relations', 'room'];
+const SEEN = ['answers', 'shown', 'models', 'things', 'tab', 'draft', 'words', 'at', 'refused', 'posed', 'relations', 'room', 'right'];
 
 const PLACES = 2; // listed places of a missing object, likeliest first
 
@@ -42,14 +42,21 @@ const judges = (answer) => !answer?.warnings?.some(({ code }) => code === 'not-j
 const row = (kind, words, probability, flag, ...more) =>
   el('li', { class: flag.kind ?? '' },
     el('div', { class: 'headline' }, words, flag.words ? el('span', { class: 'flag' }, flag.words) : null,
-      el('span', {}, percent(probability)), flag.button ?? null),
+      el('span', {}, percent(probability)), ...(flag.buttons ?? [])),
     bar(probability, kind), ...more);
 
+/** A button that confirms an answer. The name of its object follows the visible words. */
+const verdict = (words, about, onclick) => el('button', {
+  type: 'button', class: 'verdict', 'data-key': `${words} ${about}`, 'aria-label': `${words}: ${about}`,
+  // The second click of a double click would hit the next row.
+  onclick: ({ detail }) => detail < 2 && onclick(),
+}, words);
+
 const ROWS = {
-  missing(answer, name, state, store, column) {
+  missing(answer, name, state, store, column, verdicts) {
     const ghosts = new Map(column === state.shown ? ghostsOf(state).map((ghost) => [ghost.label, ghost]) : []);
     const nowhere = judges(state.answers[column].relations?.answer) ? 'no likely place' : '';
-    const rows = likely(state.answers[column], state.at).map(({ label, probability, placements, because = [] }) => {
+    const rows = likely(state.answers[column], state).map(({ label, probability, placements, because = [] }) => {
       const ghost = ghosts.get(label);
       const first = placements.slice(0, PLACES);
       // The place on the board is always listed.
@@ -63,7 +70,8 @@ const ROWS = {
         // The second click of a double click would take the next suggestion.
         onclick: ({ detail }) => detail < 2 && accept(store, ghost),
       }, '+');
-      return [probability, row('missing', el('b', {}, label), probability, { button },
+      const isThere = verdict('Is there', label, () => verdicts.isThere(label, ghost));
+      return [probability, row('missing', el('b', {}, label), probability, { buttons: [...(ghost ? [button] : []), isThere] },
         el('p', { class: 'quiet' }, places.join(' · ') || nowhere), reasons(because, name))];
     });
     // An answer about chosen classes also has improbable instances.
@@ -73,20 +81,25 @@ const ROWS = {
     return [...rows, ...further].sort(([a], [b]) => b - a).map(([, node]) => node);
   },
 
-  outliers(answer, name, state, store) {
+  outliers(found, name, state, store, column, verdicts) {
+    const answer = judgedBy(state.answers[column], state) ?? found;
     const objects = answer.outliers.map((one) =>
       row('outliers', el('button', {
         type: 'button', class: 'link', 'data-key': `of-${one.object}`,
         onclick: () => store.set({ selected: one.object }),
-      }, name(one.object)), one.probability, one.is_outlier ? { kind: 'alarm', words: 'does not belong' } : {},
+      }, name(one.object)), one.probability, one.is_outlier
+        ? { kind: 'alarm', words: 'does not belong', buttons: [verdict('Belongs here', name(one.object), () => verdicts.belongs(one.object))] }
+        : { words: one.confirmed ? 'confirmed' : '' },
       reasons(one.because, name, one.usually_with)));
-    const misplaced = wrongIn(answer).misplaced.map((one) =>
-      row('outliers', el('b', {}, spoken(one, name)), one.probability, { kind: 'alarm', words: 'in the wrong place' },
+    const misplaced = answer.misplaced.filter((one) => one.is_misplaced || one.confirmed).map((one) =>
+      row('outliers', el('b', {}, spoken(one, name)), one.probability, one.confirmed
+        ? { words: 'confirmed' }
+        : { kind: 'alarm', words: 'in the wrong place', buttons: [verdict('Stands right', spoken(one, name), () => verdicts.standsRight(one))] },
         one.moved == null ? null : el('p', { class: 'quiet' }, `moved: ${name(one.moved)}`)));
     const stated = state.posed || state.relations.length;
-    const alarms = wrongIn(answer).outliers.length; // the first ones, because the least fitting objects come first
+    const alarms = answer.outliers.map((one) => one.is_outlier);
     return [
-      ...objects.slice(0, alarms), ...misplaced, ...objects.slice(alarms),
+      ...objects.filter((_, index) => alarms[index]), ...misplaced, ...objects.filter((_, index) => !alarms[index]),
       stated ? null : el('li', { class: 'quiet' }, 'Places are not judged, because positions do not count as evidence.'),
     ].filter(Boolean);
   },
@@ -152,7 +165,7 @@ export function problemWords(problem, body) {
   ].filter(Boolean);
 }
 
-export function createColumns(store, parents, askKey) {
+export function createColumns(store, parents, askKey, verdicts) {
   const made = new Map();
   for (const question of QUESTIONS) {
     for (const column of [0, 1]) {
@@ -183,7 +196,7 @@ export function createColumns(store, parents, askKey) {
     }
     own.told = problem;
     const name = namesOf(state.things);
-    const rows = answer ? ROWS[question](answer, name, state, store, column) : [];
+    const rows = answer ? ROWS[question](answer, name, state, store, column, verdicts) : [];
     redraw(own.rows, rows);
     const waiting = status === 'down' ? 'Waiting for the service.' : whyNot(state, question, model);
     const shared = question === 'missing' && column === 0 && common(state);

@@ -11,6 +11,21 @@
 
 import { percent, SPOKEN } from './words.js';
 
+/** A relation as one text, for comparisons. */
+export const keyOf = ({ subject, relation, object }) => JSON.stringify([subject, relation, object]);
+
+/** The answer about outliers of a model, without the alarms that the user confirmed as right; undefined without an answer. */
+export function judgedBy(own, { things, right }) {
+  const answer = own.outliers?.answer;
+  const belongs = new Set(things.filter((thing) => thing.belongs).map(({ id }) => id));
+  if (!answer || !(belongs.size || right.length)) return answer ?? undefined;
+  return {
+    ...answer,
+    outliers: answer.outliers.map((one) => (belongs.has(one.object) ? { ...one, is_outlier: false, confirmed: true } : one)),
+    misplaced: answer.misplaced.map((one) => (right.includes(keyOf(one)) ? { ...one, is_misplaced: false, confirmed: true } : one)),
+  };
+}
+
 /** The alarms of an answer: outliers and misplaced relations. */
 export const wrongIn = (answer) => ({
   outliers: answer.outliers.filter((one) => one.is_outlier),
@@ -36,7 +51,8 @@ export function edgesOf(state) {
     return onePerPair(state.draft.relations.map((one) => edge(one, 'drawn', SPOKEN[one.relation])))
       .filter((one) => state.selected && [one.subject, one.object].includes(state.selected));
   }
-  const answer = state.answers[state.shown][state.tab]?.answer;
+  const own = state.answers[state.shown];
+  const answer = state.tab === 'outliers' ? judgedBy(own, state) : own[state.tab]?.answer;
   return answer && ofTab[state.tab] ? onePerPair(ofTab[state.tab](answer)) : [];
 }
 

@@ -1,67 +1,130 @@
 /** The dialog with the scene as text, to copy it, store it in a file or share it as a link. */
 
+import { labelsOf } from './class_ids.js';
 import { copy } from './dom.js';
-import { scenesIn } from './importing.js';
+import { MOST_BYTES, scenesIn } from './importing.js';
+import { linesIn } from './records.js';
 import { sizesOf } from './questions.js';
 import { SceneError, toScene } from './scene.js';
 import { toHash } from './share.js';
 
-/** @param {(scene: object) => void} put puts a scene on the board; throws SceneError */
-export function fileDialog(store, put, say) {
-  const get = (id) => document.getElementById(id);
-  const [dialog, area, error, done, which] = ['file', 'json', 'json-error', 'share-done', 'which'].map(get);
-  const scene = () => toScene(store.get(), sizesOf(store.get(), store.get().models[0]));
+const SOME = 3; // notes that the page shows
+const MOST_SHOWN = 2 ** 20; // bytes; a browser needs a minute to show a text of 50 MB
 
-  /** Lets the user choose a scene if the text has several, one a line. */
+/** @param {(scene: object, notes: string, line: object | undefined) => void} put puts a scene on the board; throws SceneError */
+export function fileDialog(store, records, put, say) {
+  const get = (id) => document.getElementById(id);
+  const [dialog, area, error, done, which, map, names] =
+    ['file', 'json', 'json-error', 'share-done', 'which', 'label-map', 'label-names'].map(get);
+  const scene = () => toScene(store.get(), sizesOf(store.get(), store.get().models[0]));
+  const chosen = (count) => Math.min(count, Math.max(1, Number(which.value))) - 1;
+  let found = [];
+  let hidden = ''; // text of a large file, which the text area does not show
+  const source = () => hidden || area.value;
+
+  /** Lets the user choose a scene if the text has several: lines, images, frames or rooms. */
   function count() {
-    let scenes = [];
+    found = [];
     try {
-      scenes = scenesIn(area.value);
-    } catch {
+      found = scenesIn(source()).names;
+    } catch (problem) {
       // The button “Put on the board” shows the error.
+      if (!(problem instanceof SceneError)) throw problem;
     }
-    which.max = scenes.length;
+    which.max = found.length;
     which.value = 1;
-    which.parentElement.hidden = scenes.length < 2;
-    get('scenes').textContent = `of ${scenes.length}`;
+    which.parentElement.hidden = found.length < 2;
+    name();
   }
 
-  area.addEventListener('input', count);
-  get('open-file').addEventListener('click', () => {
-    area.value = JSON.stringify(scene(), null, 1);
+  function name() {
+    get('scenes').textContent = `of ${found.length}: ${found[chosen(found.length)] ?? ''}`;
+  }
+
+  /** The text of the notes on values that the scene leaves out. */
+  function inWords(notes) {
+    const words = notes.slice(0, SOME).map(([index, , reason]) => (index === null ? reason : `detection ${index}: ${reason}`));
+    return words.length ? `The file was read with notes: ${words.join('; ')}${notes.length > SOME ? `; and ${notes.length - SOME} more` : ''}.` : '';
+  }
+
+  /** Shows the buttons of the confirmed scenes if there are any. */
+  function listRecords() {
+    get('download-scenes').hidden = !records.count();
+    get('download-scenes').textContent = `Download scenes.jsonl (${records.count()} confirmed)`;
+    get('forget-scenes').hidden = !records.kept();
+    get('forget-scenes').textContent = `Remove ${records.kept()} confirmed from this browser`;
+  }
+
+  function show(text, file = null) {
+    const isLarge = file && file.size > MOST_SHOWN;
+    hidden = isLarge ? text : '';
+    area.value = isLarge ? '' : text;
     error.textContent = '';
+    done.textContent = isLarge ? `${file.name} is open. It is too large to be shown here.` : '';
+    count();
+  }
+
+  area.addEventListener('input', () => {
+    hidden = '';
     done.textContent = '';
     count();
+  });
+  which.addEventListener('input', name);
+  map.addEventListener('change', () => (names.parentElement.hidden = map.value !== 'own'));
+  get('open-file').addEventListener('click', () => {
+    show(JSON.stringify(scene(), null, 1));
+    listRecords();
     dialog.showModal();
     area.focus();
   });
   get('close-file').addEventListener('click', () => dialog.close());
   get('import').addEventListener('click', () => {
     try {
-      const scenes = scenesIn(area.value);
-      put(scenes[Math.min(scenes.length, Math.max(1, Number(which.value))) - 1]);
+      const scenes = scenesIn(source());
+      const index = chosen(scenes.names.length);
+      const labels = labelsOf(map.value, names.value);
+      const given = scenes.read(index, labels);
+      if (given.notes && !given.scene.objects.length) {
+        throw new SceneError(`The file has no object for a scene: ${given.notes[0]?.[2] ?? 'it lists no detection with a class'}.`);
+      }
+      // Only requests and training scenes have no notes.
+      const lines = given.notes ? [] : linesIn(source());
+      const line = lines.length ? records.open(lines)[index] : undefined;
+      const { scene: read } = line ? scenesIn(JSON.stringify(line)).read(0, labels) : given;
+      put(read, inWords(given.notes ?? []), line);
       dialog.close();
       say('The scene is on the board.');
     } catch (problem) {
-      if (!(problem instanceof SceneError || problem instanceof SyntaxError)) throw problem;
-      error.textContent = problem instanceof SyntaxError ? `This is neither JSON nor a list of labels: ${problem.message}.` : problem.message;
+      if (!(problem instanceof SceneError)) throw problem;
+      error.textContent = problem.message;
     }
   });
-  get('download').addEventListener('click', () => {
-    const link = document.createElement('a');
-    link.href = URL.createObjectURL(new Blob([area.value], { type: 'application/json' }));
-    link.download = 'scene.json';
-    link.click();
-    URL.revokeObjectURL(link.href);
+  get('download').addEventListener('click', () => save(source(), 'scene.json'));
+  get('download-scenes').addEventListener('click', () => save(records.text(), 'scenes.jsonl'));
+  get('forget-scenes').addEventListener('click', () => {
+    records.clear();
+    listRecords();
+    done.textContent = 'This browser keeps no confirmed scene.';
+    get('download').focus();
   });
   get('upload').addEventListener('change', async ({ target }) => {
-    if (target.files[0]) area.value = await target.files[0].text();
+    const [file] = target.files;
+    if (file && file.size <= MOST_BYTES) show(await file.text(), file);
+    else if (file) error.textContent = `The file is too large: it has more than ${MOST_BYTES / 2 ** 20} MiB.`;
     target.value = '';
-    count();
   });
   get('share').addEventListener('click', async () => {
     history.replaceState(null, '', await toHash(scene()));
     await copy(location.href);
     done.textContent = 'The link is copied. It contains the whole scene, and browsers do not send this part to a server.';
   });
+}
+
+/** Saves a text as a file. */
+function save(text, name) {
+  const link = document.createElement('a');
+  link.href = URL.createObjectURL(new Blob([text], { type: 'application/json' }));
+  link.download = name;
+  link.click();
+  URL.revokeObjectURL(link.href);
 }

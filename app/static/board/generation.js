@@ -5,6 +5,7 @@ import { calls, problemWords } from './columns.js';
 import { el } from './dom.js';
 import { layOut } from './layout.js';
 import { sceneFor, sizesOf } from './questions.js';
+import { newLine } from './records.js';
 import { freshId, FULL, MOST_OBJECTS, sizer } from './scene.js';
 import { changed } from './store.js';
 import { SPOKEN } from './words.js';
@@ -107,7 +108,7 @@ export function createGeneration(form, drawn, store, say) {
     }
     // A relation that the user stated does not hold for a generated object with the same name.
     const stated = relations.filter(({ subject, object }) => !fresh.has(subject) && !fresh.has(object));
-    store.edit({ things, relations: stated, draft: null, tab: 'missing', at: null });
+    store.edit({ things, relations: stated, draft: null, tab: 'missing', at: null, line: newLine() });
     say(`The generated scene is on the board: ${things.length} objects.`);
   });
 

@@ -1,5 +1,6 @@
 /** Places on the board for missing objects ("ghosts"). */
 
+import { judgedBy } from './edges.js';
 import { gap, halves, inside, overlap, round, UNKNOWN_SIZE } from './geometry.js';
 import { LIKELY, sizesOf } from './questions.js';
 import { freshId, FULL, MOST_OBJECTS, sizer } from './scene.js';
@@ -52,7 +53,7 @@ export function ghostsOf(state) {
   if (last.keys.every((key, index) => key === keys[index]) && last.keys.length) return last.ghosts;
   const sizes = sizesOf(state, state.models[0]);
   const shown = own.missing?.answer && state.tab === 'missing' && !state.draft;
-  last = { keys, ghosts: shown ? standing(likely(own, state.at), state.things.map(sizer(sizes)), state.viewer, sizes, state.at) : [] };
+  last = { keys, ghosts: shown ? standing(likely(own, state), state.things.map(sizer(sizes)), state.viewer, sizes, state.at) : [] };
   return last.ghosts;
 }
 
@@ -63,9 +64,10 @@ const LEAST = 0.01;
  * places in an answer about a place.
  * @param {object} own the answers of one model
  */
-export function likely({ missing: { answer: { missing } }, outliers }, at) {
-  if (at) return missing;
-  const wrong = new Set((outliers?.answer?.outliers ?? []).filter((one) => one.is_outlier).map(({ object }) => object));
+export function likely(own, state) {
+  const { missing } = own.missing.answer;
+  if (state.at) return missing;
+  const wrong = new Set((judgedBy(own, state)?.outliers ?? []).filter((one) => one.is_outlier).map(({ object }) => object));
   const isLikely = ({ probability, object }) => probability >= LIKELY && !wrong.has(object);
   return missing.filter(({ probability }) => probability >= LEAST)
     .map((one) => ({ ...one, placements: one.placements.filter(isLikely) }));

@@ -17,11 +17,13 @@ import { createProperties } from './properties.js';
 import { sizesOf } from './questions.js';
 import { watchService } from './recovery.js';
 import { fromScene, SceneError, sizer } from './scene.js';
+import { createRecords, newLine, withSources } from './records.js';
 import { settings } from './settings.js';
 import { fromHash } from './share.js';
 import { changed, createStore } from './store.js';
 import { summary } from './summary.js';
 import { tabs } from './tabs.js';
+import { createVerdicts } from './verdicts.js';
 
 const get = (id) => document.getElementById(id);
 const say = (words) => (get('live').textContent = words);
@@ -30,22 +32,27 @@ const store = createStore({
   things: [], relations: [], posed: false, viewer: { x: 0, y: 0, yaw: 0 }, room: '', models: ['default', ''], shown: 0,
   tab: 'missing', selected: null, at: null, sensitivity: 'medium', refused: {}, answers: [{}, {}], draft: null, words: {},
   down: false, complaint: '', epoch: 0, canUndo: false,
+  line: newLine(), right: [],
 });
 
 const OPENING = 4; // labels that the board shows for a model without examples
 
-/** Puts a scene of the API on the board. Objects without a position are laid out by their relations. @throws {SceneError} */
-function put(scene, change = {}) {
+/**
+ * Puts a scene of the API on the board, with its line if it comes from a file of recorded scenes. Objects without a position are laid out by their relations.
+ * @throws {SceneError}
+ */
+function put(scene, change = {}, line = newLine()) {
   const sizes = sizesOf(store.get(), store.get().models[0]);
   const { things, viewer, room, relations, optical } = fromScene(scene, sizes);
   const boxes = things.map(sizer(sizes));
   const loose = boxes.filter(({ placed }) => !placed).map((box) => ({ ...box, x: undefined, y: undefined }));
   const places = new Map(layOut(boxes.filter(({ placed }) => placed), loose, relations, viewer).map((box) => [box.id, box]));
   store.edit({
-    things: things.map((thing) => {
+    things: withSources(things.map((thing) => {
       const { x, y, z } = places.get(thing.id) ?? thing;
       return { ...thing, x, y, z };
-    }),
+    }), line),
+    line, right: [],
     // As in the service, stated relations take precedence over positions.
     relations, posed: !relations.length && things.some(({ placed }) => placed),
     viewer, room, selected: null, at: null, draft: null, ...change,
@@ -116,11 +123,13 @@ const views = [
   board.render,
   createList(get('list'), get('empty'), get('count'), actions),
   createProperties(get('properties'), store, actions),
-  createColumns(store, (question) => document.querySelector(`.columns[data-question=${question}]`), askKey),
+  createColumns(store, (question) => document.querySelector(`.columns[data-question=${question}]`), askKey,
+    createVerdicts(store, say, actions.add)),
   createGeneration(get('generate'), get('drawn'), store, say),
   tabs(document.querySelector('[role=tablist]'), store),
   settings(store),
   listExamples,
+  (state, previous) => changed(state, previous, 'line') && showRecords(),
 ];
 
 // Views draw at most once per frame, even if the state changes more often.
@@ -144,11 +153,20 @@ store.subscribe((state, previous) => {
 
 combobox(get('search'), get('found'), () => store.get().words[store.get().models[0]]?.objects ?? [],
   (label) => actions.add(label));
-fileDialog(store, (scene) => {
-  put(scene);
+const records = createRecords(store, showRecords);
+fileDialog(store, records, (scene, notes, line) => {
+  put(scene, {}, line);
+  if (notes) note(`${get('note').textContent} ${notes}`.trim());
   if (!store.get().down) get('banner').hidden = true; // such as that of a broken link
 }, say);
 watchService(store, get('banner'), () => void reload());
+
+/** Says whether the scene is confirmed, and how many confirmed scenes can be downloaded. */
+function showRecords() {
+  const isConfirmed = Boolean(store.get().line.confirmed);
+  get('confirmed').hidden = !isConfirmed;
+  get('confirmed').textContent = `Confirmed scene. Import, export downloads all confirmed scenes (${records.count()}).`;
+}
 
 /** Lists the examples of the first model. */
 function listExamples(state, previous) {
@@ -165,7 +183,7 @@ get('example').addEventListener('change', ({ target }) => {
 get('undo').addEventListener('click', () => store.undo());
 get('clear').addEventListener('click', () => {
   note('');
-  store.edit({ things: [], relations: [], room: '', selected: null, at: null, draft: null });
+  store.edit({ things: [], relations: [], room: '', selected: null, at: null, draft: null, line: newLine(), right: [] });
 });
 document.addEventListener('keydown', (event) => {
   const typing = event.target.closest('input, textarea, select');

@@ -82,20 +82,43 @@ export function fromScene(scene, sizes) {
   fail(!Array.isArray(scene.objects), 'A scene must have a list "objects".');
   fail(scene.objects.length > MOST_OBJECTS, `A scene can have at most ${MOST_OBJECTS} objects.`);
   const things = [];
-  const ids = idsOf(scene.objects);
-  scene.objects.forEach((entry, index) => things.push(readThing(entry, ids[index], index, things, sizes)));
+  const entries = scene.objects.map(spelledOut);
+  const ids = idsOf(entries);
+  entries.forEach((entry, index) => things.push(readThing(entry, ids[index], index, things, sizes)));
   const optical = /_optical(_frame)?$/.test(scene.frame_id ?? '');
   // In the optical frame of a camera, x and y have other directions than on the board.
   if (optical) for (const thing of things) thing.placed = false;
   const { x = 0, y = 0, yaw = 0 } = scene.viewpoint ?? {};
   fail(!(isPlace(x) && isPlace(y)), 'The viewpoint needs numbers x and y within ±100 000 km.');
   fail(!(isNumber(yaw) && Math.abs(yaw) <= MOST_TURNED), 'The viewpoint needs a yaw within ±1000 radians.');
-  const relations = scene.relations ?? [];
-  fail(!Array.isArray(relations), '"relations" must be a list.');
+  fail(!Array.isArray(scene.relations ?? []), '"relations" must be a list.');
+  const relations = [...(scene.relations ?? []).map(readRelation(things)), ...supports(entries, ids, things)];
   const room = scene.room_type ?? '';
   fail(typeof room !== 'string', 'The room type must be a text.');
-  return { things, viewer: { x, y, yaw }, room, relations: relations.map(readRelation(things)), optical };
+  return { things, viewer: { x, y, yaw }, room, relations: distinct(relations), optical };
 }
+
+/** An object with vectors as objects, its yaw as a quaternion, and a number as id. */
+function spelledOut(entry) {
+  if (!entry || typeof entry !== 'object') return entry;
+  const named = (value, ...names) =>
+    Array.isArray(value) && value.length === names.length ? Object.fromEntries(names.map((name, index) => [name, value[index]])) : value;
+  const { id, position, size, orientation, yaw } = entry;
+  const turn = isNumber(yaw) ? { x: 0, y: 0, z: Math.sin(yaw / 2), w: Math.cos(yaw / 2) } : orientation;
+  return { ...entry, id: asId(id), position: named(position, ...AXES), size: named(size, ...AXES), orientation: named(turn, ...AXES, 'w') };
+}
+
+/** A whole number is the id with its digits. */
+const asId = (id) => (Number.isInteger(id) ? String(id) : id);
+
+/** The supports of objects as relations, unless the positions of all objects give them. */
+function supports(entries, ids, things) {
+  if (entries.every((entry) => entry?.position)) return [];
+  const stated = entries.flatMap((entry, index) => (entry?.supported_by == null ? [] : [[ids[index], 'on-top', entry.supported_by]]));
+  return stated.map(readRelation(things));
+}
+
+const distinct = (relations) => [...new Map(relations.map((one) => [JSON.stringify(Object.values(one)), one])).values()];
 
 /** Reads relations, as objects or arrays. Their ends are ids or unambiguous labels. */
 function readRelation(things) {
@@ -105,7 +128,7 @@ function readRelation(things) {
   return (found, index) => {
     const where = `Relation ${index + 1}`;
     fail(!found || typeof found !== 'object', `${where} must have a subject, a relation and an object.`);
-    const [subject, relation, object] = Array.isArray(found) ? found : [found.subject, found.relation, found.object];
+    const [subject, relation, object] = (Array.isArray(found) ? found : [found.subject, found.relation, found.object]).map(asId);
     fail(!Object.hasOwn(SPOKEN, relation), `${where} must be one of ${Object.keys(SPOKEN).join(', ')}.`);
     for (const name of [subject, object]) {
       fail(!names.has(name), `${where} names an object outside the scene: ${name}.`);

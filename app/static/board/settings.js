@@ -2,7 +2,7 @@
 
 import { outliersOf } from './board.js';
 import { el } from './dom.js';
-import { edgesOf, wrongIn } from './edges.js';
+import { edgesOf, judgedBy, wrongIn } from './edges.js';
 import { UNKNOWN_SIZE } from './geometry.js';
 import { ghostsOf } from './ghosts.js';
 import { inWords, knownTo, readings, sizesOf } from './questions.js';
@@ -82,8 +82,8 @@ export function settings(store) {
     get('at').hidden = !state.at;
     if (state.at) get('at-words').textContent = `Missing ${SPOKEN[state.at.relation]} ${namesOf(state.things)(state.at.object)}`;
     if (changed(state, previous, 'words', 'models', 'room', 'shown') || roomsOf(state) !== roomsOf(previous)) rooms(state);
-    if (changed(state, previous, 'answers', 'shown', 'draft')) {
-      const answer = state.answers[state.shown].outliers?.answer;
+    if (changed(state, previous, 'answers', 'shown', 'draft', 'things', 'right')) {
+      const answer = judgedBy(state.answers[state.shown], state);
       const { outliers, misplaced } = answer ? wrongIn(answer) : { outliers: [], misplaced: [] };
       get('alarms').textContent = outliers.length + misplaced.length;
       get('alarms').hidden = Boolean(state.draft) || get('alarms').textContent === '0';

@@ -13,6 +13,8 @@
  * @property {number} yaw degrees, from x towards y
  * @property {number} confidence
  * @property {boolean} placed whether its position comes from the scene or the user, not from the page
+ * @property {boolean} [belongs] whether the user confirmed that it belongs here
+ * @property {object} [source] its entry in the opened file, and the object as it was then
  */
 
 /**
@@ -33,8 +35,8 @@ export function createStore(initial) {
     },
     /** Changes the board, so that `undo` can restore its previous state. */
     edit(change) {
-      const { things, relations, posed, viewer, room } = state;
-      past.push({ things, relations, posed, viewer, room });
+      const { things, relations, posed, viewer, room, line, right } = state;
+      past.push({ things, relations, posed, viewer, room, line, right });
       if (past.length > 200) past.shift();
       this.set({ complaint: '', ...change, canUndo: true });
     },

@@ -1,6 +1,6 @@
 /** A summary of the answers for the live region, which screen readers read aloud. */
 
-import { wrongIn } from './edges.js';
+import { judgedBy, wrongIn } from './edges.js';
 import { likely } from './ghosts.js';
 import { QUESTIONS } from './questions.js';
 import { namesOf, percent, SPOKEN } from './words.js';
@@ -13,13 +13,13 @@ export function summary(state) {
   if (!QUESTIONS.every((question) => own[question]?.status === 'answered')) return null;
   const name = namesOf(state.things);
   const parts = [];
-  const [first] = likely(own, state.at);
+  const [first] = likely(own, state);
   if (first) {
     const [place] = first.placements;
     const where = place ? ` ${SPOKEN[place.relation]} ${name(place.object)}` : '';
     parts.push(`Most likely missing: ${first.label}${where}, ${percent(first.probability)}.`);
   }
-  const { outliers, misplaced } = wrongIn(own.outliers.answer);
+  const { outliers, misplaced } = wrongIn(judgedBy(own, state));
   if (outliers.length) parts.push(`Does not belong here: ${outliers.map((one) => name(one.object)).join(', ')}.`);
   if (misplaced.length) {
     const places = misplaced.map(({ subject, relation, object, moved }) =>

@@ -18,19 +18,25 @@ if TYPE_CHECKING:
         ProblemError,
         UnreachableError,
     )
+    from scene_client.files import from_file
+    from scene_client.formats import from_data
     from scene_client.offline import OfflineClient
+    from scene_client.recorder import Recorder
     from scene_client.sync import Client
 
 __version__ = "1.0.0"
 
 __all__ = [
     "AnswerError", "AsyncClient", "Client", "ClientError", "DeadlineError", "InvalidRequestError",
-    "OfflineClient", "ProblemError", "UnreachableError",
+    "OfflineClient", "ProblemError", "Recorder", "UnreachableError", "from_data", "from_file",
 ]  # fmt: skip
 
 # Maps each name to the module that defines the name. The package imports the module on first use of
 # the name. So the service, which needs only the schemas, starts without httpx.
-_MODULES = {"AsyncClient": "asynchronous", "Client": "sync", "OfflineClient": "offline"}
+_MODULES = {
+    "AsyncClient": "asynchronous", "Client": "sync", "OfflineClient": "offline",
+    "Recorder": "recorder", "from_data": "formats", "from_file": "files",
+}  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
 from time import monotonic
 from typing import overload
 
@@ -14,6 +15,7 @@ from scene_client import calls, schemas
 from scene_client.calls import Call, Scene, T
 from scene_client.connection import MAX_ANSWER, RETRIES, Options, async_deadline, async_transport
 from scene_client.errors import AnswerError, DeadlineError, ProblemError, UnreachableError
+from scene_client.recorder import Recorder
 
 
 class AsyncClient:
@@ -32,6 +34,8 @@ class AsyncClient:
         retries: maximum number of retries of a call. Within the timeout, the client retries after
             status 429 or 503 and after connection errors.
         transport: httpx transport that sends the requests. The default is a pool of connections.
+        record: file ``*.jsonl`` to which the client appends the scenes of answered questions, or a
+            `Recorder`. docs/clients.md describes the file. By default, nothing is recorded.
 
     The first argument of a question method is the list of objects. Other fields of the request are
     keyword arguments. The first argument may also be a whole request, without keyword arguments.
@@ -55,11 +59,13 @@ class AsyncClient:
         model: str | None = None,
         retries: int = RETRIES,
         transport: httpx.AsyncBaseTransport | None = None,
+        record: str | Path | Recorder | None = None,
     ) -> None:
         self.options = Options(url, timeout, api_key, admin_key, model, retries)
         if transport is None:
             transport = async_transport(self.options.ssl_context())
         self._http = httpx.AsyncClient(transport=transport, trust_env=False)
+        self._recorder = Recorder(record) if isinstance(record, str | Path) else record
 
     # ------------------------------------------------------------------------------ questions
 
@@ -268,6 +274,8 @@ class AsyncClient:
             else:
                 # If the client has read the answer only after the deadline, the call fails.
                 if monotonic() < ends:
+                    if self._recorder is not None:
+                        self._recorder.record(call.answered(answer))
                     return answer
         raise DeadlineError(message)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
+from itertools import compress
 from random import random
 from typing import Any, Final, Generic, TypeAlias, TypeVar
 from urllib.parse import quote
@@ -50,6 +51,7 @@ class Call(Generic[T]):
         body: body of the request as JSON text. None means a request without a body.
         administers: whether the request needs the admin key.
         repeatable: whether the client may send the request again after a connection error.
+        scenes: the observed scenes, for a recorder.
     """
 
     method: str
@@ -58,6 +60,7 @@ class Call(Generic[T]):
     body: str | None = None
     administers: bool = False
     repeatable: bool = True
+    scenes: tuple[schemas.SceneRequest, ...] = ()
 
     def read(self, status: int, headers: Mapping[str, str], body: bytes) -> T:
         """Return the answer that a response contains.
@@ -80,6 +83,12 @@ class Call(Generic[T]):
                 f"The answer of {self.path} does not match the schema {self.answer.__name__} "
                 f"({error.error_count()} errors). Check the address of the service."
             ) from None
+
+    def answered(self, answer: T) -> Iterable[schemas.SceneRequest]:
+        """Return the scenes that an answer is about, without those that the service refused."""
+        if isinstance(answer, schemas.BatchAnswer):
+            return compress(self.scenes, [one.result is not None for one in answer.results])
+        return self.scenes
 
     def retry_pause(self, error: ProblemError | UnreachableError, attempt: int) -> float | None:
         """Return the pause before a retry in seconds, or None if the client must not retry.
@@ -119,6 +128,7 @@ class Question(Generic[RequestT, AnswerT]):
     path: str
     form: type[RequestT]
     answer: type[AnswerT]
+    is_observed: bool = True  # the objects of a request are a scene that the robot sees
 
     def call(self, scene: Any, fields: Mapping[str, Any], model: str | None) -> Call[AnswerT]:
         """Build the question about one scene.
@@ -131,8 +141,9 @@ class Question(Generic[RequestT, AnswerT]):
         Raises:
             InvalidRequestError: the request is invalid.
         """
-        body = _json(_request(self.form, scene, fields, model))
-        return Call("POST", self.path, self.answer, body)
+        request = _request(self.form, scene, fields, model)
+        scenes = (request,) if self.is_observed else ()
+        return Call("POST", self.path, self.answer, _json(request), scenes=scenes)
 
     def batch(self, scenes: Iterable[Any], model: str | None) -> Call[schemas.BatchAnswer[AnswerT]]:
         """Build the question about many scenes. `call` describes the arguments.
@@ -140,22 +151,23 @@ class Question(Generic[RequestT, AnswerT]):
         Raises:
             InvalidRequestError: the batch or the request about one of its scenes is invalid.
         """
-        requests = [
-            _json(_request(self.form, scene, {}, model, ("scenes", index)))
+        requests = tuple(
+            _request(self.form, scene, {}, model, ("scenes", index))
             for index, scene in enumerate(scenes)
-        ]
+        )
         if not 1 <= len(requests) <= schemas.MAX_BATCH:
             message = f"a batch must contain from 1 to {schemas.MAX_BATCH} scenes"
             raise InvalidRequestError.about(message, "#/scenes")
         answers = schemas.BatchAnswer[self.answer]  # type: ignore[name-defined]
-        return Call("POST", f"{self.path}/batch", answers, f'{{"scenes":[{",".join(requests)}]}}')
+        body = f'{{"scenes":[{",".join(map(_json, requests))}]}}'
+        return Call("POST", f"{self.path}/batch", answers, body, scenes=requests)
 
 
 RELATIONS: Final = Question("/relations", schemas.RelationsRequest, schemas.RelationsAnswer)
 MISSING: Final = Question("/missing", schemas.MissingRequest, schemas.MissingAnswer)
 OUTLIERS: Final = Question("/outliers", schemas.OutliersRequest, schemas.OutliersAnswer)
 ROOMS: Final = Question("/rooms", schemas.RoomsRequest, schemas.RoomsAnswer)
-GENERATE: Final = Question("/generate", schemas.GenerateRequest, schemas.GenerateAnswer)
+GENERATE: Final = Question("/generate", schemas.GenerateRequest, schemas.GenerateAnswer, False)
 
 
 def promote(alias: str, fields: Mapping[str, Any]) -> Call[schemas.AliasAnswer]:

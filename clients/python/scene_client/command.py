@@ -29,7 +29,8 @@ from scene_client.errors import (
     ProblemError,
     UnreachableError,
 )
-from scene_client.files import is_file, label_map_of, read_scene, with_labels
+from scene_client.files import from_file, is_file, label_map_of
+from scene_client.formats import from_data
 from scene_client.offline import OfflineClient
 from scene_client.ros_fields import MessageError
 from scene_client.schemas import Detail, FieldError, RelationName, Sensitivity, UnknownLabels
@@ -38,8 +39,9 @@ from scene_client.sync import Client
 REFUSED, MEANINGLESS, UNREACHABLE, LATE, BUSY, FAILED = range(1, 7)
 
 _FLAGS: Final = ("--json",)
-_VALUED: Final = ("--url", "--model", "--offline", "--timeout")
+_VALUED: Final = ("--url", "--model", "--offline", "--timeout", "--record")
 _RELATIONS: Final = get_args(RelationName)
+_MAX_NOTES: Final = 10  # maximum number of printed notes on a file
 
 
 class _Group(TyperGroup):
@@ -86,15 +88,20 @@ class Options:
     store: Path | None
     timeout: float
     as_json: bool
+    record: Path | None
 
     def client(self) -> Client:
         """Return the client that sends the question."""
         if self.store is not None:
-            return OfflineClient(self.store, timeout=self.timeout, model=self.model)
+            return OfflineClient(
+                self.store, timeout=self.timeout, model=self.model, record=self.record
+            )
         # An environment variable sets the API key, because other users of the machine can read the
         # options of a process.
         key = os.environ.get("SCENE_API_KEY") or None
-        return Client(self.url, timeout=self.timeout, model=self.model, api_key=key)
+        return Client(
+            self.url, timeout=self.timeout, model=self.model, api_key=key, record=self.record
+        )
 
 
 def _show(
@@ -153,13 +160,19 @@ def main(
         float, typer.Option(help="Maximum time of the whole call in seconds.")
     ] = 10.0,
     json: Annotated[bool, typer.Option("--json", help="Print the answer as JSON.")] = False,
+    record: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="SCENES.jsonl", help="Append the scene to this file, in the training format."
+        ),
+    ] = None,
     version: Annotated[  # noqa: ARG001 — the callback prints the version
         bool,
         typer.Option("--version", help="Print the version.", callback=_version, is_eager=True),
     ] = False,
 ) -> None:
     """Store the general options for the subcommand."""
-    context.obj = Options(url, model, offline, timeout, json)
+    context.obj = Options(url, model, offline, timeout, json, record)
 
 
 # ---------------------------------------------------------------------------------- questions
@@ -167,10 +180,10 @@ def main(
 Things = Annotated[
     list[str] | None,
     typer.Argument(
-        metavar="LABEL... | SCENE.json | SCENES.jsonl:LINE | -",
-        help="Labels of the objects (spaces or commas between them), or a JSON file, or - for "
-        "standard input. The JSON is a request of the HTTP contract, a scene of the training "
-        "format, or detections in the format of rosbridge.",
+        metavar="LABEL... | FILE | FILE:SCENE | -",
+        help="Labels of the objects (spaces or commas between them), or a file, or - for standard "
+        "input: a request, a training scene, or detections (ROS, COCO, YOLO, Ultralytics, CSV and "
+        "others). SCENE is the line, the image or the room in a file with several.",
         show_default=False,
     ),
 ]
@@ -193,7 +206,8 @@ LabelMap = Annotated[
     typer.Option(
         metavar="coco80|coco91|FILE",
         help="Labels of numeric class ids: COCO's ids 0 to 79, COCO's ids 1 to 90, or a file with "
-        "one label a line, a JSON list, a JSON object from ids to labels, or COCO's categories.",
+        "one label a line, a JSON list, a JSON object from ids to labels, COCO's categories, or "
+        "the YAML of a YOLO data set.",
     ),
 ]
 HowMuch = Annotated[
@@ -370,10 +384,17 @@ def _scene(
     if files and things != files[:1]:
         _fail(f"{files[0]} is a whole scene: remove the labels and other files")
     try:
-        labels = {} if label_map is None else label_map_of(label_map)
-        scene = with_labels(read_scene(files[0], labels) if files else {"objects": things}, labels)
+        labels = None if label_map is None else label_map_of(label_map)
+        scene = from_file(files[0], labels) if files else from_data(things, labels)
     except MessageError as error:
         _fail(str(error))
+    if scene.notes and not scene["objects"]:
+        _fail(f"{files[0]} has no object for a request: {scene.notes[0].detail}")
+    for note in scene.notes[:_MAX_NOTES]:
+        which = "" if note.detection is None else f"detection {note.detection}: "
+        print(f"{files[0]}: {which}{note.detail}", file=sys.stderr)
+    if (more := len(scene.notes) - _MAX_NOTES) > 0:
+        print(f"{files[0]}: {more} more notes of this kind", file=sys.stderr)
     relations = [_relation(text) for text in stated] if stated else None
     return scene | _named(relations=relations, **options)
 

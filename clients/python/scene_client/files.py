@@ -1,109 +1,113 @@
-"""Reading of the files that the command ``scene`` accepts in place of labels."""
+"""Reading of files with scenes, for `scene_client.from_file` and for the command ``scene``."""
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import re
 import sys
-from collections import Counter
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
+from xml.etree import ElementTree
 
-from scene_client.ros_fields import WELL_KNOWN, MessageError, read_label_map
-from scene_client.vision_msgs import from_message, is_message
+from scene_client.formats import from_data
+from scene_client.image_formats import Lines
+from scene_client.ros_fields import WELL_KNOWN, LabelMap, MessageError, read_label_map
+from scene_client.vision_msgs import SceneFields
+from scene_client.world_formats import LABEL_COLUMNS, Table
 
 MAX_FILE: Final = 64 * 2**20
 """Maximum size of a scene file in bytes. The service has the same upper limit for a body."""
 
-# A file with one scene per line, and the number of a line.
-_LINES: Final = re.compile(r"(?P<file>.+\.jsonl)(:(?P<line>[0-9]{1,9}))?$")
+# A file, and the name of one of its scenes. Some of these kinds of files are refused with a reason.
+_FILE: Final = re.compile(
+    r"(?P<file>.+\.(json|jsonl|csv|txt|xml|ya?ml|zip|gz))(:(?P<scene>.+))?", re.DOTALL
+)
+_PATH_STARTS: Final = (".", "~", os.sep)
 
-# Fields that objects of training scenes and of requests have in common.
-_COPIED: Final = ("label", "position", "size", "yaw")
-
-LabelMap = Mapping[str, str | None]
-
-
-def is_file(thing: str) -> bool:
-    """Return whether an argument is a file. Labels do not end in .json or contain a slash."""
-    return thing == "-" or thing.endswith(".json") or bool(_LINES.match(thing)) or os.sep in thing
+_YAML: Final = (
+    "is YAML, as `ros2 topic echo` prints it: convert it to JSON, for example by "
+    "python -c 'import json, sys, yaml; print(json.dumps(next(yaml.safe_load_all(sys.stdin))))'"
+)
+_PACKED: Final = "is compressed: extract it, and choose one of its .json, .xml, .csv or .txt files"
 
 
-def label_map_of(option: str) -> LabelMap:
-    """Return the labels of the class ids that the option `--label-map` names.
+def is_file(argument: str) -> bool:
+    """Return whether an argument of the command is a file. Labels such as sofa/couch are not."""
+    if argument == "-" or _FILE.fullmatch(argument):
+        return True
+    return os.sep in argument and (argument.startswith(_PATH_STARTS) or Path(argument).exists())
+
+
+def from_file(
+    path: str | os.PathLike[str], label_map: LabelMap | None = None, *, scene: object = None
+) -> SceneFields:
+    """Read a file with a scene and return the fields of a request.
+
+    Args:
+        path: name of a file in a format of docs/clients.md; ``NAME:SCENE`` for one scene of a file
+            with several; or ``-`` for standard input.
+        label_map: labels of numeric class ids: a value for `read_label_map`, or the name of a file
+            with the labels.
+        scene: line of a file with one scene per line, id of an image or task, number of a frame, or
+            name of a room. Needed only if the file has several scenes.
+
+    Raises:
+        MessageError: the file cannot be read, has an unknown format, has several scenes, or lacks
+            labels.
+    """
+    name, labels = os.fspath(path), label_map
+    if isinstance(labels, str):
+        labels = label_map_of(labels)
+    if scene is None and not Path(name).exists() and (parts := _FILE.fullmatch(name)):
+        name, scene = parts["file"], parts["scene"]
+    text = _text(name, _bytes(name))
+    if (lines := _json_lines(name, text)) is not None:
+        text, scene = _line(name, lines, scene), None
+    try:
+        data = _parsed(text)
+    except RecursionError:
+        raise MessageError(
+            f"{name} is not JSON that can be read: its nesting is too deep"
+        ) from None
+    except ValueError as error:
+        raise MessageError(f"{name} {error}") from None
+    return from_data(data, labels, scene=scene, name=name)
+
+
+def label_map_of(option: str) -> dict[str, str | None]:
+    """Return the labels of the class ids that a name, or the name of a file, stands for.
 
     Raises:
         MessageError: the file cannot be read or does not contain labels.
     """
     if option in WELL_KNOWN:
         return read_label_map(option)
-    text = _bytes(option)
     try:
-        try:
-            names: Any = json.loads(text.decode())
-        except json.JSONDecodeError:
-            names = text.decode().splitlines()
-        names = names.get("categories", names) if isinstance(names, dict) else names
-        if isinstance(names, list) and isinstance(names[0], dict):
-            names = {entry["id"]: entry["name"] for entry in names}
-        return read_label_map(names)
-    except (LookupError, TypeError, ValueError):
+        return read_label_map(_names(_bytes(option).decode()))
+    except (LookupError, TypeError, ValueError, RecursionError) as error:
+        if isinstance(error, MessageError) and "cannot read" in str(error):
+            raise
         raise MessageError(f"--label-map: {option} does not contain labels") from None
 
 
-def read_scene(argument: str, labels: LabelMap) -> dict[str, Any]:
-    """Return the fields of the request in a file. Print the notes about a ROS message.
-
-    Args:
-        argument: name of a file with a request, a list of objects, a ROS message, results of COCO
-            or a scene of the training format; ``NAME.jsonl:LINE``; or ``-`` for standard input.
-        labels: labels of the class ids in a ROS message.
-
-    Raises:
-        MessageError: the file cannot be read or does not contain a scene.
-    """
-    lines = _LINES.match(argument)
-    name = lines["file"] if lines else argument
-    text = _bytes(name)
+def _names(text: str) -> Any:
+    """Return the labels of class ids: JSON, YAML with `names:`, or one label a line."""
     try:
-        scene = json.loads(_line(name, text, lines["line"]) if lines else text)
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise MessageError(f"{argument} is not JSON: {error}") from None
-    if is_message(scene):
-        return _of_message(name, scene, labels)
-    if isinstance(scene, list):
-        return {"objects": _of_coco(name, scene)}
-    if not isinstance(scene, dict):
-        raise MessageError(f"{name} must contain a request or a list of objects")
-    if "scene_id" not in scene:
-        return scene
-    try:
-        return _of_training(scene)
-    except (AttributeError, KeyError, TypeError, ValueError):
-        raise MessageError(f"{argument} is not a scene of the training format") from None
-
-
-def with_labels(scene: dict[str, Any], labels: LabelMap) -> dict[str, Any]:
-    """Replace the labels of objects that are class ids.
-
-    Raises:
-        MessageError: a class id has no label.
-    """
-    if not isinstance(scene.get("objects"), list):
-        return scene
-    objects = []
-    for thing in scene["objects"]:
-        label = thing.get("label") if isinstance(thing, dict) else thing
-        if str(label).isdecimal():
-            label = labels.get(str(label))
-            if label is None:
-                remedy = "set --label-map to coco80, coco91 or a file with the labels of the ids"
-                raise MessageError(f"an object has a class id instead of a label: {remedy}")
-            thing = {**thing, "label": label} if isinstance(thing, dict) else label
-        objects.append(thing)
-    return scene | {"objects": objects}
+        names: Any = json.loads(text)
+    except json.JSONDecodeError:
+        _, is_yaml, block = f"\n{text}".partition("\nnames:")
+        if not is_yaml:
+            return text.splitlines()
+        entries = re.findall(r"^[ \t]*(?:-|(\d+):)[ \t]*(.+?)[ \t]*$", block, re.MULTILINE)
+        if inline := re.match(r"[ \t]*\[([^\]]*)\]", block):
+            entries = [("", name.strip()) for name in inline[1].split(",")]
+        return {key or n: name.strip("'\"") for n, (key, name) in enumerate(entries)} or None
+    names = names.get("categories", names) if isinstance(names, dict) else names
+    if isinstance(names, list) and isinstance(names[0], dict):
+        return {entry["id"]: entry["name"] for entry in names}
+    return names
 
 
 def _bytes(name: str) -> bytes:
@@ -112,75 +116,107 @@ def _bytes(name: str) -> bytes:
         if name == "-":
             text = sys.stdin.buffer.read(MAX_FILE + 1)
         else:
-            with Path(name).open("rb") as file:
+            with Path(name).expanduser().open("rb") as file:
                 text = file.read(MAX_FILE + 1)
-    except OSError as error:
-        raise MessageError(f"cannot read {name}: {error.strerror}") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise MessageError(f"cannot read {name}: {reason}") from None
     if len(text) > MAX_FILE:
         raise MessageError(f"{name} is too large: it has more than {MAX_FILE} bytes")
     return text
 
 
-def _line(name: str, text: bytes, line: str | None) -> bytes:
+def _text(name: str, content: bytes) -> str:
+    if content.startswith((b"PK\x03\x04", b"\x1f\x8b")):  # ZIP and gzip
+        raise MessageError(f"{name} {_PACKED}")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise MessageError(f"{name} is not JSON and no other text in UTF-8") from None
+
+
+def _json_lines(name: str, text: str) -> list[str] | None:
+    """Return the lines of a file with one JSON value per line; None for other files."""
+    first, _, rest = text.lstrip().partition("\n")
+    if not rest.strip() or not first.rstrip().endswith(("}", "]")) or first[:1] not in "{[":
+        return [text] if name.endswith(".jsonl") else None
+    try:
+        json.loads(first)
+    except (ValueError, RecursionError):
+        return text.split("\n") if name.endswith(".jsonl") else None
+    return text.split("\n")
+
+
+def _line(name: str, lines: list[str], scene: object) -> str:
     """Return one line of a file with one scene per line."""
-    lines = text.splitlines()
-    if line is None and len(lines) != 1:
-        raise MessageError(f"{name} has {len(lines)} lines: choose one, such as {name}:1")
-    number = int(line or 1)
+    full = [number for number, line in enumerate(lines, 1) if line.strip()]
+    if scene is None and len(full) != 1:
+        raise MessageError(f"{name} has {len(full)} lines: choose one, such as {name}:1")
+    number = full[0] if scene is None else int(str(scene)) if str(scene).isdecimal() else 0
     if not 1 <= number <= len(lines):
-        raise MessageError(f"{name} has {len(lines)} lines; it has no line {number}")
+        raise MessageError(f"{name} has {len(lines)} lines; it has no line {scene}")
     return lines[number - 1]
 
 
-def _of_message(name: str, message: Any, labels: LabelMap) -> dict[str, Any]:
-    """Return the request fields for a ROS message with detections, as JSON from rosbridge."""
-    try:
-        fields = from_message(message, labels or None)
-    except MessageError as error:
-        raise MessageError(f"{name}: {error}") from None
-    for note in fields.notes:
-        which = "" if note.detection is None else f"detection {note.detection}: "
-        print(f"{name}: {which}{note.detail}", file=sys.stderr)
-    return fields
+def _parsed(text: str) -> Any:
+    """Return the data in a text.
 
-
-def _of_coco(name: str, entries: list[Any]) -> list[Any]:
-    """Return the objects of a list, which may be a file of COCO's results for one image."""
-    if not all(isinstance(entry, dict) and "category_id" in entry for entry in entries):
-        return entries
-    if len({str(entry.get("image_id")) for entry in entries}) > 1:
-        raise MessageError(f"{name} has several images: keep the results of one image_id")
-    return [
-        {"label": entry["category_id"], "confidence": entry.get("score", 1.0)} for entry in entries
-    ]
-
-
-def _of_training(scene: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the request fields for a scene of the training format.
-
-    The service accepts this format too, but its answers would name an object by its number. Here,
-    the id of an object is its label, followed by its number if several objects have the label.
+    Raises:
+        ValueError: the text has an unknown format. The message continues the name of the file.
     """
-    objects = scene["objects"]
-    counts = Counter(thing["label"] for thing in objects)
-    ids = {
-        thing["id"]: thing["label"] + (f"_{thing['id']}" if counts[thing["label"]] > 1 else "")
-        for thing in objects
-    }
-    if len(set(ids.values())) < len(objects):
-        raise ValueError("two objects have the same id")
-    detections = [
-        {name: thing[name] for name in _COPIED if thing.get(name) is not None}
-        | {name: ids[thing[name]] for name in ("id", "supported_by") if thing.get(name) is not None}
-        for thing in objects
-    ]
-    fields: dict[str, Any] = {"objects": detections}
-    if any("position" not in detection for detection in detections) and scene.get("relations"):
-        fields["relations"] = [
-            [ids[subject], relation, ids[other]] for subject, relation, other in scene["relations"]
-        ]
-    if not scene.get("viewer_frame"):
-        fields["frame_id"] = "map"
-    if scene.get("room_type") is not None:
-        fields["room_type"] = scene["room_type"]
-    return fields
+    start = text.lstrip()[:1]
+    if start == "<":
+        return _xml(text)
+    if start not in "{[":
+        lines = [line for line in re.split(r"\r?\n", text) if line.strip()]
+        if (table := _table(lines)) is not None:
+            return table
+        words = [line.split() for line in lines]
+        if all(len(line) >= 5 and all(map(_is_number, line)) for line in words):
+            return Lines(words)
+        if re.match(r"---\s|[\w.-]+:(\s|$)", text):
+            raise ValueError(_YAML)
+        labels = [label.strip() for line in lines for label in line.split(",") if label.strip()]
+        if labels and not re.search(r'[{}[\]":<]', text) and not any(map(_is_number, labels)):
+            return labels
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"is not JSON, and no other known format: {error}") from None
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _table(lines: list[str]) -> Table | None:
+    """Return the rows of a CSV file, or None if the first line does not name the columns."""
+    header = lines[0].lower()
+    delimiter = max(",;\t", key=header.count)
+    names = [name.strip().strip('"') for name in header.split(delimiter)]
+    if len(names) < 2 or not set(LABEL_COLUMNS) & set(names):
+        return None
+    if len(set(names)) < len(names):
+        raise ValueError("is a table with two columns of the same name")
+    rows = csv.reader(lines[1:], delimiter=delimiter, strict=True)
+    try:
+        return Table(dict(zip(names, map(str.strip, row), strict=False)) for row in rows)
+    except csv.Error as error:
+        raise ValueError(f"is not a table that can be read: {error}") from None
+
+
+def _xml(text: str) -> ElementTree.Element:
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ValueError("is XML with a document type, which this program does not read")
+    try:
+        # Expat bounds the expansion of entities, and a document type is refused above.
+        root = ElementTree.fromstring(text)  # noqa: S314
+    except ElementTree.ParseError as error:
+        raise ValueError(f"is not XML that can be read: {error}") from None
+    if root.tag != "annotations":
+        raise ValueError(f"is XML with the root <{root.tag[:40]}>; only exports of CVAT are read")
+    return root

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from scene_client.recorder import Recorder
 from scene_client.sync import Client
 
 
@@ -19,6 +20,7 @@ class OfflineClient(Client):
         timeout: maximum time of a call in seconds.
         model: model for requests without the field ``model``. By default, this is the model at
             which the alias `default` of the store points.
+        record: file for the scenes of answered questions, or a `Recorder`; see `Client`.
 
     Raises:
         ImportError: the packages of the service are not installed.
@@ -26,7 +28,12 @@ class OfflineClient(Client):
     """
 
     def __init__(
-        self, store: str | Path = "model_store", *, timeout: float = 10.0, model: str | None = None
+        self,
+        store: str | Path = "model_store",
+        *,
+        timeout: float = 10.0,
+        model: str | None = None,
+        record: str | Path | Recorder | None = None,
     ) -> None:
         # The import is in this method, because other clients do not need the packages.
         try:
@@ -44,4 +51,5 @@ class OfflineClient(Client):
             admin_key=transport.admin_key,
             model=model,
             transport=transport,
+            record=record,
         )

@@ -106,6 +106,59 @@ def time_of(stamp: Any) -> dict[str, int] | None:
     return None
 
 
+def unwrapped(message: Any) -> Any:
+    """Return a ROS message without the envelope that rosbridge adds."""
+    inner = message.get("msg") if isinstance(message, Mapping) else None
+    return inner if isinstance(inner, Mapping) else message
+
+
+def as_vision_msgs(message: Any) -> Any:
+    """Return a DetectionArray of yolo_ros in the layout of vision_msgs; other messages unchanged.
+
+    If a detection has a 3D box, the boxes and their frame come from `bbox3d`. Otherwise, the boxes
+    are those in the image.
+    """
+    entries = take(message, "detections")
+    if not isinstance(entries, list | tuple) or not any(has(one, "class_name") for one in entries):
+        return message
+    solids = [take(entry, "bbox3d") for entry in entries]
+    frames = [frame_of(solid) for solid in solids]
+    header = take(message, "header")
+    if not any(any((numbers(take(solid, "size"), "xyz") or {}).values()) for solid in solids):
+        boxes, frames = [_image_box(take(entry, "bbox")) for entry in entries], [""] * len(entries)
+    else:
+        boxes = solids
+    return {
+        "header": {
+            "frame_id": next(filter(None, frames), frame_of(header)),
+            "stamp": take(header, "stamp"),
+        },
+        "detections": [
+            {
+                "header": {"frame_id": frame},
+                "id": take(entry, "id"),
+                "results": [
+                    {
+                        "class_id": text(take(entry, "class_name")) or take(entry, "class_id"),
+                        "score": take(entry, "score"),
+                    }
+                ],
+                "bbox": box,
+            }
+            for entry, box, frame in zip(entries, boxes, frames, strict=True)
+        ],
+    }
+
+
+def _image_box(box: Any) -> dict[str, Any]:
+    """Return a yolo_msgs/BoundingBox2D as a vision_msgs/BoundingBox2D."""
+    return {
+        "center": take(box, "center"),
+        "size_x": take(box, "size", "x"),
+        "size_y": take(box, "size", "y"),
+    }
+
+
 # -------------------------------------------------------------------------------- class ids
 
 LabelMap: TypeAlias = Mapping[Any, str | None] | Sequence[str] | str | object
@@ -128,6 +181,11 @@ COCO: Final = (
 _UNUSED: Final = frozenset((12, 26, 29, 30, 45, 66, 68, 69, 71, 83))
 COCO_91: Final = dict(zip((n for n in range(1, 91) if n not in _UNUSED), COCO, strict=True))
 """Labels of the same classes by the `category_id` (1 to 90) of COCO's files."""
+
+REMEDY: Final = (
+    "set label_map (--label-map of the command scene) to coco80, coco91 or the labels of the ids"
+)
+"""What to do about numeric class ids."""
 
 WELL_KNOWN: Final = {"coco": COCO, "coco80": COCO, "coco91": COCO_91}
 

@@ -20,8 +20,10 @@ from typing import Any, Final, Literal, NamedTuple, get_args
 
 from scene_client.image_plane import Box, left_pairs, upright_box
 from scene_client.ros_fields import (
+    REMEDY,
     LabelMap,
     MessageError,
+    as_vision_msgs,
     frame_of,
     has,
     is_plain,
@@ -32,6 +34,7 @@ from scene_client.ros_fields import (
     take,
     text,
     time_of,
+    unwrapped,
 )
 from scene_client.schemas import UnknownLabels
 
@@ -55,6 +58,7 @@ Reason = Literal[
     "no-box",  # the box in the image is empty, not finite, or in another frame
     "renamed",  # the id is a duplicate, or is not plain text
     "no-stamp",  # the stamp is not a valid time
+    "excluded",  # the file marks entries as invisible, removed, or a crowd
 ]
 
 
@@ -155,10 +159,12 @@ def from_message(
     viewpoint: Viewpoint | None = None,
     unknown_labels: UnknownLabels = "nearest-or-ignore",
 ) -> SceneFields:
-    """Convert a Detection3DArray or a Detection2DArray. The fields of the boxes show the type.
+    """Convert a Detection3DArray, a Detection2DArray, or a DetectionArray of yolo_ros.
 
-    `from_detection3d_array` describes the arguments and the errors.
+    The fields of the message show its type. `from_detection3d_array` describes the arguments and
+    the errors.
     """
+    message = as_vision_msgs(unwrapped(message))
     options: Any = {"min_score": min_score, "unknown_labels": unknown_labels}
     if _is_flat(message):
         return from_detection2d_array(message, label_map, **options)
@@ -167,7 +173,7 @@ def from_message(
 
 def is_message(value: Any) -> bool:
     """Return whether a value is a ROS message with detections."""
-    return take(_unwrapped(value), "detections") is not None
+    return take(unwrapped(value), "detections") is not None
 
 
 # ------------------------------------------------------------------------------------ reading
@@ -190,7 +196,7 @@ class _Reader:
     def __init__(self, message: Any, label_map: LabelMap | None, min_score: float) -> None:
         if not is_message(message):
             raise MessageError("the message must have a list of detections")
-        message = _unwrapped(message)
+        message = unwrapped(message)
         self.notes: list[Note] = []
         self.header = take(message, "header")
         self.detections = items(take(message, "detections"), "detections")
@@ -203,11 +209,7 @@ class _Reader:
             if (sighting := self._sight(index, detection, min_score)) is not None
         ]
         if not sightings and label_map is None and self._only_numbers():
-            raise MessageError(
-                "the class ids are numbers: set label_map (--label-map of the command scene) to "
-                "'coco80', 'coco91' or their labels (a list in the order of the numbers, a "
-                "mapping, or a vision_msgs/LabelInfo)"
-            )
+            raise MessageError(f"the class ids are numbers: {REMEDY}")
         self.sightings = self._most_confident(sightings)
         self.ids = self._ids()
         self.frame = self._frame()
@@ -223,7 +225,7 @@ class _Reader:
             result_score = number(take(hypothesis, "score"))
             if result_score is not None and result_score > score:
                 best_result, score = result, result_score
-                class_id = text(take(hypothesis, "class_id")) or text(take(hypothesis, "id"))
+                class_id = _class_id(hypothesis)
         if best_result is None:
             self.note(index, "no-hypothesis", "the detection has no hypothesis with a score")
             return None
@@ -249,7 +251,7 @@ class _Reader:
     def _only_numbers(self) -> bool:
         """Return whether all class ids are numbers and at least one has no label."""
         return any(note.reason == "no-label" for note in self.notes) and all(
-            _is_number(text(take(result, "hypothesis", "class_id")) or text(take(result, "id")))
+            _is_number(_class_id(take(result, "hypothesis") or result))
             for detection in self.detections
             for result in items(take(detection, "results"), "results")
         )
@@ -323,7 +325,9 @@ class _Reader:
         if size is None and _is_unset(pose):
             pose = sighting.pose
             if _is_unset(pose):
-                self.note(sighting.index, "no-position", "the box and the pose are unset")
+                # Files with labels alone have neither field.
+                if box is not None or pose is not None:
+                    self.note(sighting.index, "no-position", "the box and the pose are unset")
                 return {}
         position = numbers(take(pose, "position"), "xyz")
         if position is None or any(abs(value) > _MAX_METRES for value in position.values()):
@@ -384,17 +388,14 @@ class _Reader:
         return SceneFields(fields, tuple(self.notes))
 
 
-def _unwrapped(message: Any) -> Any:
-    """Return the ROS message without the envelope that rosbridge adds."""
-    if isinstance(message, Mapping) and "detections" not in message:
-        return message.get("msg", message)
-    return message
-
-
 def _is_flat(message: Any) -> bool:
     """Return whether the message is a Detection2DArray, with boxes in an image."""
-    detections = take(_unwrapped(message), "detections")
+    detections = take(unwrapped(message), "detections")
     return any(has(take(entry, "bbox"), "size_x") for entry in items(detections, "detections"))
+
+
+def _class_id(hypothesis: Any) -> str:
+    return text(take(hypothesis, "class_id")) or text(take(hypothesis, "id"))
 
 
 def _is_number(label: str) -> bool:

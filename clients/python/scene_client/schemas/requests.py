@@ -289,6 +289,8 @@ class SceneRequest(Request):
     """field of a training scene; unused by the service"""
     group: Unused = None
     """field of a training scene; unused by the service"""
+    confirmed: bool = False
+    """field of a training scene; unused by the service"""
     viewer_frame: bool = False
     """whether the axes of a training scene are those of the viewer"""
 

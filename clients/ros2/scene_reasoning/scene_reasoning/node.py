@@ -47,6 +47,7 @@ class SceneNode(Node):
             self._parameter("url", "http://127.0.0.1:8000"),
             timeout=self._parameter("timeout", 0.5),
             api_key=Path(key_file).read_text("utf-8").strip() if key_file else None,
+            record=self._parameter("record", "") or None,
         )
         names = list(self._parameter("class_names", [""]))
         self.advisor = Advisor(

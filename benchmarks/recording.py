@@ -1,0 +1,57 @@
+"""Benchmark of the recorder: the duration of a client's call with and without a recorded file."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from benchmarks.load import servers
+from benchmarks.load.questions import bodies, labels_of
+from benchmarks.report import Result
+from benchmarks.timing import Timings
+from scene_client import Client
+
+PLAIN, KNOWN = "without a recorder", "with a recorder, of a known scene"
+NEW = "with a recorder, of a new scene"
+
+
+def recording(*, store: Path = Path("model_store"), calls: int = 1000) -> list[Result]:
+    """Measure `outliers` about scenes of 12 poses on one connection, with and without a recorder.
+
+    Args:
+        store: directory of the model store. The default model is queried.
+        calls: number of measured calls of each kind. Kinds alternate. Additional warm-up calls
+            (10 %) are not measured.
+
+    Raises:
+        ServerError: the store is missing, or the service does not become ready.
+    """
+    seconds: dict[str, list[float]] = {KNOWN: [], PLAIN: [], NEW: []}
+    with servers.service(store, pinned=False) as started, TemporaryDirectory() as folder:
+        url = f"http://127.0.0.1:{started.port}"
+        scene = bodies("12 poses", labels_of(started.port))[0]
+        file = Path(folder, "scenes.jsonl")
+        with Client(url) as plain, Client(url, record=file) as recording:
+            for turn in range(-calls // 10, calls):
+                # The hour is a part of the content of a scene.
+                other = scene | {"stamp": {"sec": 3600 * (turn + calls), "nanosec": 0}}
+                asked = [(PLAIN, plain, scene), (KNOWN, recording, scene), (NEW, recording, other)]
+                for name, client, body in asked[turn % 3 :] + asked[: turn % 3]:
+                    taken = _seconds(client, body)
+                    if turn >= 0:
+                        seconds[name].append(taken)
+        lines = len(file.read_bytes().splitlines())
+    title = "A call about 12 poses, one connection kept alive"
+    return [
+        Result(title, name, Timings({n: seconds[n] for n in (name, PLAIN)}), targets={PLAIN: 0.95},
+               facts={"recorded scenes": lines})
+        for name in (KNOWN, NEW)
+    ]  # fmt: skip
+
+
+def _seconds(client: Client, body: dict[str, Any]) -> float:
+    start = time.perf_counter()
+    client.outliers(body)
+    return time.perf_counter() - start

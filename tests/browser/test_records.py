@@ -1,0 +1,179 @@
+"""A person confirms recorded scenes, and the corrected file goes back to the robot."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from axe_playwright_python.sync_playwright import Axe  # type: ignore[import-untyped]
+from playwright.sync_api import expect
+
+from scene_client import Client
+from tests.browser.conftest import DESK
+from tests.browser.driving import Board, OpenBoard
+from training.datasets.jsonl import read_jsonl
+
+pytestmark = pytest.mark.system
+
+KITCHEN = ["oven", "refrigerator", "microwave", "kitchen cabinet", "sink", "toilet"]
+
+
+@pytest.fixture
+def recorded(api: httpx.Client, tmp_path: Path) -> Path:
+    """A file that a robot has recorded: a kitchen with a toilet is its second scene."""
+    file = tmp_path / "scenes.jsonl"
+    with Client(str(api.base_url), record=file) as scene:
+        scene.missing(["bed", "nightstand", "lamp"], room_type="bedroom")
+        scene.outliers(
+            [
+                {
+                    "id": f"track_{n}",
+                    "label": label,
+                    "position": {"x": 1.5 + n % 2, "y": 0.9 * n - 2.2, "z": 0.4567},
+                    "size": {"x": 0.61, "y": 0.6, "z": 0.9},
+                    "orientation": {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8},
+                }
+                for n, label in enumerate(KITCHEN)
+            ],
+            frame_id="map",
+            viewpoint={"x": 0.1, "y": 0.2, "yaw": 0.3},
+            stamp={"sec": 1_790_000_000, "nanosec": 7},
+        )
+        scene.outliers(["bathtub", "towel", {"label": "soap", "supported_by": "bathtub"}])
+    return file
+
+
+def choose(board: Board, file: Path, line: int) -> None:
+    """Open a line of a file."""
+    board.click("Import, export")
+    board.page.locator("#upload").set_input_files(file)
+    board.page.locator("#which").fill(str(line))
+    board.click("Put on the board")
+
+
+def downloaded(board: Board, tmp_path: Path, confirmed: int) -> Path:
+    """The file of the confirmed scenes."""
+    board.click("Import, export")
+    button = board.page.get_by_role("button", name=f"Download scenes.jsonl ({confirmed} confirmed)")
+    with board.page.expect_download() as download:
+        button.click()
+    assert download.value.suggested_filename == "scenes.jsonl"
+    file = tmp_path / "downloaded" / "scenes.jsonl"
+    download.value.save_as(file)
+    board.click("Close")
+    return file
+
+
+def lines(file: Path) -> list[Any]:
+    return [json.loads(line) for line in file.read_text("utf-8").splitlines()]
+
+
+def test_a_corrected_file_differs_only_in_the_confirmation(
+    open_board: OpenBoard, recorded: Path, tmp_path: Path
+) -> None:
+    board = open_board()
+    choose(board, recorded, 2)
+    board.tab("Wrong")
+    confirm = board.page.get_by_role("button", name="Belongs here: toilet")
+    confirm.focus()
+    board.page.keyboard.press("Enter")
+    board.settle()
+    assert board.announced.startswith("toilet (track_5) confirmed.")
+    expect(confirm).to_have_count(0)
+    assert "confirmed" in next(row for row in board.rows("outliers") if "toilet" in row)
+    expect(board.page.locator("#board .object.outlier")).to_have_count(0)
+    assert "does not belong here" not in (board.thing("toilet (track_5)").get_attribute("aria-label") or "")
+    expect(board.page.get_by_text("Confirmed scene.")).to_be_visible()
+    file = downloaded(board, tmp_path, 1)
+    before, after = lines(recorded), lines(file)
+    assert after == [before[0], before[1] | {"confirmed": True}, before[2]]
+    assert read_jsonl(file) == read_jsonl(recorded)
+    # The corrected file opens with the correction.
+    choose(board, file, 2)
+    assert downloaded(board, tmp_path, 1).read_text("utf-8") == file.read_text("utf-8")
+
+
+def test_missing_objects_are_added(open_board: OpenBoard, recorded: Path, tmp_path: Path) -> None:
+    board = open_board()
+    choose(board, recorded, 1)
+    label = board.page.get_by_role("button", name="Is there: ").first.get_attribute("aria-label")
+    added = (label or "").removeprefix("Is there: ")
+    board.page.get_by_role("button", name=f"Is there: {added}", exact=True).click()
+    board.settle()
+    assert board.things[-1] == added
+    board.press("lamp", "Delete")
+    (first, *others) = lines(downloaded(board, tmp_path, 1))
+    before = lines(recorded)
+    assert others == before[1:]
+    assert first["objects"] == [*before[0]["objects"][:2], {"id": added, "label": added}]
+    board.click("Undo")
+    board.click("Undo")
+    assert board.things == ["bed", "nightstand", "lamp"]
+    board.click("Import, export")
+    expect(board.page.get_by_role("button", name="Download scenes.jsonl")).to_be_hidden()
+
+
+def test_confirmed_scenes_of_the_page_stay_in_the_browser(
+    open_board: OpenBoard, tmp_path: Path
+) -> None:
+    lamp = {
+        "label": "lamp",
+        "position": {"x": 2, "y": 0.5, "z": 0.94},
+        "size": {"x": 0.2, "y": 0.2, "z": 0.4},
+    }
+    desk = {
+        "objects": [DESK["objects"][0], lamp],
+        "frame_id": "map",
+        "viewpoint": {"x": 1, "y": 0, "yaw": 0},
+        "room_type": "office",
+    }
+    board = open_board(desk)
+    wrong = {"subject": "lamp", "relation": "on-top", "object": "desk", "log_odds": -3.0}
+    board.alter("outliers", lambda found: found | {"misplaced": [
+        wrong | {"probability": 0.9, "is_misplaced": True, "moved": None, "expected": None}
+    ]})  # fmt: skip
+    board.add("cup")
+    board.tab("Wrong")
+    assert ("misplaced", "on top of?") in board.edges
+    board.click("Stands right: lamp on top of desk")
+    assert board.edges == []
+    assert any("lamp on top of desk confirmed" in row for row in board.rows("outliers"))
+    board.page.reload()
+    board.settle()
+    file = downloaded(board, tmp_path, 1)
+    (scene,) = lines(file)
+    assert scene["confirmed"] is True
+    assert scene["viewer_frame"] is True
+    assert scene["room_type"] == "office"
+    assert scene["objects"] == [
+        {"id": "desk", "label": "desk", "position": [1, 0, 0.37], "size": [0.8, 1.6, 0.74]},
+        {"id": "lamp", "label": "lamp", "position": [1, 0.5, 0.94], "size": [0.2, 0.2, 0.4]},
+        {"id": "cup", "label": "cup"},
+    ]
+    assert scene["scene_id"].startswith(scene["group"])
+    assert read_jsonl(file)[0].viewer_frame
+    board.click("Import, export")
+    board.click("Remove 1 confirmed from this browser")
+    expect(board.page.get_by_role("button", name="Download scenes.jsonl")).to_be_hidden()
+    board.page.reload()
+    board.settle()
+    assert board.page.evaluate("Object.keys(localStorage)") == []
+
+
+@pytest.mark.parametrize("width", [1300, 390])
+def test_the_buttons_are_accessible(open_board: OpenBoard, recorded: Path, width: int) -> None:
+    board = open_board()
+    board.page.set_viewport_size({"width": width, "height": 900})
+    choose(board, recorded, 2)
+    for tab, button in (("Wrong", "Belongs here: toilet"), ("Missing", "Is there: ")):
+        board.tab(tab)
+        shown = board.page.get_by_role("button", name=button).first
+        shown.scroll_into_view_if_needed()
+        expect(shown).to_be_in_viewport(ratio=1)
+        assert Axe().run(board.page).response["violations"] == []
+    board.page.get_by_role("button", name="Is there: ").first.click()
+    board.click("Import, export")
+    assert Axe().run(board.page).response["violations"] == []

@@ -1,0 +1,175 @@
+"""Scenes from files of detectors, tools and simulators, and the reasons for refusals."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+import scene_client
+from scene_client.command import app
+from scene_client.files import MAX_FILE, is_file
+from scene_client.ros_fields import MessageError
+from scene_client.schemas import MissingRequest
+from tests.chaos.corpus import places, replaced
+from tests.client.scene_files import EXAMPLES, REFUSED
+
+
+def rounded(value: Any) -> Any:
+    """A scene without orientations, with numbers rounded to centimetres."""
+    if isinstance(value, dict):
+        return {name: rounded(part) for name, part in value.items() if name != "orientation"}
+    if isinstance(value, list):
+        return [rounded(part) for part in value]
+    return round(value, 2) + 0.0 if isinstance(value, float) else value
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_a_file_is_read(name: str, tmp_path: Path) -> None:
+    example = EXAMPLES[name]
+    path = tmp_path / name
+    path.write_text(example.text, "utf-8")
+    fields = scene_client.from_file(path, example.labels, scene=example.scene)
+    assert rounded(dict(fields)) == rounded(example.expected)
+    assert tuple(note.reason for note in fields.notes) == example.notes
+    MissingRequest(**fields)
+    named = f"{path}:{example.scene}" if example.scene else str(path)
+    assert scene_client.from_file(named, example.labels) == fields
+
+
+def test_orientations_are_about_the_vertical_axis() -> None:
+    read = {
+        name: scene_client.from_data(json.loads(EXAMPLES[name].text))
+        for name in ("scannet.json", "moveit.json")
+    }
+    turns = {
+        thing["label"]: 2 * math.atan2(thing["orientation"]["z"], thing["orientation"]["w"])
+        for fields in read.values()
+        for thing in fields["objects"]
+        if "orientation" in thing
+    }
+    assert turns["trash can"] == pytest.approx(math.pi / 2)
+    assert turns["book"] == pytest.approx(math.pi / 2)
+    assert turns["table"] == 0
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_file_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    content, words, _ = REFUSED[name]
+    path = tmp_path / name
+    path.write_text(content, "utf-8")
+    with pytest.raises(MessageError) as refused:
+        scene_client.from_file(path)
+    assert words in str(refused.value)
+    assert str(path) in str(refused.value)
+    done = CliRunner().invoke(app, ["missing", str(path), "--url", "http://127.0.0.1:9"])
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert done.stderr == f"{refused.value}\n"
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"PK\x03\x04\0", "is compressed"),
+        (b"\x1f\x8b\0", "is compressed"),
+        (b"\xff\xfe\0", "no other text"),
+        (None, "cannot read"),
+    ],
+)
+def test_other_contents_are_refused(tmp_path: Path, content: bytes | None, words: str) -> None:
+    path = tmp_path / "scene.json"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(MessageError, match=words):
+        scene_client.from_file(path)
+
+
+def test_a_file_above_the_limit_is_refused_without_reading_it_whole(tmp_path: Path) -> None:
+    path = tmp_path / "large.json"
+    with path.open("wb") as file:
+        file.truncate(MAX_FILE + 1)  # takes no space on the disk
+    with pytest.raises(MessageError, match="too large"):
+        scene_client.from_file(path)
+
+
+WRONG = (b"null", b'""', b"{}", b"1e300", b'[{"x": [1]}, 2]')
+
+
+def corrupted(wrong: Iterable[bytes]) -> list[tuple[str, str]]:
+    """Every example in JSON with wrong values at every place, and each text cut off."""
+    made = []
+    for name, example in EXAMPLES.items():
+        made += [(name, example.text[: len(example.text) * part // 7]) for part in range(7)]
+        if name.endswith(".json") and len(example.text) < 10_000 and "NaN" not in example.text:
+            value = json.loads(example.text)
+            made += [
+                (name, replaced(value, place, one).decode())
+                for place in places(value)
+                for one in wrong
+            ]
+    return made
+
+
+@pytest.mark.slow
+def test_wrong_values_are_left_out_or_refused(tmp_path: Path) -> None:
+    """Only `MessageError` may be raised, whatever a file contains."""
+    for name, text in corrupted(WRONG):
+        path = tmp_path / name
+        path.write_text(text, "utf-8")
+        with suppress(MessageError):
+            fields = scene_client.from_file(path, EXAMPLES[name].labels)
+            assert isinstance(fields["objects"], list)
+            assert len(fields["objects"]) <= 256
+
+
+@pytest.mark.parametrize(
+    ("argument", "expected"),
+    [
+        ("sofa/couch/lounge", False), ("a.json", True), ("a.jsonl:3", True), ("a.xml:0", True),
+        ("a.yaml", True), ("./a", True), ("-", True),
+        ("Bed|-01.0|+00.0", False), ("mug, cup", False),
+    ],
+)  # fmt: skip
+def test_labels_are_not_files(argument: str, expected: bool) -> None:
+    assert is_file(argument) is expected
+
+
+NAMES = {
+    "names.yaml": "path: x\nnames:\n  0: lamp\n  1: 'bed'\n",
+    "list.yaml": "nc: 2\nnames: ['lamp', \"bed\"]\n",
+    "block.yaml": "names:\n- lamp\n- bed\n",
+    "names.txt": "lamp\nbed\n",
+    "coco.json": '{"categories": [{"id": 0, "name": "lamp"}, {"id": 1, "name": "bed"}]}',
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_names_of_class_ids_come_from_a_file(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(NAMES[name])
+    (tmp_path / "yolo.txt").write_text("1 0.5 0.5 0.2 0.2\n0 0.2 0.2 0.1 0.1\n")
+    fields = scene_client.from_file(tmp_path / "yolo.txt", str(tmp_path / name))
+    assert [thing["label"] for thing in fields["objects"]] == ["bed", "lamp"]
+
+
+def test_the_command_prints_few_notes_and_refuses_a_file_without_objects(
+    url: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "thousands.json"
+    path.write_text(EXAMPLES["thousands.json"].text)
+    line = ["outliers", str(path), "--label-map", "coco91", "--url", url]
+    done = CliRunner().invoke(app, line)
+    assert done.exit_code == 0, done.stderr
+    notes = [text for text in done.stderr.splitlines() if text.startswith(str(path))]
+    assert len(notes) == 11
+    assert notes[-1].endswith("2990 more notes of this kind")
+    path.write_text(json.dumps([{"category_id": 12, "bbox": [1, 2, 3, 4]}]))
+    done = CliRunner().invoke(app, line)
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert done.stderr == f"{path} has no object for a request: class '12' has no label\n"
