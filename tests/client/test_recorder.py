@@ -272,13 +272,15 @@ for n in range(50):
 
 def test_a_killed_writer_leaves_whole_lines(file: Path) -> None:
     killed = run("""
-torn = 0
+torn, size = 0, lambda: os.path.exists(sys.argv[1]) and os.path.getsize(sys.argv[1])
 for turn in range(60):
-    child = os.fork()
+    before, child = size(), os.fork()
     if not child:
         writer = Recorder(sys.argv[1])
         for n in itertools.count():
             writer.record([scene(f"{turn} {n}")])
+    while size() <= before:  # the first line also mends the file
+        time.sleep(0.001)
     time.sleep(random.uniform(0.0, 0.05))
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
@@ -289,7 +291,7 @@ print(torn, "torn")
 """, file)  # fmt: skip
     assert killed.endswith("torn\n")
     written = labels(file)
-    assert len(written) > 60
+    assert len(written) > 30
     assert written[-1][0].startswith("last")
 
 

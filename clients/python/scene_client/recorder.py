@@ -30,7 +30,7 @@ except ImportError:  # Windows, where only one process may write a file
     fcntl = None  # type: ignore[assignment]
 
 if TYPE_CHECKING:
-    from scene_client.schemas import Detection, SceneRequest
+    from scene_client.schemas import Detection, SceneRequest, Viewpoint
 
 MOST_BYTES: Final = 64 * 2**20
 """Default for the maximum size of the file. The older file has at most the same size."""
@@ -105,11 +105,12 @@ class Recorder:
                 self._is_failing = True
 
     def _record(self, request: SceneRequest) -> None:
-        labels = [entry if isinstance(entry, str) else entry.label for entry in _likely(request)]
+        entries = _likely(request)
+        labels = [entry if isinstance(entry, str) else entry.label for entry in entries]
         if len(labels) < LEAST_OBJECTS:
             return
         hour, _ = _time_of(request)
-        hashes = _hashes(hour, labels, request.room_type, _stated(request))
+        hashes = _hashes(hour, labels, request.room_type, _stated(request, entries))
         with self._lock:
             if self._is_new(hashes, request):
                 self._append(scene_of(request))
@@ -246,8 +247,9 @@ def scene_of(request: SceneRequest) -> dict[str, Any]:
     if request.room_type is not None:
         scene["room_type"] = request.room_type
     entries = _likely(request)
+    optical = is_optical(request.frame_id)
     objects = {
-        name: _object(name, entry, request)
+        name: _object(name, entry, request.viewpoint, optical=optical)
         for name, entry in zip(_ids(entries), entries, strict=True)
     }
     labels = Counter(thing["label"] for thing in objects.values())
@@ -318,7 +320,9 @@ def _ids(objects: Sequence[str | Detection]) -> list[str]:
     return ids
 
 
-def _object(name: str, entry: str | Detection, request: SceneRequest) -> dict[str, Any]:
+def _object(
+    name: str, entry: str | Detection, view: Viewpoint | None, *, optical: bool
+) -> dict[str, Any]:
     """Return an object in the training format. `supported_by` is an id or a label."""
     if isinstance(entry, str):
         return {"id": name, "label": entry}
@@ -331,9 +335,8 @@ def _object(name: str, entry: str | Detection, request: SceneRequest) -> dict[st
             turn = (0.0, 0.0, math.sin(entry.yaw / 2), math.cos(entry.yaw / 2))
         elif (q := entry.orientation) is not None:
             turn = (q.x, q.y, q.z, q.w)
-        optical = is_optical(request.frame_id)
         place, size, yaw = body_pose((centre.x, centre.y, centre.z), size, turn, optical=optical)
-        if (view := request.viewpoint) is not None:
+        if view is not None:
             cos, sin = math.cos(view.yaw), math.sin(view.yaw)
             x, y = place[0] - view.x, place[1] - view.y
             place, yaw = (x * cos + y * sin, y * cos - x * sin, place[2]), yaw - view.yaw
@@ -378,9 +381,9 @@ def _hashes_of_line(scene: dict[str, Any]) -> list[int]:
     return _hashes(scene["group"], label_of.values(), scene.get("room_type"), relations)
 
 
-def _stated(request: SceneRequest) -> list[Triple]:
+def _stated(request: SceneRequest, entries: Sequence[str | Detection]) -> list[Triple]:
     """Return the recorded ones of the stated relations, as triples of labels."""
-    detections = [entry for entry in _likely(request) if not isinstance(entry, str)]
+    detections = [entry for entry in entries if not isinstance(entry, str)]
     label_of = {entry.id: entry.label for entry in detections if entry.id is not None}
     relations = [
         (entry.label, "on-top", label_of.get(entry.supported_by, entry.supported_by))
