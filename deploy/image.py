@@ -48,7 +48,7 @@ QUESTIONS: list[tuple[str, dict[str, Any]]] = [
 
 
 # Fails if COPY did not obey .dockerignore. The compilation of kernels writes __pycache__ itself.
-CONTENTS = """test "$(echo *)" = "app compiled model_store scene_client" &&
+CONTENTS = """test "$(echo *)" = "app compiled model_store models scene_client" &&
     test -z "$(find app scene_client -name .numba_cache)" """
 
 
