@@ -30,8 +30,9 @@ def main(arguments: list[str] | None = None) -> int:
             _run(options, _existing(root))
             return 0
         source = _existing(root := options.source)
-        keys = _keys(source, options.reference)
+        # Aliases come first: a publisher adds a version before its alias.
         aliases = {} if options.reference else source.aliases()
+        keys = _keys(source, options.reference)
         return _copy(source, keys, aliases, _existing(root := target))
     except RegistryError as error:
         sys.stderr.write(f"store {root}: {error.reason}\n")
