@@ -89,6 +89,9 @@ ENV HOME=/tmp \
     SCENE_PORT=8000 \
     SCENE_STORE=/srv/scene/model_store
 USER 10001:10001
+LABEL org.opencontainers.image.title=scene-boltzmann \
+    org.opencontainers.image.version=2.0.0 \
+    org.opencontainers.image.licenses=Apache-2.0
 EXPOSE 8000
 # http.client, unlike urlopen, never takes a proxy that the environment names.
 HEALTHCHECK --interval=10s --timeout=3s --start-period=60s --retries=3 \
