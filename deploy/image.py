@@ -49,7 +49,7 @@ QUESTIONS: list[tuple[str, dict[str, Any]]] = [
 
 # Fails if COPY did not obey .dockerignore. The compilation of kernels writes __pycache__ itself.
 CONTENTS = """test "$(echo *)" = "app compiled model_store models scene_client" &&
-    test -z "$(find app scene_client -name .numba_cache)" """
+    test "$(stat -c %u models)" = 10001 && test -z "$(find app scene_client -name .numba_cache)" """
 
 
 class ImageError(Exception):
