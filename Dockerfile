@@ -75,6 +75,8 @@ COPY clients/python/scene_client ./scene_client
 COPY app ./app
 # Owned by the service, which moves aliases; publishing adds versions beside those shipped.
 COPY --chown=10001:10001 model_store ./model_store
+# A volume mounted here belongs to the service. docker-compose.yml copies the shipped models into it.
+RUN install -d -o 10001 -g 10001 models
 # Compiled for any CPU of the architecture, so that no start compiles. Answers take 10 to 25 % longer
 # than with loops for the own CPU, which `env -u NUMBA_CPU_NAME -u NUMBA_CPU_FEATURES` compiles.
 # The folder is private to its owner, here root; the service copies it.
@@ -87,6 +89,9 @@ ENV HOME=/tmp \
     SCENE_PORT=8000 \
     SCENE_STORE=/srv/scene/model_store
 USER 10001:10001
+LABEL org.opencontainers.image.title=scene-boltzmann \
+    org.opencontainers.image.version=2.0.0 \
+    org.opencontainers.image.licenses=Apache-2.0
 EXPOSE 8000
 # http.client, unlike urlopen, never takes a proxy that the environment names.
 HEALTHCHECK --interval=10s --timeout=3s --start-period=60s --retries=3 \

@@ -1,3 +1,3 @@
 """The scene-reasoning service, and the model code that it shares with training."""
 
-__version__ = "1.0.0"
+__version__ = "2.0.0"

@@ -110,7 +110,7 @@ class _Environment(EnvSettingsSource):
                 continue
             if _SERVICE_LINK.fullmatch(f"{name}={value}"):
                 continue
-            message = "unknown setting; app/settings.py lists the settings"
+            message = "unknown setting; docs/operations.md lists the settings"
             if name in _REMOVED:
                 message = f"this setting is removed: {_REMOVED[name]}"
             elif similar := get_close_matches(name, names, 1):

@@ -48,8 +48,8 @@ QUESTIONS: list[tuple[str, dict[str, Any]]] = [
 
 
 # Fails if COPY did not obey .dockerignore. The compilation of kernels writes __pycache__ itself.
-CONTENTS = """test "$(echo *)" = "app compiled model_store scene_client" &&
-    test -z "$(find app scene_client -name .numba_cache)" """
+CONTENTS = """test "$(echo *)" = "app compiled model_store models scene_client" &&
+    test "$(stat -c %u models)" = 10001 && test -z "$(find app scene_client -name .numba_cache)" """
 
 
 class ImageError(Exception):

@@ -1,4 +1,4 @@
-"""``python -m app.registry``: move aliases of a store, and list its versions.
+"""``python -m app.registry``: list versions, move aliases, and copy versions between stores.
 
 Without --store, the store is SCENE_STORE, or else the folder model_store, as for the service.
 """
@@ -9,10 +9,12 @@ import argparse
 import logging
 import os
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
 from app.registry import AliasTarget, RegistryError, Store, StoreError, load_model_set
+from app.registry.references import version_key
 
 _STORE: Final = "model_store"  # as `Settings.store`
 
@@ -22,15 +24,25 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     # The messages of this command contain the errors.
     logging.getLogger("app.registry").addHandler(logging.NullHandler())
-    root = options.store or os.environ.get("SCENE_STORE") or _STORE
+    root = target = options.store or os.environ.get("SCENE_STORE") or _STORE
     try:
-        if not Path(root).is_dir():  # `Store` would create it
-            raise StoreError("unreadable", f"there is no folder {root}")
-        _run(options, Store(root))
+        if options.command != "copy":
+            _run(options, _existing(root))
+            return 0
+        source = _existing(root := options.source)
+        # Aliases come first: a publisher adds a version before its alias.
+        aliases = {} if options.reference else source.aliases()
+        keys = _keys(source, options.reference)
+        return _copy(source, keys, aliases, _existing(root := target))
     except RegistryError as error:
         sys.stderr.write(f"store {root}: {error.reason}\n")
         return 1
-    return 0
+
+
+def _existing(root: str) -> Store:
+    if not Path(root).is_dir():  # `Store` would create it
+        raise StoreError("unreadable", f"there is no folder {root}")
+    return Store(root)
 
 
 def _run(options: argparse.Namespace, store: Store) -> None:
@@ -42,6 +54,45 @@ def _run(options: argparse.Namespace, store: Store) -> None:
         _print(f"alias '{options.alias}' is removed")
     else:
         _list(store)
+
+
+def _keys(store: Store, reference: str | None) -> list[tuple[str, str]]:
+    if reference is not None:
+        return [store.resolve(reference)]
+    return [(name, version) for name in store.names() for version in store.versions(name)]
+
+
+def _copy(
+    source: Store, keys: list[tuple[str, str]], aliases: Mapping[str, AliasTarget], target: Store
+) -> int:
+    """Copy versions, then aliases. Return 1 if a version is not copied."""
+    added, status = set(), 0
+    for key in keys:
+        try:
+            is_new = target.copy(source, *key)
+        except RegistryError as error:
+            sys.stderr.write(f"{'@'.join(key)} is not copied: {error.reason}\n")
+            status = 1
+            continue
+        if is_new:
+            added.add(key)
+        _print(f"{'@'.join(key)} {'is copied' if is_new else 'is already there'}")
+    present = target.aliases()
+    for alias, new in aliases.items():
+        old = present.get(alias)
+        if old is None or _is_upgrade(old, new, added):
+            target.set_alias(alias, new, expected=old)
+            _print(f"alias '{alias}' points at {new}" + (f", before at {old}" if old else ""))
+        elif old != new:
+            _print(f"alias '{alias}' still points at {old}, not at {new}")
+    return status
+
+
+def _is_upgrade(old: AliasTarget, new: AliasTarget, added: set[tuple[str, str]]) -> bool:
+    """Return whether an alias pins an older version of a model that has just been added."""
+    if old.version is None or new.version is None or old.name != new.name:
+        return False
+    return (new.name, new.version) in added and version_key(old.version) < version_key(new.version)
 
 
 def _list(store: Store) -> None:
@@ -67,7 +118,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m app.registry", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("--store", help=f"folder; default: SCENE_STORE, or else {_STORE}")
+    default = f"folder; default: SCENE_STORE, or else {_STORE}"
+    common.add_argument("--store", help=default)
 
     def add(name: str, text: str) -> argparse.ArgumentParser:
         return commands.add_parser(name, help=text, parents=[common])
@@ -76,6 +128,15 @@ def _parser() -> argparse.ArgumentParser:
     alias.add_argument("alias")
     alias.add_argument("target", help="name@version, or name for the newest usable version")
     add("remove-alias", "remove an alias").add_argument("alias")
+    copy = commands.add_parser(
+        "copy",
+        help="copy a version, or all versions and aliases, from another store",
+        description="Without a model, copy all versions, add missing aliases, and move an alias "
+        "from an older version of a model to a copied version. Other aliases stay.",
+    )
+    copy.add_argument("reference", nargs="?", metavar="NAME[@VERSION]", help="default: all")
+    copy.add_argument("--from", dest="source", metavar="STORE", required=True, help="folder")
+    copy.add_argument("--to", dest="store", metavar="STORE", help=default)
     add("list", "list versions and aliases, and verify every file")
     return parser
 

@@ -160,15 +160,34 @@ def write_artifact(
         **dict(description),
         tensors=tensors,
         files={
-            name: FileEntry(sha256=hashlib.sha256(data).hexdigest(), bytes=len(data))
+            name: FileEntry(sha256=_digest(data), bytes=len(data))
             for name, data in ((WEIGHTS, weights), (CARD, card))
         },
     )
+    _write_files(directory, weights, card, manifest.to_bytes())
+    return manifest
+
+
+def copy_artifact(artifact: Artifact, directory: Path) -> None:
+    """Copy the files of a loaded artifact into a new directory, and sync it to disk.
+
+    Raises:
+        ArtifactError: a file is invalid, or was altered after the artifact was loaded.
+        OSError: the operating system could not write a file.
+    """
+    size = artifact.manifest.files[WEIGHTS].bytes
+    manifest, text, weights, card = read_verified(artifact.path, size)
+    if _digest(text) != artifact.digest:
+        reason = f"{manifest.name}@{manifest.version} was altered during the copy"
+        raise ArtifactError("checksum_mismatch", reason)
+    _write_files(directory, weights, card.encode(), text)
+
+
+def _write_files(directory: Path, weights: bytes, card: bytes, manifest: bytes) -> None:
     directory.mkdir(mode=0o755)
-    for name, data in ((WEIGHTS, weights), (CARD, card), (MANIFEST, manifest.to_bytes())):
+    for name, data in ((WEIGHTS, weights), (CARD, card), (MANIFEST, manifest)):
         write_file(directory / name, data)
     sync_directory(directory)
-    return manifest
 
 
 def load_artifact(
@@ -185,7 +204,8 @@ def load_artifact(
     Raises:
         ArtifactError: the artifact is invalid. The exception describes the first error found.
     """
-    manifest, digest, stored, card = read_verified(directory, max_weights_bytes)
+    manifest, text, stored, card = read_verified(directory, max_weights_bytes)
+    digest = _digest(text)
     if previous is not None and previous.digest == digest:
         return previous
     tensors = unpack(stored, manifest.tensors)
@@ -207,6 +227,10 @@ def load_artifact(
         counts=Counts.from_tensors(counts, V, C) if counts else None,
         places=Places.from_tensors(places, A, V) if places else None,
     )
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
 
 
 def _weights(manifest: Manifest, tensors: Mapping[str, NDArray[Any]]) -> Weights:
@@ -236,12 +260,11 @@ def _weights(manifest: Manifest, tensors: Mapping[str, NDArray[Any]]) -> Weights
     return weights
 
 
-def read_verified(directory: Path, max_weights_bytes: int) -> tuple[Manifest, str, bytes, str]:
+def read_verified(directory: Path, max_weights_bytes: int) -> tuple[Manifest, bytes, bytes, str]:
     """Read and verify the files of an artifact; see `load_artifact`.
 
     Returns:
-        The parsed manifest, the digest of its bytes (see `Artifact`), the bytes of the weights file
-        and the model card.
+        The parsed manifest, its bytes, the bytes of the weights file and the model card.
 
     Raises:
         ArtifactError: a file is missing, unexpected, unreadable, too large, truncated or altered,
@@ -273,7 +296,7 @@ def read_verified(directory: Path, max_weights_bytes: int) -> tuple[Manifest, st
         page = card.decode()
     except UnicodeDecodeError:
         raise ArtifactError("invalid_manifest", f"{CARD} is not UTF-8") from None
-    return manifest, hashlib.sha256(text).hexdigest(), weights, page
+    return manifest, text, weights, page
 
 
 def _require_size(name: str, size: int, limit: int) -> None:
@@ -311,7 +334,7 @@ def _read_checked(folder: int, name: str, entry: FileEntry, limit: int) -> bytes
     data = _read(folder, name, entry.bytes)
     if len(data) < entry.bytes:
         raise ArtifactError("truncated", f"{name} has only {len(data)} of {entry.bytes} bytes")
-    if hashlib.sha256(data).hexdigest() != entry.sha256:
+    if _digest(data) != entry.sha256:
         reason = f"{name} does not match its checksum: the file was altered"
         raise ArtifactError("checksum_mismatch", reason)
     return data

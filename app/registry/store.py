@@ -14,7 +14,7 @@ import dataclasses
 import os
 import shutil
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from secrets import token_hex
@@ -23,7 +23,13 @@ from typing import Final, Literal, TypeAlias
 
 from numpy.typing import ArrayLike
 
-from app.registry.artifact import MAX_WEIGHTS_BYTES, Artifact, load_artifact, write_artifact
+from app.registry.artifact import (
+    MAX_WEIGHTS_BYTES,
+    Artifact,
+    copy_artifact,
+    load_artifact,
+    write_artifact,
+)
 from app.registry.description import Description
 from app.registry.durable import exclusive, make_directory, rename, replace_file
 from app.registry.errors import ArtifactError, StoreError, cause
@@ -180,25 +186,65 @@ class Store:
             StoreError: `version_exists`, `name_conflict`, `invalid_reference`, `invalid_aliases`,
                 `unsafe_path`, `locked`, or `not_writable`.
         """
-        name, version = description.name, description.version
+
+        def write(folder: Path) -> None:
+            write_artifact(folder, description, state, storage_dtype=storage_dtype)
+
         with self._writing():
-            self.require_new(name, version)
-            folder = self.root / name
-            if os.path.lexists(folder) and not _is_directory(folder):
-                raise StoreError("unsafe_path", f"the path of model '{name}' is not a directory")
-            make_directory(folder)
-            path = folder / version
-            if os.path.lexists(path):
-                advice = "Choose a new number, or remove the folder"
-                reason = f"{name}/{version} is a folder without a manifest. {advice}"
-                raise StoreError("version_exists", reason)
-            temporary = folder / f"{TEMPORARY}{version}-{token_hex(8)}"
-            try:
-                write_artifact(temporary, description, state, storage_dtype=storage_dtype)
-                artifact = load_artifact(temporary, None, self._max_weights_bytes)
-                rename(temporary, path)
-            finally:
-                shutil.rmtree(temporary, ignore_errors=True)
+            return self._add(description.name, description.version, write)
+
+    def copy(self, source: Store, name: str, version: str) -> bool:
+        """Copy a version of another store, and return whether it is new to this store.
+
+        The method verifies the version like `load`, and writes it like `publish`. A version that
+        this store already has with the same digest stays unchanged.
+
+        Raises:
+            ArtifactError: the version is not valid in ``source``, or in this store.
+            StoreError: `version_exists` if this store has another version of this number;
+                `unknown_version`, or an error of `publish`.
+        """
+        artifact = source.load(name, version)
+        with self._writing():
+            if version in self.versions(name):
+                self._require_same(artifact)
+                return False
+            self._add(name, version, lambda folder: copy_artifact(artifact, folder))
+        return True
+
+    def _require_same(self, artifact: Artifact) -> None:
+        """Check that this store has a version with the digest of an artifact."""
+        name, version = artifact.key
+        try:
+            own = self.load(name, version)
+        except ArtifactError as error:
+            advice = f"Remove its folder {name}/{version}, then copy again"
+            reason = f"the copy of {name}@{version} is damaged: {error.reason}. {advice}"
+            raise ArtifactError(error.code, reason) from None
+        if own.digest != artifact.digest:
+            digests = f"{own.digest[:12]}, not {artifact.digest[:12]}"
+            reason = f"{name}@{version} is already published with the digest {digests}"
+            raise StoreError("version_exists", f"{reason}, and a version never changes")
+
+    def _add(self, name: str, version: str, write: Callable[[Path], object]) -> Artifact:
+        """Add a version whose folder ``write`` creates. The caller holds the lock."""
+        self.require_new(name, version)
+        folder = self.root / name
+        if os.path.lexists(folder) and not _is_directory(folder):
+            raise StoreError("unsafe_path", f"the path of model '{name}' is not a directory")
+        make_directory(folder)
+        path = folder / version
+        if os.path.lexists(path):
+            advice = "Choose a new number, or remove the folder"
+            reason = f"{name}/{version} is a folder without a manifest. {advice}"
+            raise StoreError("version_exists", reason)
+        temporary = folder / f"{TEMPORARY}{version}-{token_hex(8)}"
+        try:
+            write(temporary)
+            artifact = load_artifact(temporary, None, self._max_weights_bytes)
+            rename(temporary, path)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
         return dataclasses.replace(artifact, path=path)
 
     def set_alias(

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +16,7 @@ from typer.testing import CliRunner, Result
 from scene_client import Client
 from scene_client.command import app
 from tests.client.peers import answering, say_nothing
+from tests.conftest import run_program
 
 ANSWERED: dict[str, Any] = {
     "model": {"name": "home", "version": "1.0.0", "variant": "rbm", "digest": "0"},
@@ -289,3 +293,46 @@ def test_the_key_is_taken_from_the_environment(
     started = peer(answering(b'{"models":[],"aliases":{}}', heads=heads))
     assert scene("models", "--url", started.url).exit_code == 0
     assert b"x-api-key: " + b"k" * 16 in heads[0].lower()
+
+
+# -- completion -----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> str:
+    """A path that begins with a folder of the program ``scene``."""
+    program = tmp_path / "scene"
+    program.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m scene_client "$@"\n')
+    program.chmod(0o755)
+    return f"{tmp_path}{os.pathsep}{os.environ['PATH']}"
+
+
+@pytest.mark.system
+def test_bash_completes_by_the_printed_script(
+    path: str, require_system_tool: Callable[[str], Path]
+) -> None:
+    bash = require_system_tool("bash")
+    environment = os.environ | {"PATH": path}
+
+    def completions(*words: str) -> list[str]:
+        script = (
+            'eval "$(scene --show-completion)"; read -ra COMP_WORDS <<<"$1"; '
+            "COMP_CWORD=$2; $(complete -p scene | grep -o '[a-z_]*_completion') scene; "
+            'printf "%s\\n" "${COMPREPLY[@]}"'
+        )
+        line = ("-c", script, "bash", " ".join(words), str(len(words) - 1))
+        return run_program(bash, "--norc", *line, env=environment).stdout.split()
+
+    assert completions("scene", "mi") == ["missing"]
+    assert completions("scene", "missing", "--room") == ["--room-type"]
+    assert completions("scene", "outliers", "--sensitivity", "m") == ["medium"]
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_other_shells_get_commands_with_their_help(path: str, shell: str) -> None:
+    asked = {"_SCENE_COMPLETE": f"complete_{shell}", "_TYPER_COMPLETE_ARGS": "scene gen"}
+    environment = os.environ | {"PATH": path, "_TYPER_COMPLETE_FISH_ACTION": "get-args"} | asked
+    printed = run_program("scene", env=environment).stdout
+    assert "generate" in printed
+    assert "Sample scenes" in printed
+    assert "missing" not in printed

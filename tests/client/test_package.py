@@ -14,6 +14,8 @@ from pathlib import Path
 
 import pytest
 
+import app
+from app.registry.manifest import FORMAT
 from scripts import sync_client
 from tests.client import callers
 from tests.conftest import REPOSITORY, run_program
@@ -22,6 +24,26 @@ from tests.services import LiveService
 
 def test_the_blocking_client_is_up_to_date():
     assert sync_client.TARGET.read_text("utf-8") == sync_client.generated(), "run `make format`"
+
+
+@pytest.mark.parametrize(
+    ("path", "pattern"),
+    [
+        ("clients/python/scene_client/__init__.py", r'__version__ = "(.+)"'),
+        ("clients/ros2/scene_reasoning/package.xml", r"<version>(.+)</version>"),
+        ("clients/ros2/scene_reasoning/setup.py", r'version="(.+)"'),
+        ("Dockerfile", r"org\.opencontainers\.image\.version=(\S+)"),
+        ("docs/operations.md", r"--branch v(\S+)"),
+        ("docs/upgrading.md", rf"^\| (\S+) \| {FORMAT} \| \1; "),
+        ("CHANGELOG.md", r"^## (\d\S*)"),
+    ],
+)
+def test_every_file_states_the_version_of_the_service(
+    repository: Path, path: str, pattern: str
+) -> None:
+    match = re.search(pattern, (repository / path).read_text("utf-8"), re.MULTILINE)
+    assert match is not None
+    assert match[1] == app.__version__
 
 
 def test_the_wheel_holds_the_client_alone(repository: Path, tmp_path: Path):

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import os
+import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import yaml
 
+from app.registry import Store
+from app.settings import Settings
 from tests.conftest import run_program
 
 pytestmark = pytest.mark.system
@@ -23,6 +28,8 @@ pytestmark = pytest.mark.system
         "hadolint --failure-threshold=style Dockerfile",
         "shellcheck .ci/run examples/adapt.sh examples/curl.sh",
         "check-jsonschema --builtin-schema=vendor.compose-spec docker-compose.yml",
+        "check-jsonschema --builtin-schema=vendor.github-workflows .github/workflows/ci.yml",
+        "check-jsonschema --builtin-schema=vendor.gitlab-ci .gitlab-ci.yml",
     ],
 )
 def test_a_configuration_has_no_lint(
@@ -33,3 +40,46 @@ def test_a_configuration_has_no_lint(
     monkeypatch.setenv("PROXY_BACKEND", "127.0.0.1:8000")
     program, *arguments = command.split()
     run_program(require_system_tool(program), *arguments)
+
+
+def test_workflows_run_every_python_of_the_packages(repository: Path) -> None:
+    classifier = r'"Programming Language :: Python :: (3\.\d+)"'
+    expected = re.findall(classifier, (repository / "pyproject.toml").read_text("utf-8"))
+    github = yaml.safe_load((repository / ".github/workflows/ci.yml").read_text("utf-8"))
+    gitlab = yaml.safe_load((repository / ".gitlab-ci.yml").read_text("utf-8"))
+    (job,) = github["jobs"].values()
+    assert job["strategy"]["matrix"]["python"] == expected
+    assert gitlab["test"]["parallel"]["matrix"] == [{"PYTHON": expected}]
+    assert job["steps"][-1]["run"] == gitlab["test"]["script"][0] == ".ci/run"
+    for step in job["steps"][:-1]:
+        assert re.fullmatch(r"[\w/-]+@[0-9a-f]{40}", step["uses"]), "actions are pinned by commit"
+
+
+@pytest.fixture
+def unit(repository: Path, tmp_path: Path) -> Path:
+    """The unit of systemd, with this interpreter in place of the installed one."""
+    text = (repository / "deploy/systemd/scene.service").read_text("utf-8")
+    unit = tmp_path / "scene.service"
+    unit.write_text(text.replace("/opt/scene/.venv/bin/python", sys.executable))
+    return unit
+
+
+def test_the_unit_is_valid_and_confined(
+    require_system_tool: Callable[[str], Path], unit: Path
+) -> None:
+    systemd = require_system_tool("systemd-analyze")
+    verified = run_program(systemd, "verify", "--man=no", unit)
+    assert verified.stdout + verified.stderr == ""
+    # The threshold is in tenths: at most 2.0 of 10.
+    run_program(systemd, "security", "--offline=true", "--threshold=20", "--no-pager", unit)
+
+
+def test_the_unit_names_settings_and_commands_that_exist(unit: Path, tmp_path: Path) -> None:
+    text = unit.read_text("utf-8")
+    known = {f"SCENE_{name.upper()}" for name in Settings.model_fields}
+    assert set(re.findall(r"\bSCENE_[A-Z_]+\b", text)) - {"SCENE_NAME"} <= known
+    (before,) = re.findall(r"^ExecStartPre=-(.+)$", text, re.MULTILINE)
+    (tmp_path / "models").mkdir()
+    environment = os.environ | {"SCENE_STORE": str(tmp_path / "models")}
+    run_program(*before.split(), env=environment)
+    assert Store(tmp_path / "models").resolve("default")

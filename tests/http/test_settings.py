@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -104,7 +105,7 @@ def test_the_two_keys_differ(tmp_path: Path) -> None:
         ("SCENE_STOER", "models", "unknown setting; did you mean SCENE_STORE?"),
         ("scene_max_object", "7", "unknown setting; did you mean SCENE_MAX_OBJECTS?"),
         ("SCENE_HTTP_PORT", "80", "unknown setting"),
-        ("SCENE_ZZ", "1", "unknown setting; app/settings.py lists the settings"),
+        ("SCENE_ZZ", "1", "unknown setting; docs/operations.md lists the settings"),
         ("SCENE_WORKERS", "2", "this setting is removed: a replica is one process"),
         ("SCENE_STREAM_RESUME", "1", "this setting is removed: the service has no streams"),
         ("SCENE_PORT", "tcp://10.0.0.1:8000", "Input should be a valid integer"),
@@ -167,3 +168,32 @@ def test_a_key_is_masked_in_any_spelling(kind: Callable[[list[str]], logging.For
     line = kind([secret]).format(record)
     assert "it was **********" in line
     assert "backslash" not in line
+
+
+def in_words(name: str, default: object) -> str:
+    """The default of a setting as docs/operations.md writes it."""
+    if default is None or default in ((), ""):
+        return "–"
+    if isinstance(default, bool):
+        return str(default).lower()
+    if name.endswith("_bytes") and isinstance(default, int):
+        power = (default.bit_length() - 1) // 10
+        return f"{default // 2 ** (10 * power)} {('', 'Ki', 'Mi', 'Gi')[power]}B"
+    return f"{default:g}" if isinstance(default, float) else str(default)
+
+
+def test_the_documentation_lists_every_setting_once_with_its_default(repository: Path) -> None:
+    pages = {page.name: page.read_text("utf-8") for page in (repository / "docs").glob("*.md")}
+    row = re.compile(r"^\| `SCENE_([A-Z_]+)` \| ([^|]+) \| [^|]+ \|$", re.MULTILINE)
+    rows = [(name, *found) for name, page in pages.items() for found in row.findall(page)]
+    assert {page for page, _, _ in rows} == {"operations.md"}
+    fields = Settings.model_fields.items()
+    expected = {name.upper(): in_words(name, field.default) for name, field in fields}
+    expected["LOG_FORMAT"] = "–"  # depends on the terminal
+    assert {name: default.strip("`") for _, name, default in rows} == expected
+    assert len(rows) == len(expected)
+    text = pages["operations.md"].partition("Clients read these variables:\n\n")[2]
+    listed = set(re.findall(r"^\| `(SCENE_[A-Z_]+)`", text.partition("\n\n")[0], re.MULTILINE))
+    sources = [*(repository / "clients").rglob("*.py"), *(repository / "app/registry").glob("*.py")]
+    read = {name for path in sources for name in re.findall(r'"(SCENE_[A-Z_]+)"', path.read_text())}
+    assert listed == read

@@ -8,6 +8,7 @@ import os
 import shutil
 import sys
 import time
+from collections.abc import Callable
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from typing import Any
 import pytest
 
 from app.registry import AliasTarget, ModelSet, Store, StoreError, load_model_set
+from app.registry.__main__ import main
 from tests.registry.small_artifacts import description, publish_as, state
 
 pytestmark = pytest.mark.system
@@ -26,12 +28,20 @@ PUBLISHERS = multiprocessing.get_context("forkserver")
 PUBLISHERS.set_forkserver_preload([__name__])
 
 
-def publish_until(root: Path, steps: int) -> None:
-    """Publish one version, but die before the given step that touches the file system."""
+def publish(root: Path) -> None:
+    publish_as(Store(root), "default", description(version="2.0.0"), WEIGHTS)
+
+
+def copy(root: Path) -> None:
+    assert main(["copy", "--from", str(root.parent / "newer"), "--to", str(root)]) == 0
+
+
+def run_until(write: Callable[[Path], None], root: Path, steps: int) -> None:
+    """Write to a store, but die before the given step that touches the file system."""
     left = steps
     writing = os.O_WRONLY | os.O_RDWR | os.O_CREAT
     changing = {"os.mkdir", "os.rename", "os.remove", "os.rmdir", "fcntl.flock", "os.scandir"}
-    store, fsync = Store(root), os.fsync
+    fsync = os.fsync
 
     def step() -> None:
         nonlocal left
@@ -49,7 +59,7 @@ def publish_until(root: Path, steps: int) -> None:
 
     sys.addaudithook(hook)
     os.fsync = watched
-    publish_as(store, "default", description(version="2.0.0"), WEIGHTS)
+    write(root)
     os._exit(0)
 
 
@@ -99,14 +109,16 @@ def check_survivor(root: Path) -> tuple[str, str, bool]:
     return newest, default, left
 
 
-def test_a_publisher_may_stop_before_any_step(tmp_path: Path) -> None:
+@pytest.mark.parametrize("write", [publish, copy])
+def test_a_writer_may_stop_before_any_step(tmp_path: Path, write: Callable[[Path], None]) -> None:
+    publish_as(Store(tmp_path / "newer"), "default", description(version="2.0.0"), WEIGHTS)
     published = tmp_path / "published"
     publish_as(Store(published), "default", description(), WEIGHTS)
     seen, ended = set(), None
     for steps in range(200):
         root = tmp_path / str(steps)
         shutil.copytree(published, root)
-        ended = exit_code(start(publish_until, root, steps))
+        ended = exit_code(start(run_until, write, root, steps))
         seen.add(check_survivor(root))
         if ended != KILLED:
             break

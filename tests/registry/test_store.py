@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+import shutil
 import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from app.registry import AliasTarget, ArtifactError, Store, StoreError
+from app.registry import AliasTarget, Artifact, ArtifactError, Store, StoreError
 from app.registry.__main__ import main
 from app.registry.durable import exclusive
 from app.registry.references import MAX_ALIASES_BYTES, aliases_to_bytes
@@ -344,3 +345,124 @@ def test_the_command_changes_the_store_of_the_service_and_creates_none(
     printed = capsys.readouterr()
     assert printed.out.splitlines()[-2:] == listed[:2]
     assert "store model_store: " in printed.err
+
+
+# -- copies ---------------------------------------------------------------------------------------
+
+
+def copy(source: Store, target: Store, *references: str) -> int:
+    return main(["copy", *references, "--from", str(source.root), "--to", str(target.root)])
+
+
+@pytest.fixture
+def shipped(tmp_path: Path) -> Store:
+    """A store with two versions, as an image of a newer release has it."""
+    store = Store(tmp_path / "shipped")
+    publish(store, "1.0.0")
+    publish_as(store, "default", description(version="2.0.0"), state(seed=1))
+    publish_as(store, "spare", description("other"), state(seed=2))
+    return store
+
+
+def test_copies_of_a_store_are_equal_and_repeatable(
+    shipped: Store, store: Store, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store.root.mkdir()
+    assert copy(shipped, store) == 0
+    assert tree(store.root) == tree(shipped.root)
+    assert "alias 'default' points at tiny@2.0.0\n" in capsys.readouterr().out
+    state = store.state()
+    assert copy(shipped, store) == 0
+    assert store.state() == state, "the second copy touches no file"
+    assert "tiny@2.0.0 is already there" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("reference", "version"), [("tiny@1.0.0", "1.0.0"), ("default", "2.0.0")])
+def test_copies_one_version_and_no_alias(
+    shipped: Store, store: Store, reference: str, version: str
+) -> None:
+    store.root.mkdir()
+    assert copy(shipped, store, reference) == 0
+    assert published(store) == {"tiny": (version,)}
+    assert not store.aliases()
+    assert store.load("tiny", version).digest == shipped.load("tiny", version).digest
+
+
+def test_an_upgrade_moves_an_alias_forward_once_and_keeps_own_choices(
+    shipped: Store, store: Store, capsys: pytest.CaptureFixture[str]
+) -> None:
+    publish_as(store, "default", description(version="1.5.0"), state(seed=3))
+    publish_as(store, "spare", description("own"), state(seed=4))
+    assert copy(shipped, store) == 0
+    aliases = {alias: str(target) for alias, target in store.aliases().items()}
+    assert aliases == {"default": "tiny@2.0.0", "spare": "own@1.0.0"}
+    printed = capsys.readouterr().out
+    assert "alias 'default' points at tiny@2.0.0, before at tiny@1.5.0" in printed
+    assert "alias 'spare' still points at own@1.0.0, not at other@1.0.0" in printed
+    rolled_back = AliasTarget(name="tiny", version="1.5.0")
+    store.set_alias("default", rolled_back)
+    assert copy(shipped, store) == 0
+    assert store.aliases()["default"] == rolled_back
+    assert published(store)["tiny"] == ("1.0.0", "1.5.0", "2.0.0")
+
+
+def test_a_copy_replaces_no_other_version_of_the_same_number(
+    shipped: Store, store: Store, capsys: pytest.CaptureFixture[str]
+) -> None:
+    publish(store, "2.0.0", seed=5)
+    before = store.load("tiny", "2.0.0").digest
+    assert copy(shipped, store) == 1
+    printed = capsys.readouterr()
+    assert "tiny@2.0.0 is not copied: tiny@2.0.0 is already published" in printed.err
+    assert "tiny@1.0.0 is copied" in printed.out
+    assert store.load("tiny", "2.0.0").digest == before
+    assert published(store) == {"other": ("1.0.0",), "tiny": ("1.0.0", "2.0.0")}
+
+
+def test_damaged_versions_are_not_copied_nor_taken_for_copies(
+    shipped: Store, store: Store, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store.root.mkdir()
+    assert copy(shipped, store) == 0
+    for root, version in ((shipped.root, "1.0.0"), (store.root, "2.0.0")):
+        weights = root / "tiny" / version / "model.safetensors"
+        weights.write_bytes(weights.read_bytes()[:-1])
+    (shipped.root / "tiny" / "3.0.0").mkdir()  # without a manifest: not yet uploaded
+    before = tree(store.root)
+    capsys.readouterr()
+    assert copy(shipped, store) == 1
+    first, second = capsys.readouterr().err.splitlines()
+    assert first.startswith("tiny@1.0.0 is not copied: model.safetensors has only")
+    assert "the copy of tiny@2.0.0 is damaged" in second
+    assert "Remove its folder tiny/2.0.0, then copy again" in second
+    assert tree(store.root) == before
+    assert not [path for path in (store.root / "tiny").iterdir() if path.name.startswith(".")]
+
+
+def test_a_version_that_changes_during_its_copy_is_refused(
+    shipped: Store, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    load = Store.load
+
+    def load_then_exchange(self: Store, name: str, version: str) -> Artifact:
+        loaded = load(self, name, version)
+        shutil.rmtree(folder := self.root / name / version)
+        (self.root / name / "2.0.0").rename(folder)
+        return loaded
+
+    monkeypatch.setattr(Store, "load", load_then_exchange)
+    with refused("checksum_mismatch"):
+        store.copy(shipped, "tiny", "1.0.0")
+    assert not published(store)
+
+
+def test_a_copy_names_the_store_that_is_missing(
+    shipped: Store, store: Store, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert copy(shipped, store) == 1
+    assert f"store {store.root}: there is no folder" in capsys.readouterr().err
+    assert copy(store, shipped) == 1
+    assert f"store {store.root}: there is no folder" in capsys.readouterr().err
+    store.root.mkdir()
+    assert copy(shipped, store, "tiny@9.0.0") == 1
+    assert f"store {shipped.root}: model 'tiny' does not have version" in capsys.readouterr().err

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import re
+import sys
 from configparser import ConfigParser
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from app.registry import AliasTarget, Store, load_model_set
+from app.registry.references import aliases_to_bytes
 from app.settings import Settings
 from deploy.image import first_base, pip_settings
+from tests.conftest import run_program
 
 pytestmark = pytest.mark.system
 
@@ -33,7 +38,7 @@ def test_final_stages_run_as_a_fixed_unprivileged_user(
 ) -> None:
     (user,) = re.findall(r"^USER ([1-9]\d{3,}:[1-9]\d{3,})$", stages[name], re.MULTILINE)
     built = [service for service in compose["services"].values() if "build" in service]
-    assert [service["user"] for service in built] == [user] * 2
+    assert [service["user"] for service in built] == [user] * 3
 
 
 def test_the_default_stage_serves_and_knows_nothing_of_training(stages: dict[str, str]) -> None:
@@ -52,7 +57,9 @@ def test_every_variable_given_to_the_service_is_one_it_reads(
     assert compose["services"]["scene"]["environment"].keys() <= known
 
 
-@pytest.mark.parametrize("name", ["proxy", "scene", "train", "prometheus", "grafana"])
+@pytest.mark.parametrize(
+    "name", ["proxy", "shipped-models", "scene", "train", "prometheus", "grafana"]
+)
 def test_services_are_confined(compose: dict[str, Any], name: str) -> None:
     service = compose["services"][name]
     assert re.fullmatch(r"[1-9]\d+:\d+", service["user"])
@@ -69,6 +76,31 @@ def test_ports_are_published_on_this_machine_only(compose: dict[str, Any]) -> No
     assert ports["scene"] == ports["train"] == []
     assert ports["proxy"][0].startswith("${PUBLISH_ADDRESS:-127.0.0.1}:")
     assert all(ports[name][0].startswith("127.0.0.1:") for name in ("prometheus", "grafana"))
+
+
+def test_an_upgrade_copies_the_shipped_models_into_the_volume_of_the_service(
+    stages: dict[str, str], compose: dict[str, Any], tmp_path: Path, repository: Path
+) -> None:
+    """The command of the compose file, on the paths of the image."""
+    services = compose["services"]
+    copy, scene = services["shipped-models"], services["scene"]
+    assert scene["depends_on"]["shipped-models"]["condition"] == "service_completed_successfully"
+    assert copy["volumes"] == scene["volumes"] == ["models:/srv/scene/models"]
+    assert scene["environment"]["SCENE_STORE"] == "${SCENE_STORE:-/srv/scene/models}"
+    assert copy["image"] == scene["image"]
+    assert "RUN install -d -o 10001 -g 10001 models" in stages["runtime"]
+    (tmp_path / "model_store").symlink_to(repository / "model_store")
+    old = AliasTarget(name="indoor-triway", version="1.0.0")
+    (tmp_path / "models" / "indoor-triway" / "1.0.0").mkdir(parents=True)
+    (tmp_path / "models" / "indoor-triway" / "1.0.0" / "manifest.json").touch()
+    (tmp_path / "models" / "aliases.json").write_bytes(aliases_to_bytes({"default": old}))
+    program, *arguments = copy["command"]
+    assert program == "python"
+    environment = os.environ | {"PYTHONPATH": str(repository)}
+    run_program(sys.executable, *arguments, cwd=tmp_path, env=environment)
+    models = load_model_set(Store(tmp_path / "models"))
+    assert models.resolve("default").key == Store(repository / "model_store").resolve("default")
+    assert list(models.failures) == [("indoor-triway", "1.0.0")]
 
 
 def pins(repository: Path, lock: str) -> set[str]:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from scene_client.recorder import Recorder
     from scene_client.sync import Client
 
-__version__ = "1.0.0"
+__version__ = "2.0.0"
 
 __all__ = [
     "AnswerError", "AsyncClient", "Client", "ClientError", "DeadlineError", "InvalidRequestError",

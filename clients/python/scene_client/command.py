@@ -69,7 +69,6 @@ AnswerT = TypeVar("AnswerT", bound=BaseModel)
 app = typer.Typer(
     cls=_Group,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     help="Ask which objects are missing from a scene, which do not belong, how they relate, and "
     "which room it is.",

@@ -4,7 +4,7 @@ NAME = "scene_reasoning"
 
 setup(
     name=NAME,
-    version="1.0.0",
+    version="2.0.0",
     packages=[NAME],
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
