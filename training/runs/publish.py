@@ -25,6 +25,7 @@ from training.evaluation.everyday_task import EVERYDAY
 from training.evaluation.report import Progress, evaluate, silent
 from training.evaluation.tasks import STATISTICS
 from training.fit.calibrate import calibrate
+from training.fit.calibrate_objects import refitted_lines
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, DataConfig
 from training.fit.count_statistics import fit_counts
@@ -37,6 +38,8 @@ from training.runs.example_scenes import known_examples, read_examples
 from training.runs.folder import FinishedRun
 from training.runs.pipeline import SplitScenes, read_sources, split_and_encode
 
+# Tasks whose results depend on the alarm lines.
+_OF_ALARMS = ("T3 outliers", "T3 alarms", "Everyday")
 _LIBRARIES = ("numpy", "scikit-learn", "scipy", "torch")
 
 
@@ -129,17 +132,21 @@ def refit(
     store: Store,
     version: str,
     *,
+    measured: FinishedRun | None = None,
     progress: Progress = silent,
 ) -> Artifact:
     """Publish a new version of a published model with refitted statistics, without training.
 
-    Only the statistics (offsets, counts), their metrics, the example scenes and the built-in
-    synonyms of classes are new. The examples are those of the shipped configuration with the name
-    of the model, otherwise those of its own configuration. The metrics of weights that were trained
-    on test scenes come from statistics that were not fitted to test scenes.
+    Only the statistics (offsets, counts, alarm lines), their metrics, the example scenes and the
+    built-in synonyms of classes are new. The examples are those of the shipped configuration with
+    the name of the model, otherwise those of its own configuration. The metrics of weights that
+    were trained on test scenes come from statistics that were not fitted to test scenes.
 
     Args:
         root: folder of the training scenes.
+        measured: for weights that were trained on test scenes, a run of the same configuration
+            that was not. Its results about alarms (`_OF_ALARMS`) are published. Without it, these
+            results are left out.
 
     Raises:
         RunError: the scenes in `root` are not the training scenes of the model.
@@ -166,17 +173,25 @@ def refit(
     if split := manifest.training.get("measured_split"):
         other = with_settings(config, {"data.split": split}).data
         evaluated_scenes = split_and_encode(other, annotated, root, artifact.vocabulary)
+    if measured is not None:
+        measured.require(evaluated_scenes.digest)
     progress("fitting statistics")
-    evaluated = with_statistics(artifact, evaluated_scenes)
-    rows = _measure(evaluated, evaluated_scenes.training_data(), progress, tuple(STATISTICS))
-    kept = [metric for metric in manifest.metrics if metric.task not in STATISTICS]
+    data, validation = evaluated_scenes.training_data(), scenes.training_data().validation
+    refitted = refitted_lines(with_statistics(artifact, scenes), validation, config.objects)
+    rows = _measure(with_statistics(artifact, evaluated_scenes), data, progress, tuple(STATISTICS))
+    if measured is not None:
+        rows += _measure(calibrated_draft(measured, evaluated_scenes), data, progress, _OF_ALARMS)
+    elif not split:
+        rows += _measure(refitted, data, progress, _OF_ALARMS)
+    kept = [metric for metric in manifest.metrics if metric.task not in {*STATISTICS, *_OF_ALARMS}]
     vocabulary = VocabularyEntry.of(
         with_aliases(artifact.vocabulary), artifact.spec.A, manifest.vocabulary.profiles
     )
     fields = {name: getattr(manifest, name) for name in Description.model_fields}
     fields |= {"version": version, "created": _now(), "examples": examples}
-    description = Description(**fields | {"metrics": (*kept, *rows), "vocabulary": vocabulary})
-    return _publish_rounded(store, description, with_statistics(artifact, scenes))
+    fields |= {"metrics": (*kept, *rows), "vocabulary": vocabulary}
+    description = Description(**fields | {"calibration": refitted.calibration})
+    return _publish_rounded(store, description, refitted)
 
 
 def with_statistics(artifact: Artifact, scenes: SplitScenes) -> Artifact:
