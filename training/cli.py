@@ -149,19 +149,13 @@ def publish(
     even_if_worse: Annotated[
         bool, typer.Option("--even-if-worse", "--force", help="publish even a refused version")
     ] = False,
-    measured: Annotated[
-        Path | None,
-        typer.Option(
-            help="with name@version: folder of a finished run of the same configuration without "
-            "--final; its results about intruders and alarms go into the card"
-        ),
-    ] = None,
 ) -> None:
     """Calibrate, evaluate and publish a finished run, or refit the statistics of a version.
 
     With name@version, the command fits the offsets, the counts of instances and the alarm lines
     again. The new version keeps the weights and the other calibration and metrics of the old
-    version. Without --measured, its card has no shares of flagged intruders and of alarms.
+    version. For a version of `train --final`, the shares of flagged intruders and of alarms are
+    left out, because its weights know the test scenes.
 
     The command asks the model about untouched validation scenes, and refuses a model that certainly
     raises more alarms than its sensitivities promise. A refused version is not published, and the
@@ -180,10 +174,8 @@ def publish(
         if "@" in folder and not Path(folder).is_dir():
             if promote:
                 raise ConfigError(f"--promote compares training runs; {_ALIAS}")
-            _refit(folder, data or DATA, store, version, measured)
+            _refit(folder, data or DATA, store, version)
             return
-        if measured is not None:
-            raise ConfigError("--measured belongs to name@version")
         run = load_run(Path(folder))
         models = Store(store)
         models.require_new(run.config.name, version)
@@ -255,14 +247,13 @@ def _exit_refused(error: RefusedError, remedy: str = "") -> NoReturn:
     raise typer.Exit(3) from None
 
 
-def _refit(reference: str, root: Path, store: str, version: str, measured: Path | None) -> None:
+def _refit(reference: str, root: Path, store: str, version: str) -> None:
     models = Store(store)
     name, old = models.resolve(reference)
     models.require_new(name, version)
     artifact = models.load(name, old)
-    run = None if measured is None else load_run(measured)
     with console.status("publishing") as status:
-        artifact = refit(artifact, root, models, version, measured=run, progress=status.update)
+        artifact = refit(artifact, root, models, version, progress=status.update)
     _print_published(artifact, store)
 
 

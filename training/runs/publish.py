@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import re
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -38,8 +39,9 @@ from training.runs.example_scenes import known_examples, read_examples
 from training.runs.folder import FinishedRun
 from training.runs.pipeline import SplitScenes, read_sources, split_and_encode
 
-# Tasks whose results depend on the alarm lines.
+# Tasks with results that depend on the alarm lines, and the names of these results.
 _OF_ALARMS = ("T3 outliers", "T3 alarms", "Everyday")
+_ALARM = re.compile(r"^flagged, (uniform|by popularity|signature)$|^alarms, |^outliers: .*default$")
 _LIBRARIES = ("numpy", "scikit-learn", "scipy", "torch")
 
 
@@ -132,7 +134,6 @@ def refit(
     store: Store,
     version: str,
     *,
-    measured: FinishedRun | None = None,
     progress: Progress = silent,
 ) -> Artifact:
     """Publish a new version of a published model with refitted statistics, without training.
@@ -140,13 +141,12 @@ def refit(
     Only the statistics (offsets, counts, alarm lines), their metrics, the example scenes and the
     built-in synonyms of classes are new. The examples are those of the shipped configuration with
     the name of the model, otherwise those of its own configuration. The metrics of weights that
-    were trained on test scenes come from statistics that were not fitted to test scenes.
+    were trained on test scenes come from statistics that were not fitted to test scenes. The new
+    version has no shares of flagged intruders and of alarms of such weights, because they would
+    need other weights.
 
     Args:
         root: folder of the training scenes.
-        measured: for weights that were trained on test scenes, a run of the same configuration
-            that was not. Its results about alarms (`_OF_ALARMS`) are published. Without it, these
-            results are left out.
 
     Raises:
         RunError: the scenes in `root` are not the training scenes of the model.
@@ -173,17 +173,15 @@ def refit(
     if split := manifest.training.get("measured_split"):
         other = with_settings(config, {"data.split": split}).data
         evaluated_scenes = split_and_encode(other, annotated, root, artifact.vocabulary)
-    if measured is not None:
-        measured.require(evaluated_scenes.digest)
     progress("fitting statistics")
-    data, validation = evaluated_scenes.training_data(), scenes.training_data().validation
+    held_out, validation = evaluated_scenes.training_data(), scenes.training_data().validation
     refitted = refitted_lines(with_statistics(artifact, scenes), validation, config.objects)
-    rows = _measure(with_statistics(artifact, evaluated_scenes), data, progress, tuple(STATISTICS))
-    if measured is not None:
-        rows += _measure(calibrated_draft(measured, evaluated_scenes), data, progress, _OF_ALARMS)
-    elif not split:
-        rows += _measure(refitted, data, progress, _OF_ALARMS)
-    kept = [metric for metric in manifest.metrics if metric.task not in {*STATISTICS, *_OF_ALARMS}]
+    evaluated = with_statistics(artifact, evaluated_scenes)
+    rows = _measure(evaluated, held_out, progress, tuple(STATISTICS))
+    if not split:
+        rows += _measure(refitted, held_out, progress, _OF_ALARMS)
+    again = {metric.task for metric in rows} | {*STATISTICS}
+    kept = [m for m in manifest.metrics if m.task not in again and not _ALARM.search(m.metric)]
     vocabulary = VocabularyEntry.of(
         with_aliases(artifact.vocabulary), artifact.spec.A, manifest.vocabulary.profiles
     )
