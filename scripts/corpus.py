@@ -36,7 +36,7 @@ SEED: Final = 20261123
 QUESTIONS: Final = ("relations", "missing", "outliers", "rooms")
 MODELS: Final = (
     "default", "indoor-triway", "indoor-gbm", "indoor-rbm", "indoor-triway-deep", "open-triway",
-    "indoor-triway@3.4.0",
+    "indoor-triway@3.5.0",
 )  # fmt: skip
 RELATIONS: Final = (
     *("left", "right", "front", "behind", "on-top"),
@@ -211,7 +211,7 @@ def questions(client: httpx.Client, rng: random.Random) -> Iterator[dict[str, Js
         likely = [scene["objects"] for scene in drawn["scenes"] if scene["objects"]]
         labels = [entry["label"] for entry in words["objects"]]
         scenes = Scenes(rng, labels, words["room_types"], likely)
-        count = 60 if model == "indoor-triway@3.4.0" else 210
+        count = 60 if model == "indoor-triway@3.5.0" else 210
         for k in range(count):
             question = QUESTIONS[k % len(QUESTIONS)]
             body = scenes.scene() | {"model": model}
@@ -290,7 +290,7 @@ def pages(client: httpx.Client) -> Iterator[dict[str, Json]]:
         yield {"method": "POST", "path": "/models/refresh", "headers": header, "body": ""}
         for body in (
             {"model": "indoor-rbm"}, {"model": "indoor-gbm", "expected": "open-triway"},
-            {"model": "indoor-triway@3.4.0", "expected": "indoor-rbm"}, {"model": "none"}, {},
+            {"model": "indoor-triway@3.5.0", "expected": "indoor-rbm"}, {"model": "none"}, {},
             {"model": "indoor-rbm@9.9.9"},
         ):  # fmt: skip
             request = post(alias, body, **header)

@@ -14,7 +14,7 @@ is below half of the largest increase are ignored.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,13 +39,23 @@ from app.questions.question import REFUSED, SCENES, WITH_TOILET, Example, Option
 from app.questions.reading import Reading, Triple
 from app.registry.artifact import Artifact
 from app.registry.description import AlarmLine, CountSlope, Sensitivity
-from app.scene.scene import Scene
+from app.scene.scene import Scene, SceneObject
 from scene_client.schemas import OutliersAnswer, OutliersRequest, SceneWarning
 
 COMPANIONS: Final = 3
 """Maximum number of companions in the answer for one outlier."""
 
 _LEAST_SHARE: Final = 0.5  # smallest increase of a companion, as a share of the largest
+
+
+class _Alarms(NamedTuple):
+    """When an object is an outlier: its probability reaches `threshold`, and its class can alarm.
+
+    `possible` is True for the classes that can alarm, (V,) bool.
+    """
+
+    threshold: float
+    possible: NDArray[np.bool_]
 
 
 def outliers(
@@ -72,6 +82,10 @@ def outliers(
     as wall, and classes that belong anywhere, such as cat or bag, always have the probability 0. A
     scene with few objects gives little evidence, so its threshold is higher.
 
+    The model knows little about a class that few training scenes show (`Artifact.rarely_shown`). At
+    a sensitivity, an object of such a class is never an outlier. If its probability reaches the
+    threshold, a warning names the object. A stated threshold applies to all classes.
+
     Args:
         scene: the objects and stated relations to judge.
         sensitivity: name of one of the model's thresholds.
@@ -83,7 +97,8 @@ def outliers(
 
     Returns:
         The fields `threshold`, `outliers` and `misplaced` of `scene_client.schemas.OutliersAnswer`.
-        A list is empty if the model gives no such judgement. Then the field `warnings` says so.
+        A list is empty if the model gives no such judgement. `warnings` names this case, and the
+        objects of rare classes that reach the threshold.
         `threshold` is left out if the model judges no object and the caller states no threshold.
 
     Raises:
@@ -93,8 +108,12 @@ def outliers(
     if threshold is not None and not 0 <= threshold <= 1:
         raise ValueError(f"threshold must be in [0, 1], not {threshold}")
     entry, lines = artifact.calibration.outlier, artifact.calibration.outlier_lines
+    can_alarm = ~artifact.rarely_shown
+    if threshold is not None:
+        can_alarm = np.ones_like(can_alarm)
     judged: list[Fields] = []
     wrong: list[Fields] = []
+    warnings = _unjudged(artifact, scene)
     posterior = Posterior(artifact, scene) if scene.objects else None
     if lines is not None and threshold is None:
         line: AlarmLine = getattr(lines, sensitivity)
@@ -102,7 +121,9 @@ def outliers(
     if posterior is not None:
         wrong = misplaced_fields(artifact, posterior, scene, sensitivity, flipped)
         if entry is not None and threshold is not None:
-            judged = _judged(artifact, entry, posterior, scene, threshold, details=details)
+            alarms = _Alarms(threshold, can_alarm)
+            judged, unsure = _judged(artifact, entry, posterior, scene, alarms, details=details)
+            warnings += _too_rare(unsure)
     if size_limit is not None:
         size_limit.check(
             "objects",
@@ -110,7 +131,7 @@ def outliers(
             (lengths(judged, "because", "usually_with"), CAUSE_BYTES, 1),
             (len(wrong), RELATION_BYTES, 2),
         )
-    fields: Fields = {"warnings": _unjudged(artifact, scene)}
+    fields: Fields = {"warnings": warnings}
     if threshold is not None:
         fields["threshold"] = rounded_number(threshold)
     return fields | {"outliers": judged, "misplaced": wrong}
@@ -121,11 +142,13 @@ def _judged(
     entry: CountSlope,
     posterior: Posterior,
     scene: Scene,
-    threshold: float,
+    alarms: _Alarms,
     *,
     details: bool,
-) -> list[Fields]:
+) -> tuple[list[Fields], list[SceneObject]]:
     """Return the fields of `scene_client.schemas.Outlier` for every object of a scene.
+
+    The second result lists the objects that reach the threshold, but whose class raises no alarm.
 
     `because` lists up to three other objects, in order of their effect on `log_odds`. For an
     outlier, these objects lower its log-odds. For other objects, they raise the log-odds.
@@ -133,7 +156,8 @@ def _judged(
     present, labels = posterior.present, artifact.vocabulary.labels
     log_odds, change = posterior.given_rest(explained=details)
     logits, p = _intruder_odds(artifact, entry, posterior, log_odds)
-    is_outlier = p >= threshold
+    reaches = p >= alarms.threshold
+    is_outlier = reaches & alarms.possible[present.classes]
     # The order follows the logits, because probabilities near 0 or 1 may round to the same number.
     order = (-logits[present.row]).argsort(kind="stable")
     rows, flags, n = present.row[order].tolist(), is_outlier.tolist(), len(log_odds)
@@ -161,7 +185,8 @@ def _judged(
             fields["because"] = causes[row] if row in explained else []
             fields["usually_with"] = usual[row]
         judged.append(fields)
-    return judged
+    unsure = np.flatnonzero((reaches & ~is_outlier)[present.row])
+    return judged, [scene.objects[number] for number in unsure.tolist()]
 
 
 def misplaced(
@@ -174,7 +199,7 @@ def misplaced(
 
 
 def intruders(artifact: Artifact, scene: Scene) -> NDArray[np.int64]:
-    """Return the classes that do not belong to a scene, at medium sensitivity."""
+    """Return the classes that reach the threshold of medium sensitivity, rare classes included."""
     entry, lines = artifact.calibration.outlier, artifact.calibration.outlier_lines
     posterior = Posterior(artifact, scene)
     classes = posterior.present.classes
@@ -211,6 +236,16 @@ def _companions(artifact: Artifact, present: NDArray[np.int64], flagged: int) ->
     usable[present] = False
     chosen = companions(*artifact.objects.increases(flagged), usable, _LEAST_SHARE, COMPANIONS)
     return [artifact.vocabulary.labels[index] for index in chosen.tolist()]
+
+
+def _too_rare(objects: list[SceneObject]) -> list[SceneWarning]:
+    """Return a warning for objects that reach the threshold, but whose class is rarely shown."""
+    if not objects:
+        return []
+    labels = ", ".join(sorted({thing.label for thing in objects}))
+    message = f"too few training scenes show {labels}, so the service raises no alarm"
+    ids = [thing.id for thing in objects]
+    return [SceneWarning(code="not-judged", message=message, objects=ids)]
 
 
 def _unjudged(artifact: Artifact, scene: Scene) -> list[SceneWarning]:

@@ -7,6 +7,7 @@ were hashed, so a later change of a file has no effect. Symbolic links are not f
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import stat
 from collections.abc import Mapping
@@ -41,6 +42,9 @@ MAX_CARD_BYTES: Final = 2**20
 MAX_WEIGHTS_BYTES: Final = 2**30
 """Default maximum size of the weights file in bytes. The environment variable
 SCENE_MAX_WEIGHTS_BYTES sets another maximum."""
+
+RARELY: Final = 1 / 500
+"""A class is rarely shown if a smaller share of the training scenes shows it."""
 
 _DTYPES: Final = {float: "float32", int: "int32"}
 
@@ -124,6 +128,17 @@ class Artifact:
         alone = self.objects.absent(*nothing, profile=None, coverage=1.0)
         rarest, alpha = np.nanmin(popularity), calibration.popularity_weight
         return np.where(np.isnan(popularity), alone - (1 - alpha) * rarest, alpha * popularity)
+
+    @cached_property
+    def rarely_shown(self) -> NDArray[np.bool_]:
+        """(V,) True for classes that fewer than `RARELY` of the training scenes show.
+
+        Without popularity in the calibration, no class is rare.
+        """
+        if not self.calibration.popularity:
+            return np.zeros(self.spec.V, np.bool_)
+        popularity = np.array(self.calibration.popularity, dtype=np.float64)
+        return ~(popularity >= math.log(RARELY / (1 - RARELY)))  # NaN: no training scene
 
     def context_rows(self) -> NDArray[np.float32]:
         """Return the weights between h1 and each of the T triples of the weights, (T, H1)."""

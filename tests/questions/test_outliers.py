@@ -50,6 +50,32 @@ def test_a_class_without_training_scene_counts_as_the_rarest():
         assert entry.probability == pytest.approx(1 / (1 + math.exp(-logit)), rel=1e-4)
 
 
+@pytest.mark.parametrize("level", LEVELS)
+def test_a_rarely_shown_class_raises_no_alarm_at_a_sensitivity(level):
+    """It keeps its probability. A warning names its objects, and a stated threshold applies."""
+    common, rare, unseen = 0, 1, 2
+    popularity = [0.0] * len(LABELS)
+    popularity[rare], popularity[unseen] = math.log(1 / 510), None
+    popularity[common] = math.log(1 / 490)
+    artifact = larger_artifact(
+        "triway", outlier=CountSlope(intercept=9.0), outlier_lines=LINES, popularity=popularity
+    )
+    scene = scene_of([common, rare, rare, unseen])
+    answer = outliers(artifact, scene, sensitivity=level)
+    flagged = {one.object for one in answer.outliers if one.is_outlier}
+    assert all(one.probability > answer.threshold for one in answer.outliers)
+    ids = [thing.id for thing in scene.objects]
+    assert flagged == {0}
+    (warning,) = answer.warnings
+    assert (warning.code, warning.objects) == ("not-judged", ids[1:])
+    assert all(LABELS[k] in warning.message for k in (rare, unseen))
+    stated = outliers(artifact, scene, threshold=answer.threshold)
+    assert all(one.is_outlier for one in stated.outliers)
+    assert not stated.warnings
+    certain = outliers(artifact, scene, sensitivity=level, threshold=0.0)
+    assert all(one.is_outlier for one in certain.outliers)
+
+
 def line(level: str, classes: int) -> float:
     """The probability of the alarm line of a sensitivity at a number of listed classes."""
     logit = {"low": 2.0, "medium": 0.9, "high": -0.4}[level] + SLOPE * math.log(max(1, classes))

@@ -9,7 +9,8 @@ sources for which the answers stand (`served_scenes`). Structure is not listed.
     outlier    Probability that a class is an intruder. Half of the parts contain an intruder.
     lines      An object is an outlier if its log-odds of being an intruder are above a line in the
                log of the number of listed classes. Each line raises alarms in a given share of the
-               untouched parts (`training.evaluation.alarms.ALARMS`).
+               untouched parts (`training.evaluation.alarms.ALARMS`). A class that few training
+               scenes show raises no alarm.
 
 The prior of an intruder class is proportional to (frequency of the class)^alpha. Alpha and the
 logistic regression are fitted to three kinds of intruders with equal weights. Intruders are drawn
@@ -38,6 +39,7 @@ from training.evaluation.alarms import ALARMS
 from training.evaluation.intruders import draw_intruders, intruder_weights
 from training.evaluation.parts import Parts, draw_parts, exactly, up_to_longest
 from training.fit.calibrate_rooms import calibrate_rooms, posterior_of
+from training.fit.configuration import ObjectsConfig
 
 COVERAGES = (0.15, 0.3, 0.45, 0.6, 0.8)
 # Tested exponents alpha of the prior of intruders.
@@ -190,6 +192,7 @@ class ListScores:
         log_odds: log-odds of each listed class given the rest of its list, (n,).
         popularity: log-odds of each class in the served mix, (n,).
         intruder: True for intruders, (n,) bool.
+        can_alarm: False for classes that raise no alarm (`Artifact.rarely_shown`), (n,) bool.
         size: number of listed classes of each list, (N,).
     """
 
@@ -197,6 +200,7 @@ class ListScores:
     log_odds: Floats
     popularity: Floats
     intruder: Flags
+    can_alarm: Flags
     size: Ints
 
     def score(self, alpha: float) -> Floats:
@@ -229,12 +233,7 @@ def fit_outliers(
     """
     if len(scenes) < _LEAST_SCENES:
         return {}
-    parts_by_length = {n: draw_parts(scenes, structure, exactly(n), _SEEDS) for n in LENGTHS}
-    untouched = {
-        n: score_lists(artifact, parts)
-        for n, parts in parts_by_length.items()
-        if len(parts.v) >= _LEAST_SCENES
-    }
+    untouched = score_untouched(artifact, scenes, structure)
     laws = intruder_weights(scenes, train).values()
     scored = (score_intruders(artifact, scenes, structure, weights) for weights in laws)
     with_intruder = [scores for scores in scored if len(scores.size)]
@@ -242,8 +241,20 @@ def fit_outliers(
         return {}
     alpha = chosen.popularity_weight if chosen else choose_alpha(untouched.values(), with_intruder)
     entry = _fit_intruders(untouched.values(), with_intruder, alpha)
-    lines = {name: fit_line(untouched, entry, alpha, share) for name, share in ALARMS.items()}
-    return {"popularity_weight": alpha, "outlier": entry, "outlier_lines": AlarmLines(**lines)}
+    lines = fit_lines(untouched, entry, alpha)
+    return {"popularity_weight": alpha, "outlier": entry, "outlier_lines": lines}
+
+
+def refitted_lines(artifact: Artifact, validation: SceneTensors, config: ObjectsConfig) -> Artifact:
+    """Return the model with alarm lines that are fitted again; a model without lines as it is."""
+    calibration = artifact.calibration
+    scenes = served_scenes(validation, config.served_sources)
+    structure = torch.from_numpy(artifact.vocabulary.structure.copy())
+    untouched = score_untouched(artifact, scenes, structure)
+    if calibration.outlier is None or not untouched:
+        return artifact
+    lines = fit_lines(untouched, calibration.outlier, calibration.popularity_weight)
+    return recalibrated(artifact, outlier_lines=lines)
 
 
 def judged_classes(artifact: Artifact) -> Flags:
@@ -264,7 +275,20 @@ def score_lists(artifact: Artifact, parts: Parts, intruders: Tensor | None = Non
     for row, values in zip(v, log_odds, strict=True):
         values[row] = posterior_of(artifact, torch.from_numpy(row)).given_rest()[0]
     row, classes = at = np.nonzero(v & judged_classes(artifact))
-    return ListScores(row, log_odds[at], popularity[classes], is_intruder[at], v.sum(1))
+    can_alarm = ~artifact.rarely_shown[classes]
+    return ListScores(row, log_odds[at], popularity[classes], is_intruder[at], can_alarm, v.sum(1))
+
+
+def score_untouched(
+    artifact: Artifact, scenes: SceneTensors, structure: Tensor
+) -> dict[int, ListScores]:
+    """Return the scores of random parts of scenes by length, without lengths of too few parts."""
+    parts_by_length = {n: draw_parts(scenes, structure, exactly(n), _SEEDS) for n in LENGTHS}
+    return {
+        n: score_lists(artifact, parts)
+        for n, parts in parts_by_length.items()
+        if len(parts.v) >= _LEAST_SCENES
+    }
 
 
 def score_intruders(
@@ -315,6 +339,12 @@ def _fit_intruders(
     return CountSlope(intercept=intercept, slope=slope, log_count=count)
 
 
+def fit_lines(untouched: Mapping[int, ListScores], entry: CountSlope, alpha: float) -> AlarmLines:
+    """Return the line of each sensitivity."""
+    lines = {name: fit_line(untouched, entry, alpha, share) for name, share in ALARMS.items()}
+    return AlarmLines(**lines)
+
+
 def fit_line(
     untouched: Mapping[int, ListScores], entry: CountSlope, alpha: float, share: float
 ) -> AlarmLine:
@@ -326,7 +356,7 @@ def fit_line(
     sizes, worst = np.log(list(untouched)), []
     for scores in untouched.values():
         log_odds = calibrated(entry, scores.score(alpha), scores.size[scores.row])
-        worst.append(scores.extreme(log_odds.astype(np.float64)))
+        worst.append(scores.extreme(np.where(scores.can_alarm, log_odds, -np.inf)))
     quantiles = [np.quantile(values, 1 - share) for values in worst]
     slope = float(np.polyfit(sizes, quantiles, 1)[0]) if len(worst) > 1 else 0.0
     above = np.concatenate([v - slope * n for n, v in zip(sizes, worst, strict=True)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import re
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -25,6 +26,7 @@ from training.evaluation.everyday_task import EVERYDAY
 from training.evaluation.report import Progress, evaluate, silent
 from training.evaluation.tasks import STATISTICS
 from training.fit.calibrate import calibrate
+from training.fit.calibrate_objects import refitted_lines
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, DataConfig
 from training.fit.count_statistics import fit_counts
@@ -37,6 +39,9 @@ from training.runs.example_scenes import known_examples, read_examples
 from training.runs.folder import FinishedRun
 from training.runs.pipeline import SplitScenes, read_sources, split_and_encode
 
+# Tasks with results that depend on the alarm lines, and the names of these results.
+_OF_ALARMS = ("T3 outliers", "T3 alarms", "Everyday")
+_ALARM = re.compile(r"^flagged, (uniform|by popularity|signature)$|^alarms, |^outliers: .*default$")
 _LIBRARIES = ("numpy", "scikit-learn", "scipy", "torch")
 
 
@@ -133,10 +138,12 @@ def refit(
 ) -> Artifact:
     """Publish a new version of a published model with refitted statistics, without training.
 
-    Only the statistics (offsets, counts), their metrics, the example scenes and the built-in
-    synonyms of classes are new. The examples are those of the shipped configuration with the name
-    of the model, otherwise those of its own configuration. The metrics of weights that were trained
-    on test scenes come from statistics that were not fitted to test scenes.
+    Only the statistics (offsets, counts, alarm lines), their metrics, the example scenes and the
+    built-in synonyms of classes are new. The examples are those of the shipped configuration with
+    the name of the model, otherwise those of its own configuration. The metrics of weights that
+    were trained on test scenes come from statistics that were not fitted to test scenes. The new
+    version has no shares of flagged intruders and of alarms of such weights, because they would
+    need other weights.
 
     Args:
         root: folder of the training scenes.
@@ -167,16 +174,22 @@ def refit(
         other = with_settings(config, {"data.split": split}).data
         evaluated_scenes = split_and_encode(other, annotated, root, artifact.vocabulary)
     progress("fitting statistics")
+    held_out, validation = evaluated_scenes.training_data(), scenes.training_data().validation
+    refitted = refitted_lines(with_statistics(artifact, scenes), validation, config.objects)
     evaluated = with_statistics(artifact, evaluated_scenes)
-    rows = _measure(evaluated, evaluated_scenes.training_data(), progress, tuple(STATISTICS))
-    kept = [metric for metric in manifest.metrics if metric.task not in STATISTICS]
+    rows = _measure(evaluated, held_out, progress, tuple(STATISTICS))
+    if not split:
+        rows += _measure(refitted, held_out, progress, _OF_ALARMS)
+    again = {metric.task for metric in rows} | {*STATISTICS}
+    kept = [m for m in manifest.metrics if m.task not in again and not _ALARM.search(m.metric)]
     vocabulary = VocabularyEntry.of(
         with_aliases(artifact.vocabulary), artifact.spec.A, manifest.vocabulary.profiles
     )
     fields = {name: getattr(manifest, name) for name in Description.model_fields}
     fields |= {"version": version, "created": _now(), "examples": examples}
-    description = Description(**fields | {"metrics": (*kept, *rows), "vocabulary": vocabulary})
-    return publish_rounded(store, description, with_statistics(artifact, scenes))
+    fields |= {"metrics": (*kept, *rows), "vocabulary": vocabulary}
+    description = Description(**fields | {"calibration": refitted.calibration})
+    return publish_rounded(store, description, refitted)
 
 
 def with_statistics(artifact: Artifact, scenes: SplitScenes) -> Artifact:

@@ -196,7 +196,7 @@ def test_hidden_classes_are_as_likely_as_the_answer_states(judging, size, error)
 # --------------------------------------------------------------------------------------- intruders
 
 
-def scores_of(log_odds, intruder, popularity=None):
+def scores_of(log_odds, intruder, popularity=None, can_alarm=True):
     """Scores of lists, of which each row of log_odds, (lists, n), has the listed classes."""
     lists, n = log_odds.shape
     popularity = np.zeros(log_odds.shape) if popularity is None else popularity
@@ -205,6 +205,7 @@ def scores_of(log_odds, intruder, popularity=None):
         log_odds=log_odds.ravel(),
         popularity=np.broadcast_to(popularity, log_odds.shape).ravel(),
         intruder=np.broadcast_to(intruder, log_odds.shape).ravel(),
+        can_alarm=np.broadcast_to(can_alarm, log_odds.shape).ravel(),
         size=np.full(lists, n),
     )
 
@@ -246,6 +247,15 @@ def test_alarm_lines_keep_their_share_at_each_length(share):
         shares.append(np.bincount(scores.row, alarm).astype(bool).mean())
     assert np.mean(shares) == pytest.approx(share, abs=0.006)
     assert shares == pytest.approx([share] * len(shares), abs=0.02 + share / 10)
+
+
+def test_a_class_that_raises_no_alarm_does_not_raise_the_line():
+    """The last class of each list is the most suspicious, but the service never flags it."""
+    entry = CountSlope(slope=-1.0)
+    log_odds = np.tile([0.1, 0.2, -5.0], (50, 1))
+    line = fit_line({3: scores_of(log_odds, False, can_alarm=~LAST)}, entry, 0.0, 0.1)
+    assert line.intercept == pytest.approx(-0.1)
+    assert fit_line({3: scores_of(log_odds, False)}, entry, 0.0, 0.1).intercept == 5.0
 
 
 def test_one_length_has_a_line_without_slope():

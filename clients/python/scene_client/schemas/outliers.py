@@ -44,6 +44,8 @@ class Outlier(Reply):
     probability: Probability
     log_odds: Finite
     is_outlier: bool
+    """true if `probability` reaches the threshold. At a `sensitivity`, objects of a class that few
+    training scenes show are never outliers; the warning `not-judged` names them"""
     because: list[Because] = []
     """other objects that explain `is_outlier`, largest effect first, at most 3. For an outlier,
     they lower its log-odds. Otherwise, they raise its log-odds"""
