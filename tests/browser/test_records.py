@@ -85,7 +85,9 @@ def test_a_corrected_file_differs_only_in_the_confirmation(
     expect(confirm).to_have_count(0)
     assert "confirmed" in next(row for row in board.rows("outliers") if "toilet" in row)
     expect(board.page.locator("#board .object.outlier")).to_have_count(0)
-    assert "does not belong here" not in (board.thing("toilet (track_5)").get_attribute("aria-label") or "")
+    assert "does not belong here" not in (
+        board.thing("toilet (track_5)").get_attribute("aria-label") or ""
+    )
     expect(board.page.get_by_text("Confirmed scene.")).to_be_visible()
     file = downloaded(board, tmp_path, 1)
     before, after = lines(recorded), lines(file)

@@ -20,10 +20,9 @@ import numpy as np
 import torch
 
 from app.inference import Weights
-from app.questions.outliers import intruders
 from app.registry import Artifact
 from training.datasets.array_types import Flags, Floats, Ints
-from training.domain.home import Home, with_exceptions
+from training.domain.home import Home, alarms_of, with_exceptions
 from training.fit.adapt import adapt, home_loss
 from training.fit.objects import random_parts
 from training.machines.arrays import machine_of
@@ -180,7 +179,7 @@ def _alarms(home: Home, index: Ints, sides: Sides) -> Flags:
         scene = home.scenes[number]
         if len(scene.classes):
             for column, side in enumerate(sides):
-                alarms = intruders(side, scene.question(side))
+                alarms = alarms_of(side, scene.question(side))
                 table[row, column] = bool(np.setdiff1d(alarms, scene.left_out).size)
     return table
 

@@ -121,7 +121,7 @@ class Home:
         labels, counts = artifact.vocabulary.labels, Counter[str]()
         for scene in self.scenes:
             if scene.confirmed and len(scene.classes):
-                alarms = intruders(artifact, scene.question(artifact))
+                alarms = alarms_of(artifact, scene.question(artifact))
                 counts.update(labels[c] for c in alarms.tolist())
         return counts
 
@@ -166,8 +166,14 @@ def _read(parent: Artifact, scene: AnnotatedScene) -> HomeScene:
     room = None if name is None or not parent.spec.C else vocabulary.room_index(name)
     left_out = classes[:0]
     if not scene.confirmed and len(classes):
-        left_out = intruders(parent, of_classes(parent, classes, room))
+        left_out = alarms_of(parent, of_classes(parent, classes, room))
     return HomeScene(classes, left_out, room, scene.group, scene.confirmed)
+
+
+def alarms_of(artifact: Artifact, scene: Scene) -> Ints:
+    """Return the classes that `/outliers` reports at medium sensitivity."""
+    found = intruders(artifact, scene)
+    return found[~artifact.rarely_shown[found]]
 
 
 def of_classes(artifact: Artifact, classes: Ints, room: int | None) -> Scene:

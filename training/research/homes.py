@@ -26,12 +26,11 @@ import numpy as np
 import torch
 import typer
 
-from app.questions.outliers import intruders
 from app.registry import Artifact
 from training.datasets import EncodedScene
 from training.datasets.array_types import Ints, Rng
 from training.domain.adaptation import adapted
-from training.domain.home import Home, HomeScene, of_classes
+from training.domain.home import Home, HomeScene, alarms_of, of_classes
 from training.evaluation.parts import ALL_BUT_ONE
 from training.evaluation.report import write_whole
 from training.fit.adapt import adapt
@@ -190,7 +189,7 @@ def _home(
     scenes = []
     for number, (classes, room) in enumerate([*visits, *((part, -1) for part in unconfirmed)]):
         kind = None if room < 0 else room
-        alarms = intruders(parent, of_classes(parent, classes, kind))
+        alarms = alarms_of(parent, of_classes(parent, classes, kind))
         confirmed = number < len(visits) and len(alarms) > 0
         left_out = alarms[:0] if confirmed else alarms
         scenes.append(HomeScene(classes, left_out, kind, f"visit-{number}", confirmed))
@@ -206,7 +205,7 @@ def _pair(sides: Sides, figure: Callable[[Artifact], float]) -> tuple[float, flo
 
 def _alarm_share(side: Artifact, lists: Sequence[Ints], about: int | None = None) -> float:
     """Return the share of lists with an alarm, or with an alarm about a class."""
-    alarms = [intruders(side, of_classes(side, part, None)) for part in lists]
+    alarms = [alarms_of(side, of_classes(side, part, None)) for part in lists]
     return float(np.mean([len(one) > 0 if about is None else about in one for one in alarms]))
 
 
