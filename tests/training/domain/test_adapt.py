@@ -145,7 +145,7 @@ def test_scenes_that_the_model_expects_change_no_weights(store, tmp_path):
     model = default(store)
     labels, samples = model.vocabulary.labels, model.weights.scenes
     scenes = [
-        {"objects": [labels[c] for c in np.flatnonzero(sample)[:6]], "group": str(k)}
+        {"objects": [labels[c] for c in np.flatnonzero(sample)], "group": str(k)}
         for k, sample in enumerate(samples[:30])
         if sample.sum() >= 2
     ]
