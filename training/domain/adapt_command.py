@@ -180,6 +180,8 @@ def _print_result(result: Adapted) -> None:
             f"exceptions, never reported from now on: {_counted(result.exceptions)} (confirmed "
             "scenes)"
         )
+    if result.relations:
+        lines.append(f"usual from now on: {', '.join(result.relations[:ROWS])} (confirmed scenes)")
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
 

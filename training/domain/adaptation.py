@@ -7,6 +7,8 @@
 - With fewer scenes, or if the gate refuses, the weights stay.
 - Classes of confirmed scenes that the model still reports as outliers become exceptions: the new
   version never reports them.
+- Confirmed relations that the model reports as misplaced count as usual ones
+  (`training.domain.confirmed_relations`).
 """
 
 from __future__ import annotations
@@ -21,7 +23,9 @@ import torch
 
 from app.inference import Weights
 from app.registry import Artifact
+from app.scene import CANONICAL
 from training.datasets.array_types import Flags, Floats, Ints
+from training.domain.confirmed_relations import with_confirmed
 from training.domain.home import Home, alarms_of, with_exceptions
 from training.fit.adapt import adapt, home_loss
 from training.fit.objects import random_parts
@@ -81,12 +85,14 @@ class Adapted:
         objections: reasons of the gate against new weights.
         exceptions: classes that the new model never reports, and in how many confirmed scenes it
             would report them.
+        relations: confirmed relations of classes that the parent reports, in words.
     """
 
     artifact: Artifact | None
     measured: Measured | None
     objections: tuple[str, ...]
     exceptions: Counter[str]
+    relations: tuple[str, ...] = ()
 
 
 def adapted(
@@ -95,21 +101,22 @@ def adapted(
     """Adapt a model to a home."""
     measured: Measured | None = None
     objections: tuple[str, ...] = ()
-    usable = home.tensors.v.sum(1) >= 2
-    if int(usable.sum()) >= FEWEST:
+    artifact = home.parent
+    if int((home.tensors.v.sum(1) >= 2).sum()) >= FEWEST:
         measured = measure(home, seed, progress)
         objections = tuple(measured.objections())
         if not objections:
             progress("adapting to all scenes")
-            weights = adapt(home.parent.weights, home.tensors, known=home.known, seed=seed)
-            artifact = replace(home.parent, weights=weights)
-            exceptions = home.confirmed_alarms(artifact)
-            return Adapted(with_exceptions(artifact, exceptions), measured, (), exceptions)
-    exceptions = home.confirmed_alarms(home.parent)
-    if not exceptions and not home.new_classes and not home.new_rooms:
+            weights = adapt(artifact.weights, home.tensors, known=home.known, seed=seed)
+            artifact = replace(artifact, weights=weights)
+    exceptions = home.confirmed_alarms(artifact)
+    news = (exceptions, home.relations, home.new_classes, home.new_rooms)
+    if artifact is home.parent and not any(news):
         return Adapted(None, measured, objections, exceptions)
-    artifact = with_exceptions(home.parent, exceptions)
-    return Adapted(artifact, measured, objections, exceptions)
+    artifact = with_confirmed(with_exceptions(artifact, exceptions), home.relations)
+    labels = artifact.vocabulary.labels
+    relations = [f"{labels[i]} {CANONICAL[a]} {labels[j]}" for a, i, j in sorted(home.relations)]
+    return Adapted(artifact, measured, objections, exceptions, tuple(relations))
 
 
 def measure(home: Home, seed: int, progress: Callable[[str], None]) -> Measured:

@@ -24,6 +24,7 @@ from app.scene import ObjectClass, Scene, SceneObject, label_key
 from training.datasets import AnnotatedScene
 from training.datasets.array_types import Ints
 from training.datasets.vocabulary import curated_names
+from training.domain.confirmed_relations import Triple, reported_relations
 from training.fit.adapt import HomeScenes
 from training.fit.extend import extended
 
@@ -64,6 +65,7 @@ class Home:
         scenes: distinct recorded scenes.
         recorded: number of recorded scenes, with the repeated ones.
         left_out: number of unconfirmed scenes in which each label is left out.
+        relations: confirmed relations of classes that the parent reports as misplaced.
     """
 
     parent: Artifact
@@ -71,6 +73,7 @@ class Home:
     scenes: tuple[HomeScene, ...]
     recorded: int
     left_out: Counter[str] = field(default_factory=Counter)
+    relations: frozenset[Triple] = frozenset()
 
     @classmethod
     def of(cls, model: Artifact, recorded: Sequence[AnnotatedScene]) -> Home:
@@ -86,7 +89,8 @@ class Home:
         labels = parent.vocabulary.labels
         left_out = Counter(labels[c] for scene in distinct for c in scene.left_out.tolist())
         known = len(model.vocabulary), model.spec.C
-        return cls(parent, known, distinct, len(recorded), left_out)
+        relations = frozenset(reported_relations(parent, recorded))
+        return cls(parent, known, distinct, len(recorded), left_out, relations)
 
     @property
     def new_classes(self) -> tuple[str, ...]:

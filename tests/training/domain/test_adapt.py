@@ -60,6 +60,24 @@ def test_a_confirmed_object_is_never_reported_again(store, tmp_path):
     assert home(store).manifest.training["parent"]["digest"] == default(store).digest
 
 
+def test_a_relation_that_stands_right_is_usual_from_now_on(store, tmp_path):
+    words = default(store).vocabulary
+    things = tuple(SceneObject(x, x, words.index(x)) for x in ("tv", "bed", "lamp"))
+    scene = Scene(things, relations=((2, 0, 1),))
+
+    def is_misplaced(artifact: Artifact) -> bool:
+        return any(entry["is_misplaced"] for entry in questions.misplaced(artifact, scene))
+
+    assert is_misplaced(default(store))
+    objects = [{"id": "tv", "label": "tv", "supported_by": "bed"}, "bed", "lamp"]
+    assert "nothing was published" in adapt(
+        store, write([{"objects": objects}], tmp_path / "scenes.jsonl"), code=3
+    )
+    confirmed = write([{"objects": objects, "confirmed": True}], tmp_path / "confirmed.jsonl")
+    assert "usual from now on: tv on-top bed" in adapt(store, confirmed)
+    assert not is_misplaced(home(store))
+
+
 def test_an_unconfirmed_object_teaches_nothing(store, tmp_path):
     scene = {"objects": INTRUDER, "room_type": "bedroom"}
     said = adapt(store, write([scene], tmp_path / "scenes.jsonl"), code=3)
