@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -92,7 +93,8 @@ def test_a_corrected_file_differs_only_in_the_confirmation(
     file = downloaded(board, tmp_path, 1)
     before, after = lines(recorded), lines(file)
     assert after == [before[0], before[1] | {"confirmed": True}, before[2]]
-    assert read_jsonl(file) == read_jsonl(recorded)
+    scenes = read_jsonl(recorded)
+    assert read_jsonl(file) == [scenes[0], replace(scenes[1], confirmed=True), scenes[2]]
     # The corrected file opens with the correction.
     choose(board, file, 2)
     assert downloaded(board, tmp_path, 1).read_text("utf-8") == file.read_text("utf-8")

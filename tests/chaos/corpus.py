@@ -76,6 +76,7 @@ SCENE: Final[dict[str, Any]] = {
     "scene_id": "scene 1",
     "source": "robot",
     "group": "home",
+    "confirmed": True,
     "viewer_frame": True,
 }
 

@@ -159,17 +159,18 @@ def _measure(parent: Artifact, name: str, rooms: Sequence[EncodedScene], count: 
         return _part(room, rng), room, kind
 
     recorded = [visit() for _ in range(count)]
-    later = [visit()[:2] for _ in range(_LATER)]
+    later = [visit() for _ in range(_LATER)]
+    hidden = [(part, int(rng.choice(part)), room) for part, room, _ in later]
     seen_elsewhere = [_part(room, rng) for room in others for _ in range(_OTHER)]
     home = _home(parent, [(part, kind) for part, _, kind in recorded])
     result = adapted(home)
     sides = parent, result.artifact or parent
-    lists = [part for part, _ in later]
+    lists = [part for part, *_ in later]
     return Row(
         home=name,
         scenes=count,
         alarms=_pair(sides, partial(_alarm_share, lists=lists)),
-        mrr=_pair(sides, partial(_mrr, visits=later)),
+        mrr=_pair(sides, partial(_mrr, visits=hidden)),
         other_rooms=_pair(sides, partial(_alarm_share, lists=seen_elsewhere)),
         intruder=_intruder(home, lists, np.unique(np.concatenate([c for c, _ in classes])), rng),
         refused=bool(result.objections),
@@ -210,20 +211,20 @@ def _alarm_share(side: Artifact, lists: Sequence[Ints], about: int | None = None
 
 
 @torch.no_grad()
-def _mrr(side: Artifact, visits: Sequence[tuple[Ints, Ints]]) -> float:
-    """Return the MRR of the last class of each visit, given its other classes."""
+def _mrr(side: Artifact, visits: Sequence[tuple[Ints, int, Ints]]) -> float:
+    """Return the MRR of the hidden class of visits (part, hidden class, classes of the room)."""
     machine, structure = (
         machine_of(side.weights),
         torch.from_numpy(side.vocabulary.structure.copy()),
     )
     ranks = []
-    for part, room in visits:
+    for part, hidden, room in visits:
         listed = torch.zeros(1, side.spec.V)
-        listed[0, part[:-1]] = 1
+        listed[0, np.setdiff1d(part, [hidden])] = 1
         log_odds = machine.object_log_odds(listed, share=torch.tensor([ALL_BUT_ONE]))[0]
-        others = np.setdiff1d(room, part[-1:])  # other classes of the room are no errors
-        log_odds[others] = log_odds[structure] = -torch.inf
-        ranks.append(1 / (1 + int((log_odds > log_odds[int(part[-1])]).sum())))
+        # Other classes of the room are no errors.
+        log_odds[np.setdiff1d(room, [hidden])] = log_odds[structure] = -torch.inf
+        ranks.append(1 / (1 + int((log_odds > log_odds[hidden]).sum())))
     return float(np.mean(ranks))
 
 
