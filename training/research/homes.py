@@ -63,7 +63,7 @@ class Row:
     alarms: tuple[float, float]
     mrr: tuple[float, float]
     other_rooms: tuple[float, float]
-    intruder: tuple[float, float]
+    intruder: tuple[float, float] | None  # None: the parent reports too few intruders
     refused: bool
 
 
@@ -102,8 +102,9 @@ def summary(rows: Sequence[Row]) -> Iterator[str]:
             f"worse: {worse}"
         )
         for name in ("alarms", "mrr", "other_rooms", "intruder"):
-            before, after = np.mean([getattr(row, name) for row in part], axis=0)
-            yield f"  {name:12} {before:.3f} → {after:.3f}"
+            if pairs := [pair for row in part if (pair := getattr(row, name)) is not None]:
+                before, after = np.mean(pairs, axis=0)
+                yield f"  {name:12} {before:.3f} → {after:.3f}"
 
 
 def measure_fold(
@@ -228,26 +229,25 @@ def _mrr(side: Artifact, visits: Sequence[tuple[Ints, int, Ints]]) -> float:
     return float(np.mean(ranks))
 
 
-def _intruder(home: Home, lists: Sequence[Ints], own: Ints, rng: Rng) -> tuple[float, float]:
+def _intruder(home: Home, lists: Sequence[Ints], own: Ints, rng: Rng) -> tuple[float, float] | None:
     """Return the mean share of alarms about classes that the home does not have.
 
     Each class is recorded twice, without a confirmation. The parent reports the class in at least
     one of the visits.
     """
     parent = home.parent
+    visits = [(scene.classes, -1 if scene.room is None else scene.room) for scene in home.scenes]
     shares: list[tuple[float, float]] = []
-    strange = np.setdiff1d(np.flatnonzero(parent.vocabulary.judged), own)
-    while len(shares) < _INTRUDERS:
-        intruder = int(rng.choice(strange))
+    for intruder in rng.permutation(np.setdiff1d(np.flatnonzero(parent.vocabulary.judged), own)):
         seen = [np.union1d(part, [intruder]) for part in lists[:_LOOKS]]
-        if not (before := _alarm_share(parent, seen, intruder)):
-            continue
-        twice = [np.union1d(part, [intruder]) for part in lists[-2:]]
-        confirmed = [
-            (scene.classes, -1 if scene.room is None else scene.room) for scene in home.scenes
-        ]
-        tensors = _home(parent, confirmed, twice).tensors
-        after = replace(parent, weights=adapt(parent.weights, tensors))
-        shares.append((before, _alarm_share(after, seen, intruder)))
-    before, after = np.mean(shares, axis=0).tolist()
-    return before, after
+        if before := _alarm_share(parent, seen, intruder):
+            twice = [np.union1d(part, [intruder]) for part in lists[-2:]]
+            weights = adapt(parent.weights, _home(parent, visits, twice).tensors)
+            after = _alarm_share(replace(parent, weights=weights), seen, intruder)
+            shares.append((before, after))
+        if len(shares) == _INTRUDERS:
+            break
+    else:
+        return None
+    first, second = np.mean(shares, axis=0).tolist()
+    return first, second
