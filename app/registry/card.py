@@ -35,6 +35,10 @@ The figures below measure a first training run without the test scenes. The publ
 from a second training run with the same configuration on nine tenths of all scenes. The calibration
 of the second run used the other tenth."""
 
+_ADAPTED = """\
+The model was adapted to one home from {name}@{version}. The figures below compare it with this
+parent, in five folds of the recorded scenes: scenes that the adapted weights had not seen."""
+
 _PROBABILITIES = """\
 The probabilities are calibrated on validation scenes, and those of objects on random parts of the
 scenes. Perfect probabilities have an expected calibration error (ECE) of 0 and a Brier skill of 1.
@@ -77,7 +81,7 @@ def render_card(description: Description, tensors: Mapping[str, TensorEntry]) ->
     Args:
         tensors: maps the name of each stored tensor to its dtype and shape.
     """
-    words = description.vocabulary
+    words, parent = description.vocabulary, description.training.get("parent")
     bound = [_cell(source.source) for source in description.data if source.research_only]
     proposed = sum(not entry.structure for entry in words.objects)
     machine = of_machine(tensors)
@@ -110,6 +114,7 @@ def render_card(description: Description, tensors: Mapping[str, TensorEntry]) ->
         _INTENDED_USE,
         "## Metrics",
         *([_FINAL_FIT] if "measured_split" in description.training else []),
+        *([_ADAPTED.format_map(parent)] if isinstance(parent, dict) else []),
         _metrics(description),
         "## Data and terms",
         _table(

@@ -151,6 +151,10 @@ def _print_home(home: Home, parent: Artifact) -> None:
             f"left out, because no person has confirmed them: {_counted(home.left_out)}. Confirm "
             "their scenes on the page if they belong there"
         )
+    _print(lines)
+
+
+def _print(lines: Iterable[str]) -> None:
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
 
@@ -182,8 +186,7 @@ def _print_result(result: Adapted) -> None:
         )
     if result.relations:
         lines.append(f"usual from now on: {', '.join(result.relations[:ROWS])} (confirmed scenes)")
-    for line in lines:
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    _print(lines)
 
 
 def _describe(

@@ -22,7 +22,8 @@ from training.evaluation.metrics import Figure
 from training.evaluation.outside import OutsideTest, read_test
 from training.evaluation.report import Progress, evaluate
 from training.evaluation.tasks import in_words
-from training.fit.configuration import Config, ConfigError, source_name
+from training.fit.configuration import ConfigError, source_name
+from training.runs.config_files import stored_config
 from training.runs.pipeline import prepare
 
 Figures = dict[str, list[Metric]]
@@ -101,7 +102,7 @@ def _measure(
     reference: str, artifact: Artifact, data: Path, sources: list[str] | None
 ) -> list[Metric]:
     """Return the figures of a model on the test scenes of its configuration."""
-    config = Config.model_validate(artifact.manifest.training["config"])
+    config = stored_config(artifact)
     names = sources or list(map(source_name, config.data.sources))
     with console.status("reading scenes"):
         # The split must include all data sources, as in training. Otherwise the test part

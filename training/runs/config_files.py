@@ -10,6 +10,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from app.registry import Artifact
 from training.datasets.files import DATA
 from training.fit.configuration import Config, ConfigError, first_error
 
@@ -84,6 +85,20 @@ def load_config(reference: str, *, seed: int | None = None) -> Config:
     if seed is not None:
         values.setdefault("training", {})["seed"] = seed
     return _validated(values, f"{path.name}:")
+
+
+def stored_config(artifact: Artifact) -> Config:
+    """Return the configuration of a published model.
+
+    Raises:
+        ConfigError: the model was adapted to a home, so it has no configuration.
+    """
+    if "config" not in artifact.manifest.training:
+        reference = "@".join(artifact.key)
+        raise ConfigError(
+            f"{reference} was adapted to a home: `python -m training adapt` measures and renews it"
+        )
+    return Config.model_validate(artifact.manifest.training["config"])
 
 
 def _validated(values: Mapping[str, Any], title: str) -> Config:

@@ -28,13 +28,18 @@ from training.evaluation.tasks import STATISTICS
 from training.fit.calibrate import calibrate
 from training.fit.calibrate_objects import refitted_lines
 from training.fit.checkpoint import RunError
-from training.fit.configuration import Config, DataConfig
+from training.fit.configuration import DataConfig
 from training.fit.count_statistics import fit_counts
 from training.fit.draft import placed_draft
 from training.fit.long_chains import measure_drift
 from training.fit.objects import ObjectScenes
 from training.fit.offset_statistics import fit_offsets
-from training.runs.config_files import load_config, shipped_configs, with_settings
+from training.runs.config_files import (
+    load_config,
+    shipped_configs,
+    stored_config,
+    with_settings,
+)
 from training.runs.example_scenes import known_examples, read_examples
 from training.runs.folder import FinishedRun
 from training.runs.pipeline import SplitScenes, read_sources, split_and_encode
@@ -154,7 +159,7 @@ def refit(
         StoreError, ArtifactError: see `Store.publish`.
     """
     manifest = artifact.manifest
-    config = Config.model_validate(manifest.training["config"])
+    config = stored_config(artifact)
     data, is_shipped = config.data, manifest.name in shipped_configs()
     named = load_config(manifest.name).examples if is_shipped else config.examples
     examples, reasons = known_examples(read_examples(named, root), artifact.vocabulary)

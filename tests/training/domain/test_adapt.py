@@ -58,6 +58,11 @@ def test_a_confirmed_object_is_never_reported_again(store, tmp_path):
     assert "never reported from now on: toilet (1)" in said
     assert alarms(home(store), INTRUDER, "bedroom") == []
     assert home(store).manifest.training["parent"]["digest"] == default(store).digest
+    parent = "@".join(default(store).key)
+    assert f"adapted to one home from {parent}" in " ".join(home(store).card.split())
+    for command in (["evaluate", "home"], ["publish", "home@1.0.0", "1.0.1"]):
+        said = invoke(*command, "--store", store.root, code=1)
+        assert "home@1.0.0 was adapted to a home" in said
 
 
 def test_a_relation_that_stands_right_is_usual_from_now_on(store, tmp_path):
