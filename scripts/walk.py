@@ -4,82 +4,37 @@
     python scripts/walk.py FOLDER --install    from a fresh clone, with `make run`
 
 The walk leads from the first answer and the web page over the user's own scenes to the promotion of
-an own model, a refused model and a roll-back. `FOLDER/walk.md` contains the record with
-screenshots. The walk ends with an error if a step does not do what the record says. It needs
-Debian's chromium and the development dependencies, but no internet.
+an own model, a refused model and a roll-back. On the third day, a robot records a home, and the
+default model adapts to it. `FOLDER/walk.md` contains the record with screenshots. The walk ends
+with an error if a step does not do what the record says. It needs Debian's chromium and the
+development dependencies, but no internet.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
 import random
 import re
 import shlex
 import shutil
-import socket
-import subprocess
 import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import httpx
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, sync_playwright
+from walk_robot import HABITS, VISITS
+from walk_tools import ROOT, Record, User, WalkError, require
 
-ROOT = Path(__file__).resolve().parent.parent
-FOLLOWS = 8.0  # seconds in which a service follows a change of its store
-START_TIMEOUT = 900.0
-SETTLED = 1200  # milliseconds until the page shows all answers
-
-
-class WalkError(Exception):
-    """A step of the walk failed."""
-
-
-def require(condition: object, reason: str) -> None:
-    """Raise `WalkError` with the reason unless the condition holds."""
-    if not condition:
-        raise WalkError(reason)
+CONFIRMED = 4  # scenes of each habit that the user confirms
+HABIT_SCENES = {
+    "bicycle": {"objects": ["bed", "nightstand", "lamp", "bicycle"], "room_type": "bedroom"},
+    "oven": {"objects": ["sofa", "armchair", "lamp", "oven"], "room_type": "living room"},
+}
+INTRUDER = {"objects": ["bed", "nightstand", "pillow", "lamp", "toilet"], "room_type": "bedroom"}
 
 
-class Record:
-    """The record of a walk: `walk.md` and the screenshots beside it.
-
-    Args:
-        folder: folder of the record.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._file = folder / "walk.md"
-        self._file.write_text("# A walk through the project\n", "utf-8")
-        self._started = time.monotonic()
-
-    def step(self, title: str) -> None:
-        """Begin a step."""
-        print(f"{time.monotonic() - self._started:6.1f} s  {title}", flush=True)
-        self._add(f"\n## {title}\n")
-
-    def block(self, command: str, output: str, seconds: float) -> None:
-        """Add a command, its output and its duration."""
-        self._add(f"\n```text\n$ {command}\n{output.rstrip()}\n```\n\n{seconds:.1f} s\n")
-
-    def picture(self, page: Page, name: str, words: str) -> None:
-        """Add a screenshot of the page."""
-        page.wait_for_timeout(SETTLED)
-        page.screenshot(path=self._folder / f"{name}.png")
-        self._add(f"\n{words}\n\n![{words}]({name}.png)\n")
-
-    def _add(self, text: str) -> None:
-        with self._file.open("a", encoding="utf-8") as file:
-            file.write(text)
-
-
-class Walk:
+class Walk(User):
     """The steps of the walk.
 
     Args:
@@ -90,8 +45,8 @@ class Walk:
     """
 
     def __init__(self, record: Record, work: Path, browser: Browser, install: bool) -> None:
-        self._record, self._work, self._browser, self._install = record, work, browser, install
-        self._environment = os.environ | {"COLUMNS": "80", "TERM": "dumb"}
+        super().__init__(record, work, browser)
+        self._install = install
 
     def run(self) -> None:
         """Take all steps.
@@ -104,6 +59,7 @@ class Walk:
         self.own_page()
         self.bad_model()
         self.roll_back()
+        self.own_home()
 
     # ------------------------------------------------------------------------- the first day
 
@@ -172,9 +128,82 @@ class Walk:
         require(self._served() == "my-lab@1.1.0", "the second version is not promoted")
         with self._service(["python", "-m", "app"], "my-store") as url:
             self._command("python -m app.registry alias default my-lab@1.0.0 --store my-store")
-            time.sleep(FOLLOWS)
-            answer = self._ask(url, "missing", {"objects": ["multimeter"], "top_k": 1})
-            require(answer["model"]["version"] == "1.0.0", "the first version is not served")
+            self._follow(url, "my-lab@1.0.0", "multimeter")
+
+    # ------------------------------------------------------------------------- the third day
+
+    def own_home(self) -> None:
+        """Record a home, confirm its habits, adapt the default model, and roll back."""
+        record = self._record
+        record.step("Let a robot record a home with two habits")
+        self._command(f"cp -r {ROOT / 'model_store'} home-store")
+        default = self._served("home-store")
+        with self._service(["python", "-m", "app"], "home-store") as url:
+            self._command(f"python {ROOT / 'scripts' / 'walk_robot.py'} {url} scenes.home.jsonl")
+            before = self._answers(url)
+            for habit in HABIT_SCENES:
+                require(outliers(before[habit]) == [habit], f"{habit} is no alarm of the default")
+            record.step("Confirm the habits on the page")
+            self._confirm(url)
+            record.step("Adapt the default model to the home")
+            output = self._command(
+                "python -m training adapt default corrected.jsonl --name home --store home-store "
+                "--promote"
+            )
+            require("the weights stay" not in output, "the weights have not changed")
+            require(self._served("home-store") == "home@1.0.0", "home is not promoted")
+            self._follow(url, "home@1.0.0", "lamp")
+            after = self._answers(url)
+            for habit in HABIT_SCENES:
+                require(outliers(after[habit]) == [], f"{habit} is still an alarm")
+            require(outliers(after["intruder"]) == ["toilet"], "the toilet is no alarm any more")
+            record.step("Roll back to the default model")
+            back = re.search(r"to roll back: (.+)", output)
+            self._command(back[1] if back else "")
+            require(self._served("home-store") == default, "the alias does not point back")
+            self._follow(url, default, "lamp")
+            require(self._answers(url) == before, "the answers are not those of the default")
+
+    def _answers(self, url: str) -> dict[str, Any]:
+        """Ask about a scene with each habit and one with an intruder."""
+        scenes = HABIT_SCENES | {"intruder": INTRUDER}
+        answers = {name: self._ask(url, "outliers", scene) for name, scene in scenes.items()}
+        for answer in answers.values():
+            del answer["request_id"]
+        return answers
+
+    def _confirm(self, url: str) -> None:
+        """Confirm some scenes of each habit on the page, and download the corrected file."""
+        file, corrected = self._work / "scenes.home.jsonl", self._work / "corrected.jsonl"
+        recorded = lines_of(file)
+        require(len({labels(line) for line in recorded}) >= 20, "too few distinct scenes")
+        require(len({line["group"] for line in recorded}) >= 5, "the scenes are of few hours")
+        require(len(recorded) <= VISITS, "a visit was recorded twice")
+        chosen = [
+            (number, habit)
+            for habit in HABITS.values()
+            for number in [n for n, x in enumerate(recorded) if habit in labels(x)][:CONFIRMED]
+        ]
+        with self._page(url) as page:
+            for number, habit in chosen:
+                page.get_by_role("button", name="Import, export").click()
+                page.locator("#upload").set_input_files(file)
+                page.locator("#which").fill(str(number + 1))
+                page.get_by_role("button", name="Put on the board").click()
+                page.get_by_role("tab", name="Wrong").click()
+                if number == chosen[0][0]:
+                    self._record.picture(page, "habit", "An alarm about a habit")
+                page.get_by_role("button", name=f"Belongs here: {habit}").click()
+            self._record.picture(page, "confirmed", "A confirmed scene")
+            page.get_by_role("button", name="Import, export").click()
+            self._record.picture(page, "download", "The corrected file can be downloaded")
+            with page.expect_download() as download:
+                page.get_by_role("button", name="Download scenes.jsonl").click()
+            download.value.save_as(corrected)
+        expected = [dict(line) for line in recorded]
+        for number, _ in chosen:
+            expected[number]["confirmed"] = True
+        require(lines_of(corrected) == expected, "the corrected file has other differences")
 
     # --------------------------------------------------------------------------------- tools
 
@@ -185,126 +214,31 @@ class Walk:
         self._command(f"git clone --quiet {shlex.quote(str(ROOT))} clone")
         return ["make", "--directory", str(clone), "run"]
 
-    def _command(self, command: str, status: int = 0) -> str:
-        """Run a command in the user's folder, and return its output."""
-        arguments = shlex.split(command)
-        if arguments[0] == "python":
-            arguments[0] = sys.executable
-        started = time.monotonic()
-        done = subprocess.run(
-            arguments,
-            cwd=self._work,
-            env=self._environment | {"PYTHONPATH": _python_path()},
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            check=False,
-        )
-        output = done.stdout.replace(f"{self._work}/", "")
-        self._record.block(command, output, time.monotonic() - started)
-        require(done.returncode == status, f"{command} has status {done.returncode}:\n{output}")
-        return output
 
-    @contextmanager
-    def _service(self, command: list[str], store: str | None = None) -> Iterator[str]:
-        """Run the service; yield its URL when it is ready."""
-        port = _free_port()
-        variables = {"SCENE_PORT": str(port), "PORT": str(port)}
-        if store is not None:
-            variables["SCENE_STORE"] = str(self._work / store)
-        if command[0] == "python":
-            command = [sys.executable, *command[1:]]
-            variables["PYTHONPATH"] = _python_path()
-        log = self._work / "service.log"
-        started = time.monotonic()
-        with log.open("w", encoding="utf-8") as file:
-            process = subprocess.Popen(
-                command,
-                cwd=ROOT,
-                env=self._environment | variables,
-                stdout=file,
-                stderr=file,
-                start_new_session=True,
-            )
-        try:
-            url = f"http://127.0.0.1:{port}"
-            while not _is_ready(url):
-                ended = process.poll() is not None
-                late = time.monotonic() - started > START_TIMEOUT
-                require(not (ended or late), f"the service is not ready:\n{log.read_text('utf-8')}")
-                time.sleep(0.1)
-            words = " ".join(command).replace(sys.executable, "python").replace(str(ROOT), ".")
-            self._record.block(words, log.read_text("utf-8"), time.monotonic() - started)
-            yield url
-        finally:
-            process.terminate()
-            process.wait(60)
+def lines_of(file: Path) -> list[dict[str, Any]]:
+    """Read a file of JSON lines."""
+    return [json.loads(line) for line in file.read_text("utf-8").splitlines()]
 
-    def _ask(
-        self, url: str, path: str, body: dict[str, Any], *, status: int = 200
-    ) -> dict[str, Any]:
-        """Send a request as curl does, and return the answer."""
-        started = time.monotonic()
-        response = httpx.post(f"{url}/{path}", json=body, timeout=30)
-        answer: dict[str, Any] = response.json()
-        shown = json.dumps(answer, indent=1, ensure_ascii=False)
-        seconds = time.monotonic() - started
-        self._record.block(f"POST /{path} {json.dumps(body)}", shown, seconds)
-        code = response.status_code
-        require(code == status, f"/{path} has status {code}: {shown}")
-        return answer
 
-    def _served(self) -> str:
-        """Return the version that the alias default names in the user's store."""
-        aliases = json.loads((self._work / "my-store" / "aliases.json").read_text("utf-8"))
-        return "{name}@{version}".format(**aliases["default"])
+def labels(line: dict[str, Any]) -> tuple[str, ...]:
+    """Return the labels of a recorded scene."""
+    return tuple(thing["label"] for thing in line["objects"])
 
-    @contextmanager
-    def _page(self, url: str) -> Iterator[Page]:
-        context = self._browser.new_context(viewport={"width": 1360, "height": 820})
-        page = context.new_page()
-        page.goto(url)
-        page.wait_for_timeout(SETTLED)
-        try:
-            yield page
-        finally:
-            context.close()
 
-    def _import(self, page: Page, scene: dict[str, Any]) -> None:
-        page.get_by_role("button", name=re.compile("Import")).first.click()
-        page.get_by_label("Scene, JSON").fill(json.dumps(scene))
-        page.get_by_role("button", name="Put on the board").click()
+def outliers(answer: dict[str, Any]) -> list[str]:
+    """Return the objects with an alarm."""
+    return [one["object"] for one in answer["outliers"] if one["is_outlier"]]
 
 
 def shuffle_labels(source: Path, target: Path) -> None:
     """Write half of the scenes, with labels that are exchanged between all objects."""
-    lines = source.read_text("utf-8").splitlines()
-    scenes = [json.loads(line) for line in lines[::2]]
-    labels = [thing["label"] for scene in scenes for thing in scene["objects"]]
-    random.Random(0).shuffle(labels)
+    scenes = lines_of(source)[::2]
+    every = [label for scene in scenes for label in labels(scene)]
+    random.Random(0).shuffle(every)
     for scene in scenes:
         for thing in scene["objects"]:
-            thing["label"] = labels.pop()
+            thing["label"] = every.pop()
     target.write_text("".join(json.dumps(scene) + "\n" for scene in scenes), "utf-8")
-
-
-def _python_path() -> str:
-    return os.pathsep.join([str(ROOT), str(ROOT / "clients/python")])
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
-
-
-def _is_ready(url: str) -> bool:
-    try:
-        return httpx.get(f"{url}/health/ready").is_success
-    except httpx.TransportError:
-        return False
 
 
 def main() -> int:

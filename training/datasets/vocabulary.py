@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tomllib
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -172,9 +172,19 @@ def vocabulary_json(vocabulary: Vocabulary) -> str:
     values = vocabulary.to_dict()
     for entry in values["objects"]:
         del entry["size"]
+    return vocabulary_text({name: values[name] for name in ("objects", "room_types")})
+
+
+def vocabulary_text(values: Mapping[str, Any]) -> str:
+    """Return the JSON values of a vocabulary as text, with one class on each line."""
     lines = ",\n".join(json.dumps(entry, ensure_ascii=False) for entry in values["objects"])
-    rooms = json.dumps(values["room_types"], ensure_ascii=False)
-    return f'{{\n"objects": [\n{lines}\n],\n"room_types": {rooms}\n}}\n'
+    entries = [f'"objects": [\n{lines}\n]']
+    entries += [
+        f"{json.dumps(name)}: {json.dumps(value, ensure_ascii=False)}"
+        for name, value in values.items()
+        if name != "objects"
+    ]
+    return "{\n" + ",\n".join(entries) + "\n}\n"
 
 
 def with_aliases(vocabulary: Vocabulary) -> Vocabulary:

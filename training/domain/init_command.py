@@ -10,6 +10,7 @@ from typing import Annotated, Literal, NoReturn
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 from app.registry import RegistryError
 from app.scene import label_key
@@ -18,7 +19,9 @@ from training.datasets.jsonl import scan_jsonl, write_jsonl
 from training.datasets.readers import guess_format, read_scenes
 from training.datasets.rooms import DOMAINS
 from training.datasets.vocabulary import vocabulary_json
+from training.domain.look import Label
 from training.domain.proposal import Proposal, propose
+from training.domain.update import PROPOSED, proposed_json, update
 from training.evaluation.report import write_whole
 from training.fit.configuration import ConfigError
 from training.runs.config_files import shipped_configs
@@ -49,17 +52,31 @@ def init(
     ] = None,
     terms: Annotated[str, typer.Option(help="terms of use of the scenes (model card)")] = "",
     force: Annotated[bool, typer.Option("--force", help="overwrite existing files")] = False,
+    extend: Annotated[
+        bool, typer.Option("--update", help="add new files and classes, and keep your edits")
+    ] = False,
 ) -> None:
     """Analyse your scenes, and propose a vocabulary and a training configuration.
 
     The command writes NAME.toml, vocabulary.json and examples.json (scenes for the visual page)
     into the output folder. You can edit these files. The command overwrites existing files only
     with --force.
+
+    With --update, the command adds new files to the sources, and their frequent labels to the end
+    of the vocabulary. Classes that you removed stay removed. proposed.json records the names of
+    all proposals for this purpose.
     """
     folder = Path(name) if output is None else output
-    targets = [folder / file for file in (f"{name}.toml", "vocabulary.json", "examples.json")]
+    names = (f"{name}.toml", "vocabulary.json", "examples.json", PROPOSED)
+    targets = [folder / file for file in names]
     try:
         _check_name(name)
+        if extend:
+            if force or terms:
+                option = "--force" if force else "--terms"
+                raise ConfigError(f"--update keeps your files, so {option} cannot be used with it")
+            _update(name, folder, files)
+            return
         with console.status("reading scenes"):
             scenes = [scene for file in files for scene in read_or_exit(file)]
         existing = [str(path) for path in targets if path.exists()]
@@ -74,18 +91,53 @@ def init(
     except (ConfigError, DatasetError, ValueError) as error:
         fail(error)
     folder.mkdir(parents=True, exist_ok=True)
-    vocabulary, examples = vocabulary_json(proposal.vocabulary), examples_json(proposal.examples)
-    for path, text in zip(targets, (proposal.toml(), vocabulary, examples), strict=True):
+    texts = (
+        proposal.toml(),
+        vocabulary_json(proposal.vocabulary),
+        examples_json(proposal.examples),
+        proposed_json(proposal.vocabulary.objects, proposal.vocabulary.room_types),
+    )
+    for path, text in zip(targets, texts, strict=True):
         write_whole(path, text)
-    _show(proposal)
-    lines = [
-        f"\nwritten: {', '.join(map(str, targets))}",
-        f"next: check these files, then run  python -m training train {folder}",
-    ]
+    _show(proposal, f"classes with at least {proposal.minimum} mentions")
+    _print_lines(f"\nwritten: {', '.join(map(str, targets))}", *_next(name, folder))
+
+
+def _update(name: str, folder: Path, files: Sequence[Path]) -> None:
+    """Extend the proposal in a folder, and report what was added and what was kept."""
+    with console.status("reading and analysing scenes"):
+        result = update(name, folder, files, read_or_exit)
+    for path, text in result.files.items():
+        write_whole(path, text)
+    _show(result.proposal, "classes in the vocabulary")
+    title = f"new classes with at least {result.proposal.minimum} mentions:"
+    lines = _listing(title, _mentions(result.added)) or ["no new classes"]
+    lines += _listing("new room types:", result.rooms)
+    lines += _listing("removed earlier, and not added again:", _mentions(result.removed))
+    lines += _listing("new sources:", result.sources)
+    kept = "the settings" if result.sources else f"{name}.toml"
+    _print_lines(
+        *lines,
+        f"\nwritten: {', '.join(map(str, result.files)) or 'nothing'}",
+        f"kept as they are: the earlier classes, {kept} and the examples",
+        *_next(name, folder),
+    )
+
+
+def _next(name: str, folder: Path) -> list[str]:
+    lines = [f"next: check these files, then run  python -m training train {folder}"]
     if folder.resolve().name != name:
-        lines.append(f"      (the configuration is {targets[0]})")
+        lines.append(f"      (the configuration is {folder / f'{name}.toml'})")
+    return lines
+
+
+def _print_lines(*lines: str) -> None:
     for line in lines:
-        console.print(line, markup=False, soft_wrap=True)
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def _mentions(labels: Sequence[Label]) -> list[str]:
+    return [f"{label.name} ({label.mentions})" for label in labels]
 
 
 def _check_name(name: str) -> None:
@@ -120,7 +172,7 @@ def read_or_exit(path: Path, *, recorded: bool = False) -> list[AnnotatedScene]:
     return [line for line in lines if isinstance(line, AnnotatedScene)]
 
 
-def _show(proposal: Proposal) -> None:
+def _show(proposal: Proposal, classes: str) -> None:
     """Print the facts about the scenes, joined labels, and what the user must check."""
     facts = proposal.facts
     least, mean, most = facts.objects_per_scene
@@ -131,18 +183,14 @@ def _show(proposal: Proposal) -> None:
         f"({mean:.1f} on average)",
         f"room types: {rooms or 'none'}",
         f"scenes with: {shares}",
-        f"{len(proposal.vocabulary)} classes with at least {proposal.minimum} mentions; they cover "
-        f"{proposal.coverage:.1%} of the objects",
+        f"{len(proposal.vocabulary)} {classes}; they cover {proposal.coverage:.1%} of the objects",
     ]
     joined = [x for x in proposal.labels if label_key(x.name) != label_key(x.spellings[0])]
     lines += _listing(
         "joined by built-in synonyms; vocabulary.json has the classes:",
         [f"{label.spellings[0]} = {label.name}" for label in joined],
     )
-    lines += _listing(
-        "labels without a class:",
-        [f"{label.name} ({label.mentions})" for label in proposal.dropped],
-    )
+    lines += _listing("labels without a class:", _mentions(proposal.dropped))
     console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
     console.print("Please check:" if facts.findings else "no contradictions found")
     for finding in facts.findings:
@@ -163,7 +211,7 @@ def _listing(title: str, entries: Sequence[str]) -> list[str]:
 def fail(error: Exception) -> NoReturn:
     """Print the error, without the code of a registry error, and exit with code 1."""
     reason = error.reason if isinstance(error, RegistryError) else error
-    console.print(f"[red]error:[/red] {reason}", soft_wrap=True)
+    console.print(f"[red]error:[/red] {escape(str(reason))}", soft_wrap=True)
     raise typer.Exit(1) from None
 
 

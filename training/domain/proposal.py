@@ -95,7 +95,7 @@ def propose(
     labels = count_labels(scenes)
     facts = look(scenes, labels)
     minimum, found = _choose_vocabulary(scenes)
-    vocabulary = _use_frequent_names(found, scenes)
+    vocabulary = use_frequent_names(found, scenes)
     seed, parts, test_groups = _split(scenes)
     settings, reasons = _configuration(facts, parts)
     reasons |= {
@@ -143,7 +143,7 @@ def _choose_vocabulary(scenes: Sequence[AnnotatedScene]) -> tuple[int, Vocabular
     raise ConfigError("every label occurs only once: training needs labels with more objects")
 
 
-def _use_frequent_names(vocabulary: Vocabulary, scenes: Sequence[AnnotatedScene]) -> Vocabulary:
+def use_frequent_names(vocabulary: Vocabulary, scenes: Sequence[AnnotatedScene]) -> Vocabulary:
     """Rename each class to the alias that more than half of its objects have as label.
 
     A class of "plastic bottle", "glass bottle" and "bottle" stays "bottle", unless one of these

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -82,6 +83,100 @@ def test_files_are_overwritten_only_with_force(file, lab) -> None:
     assert (lab / "lab.toml").read_text() == "mine"
     init(file, folder=lab, options=["--force"])
     assert "[machine]" in (lab / "lab.toml").read_text()
+
+
+def vocabulary(folder: Path) -> dict[str, dict]:
+    """The entries of the vocabulary file by label."""
+    values = json.loads((folder / "vocabulary.json").read_text())
+    return {entry["label"]: entry for entry in values["objects"]}
+
+
+def edit(folder: Path, entries: list[dict], **others: object) -> str:
+    values = json.loads((folder / "vocabulary.json").read_text()) | {"objects": entries} | others
+    (folder / "vocabulary.json").write_text(json.dumps(values))
+    return json.dumps(values)
+
+
+def test_an_update_keeps_edits_and_adds_new_files(lab) -> None:
+    """A removed, a renamed, a merged and a flagged class, and a removed room type."""
+    removed, renamed, merged, flagged, *_ = found = vocabulary(lab).values()
+    old = [dict(entry) for entry in (removed, renamed, merged)]
+    renamed["label"] = "my thing"
+    flagged |= {"anywhere": True, "aliases": [*flagged["aliases"], merged["label"]]}
+    entries = [x for x in found if x not in (removed, merged)]
+    rooms = {"room_types": ["workshop"], "room_aliases": {"workshop": ["garage"]}}
+    edit(lab, entries, **rooms)
+    toml = lab / "lab.toml"
+    mine = re.sub(r"(?m)^steps = .*", "steps = 7  # mine", toml.read_text())
+    toml.write_text(mine)
+    (lab / "examples.json").write_text("[]")
+    new = [
+        scene(f"new-{k}", "unicorn", "Unicorns", old[0]["label"], flagged["label"], room="stable")
+        for k in range(20)
+    ]
+    write_jsonl(new, lab.parent / "new.jsonl")
+    output = init(lab.parent / "new.jsonl", folder=lab, options=["--update"])
+
+    after = list(vocabulary(lab).values())
+    assert after[: len(entries)] == entries
+    assert [entry["label"] for entry in after[len(entries) :]] == ["unicorn"]
+    values = json.loads((lab / "vocabulary.json").read_text())
+    assert values["room_types"] == ["workshop", "stable"]
+    assert values["room_aliases"] == rooms["room_aliases"]
+    sources = '["../scenes.jsonl", "../new.jsonl"]'
+    assert toml.read_text() == mine.replace('["../scenes.jsonl"]', sources)
+    assert (lab / "examples.json").read_text() == "[]"
+    assert "mentions: unicorn (40) new room types: stable removed" in output
+    kept_out = output.split("not added again: ")[1].split(" new sources: ../new.jsonl")[0]
+    assert {f"{entry['label']} (" in kept_out for entry in old[:2]} == {True}
+    assert f"{merged['label']} (" not in kept_out
+    assert prepare(load_config(str(lab)), lab).counts == {"scenes": 80, "new": 20}
+
+    # An added class that the person removes stays removed, too. Nothing else is new.
+    text = edit(lab, entries)
+    assert "no new classes" in init(lab.parent / "new.jsonl", folder=lab, options=["--update"])
+    assert (lab / "vocabulary.json").read_text() == text
+
+
+def test_an_update_reads_a_file_that_has_grown(file, lab) -> None:
+    before = {path.name: path.read_text() for path in lab.iterdir()}
+    assert "written: nothing" in init(file, folder=lab, options=["--update"])
+    assert {path.name: path.read_text() for path in lab.iterdir()} == before
+    new = [scene(f"new-{k}", "unicorn", "lab bench") for k in range(20)]
+    write_jsonl([*SCENES, *new], file)
+    assert "unicorn (20)" in init(file, folder=lab, options=["--update"])
+    assert list(vocabulary(lab))[-1] == "unicorn"
+    assert (lab / "lab.toml").read_text() == before["lab.toml"]
+
+
+@pytest.mark.parametrize(
+    ("break_it", "options", "message"),
+    [
+        (lambda lab: (lab / "lab.toml").unlink(), (), "run init without --update"),
+        (lambda lab: (lab / "proposed.json").unlink(), (), "proposed.json is missing"),
+        (lambda lab: (lab / "proposed.json").write_text("[]"), (), "proposed.json cannot be used"),
+        (lambda lab: (lab / "vocabulary.json").write_text("{}"), (), "objects: Field required"),
+        (lambda lab: (lab / "vocabulary.json").write_text("{,"), (), "vocabulary.json cannot be"),
+        (lambda lab: None, ("--force",), "--force cannot be used with it"),
+        (lambda lab: None, ("--terms", "x"), "--terms cannot be used with it"),
+    ],
+)
+def test_an_update_without_a_usable_proposal_is_refused(
+    file, lab, break_it, options, message
+) -> None:
+    break_it(lab)
+    before = {path.name: path.read_text() for path in lab.iterdir()}
+    assert message in init(file, folder=lab, options=["--update", *options], code=1)
+    assert {path.name: path.read_text() for path in lab.iterdir()} == before
+
+
+def test_sources_that_cannot_be_edited_are_left_to_the_person(file, lab) -> None:
+    toml = lab / "lab.toml"
+    toml.write_text(toml.read_text().replace("sources = [", '"sources" = ['))
+    write_jsonl(SCENES[:30], other := file.with_name("other.jsonl"))
+    other.write_text(other.read_text().replace("rooms-0", "rooms-1"))
+    message = 'write sources = ["../scenes.jsonl", "../other.jsonl"] into [data]'
+    assert message in init(other, folder=lab, options=["--update"], code=1)
 
 
 def test_each_invalid_line_is_named_up_to_a_bound(tmp_path) -> None:

@@ -1,6 +1,6 @@
 """The walk of `scripts/walk.py`, and the next steps of its user.
 
-The scenes are generated: 300 of laboratories, workshops and storerooms.
+The scenes are generated: 300 of laboratories, workshops and storerooms, and those of a home.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def workplace(tmp_path_factory, repository, require_system_tool) -> Workplace:
 
 def test_the_walk_is_recorded(workplace) -> None:
     record = (workplace.folder.parent / "walk.md").read_text()
-    for word in ("300 generated scenes", "next:", "trained in", "refused:"):
+    for word in ("300 generated scenes", "next:", "trained in", "refused:", "published home@1.0.0"):
         assert word in record
     for name in re.findall(r"\(([a-z-]+\.png)\)", record):
         assert (workplace.folder.parent / name).stat().st_size > 20_000

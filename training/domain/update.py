@@ -1,0 +1,215 @@
+"""Extend a proposal of `init` with new scenes, and keep what a person has edited.
+
+`proposed.json` contains every name that a proposal had. A name that is in `proposed.json` but not
+in the vocabulary was removed by a person, so no update adds it again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import tomllib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+from pydantic import ValidationError
+
+from app.registry import VocabularyEntry
+from app.registry.fields import first_error
+from app.scene import ObjectClass, Vocabulary, label_key
+from training.datasets import AnnotatedScene, source_vocabulary
+from training.datasets.records import AnnotatedObject
+from training.datasets.vocabulary import coverage, vocabulary_text
+from training.domain.look import Label
+from training.domain.proposal import Proposal, propose, use_frequent_names
+from training.fit.configuration import ConfigError, is_file
+from training.runs.config_files import load_config, read_toml
+
+PROPOSED: Final = "proposed.json"
+"""The file with the names of all proposals."""
+_NOTHING: Final[Mapping[str, set[str]]] = {}
+
+
+@dataclass(frozen=True)
+class Update:
+    """The files that `init --update` writes, and what it reports.
+
+    Attributes:
+        proposal: the proposal for all scenes, with the edited and extended vocabulary.
+        files: text of each changed file.
+        added: new classes.
+        rooms: new room types.
+        removed: frequent labels that the person removed from the vocabulary.
+        sources: new entries of `data.sources`.
+    """
+
+    proposal: Proposal
+    files: dict[Path, str]
+    added: tuple[Label, ...]
+    rooms: tuple[str, ...]
+    removed: tuple[Label, ...]
+    sources: tuple[str, ...]
+
+
+def update(
+    name: str,
+    folder: Path,
+    files: Sequence[Path],
+    read: Callable[[Path], Sequence[AnnotatedScene]],
+) -> Update:
+    """Extend the proposal in a folder with the scenes of files.
+
+    The scenes of the sources of the configuration are read again, together with new files.
+
+    Raises:
+        ConfigError: the folder has no proposal, or one of its files cannot be read or extended.
+        DatasetError: a file has no scenes.
+    """
+    config_file = folder / f"{name}.toml"
+    if not config_file.is_file():
+        raise ConfigError(
+            f"{config_file} does not exist, so nothing can be updated: run init without --update"
+        )
+    data = load_config(str(config_file)).data
+    if not data.vocabulary.endswith(".json"):
+        raise ConfigError(
+            f"{config_file}: data.vocabulary is {data.vocabulary!r}; --update extends .json files"
+        )
+    own = [folder / source for source in data.sources if is_file(source)]
+    known = {path.resolve() for path in own}
+    new = [file for file in files if file.resolve() not in known]
+    added = tuple(Path(os.path.relpath(file, folder)).as_posix() for file in new)
+    scenes = [scene for file in (*own, *new) for scene in read(file)]
+    proposal = propose(name, scenes, (*data.sources, *added))
+    proposed = _proposed(folder / PROPOSED)
+    path = folder / data.vocabulary
+    values = _edited(path)
+    edited = VocabularyEntry.model_validate(values).vocabulary()
+    classes = _new_classes(edited, proposed, scenes, proposal.minimum)
+    rooms = tuple(
+        room
+        for room in proposal.vocabulary.room_types
+        if edited.room_index(room) is None and label_key(room) not in proposed["room_types"]
+    )
+    texts = {}
+    if classes or rooms:
+        entries = Vocabulary(classes).to_dict()["objects"] if classes else []
+        for entry in entries:
+            del entry["size"]
+        values["objects"] = [*values["objects"], *entries]
+        values["room_types"] = [*values.get("room_types", ()), *rooms]
+        texts[path] = vocabulary_text(values)
+        texts[folder / PROPOSED] = proposed_json(classes, rooms, proposed)
+    if added:
+        texts[config_file] = _with_sources(config_file, [*data.sources, *added])
+    extended = VocabularyEntry.model_validate(values).vocabulary()
+    without = [label for label in proposal.labels if not _has(extended, label)]
+    removed = tuple(x for x in without if _keys(x) & proposed["objects"])
+    result = replace(
+        proposal,
+        vocabulary=extended,
+        coverage=coverage(extended, scenes),
+        dropped=tuple(x for x in without if x not in removed),
+    )
+    labels = tuple(x for x in proposal.labels if _has(extended, x) and not _has(edited, x))
+    return Update(result, texts, labels, rooms, removed, added)
+
+
+def proposed_json(
+    classes: Iterable[ObjectClass], rooms: Iterable[str], earlier: Mapping[str, set[str]] = _NOTHING
+) -> str:
+    """Return the text of `proposed.json`: the keys of the names of this and earlier proposals."""
+    names = {
+        "objects": {label_key(x) for entry in classes for x in (entry.label, *entry.aliases)},
+        "room_types": set(map(label_key, rooms)),
+    }
+    values = {kind: sorted(own | earlier.get(kind, set())) for kind, own in names.items()}
+    return json.dumps(values, ensure_ascii=False, indent=0) + "\n"
+
+
+def _proposed(path: Path) -> dict[str, set[str]]:
+    """Read the keys of the names of earlier proposals."""
+    try:
+        values = json.loads(path.read_bytes())
+        return {kind: set(map(label_key, values[kind])) for kind in ("objects", "room_types")}
+    except FileNotFoundError:
+        raise ConfigError(
+            f"{path} is missing, so removed classes cannot be told from new ones. To let every "
+            'frequent label in, write {"objects": [], "room_types": []} into this file'
+        ) from None
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ConfigError(f"{path} cannot be used: {error!r}") from None
+
+
+def _edited(path: Path) -> dict[str, Any]:
+    """Return the values of a valid vocabulary file."""
+    try:
+        values: dict[str, Any] = json.loads(path.read_bytes())
+        VocabularyEntry.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(f"{path} cannot be used: {first_error(error)}") from None
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path} cannot be used: {error}") from None
+    return values
+
+
+def _new_classes(
+    edited: Vocabulary,
+    proposed: dict[str, set[str]],
+    scenes: Sequence[AnnotatedScene],
+    minimum: int,
+) -> tuple[ObjectClass, ...]:
+    """Return the frequent classes of the labels that are in no earlier proposal and no class."""
+
+    def is_new(label: str) -> bool:
+        return edited.index(label) is None and label_key(label) not in proposed["objects"]
+
+    rest = []
+    for scene in scenes:
+        things = [AnnotatedObject(x.id, x.label) for x in scene.objects if is_new(x.label)]
+        rest.append(AnnotatedScene(scene.scene_id, scene.source, scene.group, None, tuple(things)))
+    try:
+        found = use_frequent_names(source_vocabulary(rest, minimum=minimum), rest)
+    except ValueError:
+        return ()  # no new label is frequent
+    new = [entry for entry in found.objects if is_new(entry.label)]
+    labels = {entry.label for entry in new}
+    return tuple(
+        replace(
+            entry,
+            aliases=tuple(filter(is_new, entry.aliases)),
+            parent=entry.parent if entry.parent in labels else None,
+        )
+        for entry in new
+    )
+
+
+def _keys(label: Label) -> set[str]:
+    return set(map(label_key, (label.name, *label.spellings)))
+
+
+def _has(vocabulary: Vocabulary, label: Label) -> bool:
+    return any(vocabulary.index(x) is not None for x in (label.name, *label.spellings))
+
+
+def _with_sources(path: Path, sources: Sequence[str]) -> str:
+    """Return the text of a configuration with other sources. All other entries stay."""
+    expected = read_toml(path)
+    expected["data"]["sources"] = list(sources)
+    array = json.dumps(list(sources), ensure_ascii=False)
+    text = re.sub(
+        r"^(\s*sources\s*=\s*)\[[^\]]*\]",
+        lambda match: match[1] + array,
+        path.read_text("utf-8"),
+        count=1,
+        flags=re.MULTILINE,
+    )
+    try:
+        if tomllib.loads(text) == expected:
+            return text
+    except tomllib.TOMLDecodeError:
+        pass
+    raise ConfigError(f"{path}: write sources = {array} into [data] yourself, then repeat")
