@@ -25,7 +25,7 @@ from training.datasets.records import AnnotatedObject
 from training.datasets.vocabulary import coverage, vocabulary_text
 from training.domain.look import Label
 from training.domain.proposal import Proposal, propose, use_frequent_names
-from training.fit.configuration import ConfigError, is_file
+from training.fit.configuration import ConfigError, DataConfig, is_file
 from training.runs.config_files import load_config, read_toml
 
 PROPOSED: Final = "proposed.json"
@@ -69,6 +69,40 @@ def update(
         DatasetError: a file has no scenes.
     """
     config_file = folder / f"{name}.toml"
+    data = _data_of(config_file)
+    own = [folder / source for source in data.sources if is_file(source)]
+    known = {path.resolve() for path in own}
+    new = [file for file in files if file.resolve() not in known]
+    added = tuple(Path(os.path.relpath(file, folder)).as_posix() for file in new)
+    scenes = [scene for file in (*own, *new) for scene in read(file)]
+    proposal = propose(name, scenes, (*data.sources, *added))
+    proposed = _proposed(folder / PROPOSED)
+    values, edited = _edited(folder / data.vocabulary)
+    classes = _new_classes(edited, proposed, scenes, proposal.minimum)
+    rooms = tuple(
+        room
+        for room in proposal.vocabulary.room_types
+        if edited.room_index(room) is None and label_key(room) not in proposed["room_types"]
+    )
+    extended, texts = edited, {}
+    if classes or rooms:
+        values = _with_entries(values, classes, rooms)
+        extended = VocabularyEntry.model_validate(values).vocabulary()
+        texts[folder / data.vocabulary] = vocabulary_text(values)
+        texts[folder / PROPOSED] = proposed_json(classes, rooms, proposed)
+    if added:
+        texts[config_file] = _with_sources(config_file, [*data.sources, *added])
+    without = [label for label in proposal.labels if not _has(extended, label)]
+    removed = tuple(label for label in without if _keys(label) & proposed["objects"])
+    dropped = tuple(label for label in without if label not in removed)
+    covered = coverage(extended, scenes)
+    result = replace(proposal, vocabulary=extended, coverage=covered, dropped=dropped)
+    labels = tuple(x for x in proposal.labels if _has(extended, x) and not _has(edited, x))
+    return Update(result, texts, labels, rooms, removed, added)
+
+
+def _data_of(config_file: Path) -> DataConfig:
+    """Return the data section of a configuration whose vocabulary can be extended."""
     if not config_file.is_file():
         raise ConfigError(
             f"{config_file} does not exist, so nothing can be updated: run init without --update"
@@ -78,44 +112,7 @@ def update(
         raise ConfigError(
             f"{config_file}: data.vocabulary is {data.vocabulary!r}; --update extends .json files"
         )
-    own = [folder / source for source in data.sources if is_file(source)]
-    known = {path.resolve() for path in own}
-    new = [file for file in files if file.resolve() not in known]
-    added = tuple(Path(os.path.relpath(file, folder)).as_posix() for file in new)
-    scenes = [scene for file in (*own, *new) for scene in read(file)]
-    proposal = propose(name, scenes, (*data.sources, *added))
-    proposed = _proposed(folder / PROPOSED)
-    path = folder / data.vocabulary
-    values = _edited(path)
-    edited = VocabularyEntry.model_validate(values).vocabulary()
-    classes = _new_classes(edited, proposed, scenes, proposal.minimum)
-    rooms = tuple(
-        room
-        for room in proposal.vocabulary.room_types
-        if edited.room_index(room) is None and label_key(room) not in proposed["room_types"]
-    )
-    texts = {}
-    if classes or rooms:
-        entries = Vocabulary(classes).to_dict()["objects"] if classes else []
-        for entry in entries:
-            del entry["size"]
-        values["objects"] = [*values["objects"], *entries]
-        values["room_types"] = [*values.get("room_types", ()), *rooms]
-        texts[path] = vocabulary_text(values)
-        texts[folder / PROPOSED] = proposed_json(classes, rooms, proposed)
-    if added:
-        texts[config_file] = _with_sources(config_file, [*data.sources, *added])
-    extended = VocabularyEntry.model_validate(values).vocabulary()
-    without = [label for label in proposal.labels if not _has(extended, label)]
-    removed = tuple(x for x in without if _keys(x) & proposed["objects"])
-    result = replace(
-        proposal,
-        vocabulary=extended,
-        coverage=coverage(extended, scenes),
-        dropped=tuple(x for x in without if x not in removed),
-    )
-    labels = tuple(x for x in proposal.labels if _has(extended, x) and not _has(edited, x))
-    return Update(result, texts, labels, rooms, removed, added)
+    return data
 
 
 def proposed_json(
@@ -144,16 +141,26 @@ def _proposed(path: Path) -> dict[str, set[str]]:
         raise ConfigError(f"{path} cannot be used: {error!r}") from None
 
 
-def _edited(path: Path) -> dict[str, Any]:
-    """Return the values of a valid vocabulary file."""
+def _edited(path: Path) -> tuple[dict[str, Any], Vocabulary]:
+    """Return the values of a vocabulary file, and the vocabulary."""
     try:
-        values: dict[str, Any] = json.loads(path.read_bytes())
-        VocabularyEntry.model_validate(values)
+        values = json.loads(path.read_bytes())
+        return values, VocabularyEntry.model_validate(values).vocabulary()
     except ValidationError as error:
         raise ConfigError(f"{path} cannot be used: {first_error(error)}") from None
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path} cannot be used: {error}") from None
-    return values
+
+
+def _with_entries(
+    values: dict[str, Any], classes: Sequence[ObjectClass], rooms: Sequence[str]
+) -> dict[str, Any]:
+    """Return the values of a vocabulary file with further classes and room types at the end."""
+    entries = Vocabulary(classes).to_dict()["objects"] if classes else []
+    for entry in entries:
+        del entry["size"]
+    objects, room_types = values["objects"], values.get("room_types", ())
+    return values | {"objects": [*objects, *entries], "room_types": [*room_types, *rooms]}
 
 
 def _new_classes(
