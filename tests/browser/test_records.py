@@ -100,6 +100,23 @@ def test_a_corrected_file_differs_only_in_the_confirmation(
     assert downloaded(board, tmp_path, 1).read_text("utf-8") == file.read_text("utf-8")
 
 
+def test_an_intruder_is_removed_and_the_next_scene_follows(
+    open_board: OpenBoard, recorded: Path, tmp_path: Path
+) -> None:
+    board = open_board()
+    choose(board, recorded, 2)
+    board.press("toilet (track_5)", "Delete")
+    board.click("This scene is right")
+    expect(board.page.get_by_text("Confirmed scene.")).to_be_visible()
+    board.click("Next scene (3 of 3)")
+    expect(board.page.get_by_text("Confirmed scene.")).to_be_hidden()
+    assert "bathtub" in " ".join(board.things)
+    expect(board.page.get_by_role("button", name="Next scene")).to_be_hidden()
+    before, after = lines(recorded), lines(downloaded(board, tmp_path, 1))
+    kept = before[1] | {"objects": before[1]["objects"][:-1], "confirmed": True}
+    assert after == [before[0], kept, before[2]]
+
+
 def test_missing_objects_are_added(open_board: OpenBoard, recorded: Path, tmp_path: Path) -> None:
     board = open_board()
     choose(board, recorded, 1)

@@ -173,9 +173,9 @@ def _print_result(result: Adapted) -> None:
         alarms, rank = measured.alarms.mean(0), measured.rank.mean(0)
         lines += [
             f"on {len(measured.alarms)} scenes of folds that the fit did not see:",
-            f"  scenes with an alarm      {alarms[0]:6.1%} → {alarms[1]:6.1%}",
+            f"  scenes with an alarm      {alarms[0]:6.1%} → {alarms[1]:6.1%}   (right or false)",
             f"  MRR of a missing object   {rank[0]:6.3f} → {rank[1]:6.3f}",
-            f"  t of the gain             {measured.t:6.1f}",
+            f"  t of the gain             {measured.t:6.1f}            (above 2: certain)",
         ]
     if result.objections:
         lines.append(f"the weights stay: {'; '.join(result.objections)}")

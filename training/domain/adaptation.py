@@ -48,7 +48,7 @@ class Measured:
     Attributes:
         loss: (N, 2) log loss of hidden objects: of the parent, and of the adapted weights.
         rank: (M, 2) reciprocal rank of a hidden object.
-        alarms: (N, 2) True if the scene has an alarm that is false or not yet confirmed.
+        alarms: (N, 2) True if the scene has an alarm about an object.
         change: mean change of the probability of unrecorded classes in rooms of the parent.
     """
 
@@ -180,14 +180,12 @@ def _ranks(home: Home, index: Ints, sides: Sides, seed: int) -> Floats:
 
 
 def _alarms(home: Home, index: Ints, sides: Sides) -> Flags:
-    """Return whether each scene has an alarm about an object that is not left out, (N, 2)."""
+    """Return whether each scene has an alarm about an object, (N, 2)."""
     table = np.zeros((len(index), 2), bool)
     for row, number in enumerate(index.tolist()):
         scene = home.scenes[number]
         if len(scene.classes):
-            for column, side in enumerate(sides):
-                alarms = alarms_of(side, scene.question(side))
-                table[row, column] = bool(np.setdiff1d(alarms, scene.left_out).size)
+            table[row] = [len(alarms_of(side, scene.question(side))) > 0 for side in sides]
     return table
 
 

@@ -1,6 +1,6 @@
 """The recorded scenes of a home, in the classes of the model that adapts to it.
 
-A robot records what it sees, also an object that does not belong there. A habit of the home cannot
+A robot also records objects that do not belong there. A habit of the home cannot
 be told from a fault without a person. So an unconfirmed scene does not teach the objects that the
 model reports as outliers: they are neither present nor absent there. A confirmed scene teaches all
 its objects.
@@ -77,12 +77,15 @@ class Home:
 
     @classmethod
     def of(cls, model: Artifact, recorded: Sequence[AnnotatedScene]) -> Home:
-        """Read recorded scenes in the classes of a model. Repeated scenes count once."""
+        """Read recorded scenes in the classes of a model.
+
+        Scenes with equal classes and room type count once, because a robot sees a room many times.
+        """
         parent = _with_new_words(model, recorded)
         scenes: dict[tuple[object, ...], HomeScene] = {}
         for scene in recorded:
             read = _read(parent, scene)
-            key = (read.group, read.room, read.classes.tobytes())
+            key = (read.room, read.classes.tobytes())
             if key not in scenes or read.confirmed:
                 scenes[key] = read
         distinct = tuple(scenes.values())

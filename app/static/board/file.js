@@ -19,6 +19,7 @@ export function fileDialog(store, records, put, say) {
   const scene = () => toScene(store.get(), sizesOf(store.get(), store.get().models[0]));
   const chosen = (count) => Math.min(count, Math.max(1, Number(which.value))) - 1;
   let found = [];
+  let opened = { text: '', index: 0 }; // the scene of a file that was put on the board last
   let hidden = ''; // text of a large file, which the text area does not show
   const source = () => hidden || area.value;
 
@@ -80,25 +81,34 @@ export function fileDialog(store, records, put, say) {
   get('close-file').addEventListener('click', () => dialog.close());
   get('import').addEventListener('click', () => {
     try {
-      const scenes = scenesIn(source());
-      const index = chosen(scenes.names.length);
-      const labels = labelsOf(map.value, names.value);
-      const given = scenes.read(index, labels);
-      if (given.notes && !given.scene.objects.length) {
-        throw new SceneError(`The file has no object for a scene: ${given.notes[0]?.[2] ?? 'it lists no detection with a class'}.`);
-      }
-      // Only requests and training scenes have no notes.
-      const lines = given.notes ? [] : linesIn(source());
-      const line = lines.length ? records.open(lines)[index] : undefined;
-      const { scene: read } = line ? scenesIn(JSON.stringify(line)).read(0, labels) : given;
-      put(read, inWords(given.notes ?? []), line);
+      place(source(), chosen(found.length));
       dialog.close();
-      say('The scene is on the board.');
     } catch (problem) {
       if (!(problem instanceof SceneError)) throw problem;
       error.textContent = problem.message;
     }
   });
+  get('next-scene').addEventListener('click', () => place(opened.text, opened.index + 1));
+
+  /** Puts a scene of a text on the board. Throws SceneError. */
+  function place(text, index) {
+    const scenes = scenesIn(text);
+    const labels = labelsOf(map.value, names.value);
+    const given = scenes.read(index, labels);
+    if (given.notes && !given.scene.objects.length) {
+      throw new SceneError(`The file has no object for a scene: ${given.notes[0]?.[2] ?? 'it lists no detection with a class'}.`);
+    }
+    // Only requests and training scenes have no notes.
+    const lines = given.notes ? [] : linesIn(text);
+    const line = lines.length ? records.open(lines)[index] : undefined;
+    const { scene: read } = line ? scenesIn(JSON.stringify(line)).read(0, labels) : given;
+    put(read, inWords(given.notes ?? []), line);
+    opened = { text, index };
+    const count = lines.length;
+    get('next-scene').hidden = index + 1 >= count;
+    get('next-scene').textContent = `Next scene (${index + 2} of ${count})`;
+    say(count > 1 ? `Scene ${index + 1} of ${count} is on the board.` : 'The scene is on the board.');
+  }
   get('download').addEventListener('click', () => save(source(), 'scene.json'));
   get('download-scenes').addEventListener('click', () => save(records.text(), 'scenes.jsonl'));
   get('forget-scenes').addEventListener('click', () => {

@@ -119,12 +119,14 @@ const takeGhost = (ghost) => {
 };
 const board = createBoard(get('board'), store, actions, takeGhost);
 const models = createModels(store, get('model'), get('second'), tell);
+const verdicts = createVerdicts(store, say, actions.add);
+get('confirm-scene').addEventListener('click', verdicts.sceneIsRight);
 const views = [
   board.render,
   createList(get('list'), get('empty'), get('count'), actions),
   createProperties(get('properties'), store, actions),
   createColumns(store, (question) => document.querySelector(`.columns[data-question=${question}]`), askKey,
-    createVerdicts(store, say, actions.add)),
+    verdicts),
   createGeneration(get('generate'), get('drawn'), store, say),
   tabs(document.querySelector('[role=tablist]'), store),
   settings(store),
@@ -165,6 +167,8 @@ watchService(store, get('banner'), () => void reload());
 function showRecords() {
   const isConfirmed = Boolean(store.get().line.confirmed);
   get('confirmed').hidden = !isConfirmed;
+  get('recorded').hidden = !store.get().line.objects;
+  get('confirm-scene').hidden = isConfirmed;
   get('confirmed').textContent = `Confirmed scene. Import, export downloads all confirmed scenes (${records.count()}).`;
 }
 

@@ -11,6 +11,11 @@ export function createVerdicts(store, say, add) {
   const confirmed = () => ({ line: { ...store.get().line, confirmed: true } });
   const name = (id) => namesOf(store.get().things)(id);
   return {
+    /** The objects of the board are the whole scene, and belong there. */
+    sceneIsRight() {
+      store.edit({ things: store.get().things.map((thing) => ({ ...thing, belongs: true })), ...confirmed() });
+      say(`The scene is confirmed. ${NEXT}`);
+    },
     /** An object that looked wrong belongs to the scene. */
     belongs(id) {
       const things = store.get().things.map((thing) => (thing.id === id ? { ...thing, belongs: true } : thing));

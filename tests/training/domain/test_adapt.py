@@ -101,13 +101,17 @@ def test_a_later_file_confirms_a_scene(store, tmp_path):
 def test_words_that_the_model_cannot_read_become_classes(store, tmp_path):
     """They are accepted at once, and judged after three scenes."""
     balcony = {"room_type": "balcony", "objects": ["deck chair", "stairlift"]}
+    others = ["plant", "lamp", "table"]
     said = adapt(store, write([balcony], tmp_path / "scenes.jsonl"))
     assert "new classes, judged after 3 scenes: stairlift" in said
     assert "new room types: balcony" in said
     words = home(store).vocabulary
     assert words.objects[words.index("Stairlifts")].anywhere
     assert words.room_types[words.room_index("balcony")] == "balcony"
-    more = write([balcony | {"group": str(day)} for day in range(3)], tmp_path / "more.jsonl")
+    more = write(
+        [balcony | {"objects": [*balcony["objects"], other]} for other in others],
+        tmp_path / "more.jsonl",
+    )
     adapt(store, more)
     words = home(store, "1.1.0").vocabulary
     assert not words.objects[words.index("stairlift")].anywhere
