@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import pytest
@@ -13,8 +14,10 @@ from training.datasets.jsonl import write_jsonl
 
 
 @pytest.mark.slow
-def test_homes_are_measured_with_parents_that_never_saw_them(tmp_path):
-    """Five houses of twelve rooms. A second call uses the finished trainings."""
+def test_homes_are_measured_with_parents_that_never_saw_them(tmp_path, monkeypatch):
+    """Five houses of twelve rooms, and two parents. A second call uses the finished trainings."""
+    monkeypatch.setattr("training.research.homes._FOLDS", 2)
+    monkeypatch.setattr("training.research.homes.ProcessPoolExecutor", ThreadPoolExecutor)
     scenes = [
         replace(scene, scene_id=str(k), source="matterport_rooms", group=f"house-{k // 12}")
         for k, scene in enumerate(generate_rooms(60, seed=5))
