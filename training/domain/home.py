@@ -1,9 +1,8 @@
 """The recorded scenes of a home, in the classes of the model that adapts to it.
 
-A robot also records objects that do not belong there. A habit of the home cannot
-be told from a fault without a person. So an unconfirmed scene does not teach the objects that the
-model reports as outliers: they are neither present nor absent there. A confirmed scene teaches all
-its objects.
+A robot also records objects that do not belong there. Only a person can tell a habit of the home
+from a fault. So an unconfirmed scene does not teach the objects that the model reports as outliers:
+they are neither present nor absent there. A confirmed scene teaches all its objects.
 
 A label that the model cannot read becomes a new class. It is judged once `JUDGED` scenes show it.
 """
