@@ -122,17 +122,19 @@ def adapted(
 def measure(home: Home, seed: int, progress: Callable[[str], None]) -> Measured:
     """Compare the parent with adapted weights in folds of groups.
 
-    If the scenes have fewer than five groups, the folds are made of scenes.
+    Scenes with fewer than two classes have no part in it. If a fold of groups has no other scene,
+    the folds are made of scenes.
     """
-    groups = [scene.group for scene in home.scenes]
-    names = sorted(set(groups))
-    few = len(names) < _FOLDS
-    units = np.arange(len(groups)) if few else np.searchsorted(names, groups)
-    fold_of = np.random.default_rng(seed).permutation(units.max() + 1)[units] % _FOLDS
+    index = np.flatnonzero((home.tensors.v.sum(1) >= 2).numpy())
+    names, group = np.unique([home.scenes[k].group for k in index], return_inverse=True)
+    rng = np.random.default_rng(seed)
+    fold_of = rng.permutation(len(names))[group] % _FOLDS
+    if len(np.unique(fold_of)) < _FOLDS:
+        fold_of = rng.permutation(len(index)) % _FOLDS
     loss, rank, alarms, change = [], [], [], []
     for fold in range(_FOLDS):
         progress(f"comparing in folds: {fold + 1} of {_FOLDS}")
-        held_out, seen = np.flatnonzero(fold_of == fold), np.flatnonzero(fold_of != fold)
+        held_out, seen = index[fold_of == fold], index[fold_of != fold]
         scenes = home.tensors.rows(torch.from_numpy(seen))
         weights = adapt(home.parent.weights, scenes, known=home.known, seed=seed)
         sides = home.parent, replace(home.parent, weights=weights)
@@ -152,7 +154,6 @@ Sides = tuple[Artifact, Artifact]
 def _losses(home: Home, index: Ints, sides: Sides, seed: int) -> Floats:
     """Return the mean log loss of random parts of each scene, (N, 2)."""
     scenes = home.tensors.rows(torch.from_numpy(index))
-    scenes = scenes.rows(scenes.v.sum(1) >= 2)
     generator = torch.Generator().manual_seed(seed)
     table = torch.zeros(len(scenes), 2)
     for _ in range(_PARTS):
@@ -167,7 +168,6 @@ def _losses(home: Home, index: Ints, sides: Sides, seed: int) -> Floats:
 def _ranks(home: Home, index: Ints, sides: Sides, seed: int) -> Floats:
     """Return the reciprocal rank of one hidden class of each scene, (N, 2)."""
     scenes = home.tensors.rows(torch.from_numpy(index))
-    scenes = scenes.rows(scenes.v.sum(1) >= 2)
     parts = random_parts(scenes.v, 1.0, torch.Generator().manual_seed(seed))
     hidden = (scenes.v - parts.listed).argmax(1, keepdim=True)
     table = torch.zeros(len(scenes), 2)
@@ -184,8 +184,7 @@ def _alarms(home: Home, index: Ints, sides: Sides) -> Flags:
     table = np.zeros((len(index), 2), bool)
     for row, number in enumerate(index.tolist()):
         scene = home.scenes[number]
-        if len(scene.classes):
-            table[row] = [len(alarms_of(side, scene.question(side))) > 0 for side in sides]
+        table[row] = [len(alarms_of(side, scene.question(side))) > 0 for side in sides]
     return table
 
 

@@ -169,14 +169,18 @@ def default_parent(store: Store) -> Artifact:
 
 @pytest.mark.slow
 def test_scenes_that_the_model_expects_change_no_weights(store, tmp_path):
-    """The scenes are samples of the model itself, so there is nothing to learn."""
+    """The scenes are samples of the model itself, so there is nothing to learn.
+
+    All are of one group, and scenes of one object are groups of their own.
+    """
     model = default(store)
     labels, samples = model.vocabulary.labels, model.weights.scenes
     scenes = [
-        {"objects": [labels[c] for c in np.flatnonzero(sample)], "group": str(k)}
-        for k, sample in enumerate(samples[:30])
+        {"objects": [labels[c] for c in np.flatnonzero(sample)], "group": "day"}
+        for sample in samples[:30]
         if sample.sum() >= 2
     ]
+    scenes += [{"objects": [label], "group": label} for label in ("lamp", "chair", "bed", "plant")]
     said = adapt(store, write(scenes, tmp_path / "scenes.jsonl"), code=3)
     assert "the weights stay: hidden objects are not certainly predicted better" in said
     assert store.versions("home") == ()
