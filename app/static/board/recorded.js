@@ -110,12 +110,13 @@ export function createRecorded(store, records, go) {
 
 const MOST_NAMED = 3;
 
-/** The labels of outliers, and the subjects of misplaced relations. */
+/** The labels of outliers, and of the subjects of misplaced relations. */
 function alarmsOf(answer) {
   if (!answer) return [];
   const { outliers, misplaced } = answer;
+  const labels = new Map(outliers.map(({ object, label }) => [object, label]));
   const found = [...outliers.filter((one) => one.is_outlier).map(({ label }) => label),
-    ...misplaced.filter((one) => one.is_misplaced).map(({ subject }) => `place of ${subject}`)];
+    ...misplaced.filter((one) => one.is_misplaced).map(({ subject }) => `place of ${labels.get(subject) ?? subject}`)];
   const names = [...new Set(found)];
   return names.length > MOST_NAMED ? [...names.slice(0, MOST_NAMED), '…'] : names;
 }
