@@ -177,7 +177,7 @@ function showRecords() {
   get('confirmed').hidden = !isConfirmed && !isJudged(state);
   get('recorded').hidden = !state.line.objects && (isConfirmed || !isJudged(state));
   get('confirm-scene').hidden = isConfirmed;
-  get('confirm-scene').textContent = `This scene is right${open ? ` (${open} ${open === 1 ? 'alarm' : 'alarms'} wrong)` : ''}`;
+  get('confirm-scene').textContent = `This scene is right${open ? ` (${open} false ${open === 1 ? 'alarm' : 'alarms'})` : ''}`;
   get('confirmed').textContent = isConfirmed
     ? `Confirmed scene. Import, export downloads all confirmed scenes (${records.count()}).` : statusOf(state);
   recorded.draw();
