@@ -1,7 +1,7 @@
 """``python -m app.compile``: compile kernels and sources for this machine before the first start.
 
-Without this command, the first start of the service compiles the kernels, which takes about 20
-seconds. If the service cannot store the compiled kernels, every start compiles the kernels again.
+Without this command, the first start of the service compiles the kernels. If the service cannot
+store the compiled kernels, every start compiles the kernels again.
 """
 
 from __future__ import annotations

@@ -112,7 +112,7 @@ class _Progress(event.Listener):
         if kernel not in self._kernels:
             return
         if not self._begun:
-            _logger.info("compiling loops, which takes about 20 seconds, once for this version")
+            _logger.info("compiling loops, once for this version")
             self._lock = _lock()
         self._begun.add(kernel)
         if time.monotonic() - self._logged >= 1:

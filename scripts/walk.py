@@ -194,6 +194,8 @@ class Walk(User):
                 if number == chosen[0][0]:
                     self._record.picture(page, "habit", "An alarm about a habit")
                 page.get_by_role("button", name=f"Belongs here: {habit}").click()
+                if page.locator("#confirm-scene").is_visible():  # another alarm is open
+                    page.locator("#confirm-scene").click()
             self._record.picture(page, "confirmed", "A confirmed scene")
             page.get_by_role("button", name="Import, export").click()
             self._record.picture(page, "download", "The corrected file can be downloaded")

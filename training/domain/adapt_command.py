@@ -41,6 +41,7 @@ _NOTHING = (
     f"reports. Record at least {FEWEST} scenes, or confirm scenes on the page"
 )
 _LIBRARIES = ("numpy", "torch")
+_NAMED = 3  # listed scenes of an object that is left out
 
 
 def adapt_command(
@@ -148,15 +149,22 @@ def _print_home(home: Home, parent: Artifact) -> None:
         lines.append(f"new room types: {', '.join(home.new_rooms[:ROWS])}")
     if home.left_out:
         lines.append(
-            f"left out, because no person has confirmed them: {_counted(home.left_out)}. Confirm "
-            "their scenes on the page if they belong there"
+            "left out, because no person has confirmed them. Confirm their scenes on the page if "
+            "they belong there:"
         )
+        most = sorted(home.left_out.items(), key=lambda entry: -len(entry[1]))[:ROWS]
+        lines += [f"  {label} ({len(scenes)}): {_some(scenes)}" for label, scenes in most]
     _print(lines)
 
 
 def _print(lines: Iterable[str]) -> None:
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def _some(scenes: Sequence[str]) -> str:
+    more = ["..."] if len(scenes) > _NAMED else []
+    return ", ".join([*scenes[:_NAMED], *more])
 
 
 def _counted(counts: Counter[str]) -> str:

@@ -9,8 +9,8 @@ A label that the model cannot read becomes a new class. It is judged once `JUDGE
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -63,7 +63,7 @@ class Home:
         known: number of classes and of room types of the model itself.
         scenes: distinct recorded scenes.
         recorded: number of recorded scenes, with the repeated ones.
-        left_out: number of unconfirmed scenes in which each label is left out.
+        left_out: ids of the unconfirmed scenes in which each label is left out.
         relations: confirmed relations of classes that the parent reports as misplaced.
     """
 
@@ -71,7 +71,7 @@ class Home:
     known: tuple[int, int]
     scenes: tuple[HomeScene, ...]
     recorded: int
-    left_out: Counter[str] = field(default_factory=Counter)
+    left_out: Mapping[str, Sequence[str]] = field(default_factory=dict)
     relations: frozenset[Triple] = frozenset()
 
     @classmethod
@@ -81,17 +81,19 @@ class Home:
         Scenes with equal classes and room type count once, because a robot sees a room many times.
         """
         parent = _with_new_words(model, recorded)
-        scenes: dict[tuple[object, ...], HomeScene] = {}
+        scenes: dict[tuple[object, ...], tuple[HomeScene, str]] = {}
         for scene in recorded:
             read = _read(parent, scene)
             key = (read.room, read.classes.tobytes())
             if key not in scenes or read.confirmed:
-                scenes[key] = read
-        distinct = tuple(scenes.values())
-        labels = parent.vocabulary.labels
-        left_out = Counter(labels[c] for scene in distinct for c in scene.left_out.tolist())
+                scenes[key] = read, scene.scene_id
+        left_out: dict[str, list[str]] = defaultdict(list)
+        for read, scene_id in scenes.values():
+            for c in read.left_out.tolist():
+                left_out[parent.vocabulary.labels[c]].append(scene_id)
         known = len(model.vocabulary), model.spec.C
         relations = frozenset(reported_relations(parent, recorded))
+        distinct = tuple(read for read, _ in scenes.values())
         return cls(parent, known, distinct, len(recorded), left_out, relations)
 
     @property

@@ -95,7 +95,8 @@ const ROWS = {
       row('outliers', el('b', {}, spoken(one, name)), one.probability, one.confirmed
         ? { words: 'confirmed' }
         : { kind: 'alarm', words: 'in the wrong place', buttons: [verdict('Stands right', spoken(one, name), () => verdicts.standsRight(one))] },
-        one.moved == null ? null : el('p', { class: 'quiet' }, `moved: ${name(one.moved)}`)));
+        one.moved == null ? null : el('p', { class: 'quiet' }, `moved: ${name(one.moved)}`),
+        one.confirmed && !isLearnt(one) ? el('p', { class: 'quiet' }, NOT_LEARNT) : null));
     const stated = state.posed || state.relations.length;
     const alarms = answer.outliers.map((one) => one.is_outlier);
     return [
@@ -117,6 +118,10 @@ const ROWS = {
         one.expected == null ? null : el('p', { class: 'quiet' }, `expected: ${percent(one.expected)}`))),
   ],
 };
+
+/** Whether adapt learns a confirmed relation (training/domain/confirmed_relations.py). */
+const isLearnt = ({ relation, object }) => object !== 'floor' && !['left', 'right', 'front', 'behind'].includes(relation);
+const NOT_LEARNT = 'An adapted model reports this again: adapt learns which objects support others, not places on the floor or beside objects.';
 
 const NOTHING = {
   missing: 'The model suggests no object.',

@@ -15,14 +15,16 @@ import { percent, SPOKEN } from './words.js';
 export const keyOf = ({ subject, relation, object }) => JSON.stringify([subject, relation, object]);
 
 /** The answer about outliers of a model, without the alarms that the user confirmed as right; undefined without an answer. */
-export function judgedBy(own, { things, right }) {
+export function judgedBy(own, { things, right, line }) {
   const answer = own.outliers?.answer;
   const belongs = new Set(things.filter((thing) => thing.belongs).map(({ id }) => id));
   if (!answer || !(belongs.size || right.length)) return answer ?? undefined;
+  // In a confirmed scene, objects that belong there also stand right.
+  const stands = (one) => right.includes(keyOf(one)) || (line.confirmed && belongs.has(one.subject) && belongs.has(one.object));
   return {
     ...answer,
     outliers: answer.outliers.map((one) => (belongs.has(one.object) ? { ...one, is_outlier: false, confirmed: true } : one)),
-    misplaced: answer.misplaced.map((one) => (right.includes(keyOf(one)) ? { ...one, is_misplaced: false, confirmed: true } : one)),
+    misplaced: answer.misplaced.map((one) => (stands(one) ? { ...one, is_misplaced: false, confirmed: true } : one)),
   };
 }
 
@@ -31,6 +33,16 @@ export const wrongIn = (answer) => ({
   outliers: answer.outliers.filter((one) => one.is_outlier),
   misplaced: answer.misplaced.filter((one) => one.is_misplaced),
 });
+
+/** The number of alarms without a verdict; undefined until the model has answered about the board. */
+export function openAlarms(state) {
+  const own = state.answers[state.shown];
+  if (own.outliers?.status !== 'answered') return undefined;
+  const { outliers, misplaced } = wrongIn(judgedBy(own, state));
+  const ids = new Set(state.things.map(({ id }) => id));
+  return [...outliers.map((one) => [one.object]), ...misplaced.map((one) => [one.subject, one.object])]
+    .filter((ends) => ends.every((id) => ids.has(id) || id === 'floor')).length; // without objects that were just removed
+}
 
 const ofTab = {
   relations: ({ disagreements, relations }) => [

@@ -11,15 +11,18 @@ import { toHash } from './share.js';
 const SOME = 3; // notes that the page shows
 const MOST_SHOWN = 2 ** 20; // bytes; a browser needs a minute to show a text of 50 MB
 
-/** @param {(scene: object, notes: string, line: object | undefined) => void} put puts a scene on the board; throws SceneError */
-export function fileDialog(store, records, put, say) {
+/**
+ * @param {(scene: object, notes: string, line: object | undefined) => void} put puts a scene on the board; throws SceneError
+ * @returns {{place: (index: number) => void}} puts another scene of the opened text on the board
+ */
+export function fileDialog(store, records, recorded, put, say) {
   const get = (id) => document.getElementById(id);
   const [dialog, area, error, done, which, map, names] =
     ['file', 'json', 'json-error', 'share-done', 'which', 'label-map', 'label-names'].map(get);
   const scene = () => toScene(store.get(), sizesOf(store.get(), store.get().models[0]));
   const chosen = (count) => Math.min(count, Math.max(1, Number(which.value))) - 1;
   let found = [];
-  let opened = { text: '', index: 0 }; // the scene of a file that was put on the board last
+  let opened = ''; // the text whose scene was put on the board last
   let hidden = ''; // text of a large file, which the text area does not show
   const source = () => hidden || area.value;
 
@@ -88,8 +91,6 @@ export function fileDialog(store, records, put, say) {
       error.textContent = problem.message;
     }
   });
-  get('next-scene').addEventListener('click', () => place(opened.text, opened.index + 1));
-
   /** Puts a scene of a text on the board. Throws SceneError. */
   function place(text, index) {
     const scenes = scenesIn(text);
@@ -103,10 +104,9 @@ export function fileDialog(store, records, put, say) {
     const line = lines.length ? records.open(lines)[index] : undefined;
     const { scene: read } = line ? scenesIn(JSON.stringify(line)).read(0, labels) : given;
     put(read, inWords(given.notes ?? []), line);
-    opened = { text, index };
+    opened = text;
     const count = lines.length;
-    get('next-scene').hidden = index + 1 >= count;
-    get('next-scene').textContent = `Next scene (${index + 2} of ${count})`;
+    recorded.open(lines, index);
     say(count > 1 ? `Scene ${index + 1} of ${count} is on the board.` : 'The scene is on the board.');
   }
   get('download').addEventListener('click', () => save(source(), 'scene.json'));
@@ -128,6 +128,7 @@ export function fileDialog(store, records, put, say) {
     await copy(location.href);
     done.textContent = 'The link is copied. It contains the whole scene, and browsers do not send this part to a server.';
   });
+  return { place: (index) => place(opened, index) };
 }
 
 /** Saves a text as a file. */

@@ -20,10 +20,12 @@ import { fromScene, SceneError, sizer } from './scene.js';
 import { createRecords, newLine, withSources } from './records.js';
 import { settings } from './settings.js';
 import { fromHash } from './share.js';
+import { openAlarms } from './edges.js';
 import { changed, createStore } from './store.js';
 import { summary } from './summary.js';
 import { tabs } from './tabs.js';
-import { createVerdicts } from './verdicts.js';
+import { createRecorded } from './recorded.js';
+import { createVerdicts, isJudged, statusOf } from './verdicts.js';
 
 const get = (id) => document.getElementById(id);
 const say = (words) => (get('live').textContent = words);
@@ -50,7 +52,7 @@ function put(scene, change = {}, line = newLine()) {
   store.edit({
     things: withSources(things.map((thing) => {
       const { x, y, z } = places.get(thing.id) ?? thing;
-      return { ...thing, x, y, z };
+      return { ...thing, x, y, z, ...(line.confirmed && { belongs: true }) };
     }), line),
     line, right: [],
     // As in the service, stated relations take precedence over positions.
@@ -118,7 +120,10 @@ const takeGhost = (ghost) => {
   requestAnimationFrame(() => board.focus(id));
 };
 const board = createBoard(get('board'), store, actions, takeGhost);
-const models = createModels(store, get('model'), get('second'), tell);
+const models = createModels(store, get('model'), get('second'), tell, (words) => {
+  get('news').textContent = words;
+  get('news').hidden = false;
+});
 const verdicts = createVerdicts(store, say, actions.add);
 get('confirm-scene').addEventListener('click', verdicts.sceneIsRight);
 const views = [
@@ -131,7 +136,7 @@ const views = [
   tabs(document.querySelector('[role=tablist]'), store),
   settings(store),
   listExamples,
-  (state, previous) => changed(state, previous, 'line') && showRecords(),
+  (state, previous) => changed(state, previous, 'line', 'things', 'right', 'answers', 'shown') && showRecords(),
 ];
 
 // Views draw at most once per frame, even if the state changes more often.
@@ -156,7 +161,8 @@ store.subscribe((state, previous) => {
 combobox(get('search'), get('found'), () => store.get().words[store.get().models[0]]?.objects ?? [],
   (label) => actions.add(label));
 const records = createRecords(store, showRecords);
-fileDialog(store, records, (scene, notes, line) => {
+const recorded = createRecorded(store, records, (index) => file.place(index));
+const file = fileDialog(store, records, recorded, (scene, notes, line) => {
   put(scene, {}, line);
   if (notes) note(`${get('note').textContent} ${notes}`.trim());
   if (!store.get().down) get('banner').hidden = true; // such as that of a broken link
@@ -165,11 +171,16 @@ watchService(store, get('banner'), () => void reload());
 
 /** Says whether the scene is confirmed, and how many confirmed scenes can be downloaded. */
 function showRecords() {
-  const isConfirmed = Boolean(store.get().line.confirmed);
-  get('confirmed').hidden = !isConfirmed;
-  get('recorded').hidden = !store.get().line.objects;
+  const state = store.get();
+  const isConfirmed = Boolean(state.line.confirmed);
+  const open = openAlarms(state);
+  get('confirmed').hidden = !isConfirmed && !isJudged(state);
+  get('recorded').hidden = !state.line.objects && (isConfirmed || !isJudged(state));
   get('confirm-scene').hidden = isConfirmed;
-  get('confirmed').textContent = `Confirmed scene. Import, export downloads all confirmed scenes (${records.count()}).`;
+  get('confirm-scene').textContent = `This scene is right${open ? ` (${open} false ${open === 1 ? 'alarm' : 'alarms'})` : ''}`;
+  get('confirmed').textContent = isConfirmed
+    ? `Confirmed scene. Import, export downloads all confirmed scenes (${records.count()}).` : statusOf(state);
+  recorded.draw();
 }
 
 /** Lists the examples of the first model. */

@@ -1,6 +1,6 @@
 /** The available models and their vocabularies. */
 
-import { call } from './api.js';
+import { call, UnreachableError } from './api.js';
 import { el } from './dom.js';
 import { changed } from './store.js';
 import { plain } from './words.js';
@@ -15,6 +15,12 @@ function choices({ models, aliases }, chosen) {
   const named = Object.entries(aliases).map(([alias, target]) => ({ value: alias, words: `${alias}: ${target.replace('@', ' ')}` }));
   return [...named, ...versions];
 }
+
+/** The usable versions and the aliases, in words. */
+const versionsOf = ({ models, aliases }) => new Set([
+  ...models.flatMap(({ name, versions }) => versions.filter(({ status }) => status === 'ready').map(({ version }) => `${name} ${version}`)),
+  ...Object.entries(aliases).map(([alias, target]) => `${alias} is now ${target.replace('@', ' ')}`),
+]);
 
 function words({ objects, room_types: rooms, examples = [] }) {
   const names = new Map();
@@ -32,8 +38,11 @@ function words({ objects, room_types: rooms, examples = [] }) {
   };
 }
 
-export function createModels(store, first, second, tell) {
+/** @param {(words: string) => void} announce says that the models of the service have changed */
+export function createModels(store, first, second, tell, announce) {
   const asked = new Map(); // model → promise of its vocabulary
+  let listed = null; // the last answer of the service about its models
+  let refreshing = false;
 
   async function learn(model) {
     try {
@@ -54,7 +63,8 @@ export function createModels(store, first, second, tell) {
 
   async function load() {
     try {
-      const found = choices(await call('models'), store.get().models);
+      listed = await call('models');
+      const found = choices(listed, store.get().models);
       const [model, other] = store.get().models;
       asked.clear();
       // A store without the alias "default" opens with its first model.
@@ -78,6 +88,40 @@ export function createModels(store, first, second, tell) {
       draft: null,
     });
   };
+
+  /** Loads the models again if the service serves others than the page knows, and says so. */
+  async function refresh() {
+    if (!listed || refreshing) return;
+    refreshing = true;
+    try {
+      const before = versionsOf(listed);
+      const after = versionsOf(await call('models'));
+      const news = [...after].filter((one) => !before.has(one));
+      if (news.length || [...before].some((one) => !after.has(one))) {
+        await load();
+        store.set({ epoch: store.get().epoch + 1 }); // ask the questions again
+        announce(news.length ? `The service has new models: ${news.join(', ')}.` : 'The service has removed models.');
+      }
+    } catch (error) {
+      if (error instanceof UnreachableError) tell(error);
+    } finally {
+      refreshing = false;
+    }
+  }
+
+  /** Whether an answer comes from another version than the list of models says. */
+  const isNews = ({ model: answered }, model) => {
+    const target = listed?.aliases[model];
+    return target !== undefined && target !== `${answered.name}@${answered.version}`;
+  };
+
+  addEventListener('focus', () => void refresh());
+  store.subscribe((state, previous) => {
+    if (state.answers === previous.answers) return;
+    const fresh = state.answers.some((own, column) => Object.entries(own).some(([question, { answer }]) =>
+      answer && answer !== previous.answers[column][question]?.answer && isNews(answer, state.models[column])));
+    if (fresh) void refresh();
+  });
   first.addEventListener('change', choose);
   second.addEventListener('change', choose);
   store.subscribe((state, previous) => changed(state, previous, 'models') && void learnAll(state));

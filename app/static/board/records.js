@@ -131,6 +131,8 @@ export function createRecords(store, whenChanged) {
   return {
     /** The number of confirmed scenes. */
     count: () => [...lines().values()].filter((line) => line.confirmed).length,
+    /** The confirmed scene with the id of a line, or the line. */
+    current: (line) => confirmed.get(line.scene_id) ?? line,
     /** The number of scenes that this browser keeps. */
     kept: () => confirmed.size,
     /** Replaces the opened file. Returns its lines, with the confirmed scenes of this browser. */

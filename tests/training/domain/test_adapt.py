@@ -84,9 +84,16 @@ def test_a_relation_that_stands_right_is_usual_from_now_on(store, tmp_path):
 
 
 def test_an_unconfirmed_object_teaches_nothing(store, tmp_path):
-    scene = {"objects": INTRUDER, "room_type": "bedroom"}
-    said = adapt(store, write([scene], tmp_path / "scenes.jsonl"), code=3)
-    assert "left out, because no person has confirmed them: toilet (1)" in said
+    rooms = [INTRUDER, *([*INTRUDER, other] for other in ("rug", "mirror", "dresser"))]
+    scenes = [
+        {"scene_id": f"id{n}", "objects": objects, "room_type": "bedroom"}
+        for n, objects in enumerate(rooms)
+    ]
+    said = adapt(store, write(scenes[:1], tmp_path / "scenes.jsonl"), code=3)
+    assert "left out, because no person has confirmed them" in said
+    assert "toilet (1): id0" in said
+    said = adapt(store, write(scenes, tmp_path / "scenes.jsonl"), code=3)
+    assert "toilet (4): id0, id1, id2, ..." in said
     assert "nothing was published" in said
     assert store.versions("home") == ()
 
