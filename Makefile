@@ -18,6 +18,9 @@ WORKERS ?= $$(($$($(BIN)/python -c 'import os; print(os.cpu_count())') + 1))
 PYTEST := $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadscope --no-loadscope-reorder
 TORCH := -r requirements-torch.lock $(if $(TORCH_INDEX_URL),--index-url $(TORCH_INDEX_URL))
 
+# Where this is set, every process of the tests compiles all sources again, for up to two seconds.
+unexport PYTHONDONTWRITEBYTECODE
+
 # A stamp file marks an environment with the packages of its lock file. A newer lock file or
 # pyproject.toml makes the stamp out of date. Both lock files have the same versions, so they share
 # one environment.

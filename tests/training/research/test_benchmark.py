@@ -41,7 +41,7 @@ changes = { "objects.learning_rate" = 1e30 }
 
 def write(folder, *, variant="triway", rooms=60):
     config = small_config(f"rooms-{variant}", variant, rooms=rooms)
-    return write_config(folder / f"{variant}-{rooms}.toml", config)
+    return write_config(folder / f"{variant}-{rooms}.toml", config, {"objects.steps": 40})
 
 
 def read(folder):
