@@ -324,7 +324,9 @@ class UnknownLabelsError(RequestError, slug="unknown-labels", status=422, steps=
     example = _example("#/objects/1", "the model does not know this label", "nightstand")
     _hint = (
         " GET /models/{name}/vocabulary lists the known names. With `unknown_labels` set to "
-        "`ignore`, the service leaves unknown names out."
+        "`ignore`, the service leaves unknown names out. `nearest-or-ignore` corrects them first. "
+        "`python -m training adapt` adds the names of your home to a model. For a model of your "
+        "own, add synonyms to vocabulary.json, or new classes with `init --update`."
     )
 
 

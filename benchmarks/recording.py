@@ -12,7 +12,7 @@ from benchmarks.load import servers
 from benchmarks.load.questions import bodies, labels_of
 from benchmarks.report import Result
 from benchmarks.timing import Timings
-from scene_client import Client
+from scene_client import Client, Recorder
 
 PLAIN, KNOWN = "without a recorder", "with a recorder, of a known scene"
 NEW = "with a recorder, of a new scene"
@@ -33,15 +33,17 @@ def recording(*, store: Path = Path("model_store"), calls: int = 1000) -> list[R
     processor: dict[str, list[float]] = {KNOWN: [], PLAIN: [], NEW: []}
     with servers.service(store, pinned=False) as started, TemporaryDirectory() as folder:
         url = f"http://127.0.0.1:{started.port}"
-        scene = bodies("12 poses", labels_of(started.port))[0]
+        scene = bodies("12 poses", labels_of(started.port))[0] | {"stamp": _stamp(0)}
         file = Path(folder, "scenes.jsonl")
-        with Client(url) as plain, Client(url, record=file) as recording:
+        recorder = Recorder(file)
+        with Client(url) as plain, Client(url, record=recorder) as recording:
             for turn in range(-calls // 10, calls):
                 # The hour is a part of the content of a scene.
-                other = scene | {"stamp": {"sec": 3600 * (turn + calls), "nanosec": 0}}
-                asked = [(PLAIN, plain, scene), (KNOWN, recording, scene), (NEW, recording, other)]
+                other = scene | {"stamp": _stamp(turn + calls)}
+                asked = [(PLAIN, plain, other), (KNOWN, recording, scene), (NEW, recording, other)]
                 for name, client, body in asked[turn % 3 :] + asked[: turn % 3]:
                     taken, worked = _seconds(client, body)
+                    recorder.flush()  # otherwise its thread would slow down the next call
                     if turn >= 0:
                         seconds[name].append(taken)
                         processor[name].append(worked)
@@ -62,6 +64,10 @@ def recording(*, store: Path = Path("model_store"), calls: int = 1000) -> list[R
         )
         for name in (KNOWN, NEW)
     ]
+
+
+def _stamp(hour: int) -> dict[str, int]:
+    return {"sec": 3600 * hour, "nanosec": 0}
 
 
 def _seconds(client: Client, body: dict[str, Any]) -> tuple[float, float]:

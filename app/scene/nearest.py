@@ -32,7 +32,7 @@ The length counts after Unicode normalisation, which can turn one character into
 comparison grows with the length. All class names have fewer than 32 characters.
 """
 
-_LEAST: Final = 0.6  # minimum similarity of a suggestion
+_LEAST: Final = 0.7  # minimum similarity of a suggestion
 _BY_REST: Final = 0.9  # factor if the first letters differ, because people rarely mistype them
 _SAME_HEAD: Final = 0.5  # minimum similarity of names with the same last word
 _FARTHER: Final = 0.1  # maximum difference of similarity between a suggestion and the best one

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -80,10 +81,22 @@ def test_unknown_labels_are_a_problem_with_suggestions_and_the_first_errors_as_t
     assert "12 errors" in problem.detail
     assert problem.retry_after is None
     assert problem.title in text
-    assert "#/objects/0: the model does not know this label (did you mean night" in text
+    assert ": the model does not know this label (did you mean night" in text
+    for way_out in ("`ignore`", "synonyms", "init --update", "training adapt"):
+        assert way_out in problem.detail
     assert "#/objects/9: " in text
     assert "#/objects/10: " not in text
     assert text.endswith("\n  and 2 more errors")
+
+
+def test_the_error_quotes_unknown_labels(url: str) -> None:
+    unknown = "the model does not know this label"
+    objects = ["bed", {"label": "nonsuch"}, "nightstnad"]
+    with Client(url) as client, pytest.raises(ProblemError) as raised:
+        client.missing(objects)
+    text = str(raised.value)
+    assert re.search(rf'#/objects/1\S*: "nonsuch": {unknown}', text)
+    assert f'#/objects/2: "nightstnad": {unknown} (did you mean nightstand' in text
 
 
 def test_offline_and_online_clients_list_models_alike(url: str, shared_store: Path) -> None:

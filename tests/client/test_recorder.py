@@ -31,7 +31,7 @@ from scene_client import (
     recorder,
 )
 from scene_client.command import app
-from scene_client.recorder import scene_of
+from scene_client.recorded_scene import scene_of
 from scene_client.schemas import MissingRequest
 from tests.conftest import run_program
 from tests.http.stores import VOCABULARY
@@ -48,6 +48,12 @@ def file(tmp_path: Path) -> Path:
 
 def request(*objects: Any, **fields: Any) -> MissingRequest:
     return MissingRequest.model_validate({"objects": list(objects), **fields})
+
+
+def write(file: Path, requests: list[MissingRequest]) -> None:
+    writer = Recorder(file)
+    writer.record(requests)
+    writer.flush()
 
 
 def box(label: str, x: float, y: float, z: float, **more: Any) -> dict[str, Any]:
@@ -124,6 +130,7 @@ def test_a_scene_is_written_again_if_the_request_says_more(file: Path) -> None:
     ]
     for _ in range(3):
         writer.record(said)
+        writer.flush()
     assert [(one.get("room_type"), len(one["objects"])) for one in lines(file)] == [
         (None, 2), ("bedroom", 2), (None, 2), (None, 3), (None, 2)
     ]  # fmt: skip
@@ -142,6 +149,7 @@ def test_moved_objects_are_written_after_a_pause(
 
     def see(x: float) -> int:
         writer.record([request(desk, box("lamp", x, 1.1, 0.25))])
+        writer.flush()
         return len(lines(file))
 
     assert [see(1.2), see(1.3), see(2.8)] == [1, 1, 1]
@@ -154,15 +162,15 @@ def test_moved_objects_are_written_after_a_pause(
 def test_another_run_does_not_repeat_the_last_scenes(file: Path) -> None:
     stated = request("bed", {"label": "lamp", "supported_by": "bed"}, room_type="bedroom")
     complete = request("bed", "desk", relations=[("bed", "left", "desk")], relations_complete=True)
-    Recorder(file).record([stated, complete])
-    Recorder(file).record([complete, stated, request("bed", "desk", "lamp")])
+    write(file, [stated, complete])
+    write(file, [complete, stated, request("bed", "desk", "lamp")])
     assert len(lines(file)) == 3
 
 
 def test_improbable_objects_are_left_out(file: Path) -> None:
     faint = {"id": "cup", "label": "cup", "confidence": 0.49}
     lamp = {"id": "lamp", "label": "lamp", "confidence": 0.5, "supported_by": "cup"}
-    Recorder(file).record([request("bed", faint, lamp, relations=[("cup", "on-top", "bed")])])
+    write(file, [request("bed", faint, lamp, relations=[("cup", "on-top", "bed")])])
     (scene,) = lines(file)
     assert scene["objects"] == [{"id": "bed", "label": "bed"}, {"id": "lamp", "label": "lamp"}]
 
@@ -257,17 +265,52 @@ for n in range(50):
     ]  # fmt: skip
     own = Recorder(file)
 
-    def write(name: str) -> None:
+    def ask(name: str) -> None:
         for n in range(50):
             own.record([request(f"{name} {n}", "lamp")])
 
-    writers += [threading.Thread(target=write, args=(name,)) for name in "de"]
+    writers += [threading.Thread(target=ask, args=(name,)) for name in "de"]
     for writer in writers:
         writer.start()
     for writer in writers:
         writer.join()
+    own.flush()
     first = [scene[0].split(" ")[:2] for scene in labels(file)]
     assert sorted(first) == sorted([name, str(n)] for name in "abcde" for n in range(50))
+
+
+def test_a_forked_process_records_with_its_own_thread(file: Path) -> None:
+    run("""
+writer = Recorder(sys.argv[1])
+writer.record([scene("parent")])
+if not (child := os.fork()):
+    writer.record([scene("child")])
+    writer.flush()
+    os._exit(0)
+os.waitpid(child, 0)
+writer.record([scene("later")])
+""", file)  # fmt: skip
+    assert sorted(scene[0].split()[0] for scene in labels(file)) == ["child", "later", "parent"]
+
+
+def test_a_slow_disk_limits_the_waiting_scenes(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    disk, append = threading.Event(), Recorder._append
+
+    def slow(self: Recorder, scene: dict[str, Any]) -> None:
+        disk.wait(60.0)
+        append(self, scene)
+
+    monkeypatch.setattr(Recorder, "_append", slow)
+    writer = Recorder(file)
+    writer.record([request("bed", f"thing {n}") for n in range(recorder.MOST_WAITING)])
+    more = threading.Thread(target=writer.record, args=([request("bed", "lamp")],))
+    more.start()
+    more.join(0.2)
+    assert more.is_alive()
+    disk.set()
+    more.join(60.0)
+    writer.flush()
+    assert len(lines(file)) == recorder.MOST_WAITING + 1
 
 
 def test_a_killed_writer_leaves_whole_lines(file: Path) -> None:
@@ -301,10 +344,10 @@ def test_a_line_of_a_crash_is_repaired(file: Path) -> None:
         (scene[:-9], 0), (scene, 1), (f"{scene}\n{scene[:40]}", 1), (f"{scene}\n{{", 1), ("", 0)
     ]:  # fmt: skip
         file.write_text(left)
-        Recorder(file).record([request("desk", "lamp")])
+        write(file, [request("desk", "lamp")])
         assert len(lines(file)) == kept + 1
     file.write_text("notes of a person")
-    Recorder(file).record([request("desk", "lamp")])
+    write(file, [request("desk", "lamp")])
     assert file.read_text().startswith("notes of a person\n{")
 
 
@@ -317,9 +360,11 @@ resource.setrlimit(limit, (100_000, resource.RLIM_INFINITY))
 writer = Recorder(sys.argv[1])
 for n in range(20):
     writer.record([scene(n)])
+writer.flush()
 print(os.path.getsize(sys.argv[1]))
 resource.setrlimit(limit, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
 writer.record([scene(19)])
+writer.flush()
 resource.setrlimit(limit, (100_000, resource.RLIM_INFINITY))
 writer.record([scene(20)])
 """, file).splitlines()  # fmt: skip
@@ -337,14 +382,18 @@ def test_a_folder_that_comes_and_goes_disturbs_no_question(
     url: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     file = tmp_path / "later" / "scenes.jsonl"
-    with Client(url, record=file) as scene:
+    writer = Recorder(file)
+    with Client(url, record=writer) as scene:
         for _ in range(3):
             assert scene.missing(["bed", "lamp"]).missing
+            writer.flush()
         file.parent.mkdir()
         scene.missing(["bed", "lamp"])
+        writer.flush()
         assert labels(file) == [["bed", "lamp"]]
         file.rename(tmp_path / "moved.jsonl")
         scene.missing(["bed", "desk"])
+        writer.flush()
         assert labels(file) == [["bed", "desk"]]
         file.unlink()
         file.mkdir()
@@ -356,7 +405,7 @@ def test_a_folder_that_comes_and_goes_disturbs_no_question(
 
 def test_a_pipe_is_no_file(file: Path, caplog: pytest.LogCaptureFixture) -> None:
     os.mkfifo(file)
-    Recorder(file).record([request("bed", "lamp")])
+    write(file, [request("bed", "lamp")])
     assert "not a regular file" in caplog.text
 
 
@@ -366,9 +415,11 @@ def test_a_locked_file_is_left_alone(file: Path, caplog: pytest.LogCaptureFixtur
     with file.open("w") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
         writer.record([request("bed", "lamp")])
+        writer.flush()
     assert "another program has locked the file" in caplog.text
     assert lines(file) == []
     writer.record([request("bed", "lamp")])
+    writer.flush()
     assert labels(file) == [["bed", "lamp"]]
 
 
@@ -377,6 +428,7 @@ def test_the_disk_and_the_memory_have_bounds(file: Path) -> None:
     for n in range(5000):
         writer.record([request("bed", f"thing {n}")])
         writer.record([request("bed", f"thing {n % 2}")])
+    writer.flush()
     assert sorted(file.parent.iterdir()) == [file, file.with_name("scenes.old.jsonl")]
     assert 19_000 < writer.older.stat().st_size <= 20_000
     assert file.stat().st_size <= 20_000
@@ -402,7 +454,7 @@ def test_the_command_records(url: str, file: Path) -> None:
 
 
 def test_the_service_accepts_recorded_scenes(url: str, file: Path) -> None:
-    Recorder(file).record([request(box("bed", 2, 0, 0.25), box("lamp", 2, 1, 0.25))])
+    write(file, [request(box("bed", 2, 0, 0.25), box("lamp", 2, 1, 0.25))])
     (scene,) = lines(file)
     with Client(url) as client:
         answer = client.outliers(scene | {"confirmed": True})

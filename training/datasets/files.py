@@ -43,7 +43,7 @@ def read_lines(path: Path, limit: int) -> Iterator[bytes]:
                     )
                 yield line
     except (OSError, EOFError, zlib.error) as error:
-        raise DatasetError(path, "", f"cannot be read: {error}") from error
+        raise DatasetError.unreadable(path, error) from error
 
 
 def check_size(path: Path, size: int, limit: int) -> None:
@@ -63,7 +63,7 @@ def read_json(path: Path, content: type[T]) -> T:
         check_size(path, path.stat().st_size, MAX_BYTES)
         return TypeAdapter(content).validate_json(path.read_bytes())
     except OSError as error:
-        raise DatasetError(path, "", f"cannot be read: {error}") from error
+        raise DatasetError.unreadable(path, error) from error
     except ValidationError as error:
         raise DatasetError(path, *position_and_problem(error)) from error
 

@@ -31,6 +31,13 @@ class DatasetError(ValueError):
         self.where = where
         self.problem = problem
 
+    @classmethod
+    def unreadable(cls, path: Path, error: Exception) -> DatasetError:
+        """Return the error for a file that is missing or cannot be read."""
+        if isinstance(error, FileNotFoundError):
+            return cls(path, "", "no such file")
+        return cls(path, "", f"cannot be read: {getattr(error, 'strerror', None) or error}")
+
 
 def _of_request(values: Any) -> Any:
     """Return the values of an object {x, y, z}, as in a request; other values as they are."""

@@ -115,7 +115,7 @@ def read_word_vectors(path: Path) -> WordVectors:
     except DatasetError:
         raise
     except _UNREADABLE as error:
-        raise DatasetError(path, "", f"cannot be read: {error}") from error
+        raise DatasetError.unreadable(path, error) from error
     if words.ndim != 1 or words.dtype.kind != "U" or not 0 < len(words) <= MAX_WORDS:
         raise DatasetError(path, "words", f"must be 1 to {MAX_WORDS} strings in one dimension")
     if vectors.dtype != np.int8 or vectors.ndim != 2 or len(vectors) != len(words):

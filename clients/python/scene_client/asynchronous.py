@@ -304,8 +304,10 @@ class AsyncClient:
     # ------------------------------------------------------------------------------- lifetime
 
     async def close(self) -> None:
-        """Close all connections."""
+        """Close all connections, and wait until the recorder has written its scenes."""
         await self._http.aclose()
+        if self._recorder is not None:
+            self._recorder.flush()
 
     async def __aenter__(self) -> Self:
         return self

@@ -71,7 +71,7 @@ class Call(Generic[T]):
             AnswerError: the client cannot read the answer.
         """
         if status != HTTPStatus.OK:
-            problem = problem_of(status, headers, body)
+            problem = problem_of(status, headers, body, self.body)
             if status == HTTPStatus.GATEWAY_TIMEOUT:
                 raise DeadlineError(problem.detail or problem.title, problem.request_id)
             raise problem

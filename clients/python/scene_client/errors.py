@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copyreg
+import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime, timezone
@@ -111,13 +112,17 @@ class AnswerError(ClientError):
     """The client cannot read the answer of the service."""
 
 
-def problem_of(status: int, headers: Mapping[str, str], body: bytes) -> ProblemError:
+def problem_of(
+    status: int, headers: Mapping[str, str], body: bytes, request: str | None = None
+) -> ProblemError:
     """Return the problem of a response with an error status.
 
     Args:
         status: HTTP status.
         headers: headers of the response, with lower-case names.
         body: body of the response.
+        request: body of the request. The messages of unknown labels quote the labels from it,
+            because the service never repeats text of a request.
     """
     try:
         problem = Problem.model_validate_json(body, extra="ignore")
@@ -137,11 +142,38 @@ def problem_of(status: int, headers: Mapping[str, str], body: bytes) -> ProblemE
         status,
         problem.title,
         problem.detail,
-        errors=problem.errors or (),
+        errors=_quoted(problem, request),
         failures=problem.failures or (),
         request_id=problem.request_id,
         retry_after=_seconds(headers.get("retry-after", "")),
     )
+
+
+def _quoted(problem: Problem, request: str | None) -> Sequence[FieldError]:
+    """Return the errors of a problem. The messages of unknown labels quote the labels."""
+    errors = problem.errors or ()
+    if problem.type != "/problems/unknown-labels" or request is None:
+        return errors
+    body = json.loads(request)
+    return [
+        error.model_copy(
+            update={"message": f"{json.dumps(label, ensure_ascii=False)}: {error.message}"}
+        )
+        if (label := _label_at(body, error.pointer))
+        else error
+        for error in errors
+    ]
+
+
+def _label_at(body: Any, pointer: str) -> str | None:
+    """Return the label at a JSON pointer, or of the object there."""
+    with suppress(LookupError, TypeError, ValueError):
+        for part in pointer.split("/")[1:]:
+            name = part.replace("~1", "/").replace("~0", "~")
+            body = body[int(name)] if isinstance(body, list) else body[name]
+        label = body["label"] if isinstance(body, dict) else body
+        return label if isinstance(label, str) else None
+    return None
 
 
 def _seconds(retry_after: str) -> float | None:

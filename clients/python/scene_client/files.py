@@ -120,7 +120,7 @@ def _bytes(name: str) -> bytes:
                 text = file.read(MAX_FILE + 1)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise MessageError(f"cannot read {name}: {reason}") from None
+        raise MessageError(f"{name}: {str(reason).lower()}") from None
     if len(text) > MAX_FILE:
         raise MessageError(f"{name} is too large: it has more than {MAX_FILE} bytes")
     return text

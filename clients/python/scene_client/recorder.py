@@ -9,20 +9,21 @@ from __future__ import annotations
 import errno
 import json
 import logging
-import math
 import os
 import stat
 import threading
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from secrets import token_hex
-from time import localtime, monotonic, sleep, strftime, time_ns
+from time import monotonic, sleep
 from typing import TYPE_CHECKING, Any, Final
 
+from pydantic_core import to_json
+
 from scene_client.errors import InvalidRequestError
-from scene_client.frames import body_pose, is_optical, is_world_fixed
+from scene_client.recorded_scene import ON_TOP, Time, Triple, likely, scene_of, time_of
 
 try:
     import fcntl
@@ -30,13 +31,10 @@ except ImportError:  # Windows, where only one process may write a file
     fcntl = None  # type: ignore[assignment]
 
 if TYPE_CHECKING:
-    from scene_client.schemas import Detection, SceneRequest, Viewpoint
+    from scene_client.schemas import Detection, SceneRequest
 
 MOST_BYTES: Final = 64 * 2**20
 """Default for the maximum size of the file. The older file has at most the same size."""
-
-LEAST_CONFIDENCE: Final = 0.5
-"""Objects with a lower confidence are left out of a scene."""
 
 LEAST_OBJECTS: Final = 2
 """Scenes with fewer objects are not written, because they show no objects that occur together."""
@@ -49,6 +47,9 @@ PAUSE: Final = 60.0
 
 REMEMBERED: Final = 4096
 """Number of remembered hashes. Each scene has a hash of its labels, and up to two further ones."""
+
+MOST_WAITING: Final = 64
+"""Maximum number of scenes that wait for the thread. Then `record` waits for the oldest scene."""
 
 # A named pipe must not block, and Windows must not convert line ends.
 _OF_THE_SYSTEM: Final = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
@@ -65,6 +66,8 @@ class Recorder:
 
     A scene is written if its labels are new within the hour, or its room type, its stated
     relations, or the places of its objects. For new places alone, `PAUSE` must have passed.
+
+    `record` only decides which scenes are new. One thread of the recorder converts and writes them.
 
     If the file would become larger than `most_bytes`, it becomes the older file: ``scenes.jsonl``
     is renamed to ``scenes.old.jsonl``, and an earlier older file is deleted. An error never reaches
@@ -88,34 +91,55 @@ class Recorder:
         # Hashes of the newest scenes, in order of use, with a hash of the places and the time of
         # the last comparison of places.
         self._recent: OrderedDict[int, tuple[int, float]] = OrderedDict()
-        self._lock, self._process = threading.Lock(), os.getpid()
         self._is_failing = False
+        self._start()
         self._recall()
 
     def record(self, requests: Iterable[SceneRequest]) -> None:
-        """Write the new scenes among those of the requests."""
-        if self._process != os.getpid():  # a fork may have copied a locked lock
-            self._lock, self._process = threading.Lock(), os.getpid()
+        """Write the new scenes among those of the requests, in the thread of the recorder."""
+        if self._process != os.getpid():
+            self._start()
         for request in requests:
-            try:
-                self._record(request)
-            except (OSError, ValueError) as error:
-                if not self._is_failing:
-                    _logger.warning("cannot record scenes in %s: %s", self.path, error)
-                self._is_failing = True
-
-    def _record(self, request: SceneRequest) -> None:
-        entries = _likely(request)
-        labels = [entry if isinstance(entry, str) else entry.label for entry in entries]
-        if len(labels) < LEAST_OBJECTS:
-            return
-        hour, _ = _time_of(request)
-        hashes = _hashes(hour, labels, request.room_type, _stated(request, entries))
-        with self._lock:
-            if self._is_new(hashes, request):
-                self._append(scene_of(request))
+            time, entries = time_of(request), likely(request)
+            labels = [entry if isinstance(entry, str) else entry.label for entry in entries]
+            if len(labels) < LEAST_OBJECTS:
+                continue
+            hashes = _hashes(time[0], labels, request.room_type, _stated(request, entries))
+            with self._lock:
+                if not self._is_new(hashes, request):
+                    continue
                 self._remember(hashes, _places(request))
-                self._is_failing = False
+            self._waiting.acquire()
+            try:
+                self._thread.submit(self._write, request, time, hashes)
+            except RuntimeError:  # no thread can start, for example at the end of the program
+                self._write(request, time, hashes)
+
+    def flush(self) -> None:
+        """Wait until the scenes are written. The end of the program waits too."""
+        if self._process == os.getpid():
+            with suppress(RuntimeError):  # no thread can start, so no scene waits
+                self._thread.submit(int).result()
+
+    def _start(self) -> None:
+        """Make a thread and its locks. After a fork, the locks may be locked without a thread."""
+        self._process, self._lock = os.getpid(), threading.Lock()
+        self._thread = ThreadPoolExecutor(1, "scene-recorder")
+        self._waiting = threading.Semaphore(MOST_WAITING)
+
+    def _write(self, request: SceneRequest, time: Time, hashes: Sequence[int]) -> None:
+        try:
+            self._append(scene_of(request, time))
+            self._is_failing = False
+        except (OSError, ValueError) as error:
+            if not self._is_failing:
+                _logger.warning("cannot record scenes in %s: %s", self.path, error)
+            self._is_failing = True
+            with self._lock:
+                for key in hashes:
+                    self._recent.pop(key, None)
+        finally:
+            self._waiting.release()
 
     def _is_new(self, hashes: Sequence[int], request: SceneRequest) -> bool:
         if not all(key in self._recent for key in hashes):
@@ -151,7 +175,7 @@ class Recorder:
 
     def _append(self, scene: dict[str, Any]) -> None:
         """Append a scene to the file, or to a new file if this file would become too large."""
-        line = (json.dumps(scene, ensure_ascii=False, separators=(",", ":")) + "\n").encode()
+        line = to_json(scene) + b"\n"
         if len(line) > _LONGEST_LINE:
             raise ValueError(f"a scene has more than {_LONGEST_LINE} bytes")
         with _locked(self.path) as file:
@@ -178,12 +202,12 @@ def _locked(path: Path) -> Iterator[int]:
     while True:
         file = os.open(path, _FLAGS, 0o600)
         try:
-            if not stat.S_ISREG(os.fstat(file).st_mode):
-                raise OSError(errno.EINVAL, "not a regular file")
             if _lock(file, path):
                 yield file
                 return
         finally:
+            if fcntl is not None:  # a fork in another thread may keep a copy of the open file
+                fcntl.flock(file, fcntl.LOCK_UN)
             os.close(file)
         if monotonic() >= ends:
             raise OSError(errno.EWOULDBLOCK, "another program has locked the file")
@@ -195,7 +219,10 @@ def _lock(file: int, path: Path) -> bool:
     try:
         if fcntl is not None:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return os.path.samestat(os.fstat(file), path.stat())
+        status = os.fstat(file)
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError(errno.EINVAL, "not a regular file")
+        return os.path.samestat(status, path.stat())
     except (BlockingIOError, FileNotFoundError):
         return False
 
@@ -230,128 +257,6 @@ def _write(file: int, size: int, line: bytes) -> None:
     if os.write(file, line) < len(line):
         os.ftruncate(file, size)
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
-# --------------------------------------------------------------------------------- the scene
-
-
-def scene_of(request: SceneRequest) -> dict[str, Any]:
-    """Return the scene of a request in the training format.
-
-    Positions are in the axes of the viewer, except in world-fixed frames without a viewpoint. The
-    training takes unlisted relations for false, so relations are listed only if the request states
-    all of them. Otherwise, on-top becomes `supported_by`, and the other relations are left out.
-    """
-    hour, stamp = _time_of(request)
-    scene: dict[str, Any] = {"scene_id": f"{hour}-{token_hex(8)}", "group": hour}
-    if request.room_type is not None:
-        scene["room_type"] = request.room_type
-    entries = _likely(request)
-    optical = is_optical(request.frame_id)
-    objects = {
-        name: _object(name, entry, request.viewpoint, optical=optical)
-        for name, entry in zip(_ids(entries), entries, strict=True)
-    }
-    labels = Counter(thing["label"] for thing in objects.values())
-    names = {thing["label"]: name for name, thing in objects.items() if labels[thing["label"]] == 1}
-    names |= {name: name for name in objects}
-    relations = [
-        [names[one.subject], one.relation, names[one.object]]
-        for one in request.relations or ()
-        if one.subject in names and one.object in names
-    ]
-    for subject, relation, anchor in () if request.relations_complete else relations:
-        if relation in _ON_TOP:
-            upper, lower = (subject, anchor) if relation == "on-top" else (anchor, subject)
-            objects[upper].setdefault("supported_by", lower)
-    for thing in objects.values():
-        if "supported_by" in thing and (support := names.get(thing.pop("supported_by"))):
-            thing["supported_by"] = support
-    scene["objects"] = list(objects.values())
-    if request.relations_complete:
-        supports = [
-            [thing["id"], "on-top", thing["supported_by"]]
-            for thing in objects.values()
-            if "supported_by" in thing
-        ]
-        scene["relations"] = relations + [one for one in supports if one not in relations]
-    if any("position" in thing for thing in scene["objects"]):
-        has_viewer = request.viewpoint is not None or not is_world_fixed(request.frame_id)
-        scene["viewer_frame"] = has_viewer
-    return scene | {"stamp": stamp}
-
-
-Triple = tuple[str, str, str]
-_ON_TOP: Final = ("on-top", "under")
-
-
-def _time_of(request: SceneRequest) -> tuple[str, dict[str, int]]:
-    """Return the hour in local time, which is the group of the scene, and the stamp."""
-    if request.stamp is None:
-        second, nanosecond = divmod(time_ns(), 10**9)
-    else:
-        second, nanosecond = request.stamp.sec, request.stamp.nanosec
-    return strftime("%Y-%m-%dT%H", localtime(second)), {"sec": second, "nanosec": nanosecond}
-
-
-def _likely(request: SceneRequest) -> list[str | Detection]:
-    """Return the objects that are recorded."""
-    return [
-        entry
-        for entry in request.objects
-        if isinstance(entry, str) or entry.confidence >= LEAST_CONFIDENCE
-    ]
-
-
-def _ids(objects: Sequence[str | Detection]) -> list[str]:
-    """Return distinct ids, as the service chooses them."""
-    stated = [None if isinstance(entry, str) else entry.id for entry in objects]
-    labels = [entry if isinstance(entry, str) else entry.label for entry in objects]
-    used = {name for name in stated if name is not None}
-    bare = Counter(label for label, name in zip(labels, stated, strict=True) if name is None)
-    ids = []
-    for name, label in zip(stated, labels, strict=True):
-        own, number = label if name is None else name, 0
-        while name is None and (own in used or (bare[label] > 1 and not number)):
-            number += 1
-            own = f"{label}_{number}"
-        used.add(own)
-        ids.append(own)
-    return ids
-
-
-def _object(
-    name: str, entry: str | Detection, view: Viewpoint | None, *, optical: bool
-) -> dict[str, Any]:
-    """Return an object in the training format. `supported_by` is an id or a label."""
-    if isinstance(entry, str):
-        return {"id": name, "label": entry}
-    thing: dict[str, Any] = {"id": name, "label": entry.label}
-    size = None if entry.size is None else (entry.size.x, entry.size.y, entry.size.z)
-    yaw = 0.0
-    if (centre := entry.position) is not None:
-        turn = None
-        if entry.yaw is not None:
-            turn = (0.0, 0.0, math.sin(entry.yaw / 2), math.cos(entry.yaw / 2))
-        elif (q := entry.orientation) is not None:
-            turn = (q.x, q.y, q.z, q.w)
-        place, size, yaw = body_pose((centre.x, centre.y, centre.z), size, turn, optical=optical)
-        if view is not None:
-            cos, sin = math.cos(view.yaw), math.sin(view.yaw)
-            x, y = place[0] - view.x, place[1] - view.y
-            place, yaw = (x * cos + y * sin, y * cos - x * sin, place[2]), yaw - view.yaw
-        thing["position"] = _rounded(place)
-    if size is not None:
-        thing["size"] = _rounded(size)
-    if yaw:
-        thing["yaw"] = round(math.remainder(yaw, math.tau), 4)
-    if entry.supported_by is not None:
-        thing["supported_by"] = entry.supported_by
-    return thing
-
-
-def _rounded(vector: Iterable[float]) -> list[float]:
-    return [round(value, 4) + 0.0 for value in vector]  # 0.0 in place of -0.0
 
 
 # ------------------------------------------------------------------------------ known scenes
@@ -394,7 +299,7 @@ def _stated(request: SceneRequest, entries: Sequence[str | Detection]) -> list[T
         subject, anchor = (label_of.get(name, name) for name in (one.subject, one.object))
         if request.relations_complete:
             relations.append((subject, one.relation, anchor))
-        elif one.relation in _ON_TOP:
+        elif one.relation in ON_TOP:
             upper, lower = (subject, anchor) if one.relation == "on-top" else (anchor, subject)
             relations.append((upper, "on-top", lower))
     return relations
@@ -404,7 +309,7 @@ def _places(request: SceneRequest) -> int:
     """Return a hash of the labels and their cells."""
     cells = [
         (entry.label, at.x // STEP, at.y // STEP, at.z // STEP)
-        for entry in _likely(request)
+        for entry in likely(request)
         if not isinstance(entry, str) and (at := entry.position) is not None
     ]
     return hash(tuple(sorted(cells)))

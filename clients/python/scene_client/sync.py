@@ -305,8 +305,10 @@ class Client:
     # ------------------------------------------------------------------------------- lifetime
 
     def close(self) -> None:
-        """Close all connections."""
+        """Close all connections, and wait until the recorder has written its scenes."""
         self._http.close()
+        if self._recorder is not None:
+            self._recorder.flush()
 
     def __enter__(self) -> Self:
         return self

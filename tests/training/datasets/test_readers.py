@@ -286,8 +286,8 @@ def test_3dssg_whole(tmp_path: Path) -> None:
 def test_3dssg_needs_its_other_files(tmp_path: Path) -> None:
     path = write_json(tmp_path / "relationships.json", WHOLE)
     for file, content, message in (
-        ("other.json", [], r"3RScan\.json: cannot be read"),
-        ("3RScan.json", RESCANS, r"objects\.json: cannot be read"),
+        ("other.json", [], r"3RScan\.json: no such file"),
+        ("3RScan.json", RESCANS, r"objects\.json: no such file"),
         ("objects.json", {"scans": []}, r"scans\.0: scan room-2 is not in objects\.json"),
         ("objects.json", OBJECTS, None),
         ("3RScan.json", RESCANS[:1], r"scans\.0: scan room-2 is not in 3RScan\.json"),
@@ -596,7 +596,7 @@ def test_malformed_rows(tmp_path: Path, row: str, message: str) -> None:
 
 
 def test_files_that_are_no_table(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match=r"none\.tsv\.gz: cannot be read"):
+    with pytest.raises(DatasetError, match=r"none\.tsv\.gz: no such file"):
         read_prior_scenes(tmp_path / "none.tsv.gz")
     with pytest.raises(DatasetError, match="line 1: must name the columns source, subject"):
         read_prior_scenes(table(tmp_path, head="a\tb"))

@@ -122,7 +122,7 @@ def test_training_data_is_no_outside_test(tmp_path):
         ("rooms.jsonl", '{"label": 1}', "line 1: objects: Field required"),
         ("places.tsv", "", "places.tsv: no row has a room and the relation on-top or inside"),
         ("places.tsv", "thing\tplace\n", "line 1: must name the columns source, subject"),
-        ("places.tsv", None, "cannot be read"),
+        ("places.tsv", None, "no such file"),
     ],
 )
 def test_files_that_are_no_test(tmp_path, name, text, message):

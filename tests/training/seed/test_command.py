@@ -122,7 +122,7 @@ def test_errors_are_named(finished, tmp_path, monkeypatch):
     arguments, folder, _ = finished
     again = (*arguments, 1, "--out", folder.parent)
     assert "other scenes or settings" in invoke(*again, "--epochs", 3, code=1)
-    assert "cannot be read" in invoke("seed", "nowhere", "--data", tmp_path, code=1)
+    assert "no such file" in invoke("seed", "nowhere", "--data", tmp_path, code=1)
     large = (*arguments, 1, "--out", tmp_path, "--learning-rate", 1000)
     assert "scenes, rbm, seed 0: training diverged in epoch 1" in invoke(*large, code=1)
 
