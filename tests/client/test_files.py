@@ -80,7 +80,7 @@ def test_a_file_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
         (b"PK\x03\x04\0", "is compressed"),
         (b"\x1f\x8b\0", "is compressed"),
         (b"\xff\xfe\0", "no other text"),
-        (None, "cannot read"),
+        (None, "no such file"),
     ],
 )
 def test_other_contents_are_refused(tmp_path: Path, content: bytes | None, words: str) -> None:

@@ -135,7 +135,7 @@ def test_errors_name_the_reason(store, tmp_path):
     assert "broken.jsonl, line 2" in adapt(store, broken, code=1)
     others = [{"objects": ["bed"], "source": source, "scene_id": source} for source in "ab"]
     assert "several homes (a, b)" in adapt(store, write(others, tmp_path / "two.jsonl"), code=1)
-    assert "cannot be read" in adapt(store, tmp_path / "missing.jsonl", code=1)
+    assert "missing.jsonl: no such file" in adapt(store, tmp_path / "missing.jsonl", code=1)
 
 
 @pytest.mark.slow
