@@ -118,6 +118,7 @@ class Store:
             StoreError: the reference does not resolve (see `resolve_reference`), or the code is
                 `invalid_aliases` or `unreadable`.
         """
+        self.names()  # without a readable root, no name is unknown
         return resolve_reference(reference, self.aliases(), self.versions)
 
     def load(self, name: str, version: str, previous: Artifact | None = None) -> Artifact:
