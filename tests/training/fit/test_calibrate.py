@@ -102,14 +102,16 @@ def test_every_entry_is_fitted(fitted):
     assert fitted.popularity == pytest.approx(popularity, abs=1e-4)
 
 
-def test_chosen_values_are_copied_and_a_seed_gives_the_same_calibration(model, fitted):
+def test_chosen_values_are_copied(model, fitted):
     chosen = fitted.model_copy(update={"coverage": 0.15, "popularity_weight": 0.25})
-    first, again = (
-        calibrate(model, data_of(rooms(60, 1)), CONFIG, chosen=chosen) for _ in range(2)
-    )
-    assert (first.coverage, first.popularity_weight) == (0.15, 0.25)
-    assert first.missing != fitted.missing
-    assert again == first
+    again = calibrate(model, data_of(rooms(60, 1)), CONFIG, chosen=chosen)
+    assert (again.coverage, again.popularity_weight) == (0.15, 0.25)
+    assert again.missing != fitted.missing
+
+
+@pytest.mark.slow
+def test_a_seed_gives_the_same_calibration(model, fitted):
+    assert calibrate(model, data_of(rooms(200, 1)), CONFIG) == fitted
 
 
 # ------------------------------------------------------------------------------- scenes of the fits
