@@ -27,7 +27,7 @@ from app.scene import CANONICAL
 from training.datasets.array_types import Flags, Floats, Ints
 from training.domain.confirmed_relations import with_confirmed
 from training.domain.home import Home, alarms_of, with_exceptions
-from training.fit.adapt import adapt, home_loss
+from training.fit.adapt import adapt, part_loss
 from training.fit.objects import random_parts
 from training.machines.arrays import machine_of
 
@@ -107,7 +107,7 @@ def adapted(
         objections = tuple(measured.objections())
         if not objections:
             progress("adapting to all scenes")
-            weights = adapt(artifact.weights, home.tensors, known=home.known, seed=seed)
+            weights = adapt(artifact.weights, home.tensors, known=home.learnt, seed=seed)
             artifact = replace(artifact, weights=weights)
     exceptions = home.confirmed_alarms(artifact)
     news = (exceptions, home.relations, home.new_classes, home.new_rooms)
@@ -136,7 +136,7 @@ def measure(home: Home, seed: int, progress: Callable[[str], None]) -> Measured:
         progress(f"comparing in folds: {fold + 1} of {_FOLDS}")
         held_out, seen = index[fold_of == fold], index[fold_of != fold]
         scenes = home.tensors.rows(torch.from_numpy(seen))
-        weights = adapt(home.parent.weights, scenes, known=home.known, seed=seed)
+        weights = adapt(home.parent.weights, scenes, known=home.learnt, seed=seed)
         sides = home.parent, replace(home.parent, weights=weights)
         loss.append(_losses(home, held_out, sides, seed))
         rank.append(_ranks(home, held_out, sides, seed))
@@ -160,7 +160,8 @@ def _losses(home: Home, index: Ints, sides: Sides, seed: int) -> Floats:
         parts = random_parts(scenes.v, _LEAVE_ONE_OUT, generator)
         for column, side in enumerate(sides):
             machine = machine_of(side.weights)
-            table[:, column] += home_loss(machine, scenes, parts, scenes.room) / _PARTS
+            log_odds = machine.object_log_odds(parts.listed, room=scenes.room, share=parts.share)
+            table[:, column] += part_loss(log_odds, scenes.v, scenes, parts) / _PARTS
     return table.numpy()
 
 

@@ -24,7 +24,7 @@ from training.datasets import AnnotatedScene
 from training.datasets.array_types import Ints
 from training.datasets.vocabulary import curated_names
 from training.domain.confirmed_relations import Triple, reported_relations
-from training.fit.adapt import HomeScenes
+from training.fit.adapt import HomeScenes, Known
 from training.fit.extend import extended
 
 JUDGED = 3
@@ -95,6 +95,13 @@ class Home:
         relations = frozenset(reported_relations(parent, recorded))
         distinct = tuple(read for read, _ in scenes.values())
         return cls(parent, known, distinct, len(recorded), left_out, relations)
+
+    @property
+    def learnt(self) -> Known:
+        """What the model knows: not the new classes and room types, nor its rare classes."""
+        classes = torch.from_numpy(~self.parent.rarely_shown)
+        classes[self.known[0] :] = False
+        return Known(classes, self.known[1])
 
     @property
     def new_classes(self) -> tuple[str, ...]:

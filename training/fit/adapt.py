@@ -3,15 +3,20 @@
 The weights change little where the home says little. δ is the change of the bias of each class, and
 Δ is the change of the rows of W of the recorded classes. The fit minimises
 
-    sum over recorded scenes of [BCE(hidden classes | listed) - log p(t | listed)]
-    + 2 n · mean over stored samples of the cross-entropy of the parent's answers and the new ones
+    n · [mean over parts of recorded scenes of (BCE(hidden classes | listed) - log p(t | listed))
+         + 2 · mean over parts of stored samples of the cross-entropy of the parent and the home]
     + ρ_δ |δ|² + ρ_Δ |Δ|²
 
 - Random parts of the n recorded scenes ask for the rest, as in training (`training.fit.objects`).
 - The second line is distillation: random parts of the samples that the artifact stores ask both
   machines for unlisted classes and room types. Without this line, the machine forgets other rooms.
-- The parent does not know the new classes (`training.fit.extend`). So they have no part in the
-  distillation, and the prior of their biases is weak.
+- Few scenes without a class k do not prove that the home lacks it. Let the parent expect the class
+  in E_k of the n scenes. If no scene shows it, its target is the answer of the parent, divided by
+  1 + E_k. The factor is the posterior mean of a rate with the prior exp(-rate), given no event
+  where E_k were expected.
+- The parent does not know new classes (`training.fit.extend`), and hardly knows rare ones. The
+  recorded ones among them have no part in the distillation. The prior of their biases is weak, and
+  their biases start at least at the log-odds of the share of scenes that show the class.
 
 Source of the distillation: Li and Hoiem, "Learning without forgetting" (2016).
 """
@@ -22,21 +27,34 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import binary_cross_entropy_with_logits, nll_loss
+from torch.nn.functional import binary_cross_entropy_with_logits, one_hot
 
 from app.inference import Weights
 from training.fit.objects import Parts, random_parts
-from training.machines import BoltzmannMachine
 from training.machines.arrays import machine_of, weights_of
 
 _STEPS = 80
 _RATE = 0.03
-_BATCH, _DISTILLED = 128, 64  # parts in a step: of recorded scenes, and of stored samples
+_BATCH, _DISTILLED = 96, 48  # parts in a step: of recorded scenes, and of stored samples
 _LEAVE_ONE_OUT = 0.3
 _DISTILLATION = 2.0  # weight of a part of a stored sample, in parts of recorded scenes
 _ROOM_SHARE = 0.5  # share of the parts that list their room type
+_REPEATS = 4  # random parts of each recorded scene that give E_k
 # Precisions of the normal priors: of biases, of biases of new classes, and of other weights.
 _BIAS, _NEW_BIAS, _WEIGHT = 3.0, 0.03, 0.3
+
+
+@dataclass(frozen=True)
+class Known:
+    """What the parent knows of its V classes and C room types.
+
+    Attributes:
+        classes: True for the classes that its training scenes show often enough, (V,) bool.
+        rooms: number of room types that it learnt. The later ones are new.
+    """
+
+    classes: Tensor
+    rooms: int
 
 
 @dataclass(frozen=True)
@@ -62,7 +80,7 @@ class HomeScenes:
 
 
 def adapt(
-    parent: Weights, scenes: HomeScenes, *, known: tuple[int, int] | None = None, seed: int = 0
+    parent: Weights, scenes: HomeScenes, *, known: Known | None = None, seed: int = 0
 ) -> Weights:
     """Return the weights of a machine that knows the home.
 
@@ -70,8 +88,7 @@ def adapt(
 
     Args:
         parent: weights of V classes and C room types, with stored samples.
-        known: number of classes and of room types that the parent learnt. The later ones are new.
-            None means that all are known.
+        known: what the parent knows. None means everything.
 
     Raises:
         ValueError: no scene has two classes, or the parent stores no samples.
@@ -81,106 +98,116 @@ def adapt(
         raise ValueError("no recorded scene has two known objects")
     if not parent.spec.N:
         raise ValueError("the model stores no samples, so its other rooms would be forgotten")
-    spec = parent.spec
-    fit = _Fit(parent, scenes, known or (spec.V, spec.C), seed)
+    everything = Known(torch.ones(parent.spec.V, dtype=torch.bool), parent.spec.C)
+    fit = _Fit(parent, scenes, known or everything, seed)
     for _ in range(_STEPS):
         fit.step()
     return weights_of(fit.machine)
 
 
-def home_loss(machine: BoltzmannMachine, scenes: HomeScenes, parts: Parts, room: Tensor) -> Tensor:
-    """Return the log loss of the classes that random parts of N scenes do not list, (N,)."""
-    log_odds = machine.object_log_odds(parts.listed, room=room, share=parts.share)
-    hidden = scenes.v - parts.listed
+def part_loss(log_odds: Tensor, target: Tensor, scenes: HomeScenes, parts: Parts) -> Tensor:
+    """Return the cross-entropy of the classes that random parts of N scenes do not list, (N,).
+
+    Args:
+        log_odds: answers of a machine about the parts, (N, V).
+        target: probabilities of the classes, (N, V).
+    """
     weight = scenes.asked * (1 - parts.listed)
-    weight = weight * torch.where(hidden > 0, parts.weight.unsqueeze(1), 1.0)
-    loss = binary_cross_entropy_with_logits(log_odds, hidden, weight, reduction="none")
-    return loss.sum(1)
+    weight = weight * torch.where(scenes.v > 0, parts.weight.unsqueeze(1), 1.0)
+    return binary_cross_entropy_with_logits(log_odds, target, weight, reduction="none").sum(1)
 
 
 class _Fit:
     """The fit of one home. `known`: see `adapt`."""
 
-    def __init__(
-        self, parent: Weights, scenes: HomeScenes, known: tuple[int, int], seed: int
-    ) -> None:
-        self.parent, self.scenes, self.known = machine_of(parent), scenes, known
+    def __init__(self, parent: Weights, scenes: HomeScenes, known: Known, seed: int) -> None:
+        self.parent, self.scenes = machine_of(parent), scenes
         self.machine = machine_of(weights_of(self.parent))
-        samples = torch.from_numpy(parent.scenes)
-        several = samples.sum(1) >= 2
-        self._samples = samples[several]
-        self._sample_rooms = torch.from_numpy(parent["fantasy_rooms"]).long()[several]
         self._generator = torch.Generator().manual_seed(seed)
-        self._changes = self._changing()
+        self._recorded = (scenes.v > 0).any(0)
+        new = self._recorded & ~known.classes
+        samples = torch.from_numpy(parent.scenes)
+        rooms = torch.from_numpy(parent["fantasy_rooms"]).long()
+        self._samples = HomeScenes(samples, (~new).expand_as(samples), rooms)
+        self._samples = self._samples.rows(samples.sum(1) >= 2)
+        self._kept = 1 / (1 + self._expected())
+        self._changes = self._changing(new, known.rooms)
+        self._start = {weight: weight.clone() for weight in self._changes}
+        share = scenes.v.sum(0) / (scenes.asked.sum(0) + 1)
+        self.machine.b[new] = self.machine.b.maximum(share.logit())[new]
         for weight in self._changes:
             weight.requires_grad_(True)
-        self._start = {weight: weight.detach().clone() for weight in self._changes}
         self._optimiser = torch.optim.Adam(self._changes, lr=_RATE)
 
-    def _changing(self) -> dict[Tensor, Tensor]:
-        """Return the weights that change, with the precisions of their entries; inf is constant."""
-        machine, (V, C) = self.machine, self.known
-        recorded = (self.scenes.v > 0).any(0)
-        bias = torch.full_like(machine.b, _BIAS)
-        bias[V:] = _NEW_BIAS
-        rows = torch.where(recorded, _WEIGHT, torch.inf).unsqueeze(1).expand_as(machine.W)
+    def _expected(self) -> Tensor:
+        """Return in how many recorded scenes the parent expects each class, (V,)."""
+        several = self.scenes.rows(torch.arange(len(self.scenes)).repeat(_REPEATS))
+        parts = random_parts(several.v, _LEAVE_ONE_OUT, self._generator)
+        p = self.parent.object_log_odds(parts.listed, room=several.room, share=parts.share)
+        return (several.asked * p.sigmoid()).sum(0) / _REPEATS
+
+    def _changing(self, new: Tensor, C: int) -> dict[Tensor, Tensor]:
+        """Return the weights that change, with the precisions of their entries; 0 is constant."""
+        machine = self.machine
+        bias = torch.where(new, _NEW_BIAS, _BIAS)
+        rows = torch.where(self._recorded, _WEIGHT, 0.0).unsqueeze(1).expand_as(machine.W)
         changes: dict[Tensor, Tensor] = {machine.b: bias, machine.W: rows}
         if machine.spec.C > C:
             named = {"e": _NEW_BIAS, "Q": _WEIGHT, "Y": _WEIGHT}
             for name in ("e", "Q", "Y") if machine.spec.coupled else ("e", "Q"):
                 weight = machine.get_parameter(name)
-                table = torch.full_like(weight, torch.inf)
+                table = torch.zeros_like(weight)
                 table[C:] = named[name]
                 changes[weight] = table
         return changes
 
     def step(self) -> None:
         """Update the weights by one batch."""
-        loss = self._home_loss() + _DISTILLATION * self._distillation()
-        loss = len(self.scenes) * loss + self._prior()
+        loss = len(self.scenes) * self._batch_loss() + self._prior()
         self._optimiser.zero_grad()
         loss.backward()
         for weight, precision in self._changes.items():
             if weight.grad is not None:
-                weight.grad[precision.isinf()] = 0
+                weight.grad[precision == 0] = 0
         self._optimiser.step()
 
-    def _home_loss(self) -> Tensor:
-        index = torch.randint(len(self.scenes), (_BATCH,), generator=self._generator)
-        scenes = self.scenes.rows(index)
+    def _batch_loss(self) -> Tensor:
+        """Return the loss of parts of recorded scenes, followed by parts of stored samples."""
+        scenes = _joined(
+            self._draw(self.scenes, _BATCH),
+            self._draw(self._samples, _DISTILLED),
+        )
+        of_home = (torch.arange(len(scenes)) < _BATCH).unsqueeze(1)
+        scale = torch.where(of_home.squeeze(1), 1 / _BATCH, _DISTILLATION / _DISTILLED)
         parts = random_parts(scenes.v, _LEAVE_ONE_OUT, self._generator)
-        room = self._some_rooms(scenes.room)
-        loss = home_loss(self.machine, scenes, parts, room).mean()
-        asked = (scenes.room >= 0) & (room < 0)
-        if bool(asked.any()):
-            log_p = self.machine.room_log_p(parts.listed[asked])
-            loss = loss + nll_loss(log_p, scenes.room[asked], reduction="sum") / _BATCH
-        return loss
-
-    def _distillation(self) -> Tensor:
-        index = torch.randint(len(self._samples), (_DISTILLED,), generator=self._generator)
-        parts = random_parts(self._samples[index], _LEAVE_ONE_OUT, self._generator)
-        room = self._some_rooms(self._sample_rooms[index])
-        V = self.known[0]
-        p, log_odds = (
-            machine.object_log_odds(parts.listed, room=room, share=parts.share)[:, :V]
+        listed_room = torch.rand(len(scenes), generator=self._generator) < _ROOM_SHARE
+        room = torch.where(listed_room, scenes.room, -1)
+        of_parent, log_odds = (
+            machine.object_log_odds(parts.listed, room=room, share=parts.share)
             for machine in (self.parent, self.machine)
         )
-        weight = 1 - parts.listed[:, :V]
-        loss = binary_cross_entropy_with_logits(log_odds, p.sigmoid(), weight, reduction="sum")
-        if self.machine.spec.C:
-            listed = parts.listed[room < 0]
-            of_parent, log_p = (side.room_log_p(listed) for side in (self.parent, self.machine))
-            loss = loss - (of_parent.exp() * log_p).sum()
-        return loss / _DISTILLED
+        p, present = of_parent.sigmoid(), scenes.v - parts.listed
+        target = torch.where(of_home, torch.where(self._recorded, present, self._kept * p), p)
+        loss = (scale * part_loss(log_odds, target, scenes, parts)).sum()
+        asked = (room < 0) & (scenes.room >= 0)
+        if bool(asked.any()):
+            p, log_p = (
+                machine.room_log_p(parts.listed[asked]) for machine in (self.parent, self.machine)
+            )
+            true = one_hot(scenes.room[asked], self.machine.spec.C)
+            target = torch.where(of_home[asked], true, p.exp())
+            loss = loss - (scale[asked].unsqueeze(1) * target * log_p).sum()
+        return loss
+
+    def _draw(self, scenes: HomeScenes, size: int) -> HomeScenes:
+        return scenes.rows(torch.randint(len(scenes), (size,), generator=self._generator))
 
     def _prior(self) -> Tensor:
         total = torch.zeros(())
         for weight, precision in self._changes.items():
-            change = torch.where(precision.isinf(), 0.0, weight - self._start[weight])
-            total = total + (precision.nan_to_num(posinf=0.0) * change**2).sum()
+            total = total + (precision * (weight - self._start[weight]) ** 2).sum()
         return total
 
-    def _some_rooms(self, room: Tensor) -> Tensor:
-        is_listed = torch.rand(len(room), generator=self._generator) < _ROOM_SHARE
-        return torch.where(is_listed, room, -1)
+
+def _joined(*parts: HomeScenes) -> HomeScenes:
+    return HomeScenes(*map(torch.cat, zip(*(vars(part).values() for part in parts), strict=True)))

@@ -242,7 +242,8 @@ def _intruder(home: Home, lists: Sequence[Ints], own: Ints, rng: Rng) -> tuple[f
         seen = [np.union1d(part, [intruder]) for part in lists[:_LOOKS]]
         if before := _alarm_share(parent, seen, intruder):
             twice = [np.union1d(part, [intruder]) for part in lists[-2:]]
-            weights = adapt(parent.weights, _home(parent, visits, twice).tensors)
+            recorded = _home(parent, visits, twice)
+            weights = adapt(parent.weights, recorded.tensors, known=recorded.learnt)
             after = _alarm_share(replace(parent, weights=weights), seen, intruder)
             shares.append((before, after))
         if len(shares) == _INTRUDERS:

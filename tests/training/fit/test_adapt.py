@@ -12,7 +12,7 @@ from app import questions
 from app.inference import MachineSpec, Weights
 from app.registry import Artifact, Store
 from app.scene import ObjectClass, Scene, SceneObject
-from training.fit.adapt import HomeScenes, adapt
+from training.fit.adapt import HomeScenes, Known, adapt
 from training.fit.extend import extended
 from training.fit.objects import random_parts
 from training.machines import build
@@ -82,6 +82,36 @@ def test_a_class_that_is_left_out_keeps_its_log_odds():
     assert abs(shift[1]) < 0.5 * abs(shift[0])
 
 
+def test_more_scenes_without_a_class_make_it_less_likely():
+    """The target is the answer of the parent over 1 + the expected number of its scenes."""
+    parent = small()
+    listed = torch.zeros(1, V)
+    listed[0, 0] = 1
+    before, few, many = (
+        float(machine_of(side).object_log_odds(listed).sigmoid()[0, 5])
+        for side in (parent, *(adapt(parent, scenes_of(*HOME[:n])) for n in (2, 24)))
+    )
+    assert few > 0.9 * before
+    assert many < 0.8 * before
+
+
+def test_a_class_that_the_parent_hardly_knows_is_learnt_from_few_scenes():
+    """Class 3 is in half of the scenes. A strong prior would keep it improbable."""
+    weights = small().arrays
+    weights["b"] = weights["b"].copy()
+    weights["b"][3] = -10
+    parent, home = Weights(small().spec, weights), scenes_of(*HOME)
+    known = Known(torch.arange(V) != 3, C)
+    listed = torch.zeros(1, V)
+    listed[0, :2] = 1
+    rare, common = (
+        float(machine_of(adapt(parent, home, known=x)).object_log_odds(listed).sigmoid()[0, 3])
+        for x in (known, None)
+    )
+    assert common < 0.2
+    assert 0.3 < rare < 0.7
+
+
 def test_distillation_keeps_the_answers_about_stored_samples(monkeypatch):
     """Without it, the rooms of the parent change several times more."""
     parent, home = small(), scenes_of(*HOME)
@@ -95,7 +125,7 @@ def test_distillation_keeps_the_answers_about_stored_samples(monkeypatch):
         return float((p - q).abs()[parts.listed == 0].mean())
 
     kept = change()
-    monkeypatch.setattr("training.fit.adapt._Fit._distillation", lambda _: torch.zeros(()))
+    monkeypatch.setattr("training.fit.adapt._DISTILLATION", 0.0)
     assert change() > 1.5 * kept
 
 
@@ -171,7 +201,7 @@ def test_a_new_room_is_recognised_by_its_objects(repository):
     lists = [["deck chair", "flower pot", "watering can"], ["deck chair", "clothespin", "plant"]]
     classes = [[words.index(label) for label in labels] for labels in lists * 10]
     home = scenes_of(*classes, rooms=[room] * 20, size=len(words))
-    known = len(words), len(model.vocabulary.room_types)
+    known = Known(torch.ones(len(words), dtype=torch.bool), len(model.vocabulary.room_types))
     adapted = replace(larger, weights=adapt(larger.weights, home, known=known))
     answer = questions.rooms(adapted, scene(adapted, "deck chair", "flower pot"), top_k=1)
     assert answer["room_types"][0]["room_type"] == "balcony"
