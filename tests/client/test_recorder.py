@@ -321,14 +321,15 @@ for turn in range(60):
     if not child:
         writer = Recorder(sys.argv[1], most_bytes=2**40)
         for n in itertools.count():
-            writer.record([scene(f"{turn} {n}")])
+            writer.record([scene(f"{turn} {n}", 50)])
     while size() <= before:  # the first line also mends the file
         time.sleep(0.001)
     time.sleep(random.uniform(0.0, 0.05))
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
     with open(sys.argv[1], "rb") as file:
-        torn += not file.read().endswith(b"\\n")
+        file.seek(-1, os.SEEK_END)
+        torn += file.read() != b"\\n"
 Recorder(sys.argv[1], most_bytes=2**40).record([scene("last")])
 print(torn, "torn")
 """, file)  # fmt: skip
