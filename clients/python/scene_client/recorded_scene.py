@@ -78,10 +78,10 @@ def _relate(scene: dict[str, Any], request: SceneRequest) -> None:
         scene["relations"] = relations + [one for one in supports if one not in relations]
 
 
-def time_of(request: SceneRequest, now: int | None = None) -> Time:
+def time_of(request: SceneRequest) -> Time:
     """Return the hour in local time, which is the group of the scene, and the stamp."""
     if request.stamp is None:
-        second, nanosecond = divmod(time_ns() if now is None else now, 10**9)
+        second, nanosecond = divmod(time_ns(), 10**9)
     else:
         second, nanosecond = request.stamp.sec, request.stamp.nanosec
     return strftime("%Y-%m-%dT%H", localtime(second)), {"sec": second, "nanosec": nanosecond}

@@ -17,13 +17,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from time import monotonic, sleep, time_ns
+from time import monotonic, sleep
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from pydantic_core import to_json
 
 from scene_client.errors import InvalidRequestError
-from scene_client.recorded_scene import ON_TOP, Thing, Triple, likely, scene_of, time_of
+from scene_client.recorded_scene import ON_TOP, Thing, Time, Triple, likely, scene_of, time_of
 
 try:
     import fcntl
@@ -72,7 +72,7 @@ class Recorder:
     A scene is written if its labels are new within the hour, or its room type, its stated
     relations, or the places of its objects. For new places alone, `PAUSE` must have passed.
 
-    `record` only keeps the requests. One thread of the recorder converts and writes new scenes.
+    `record` only decides which scenes are new. One thread of the recorder converts and writes them.
     If the file would become larger than `most_bytes`, it becomes the older file: ``scenes.jsonl``
     is renamed to ``scenes.old.jsonl``, and an earlier older file is deleted. An error never reaches
     the caller. The recorder logs one warning, and tries again with the next scene.
@@ -104,7 +104,19 @@ class Recorder:
         if self._process != os.getpid():
             self._start()
         for request in requests:
-            self._waiting.append((request, time_ns()))
+            time, things = time_of(request), likely(request)
+            if len(things) < LEAST_OBJECTS:
+                continue
+            relations = [
+                (one.subject, one.relation, one.object)
+                for one in request.relations or ()
+                if request.relations_complete or one.relation in ON_TOP
+            ]
+            hashes = _hashes(time[0], things, request.room_type, relations)
+            with self._lock:
+                if not self._is_new(hashes, things):
+                    continue
+            self._waiting.append((hashes, request, time, things))
             if len(self._waiting) >= MOST_WAITING:
                 self.flush()
         if self._waiting and self._is_due.is_set():
@@ -119,27 +131,20 @@ class Recorder:
         if self._process != os.getpid():
             return  # the scenes wait in the parent process
         self._is_due.set()
-        with self._lock:
+        with self._writing:
             scenes: _Scenes = deque()
             for _ in range(len(self._waiting)):
-                request, now = self._waiting.popleft()
-                time, things = time_of(request, now), likely(request)
-                relations = [
-                    (one.subject, one.relation, one.object)
-                    for one in request.relations or ()
-                    if request.relations_complete or one.relation in ON_TOP
-                ]
-                hashes = _hashes(time[0], things, request.room_type, relations)
-                if len(things) >= LEAST_OBJECTS and self._is_new(hashes, things):
-                    scenes.append((hashes, to_json(scene_of(request, time, things)) + b"\n"))
+                hashes, request, time, things = self._waiting.popleft()
+                scenes.append((hashes, to_json(scene_of(request, time, things)) + b"\n"))
             while scenes:
                 self._append(scenes)
 
     def _start(self) -> None:
-        """Make a thread and its lock. After a fork, the lock may be locked without a thread."""
-        self._process, self._lock = os.getpid(), threading.Lock()
+        """Make a thread and the locks. After a fork, they may be locked without a thread."""
+        self._process = os.getpid()
+        self._lock, self._writing = threading.Lock(), threading.Lock()  # of hashes, of the file
         self._thread = ThreadPoolExecutor(1, "scene-recorder")
-        self._waiting: deque[tuple[SceneRequest, int]] = deque()
+        self._waiting: deque[tuple[list[int], SceneRequest, Time, list[Thing]]] = deque()
         # While the event is not set, the thread delays the waiting scenes.
         self._is_due = threading.Event()
         self._is_due.set()
@@ -203,8 +208,9 @@ class Recorder:
             if not self._is_failing:
                 _logger.warning("cannot record scenes in %s: %s", self.path, error)
             self._is_failing = True
-            for key in scenes.popleft()[0]:
-                self._recent.pop(key, None)
+            with self._lock:
+                for key in scenes.popleft()[0]:
+                    self._recent.pop(key, None)
 
 
 # ---------------------------------------------------------------------------------- the file
