@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator
+from itertools import count
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from benchmarks.load import servers
 from benchmarks.load.questions import bodies, labels_of
@@ -16,6 +17,8 @@ from scene_client import Client, Recorder
 
 PLAIN, KNOWN = "without a recorder", "with a recorder, of a known scene"
 NEW = "with a recorder, of a new scene"
+BLOCK = 50
+"""Number of calls without a pause. Their time includes the writing of their scenes."""
 
 
 def recording(*, store: Path = Path("model_store"), calls: int = 1000) -> list[Result]:
@@ -23,55 +26,60 @@ def recording(*, store: Path = Path("model_store"), calls: int = 1000) -> list[R
 
     Args:
         store: directory of the model store. The default model is queried.
-        calls: number of measured calls of each kind. Kinds alternate. Additional warm-up calls
-            (10 %) are not measured.
+        calls: number of measured calls of each kind, once with a pause after each call, and once
+            without pauses. Kinds alternate. Additional warm-up calls (10 %) are not measured.
 
     Raises:
         ServerError: the store is missing, or the service does not become ready.
     """
-    seconds: dict[str, list[float]] = {KNOWN: [], PLAIN: [], NEW: []}
-    processor: dict[str, list[float]] = {KNOWN: [], PLAIN: [], NEW: []}
+    results: list[Result] = []
     with servers.service(store, pinned=False) as started, TemporaryDirectory() as folder:
         url = f"http://127.0.0.1:{started.port}"
-        scene = bodies("12 poses", labels_of(started.port))[0] | {"stamp": _stamp(0)}
-        file = Path(folder, "scenes.jsonl")
-        recorder = Recorder(file)
+        scene = bodies("12 poses", labels_of(started.port))[0]
+        recorder = Recorder(Path(folder, "scenes.jsonl"))
+        hours = count(1)  # the hour is a part of the content of a scene
         with Client(url) as plain, Client(url, record=recorder) as recording:
-            for turn in range(-calls // 10, calls):
-                # The hour is a part of the content of a scene.
-                other = scene | {"stamp": _stamp(turn + calls)}
-                asked = [(PLAIN, plain, other), (KNOWN, recording, scene), (NEW, recording, other)]
-                for name, client, body in asked[turn % 3 :] + asked[: turn % 3]:
-                    taken, worked = _seconds(client, body)
-                    recorder.flush()  # otherwise its thread would slow down the next call
-                    if turn >= 0:
-                        seconds[name].append(taken)
-                        processor[name].append(worked)
-        lines = len(file.read_bytes().splitlines())
-    title = "A call about 12 poses, one connection kept alive"
-    return [
-        Result(
-            title,
+
+            def ask(name: str, length: int, flushes: bool) -> tuple[float, float]:
+                """Return the duration of a call, and the processor time of the client."""
+                client = plain if name == PLAIN else recording
+                start, worked = time.perf_counter(), time.process_time()
+                for _ in range(length):
+                    hour = 0 if name == KNOWN else next(hours)
+                    client.outliers(scene | {"stamp": {"sec": 3600 * hour, "nanosec": 0}})
+                if flushes:
+                    recorder.flush()
+                taken = time.perf_counter() - start, time.process_time() - worked
+                recorder.flush()  # otherwise its thread would slow down the next call
+                return taken[0] / length, taken[1] / length
+
+            results += _results("with pauses", calls, lambda name: ask(name, 1, False))
+            title = f"without pauses, in blocks of {BLOCK} calls"
+            results += _results(title, calls // BLOCK, lambda name: ask(name, BLOCK, True))
+    return results
+
+
+def _results(
+    title: str, rounds: int, ask: Callable[[str], tuple[float, float]]
+) -> Iterator[Result]:
+    kinds = [PLAIN, KNOWN, NEW]
+    seconds: dict[str, list[float]] = {name: [] for name in kinds}
+    processor: dict[str, list[float]] = {name: [] for name in kinds}
+    for turn in range(-max(1, rounds // 10), rounds):
+        for name in kinds[turn % 3 :] + kinds[: turn % 3]:
+            taken, worked = ask(name)
+            if turn >= 0:
+                seconds[name].append(taken)
+                processor[name].append(worked)
+    for name in (KNOWN, NEW):
+        yield Result(
+            f"A call about 12 poses, one connection kept alive, {title}",
             name,
             Timings({one: seconds[one] for one in (name, PLAIN)}),
             targets={PLAIN: 0.95},
             facts={
-                "recorded scenes": lines,
                 # On a busy machine, the processor time of the client varies less.
                 "processor time of the client in µs": 1e6 * median(processor[name]),
                 f"the same {PLAIN}": 1e6 * median(processor[PLAIN]),
             },
         )
-        for name in (KNOWN, NEW)
-    ]
-
-
-def _stamp(hour: int) -> dict[str, int]:
-    return {"sec": 3600 * hour, "nanosec": 0}
-
-
-def _seconds(client: Client, body: dict[str, Any]) -> tuple[float, float]:
-    """Return the duration of a call, and the processor time of its thread."""
-    start, worked = time.perf_counter(), time.thread_time()
-    client.outliers(body)
-    return time.perf_counter() - start, time.thread_time() - worked

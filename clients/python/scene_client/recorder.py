@@ -12,18 +12,18 @@ import logging
 import os
 import stat
 import threading
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic, sleep
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 from pydantic_core import to_json
 
 from scene_client.errors import InvalidRequestError
-from scene_client.recorded_scene import ON_TOP, Time, Triple, likely, scene_of, time_of
+from scene_client.recorded_scene import ON_TOP, Thing, Time, Triple, likely, scene_of, time_of
 
 try:
     import fcntl
@@ -31,7 +31,7 @@ except ImportError:  # Windows, where only one process may write a file
     fcntl = None  # type: ignore[assignment]
 
 if TYPE_CHECKING:
-    from scene_client.schemas import Detection, SceneRequest
+    from scene_client.schemas import SceneRequest
 
 MOST_BYTES: Final = 64 * 2**20
 """Default for the maximum size of the file. The older file has at most the same size."""
@@ -48,8 +48,11 @@ PAUSE: Final = 60.0
 REMEMBERED: Final = 4096
 """Number of remembered hashes. Each scene has a hash of its labels, and up to two further ones."""
 
+DELAY: Final = 0.05
+"""Seconds until the thread writes a new scene. Many scenes at once take less time for each."""
+
 MOST_WAITING: Final = 64
-"""Maximum number of scenes that wait for the thread. Then `record` waits for the oldest scene."""
+"""Maximum number of scenes that wait for the thread. Then `record` itself writes them."""
 
 # A named pipe must not block, and Windows must not convert line ends.
 _OF_THE_SYSTEM: Final = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
@@ -60,6 +63,8 @@ _TAIL: Final = 2**16  # bytes that are read at once from the end of the file
 
 _logger: Final = logging.getLogger(__name__)
 
+_Scenes: TypeAlias = deque[tuple[list[int], bytes]]  # hashes and lines
+
 
 class Recorder:
     """Writer of a file with one scene per line, which several threads and processes may share.
@@ -68,7 +73,6 @@ class Recorder:
     relations, or the places of its objects. For new places alone, `PAUSE` must have passed.
 
     `record` only decides which scenes are new. One thread of the recorder converts and writes them.
-
     If the file would become larger than `most_bytes`, it becomes the older file: ``scenes.jsonl``
     is renamed to ``scenes.old.jsonl``, and an earlier older file is deleted. An error never reaches
     the caller. The recorder logs one warning, and tries again with the next scene.
@@ -100,57 +104,66 @@ class Recorder:
         if self._process != os.getpid():
             self._start()
         for request in requests:
-            time, entries = time_of(request), likely(request)
-            labels = [entry if isinstance(entry, str) else entry.label for entry in entries]
-            if len(labels) < LEAST_OBJECTS:
+            time, things = time_of(request), likely(request)
+            if len(things) < LEAST_OBJECTS:
                 continue
-            hashes = _hashes(time[0], labels, request.room_type, _stated(request, entries))
+            relations = [
+                (one.subject, one.relation, one.object)
+                for one in request.relations or ()
+                if request.relations_complete or one.relation in ON_TOP
+            ]
+            hashes = _hashes(time[0], things, request.room_type, relations)
             with self._lock:
-                if not self._is_new(hashes, request):
+                if not self._is_new(hashes, things):
                     continue
-                self._remember(hashes, _places(request))
-            self._waiting.acquire()
+            self._waiting.append((hashes, request, time, things))
+            if len(self._waiting) >= MOST_WAITING:
+                self.flush()
+        if self._waiting and self._is_due.is_set():
+            self._is_due.clear()
             try:
-                self._thread.submit(self._write, request, time, hashes)
+                self._thread.submit(self._write_later)
             except RuntimeError:  # no thread can start, for example at the end of the program
-                self._write(request, time, hashes)
+                self.flush()
 
     def flush(self) -> None:
-        """Wait until the scenes are written. The end of the program waits too."""
-        if self._process == os.getpid():
-            with suppress(RuntimeError):  # no thread can start, so no scene waits
-                self._thread.submit(int).result()
+        """Write the waiting scenes. The end of the program writes them too."""
+        if self._process != os.getpid():
+            return  # the scenes wait in the parent process
+        self._is_due.set()
+        with self._writing:
+            scenes: _Scenes = deque()
+            for _ in range(len(self._waiting)):
+                hashes, request, time, things = self._waiting.popleft()
+                scenes.append((hashes, to_json(scene_of(request, time, things)) + b"\n"))
+            while scenes:
+                self._append(scenes)
 
     def _start(self) -> None:
-        """Make a thread and its locks. After a fork, the locks may be locked without a thread."""
-        self._process, self._lock = os.getpid(), threading.Lock()
+        """Make a thread and the locks. After a fork, they may be locked without a thread."""
+        self._process = os.getpid()
+        self._lock, self._writing = threading.Lock(), threading.Lock()  # of hashes, of the file
         self._thread = ThreadPoolExecutor(1, "scene-recorder")
-        self._waiting = threading.Semaphore(MOST_WAITING)
+        self._waiting: deque[tuple[list[int], SceneRequest, Time, list[Thing]]] = deque()
+        # While the event is not set, the thread delays the waiting scenes.
+        self._is_due = threading.Event()
+        self._is_due.set()
 
-    def _write(self, request: SceneRequest, time: Time, hashes: Sequence[int]) -> None:
-        try:
-            self._append(scene_of(request, time))
-            self._is_failing = False
-        except (OSError, ValueError) as error:
-            if not self._is_failing:
-                _logger.warning("cannot record scenes in %s: %s", self.path, error)
-            self._is_failing = True
-            with self._lock:
-                for key in hashes:
-                    self._recent.pop(key, None)
-        finally:
-            self._waiting.release()
+    def _write_later(self) -> None:
+        self._is_due.wait(DELAY)
+        self.flush()
 
-    def _is_new(self, hashes: Sequence[int], request: SceneRequest) -> bool:
-        if not all(key in self._recent for key in hashes):
-            return True
-        for key in hashes:
-            self._recent.move_to_end(key)
-        places, checked = self._recent[hashes[0]]
-        if monotonic() - checked < PAUSE:
-            return False
-        self._recent[hashes[0]] = (places, monotonic())
-        return places != _places(request)
+    def _is_new(self, hashes: Sequence[int], things: Sequence[Thing]) -> bool:
+        before = None
+        if all(key in self._recent for key in hashes):
+            for key in hashes:
+                self._recent.move_to_end(key)
+            before, checked = self._recent[hashes[0]]
+            if monotonic() - checked < PAUSE:
+                return False
+        places = _places(things)
+        self._remember(hashes, places)
+        return places != before
 
     def _remember(self, hashes: Sequence[int], places: int) -> None:
         self._recent.update(dict.fromkeys(hashes, (places, monotonic())))
@@ -169,23 +182,35 @@ class Recorder:
             return
         for line in lines:
             try:
-                self._remember(_hashes_of_line(json.loads(line)), 0)
+                scene = json.loads(line)
+                room, relations = scene.get("room_type"), scene.get("relations") or ()
+                self._remember(_hashes(scene["group"], scene["objects"], room, relations), 0)
             except (AttributeError, LookupError, TypeError, ValueError):
                 continue  # a line of another program, or a part of a line
 
-    def _append(self, scene: dict[str, Any]) -> None:
-        """Append a scene to the file, or to a new file if this file would become too large."""
-        line = to_json(scene) + b"\n"
-        if len(line) > _LONGEST_LINE:
-            raise ValueError(f"a scene has more than {_LONGEST_LINE} bytes")
-        with _locked(self.path) as file:
-            size = _mend(file)
-            if not size or size + len(line) <= self.most_bytes:
-                _write(file, size, line)
-                return
-            self.path.replace(self.older)
-        with _locked(self.path) as file:
-            _write(file, _mend(file), line)
+    def _append(self, scenes: _Scenes) -> None:
+        """Write scenes until the file is full or an error occurs, and remove them from `scenes`."""
+        try:
+            with _locked(self.path) as file:
+                size = _mend(file)
+                while scenes:
+                    _, line = scenes[0]
+                    if len(line) > _LONGEST_LINE:
+                        raise ValueError(f"a scene has more than {_LONGEST_LINE} bytes")
+                    if size and size + len(line) > self.most_bytes:
+                        self.path.replace(self.older)
+                        return
+                    _write(file, size, line)
+                    size += len(line)
+                    scenes.popleft()
+                    self._is_failing = False
+        except (OSError, ValueError) as error:
+            if not self._is_failing:
+                _logger.warning("cannot record scenes in %s: %s", self.path, error)
+            self._is_failing = True
+            with self._lock:
+                for key in scenes.popleft()[0]:
+                    self._recent.pop(key, None)
 
 
 # ---------------------------------------------------------------------------------- the file
@@ -263,53 +288,31 @@ def _write(file: int, size: int, line: bytes) -> None:
 
 
 def _hashes(
-    hour: str, labels: Iterable[str], room: str | None, relations: Iterable[Triple]
+    hour: str, things: Sequence[Thing], room: str | None, relations: Iterable[Triple]
 ) -> list[int]:
-    """Return hashes of the labels, the room type and the relations between labels."""
-    hashes = [hash((hour, *sorted(labels)))]
+    """Return hashes of the labels, the room type and the recorded relations between labels."""
+    hashes = [hash((hour, *sorted([one["label"] for one in things])))]
     if room is not None:
         hashes.append(hash((hashes[0], room)))
-    if relations := sorted(set(relations)):
-        hashes.append(hash((hashes[0], *relations)))
+    label_of = {one.get("id"): one["label"] for one in things}
+    stated = {
+        (one["label"], "on-top", label_of.get(support, support))
+        for one in things
+        if (support := one.get("supported_by")) is not None
+    }
+    for one, name, other in relations:
+        subject, anchor = label_of.get(one, one), label_of.get(other, other)
+        stated.add((anchor, "on-top", subject) if name == "under" else (subject, name, anchor))
+    if stated:
+        hashes.append(hash((hashes[0], *sorted(stated))))
     return hashes
 
 
-def _hashes_of_line(scene: dict[str, Any]) -> list[int]:
-    label_of = {thing["id"]: thing["label"] for thing in scene["objects"]}
-    supports = [
-        (thing["id"], "on-top", thing["supported_by"])
-        for thing in scene["objects"]
-        if "supported_by" in thing
-    ]
-    triples = (*(scene.get("relations") or ()), *supports)
-    relations = [(label_of[i], name, label_of[j]) for i, name, j in triples]
-    return _hashes(scene["group"], label_of.values(), scene.get("room_type"), relations)
-
-
-def _stated(request: SceneRequest, entries: Sequence[str | Detection]) -> list[Triple]:
-    """Return the recorded ones of the stated relations, as triples of labels."""
-    detections = [entry for entry in entries if not isinstance(entry, str)]
-    label_of = {entry.id: entry.label for entry in detections if entry.id is not None}
-    relations = [
-        (entry.label, "on-top", label_of.get(entry.supported_by, entry.supported_by))
-        for entry in detections
-        if entry.supported_by is not None
-    ]
-    for one in request.relations or ():
-        subject, anchor = (label_of.get(name, name) for name in (one.subject, one.object))
-        if request.relations_complete:
-            relations.append((subject, one.relation, anchor))
-        elif one.relation in ON_TOP:
-            upper, lower = (subject, anchor) if one.relation == "on-top" else (anchor, subject)
-            relations.append((upper, "on-top", lower))
-    return relations
-
-
-def _places(request: SceneRequest) -> int:
+def _places(things: Sequence[Thing]) -> int:
     """Return a hash of the labels and their cells."""
     cells = [
-        (entry.label, at.x // STEP, at.y // STEP, at.z // STEP)
-        for entry in likely(request)
-        if not isinstance(entry, str) and (at := entry.position) is not None
+        (one["label"], at.x // STEP, at.y // STEP, at.z // STEP)
+        for one in things
+        if (at := one.get("position")) is not None
     ]
     return hash(tuple(sorted(cells)))
