@@ -241,9 +241,7 @@ def test_another_name_of_a_room_type_has_its_probability(
     open_board: OpenBoard, api: httpx.Client
 ) -> None:
     board = open_board({"objects": ["desk", "chair"], "room_type": "hall"})
-    (answer,) = ask(api, "rooms", board.scene, candidates=["hall", "office"], top_k=4096)[
-        "mapped"
-    ]
+    (answer,) = ask(api, "rooms", board.scene, candidates=["hall", "office"], top_k=4096)["mapped"]
     assert (answer["label"], answer["class"]) == ("hall", "corridor")
     every = ask(api, "rooms", board.scene, top_k=4096)["room_types"]
     p = next(one["probability"] for one in every if one["room_type"] == "corridor")
