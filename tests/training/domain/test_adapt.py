@@ -99,10 +99,11 @@ def test_an_unconfirmed_object_teaches_nothing(store, tmp_path):
 
 
 def test_a_later_file_confirms_a_scene(store, tmp_path):
-    scene = {"scene_id": "a", "objects": INTRUDER}
-    recorded = write([scene], tmp_path / "scenes.jsonl.1")
-    corrected = write([scene | {"confirmed": True}], tmp_path / "scenes.jsonl")
-    assert "1 recorded scenes" in adapt(store, recorded, corrected)
+    scenes = [{"scene_id": name, "objects": INTRUDER} for name in "ab"]
+    recorded = write(scenes, tmp_path / "scenes.jsonl.1")
+    corrected = write([scene | {"confirmed": True} for scene in scenes], tmp_path / "scenes.jsonl")
+    said = adapt(store, recorded, corrected)
+    assert "2 recorded scenes; 1 distinct scenes, 1 of these confirmed" in said
 
 
 def test_words_that_the_model_cannot_read_become_classes(store, tmp_path):

@@ -156,9 +156,9 @@ class Answer(Reply):
     """with `ignore` or `nearest-or-ignore` as `unknown_labels`: ids of the objects, candidates and
     room type that the model does not know. The answer ignores them"""
     mapped: list[Mapped] = []
-    """each label that the vocabulary does not list, and each alias of a candidate or room type, with
-    the class that replaces it. Aliases of objects are not listed, because answers name objects by
-    id. Guesses need `nearest` or `nearest-or-ignore` as `unknown_labels`"""
+    """each label that the vocabulary does not list, and each alias of a candidate or room type. The
+    class replaces the label. Aliases of objects are not listed, because answers name objects by id.
+    Guesses need `nearest` or `nearest-or-ignore` as `unknown_labels`"""
     warnings: list[SceneWarning] = []
     """probable mistakes in the scene"""
     observed_relations: list[ObservedRelation] | None = None
