@@ -84,7 +84,7 @@ export function settings(store) {
     get('at').hidden = !state.at;
     if (state.at) get('at-words').textContent = `Missing ${SPOKEN[state.at.relation]} ${namesOf(state.things)(state.at.object)}`;
     if (changed(state, previous, 'words', 'models', 'room', 'shown') || roomsOf(state) !== roomsOf(previous) || roomRead(state) !== roomRead(previous)) rooms(state);
-    if (changed(state, previous, 'answers', 'shown', 'draft', 'things', 'right')) {
+    if (changed(state, previous, 'answers', 'shown', 'draft', 'things', 'right', 'line')) {
       const answer = judgedBy(state.answers[state.shown], state);
       const { outliers, misplaced } = answer ? wrongIn(answer) : { outliers: [], misplaced: [] };
       get('alarms').textContent = outliers.length + misplaced.length;
