@@ -73,9 +73,8 @@ THE_FLOOR: Final = "floor"
 
 LEAST_Z: Final = -8.0  # below it, log-odds do not tell wrong relations from rare ones
 _LEAST_P: Final = 1e-6  # minimum of p(stand)
-# Minimum z of an object above another object if a third object supports it, and z of a confirmed
-# relation.
 EXPLAINED: Final = 5.0
+"""z of a confirmed relation; minimum z of an object above another object on a third object."""
 
 Indices = NDArray[np.int64]
 Floats = NDArray[np.float64]

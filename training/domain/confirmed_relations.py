@@ -34,8 +34,8 @@ Triple = tuple[int, int, int]
 def reported_relations(model: Artifact, recorded: Sequence[AnnotatedScene]) -> set[Triple]:
     """Return the relations (a, i, j) of classes that the model reports in confirmed scenes.
 
-    They are stacked relations, such as on-top. The model may report a relation only as stated, or
-    only with boxes, because boxes also show what holds an object.
+    They are stacked relations, such as on-top. Each scene is asked as stated and with its boxes.
+    Boxes also show the stand of each object, so the model reports other relations with boxes.
     """
     if model.places is None:
         return set()

@@ -142,7 +142,7 @@ export function createRecords(store, whenChanged) {
     current: (line) => confirmed.get(line.scene_id)?.line ?? line,
     /** The number of scenes that this browser keeps. */
     kept: () => confirmed.size,
-    /** Replaces the opened file. Returns its lines, with the confirmed scenes of this browser. */
+    /** Replaces the opened file by that of the name `of`. Returns its lines, with the confirmed scenes of this browser. */
     open(found, of) {
       file = new Map(found.map((line) => [line.scene_id, line]));
       name = of.replace(/\.json$/, '.jsonl');
