@@ -22,9 +22,10 @@ TORCH := -r requirements-torch.lock $(if $(TORCH_INDEX_URL),--index-url $(TORCH_
 unexport PYTHONDONTWRITEBYTECODE
 
 # A stamp file marks an environment with the packages of its lock file. A newer lock file or
-# pyproject.toml makes the stamp out of date. Both lock files have the same versions, so they share
+# pyproject.toml makes the stamp out of date. The lock files have the same versions, so they share
 # one environment.
 SERVICE := $(VENV)/.installed-service
+TRAINING := $(VENV)/.installed-training
 EVERYTHING := $(VENV)/.installed-everything
 RAY := $(RAY_VENV)/.installed
 
@@ -35,8 +36,19 @@ define compile
 		$(addprefix --extra ,$(2)) --output-file $(1) $(ARGS) pyproject.toml clients/python/pyproject.toml
 endef
 
+# Install torch, the packages of a lock file, and this repository.
+define install
+	@# torch first and alone, because a package of the lock file needs it. A CUDA build, from the default
+	@# index, then gets its companions.
+	@$(PIP) install --no-deps $(TORCH)
+	@$(PIP) install --require-hashes -r $(1)
+	@$(if $(TORCH_INDEX_URL),,$(PIP) install -qq $(TORCH))
+	@$(PIP) install -qq --no-deps --editable clients/python --editable .
+	@echo "Installed."
+endef
+
 .DEFAULT_GOAL := help
-.PHONY: checks help run ray test test-fast test-slow coverage docs image audit setup format bench lock clean
+.PHONY: checks help run ray test test-fast test-slow coverage docs image audit setup training format bench lock clean
 .DELETE_ON_ERROR:
 
 help:  ## show this help
@@ -82,6 +94,8 @@ audit: $(EVERYTHING)  ## report known vulnerabilities and risky code, write bill
 image: $(BIN)/python  ## build the image, ask its service the five questions, remove it (Docker or buildah)
 	$(BIN)/python deploy/image.py $(ARGS)
 
+training: $(TRAINING)  ## install the service and training: adapt a home, train on your own scenes
+
 setup: $(EVERYTHING)  ## install everything that training, tests and benchmarks need
 
 format: $(EVERYTHING)  ## format the sources and generate the blocking client
@@ -113,16 +127,15 @@ $(SERVICE): requirements.lock pyproject.toml clients/python/pyproject.toml | $(B
 	@echo "Compiled."
 	@touch $@
 
+$(TRAINING): requirements-training.lock requirements-torch.lock pyproject.toml clients/python/pyproject.toml | $(BIN)/python
+	@echo "Installing the packages of the service and of training into $(VENV) ..."
+	$(call install,requirements-training.lock)
+	@touch $(SERVICE) $@
+
 $(EVERYTHING): requirements-dev.lock requirements-torch.lock pyproject.toml clients/python/pyproject.toml | $(BIN)/python
 	@echo "Installing every package into $(VENV) ..."
-	@# torch first and alone, because a package of the lock file needs it. A CUDA build, from the default
-	@# index, then gets its companions.
-	@$(PIP) install --no-deps $(TORCH)
-	@$(PIP) install --require-hashes -r requirements-dev.lock
-	@$(if $(TORCH_INDEX_URL),,$(PIP) install -qq $(TORCH))
-	@$(PIP) install -qq --no-deps --editable clients/python --editable .
-	@echo "Installed."
-	@touch $(SERVICE) $@
+	$(call install,requirements-dev.lock)
+	@touch $(SERVICE) $(TRAINING) $@
 
 $(RAY): requirements-ray.lock pyproject.toml clients/python/pyproject.toml | $(RAY_VENV)/bin/python
 	@echo "Installing the service and Ray into $(RAY_VENV) ..."

@@ -14,7 +14,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 from rich.console import Console
 
-from app.registry import Artifact, RegistryError, Store
+from app.registry import DEFAULT_STORE, Artifact, RegistryError, Store
 from app.registry.references import AliasTarget
 from training.datasets import DatasetError
 from training.datasets.files import DATA
@@ -23,7 +23,7 @@ from training.domain.candidates import Candidate
 from training.domain.compare import compare, compare_command, show
 from training.domain.evaluate_command import evaluate_command
 from training.domain.gate import MARGIN, NEW, losses, measure_usefulness, served_model
-from training.domain.init_command import STORE, StorePath, example, fail, init
+from training.domain.init_command import StorePath, example, fail, init
 from training.domain.look import outside_vocabulary
 from training.evaluation.report import Progress
 from training.fit.checkpoint import RunError
@@ -93,7 +93,7 @@ def train(
         ),
     ] = False,
     publish: Annotated[str | None, typer.Option(help="publish the run as this version")] = None,
-    store: StorePath = STORE,
+    store: StorePath = DEFAULT_STORE,
 ) -> None:
     """Train a configuration. With --publish, also calibrate, evaluate and publish the model."""
     try:
@@ -135,7 +135,7 @@ def publish(
     ],
     version: Annotated[str, typer.Argument(help="number of the new version, such as 1.0.0")],
     data: StoredData = None,
-    store: StorePath = STORE,
+    store: StorePath = DEFAULT_STORE,
     promote: Annotated[
         bool,
         typer.Option(

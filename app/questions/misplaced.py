@@ -29,6 +29,9 @@ or in a listed object hangs on a wall, or an unlisted object holds it:
 The sum of the shares q is over the listed classes. Positions and sizes show the stand of every
 object; otherwise s = 0. Classes that belong everywhere, such as pets and bags, have s = q = 0, and
 only their supports are judged.
+
+A relation that a person has confirmed (`app.registry.Misplaced.usual`) has z = `EXPLAINED` and
+d = s = q = 0, because its stand may be rare for the class.
 """
 
 from __future__ import annotations
@@ -70,7 +73,8 @@ THE_FLOOR: Final = "floor"
 
 LEAST_Z: Final = -8.0  # below it, log-odds do not tell wrong relations from rare ones
 _LEAST_P: Final = 1e-6  # minimum of p(stand)
-EXPLAINED: Final = 5.0  # minimum z of an object above another object if a third object supports it
+EXPLAINED: Final = 5.0
+"""z of a confirmed relation; minimum z of an object above another object on a third object."""
 
 Indices = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -132,6 +136,7 @@ def entries_of(
     of_relation, changes = (
         values[relation, *pairs].tolist() for values in (alone, posterior.relation_change())
     )
+    usual = {*artifact.calibration.misplaced.usual}
     entries: list[tuple[float, ...]] = []  # relation, subject, object, kind, terms, mover
     for (a, i, j), z, d in zip(stated, of_relation, changes, strict=True):
         mover = j if (a, i, j) in flipped and a != INSIDE else i
@@ -156,6 +161,8 @@ def entries_of(
             kind, mover, s, q = SUPPORT, i, log_p[i], log_q[i]
         if not moves[mover]:
             s = q = 0.0
+        if (a, classes[i], classes[j]) in usual:
+            z, d, s, q = EXPLAINED, 0.0, 0.0, 0.0
         entries.append((a, i, j, kind, max(z, LEAST_Z), d, s, q, mover))
     for i, stand in enumerate(stands if heights is not None else ()):
         if is_thing[i] and moves[i] and stand in (FLOOR, HANGS):

@@ -126,8 +126,8 @@ class Unknown:
         treatment: value of the field `unknown_labels` of the request.
         look_ups: searches for similar classes, shared by all scenes of the request.
         ignored: names of the ignored objects.
-        mapped: the class that replaces each label. A key consists of the label and whether it is a
-            room type.
+        mapped: the class that replaces each label, also for aliases of candidates and room types. A
+            key consists of the label and whether it is a room type.
     """
 
     vocabulary: Vocabulary
@@ -157,16 +157,16 @@ class Unknown:
         vocabulary = self.vocabulary
         index = vocabulary.room_index(label) if is_room else vocabulary.index(label)
         if index is not None:
+            # Answers name objects by id, but room types and candidates by their canonical names.
+            if location[0] != "objects":
+                self._list_alias(label, index, is_room=is_room)
             return index
         match = vocabulary.read(label, is_room=is_room)
         if match is None and self.treatment.startswith("nearest"):
             match = self._guess(label, is_room=is_room)
         if match is not None:
-            entry, similarity, rule = match
-            names = vocabulary.room_types if is_room else vocabulary.labels
-            mapped = Mapped(label=label, class_=names[entry], similarity=similarity, rule=rule)
-            self.mapped[label, is_room] = mapped
-            return entry
+            self._list(label, match, is_room=is_room)
+            return match.entry
         if self.treatment.endswith("ignore"):
             self.ignored.append(name)
         else:
@@ -182,6 +182,17 @@ class Unknown:
             for position, label in enumerate(labels)
         ]
         return list(dict.fromkeys(index for index in indices if index is not None))
+
+    def _list_alias(self, label: str, index: int, *, is_room: bool) -> None:
+        rule = self.vocabulary.rule_of(label, index, is_room=is_room)
+        if rule != "label":
+            self._list(label, Guess(index, 1.0, rule), is_room=is_room)
+
+    def _list(self, label: str, match: Guess, *, is_room: bool) -> None:
+        entry, similarity, rule = match
+        names = self.vocabulary.room_types if is_room else self.vocabulary.labels
+        mapped = Mapped(label=label, class_=names[entry], similarity=similarity, rule=rule)
+        self.mapped[label, is_room] = mapped
 
     def _guess(self, label: str, *, is_room: bool) -> Guess | None:
         key = label, is_room

@@ -24,12 +24,12 @@ from app.registry.model_set import ModelSet, load_model_set
 from app.registry.offsets import Offsets
 from app.registry.places import Places
 from app.registry.references import AliasTarget
-from app.registry.store import Store, StoreState
+from app.registry.store import DEFAULT_STORE, Store, StoreState
 
 __all__ = [
-    "AlarmLine", "AlarmLines", "AliasTarget", "Artifact", "ArtifactError", "Calibration",
-    "CountSlope", "Counts", "DataSource", "Description", "Example", "Judgement", "Manifest",
-    "Metric", "Misplaced", "ModelSet", "Offsets", "PlaceFit", "Places", "RegistryError",
-    "Sensitivity", "Sharpness", "Store", "StoreError", "StoreState", "VocabularyEntry",
-    "load_artifact", "load_model_set", "write_artifact",
+    "DEFAULT_STORE", "AlarmLine", "AlarmLines", "AliasTarget", "Artifact", "ArtifactError",
+    "Calibration", "CountSlope", "Counts", "DataSource", "Description", "Example", "Judgement",
+    "Manifest", "Metric", "Misplaced", "ModelSet", "Offsets", "PlaceFit", "Places",
+    "RegistryError", "Sensitivity", "Sharpness", "Store", "StoreError", "StoreState",
+    "VocabularyEntry", "load_artifact", "load_model_set", "write_artifact",
 ]  # fmt: skip

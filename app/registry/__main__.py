@@ -11,12 +11,16 @@ import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
 
-from app.registry import AliasTarget, RegistryError, Store, StoreError, load_model_set
+from app.registry import (
+    DEFAULT_STORE,
+    AliasTarget,
+    RegistryError,
+    Store,
+    StoreError,
+    load_model_set,
+)
 from app.registry.references import version_key
-
-_STORE: Final = "model_store"  # as `Settings.store`
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -24,7 +28,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     # The messages of this command contain the errors.
     logging.getLogger("app.registry").addHandler(logging.NullHandler())
-    root = target = options.store or os.environ.get("SCENE_STORE") or _STORE
+    root = target = options.store or os.environ.get("SCENE_STORE") or DEFAULT_STORE
     try:
         if options.command != "copy":
             _run(options, _existing(root))
@@ -118,7 +122,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m app.registry", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     common = argparse.ArgumentParser(add_help=False)
-    default = f"folder; default: SCENE_STORE, or else {_STORE}"
+    default = f"folder; default: SCENE_STORE, or else {DEFAULT_STORE}"
     common.add_argument("--store", help=default)
 
     def add(name: str, text: str) -> argparse.ArgumentParser:

@@ -113,13 +113,19 @@ class Judgement(Frozen):
 
 
 class Misplaced(Frozen):
-    """The judgement of each kind of entry. None: training had too few scenes for the fit."""
+    """The judgement of each kind of entry. None: training had too few scenes for the fit.
+
+    Attributes:
+        usual: indices (relation, subject, object) of relations between classes that a person has
+            confirmed.
+    """
 
     lateral: Judgement | None = None
     support: Judgement | None = None
     above: Judgement | None = None
     under: Judgement | None = None
     stand: Judgement | None = None
+    usual: Many[tuple[Count, Count, Count]] = ()
 
     @property
     def judges_relations(self) -> bool:

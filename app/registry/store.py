@@ -45,6 +45,9 @@ from app.registry.references import (
 )
 from app.registry.tensors import StorageDtype
 
+DEFAULT_STORE: Final = "model_store"
+"""Folder of the store without SCENE_STORE, as `Settings.store`."""
+
 ALIASES: Final = "aliases.json"
 _LOCK: Final = ".lock"
 TEMPORARY: Final = ".publishing-"

@@ -18,7 +18,17 @@ from collections.abc import Callable, Iterator
 from functools import lru_cache
 from typing import Final, Literal
 
-Rule = Literal["qualifier", "alternative", "article", "instance", "prompt", "spelling", "head"]
+Rule = Literal[
+    "alias",
+    "phrase",
+    "qualifier",
+    "alternative",
+    "article",
+    "instance",
+    "prompt",
+    "spelling",
+    "head",
+]
 """How a label was read. The rules "spelling" and "head" are guesses of `app.scene.nearest`."""
 
 _SEPARATORS: Final = re.compile(r"[\s_\-./'’‐-―]+")

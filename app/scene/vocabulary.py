@@ -62,7 +62,7 @@ class LookUp(NamedTuple):
     """The index of the class that a label becomes, and the rule."""
 
     entry: int
-    rule: Literal["label", "alias", "phrase"] | Rule
+    rule: Literal["label"] | Rule
     certain: bool
 
 
@@ -198,16 +198,22 @@ class Vocabulary:
 
         A label is accepted in every request by `index` or `read`, or needs `guess`.
         """
-        key, index = label_key(label), self.index(label)
-        if index is not None:
-            if label_key(self.objects[index].label) == key:
-                return LookUp(index, "label", certain=True)
-            return LookUp(index, "alias" if key in self._by_key else "phrase", certain=True)
+        if (index := self.index(label)) is not None:
+            return LookUp(index, self.rule_of(label, index), certain=True)
         if (reading := self.read(label)) is not None:
             return LookUp(reading.entry, reading.rule, certain=True)
         if (guess := self.guess(label)) is not None:
             return LookUp(guess.entry, guess.rule, certain=False)
         return None
+
+    def rule_of(
+        self, label: str, index: int, *, is_room: bool = False
+    ) -> Literal["label", "alias", "phrase"]:
+        """Return why `index` or `room_index` gives this index for a label."""
+        key = label_key(label)
+        if key == label_key((self.room_types if is_room else self.labels)[index]):
+            return "label"
+        return "alias" if key in (self._room_by_key if is_room else self._by_key) else "phrase"
 
     def room_index(self, room: str) -> int | None:
         """Return the index of a room type, or None for an unknown room type.

@@ -237,6 +237,20 @@ def test_room_types_are_listed_by_their_probability(bedroom: Board, api: httpx.C
     expect(options).to_have_text(["unknown", *names])
 
 
+def test_another_name_of_a_room_type_has_its_probability(
+    open_board: OpenBoard, api: httpx.Client
+) -> None:
+    board = open_board({"objects": ["desk", "chair"], "room_type": "hall"})
+    (answer,) = ask(api, "rooms", board.scene, candidates=["hall", "office"], top_k=4096)["mapped"]
+    assert (answer["label"], answer["class"]) == ("hall", "corridor")
+    every = ask(api, "rooms", board.scene, top_k=4096)["room_types"]
+    p = next(one["probability"] for one in every if one["room_type"] == "corridor")
+    expect(board.page.locator("#room option:checked")).to_have_text(f"hall {percent(p)}")
+    expect(board.page.locator("#room-error")).to_have_text("hall → corridor")
+    board.put('{"objects": ["desk"], "room_type": "Living Room"}')
+    expect(board.page.locator("#room option:checked")).to_have_text(re.compile(r"Living Room \d"))
+
+
 def test_the_calls_shown_give_the_answer_shown_and_can_be_copied(
     open_board: OpenBoard, api: httpx.Client, require_system_tool: Callable[[str], Path]
 ) -> None:

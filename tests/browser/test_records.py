@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -55,14 +56,14 @@ def choose(board: Board, file: Path, line: int) -> None:
     board.click("Put on the board")
 
 
-def downloaded(board: Board, tmp_path: Path, confirmed: int) -> Path:
-    """The file of the confirmed scenes."""
+def downloaded(board: Board, tmp_path: Path, confirmed: int, name: str = "scenes.jsonl") -> Path:
+    """The opened file with its confirmed scenes."""
     board.click("Import, export")
-    button = board.page.get_by_role("button", name=f"Download scenes.jsonl ({confirmed} confirmed)")
+    button = board.page.get_by_role("button", name=f"Download {name} ({confirmed} confirmed)")
     with board.page.expect_download() as download:
         button.click()
-    assert download.value.suggested_filename == "scenes.jsonl"
-    file = tmp_path / "downloaded" / "scenes.jsonl"
+    assert download.value.suggested_filename == name
+    file = tmp_path / "downloaded" / name
     download.value.save_as(file)
     board.click("Close")
     return file
@@ -214,13 +215,15 @@ def test_the_list_of_scenes_marks_alarms(open_board: OpenBoard, recorded: Path) 
     board = open_board()
     choose(board, recorded, 1)
     scenes, status = board.page.locator("#scenes-of-file"), board.page.locator("#file-status")
-    expect(status).to_have_text("1 of 3 scenes with an open alarm.")
-    expect(scenes.locator("option").nth(1)).to_have_text("2 · ⚠ toilet, place of microwave")
+    first, second, _ = (line["scene_id"] for line in lines(recorded))
+    expect(status).to_have_text(f"1 of 3 scenes with an open alarm. On the board: {first}.")
+    marked = f"2 · ⚠ toilet, place of microwave · {second}"  # `adapt` names scenes by their id
+    expect(scenes.locator("option").nth(1)).to_have_text(marked)
     board.click("Next alarm (scene 2)")
     board.click("Belongs here: toilet")
     board.click("Stands right: microwave")
-    expect(scenes.locator("option:checked")).to_have_text("2 · ✓ confirmed")
-    expect(status).to_have_text("0 of 3 scenes with an open alarm.")
+    expect(scenes.locator("option:checked")).to_have_text(f"2 · ✓ confirmed · {second}")
+    expect(status).to_have_text(f"0 of 3 scenes with an open alarm. On the board: {second}.")
     expect(board.page.get_by_role("button", name="Next alarm")).to_be_hidden()
     scenes.select_option("0")
     board.settle()
@@ -228,6 +231,77 @@ def test_the_list_of_scenes_marks_alarms(open_board: OpenBoard, recorded: Path) 
     scenes.select_option("1")
     board.tab("Wrong")
     assert "confirmed" in next(row for row in board.rows("outliers") if "toilet" in row)
+
+
+def test_an_object_added_to_a_confirmed_scene_is_confirmed_too(
+    open_board: OpenBoard, recorded: Path, tmp_path: Path
+) -> None:
+    board = open_board()
+    choose(board, recorded, 1)
+    board.add("oven")
+    board.tab("Wrong")
+    assert any("oven" in row and "does not belong" in row for row in board.rows("outliers"))
+    board.press("oven", "Delete")
+    board.click("This scene is right")
+    board.add("oven")
+    rows = [row for row in board.rows("outliers") if "Places are not judged" not in row]
+    assert len(rows) == 4
+    assert all("confirmed" in row for row in rows)
+    expect(board.page.locator("#alarms")).to_be_hidden()
+    expect(board.page.locator("#board .object.outlier")).to_have_count(0)
+    saved, *_ = lines(downloaded(board, tmp_path, 1))
+    assert [thing.get("label") for thing in saved["objects"][3:]] == ["oven"]
+    choose(board, recorded, 1)
+    assert sum("confirmed" in row for row in board.rows("outliers")) == 4
+
+
+def test_a_download_has_the_scenes_of_one_file(
+    open_board: OpenBoard, recorded: Path, tmp_path: Path
+) -> None:
+    first, second = tmp_path / "flat.jsonl", tmp_path / "office.jsonl"
+    first.write_text(recorded.read_text("utf-8"), "utf-8")
+    scenes = [{"scene_id": name, "objects": ["desk", "lamp"]} for name in "ab"]
+    second.write_text("".join(f"{json.dumps(scene)}\n" for scene in scenes), "utf-8")
+    board = open_board()
+    choose(board, first, 1)
+    board.click("This scene is right")
+    choose(board, second, 2)
+    board.click("This scene is right")
+    saved = lines(downloaded(board, tmp_path, 1, "office.jsonl"))
+    assert [(line["scene_id"], "confirmed" in line) for line in saved] == [
+        ("a", False),
+        ("b", True),
+    ]
+    # A scene that is drawn by hand goes with the opened file.
+    board.click("Clear")
+    board.add("sofa")
+    board.page.get_by_role("button", name="Is there: ").first.click()
+    board.settle()
+    board.click("Import, export")
+    expect(board.page.locator("#share-done")).to_contain_text("Confirmed scenes of other files: 1.")
+    board.click("Close")
+    saved = lines(downloaded(board, tmp_path, 2, "office.jsonl"))
+    assert [len(line["objects"]) for line in saved] == [2, 2, 2]
+    choose(board, first, 2)
+    saved = lines(downloaded(board, tmp_path, 1, "flat.jsonl"))
+    assert [line.get("confirmed", False) for line in saved] == [True, False, False]
+
+
+def test_the_selected_object_is_visible_in_a_long_list(open_board: OpenBoard) -> None:
+    board = open_board({"objects": [f"book {n}" for n in range(1, 41)] + ["toilet"]})
+    board.tab("Wrong")
+    page, row = board.page, board.page.locator("#list li").last
+    inside = """row => {
+      const [own, list] = [row, row.parentElement].map((node) => node.getBoundingClientRect());
+      return own.top >= list.top - 1 && own.bottom <= list.bottom + 1;
+    }"""
+    assert not row.evaluate(inside)
+    page.evaluate("scrollTo(0, 0)")
+    page.locator("[data-key='of-toilet']").evaluate("node => node.click()")
+    board.settle()
+    expect(row).to_have_class(re.compile("selected"))
+    assert row.evaluate(inside)
+    assert page.evaluate("scrollY") == 0
 
 
 @pytest.mark.parametrize("width", [1300, 390])
@@ -246,7 +320,8 @@ def test_the_buttons_are_accessible(open_board: OpenBoard, recorded: Path, width
     assert Axe().run(board.page).response["violations"] == []
 
 
-def test_an_open_page_notices_a_new_model(open_board: OpenBoard) -> None:
+@pytest.mark.parametrize("dismissed", [True, False])
+def test_an_open_page_notices_a_new_model(open_board: OpenBoard, dismissed: bool) -> None:
     """The page lists the models again when its window gets the focus."""
     board = open_board()
     choice = board.page.locator("#model option", has_text="home 1.0.0")
@@ -261,9 +336,16 @@ def test_an_open_page_notices_a_new_model(open_board: OpenBoard) -> None:
 
     board.page.route("**/models", with_home)
     board.page.evaluate("dispatchEvent(new Event('focus'))")
-    expect(board.page.locator("#news")).to_have_text("The service has new models: home 1.0.0.")
+    news = board.page.locator("#news")
+    expect(news).to_contain_text("The service has new models: home 1.0.0.")
     expect(choice).to_have_count(1)
     assert board.things == ["desk", "chair"]
+    if dismissed:
+        board.click("Dismiss")
+        expect(board.page.locator("#model")).to_be_focused()
+    else:
+        board.page.locator("#second").select_option(index=2)
+    expect(news).to_be_hidden()
 
 
 def test_an_answer_of_another_version_reloads_the_models(open_board: OpenBoard) -> None:

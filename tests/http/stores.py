@@ -33,6 +33,7 @@ VOCABULARY = Vocabulary(
         ObjectClass("object", structure=True),
     ],
     ("bedroom", "bathroom", "office"),
+    {"office": ("study",)},
 )
 V, A, C = len(VOCABULARY), len(CANONICAL), len(VOCABULARY.room_types)
 TRIPLES = torch.tensor([(0, 0, 1), (0, 1, 0), (1, 3, 5), (2, 2, 1), (2, 7, 5), (3, 2, 0)])
@@ -85,7 +86,8 @@ def publish(
     """Publish a machine with random weights for the first classes and room types."""
     machine = random_machine(variant, seed, classes, room_types)
     names = VOCABULARY.room_types[:room_types]
-    vocabulary = Vocabulary(VOCABULARY.objects[:classes], names)
+    aliases = {name: VOCABULARY.room_aliases.get(name, ()) for name in names}
+    vocabulary = Vocabulary(VOCABULARY.objects[:classes], names, aliases)
     Store(root).publish(
         description(
             name,

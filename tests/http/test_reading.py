@@ -162,6 +162,23 @@ async def test_the_syntax_of_detectors_is_read(
         assert response.json()["mapped"] == [entry]
 
 
+async def test_aliases_of_room_types_and_candidates_are_named(client: httpx.AsyncClient) -> None:
+    """Answers name them by their canonical names. Objects keep their ids."""
+    study = {"label": "study", "class": "office", "similarity": 1.0, "rule": "alias"}
+    answer = await ask(client, "rooms", objects=["couch"], candidates=["study", "Bedrooms"])
+    assert {one["room_type"] for one in answer["room_types"]} == {"office", "bedroom"}
+    assert answer["mapped"] == [study]
+    candidates = ["tv", "bottle of milk", "Lamps", "box of books", "pair of sofas"]
+    body = {"objects": ["couch"], "room_type": "study", "unknown_labels": "ignore"}
+    answer = await ask(client, "missing", **body, candidates=candidates)
+    assert answer["ignored"] == ["bottle of milk", "box of books"]
+    assert [(one["label"], one["class"], one["rule"]) for one in answer["mapped"]] == [
+        ("study", "office", "alias"),
+        ("tv", "television", "alias"),
+        ("pair of sofas", "sofa", "phrase"),
+    ]
+
+
 # ------------------------------------------------------------------------------------- poses
 
 

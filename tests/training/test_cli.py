@@ -172,6 +172,16 @@ def test_a_stored_model_is_evaluated_on_files(tmp_path):
     assert "--file replaces the scenes of --data and --source" in refused
 
 
+def test_the_store_is_that_of_the_service(tmp_path, monkeypatch):
+    """`SCENE_STORE` is the default of `--store`, as in `python -m app.registry`."""
+    monkeypatch.setenv("SCENE_STORE", str(tmp_path / "served"))
+    assert "nor a model in " + str(tmp_path / "served") in invoke("compare", "nowhere", code=1)
+    own = invoke("compare", "nowhere", "--store", tmp_path / "own", code=1)
+    assert "nor a model in " + str(tmp_path / "own") in own
+    monkeypatch.setenv("SCENE_STORE", "")
+    assert "nor a model in model_store" in invoke("compare", "nowhere", code=1)
+
+
 def test_the_version_is_checked_before_training(tmp_path):
     store = tmp_path / "store"
     Store(store).publish(description("tiny", "1.2.0"), state())

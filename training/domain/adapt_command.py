@@ -16,6 +16,7 @@ import typer
 from pydantic import JsonValue
 
 from app.registry import (
+    DEFAULT_STORE,
     Artifact,
     DataSource,
     Description,
@@ -29,7 +30,7 @@ from training.datasets import AnnotatedScene, DatasetError
 from training.datasets.records import digest_of
 from training.domain.adaptation import FEWEST, Adapted, Measured, adapted
 from training.domain.home import JUDGED, Home
-from training.domain.init_command import ROWS, STORE, StorePath, console, fail, read_or_exit
+from training.domain.init_command import ROWS, StorePath, console, fail, read_or_exit
 from training.evaluation.metrics import Ratio
 from training.fit.configuration import ConfigError
 from training.runs.example_scenes import choose_examples
@@ -51,7 +52,7 @@ def adapt_command(
         typer.Argument(help="recorded scenes of one home; a later file corrects earlier scenes"),
     ],
     name: Annotated[str, typer.Option("--name", help="name of the home's model")] = "home",
-    store: StorePath = STORE,
+    store: StorePath = DEFAULT_STORE,
     promote: Annotated[
         bool, typer.Option("--promote", help="point the alias `default` at the new version")
     ] = False,
@@ -138,8 +139,8 @@ def _corrected(files: Iterable[Sequence[AnnotatedScene]]) -> list[AnnotatedScene
 
 def _print_home(home: Home, parent: Artifact) -> None:
     lines = [
-        f"{home.recorded} recorded scenes, {len(home.scenes)} of them distinct, {home.confirmed} "
-        f"confirmed; model {_reference(parent)}"
+        f"{home.recorded} recorded scenes; {len(home.scenes)} distinct scenes, {home.confirmed} of "
+        f"these confirmed; model {_reference(parent)}"
     ]
     if home.new_classes:
         lines.append(

@@ -15,13 +15,13 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from app.registry import RegistryError, Store
+from app.registry import DEFAULT_STORE, RegistryError, Store
 from training.datasets import AnnotatedScene, DatasetError, annotated_classes, encode
 from training.datasets.batches import SceneTensors, scene_tensors
 from training.datasets.cases import some_scenes
 from training.datasets.files import DATA
 from training.domain.candidates import BASELINES, Candidate, find, held_out
-from training.domain.init_command import STORE, StorePath, fail
+from training.domain.init_command import StorePath, fail
 from training.domain.translation import Translation, same_classes
 from training.evaluation.metrics import Figure
 from training.evaluation.model import Model
@@ -99,7 +99,7 @@ def compare_command(
     data: Annotated[
         Path | None, typer.Option("--data", help="folder with the scenes of the first model")
     ] = None,
-    store: StorePath = STORE,
+    store: StorePath = DEFAULT_STORE,
     output: Annotated[Path | None, typer.Option("--json", help="write all results here")] = None,
 ) -> None:
     """Compare two models on scenes held out from both.

@@ -1,8 +1,12 @@
 """Relations that a person has confirmed, although the model reports them as misplaced.
 
-A confirmed relation counts like `_SCENES` training scenes in the places of the model
-(`app.registry.places`). So the supporter of an object becomes a usual one. Of 274 random pairs of
-common classes whose relation on-top is reported, 233 are not reported afterwards.
+The new model never reports a confirmed relation of two classes (`app.registry.Misplaced.usual`).
+The relation also counts like `_SCENES` training scenes in the places of the model
+(`app.registry.places`), so the place becomes a usual one for missing objects.
+
+Of 150 random pairs of common classes whose relation on-top is reported with boxes, none is reported
+afterwards. In 111 of these scenes, the model also reports the object on another class, before and
+afterwards. 70 of the 150 relations are reported only with boxes, and not as stated.
 """
 
 from __future__ import annotations
@@ -13,13 +17,14 @@ from typing import Final
 
 import numpy as np
 
-from app import questions
+from app.questions.misplaced import THE_FLOOR
 from app.registry import Artifact
 from app.scene import Vocabulary
 from app.scene.relations import STACKED
 from training.datasets import AnnotatedScene, encode
 from training.datasets.cases import scene_of
-from training.evaluation.asking import canonical_triple
+from training.datasets.moved import has_boxes, posed_scene
+from training.evaluation.asking import canonical_triple, score_misplaced
 
 _SCENES: Final = 20.0
 
@@ -29,7 +34,8 @@ Triple = tuple[int, int, int]
 def reported_relations(model: Artifact, recorded: Sequence[AnnotatedScene]) -> set[Triple]:
     """Return the relations (a, i, j) of classes that the model reports in confirmed scenes.
 
-    They are stacked relations, such as on-top.
+    They are stacked relations, such as on-top. Each scene is asked as stated and with its boxes.
+    Boxes also show the stand of each object, so the model reports other relations with boxes.
     """
     if model.places is None:
         return set()
@@ -39,12 +45,15 @@ def reported_relations(model: Artifact, recorded: Sequence[AnnotatedScene]) -> s
     for encoded in encode(words, model.vocabulary, model.places.roles):
         holds = encoded.instance_holds
         triples = [(a, i, j) for a in STACKED for i, j in np.argwhere(holds[a]).tolist()]
-        scene = scene_of(encoded, range(len(encoded.instance_classes)), triples)
-        for entry in questions.misplaced(model, scene) if triples else ():
-            if entry["is_misplaced"]:
-                a, i, j = canonical_triple(scene, entry)
-                subject, other = encoded.instance_classes[[i, j]].tolist()
-                found.add((a, subject, other))
+        scenes = [scene_of(encoded, range(len(encoded.instance_classes)), triples)]
+        if has_boxes(encoded):
+            scenes.append(posed_scene(encoded))
+        for scene in scenes if triples else ():
+            for entry in score_misplaced(model, scene):
+                if entry["is_misplaced"] and entry["object"] != THE_FLOOR:
+                    a, i, j = canonical_triple(scene, entry)
+                    subject, other = encoded.instance_classes[[i, j]].tolist()
+                    found |= {(a, subject, other)} if a in STACKED else set()
     return found
 
 
@@ -59,12 +68,14 @@ def _canonical(scene: AnnotatedScene, vocabulary: Vocabulary) -> AnnotatedScene:
 
 
 def with_confirmed(artifact: Artifact, triples: Iterable[Triple]) -> Artifact:
-    """Return the model, whose places show these relations of classes."""
-    places, V = artifact.places, len(artifact.vocabulary)
+    """Return the model, which never reports these relations of classes."""
+    places, V, triples = artifact.places, len(artifact.vocabulary), sorted(triples)
     if places is None:
         return artifact
+    misplaced = artifact.calibration.misplaced.model_copy(update={"usual": tuple(triples)})
+    calibration = artifact.calibration.model_copy(update={"misplaced": misplaced})
     new = np.array([(a * V + i) * V + j for a, i, j in triples], places.triple.dtype)
     keys, index = np.unique(np.concatenate([places.triple, new]), return_inverse=True)
     held = np.bincount(index, np.concatenate([places.held, np.full(len(new), _SCENES)]))
     places = replace(places, triple=keys, held=held.astype(places.held.dtype))
-    return replace(artifact, places=places)
+    return replace(artifact, places=places, calibration=calibration)

@@ -12,11 +12,11 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from app.registry import Artifact, Metric, RegistryError, Store
+from app.registry import DEFAULT_STORE, Artifact, Metric, RegistryError, Store
 from training.datasets import DatasetError
 from training.datasets.batches import subset
 from training.datasets.files import DATA
-from training.domain.init_command import STORE, StorePath, fail
+from training.domain.init_command import StorePath, fail
 from training.evaluation.everyday_task import EVERYDAY
 from training.evaluation.metrics import Figure
 from training.evaluation.outside import OutsideTest, read_test
@@ -49,7 +49,7 @@ def evaluate_command(
             f"folder of its configuration file; default: {DATA}",
         ),
     ] = None,
-    store: StorePath = STORE,
+    store: StorePath = DEFAULT_STORE,
     source: Annotated[list[str] | None, typer.Option(help="use only these data sources")] = None,
     output: Annotated[Path | None, typer.Option("--json", help="write figures to a file")] = None,
 ) -> None:

@@ -32,8 +32,9 @@ BAD_LINES = 20
 ROWS = 12
 """Maximum number of entries of a printed list."""
 
-StorePath = Annotated[str, typer.Option("--store", help="folder of the model store")]
-STORE = "model_store"
+StorePath = Annotated[
+    str, typer.Option("--store", envvar="SCENE_STORE", help="folder of the model store")
+]
 
 console = Console()
 

@@ -20,7 +20,7 @@ from pydantic import ValidationError
 from app.registry import VocabularyEntry
 from app.registry.fields import first_error
 from app.scene import ObjectClass, Vocabulary, label_key
-from training.datasets import AnnotatedScene, source_vocabulary
+from training.datasets import AnnotatedScene, DatasetError, source_vocabulary
 from training.datasets.records import AnnotatedObject
 from training.datasets.vocabulary import coverage, vocabulary_text
 from training.domain.look import Label
@@ -148,7 +148,9 @@ def _edited(path: Path) -> tuple[dict[str, Any], Vocabulary]:
         return values, VocabularyEntry.model_validate(values).vocabulary()
     except ValidationError as error:
         raise ConfigError(f"{path} cannot be used: {first_error(error)}") from None
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise ConfigError(str(DatasetError.unreadable(path, error))) from None
+    except ValueError as error:
         raise ConfigError(f"{path} cannot be used: {error}") from None
 
 

@@ -100,12 +100,11 @@ def fit_misplaced(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int 
     cases = _cases(artifact, _some(scenes, seed), seed)
     if cases is None:
         return Misplaced()
-    return Misplaced(
-        **{
-            name: _fit_kind(cases.rows(cases.kind == kind), _BUDGET[name])
-            for kind, name in enumerate(KINDS)
-        }
-    )
+    kinds = {
+        name: _fit_kind(cases.rows(cases.kind == kind), _BUDGET[name])
+        for kind, name in enumerate(KINDS)
+    }
+    return Misplaced().model_copy(update=kinds)
 
 
 def _some(scenes: Sequence[EncodedScene], seed: int) -> list[EncodedScene]:

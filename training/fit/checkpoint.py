@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import torch
 
+from training.datasets import DatasetError
 from training.machines import BoltzmannMachine
 
 
@@ -68,12 +69,16 @@ def load_checkpoint(path: Path, digest: str) -> dict[str, Any] | None:
         return None
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+    except OSError as error:
+        raise RunError(str(DatasetError.unreadable(path, error))) from error
     except Exception as error:
-        raise RunError(f"{path.name} cannot be read: {error}") from error
+        # The messages of torch have several lines, and advise to load the file without checks.
+        raise RunError(
+            f"{path}: cannot be read: it is damaged or no checkpoint; use --fresh to start over"
+        ) from error
     if state.get("digest") != digest:
         raise RunError(
-            f"{path.name} belongs to another configuration or other scenes: use --fresh to start "
-            "over"
+            f"{path}: belongs to another configuration or other scenes; use --fresh to start over"
         )
     return state
 

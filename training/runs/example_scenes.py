@@ -21,7 +21,7 @@ from app.errors import RequestError
 from app.questions.reading import Limits, read_scene
 from app.registry.examples import MAX_WORD, Example, Examples
 from app.scene import Vocabulary, canonicalise
-from training.datasets import AnnotatedScene
+from training.datasets import AnnotatedScene, DatasetError
 from training.datasets.encoding import room_viewpoint
 from training.datasets.records import AnnotatedObject
 from training.datasets.sources import source_of
@@ -58,8 +58,8 @@ def read_examples(reference: str, root: Path) -> tuple[Example, ...]:
         raise ConfigError(f"{path}, {first_error(error)}") from error
     except OSError as error:
         raise ConfigError(
-            f"{path} cannot be read: {error}. Remove the entry `examples` of the configuration, or "
-            "provide the file"
+            f"{DatasetError.unreadable(path, error)}. Remove the entry `examples` of the "
+            "configuration, or provide the file"
         ) from error
 
 

@@ -15,6 +15,7 @@ from app.registry import Example
 from app.scene import RoleCounts, Vocabulary
 from training.datasets import (
     AnnotatedScene,
+    DatasetError,
     EncodedScene,
     annotated_classes,
     encode,
@@ -181,7 +182,11 @@ def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path)
         return with_typical_sizes(makers[name](), scenes)
     try:
         vocabulary = read_vocabulary(root / name)
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise ConfigError(
+            f"data.vocabulary: {DatasetError.unreadable(root / name, error)}"
+        ) from error
+    except ValueError as error:
         raise ConfigError(f"data.vocabulary: {root / name} cannot be used: {error}") from error
     return with_typical_sizes(vocabulary, scenes)
 

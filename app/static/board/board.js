@@ -17,7 +17,7 @@ const MARK = 9; // radius of the mark of an outlier, in pixels
 const FONT = '500 13px system-ui, sans-serif';
 const SEEN = [
   'things', 'viewer', 'answers', 'shown', 'tab', 'selected', 'draft', 'words', 'at', 'models', 'posed', 'refused',
-  'right',
+  'right', 'line',
 ];
 
 /** Outlier entries of the shown model, by object id. */

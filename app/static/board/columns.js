@@ -8,7 +8,7 @@ import { common, inWords, QUESTIONS, reading, whyNot } from './questions.js';
 import { changed } from './store.js';
 import { namesOf, percent, SPOKEN } from './words.js';
 
-const SEEN = ['answers', 'shown', 'models', 'things', 'tab', 'draft', 'words', 'at', 'refused', 'posed', 'relations', 'room', 'right'];
+const SEEN = ['answers', 'shown', 'models', 'things', 'tab', 'draft', 'words', 'at', 'refused', 'posed', 'relations', 'room', 'right', 'line'];
 
 const PLACES = 2; // listed places of a missing object, likeliest first
 

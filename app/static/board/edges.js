@@ -17,14 +17,14 @@ export const keyOf = ({ subject, relation, object }) => JSON.stringify([subject,
 /** The answer about outliers of a model, without the alarms that the user confirmed as right; undefined without an answer. */
 export function judgedBy(own, { things, right, line }) {
   const answer = own.outliers?.answer;
-  const belongs = new Set(things.filter((thing) => thing.belongs).map(({ id }) => id));
+  // In a confirmed scene, all objects belong there and stand right, also those that are added later.
+  const belongs = new Set(things.filter((thing) => line.confirmed || thing.belongs).map(({ id }) => id));
   if (!answer || !(belongs.size || right.length)) return answer ?? undefined;
-  // In a confirmed scene, objects that belong there also stand right.
-  const stands = (one) => right.includes(keyOf(one)) || (line.confirmed && belongs.has(one.subject) && belongs.has(one.object));
+  const stands = (one) => line.confirmed || right.includes(keyOf(one));
   return {
     ...answer,
     outliers: answer.outliers.map((one) => (belongs.has(one.object) ? { ...one, is_outlier: false, confirmed: true } : one)),
-    misplaced: answer.misplaced.map((one) => (stands(one) ? { ...one, is_misplaced: false, confirmed: true } : one)),
+    misplaced: answer.misplaced.map((one) => (one.is_misplaced && stands(one) ? { ...one, is_misplaced: false, confirmed: true } : one)),
   };
 }
 

@@ -22,7 +22,8 @@ export function fileDialog(store, records, recorded, put, say) {
   const scene = () => toScene(store.get(), sizesOf(store.get(), store.get().models[0]));
   const chosen = (count) => Math.min(count, Math.max(1, Number(which.value))) - 1;
   let found = [];
-  let opened = ''; // the text whose scene was put on the board last
+  let name = ''; // of the file in the text area
+  let opened = []; // text and name of the file whose scene was put on the board last
   let hidden = ''; // text of a large file, which the text area does not show
   const source = () => hidden || area.value;
 
@@ -38,10 +39,10 @@ export function fileDialog(store, records, recorded, put, say) {
     which.max = found.length;
     which.value = 1;
     which.parentElement.hidden = found.length < 2;
-    name();
+    nameScene();
   }
 
-  function name() {
+  function nameScene() {
     get('scenes').textContent = `of ${found.length}: ${found[chosen(found.length)] ?? ''}`;
   }
 
@@ -54,13 +55,15 @@ export function fileDialog(store, records, recorded, put, say) {
   /** Shows the buttons of the confirmed scenes if there are any. */
   function listRecords() {
     get('download-scenes').hidden = !records.count();
-    get('download-scenes').textContent = `Download scenes.jsonl (${records.count()} confirmed)`;
+    get('download-scenes').textContent = `Download ${records.name()} (${records.count()} confirmed)`;
     get('forget-scenes').hidden = !records.kept();
     get('forget-scenes').textContent = `Remove ${records.kept()} confirmed from this browser`;
+    if (records.others()) done.textContent = `Confirmed scenes of other files: ${records.others()}. Open such a file to download its scenes.`;
   }
 
   function show(text, file = null) {
     const isLarge = file && file.size > MOST_SHOWN;
+    name = file?.name ?? 'scenes.jsonl';
     hidden = isLarge ? text : '';
     area.value = isLarge ? '' : text;
     error.textContent = '';
@@ -73,7 +76,7 @@ export function fileDialog(store, records, recorded, put, say) {
     done.textContent = '';
     count();
   });
-  which.addEventListener('input', name);
+  which.addEventListener('input', nameScene);
   map.addEventListener('change', () => (names.parentElement.hidden = map.value !== 'own'));
   get('open-file').addEventListener('click', () => {
     show(JSON.stringify(scene(), null, 1));
@@ -84,7 +87,7 @@ export function fileDialog(store, records, recorded, put, say) {
   get('close-file').addEventListener('click', () => dialog.close());
   get('import').addEventListener('click', () => {
     try {
-      place(source(), chosen(found.length));
+      place(chosen(found.length), source(), name);
       dialog.close();
     } catch (problem) {
       if (!(problem instanceof SceneError)) throw problem;
@@ -92,7 +95,7 @@ export function fileDialog(store, records, recorded, put, say) {
     }
   });
   /** Puts a scene of a text on the board. Throws SceneError. */
-  function place(text, index) {
+  function place(index, text, of) {
     const scenes = scenesIn(text);
     const labels = labelsOf(map.value, names.value);
     const given = scenes.read(index, labels);
@@ -100,17 +103,17 @@ export function fileDialog(store, records, recorded, put, say) {
       throw new SceneError(`The file has no object for a scene: ${given.notes[0]?.[2] ?? 'it lists no detection with a class'}.`);
     }
     // Only requests and training scenes have no notes.
-    const lines = given.notes ? [] : linesIn(text);
-    const line = lines.length ? records.open(lines)[index] : undefined;
+    const lines = given.notes ? [] : linesIn(text, of);
+    const line = lines.length ? records.open(lines, of)[index] : undefined;
     const { scene: read } = line ? scenesIn(JSON.stringify(line)).read(0, labels) : given;
     put(read, inWords(given.notes ?? []), line);
-    opened = text;
+    opened = [text, of];
     const count = lines.length;
     recorded.open(lines, index);
     say(count > 1 ? `Scene ${index + 1} of ${count} is on the board.` : 'The scene is on the board.');
   }
   get('download').addEventListener('click', () => save(source(), 'scene.json'));
-  get('download-scenes').addEventListener('click', () => save(records.text(), 'scenes.jsonl'));
+  get('download-scenes').addEventListener('click', () => save(records.text(), records.name()));
   get('forget-scenes').addEventListener('click', () => {
     records.clear();
     listRecords();
@@ -128,7 +131,7 @@ export function fileDialog(store, records, recorded, put, say) {
     await copy(location.href);
     done.textContent = 'The link is copied. It contains the whole scene, and browsers do not send this part to a server.';
   });
-  return { place: (index) => place(opened, index) };
+  return { place: (index) => place(index, ...opened) };
 }
 
 /** Saves a text as a file. */

@@ -7,7 +7,7 @@ import { readings } from './questions.js';
 import { changed } from './store.js';
 import { nameOf } from './words.js';
 
-const SEEN = ['things', 'selected', 'answers', 'shown', 'viewer', 'draft', 'refused', 'models', 'posed'];
+const SEEN = ['things', 'selected', 'answers', 'shown', 'viewer', 'draft', 'refused', 'models', 'posed', 'line'];
 
 export function createList(list, empty, count, actions) {
   function row({ id }) {
@@ -66,5 +66,14 @@ export function createList(list, empty, count, actions) {
     count.textContent = things.length ? `(${things.length}${state.draft ? `, ${state.draft.fresh.size} new` : ''})` : '';
   }
 
-  return (state, previous) => changed(state, previous, ...SEEN) && draw(state);
+  /** Scrolls the list, but not the page, to the selected object. */
+  function reveal() {
+    const [row, view] = [list.querySelector('.selected'), list].map((node) => node?.getBoundingClientRect());
+    if (row) list.scrollTop += Math.min(0, row.top - view.top) + Math.max(0, row.bottom - view.bottom);
+  }
+
+  return (state, previous) => {
+    if (changed(state, previous, ...SEEN)) draw(state);
+    if (changed(state, previous, 'selected')) reveal();
+  };
 }

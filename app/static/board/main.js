@@ -52,7 +52,7 @@ function put(scene, change = {}, line = newLine()) {
   store.edit({
     things: withSources(things.map((thing) => {
       const { x, y, z } = places.get(thing.id) ?? thing;
-      return { ...thing, x, y, z, ...(line.confirmed && { belongs: true }) };
+      return { ...thing, x, y, z };
     }), line),
     line, right: [],
     // As in the service, stated relations take precedence over positions.
@@ -121,15 +121,21 @@ const takeGhost = (ghost) => {
 };
 const board = createBoard(get('board'), store, actions, takeGhost);
 const models = createModels(store, get('model'), get('second'), tell, (words) => {
-  get('news').textContent = words;
+  get('news').replaceChildren(words, ' ', el('button', { type: 'button', onclick: dismiss }, 'Dismiss'));
   get('news').hidden = false;
 });
+function dismiss() {
+  get('news').hidden = true;
+  get('model').focus();
+}
+get('model').addEventListener('change', () => (get('news').hidden = true));
+get('second').addEventListener('change', () => (get('news').hidden = true));
 const verdicts = createVerdicts(store, say, actions.add);
 get('confirm-scene').addEventListener('click', verdicts.sceneIsRight);
 const views = [
   board.render,
+  createProperties(get('properties'), store, actions), // leaves less room for the list
   createList(get('list'), get('empty'), get('count'), actions),
-  createProperties(get('properties'), store, actions),
   createColumns(store, (question) => document.querySelector(`.columns[data-question=${question}]`), askKey,
     verdicts),
   createGeneration(get('generate'), get('drawn'), store, say),
@@ -179,7 +185,7 @@ function showRecords() {
   get('confirm-scene').hidden = isConfirmed;
   get('confirm-scene').textContent = `This scene is right${open ? ` (${open} false ${open === 1 ? 'alarm' : 'alarms'})` : ''}`;
   get('confirmed').textContent = isConfirmed
-    ? `Confirmed scene. Import, export downloads all confirmed scenes (${records.count()}).` : statusOf(state);
+    ? `Confirmed scene. Import, export downloads the file (${records.count()} confirmed).` : statusOf(state);
   recorded.draw();
 }
 

@@ -75,17 +75,21 @@ export function whyNot(state, question, model) {
   return common(state)?.length === 0 ? 'The two models have no class in common.' : '';
 }
 
+/** How a model reads a name that is no label of its own: {class, similarity}, or undefined. */
+export const mappedBy = (state, column, name) => QUESTIONS
+  .flatMap((question) => state.answers[column][question]?.answer?.mapped ?? []).find(({ label }) => label === name);
+
 /**
- * How a model reads an unknown name: ["fridgee →", "fridge"], ["flux not known, left out"], or [].
+ * How a model reads an unknown name: ["fridgee →", "fridge"], ["hall → corridor"] for certain, ["flux not known, left out"], or [].
  * @param {'objects' | 'rooms'} kind
  * @returns {string[]} words, then similar names
  */
 export function reading(state, column, kind, name) {
   const similar = refusedBy(state, state.models[column])[kind].get(name);
   if (similar) return [`${name} not known, left out${similar.length ? ':' : ''}`, ...similar];
-  const mapped = QUESTIONS.flatMap((question) => state.answers[column][question]?.answer?.mapped ?? []);
-  const found = mapped.find(({ label }) => label === name);
-  return found ? [`${name} →`, found.class] : [];
+  const found = mappedBy(state, column, name);
+  if (!found) return [];
+  return found.similarity < 1 ? [`${name} →`, found.class] : [`${name} → ${found.class}`];
 }
 
 /** A reading as text: "fridgee → fridge?". */

@@ -70,7 +70,7 @@ export function createRecorded(store, records, go) {
     nextAlarm.textContent = `Next alarm (scene ${alarm + 1})`;
     if (!several) return;
     const known = alarms.length < lines.length ? `${alarms.length} of ${lines.length} scenes asked. ` : '';
-    status.textContent = `${known}${open} of ${lines.length} scenes with an open alarm.`;
+    status.textContent = `${known}${open} of ${lines.length} scenes with an open alarm. On the board: ${lines[current].scene_id}.`;
     lines.forEach((line, index) => {
       const words = nameOf(line, index);
       if (list.options[index].textContent !== words) list.options[index].textContent = words;
@@ -80,7 +80,7 @@ export function createRecorded(store, records, go) {
 
   function nameOf(line, index) {
     const about = records.current(line).confirmed ? '✓ confirmed' : alarms[index]?.length ? `⚠ ${alarms[index].join(', ')}` : '';
-    return [index + 1, line.room_type, about].filter(Boolean).join(' · ');
+    return [index + 1, line.room_type, about, line.scene_id].filter(Boolean).join(' · ');
   }
 
   next.addEventListener('click', () => go(current + 1));

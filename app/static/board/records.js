@@ -8,7 +8,7 @@ import { sizesOf } from './questions.js';
 import { sizer } from './scene.js';
 import { changed } from './store.js';
 
-const PREFIX = 'confirmed-scene ';
+const PREFIX = 'confirmed ';
 const MOST_SCENES = 1000;
 const LEAST_CONFIDENCE = 0.5;
 const FULL = 'This browser has no room for more confirmed scenes. Download them, then remove them from the browser.';
@@ -24,7 +24,7 @@ export function newLine(now = new Date()) {
 }
 
 /** The scenes of a file with recorded scenes, or [] for another text. A scene without id is named as in the training. */
-export function linesIn(text, file = 'scenes.jsonl') {
+export function linesIn(text, file) {
   try {
     const lines = text.split('\n').flatMap((line, index) => (line.trim() ? [[JSON.parse(line), index + 1]] : []));
     const named = lines.map(([line, number]) => ({ scene_id: `${file}:${number}`, ...line }));
@@ -98,17 +98,20 @@ const AXES = ['x', 'y', 'z'];
 
 /** Keeps the confirmed scenes of the board. @param {() => void} whenChanged */
 export function createRecords(store, whenChanged) {
-  const confirmed = new Map(stored());
+  const confirmed = new Map(stored()); // scene_id → {line, of}; of: the first scene_id of the opened file, or ''
   let file = new Map();
+  let name = 'scenes.jsonl';
+  const opened = () => file.keys().next().value ?? '';
 
   function keep(line) {
     if (confirmed.size >= MOST_SCENES && !confirmed.has(line.scene_id)) {
       store.set({ complaint: FULL });
       return;
     }
-    confirmed.set(line.scene_id, line);
+    const entry = { line, of: confirmed.get(line.scene_id)?.of ?? opened() };
+    confirmed.set(line.scene_id, entry);
     try {
-      localStorage.setItem(PREFIX + line.scene_id, JSON.stringify(line));
+      localStorage.setItem(PREFIX + line.scene_id, JSON.stringify(entry));
     } catch {
       store.set({ complaint: FULL }); // or the browser forbids storage; the scene stays in memory
     }
@@ -129,17 +132,22 @@ export function createRecords(store, whenChanged) {
   });
 
   return {
-    /** The number of confirmed scenes. */
+    /** The name of the opened file. */
+    name: () => name,
+    /** The number of confirmed scenes of the opened file, with those that were drawn since. */
     count: () => [...lines().values()].filter((line) => line.confirmed).length,
+    /** The number of confirmed scenes of other files. */
+    others: () => [...confirmed.keys()].filter((id) => !lines().has(id)).length,
     /** The confirmed scene with the id of a line, or the line. */
-    current: (line) => confirmed.get(line.scene_id) ?? line,
+    current: (line) => confirmed.get(line.scene_id)?.line ?? line,
     /** The number of scenes that this browser keeps. */
     kept: () => confirmed.size,
-    /** Replaces the opened file. Returns its lines, with the confirmed scenes of this browser. */
-    open(found) {
+    /** Replaces the opened file by that of the name `of`. Returns its lines, with the confirmed scenes of this browser. */
+    open(found, of) {
       file = new Map(found.map((line) => [line.scene_id, line]));
+      name = of.replace(/\.json$/, '.jsonl');
       whenChanged();
-      return found.map((line) => confirmed.get(line.scene_id) ?? line);
+      return found.map(this.current);
     },
     text: () => [...lines().values()].map((line) => `${JSON.stringify(line)}\n`).join(''),
     clear() {
@@ -151,7 +159,7 @@ export function createRecords(store, whenChanged) {
 
   function lines() {
     const all = new Map(file);
-    for (const [id, line] of confirmed) all.set(id, line);
+    for (const [id, { line, of }] of confirmed) if (file.has(id) || of === opened()) all.set(id, line);
     return all;
   }
 }

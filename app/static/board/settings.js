@@ -5,10 +5,10 @@ import { el } from './dom.js';
 import { edgesOf, judgedBy, wrongIn } from './edges.js';
 import { UNKNOWN_SIZE } from './geometry.js';
 import { ghostsOf } from './ghosts.js';
-import { inWords, knownTo, readings, sizesOf } from './questions.js';
+import { inWords, knownTo, mappedBy, readings, sizesOf } from './questions.js';
 import { sizer } from './scene.js';
 import { changed } from './store.js';
-import { namesOf, percent, SPOKEN } from './words.js';
+import { namesOf, percent, plain, SPOKEN } from './words.js';
 
 const get = (id) => document.getElementById(id);
 
@@ -46,6 +46,7 @@ function evidence(state) {
 }
 
 const roomsOf = (state) => state.answers?.[state.shown].rooms?.answer;
+const roomRead = (state) => state.answers && mappedBy(state, state.shown, state.room)?.class;
 
 export function settings(store) {
   get('sensitivity').addEventListener('change', ({ target }) => store.set({ sensitivity: target.value }));
@@ -61,9 +62,10 @@ export function settings(store) {
     const known = state.words[state.models[0]]?.rooms ?? [];
     const all = state.room && !known.includes(state.room) ? [...known, state.room] : [...known];
     const answer = roomsOf(state)?.room_types ?? [];
-    const likely = new Map(answer.map((one) => [one.room_type, one.probability]));
-    all.sort((a, b) => (likely.get(b) ?? 0) - (likely.get(a) ?? 0));
-    const words = (room) => (likely.has(room) ? `${room} ${percent(likely.get(room))}` : room);
+    const likely = new Map(answer.map((one) => [plain(one.room_type), one.probability]));
+    const probability = (room) => likely.get(plain(room)) ?? likely.get(plain(mappedBy(state, state.shown, room)?.class ?? ''));
+    all.sort((a, b) => (probability(b) ?? 0) - (probability(a) ?? 0));
+    const words = (room) => (probability(room) === undefined ? room : `${room} ${percent(probability(room))}`);
     get('room').replaceChildren(el('option', { value: '' }, 'unknown'), ...all.map((room) => el('option', { value: room }, words(room))));
     get('room').value = state.room;
     get('room').parentElement.hidden = !all.length;
@@ -81,8 +83,8 @@ export function settings(store) {
     document.body.classList.toggle('two', Boolean(state.models[1]));
     get('at').hidden = !state.at;
     if (state.at) get('at-words').textContent = `Missing ${SPOKEN[state.at.relation]} ${namesOf(state.things)(state.at.object)}`;
-    if (changed(state, previous, 'words', 'models', 'room', 'shown') || roomsOf(state) !== roomsOf(previous)) rooms(state);
-    if (changed(state, previous, 'answers', 'shown', 'draft', 'things', 'right')) {
+    if (changed(state, previous, 'words', 'models', 'room', 'shown') || roomsOf(state) !== roomsOf(previous) || roomRead(state) !== roomRead(previous)) rooms(state);
+    if (changed(state, previous, 'answers', 'shown', 'draft', 'things', 'right', 'line')) {
       const answer = judgedBy(state.answers[state.shown], state);
       const { outliers, misplaced } = answer ? wrongIn(answer) : { outliers: [], misplaced: [] };
       get('alarms').textContent = outliers.length + misplaced.length;

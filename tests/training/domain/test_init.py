@@ -75,6 +75,9 @@ def test_an_edited_vocabulary_is_used(lab) -> None:
     path.write_text("{}")
     with pytest.raises(ConfigError, match=r"vocabulary\.json cannot be used"):
         prepare(config, lab)
+    path.unlink()
+    with pytest.raises(ConfigError, match=r"vocabulary\.json: no such file$"):
+        prepare(config, lab)
 
 
 def test_files_are_overwritten_only_with_force(file, lab) -> None:
@@ -157,6 +160,7 @@ def test_an_update_reads_a_file_that_has_grown(file, lab) -> None:
         (lambda lab: (lab / "proposed.json").write_text("[]"), (), "proposed.json cannot be used"),
         (lambda lab: (lab / "vocabulary.json").write_text("{}"), (), "objects: Field required"),
         (lambda lab: (lab / "vocabulary.json").write_text("{,"), (), "vocabulary.json cannot be"),
+        (lambda lab: (lab / "vocabulary.json").unlink(), (), "vocabulary.json: no such file"),
         (lambda lab: None, ("--force",), "--force cannot be used with it"),
         (lambda lab: None, ("--terms", "x"), "--terms cannot be used with it"),
     ],

@@ -183,7 +183,14 @@ def test_a_checkpoint_that_is_broken_or_another_configuration_s_is_refused(data,
     with pytest.raises(RunError, match="another configuration"):
         Trainer(small_config(**{"objects.steps": 11}), data, tmp_path).resume()
     (tmp_path / "checkpoint.pt").write_bytes(b"not a checkpoint")
-    with pytest.raises(RunError, match="cannot be read"):
+    with pytest.raises(
+        RunError, match=r"checkpoint\.pt: cannot be read: it is damaged.*--fresh"
+    ) as bad:
+        Trainer(small_config(), data, tmp_path).resume()
+    assert "\n" not in str(bad.value)
+    (tmp_path / "checkpoint.pt").unlink()
+    (tmp_path / "checkpoint.pt").mkdir()
+    with pytest.raises(RunError, match=r"checkpoint\.pt: cannot be read: Is a directory$"):
         Trainer(small_config(), data, tmp_path).resume()
     assert not Trainer(small_config(), data, tmp_path / "empty").resume()
 

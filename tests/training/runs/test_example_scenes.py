@@ -71,7 +71,7 @@ def test_research_only_scenes_are_never_chosen() -> None:
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        (None, "cannot be read"),
+        (None, r": no such file\. Remove the entry"),
         ("{", "Invalid JSON"),
         ([{"name": "a", "scene": {"objects": [{"id": "bed"}]}}], "label: Field required"),
         ([{"name": "a", "scene": {"objects": ["bed"]}}] * 9, "at most 8 items"),

@@ -81,25 +81,36 @@ class ObservedRelation:
     object: str
 
 
-Rule = Literal["qualifier", "alternative", "article", "instance", "prompt", "spelling", "head"]
-"""how the service reads a label that the vocabulary does not list"""
+Rule = Literal[
+    "alias",
+    "phrase",
+    "qualifier",
+    "alternative",
+    "article",
+    "instance",
+    "prompt",
+    "spelling",
+    "head",
+]
+"""how the service reads a label that is not a label of the vocabulary"""
 
 
 class Mapped(Reply):
-    """A label that the vocabulary does not list, and the class that replaces it."""
+    """A label that the service has read as a class or room type with another name."""
 
     model_config = ConfigDict(frozen=True, populate_by_name=True, serialize_by_alias=True)
 
     label: str
-    """unlisted label of an object or candidate, or room type"""
+    """label of an object or candidate, or room type"""
     class_: Annotated[str, Field(alias="class")]
-    """canonical label of the class"""
+    """canonical label of the class, or room type of the model"""
     similarity: Annotated[float, Field(ge=0, le=1)]
     """similarity of the label and the class. 1 means that the rule is certain"""
     rule: Rule
-    """how the service read the label. Certain rules: qualifier (`mouse_(computer_equipment)`),
-    alternative (`sofa/couch`), article (`a chair`), instance (`chair_12`), prompt (`a photo of a
-    chair`). Guesses: spelling (`nigthstand`), head (`office table`)"""
+    """how the service read the label. Certain rules: alias (`hall`), phrase (`bottle of milk`),
+    qualifier (`mouse_(computer_equipment)`), alternative (`sofa/couch`), article (`a chair`),
+    instance (`chair_12`), prompt (`a photo of a chair`). Guesses: spelling (`nigthstand`), head
+    (`office table`)"""
 
 
 WarningCode = Literal[
@@ -145,8 +156,9 @@ class Answer(Reply):
     """with `ignore` or `nearest-or-ignore` as `unknown_labels`: ids of the objects, candidates and
     room type that the model does not know. The answer ignores them"""
     mapped: list[Mapped] = []
-    """each label that the vocabulary does not list, with the class that replaces it. Guesses need
-    `nearest` or `nearest-or-ignore` as `unknown_labels`"""
+    """each label that the vocabulary does not list, and each alias of a candidate or room type. The
+    class replaces the label. Aliases of objects are not listed, because answers name objects by id.
+    Guesses need `nearest` or `nearest-or-ignore` as `unknown_labels`"""
     warnings: list[SceneWarning] = []
     """probable mistakes in the scene"""
     observed_relations: list[ObservedRelation] | None = None

@@ -130,9 +130,8 @@ class WordAnswer(Reply):
     model: ModelReference
     word: str
     class_: Annotated[VocabularyEntry | None, Field(alias="class")] = None
-    rule: Literal["label", "alias", "phrase"] | Rule | None = None
-    """how the service reads the label: label, alias or phrase (`bottle of milk`) of the vocabulary,
-    or a rule of `mapped`"""
+    rule: Literal["label"] | Rule | None = None
+    """how the service reads the label: `label` of the vocabulary, or a rule of `mapped`"""
     certain: bool = False
     """true if every request accepts the label; false if it needs `unknown_labels: nearest`"""
     suggestions: list[str] = []
