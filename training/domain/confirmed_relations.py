@@ -19,7 +19,7 @@ from app.scene import Vocabulary
 from app.scene.relations import STACKED
 from training.datasets import AnnotatedScene, encode
 from training.datasets.cases import scene_of
-from training.evaluation.asking import canonical_triple
+from training.evaluation.asking import canonical_triple, index_of_ids
 
 _SCENES: Final = 20.0
 
@@ -40,9 +40,10 @@ def reported_relations(model: Artifact, recorded: Sequence[AnnotatedScene]) -> s
         holds = encoded.instance_holds
         triples = [(a, i, j) for a in STACKED for i, j in np.argwhere(holds[a]).tolist()]
         scene = scene_of(encoded, range(len(encoded.instance_classes)), triples)
+        index = index_of_ids(scene)
         for entry in questions.misplaced(model, scene) if triples else ():
             if entry["is_misplaced"]:
-                a, i, j = canonical_triple(scene, entry)
+                a, i, j = canonical_triple(index, entry)
                 subject, other = encoded.instance_classes[[i, j]].tolist()
                 found.add((a, subject, other))
     return found
