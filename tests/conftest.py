@@ -77,7 +77,17 @@ def require_system_tool() -> Callable[[str], Path]:
     return find
 
 
+# The modules that take longest, the longest first.
+LONGEST = (
+    "tests/training/domain/test_own_scenes.py",
+    "tests/examples/test_adaptation.py",
+    "tests/training/research/test_benchmark.py",
+    "tests/training/test_cli.py",
+)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put modules with slow tests first, so that no worker has a long module left at the end."""
+    """Put long modules first, then modules with slow tests, so that none is left at the end."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+    ranks = {REPOSITORY / name: rank for rank, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: (ranks.get(item.path, len(LONGEST)), item.path not in slow))

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 
 if __name__ == "__main__":
     if find_spec("torch") is None:
-        sys.exit("error: training needs more packages than the service. Install: make setup")
+        sys.exit("error: training needs more packages than the service. Install: make training")
 
     from training.cli import app
 

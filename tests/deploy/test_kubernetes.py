@@ -14,7 +14,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import kubernetes_validate
 import pytest
 import yaml
 
@@ -104,6 +103,9 @@ def overlay(request: pytest.FixtureRequest, rendered: dict[str, str]) -> Overlay
 
 
 def test_manifests_fit_the_schemas_of_kubernetes(overlay: Overlay) -> None:
+    # Imported here, because every worker imports every module of tests, and this takes seconds.
+    import kubernetes_validate
+
     kinds = {kind for kind, _ in overlay.manifests}
     assert {"Deployment", "Service", "PodDisruptionBudget", "NetworkPolicy"} < kinds
     for (kind, _), manifest in overlay.manifests.items():

@@ -15,7 +15,6 @@ from zlib import crc32
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from sklearn.linear_model import LogisticRegression
 
 from app.scene import CANONICAL, Scene, SceneObject, Vocabulary
 from app.scene.relations import ABOVE, LATERAL, STACKED
@@ -248,6 +247,8 @@ def logistic(
     C is the inverse of the ridge penalty on the coefficients. `RIDGE` keeps them finite if a few
     examples without `weight`, (examples,), are separable.
     """
+    from sklearn.linear_model import LogisticRegression  # slow to import
+
     fit = LogisticRegression(C=C, max_iter=1000).fit(features, truth, weight)
     return [float(x) for x in (*fit.coef_[0], fit.intercept_[0])]
 

@@ -24,7 +24,7 @@ from app.scene.relations import STACKED
 from training.datasets import AnnotatedScene, encode
 from training.datasets.cases import scene_of
 from training.datasets.moved import has_boxes, posed_scene
-from training.evaluation.asking import canonical_triple, score_misplaced
+from training.evaluation.asking import canonical_triple, index_of_ids, score_misplaced
 
 _SCENES: Final = 20.0
 
@@ -49,9 +49,10 @@ def reported_relations(model: Artifact, recorded: Sequence[AnnotatedScene]) -> s
         if has_boxes(encoded):
             scenes.append(posed_scene(encoded))
         for scene in scenes if triples else ():
+            index = index_of_ids(scene)
             for entry in score_misplaced(model, scene):
                 if entry["is_misplaced"] and entry["object"] != THE_FLOOR:
-                    a, i, j = canonical_triple(scene, entry)
+                    a, i, j = canonical_triple(index, entry)
                     subject, other = encoded.instance_classes[[i, j]].tolist()
                     found |= {(a, subject, other)} if a in STACKED else set()
     return found

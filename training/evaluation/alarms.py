@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from scipy.stats import binomtest
+from scipy.special import betaincinv
 
 from app import questions
 from app.registry import Artifact, Sensitivity
@@ -53,8 +53,9 @@ class Alarms:
     @property
     def at_least(self) -> float:
         """Exact 95 % lower bound of the share of scenes with an alarm."""
-        test = binomtest(self.alarms, self.scenes, alternative="greater")
-        return float(test.proportion_ci(0.95, method="exact").low)
+        if self.alarms == 0:
+            return 0.0
+        return float(betaincinv(self.alarms, self.scenes - self.alarms + 1, 0.05))
 
     def objection(self) -> str | None:
         """Return the reason against the model, or None if the share may agree with the promise."""

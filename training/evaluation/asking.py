@@ -111,9 +111,11 @@ def index_of_ids(scene: Scene) -> dict[str, int]:
     return {thing.id: index for index, thing in enumerate(scene.objects)}
 
 
-def canonical_triple(scene: Scene, entry: Mapping[str, Any]) -> tuple[int, int, int]:
-    """Return (canonical relation, subject, object) of a relation in an answer about a scene."""
-    index = index_of_ids(scene)
+def canonical_triple(index: Mapping[str, int], entry: Mapping[str, Any]) -> tuple[int, int, int]:
+    """Return (canonical relation, subject, object) of a relation in an answer about a scene.
+
+    `index`: see `index_of_ids`.
+    """
     return canonicalise(index[entry["subject"]], entry["relation"], index[entry["object"]])
 
 
@@ -230,6 +232,7 @@ def relation_probabilities(
     n = len(scene.objects)
     p = np.zeros((len(CANONICAL), n, n))
     answer = questions.relations(artifact, scene, top_k=max(1, p.size), pairs=pairs)
+    index = index_of_ids(scene)
     for entry in answer["relations"]:
-        p[canonical_triple(scene, entry)] = entry["probability"]
+        p[canonical_triple(index, entry)] = entry["probability"]
     return p

@@ -149,8 +149,9 @@ def ask_given(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered |
 
 def _answers_on(artifact: Artifact, encoded: EncodedScene, scene: Scene, mask: Flags) -> Answered:
     """Return the answers about the relations in `mask`, (relations, objects, objects) bool."""
+    index = index_of_ids(scene)
     answers = [
-        (entry["probability"], canonical_triple(scene, entry))
+        (entry["probability"], canonical_triple(index, entry))
         for entry in relations(artifact, scene)["relations"]
     ]
     return [(p, bool(encoded.instance_holds[triple])) for p, triple in answers if mask[triple]]
@@ -285,8 +286,9 @@ def ask_misplaced(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answer
     if case is None:
         return None
     scene, false = case
+    index = index_of_ids(scene)
     return [
-        (entry["probability"], canonical_triple(scene, entry) == false)
+        (entry["probability"], canonical_triple(index, entry) == false)
         for entry in misplaced(artifact, replace(scene, room_type=None))
     ] or None
 

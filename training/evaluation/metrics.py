@@ -20,7 +20,7 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm, t
+from scipy.special import ndtri, stdtrit
 
 from training.datasets.array_types import Flags, Floats, Ints
 
@@ -121,7 +121,7 @@ def _widening(groups: int) -> float:
     Source: Cameron, Gelbach and Miller, "Bootstrap-based improvements for inference with clustered
     errors" (2008), on the problem of few clusters.
     """
-    quantiles = t.ppf(0.975, groups - 1) / norm.ppf(0.975)
+    quantiles = stdtrit(groups - 1, 0.975) / ndtri(0.975)
     return float(quantiles * np.sqrt(groups / (groups - 1)))
 
 

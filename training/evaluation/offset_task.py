@@ -13,7 +13,7 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from app.registry import Artifact
 from app.scene import CANONICAL
@@ -54,7 +54,7 @@ def offsets_task(artifact: Artifact, setting: Setting) -> Outcome | None:
     for a, name in enumerate(CANONICAL):
         in_relation = observed.relation == a
         for region, axes in _REGIONS.items():
-            is_inside = squares[in_relation, :axes].sum(axis=1) <= chi2.ppf(SHARE, axes)
+            is_inside = squares[in_relation, :axes].sum(axis=1) <= chdtri(axes, 1 - SHARE)
             if in_relation.any():
                 metrics[f"in {region}, {name}"] = Ratio.of_items(
                     observed.scene[in_relation], is_inside.astype(np.float64), len(scenes)

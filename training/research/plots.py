@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING
 
 from training.evaluation.calibration_task import NAMES
 from training.evaluation.metrics import Scored
 from training.evaluation.results import Reports
 from training.evaluation.setting import Outcome
 from training.research.measure import POOLED, slug
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def write_plots(folder: Path, machines: Sequence[str], reports: Reports) -> None:
@@ -29,6 +31,8 @@ def reliability_diagrams(outcome: Outcome, title: str) -> Figure:
 
     The axes are logarithmic because most probabilities are small.
     """
+    from matplotlib.figure import Figure  # slow to import
+
     questions = [name for name in NAMES if f"ECE, {name}" in outcome.metrics]
     figure = Figure(figsize=(3.2 * len(questions), 3.6), layout="constrained")
     figure.suptitle(title)

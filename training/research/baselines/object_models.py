@@ -9,7 +9,6 @@ from typing import Any, Final, cast
 
 import numpy as np
 import torch
-from sklearn.neural_network import BernoulliRBM
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, embedding_bag, normalize, softplus
 
@@ -217,6 +216,8 @@ def fit_annealed(
     Persistent chains are accurate only if the model changes slowly at the end. On the indoor
     validation scenes, the MRR is .411 with the falling rate and .378 with a constant one.
     """
+    from sklearn.neural_network import BernoulliRBM  # slow to import
+
     size, v = min(batch_size, len(lists.v)), lists.filled().numpy()
     rbm = BernoulliRBM(n_components=hidden, batch_size=size, random_state=seed)
     order = np.random.default_rng(seed)
