@@ -201,7 +201,12 @@ get('example').addEventListener('change', ({ target }) => {
   put(store.get().words[store.get().models[0]].examples[target.value].scene, { posed: false });
   target.value = '';
 });
-get('undo').addEventListener('click', () => store.undo());
+function undo() {
+  if (!store.get().canUndo) return;
+  store.undo();
+  say('The last change is undone.');
+}
+get('undo').addEventListener('click', undo);
 get('clear').addEventListener('click', () => {
   note('');
   store.edit({ things: [], relations: [], room: '', selected: null, at: null, draft: null, line: newLine(), right: [] });
@@ -210,7 +215,7 @@ document.addEventListener('keydown', (event) => {
   const typing = event.target.closest('input, textarea, select');
   if ((event.ctrlKey || event.metaKey) && event.key === 'z' && !typing) {
     event.preventDefault();
-    store.undo();
+    undo();
   }
 });
 
