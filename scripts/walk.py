@@ -201,7 +201,7 @@ class Walk(User):
             page.get_by_role("button", name="Import, export").click()
             self._record.picture(page, "download", "The corrected file can be downloaded")
             with page.expect_download() as download:
-                page.get_by_role("button", name="Download scenes.jsonl").click()
+                page.get_by_role("button", name=f"Download {file.name}").click()
             download.value.save_as(corrected)
         expected = [dict(line) for line in recorded]
         for number, _ in chosen:
