@@ -168,7 +168,7 @@ def test_the_cpp_example_is_made_and_asks_all_five_questions(
         "A scene like it:",
     ]
     for arguments, error in (
-        (["http://127.0.0.1:9"], "cannot reach http://127.0.0.1:9: connection refused"),
+        (["http://127.0.0.1:9", "20"], "cannot reach http://127.0.0.1:9: connection refused"),
         (["robot:8000"], "the URL must begin with http://\n"),
         ([url, "soon"], "SECONDS must be a number, not 'soon'\n"),
     ):
