@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from itertools import cycle
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import httpx
@@ -84,7 +85,7 @@ async def measure(port: int, hostile: list[bytes], attackers: int) -> Any:
     health = ask(port, "127.0.0.3", cycle([HEALTH]), until, 0.02)
     (_, seconds), *answers = await asyncio.gather(health, *others, *attack)
     statuses = [sum((one[0] for one in part), Counter()) for part in (answers[:64], answers[64:])]
-    return *statuses, sorted(seconds)
+    return *statuses, seconds
 
 
 @pytest.mark.parametrize(
@@ -102,14 +103,15 @@ async def measure(port: int, hostile: list[bytes], attackers: int) -> Any:
 async def test_others_keep_half_of_their_rate(
     shipped: LiveService, hostile: list[bytes], least: float
 ) -> None:
-    alone, _, usual = await measure(shipped.port, [], 0)
+    before, _, delays_before = await measure(shipped.port, [], 0)
     beside, attacker, delays = await measure(shipped.port, hostile, 24)
-    assert set(alone) == set(beside) == {200}  # the attack causes no refusal
+    after, _, delays_after = await measure(shipped.port, [], 0)
+    assert set(before) == set(beside) == set(after) == {200}  # the attack causes no refusal
     assert not {500, 502} & set(attacker)
-    assert beside[200] > least * alone[200]
-    median = len(delays) // 2
+    # Other tests take a varying part of the machine, so the slower of two measurements counts.
+    assert beside[200] > least * min(before[200], after[200])
     # Without admission control, one client delays health by .5 s; a busy machine, by .07 s.
-    assert delays[median] < usual[median] + 0.2
+    assert median(delays) < max(median(delays_before), median(delays_after)) + 0.2
 
 
 def test_overload_is_refused_and_leaves_nothing_behind(service: LiveService) -> None:

@@ -43,13 +43,13 @@ async def test_generate_past_its_deadline_gets_504_and_delays_no_request(
         release = hold("generate").release
         began = time.monotonic()
         drawing = asyncio.ensure_future(
-            client.post("/generate", json=SCENE, headers={"X-Request-Timeout-Ms": "300"})
+            client.post("/generate", json=SCENE, headers={"X-Request-Timeout-Ms": "1000"})
         )
         for question in ("relations", "missing", "outliers"):
             assert (await client.post(f"/{question}", json=SCENE)).is_success
         assert not drawing.done()
         problem(await drawing, 504, "deadline-passed")
-        assert time.monotonic() - began >= 0.3
+        assert time.monotonic() - began >= 1
         release.set()
         assert (await client.post("/generate", json=SCENE)).is_success
         assert 'scene_pending{lane="draws"} 0.0' in (await client.get("/metrics")).text
