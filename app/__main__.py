@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import ctypes
 import errno
 import gc
@@ -16,9 +17,39 @@ from pydantic import ValidationError
 from app.settings import Settings
 
 
-def main() -> int:
-    """Serve until the process is stopped. Return 2 for invalid settings, else as `serve`."""
+def _refuse_arguments(arguments: list[str] | None) -> None:
+    """Exit with status 2 after unknown arguments. After --help, print the settings and exit."""
+    lines = []
+    for name, field in Settings.model_fields.items():
+        default = field.get_default(call_default_factory=True)
+        lines.append(f"  SCENE_{name.upper():<24}{'-' if default in (None, (), '') else default}")
+    parser = argparse.ArgumentParser(
+        prog="python -m app",
+        description="\n".join(
+            ("Start the service. These settings are environment variables:\n", *lines)
+        ),
+        epilog="The second column has the defaults. docs/operations.md describes the settings.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    _, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        parser.error(
+            f"unknown arguments: {' '.join(unknown)}; settings are environment variables, "
+            "for example: SCENE_PORT=8001 python -m app"
+        )
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Serve until the process is stopped. Return 2 for invalid settings, else as `serve`.
+
+    Args:
+        arguments: those of the command line, by default. Every argument but --help is an error.
+
+    Raises:
+        SystemExit: there are arguments.
+    """
     began = monotonic()
+    _refuse_arguments(arguments)
     try:
         settings = Settings()
     except ValidationError as error:

@@ -246,7 +246,7 @@ def test_another_name_of_a_room_type_has_its_probability(
     every = ask(api, "rooms", board.scene, top_k=4096)["room_types"]
     p = next(one["probability"] for one in every if one["room_type"] == "corridor")
     expect(board.page.locator("#room option:checked")).to_have_text(f"hall {percent(p)}")
-    expect(board.page.locator("#room-error")).to_have_text("hall → corridor")
+    expect(board.page.locator("#room-error.certain")).to_have_text("hall → corridor")
     board.put('{"objects": ["desk"], "room_type": "Living Room"}')
     expect(board.page.locator("#room option:checked")).to_have_text(re.compile(r"Living Room \d"))
 

@@ -121,9 +121,28 @@ def test_unknown_names_stop_the_start(
 ) -> None:
     monkeypatch.setenv("SCENE_STORE", str(tmp_path))
     monkeypatch.setenv(name, value)
-    assert main() == 2
+    assert main([]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"{name.upper()}: {message}")
+
+
+def test_arguments_are_refused_and_help_lists_the_settings(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["--port", "9000"])
+    assert (
+        "unknown arguments: --port 9000; settings are environment variables"
+        in capsys.readouterr().err
+    )
+    with pytest.raises(SystemExit, match="0"):
+        main(["--help"])
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    shown = [line for line in lines if line and line[0].startswith("SCENE_")]
+    assert [name for name, *_ in shown] == [
+        f"SCENE_{name.upper()}" for name in Settings.model_fields
+    ]
+    assert ["SCENE_PORT", "8000"] in shown
 
 
 def test_variables_of_kubernetes_and_of_clients_are_no_settings(

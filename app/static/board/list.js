@@ -3,7 +3,7 @@
 import { whereabouts } from './actions.js';
 import { outliersOf } from './board.js';
 import { el, redraw } from './dom.js';
-import { readings } from './questions.js';
+import { isCertain, readings } from './questions.js';
 import { changed } from './store.js';
 import { nameOf } from './words.js';
 
@@ -60,6 +60,7 @@ export function createList(list, empty, count, actions) {
       remove.setAttribute('aria-label', `Remove ${nameOf(thing)}`);
       this.querySelector('.name b').textContent = nameOf(thing);
       this.querySelector('.name span').textContent = about(thing, state, out);
+      this.querySelector('.error').classList.toggle('certain', isCertain(state, thing.label));
       redraw(this.querySelector('.error'), (state.draft ? [] : readings(state, 'objects', thing.label)).map((one) => suggested(thing, one)));
     });
     empty.hidden = things.length > 0;

@@ -79,6 +79,9 @@ export function whyNot(state, question, model) {
 export const mappedBy = (state, column, name) => QUESTIONS
   .flatMap((question) => state.answers[column][question]?.answer?.mapped ?? []).find(({ label }) => label === name);
 
+/** Whether the shown model reads a name for certain as one of its classes, such as "hall" as "corridor". */
+export const isCertain = (state, name) => Boolean(state.answers) && mappedBy(state, state.shown, name)?.similarity === 1;
+
 /**
  * How a model reads an unknown name: ["fridgee →", "fridge"], ["hall → corridor"] for certain, ["flux not known, left out"], or [].
  * @param {'objects' | 'rooms'} kind

@@ -5,7 +5,7 @@ import { el } from './dom.js';
 import { edgesOf, judgedBy, wrongIn } from './edges.js';
 import { UNKNOWN_SIZE } from './geometry.js';
 import { ghostsOf } from './ghosts.js';
-import { inWords, knownTo, mappedBy, readings, sizesOf } from './questions.js';
+import { inWords, isCertain, knownTo, mappedBy, readings, sizesOf } from './questions.js';
 import { sizer } from './scene.js';
 import { changed } from './store.js';
 import { namesOf, percent, plain, SPOKEN } from './words.js';
@@ -79,6 +79,7 @@ export function settings(store) {
     get('evidence').textContent = evidence(state);
     get('search-error').textContent = state.complaint;
     get('room-error').textContent = readings(state, 'rooms', state.room).map(inWords).join('. ');
+    get('room-error').classList.toggle('certain', isCertain(state, state.room));
     get('undo').disabled = !state.canUndo;
     document.body.classList.toggle('two', Boolean(state.models[1]));
     get('at').hidden = !state.at;
