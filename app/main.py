@@ -46,7 +46,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         title="Scene reasoning",
         description=_DESCRIPTION,
         version=__version__,
-        openapi_url="/openapi.json" if settings.docs else None,
+        openapi_url=None,  # `openapi.show_document` serves the document
         docs_url=None,
         redoc_url=None,
         redirect_slashes=False,
@@ -77,5 +77,7 @@ def _add_routes(app: FastAPI, settings: Settings) -> None:
     for router in routers:
         app.include_router(router)
     pages.install(app, docs=settings.docs)
+    if settings.docs:
+        app.add_route("/openapi.json", openapi.show_document, include_in_schema=False)
     every = itertools.chain(app.routes, *(router.routes for router in routers))
     app.state.paths = {route.path for route in every if hasattr(route, "path")}

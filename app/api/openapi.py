@@ -6,12 +6,15 @@ from typing import Any, Final
 
 from fastapi import FastAPI
 from fastapi.routing import APIRoute
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
 
 from app.api import examples
 from app.api.gateway import API_KEY, HEALTH, OPEN_ROUTES, TIMEOUT_HEADER
 from app.api.problems import MEDIA_TYPE
 from app.errors import ERRORS, Step
 from app.questions.question import Example
+from app.serving.runtime import Runtime
 from app.settings import Settings
 from scene_client.schemas import MAX_SEED, Problem
 
@@ -91,22 +94,38 @@ class DocumentedAPI(FastAPI):
     def openapi(self) -> dict[str, Any]:
         """Return FastAPI's OpenAPI document with examples and with problems as error responses."""
         if self.openapi_schema is None:
-            document, settings = super().openapi(), self.state.settings
-            schemas = document["components"]["schemas"]
-            problem = Problem.model_json_schema(mode="serialization", ref_template=_REFERENCE)
-            schemas |= problem.pop("$defs") | {"Problem": problem}
-            for path, operations in document["paths"].items():
-                for operation in operations.values():
-                    _complete(operation, path, settings)
-            schemas.pop("HTTPValidationError", None)
-            schemas.pop("ValidationError", None)
-            if settings.api_key is not None:
-                document["components"].setdefault("securitySchemes", {}).update(_KEY_SCHEMES)
-            _state_whole_numbers(document)
+            _complete(super().openapi(), self.state.settings)
         return super().openapi()
 
 
-def _complete(operation: dict[str, Any], path: str, settings: Settings) -> None:
+async def show_document(http: Request) -> Response:
+    """Return the OpenAPI document. Behind a proxy, it names the path of the service."""
+
+    def build() -> Response:
+        document, root = http.app.openapi(), http.scope.get("root_path")
+        return JSONResponse(document | {"servers": [{"url": root}]} if root else document)
+
+    # The first document takes 0.3 s.
+    runtime: Runtime = http.app.state.runtime
+    return await runtime.admission.in_worker(http.state.ticket, build)
+
+
+def _complete(document: dict[str, Any], settings: Settings) -> None:
+    """Add the schema of problems, the examples, the API key and the problems of each operation."""
+    schemas = document["components"]["schemas"]
+    problem = Problem.model_json_schema(mode="serialization", ref_template=_REFERENCE)
+    schemas |= problem.pop("$defs") | {"Problem": problem}
+    for path, operations in document["paths"].items():
+        for operation in operations.values():
+            _complete_operation(operation, path, settings)
+    schemas.pop("HTTPValidationError", None)
+    schemas.pop("ValidationError", None)
+    if settings.api_key is not None:
+        document["components"].setdefault("securitySchemes", {}).update(_KEY_SCHEMES)
+    _state_whole_numbers(document)
+
+
+def _complete_operation(operation: dict[str, Any], path: str, settings: Settings) -> None:
     """Add the examples, the time limit, the API key and the problems of an operation."""
     responses, name = operation["responses"], operation["operationId"]
     (ok,) = responses["200"]["content"].values()

@@ -332,7 +332,11 @@ class SharedUnits(RelationUnits):
     def context_weights(self, a: Indices, i: Indices, j: Indices) -> Floats:
         """See `RelationUnits`."""
         z = self._w.S[i] * self._w.O[j]
-        weights: Floats = np.einsum("ek,ekh->eh", z, self._G[a])
+        weights = np.empty((len(a), self._G.shape[2]), np.float32)
+        # One matrix product for each relation: G[a] for all units would have gigabytes.
+        for relation, G in enumerate(self._G):
+            of_relation = a == relation
+            weights[of_relation] = z[of_relation] @ G
         return weights
 
     def normal(

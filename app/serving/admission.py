@@ -5,7 +5,7 @@ Requests of different cost wait in different lanes:
 | lane | requests | weight of a request | requests at a time |
 |---|---|---|---|
 | quick | all at their start | 1 | 8 |
-| slow | batches, large bodies, large scenes | number of scenes | 2 |
+| slow | batches, large bodies and scenes, long documents | number of scenes | 2 |
 | draws | `/generate` | number of scenes x sweeps | 1 |
 
 A lane bounds the total weight of its requests. One client holds at most a quarter of a lane, and
@@ -221,6 +221,19 @@ class Admission:
         self.draws = Lane(1, SHARE * MAX_SWEEPS)
         self.worker = ThreadPoolExecutor(1, "slow", _lower_priority)
         self.drawing = ThreadPoolExecutor(1, "drawing", _lower_priority)
+
+    async def in_worker(self, ticket: Ticket, call: Callable[[], T]) -> T:
+        """Run a computation in a turn of the lane `slow`, in its thread, and return the result.
+
+        In the lane `quick`, a request that waits for a thread would keep others out.
+
+        Raises:
+            QueueFullError, DeadlinePassedError, DisconnectedError, Exception: see `Lane.enter` and
+                `in_thread`.
+        """
+        await ticket.enter(self.slow, 1)
+        result, _ = await in_thread(lambda _: call(), ticket, self.worker)
+        return result
 
     def stop(self) -> None:
         """Stop the threads and drop the computations that have not started."""

@@ -132,6 +132,7 @@ def open_board(chromium: Browser, shipped: LiveService) -> Iterator[Callable[...
     yield open_page
     for page, wrong in opened:
         found = [*wrong, *page.evaluate("window.violations")]
+        page.unroute_all(behavior="wait")
         page.context.unroute_all(behavior="wait")
         page.context.close()
         assert found == []

@@ -77,6 +77,24 @@ async def test_a_client_with_a_quarter_of_a_queue_gets_429(shared_store: Path, h
         assert "`steps` must be at most 32000" in document["errors"][0]["message"]
 
 
+async def test_requests_for_documents_that_wait_delay_no_question(
+    shared_store: Path, hold: Hold
+) -> None:
+    """More requests than run at a time wait for the worker thread, which a large scene holds."""
+    async with serve(shared_store) as client:
+        held = hold("outliers")
+        large = asyncio.ensure_future(client.post("/outliers", json={"objects": ["bed"] * 40}))
+        assert await asyncio.to_thread(held.started.wait, 30)
+        paths = ["/models/default/contexts", "/openapi.json"] * 12
+        documents = [asyncio.ensure_future(client.get(path)) for path in paths]
+        await asyncio.sleep(0.2)
+        assert (await client.post("/missing", json=SCENE)).is_success
+        assert not any(document.done() for document in documents)
+        held.release.set()
+        assert (await large).is_success
+        assert all(answer.is_success for answer in await asyncio.gather(*documents))
+
+
 async def test_a_batch_stops_where_its_deadline_passes(
     shared_store: Path, replace: Replace
 ) -> None:
