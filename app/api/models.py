@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 from collections.abc import Callable
 from dataclasses import asdict
@@ -136,23 +135,24 @@ async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> Response:
     responses=_LOADED_ERRORS,
     response_model_exclude_none=True,
 )
-async def show_word(name: Reference, word: Word, runtime: RuntimeDep) -> schemas.WordAnswer:
+async def show_word(
+    http: Request, name: Reference, word: Word, runtime: RuntimeDep
+) -> schemas.WordAnswer:
     """Return the class that a label of an object becomes, and by which rule."""
     served = runtime.models.resolve(name)
     vocabulary = served.vocabulary
+
+    def look_up() -> schemas.WordAnswer:
+        answer = partial(schemas.WordAnswer, model=served.reference, word=word)
+        reading = vocabulary.look_up(word)
+        if reading is None:
+            matches = vocabulary.nearest(word)
+            return answer(suggestions=[vocabulary.labels[match.entry] for match in matches])
+        entry = _class(vocabulary.objects[reading.entry])
+        return answer(class_=entry, rule=reading.rule, certain=reading.certain)
+
     # A guess compares the label with all names, which takes milliseconds.
-    reading = await asyncio.to_thread(vocabulary.look_up, word)
-    if reading is None:
-        matches = await asyncio.to_thread(vocabulary.nearest, word)
-        suggestions = [vocabulary.labels[match.entry] for match in matches]
-        return schemas.WordAnswer(model=served.reference, word=word, suggestions=suggestions)
-    return schemas.WordAnswer(
-        model=served.reference,
-        word=word,
-        class_=_class(vocabulary.objects[reading.entry]),
-        rule=reading.rule,
-        certain=reading.certain,
-    )
+    return await runtime.admission.in_worker(http.state.ticket, look_up)
 
 
 @router.get(

@@ -333,7 +333,7 @@ class SharedUnits(RelationUnits):
         """See `RelationUnits`."""
         z = self._w.S[i] * self._w.O[j]
         weights = np.empty((len(a), self._G.shape[2]), np.float32)
-        # One matrix product for each relation: G[a] for all units would have gigabytes.
+        # One matrix product for each relation, because G[a] of all units would have 0.8 GB.
         for relation, G in enumerate(self._G):
             of_relation = a == relation
             weights[of_relation] = z[of_relation] @ G

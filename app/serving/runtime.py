@@ -269,7 +269,7 @@ def _freeze_memory() -> None:
     this.
     """
     if gc.isenabled():
-        gc.collect()  # what is not frozen yet
+        gc.collect()  # objects that are not frozen yet
     if (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
         trim(0)
     gc.freeze()

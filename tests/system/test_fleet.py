@@ -6,7 +6,6 @@ import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from statistics import median
 
 import pytest
 
@@ -93,9 +92,8 @@ def test_promotions_under_load_lose_and_mix_nothing(fleet: Fleet, load: Constant
     with load:
         seconds = [fleet.promote(f"1.{number % 2}.0") for number in range(PROMOTIONS)]
     load.tally.check()
-    # A poll, and half a second for the two loads beside the requests. The median is that of a free
-    # machine also where other tests delay some promotions.
-    assert median(seconds) < POLL + 0.5, sorted(seconds)[-5:]
+    # A poll, and half a second for the two loads beside the requests.
+    assert max(seconds) < POLL + 0.5, sorted(seconds)[-5:]
 
 
 def test_a_rolling_update_of_the_settings_loses_and_mixes_nothing(
