@@ -12,16 +12,14 @@ from typing import Any, ClassVar, Final, Literal
 
 from starlette.exceptions import HTTPException
 
-from scene_client.schemas import Failure, FieldError, Problem
+from scene_client.schemas import FieldError, Problem
 from scene_client.validation import MAX_ERRORS, pointer
 
 Location = tuple[str | int, ...]
 """Path to a value in a request: field names and list indices, from the root of the request."""
 
 Step = Literal[
-    "admin",  # administration routes: the admin key and the new state of the store
     "admission",  # all routes except health checks and metrics
-    "alias",  # a change of an alias
     "body",  # routes that read a JSON body
     "host",  # the check of the Host header, if SCENE_ALLOWED_HOSTS is not *
     "key",  # the check of the API key, if SCENE_API_KEY is set
@@ -73,7 +71,6 @@ class ServiceError(HTTPException):
     Args:
         detail: cause of this error. Clients receive it. The default is the title.
         errors: the errors in the request. The first `MAX_ERRORS` are kept.
-        failures: unusable versions and aliases, with the reasons.
         headers: further headers of the response.
     """
 
@@ -100,12 +97,10 @@ class ServiceError(HTTPException):
         detail: str = "",
         *,
         errors: Sequence[FieldError] = (),
-        failures: Sequence[Failure] = (),
         headers: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(self.status, detail or f"{self.title}.", headers)
         self.errors = list(errors[:MAX_ERRORS])
-        self.failures = list(failures)
 
     def __str__(self) -> str:
         return self.detail
@@ -120,7 +115,6 @@ class ServiceError(HTTPException):
             instance=f"{self.uri}#{request_id}",
             request_id=request_id,
             errors=self.errors or None,
-            failures=self.failures or None,
         )
 
 
@@ -192,13 +186,11 @@ class DisconnectedError(BadRequestError):
     """The client has closed its connection."""
 
 
-class UnauthorizedError(ServiceError, slug="unauthorized", status=401, steps=("key", "admin")):
+class UnauthorizedError(ServiceError, slug="unauthorized", status=401, steps=("key",)):
     """A valid key is required.
 
-    Administration routes need the admin key in the header X-Admin-Key or Authorization: Bearer. If
-    SCENE_ADMIN_KEY is not set, the service refuses every administration request. If SCENE_API_KEY
-    is set, all other routes need that key in the header X-API-Key or Authorization: Bearer. Health
-    checks and HTML pages need no key.
+    If SCENE_API_KEY is set, requests need that key in the header X-API-Key or Authorization:
+    Bearer. Health checks and HTML pages need no key.
     """
 
 
@@ -206,8 +198,7 @@ class OriginRefusedError(ServiceError, slug="origin-refused", status=403):
     """Pages of this origin may not send this request.
 
     A browser asked whether a page of another origin may send a request. SCENE_CORS_ORIGINS lists
-    the allowed origins. Pages of these origins may ask questions and read the models. They may not
-    administer the service.
+    the allowed origins. Pages of these origins may ask questions and read the models.
     """
 
 
@@ -238,47 +229,6 @@ class RequestTimeoutError(ServiceError, slug="request-timeout", status=408, step
 
     The body of a request must arrive within SCENE_CLIENT_TIMEOUT seconds after its headers. The
     service closes the connection. Send the request again on a new connection.
-    """
-
-
-class AliasConflictError(ServiceError, slug="alias-conflict", status=409, steps=("alias",)):
-    """The alias does not point to the expected version.
-
-    Another client has moved the alias. GET /models shows its new target. Send the request again
-    with this target as `expected`. An alias cannot have the name of a model either.
-    """
-
-
-class ModelUnusableError(ServiceError, slug="model-unusable", status=409, steps=("alias",)):
-    """An alias cannot point to this version.
-
-    The version is in the store, but the service refused to load it. GET /models gives the reason.
-    """
-
-
-class RefreshRefusedError(ServiceError, slug="refresh-refused", status=409, steps=("admin",)):
-    """The new state of the store was refused.
-
-    A version in the store failed its verification or its warm-up, or the target of an alias is not
-    usable. The service still serves the previous versions. `failures` lists each refused version or
-    alias with the reason.
-    """
-
-
-class StoreNotWritableError(ServiceError, slug="store-not-writable", status=409, steps=("alias",)):
-    """The store cannot be written.
-
-    Either this service has no write access to the store, which holds the aliases, or the table of
-    aliases is full. Without write access, change the alias on a computer that has it. Then send
-    POST /models/refresh to this service.
-    """
-
-
-class StoreBusyError(ServiceError, slug="store-busy", status=503, steps=("alias",)):
-    """Another process is writing to the store.
-
-    That process holds the lock of the store, for example while it publishes a version. Send the
-    request again after the time in Retry-After.
     """
 
 

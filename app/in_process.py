@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import secrets
 import weakref
 from contextlib import ExitStack
 from pathlib import Path
 
 import httpx
 from anyio.from_thread import start_blocking_portal
-from pydantic import SecretStr, ValidationError
+from pydantic import ValidationError
 
 from app.main import create_app
 from app.settings import Settings
@@ -28,19 +27,14 @@ class InProcess(httpx.BaseTransport):
     Args:
         store: directory of published models.
 
-    Attributes:
-        admin_key: random key for the administration routes of this application.
-
     Raises:
         InvalidRequestError: the store is not a directory.
     """
 
     def __init__(self, store: Path) -> None:
-        self.admin_key = secrets.token_hex()
         try:
             settings = _FixedSettings(
                 store=store,
-                admin_key=SecretStr(self.admin_key),
                 metrics=False,
                 access_log=False,
                 docs=False,

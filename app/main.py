@@ -65,13 +65,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 def _add_routes(app: FastAPI, settings: Settings) -> None:
     app.router.routes.extend((*questions.router.routes, *questions.batches.routes))
     routers = [
-        # `models.administration` stands before `models.router`, because both have the same paths.
-        # The first route with a path sets the Allow header of a 405 response.
-        models.administration,
-        models.changes,
         models.router,
         health.router,
-        health.protocol,
         *([health.monitoring] if settings.metrics else []),
     ]
     for router in routers:

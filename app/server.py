@@ -20,7 +20,7 @@ from app.errors import ServiceError
 from app.main import create_app
 from app.serving.logs import log_config
 from app.serving.runtime import Runtime
-from app.settings import Settings
+from app.settings import Settings, warnings
 
 # The server closes a connection after this idle time in seconds. A proxy must close its idle
 # connections earlier. Otherwise the proxy may send a request while the server closes the
@@ -119,6 +119,7 @@ class Server(uvicorn.Server):
         self._drain_seconds = drain_seconds
         self._closing_at: float | None = None
         self._began = began
+        self._has_terminal = os.isatty(0)
 
     async def startup(self, sockets: list[socket] | None = None) -> None:
         """Load the models, accept connections and log the addresses of the service.
@@ -135,7 +136,15 @@ class Server(uvicorn.Server):
             self.started = False
             await self.lifespan.shutdown()
             raise
+        asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self._handle_hangup)
         self._log_addresses(sockets or [])
+
+    def _handle_hangup(self) -> None:
+        """Load the changes in the store, or shut down if the terminal of the service is closed."""
+        if self._has_terminal and not os.isatty(0):
+            self.handle_exit(signal.SIGTERM, None)
+        else:
+            self._runtime.request_check()
 
     def _log_addresses(self, sockets: list[socket]) -> None:
         addresses = [listener.getsockname() for listener in sockets]
@@ -219,6 +228,8 @@ def build(settings: Settings, began: float) -> Server:
         forwarded_allow_ips=list(settings.trusted_proxies),
         timeout_graceful_shutdown=settings.drain_timeout,
     )
+    for warning in warnings():
+        _logger.warning(warning)
     if settings.is_open:
         _logger.warning(
             "SCENE_HOST gives other machines access and SCENE_API_KEY is not set, so every machine "

@@ -34,6 +34,9 @@ _ENDPOINTS = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT
 _PREFIX: Final = "SCENE_"
 # Variables of the clients, which may run in the same environment.
 _OF_CLIENTS: Final = ("URL",)
+_WITHOUT_USE: Final = {
+    "ADMIN_KEY": "the service is administered with `python -m app.registry`, which needs no key"
+}
 _NO_STREAMS: Final = "the service has no streams; send each scene in a request of its own"
 _REMOVED: Final = {
     "WORKERS": "a replica is one process; start several replicas",
@@ -103,10 +106,11 @@ class _Environment(EnvSettingsSource):
             pydantic.ValidationError: the environment contains an unknown setting.
         """
         names = [name.upper() for name in self.settings_cls.model_fields]
+        known = {*names, *_OF_CLIENTS, *_WITHOUT_USE}
         errors: list[InitErrorDetails] = []
         for variable, value in sorted(os.environ.items()):
             name = variable.upper().removeprefix(_PREFIX)
-            if name == variable.upper() or not value or name in {*names, *_OF_CLIENTS}:
+            if name == variable.upper() or not value or name in known:
                 continue
             if _SERVICE_LINK.fullmatch(f"{name}={value}"):
                 continue
@@ -122,11 +126,19 @@ class _Environment(EnvSettingsSource):
         return super().__call__()
 
 
+def warnings() -> list[str]:
+    """Return a warning for each set environment variable that the service no longer uses."""
+    return [
+        f"{_PREFIX}{name} has no effect: {reason}"
+        for name, reason in _WITHOUT_USE.items()
+        if os.environ.get(_PREFIX + name)
+    ]
+
+
 class Settings(BaseSettings):
     """The settings of the service.
 
-    The defaults are safe: the service listens only on the loopback address, and the administration
-    routes refuse every request.
+    By default, the service listens only on the loopback address.
 
     Raises:
         pydantic.ValidationError: a value is invalid. Each message names the environment variable.
@@ -150,12 +162,9 @@ class Settings(BaseSettings):
     """Folder of published models."""
     store_poll: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] = 5
     """Seconds between two checks of the store for changes; 0 = never."""
-    admin_key: SecretStr | None = None
-    """Key of the administration routes, at least 16 characters; without a key, these routes refuse
-    every request."""
     api_key: SecretStr | None = None
-    """Key of all routes except health checks and pages, at least 16 characters, different from the
-    admin key; without a key, these routes are open."""
+    """Key of all routes except health checks and pages, at least 16 characters; without a key,
+    these routes are open."""
     cors_origins: _Words = ()
     """Web origins whose pages may use the service, separated by commas, such as
     `https://panel.example:8443`; none by default."""
@@ -231,7 +240,7 @@ class Settings(BaseSettings):
     @property
     def secrets(self) -> list[str]:
         """The configured keys, which every log line masks."""
-        return [key.get_secret_value() for key in (self.admin_key, self.api_key) if key]
+        return [self.api_key.get_secret_value()] if self.api_key else []
 
     @property
     def accepted_hosts(self) -> frozenset[str] | None:
@@ -304,22 +313,16 @@ class Settings(BaseSettings):
             raise ValueError(f"SCENE_OPENTELEMETRY needs {url}")
         return value
 
-    @field_validator("admin_key", "api_key")
+    @field_validator("api_key")
     @classmethod
-    def _is_key(cls, value: SecretStr | None, info: ValidationInfo) -> SecretStr | None:
+    def _is_key(cls, value: SecretStr | None) -> SecretStr | None:
         if value is None:
             return None
         key = value.get_secret_value()
         # The key must be valid in an HTTP header. An attacker could guess a short key.
         if len(key) < 16 or not (key.isascii() and key.isprintable()) or " " in key:
             raise ValueError(
-                f"SCENE_{str(info.field_name).upper()} must have at least 16 printable ASCII "
-                "characters, without spaces"
-            )
-        if value == info.data.get("admin_key"):
-            raise ValueError(
-                "SCENE_API_KEY must differ from SCENE_ADMIN_KEY, because clients must not "
-                "administer the service"
+                "SCENE_API_KEY must have at least 16 printable ASCII characters, without spaces"
             )
         return value
 

@@ -19,7 +19,6 @@ from starlette.requests import Request
 from starlette.types import Receive, Scope, Send
 
 from app import errors
-from app.api.gateway import ADMIN_KEY, has_key
 from app.serving.admission import SMALL, Bodies, in_thread
 from app.serving.runtime import Runtime
 from scene_client.schemas import FieldError
@@ -192,7 +191,7 @@ class JSONRoute(APIRoute):
 
     FastAPI only documents the route, because FastAPI's JSON parser is too lenient. The endpoint
     receives the validated body as ``data``, the HTTP request as ``http`` and the path parameters.
-    It returns the answer as bytes. Routes with the tag "administration" require the admin key.
+    It returns the answer as bytes.
     """
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -205,8 +204,6 @@ class JSONRoute(APIRoute):
             await super().handle(scope, receive, send)
             return
         http = Request(scope, receive)
-        if "administration" in self.tags:
-            check_admin(http)
         if scope["query_string"]:
             detail = "This route has no query parameters. Send all fields in the JSON body."
             raise errors.BadRequestError(detail)
@@ -253,13 +250,3 @@ async def _send(answer: bytes, bodies: Bodies, client: str, send: Send) -> None:
                 for at in range(0, len(answer), _PART):
                     part, more = answer[at : at + _PART], at + _PART < len(answer)
                     await send({"type": "http.response.body", "body": part, "more_body": more})
-
-
-def check_admin(http: Request) -> None:
-    """Check that the request carries the admin key.
-
-    Raises:
-        UnauthorizedError: the request lacks the key, or the service has no admin key.
-    """
-    if not has_key(http.headers, ADMIN_KEY, http.app.state.settings.admin_key):
-        raise errors.UnauthorizedError("This route needs the admin key of the service.")

@@ -55,19 +55,6 @@ def _batch(result: dict[str, Any]) -> dict[str, Any]:
 REQUESTS: Final[dict[str, dict[str, Example]]] = {
     **{question.name: dict(question.examples) for question in QUESTIONS},
     **{f"{question.name}_batch": BATCH for question in QUESTIONS if not question.samples},
-    "move_alias": {
-        "promote": Example("point the alias at a version", {"model": "home@1.1.0"}),
-        "guarded": Example(
-            "change the alias only if it still points at the expected version",
-            {"model": "home@1.1.0", "expected": "home@1.0.0"},
-        ),
-        "create": Example(
-            "create an alias that does not exist yet", {"model": "home@1.0.0", "expected": None}
-        ),
-        "model-not-found": Example(
-            "a model that does not exist", {"model": "nobody@9.9.9"}, "model-not-found"
-        ),
-    },
 }
 _OF_QUESTIONS: Final = {
     question.name: {**_ENVELOPE, **question.example_answer} for question in QUESTIONS
@@ -153,47 +140,8 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
         "certain": True,
         "suggestions": [],
     },
-    "show_contexts": {
-        "model": _MODEL,
-        "layers": {
-            "h1": [
-                {
-                    "unit": 0,
-                    "state": 1,
-                    "name": "bed, nightstand; pillow on-top bed",
-                    "objects": [
-                        {"label": "bed", "weight": 2.1},
-                        {"label": "nightstand", "weight": 1.7},
-                    ],
-                    "relations": [
-                        {"subject": "pillow", "relation": "on-top", "object": "bed", "weight": 1.2}
-                    ],
-                    "room_types": [{"label": "bedroom", "weight": 0.9}],
-                }
-            ]
-        },
-    },
-    "refresh_models": {
-        "request_id": REQUEST_ID,
-        "default": _MODEL,
-        "added": ["home@1.0.0"],
-        "removed": [],
-        "failures": [_FAILURE],
-    },
-    "move_alias": {
-        "request_id": REQUEST_ID,
-        "alias": "default",
-        "model": "home@1.1.0",
-        "previous": "home@1.0.0",
-    },
-    "health_live": {"status": "live"},
+    "health_live": {"status": "live", "version": "2.0.0"},
     "health_ready": {"status": "ready"},
-    "server_metadata": {"name": "scene-boltzmann", "version": "1.0.0", "extensions": []},
-    "server_live": {"live": True},
-    "server_ready": {"ready": True},
-    "model_metadata": {"name": "home", "versions": ["1.0.0", "1.1.0"]}
-    | {"platform": "numpy_triway", "inputs": [], "outputs": []},
-    "model_ready": {"name": "home", "ready": True},
     "show_metrics": (
         "# HELP scene_requests_total Requests answered\n"
         "# TYPE scene_requests_total counter\n"

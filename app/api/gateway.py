@@ -27,7 +27,6 @@ from app.settings import Settings
 
 TIMEOUT_HEADER: Final = "X-Request-Timeout-Ms"
 API_KEY: Final = "X-API-Key"
-ADMIN_KEY: Final = "X-Admin-Key"
 
 CANCELLED: Final = "cancelled"
 """Outcome of a request that the server cancelled during its shutdown."""
@@ -49,7 +48,7 @@ health check contains only a status, so it reveals no data.
 # Paths that need no API key. Orchestrators send health checks without credentials. The HTML pages
 # contain no private data. docs/security.md gives the reasons.
 _PAGES: Final = ("/", "/docs", "/redoc", "/openapi.json", "/problems")
-OPEN_ROUTES: Final = frozenset((*_PAGES, *HEALTH, *(f"/v2{path}" for path in HEALTH)))
+OPEN_ROUTES: Final = frozenset((*_PAGES, *HEALTH))
 _OPEN_FOLDERS: Final = ("/docs/", "/redoc/", "/static/", "/problems/")
 
 _REQUEST_ID: Final = re.compile(rb"[A-Za-z0-9._~:-]{1,128}")
@@ -78,7 +77,7 @@ class Gateway:
     2. Host header: the header must name this service. This check prevents DNS rebinding, where
        an attacker points the host name of a web page at this machine.
     3. Origin: pages of other origins get an answer only if the settings list the origin.
-    4. Key: if the settings contain an API key, the request needs this key or the admin key.
+    4. Key: if the settings contain an API key, the request needs this key.
     5. Admission: the gateway sets the deadline of the request and reads its body. Then the request
        waits for its turn, which ends when its response starts.
 
@@ -151,9 +150,8 @@ class Gateway:
     async def _admit(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Check the key and the size of a request, wait for admission, and answer every failure."""
         try:
-            if self._settings.api_key is not None and not self._has_access(scope):
-                detail = "This service needs its API key, or the admin key for administration."
-                raise errors.UnauthorizedError(detail)
+            if not self._has_access(scope):
+                raise errors.UnauthorizedError("This service needs its API key.")
             if scope["path"].endswith(HEALTH):
                 await self._app(scope, receive, send)
             else:
@@ -215,10 +213,8 @@ class Gateway:
         path: str = scope["path"].removeprefix(scope.get("root_path", ""))
         if path in OPEN_ROUTES or path.startswith(_OPEN_FOLDERS):
             return True
-        headers = Headers(scope=scope)
-        has_api_key = has_key(headers, API_KEY, self._settings.api_key)
-        has_admin_key = has_key(headers, ADMIN_KEY, self._settings.admin_key)
-        return has_api_key or has_admin_key
+        key = self._settings.api_key
+        return key is None or _has_key(Headers(scope=scope), key)
 
     def _seconds(self, value: bytes) -> float:
         longest = self._settings.max_request_timeout_ms
@@ -262,18 +258,13 @@ def _with_defaults(headers: Sequence[tuple[bytes, bytes]], request_id: bytes) ->
     return completed
 
 
-def has_key(headers: Headers, name: str, expected: SecretStr | None) -> bool:
-    """Return whether a request contains the expected key. The result is False if this key is None.
-
-    The key may be in the header ``name`` or, without this header, in a bearer token.
-    """
+def _has_key(headers: Headers, expected: SecretStr) -> bool:
+    """Return whether a request contains the expected key, in `API_KEY` or in a bearer token."""
     scheme, _, token = headers.get("authorization", "").partition(" ")
-    key = headers.get(name) or (token.strip() if scheme.lower() == "bearer" else "")
-    secret = expected.get_secret_value() if expected else ""
-    # The comparison always runs and takes constant time. Otherwise the response time would show
-    # whether a key is configured, or how many characters match.
-    equal = hmac.compare_digest(key.encode(), secret.encode())
-    return equal and bool(secret)
+    key = headers.get(API_KEY) or (token.strip() if scheme.lower() == "bearer" else "")
+    # The comparison takes constant time. Otherwise the response time would show how many characters
+    # match.
+    return hmac.compare_digest(key.encode(), expected.get_secret_value().encode())
 
 
 class CrossOrigin(CORSMiddleware):
@@ -288,8 +279,6 @@ class CrossOrigin(CORSMiddleware):
         super().__init__(
             app,
             allow_origins=origins,
-            # The lists do not contain PUT and the admin key header, because pages of other origins
-            # must not administer the service.
             allow_methods=("GET", "POST"),
             allow_headers=(
                 "Authorization",

@@ -1,4 +1,4 @@
-"""Routes that list the models, and administration routes that change aliases and versions."""
+"""Routes that list the models, their versions and their vocabularies."""
 
 from __future__ import annotations
 
@@ -9,16 +9,12 @@ from functools import partial
 from typing import Annotated, Final, cast
 from weakref import WeakKeyDictionary
 
-from fastapi import APIRouter, Depends, Path, Security
-from fastapi.security import APIKeyHeader, HTTPBearer
+from fastapi import APIRouter, Depends, Path
 from pydantic import BaseModel
 from starlette.requests import Request
 from starlette.responses import Response
 
-from app.api.body import JSONRoute, check_admin
-from app.api.gateway import ADMIN_KEY
 from app.api.openapi import error_responses
-from app.questions.contexts import contexts
 from app.registry import Artifact
 from app.scene.relations import relation_names
 from app.scene.vocabulary import ObjectClass
@@ -45,13 +41,6 @@ Word = Annotated[
 ]
 Version = Annotated[str, Path(description="a version that GET /models lists")]
 
-# These security schemes are only for the documentation. The routes themselves check the key, before
-# they read the body.
-_SCHEMES: Final = [
-    Security(APIKeyHeader(name=ADMIN_KEY, scheme_name="admin-key", auto_error=False)),
-    Security(HTTPBearer(scheme_name="admin-key-as-bearer-token", auto_error=False)),
-]
-
 
 # `_runtime` is a coroutine, because FastAPI runs plain functions in a thread. This takes 100 µs.
 async def _runtime(http: Request) -> Runtime:
@@ -62,10 +51,6 @@ async def _runtime(http: Request) -> Runtime:
 RuntimeDep = Annotated[Runtime, Depends(_runtime)]
 
 router = APIRouter(prefix="/models", tags=["models"])
-administration = APIRouter(prefix="/models", tags=["administration"], dependencies=_SCHEMES)
-changes = APIRouter(
-    prefix="/models", tags=["administration"], route_class=JSONRoute, dependencies=_SCHEMES
-)
 
 
 @router.get(
@@ -155,62 +140,6 @@ async def show_word(
     return await runtime.admission.in_worker(http.state.ticket, look_up)
 
 
-@router.get(
-    "/{name}/contexts",
-    summary="The hidden units of a model",
-    response_model=schemas.ContextsAnswer,
-    responses=_LOADED_ERRORS,
-)
-async def show_contexts(http: Request, name: Reference, runtime: RuntimeDep) -> Response:
-    """List the hidden units of a model with the classes of their largest weights.
-
-    The field `context` of `POST /generate` accepts the numbers of these units.
-    """
-    # The first request for a model takes 0.1 to 0.5 s.
-    call = partial(_contexts, runtime.models.resolve(name))
-    return await runtime.admission.in_worker(http.state.ticket, call)
-
-
-@administration.post(
-    "/refresh",
-    summary="Load the current state of the store",
-    responses=error_responses("admission", "admin"),
-    response_model_exclude_none=True,
-)
-async def refresh_models(http: Request) -> schemas.RefreshAnswer:
-    """Load, verify and warm up all versions in the store, then replace all served models at once.
-
-    The previous models answer requests until then. If a new model fails, the service keeps the
-    previous models.
-    """
-    check_admin(http)
-    runtime: Runtime = http.app.state.runtime
-    return await runtime.refresh(http.state.request_id)
-
-
-@changes.put(
-    "/aliases/{alias}",
-    summary="Point an alias at another version",
-    responses=error_responses("admission", "admin", "alias", "body", "models", "name"),
-    response_model=schemas.AliasAnswer,
-)
-async def move_alias(
-    alias: Annotated[
-        str,
-        Path(
-            description="`default`, or another name of your choice",
-            openapi_examples={"default": {"summary": "the default model", "value": "default"}},
-        ),
-    ],
-    data: schemas.AliasRequest,
-    http: Request,
-) -> bytes:
-    """Point an alias at a served version, and save the alias in the store."""
-    runtime: Runtime = http.app.state.runtime
-    answer = await runtime.move_alias(alias, data, http.state.request_id)
-    return answer.model_dump_json(exclude_none=True).encode()
-
-
 def _once(build: Callable[[Artifact], BaseModel]) -> Callable[[Artifact], Response]:
     """Return a function that builds an answer about a model once, because it never changes."""
     documents: WeakKeyDictionary[Artifact, bytes] = WeakKeyDictionary()
@@ -239,11 +168,6 @@ def _vocabulary(served: Artifact) -> schemas.VocabularyAnswer:
             for example in manifest.examples
         ],
     )
-
-
-@_once
-def _contexts(served: Artifact) -> schemas.ContextsAnswer:
-    return schemas.ContextsAnswer(model=served.reference, layers=dict(contexts(served)))
 
 
 def _class(entry: ObjectClass) -> schemas.VocabularyEntry:

@@ -30,10 +30,8 @@ TAGS: Final = [
     {"name": "questions", "description": "The five questions about one scene."},
     {"name": "batches", "description": "The same questions about many scenes in one request."},
     {"name": "models", "description": "The models, their versions and their vocabularies."},
-    {"name": "administration", "description": "Change the served models, with the admin key."},
     {"name": "health", "description": "Health checks for orchestrators."},
     {"name": "monitoring", "description": "Metrics for Prometheus."},
-    {"name": "inference protocol", "description": "Routes of the Open Inference Protocol."},
 ]
 
 
@@ -138,7 +136,7 @@ def _complete_operation(operation: dict[str, Any], path: str, settings: Settings
         operation.setdefault("parameters", []).append(timeout)
     if "application/json" in responses.get("422", {}).get("content", {}):
         del responses["422"]
-    if settings.api_key is not None and path not in OPEN_ROUTES and "security" not in operation:
+    if settings.api_key is not None and path not in OPEN_ROUTES:
         operation["security"] = [{scheme: []} for scheme in _KEY_SCHEMES]
         responses["401"] = error_responses("key")[401]
     if settings.accepted_hosts is not None and not path.endswith(HEALTH):

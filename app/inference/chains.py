@@ -5,7 +5,7 @@ end, because relations do not act on the other units. Observed relations hold fr
 
 The start of a chain is a random stored scene. Its weight, given the evidence, is
 
-    log w = sum_{i given} log p(v_i = 1 | h1, other classes) + sum_{u held} log p(state of u)
+    log w = sum_{i given} log p(v_i = 1 | h1, other classes)
             - 6 [sampled under another room type than t],
 
 where h1 is the mean of the hidden units given the stored scene, and t is the requested room type.
@@ -69,8 +69,6 @@ class Conditions:
         classes: (n,) int64, distinct indices of the classes that stay present, ascending.
         log_counts: (n,) log of the number of instances of each class.
         observed: observed relations between these classes, or None without observed relations.
-        held: (held units, 2) units of h1 and the state that each of them keeps.
-        held2: distinct indices of the units of h2 that stay on.
         room: index of the room type, or None if unknown.
         profile: index of the data source whose base rates apply, or None.
     """
@@ -78,8 +76,6 @@ class Conditions:
     classes: Indices
     log_counts: Floats
     observed: ObservedRelations | None
-    held: Indices
-    held2: Indices
     room: int | None = None
     profile: int | None = None
 
@@ -91,8 +87,6 @@ class ChainState:
     Attributes:
         classes: (n,) int64, indices of the present classes, ascending.
         room: index of the room type, or None if unknown.
-        h1: (units,) state of each unit of h1.
-        h2: indices of the units of h2 that are on, ascending.
         logits: (A, n, n) logits of the relations between the classes at temperature 1.
         r: (A, n, n) bool, relations that are on. Relations of a class to itself are on only if
             observed.
@@ -100,8 +94,6 @@ class ChainState:
 
     classes: Indices
     room: int | None
-    h1: Indices
-    h2: Indices
     logits: Floats
     r: Mask
 
@@ -152,8 +144,7 @@ class SceneChains:
             room: index of the room type that the chain keeps, or None.
         """
         none = np.zeros(0, np.int64)
-        held = np.zeros((0, 2), np.int64)
-        conditions = Conditions(none, np.zeros(0, np.float32), None, held, none, room)
+        conditions = Conditions(none, np.zeros(0, np.float32), None, room)
         on = (present > 0).astype(np.uint8)
         self.under(conditions).sweep(on, steps, stream)
         return on
@@ -161,12 +152,11 @@ class SceneChains:
     def sample_weights(self, conditions: Conditions) -> NDArray[np.float64]:
         """Return the probability of each stored scene as the start of a chain, (N,).
 
-        The log weight of a stored scene is a sum of three terms: of its room type, of the required
-        classes, and of the held states of h1. The module contains the formula.
+        The log weight of a stored scene is a sum of two terms: of its room type and of the required
+        classes. The module contains the formula.
         """
         log_weights = self._room_log_weights(conditions.room)
         log_weights += self._classes_log_p(conditions.classes)
-        log_weights += self._held_log_p(conditions.held)
         weights = np.exp(log_weights - log_weights.max()).astype(np.float64)
         probabilities: NDArray[np.float64] = weights / weights.sum()
         return probabilities
@@ -199,16 +189,6 @@ class SceneChains:
         log_p: Floats = -softplus(-logits).sum(1)
         return log_p
 
-    def _held_log_p(self, held: Indices) -> Floats:
-        """Return the log probability of the held states of h1 given each stored scene, (N,)."""
-        unit, state = held.T
-        other_states = self.mean.reshape(len(self.mean), -1, self.machine.spec.states - 1)
-        # `self.mean` leaves out state 0. Its probability is the rest to 1.
-        state_0 = 1 - other_states.sum(2, keepdims=True)
-        p = np.concatenate([state_0, other_states], 2)[:, unit, state]
-        log_p: Floats = np.log(np.maximum(p, 1e-37)).sum(1)
-        return log_p
-
 
 class ConditionedChains:
     """Chains under the same conditions. Each chain has its own random stream.
@@ -225,10 +205,8 @@ class ConditionedChains:
         self._w = chains.arrays._replace(b=bias)
         self._beta = np.float32(1.0 / temperature)
         self._room, self._bias = conditions.room, chains.machine.room_bias(conditions.room)
-        self._required_classes = _indicator(spec.V, conditions.classes)
-        self._held = np.full(spec.units, -1, np.int64)
-        self._held[conditions.held[:, 0]] = conditions.held[:, 1]
-        self._required_h2 = _indicator(spec.H2, conditions.held2)
+        self._required_classes = np.zeros(spec.V, np.uint8)
+        self._required_classes[conditions.classes] = 1
         self._classes, self._observed = conditions.classes, conditions.observed
         self._others: dict[int | None, ConditionedChains] = {}
 
@@ -263,11 +241,11 @@ class ConditionedChains:
 
     def _continued(self, on: Bits, steps: int, stream: np.random.Generator) -> ChainState:
         """Return the state of a chain after ``steps`` sweeps from the classes ``on``, (V,)."""
-        h1, h2 = self.sweep(on, steps, stream)
+        h1, _ = self.sweep(on, steps, stream)
         classes = np.flatnonzero(on)
         logits = self._logits(classes, h1)
         r = self._relations(classes, logits, stream)
-        return ChainState(classes, self._room, h1, np.flatnonzero(h2), logits, r)
+        return ChainState(classes, self._room, logits, r)
 
     def sweep(
         self, on: Bits, steps: int, stream: np.random.Generator, h2: Bits | None = None
@@ -282,16 +260,16 @@ class ConditionedChains:
             The state of each unit of h1, (units,), and the states of h2, (H2,).
         """
         on |= self._required_classes
-        h1 = np.zeros(len(self._held), np.int64)
+        h1 = np.zeros(self._machine.spec.units, np.int64)
         if h2 is None:
             _, means = self._context(np.flatnonzero(on), float(self._beta))
             h2 = (stream.random(len(means), np.float32) < means).astype(np.uint8)
-        h2 |= self._required_h2
-        required = self._required_classes, self._held, self._required_h2
         per_sweep = len(on) + len(h1) + len(h2)
         while steps > 0:
             uniform = stream.random((min(steps, _AT_ONCE), per_sweep), np.float32)
-            kernels.sweeps(self._w, self._bias, *required, self._beta, uniform, on, h1, h2)
+            kernels.sweeps(
+                self._w, self._bias, self._required_classes, self._beta, uniform, on, h1, h2
+            )
             steps -= _AT_ONCE
         return h1, h2
 
@@ -369,9 +347,3 @@ class ConditionedChains:
         if machine.spec.coupled:
             score += 0.5 * machine["L"][np.ix_(listed, listed)].sum()
         return float(score + self._room_bias + entropy + (on * logits - softplus(logits)).sum())
-
-
-def _indicator(size: int, units: Indices) -> Bits:
-    indicator = np.zeros(size, np.uint8)
-    indicator[units] = 1
-    return indicator

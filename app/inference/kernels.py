@@ -904,7 +904,7 @@ def _draw_state(logits, beta, uniform):
 
 
 @compiled
-def sweeps(w, bias, always, held, held2, beta, uniform, on, h1, h2):
+def sweeps(w, bias, always, beta, uniform, on, h1, h2):
     """Run Gibbs sweeps that change the arrays on, h1 and h2 in place.
 
     A sweep draws h1 given the rest, then h2 given h1, and then the classes. Coupled classes are
@@ -914,8 +914,6 @@ def sweeps(w, bias, always, held, held2, beta, uniform, on, h1, h2):
         w: `chains.Arrays`.
         bias: (H1,) bias of h1.
         always: (V,) uint8, 1 for classes that stay present.
-        held: (units,) state that a unit of h1 keeps, or -1 for a free unit.
-        held2: (H2,) uint8, 1 for units of h2 that stay on.
         beta: 1 / temperature.
         uniform: (sweeps, units + H2 + V) random numbers.
         on: (V,) uint8, presence of the classes.
@@ -936,9 +934,7 @@ def sweeps(w, bias, always, held, held2, beta, uniform, on, h1, h2):
         _add_rows(w.W, on, x)
         _add_rows(w.JT, h2, x)
         for m in range(units):
-            h1[m] = held[m]
-            if held[m] < 0:
-                h1[m] = _draw_state(x[m * states : (m + 1) * states], beta, row[m])
+            h1[m] = _draw_state(x[m * states : (m + 1) * states], beta, row[m])
         field[:] = w.b
         logits2[:] = w.c2
         for m in range(units):
@@ -950,7 +946,7 @@ def sweeps(w, bias, always, held, held2, beta, uniform, on, h1, h2):
                 for k in range(H2):
                     logits2[k] += from_h1_to_h2[k]
         for k in range(H2):
-            h2[k] = max(held2[k], np.uint8(row[units + k] < logistic(beta * logits2[k])))
+            h2[k] = row[units + k] < logistic(beta * logits2[k])
         for i in range(V):
             logit = beta * (field[i] + from_classes[i])
             drawn = max(always[i], np.uint8(row[units + H2 + i] < logistic(logit)))

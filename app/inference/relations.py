@@ -137,13 +137,6 @@ class RelationUnits(ABC):
         self._states = weights.spec.states
 
     @abstractmethod
-    def context_weights(self, a: Indices, i: Indices, j: Indices) -> Floats:
-        """Return the weights U_e of E relations a between classes i and j, (E, H1).
-
-        The weights of a relation without a unit are 0.
-        """
-
-    @abstractmethod
     def normal(
         self, means: Floats, ends: Ends, only: int | None = None, *, certain: bool = False
     ) -> tuple[Floats, Floats]:
@@ -244,12 +237,6 @@ class FreeUnits(RelationUnits):
         self._index = np.full((len(self._table[1]) + 1, self._A), -1, np.int32)
         self._index[index] = np.arange(len(U))
 
-    def context_weights(self, a: Indices, i: Indices, j: Indices) -> Floats:
-        """See `RelationUnits`."""
-        unit = self._units(a, i, j)
-        rows: Floats = self._U[unit] * (unit >= 0)[:, None]
-        return rows
-
     def _units(self, a: Indices, i: Indices, j: Indices) -> Indices:
         """Return the unit of each relation, or -1 for relations without a unit, (E,)."""
         rows = kernels.pair_rows(*self._table, i * self._V + j)
@@ -328,16 +315,6 @@ class SharedUnits(RelationUnits):
             # A relation does not imply itself.
             gamma[:, range(A), range(A)] = 0
             self._gamma = gamma.reshape(len(gamma), -1)
-
-    def context_weights(self, a: Indices, i: Indices, j: Indices) -> Floats:
-        """See `RelationUnits`."""
-        z = self._w.S[i] * self._w.O[j]
-        weights = np.empty((len(a), self._G.shape[2]), np.float32)
-        # One matrix product for each relation, because G[a] of all units would have 0.8 GB.
-        for relation, G in enumerate(self._G):
-            of_relation = a == relation
-            weights[of_relation] = z[of_relation] @ G
-        return weights
 
     def normal(
         self, means: Floats, ends: Ends, only: int | None = None, *, certain: bool = False

@@ -16,14 +16,13 @@ After `ATTEMPTS` draws for the same scene, the last draw is accepted in any case
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from collections.abc import Callable, Collection, Iterator
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from app.errors import InvalidRequestError, RareRoomTypeError
-from app.inference import MachineSpec
+from app.errors import RareRoomTypeError
 from app.inference.chains import ChainState, ConditionedChains, Conditions, random_stream
 from app.inference.kernels import select_consistent
 from app.inference.posterior import context_of
@@ -58,8 +57,6 @@ DRAWN_SEED_BITS: Final = 53
 A JSON reader may store numbers as doubles. A double represents an integer of 53 bits exactly.
 """
 
-_UNIT_BYTES: Final = 20  # maximum size in bytes of the pair of one hidden unit
-
 
 def generate(
     artifact: Artifact,
@@ -69,7 +66,6 @@ def generate(
     seed: int,
     steps: int | None = None,
     temperature: float = 1.0,
-    context: Mapping[str, Sequence[tuple[int, int]]] | None = None,
     stop: Callable[[], bool] = lambda: False,
     size_limit: SizeLimit | None = None,
 ) -> Fields:
@@ -92,8 +88,6 @@ def generate(
         seed: seed of the random numbers. The same seed gives the same scenes.
         steps: number of Gibbs sweeps for each draw. None means `STEPS`.
         temperature: temperature of the chains. Above 1, the scenes are more varied.
-        context: maps the name of a layer, "h1" or "h2", to pairs (unit, state). These hidden units
-            keep their state.
         stop: function called between draws. After it returns True, `generate` returns the scenes
             drawn so far.
         size_limit: limit on the size of the answer, or None.
@@ -104,7 +98,7 @@ def generate(
         classes and profile, can be compared.
 
     Raises:
-        ValueError: a number is out of range, or `context` has an invalid layer, unit or state.
+        ValueError: a number is out of range.
         RequestError: the answer would exceed `size_limit`.
     """
     steps = STEPS if steps is None else steps
@@ -116,7 +110,7 @@ def generate(
         raise ValueError(f"steps must be at least 1, not {steps}")
     if not temperature > 0:
         raise ValueError(f"temperature must be positive, not {temperature}")
-    conditions = _conditions(artifact, scene, context or {})
+    conditions = _conditions(artifact, scene)
     chains = artifact.scene_chains.under(conditions, temperature)
     shown = ~artifact.vocabulary.structure
     shown[conditions.classes] = True
@@ -134,69 +128,20 @@ def generate(
                 scenes.append(_scene(artifact, chains, state, is_shown, evidence))
                 break
     if size_limit is not None:
-        units = sum([len(layer) for scene in scenes for layer in scene["context"].values()])
         size_limit.check(
             "count",
             (len(scenes), OBJECT_BYTES, 0),
             (lengths(scenes, "objects"), 0, 1),
             (lengths(scenes, "relations"), RELATION_BYTES, 2),
-            (units, _UNIT_BYTES, 0),
         )
     return {"seed": seed, "scenes": scenes}
 
 
-def _conditions(
-    artifact: Artifact, scene: Scene, context: Mapping[str, Sequence[tuple[int, int]]]
-) -> Conditions:
-    """Return the fixed part of each chain: classes, relations, room type and hidden units.
-
-    Raises:
-        ValueError: `context` has an invalid layer, unit or state.
-    """
-    spec, listing = artifact.spec, present(scene, artifact.spec)
-    layers = _layers(spec)
-    for layer, pairs in context.items():
-        if layer not in layers:
-            raise ValueError(
-                f"the model has no layer {layer!r}; layers are h1, and h2 in two-layer models"
-            )
-        for _, error in layers[layer].errors(pairs):
-            raise ValueError(f"context of {layer}: {error}")
-    held = np.unique(np.array(context.get("h1", ()), dtype=np.int64).reshape(-1, 2), axis=0)
-    # A unit of h2 is binary. It can be held in state 1 only; state 0 is its most common state.
-    held2 = np.unique(np.array([u for u, _ in context.get("h2", ())], dtype=np.int64))
-    observed = given_relations(scene, listing, spec.A)
-    return Conditions(
-        *(listing.classes, listing.log_counts, observed, held, held2),
-        room=scene.room_type,
-        profile=scene.profile,
-    )
-
-
-class _Layer(NamedTuple):
-    """The number of units of a hidden layer, and the states that `context` can hold."""
-
-    units: int
-    states: range
-
-    def errors(self, pairs: Sequence[tuple[int, int]]) -> Iterator[tuple[int, str]]:
-        """Yield the position of each invalid pair (unit, state), and the reason."""
-        first, last = self.states[0], self.states[-1]
-        states = f"states {first} to {last}" if first < last else f"state {first}"
-        held: dict[int, int] = {}
-        for position, (unit, state) in enumerate(pairs):
-            if not 0 <= unit < self.units:
-                yield position, f"the hidden layer has only the units 0 to {self.units - 1}"
-            elif state not in self.states:
-                yield position, f"a unit of this hidden layer can keep only {states}"
-            elif held.setdefault(unit, state) != state:
-                yield position, "the unit already keeps another state"
-
-
-def _layers(spec: MachineSpec) -> dict[str, _Layer]:
-    """Map the name of each hidden layer to its sizes."""
-    layers = {"h1": _Layer(spec.units, range(spec.states))}
-    return layers | ({"h2": _Layer(spec.H2, range(1, 2))} if spec.H2 else {})
+def _conditions(artifact: Artifact, scene: Scene) -> Conditions:
+    """Return the fixed part of each chain: classes, relations, room type and profile."""
+    listing = present(scene, artifact.spec)
+    observed = given_relations(scene, listing, artifact.spec.A)
+    return Conditions(listing.classes, listing.log_counts, observed, scene.room_type, scene.profile)
 
 
 def _scene(
@@ -226,14 +171,7 @@ def _scene(
             for a, i, j in triples
         ],
         "log_score": rounded_number(chains.log_score(state, shown, kept)),
-        "context": _context(artifact.spec, state),
     }
-
-
-def _context(spec: MachineSpec, state: ChainState) -> dict[str, list[tuple[int, int]]]:
-    """Return (unit, state) of the hidden units that are not in state 0, by layer."""
-    h1 = [(unit, value) for unit, value in enumerate(state.h1.tolist()) if value]
-    return {"h1": h1} | ({"h2": [(unit, 1) for unit in state.h2.tolist()]} if spec.H2 else {})
 
 
 def staying(
@@ -312,24 +250,16 @@ def room_fit(artifact: Artifact, classes: list[int], room: int) -> float:
 
 def _read(request: GenerateRequest, artifact: Artifact, reading: Reading) -> Options:
     """Return the arguments of `generate` for a request."""
-    errors, layers = ErrorList(), _layers(artifact.spec)
+    errors = ErrorList()
     if reading.scene.room_type in artifact.calibration.rare_rooms:
         message = "the model has too few training scenes of this room type to sample such a room"
         errors.add(RareRoomTypeError, ("room_type",), message)
-    for layer, pairs in (request.context or {}).items():
-        if layer not in layers:
-            message = "the model lacks this hidden layer"
-            errors.add(InvalidRequestError, ("context", layer), message, tuple(layers))
-            continue
-        for position, error in layers[layer].errors(pairs):
-            errors.add(InvalidRequestError, ("context", layer, position), error)
     errors.raise_any()
     return {
         "count": request.count,
         "seed": secrets.randbits(DRAWN_SEED_BITS) if request.seed is None else request.seed,
         "steps": request.steps,
         "temperature": request.temperature,
-        "context": request.context,
     }
 
 
@@ -344,10 +274,6 @@ _EXAMPLES: Final = {
         "scenes that contain these objects and this relation", {**BEDROOM, "count": 2, "seed": 7}
     ),
     "poses": Example("scenes around the objects that the robot sees", {**POSES, "seed": 7}),
-    "context": Example(
-        "hidden units in given states (GET /models/{name}/contexts lists them)",
-        {"context": {"h1": [[0, 1], [3, 1]]}, "seed": 7},
-    ),
     "varied": Example(
         "more Gibbs steps and a higher temperature, for more varied scenes",
         {"objects": ["desk"], "steps": 100, "temperature": 1.5, "count": 4, "seed": 7},
@@ -362,7 +288,6 @@ _EXAMPLE_ANSWER: Final = {
             "objects": ["bed", "nightstand", "lamp"],
             "relations": [{"subject": "lamp", "relation": "on-top", "object": "nightstand"}],
             "log_score": -6.1,
-            "context": {"h1": [[3, 1], [5, 1]]},
         }
     ],
 }

@@ -140,11 +140,6 @@ class Artifact:
         popularity = np.array(self.calibration.popularity, dtype=np.float64)
         return ~(popularity >= math.log(RARELY / (1 - RARELY)))  # NaN: no training scene
 
-    def context_rows(self) -> NDArray[np.float32]:
-        """Return the weights between h1 and each of the T triples of the weights, (T, H1)."""
-        relation, subject, object_ = self.weights["triples"].astype(np.int64).T.copy()
-        return self.relation_units.context_weights(relation, subject, object_)
-
     @cached_property
     def scene_chains(self) -> SceneChains:
         """Compiled Gibbs chains that sample scenes."""

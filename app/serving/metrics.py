@@ -29,7 +29,6 @@ from app.serving.models import DEFAULT, Key, ServedModels
 
 CONTENT_TYPE: Final = CONTENT_TYPE_PLAIN_0_0_4
 
-Change = Literal["refresh", "alias", "poll"]
 Outcome = Literal["success", "refused", "failed"]
 Info = tuple[str, str, str, str, str]
 
@@ -103,9 +102,7 @@ class Metrics:
             (*_MODEL, "variant", "digest", "alias"),
         )
         self._reloads = counter(
-            "scene_reloads_total",
-            "Attempts to change the served models: refreshes, alias changes, polls of the store",
-            ("change", "outcome"),
+            "scene_reloads_total", "Attempts to load changes in the store", ("outcome",)
         )
         gauge(
             "scene_start_time_seconds", "Unix time when the process began to load its models"
@@ -122,9 +119,8 @@ class Metrics:
         # series are kept here: of requests, and of the questions of each served model.
         self._of_requests: dict[tuple[str, str, str], tuple[Counter, Histogram]] = {}
         self._of_model: dict[Key, dict[str, tuple[Histogram, Histogram, Histogram]]] = {}
-        for change in get_args(Change):
-            for outcome in get_args(Outcome):
-                self._reloads.labels(change, outcome)
+        for outcome in get_args(Outcome):
+            self._reloads.labels(outcome)
 
     def serving(self, models: ServedModels) -> None:
         """Report these models as served, and remove the series of all other models."""
@@ -146,9 +142,9 @@ class Metrics:
             self._is_ready = True
             self._ready.set(time.time())
 
-    def reloaded(self, change: Change, outcome: Outcome) -> None:
-        """Count one attempt to change the served models, with its outcome."""
-        self._reloads.labels(change, outcome).inc()
+    def reloaded(self, outcome: Outcome) -> None:
+        """Count one attempt to load changes in the store, with its outcome."""
+        self._reloads.labels(outcome).inc()
 
     def answered(
         self, route: str, method: str, outcome: str, seconds: float, serialised: float | None = None

@@ -14,7 +14,6 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from types import MappingProxyType
 from typing import Final
 
 from app.errors import (
@@ -26,7 +25,7 @@ from app.errors import (
 )
 from app.questions import QUESTIONS
 from app.questions.answer import written
-from app.registry import AliasTarget, Artifact, ArtifactError, ModelSet, StoreError
+from app.registry import Artifact, ArtifactError, ModelSet, StoreError
 from app.registry.model_set import EMPTY
 from app.scene.nearest import spelt_alike
 from app.scene.scene import Scene, SceneObject, observe
@@ -59,6 +58,9 @@ class ServedModels:
     def resolve(self, reference: str) -> Artifact:
         """Return the model that an alias, `name` or `name@version` points at.
 
+        If the target of the alias `default` is not usable, this alias points at the newest usable
+        version of the target's model.
+
         Raises:
             UnknownModelError: the alias, model or version does not exist.
             ModelUnavailableError: the service refused the version, or the store lacks the target of
@@ -68,7 +70,7 @@ class ServedModels:
         if (cached := self._resolved.get(reference)) is not None:
             return cached
         try:
-            model = self._resolved[reference] = self.store.resolve(reference)
+            model = self._resolved[reference] = self._find(reference)
         except (StoreError, ArtifactError) as error:
             if reference == DEFAULT:
                 raise NotReadyError("The default model is not usable.") from None
@@ -76,6 +78,15 @@ class ServedModels:
                 raise self.unknown(reference) from None
             raise ModelUnavailableError("The service refused to load this model.") from None
         return model
+
+    def _find(self, reference: str) -> Artifact:
+        try:
+            return self.store.resolve(reference)
+        except (StoreError, ArtifactError):
+            target = self.store.aliases.get(DEFAULT)
+            if reference != DEFAULT or target is None:
+                raise
+            return self.store.resolve(target.name)
 
     def unknown(self, reference: str) -> UnknownModelError:
         """Return the error for a reference to nothing. The error lists the known names."""
@@ -92,11 +103,6 @@ class ServedModels:
         return UnknownModelError(
             f"No model or alias has this name.{hint} Aliases: {aliases}. Models: {models}."
         )
-
-    def with_alias(self, alias: str, target: AliasTarget) -> ServedModels:
-        """Return a copy of the snapshot in which an alias has another target."""
-        aliases = MappingProxyType({**self.store.aliases, alias: target})
-        return ServedModels(replace(self.store, aliases=aliases))
 
     @cached_property
     def _resolved(self) -> dict[str, Artifact]:
@@ -123,6 +129,19 @@ class ServedModels:
         subjects = versions | self.store.aliases.keys() | {DEFAULT, "store"}
         return frozenset(subjects - self.failures.keys())
 
+    @property
+    def is_ready(self) -> bool:
+        """Whether a model answers requests for the alias `default`."""
+        try:
+            return bool(self.resolve(DEFAULT))
+        except NotReadyError:
+            return False
+
+    def lost_in(self, new: ServedModels) -> list[Failure]:
+        """Return the failures of entries that are usable here and unusable in a newer snapshot."""
+        lost = {*self.usable, DEFAULT} if self.is_ready and not new.is_ready else self.usable
+        return [failure for subject, failure in new.failures.items() if subject in lost]
+
     @cached_property
     def generation(self) -> str:
         """Digest of the served versions and aliases. Equal digests mean equal states."""
@@ -144,6 +163,10 @@ class ServedModels:
                 causes[alias] = error
         if self.store.failure is not None:
             causes["store"] = self.store.failure
+        if DEFAULT in causes and self.is_ready:
+            instead = "@".join(self.resolve(DEFAULT).key)
+            cause = causes[DEFAULT]
+            causes[DEFAULT] = type(cause)(cause.code, f"{cause.reason}; {instead} answers instead")
         return {
             subject: Failure(subject=subject, reason=cause.code, detail=cause.reason)
             for subject, cause in causes.items()

@@ -7,25 +7,21 @@ import ctypes
 import gc
 import logging
 import sys
-from collections.abc import AsyncIterator, Callable, Iterable
-from contextlib import asynccontextmanager
-from typing import Literal
+from collections.abc import Iterable
+from contextlib import suppress
 
 from app import errors
 from app.compiling import check_cache, progress
 from app.inference.kernels import KERNELS
 from app.questions.reading import Limits
-from app.registry import AliasTarget, Store, StoreError, StoreState, load_model_set
+from app.registry import Store, StoreState, load_model_set
 from app.serving.admission import Admission, Bodies
-from app.serving.metrics import Change, Metrics
-from app.serving.models import DEFAULT, NO_MODELS, Key, ServedModels, warm_up
+from app.serving.metrics import Metrics, Outcome
+from app.serving.models import DEFAULT, NO_MODELS, ServedModels, warm_up
 from app.settings import Settings
-from scene_client.schemas import AliasAnswer, AliasRequest, RefreshAnswer
+from scene_client.schemas import Failure
 
 _logger = logging.getLogger("app.serving")
-
-# Maximum time in seconds that an administration request waits for the lock of the store.
-_LOCK_TIMEOUT = 5.0
 
 # Time in seconds after which the interpreter switches from a worker thread to the event loop.
 # Python's default of 5 ms would delay answers by a quarter of a robot's control cycle (20 ms).
@@ -51,13 +47,13 @@ class Runtime:
         self.draining = False
         self.metrics = Metrics(self.admission)
         limit = settings.max_weights_bytes
-        self._store = Store(settings.store, lock_timeout=_LOCK_TIMEOUT, max_weights_bytes=limit)
+        self._store = Store(settings.store, max_weights_bytes=limit)
         self.limits = Limits(
             settings.max_objects, settings.max_relations, settings.max_answer_bytes
         )
         self._poll = settings.store_poll
-        self._polling: asyncio.Task[None] | None = None
-        self._changing = asyncio.Lock()
+        self._requested = asyncio.Event()
+        self._following: asyncio.Task[None] | None = None
         self.models = NO_MODELS
         self._loaded_state: StoreState | None = None
 
@@ -82,127 +78,68 @@ class Runtime:
         # The models load on this thread, because the service has no requests yet. Another thread
         # would cost time and memory.
         self._serve(self._load())
-        for failure in self.models.failures.values():
-            _logger.error("%s: %s: %s", failure.subject, failure.reason, failure.detail)
-        if self._poll:
-            self._polling = asyncio.create_task(self._follow_store())
+        self._following = asyncio.create_task(self._follow_store())
 
     def stop(self) -> None:
         """Stop the worker threads and drop the computations that have not started."""
-        if self._polling is not None:
-            self._polling.cancel()
+        if self._following is not None:
+            self._following.cancel()
         self.admission.stop()
 
-    async def refresh(self, request_id: str) -> RefreshAnswer:
-        """Load the current state of the store and serve it, or keep the served models.
+    def request_check(self) -> None:
+        """Make the service load the state of the store now, even if nothing has changed."""
+        self._requested.set()
 
-        The service refuses a state of the store with a new failure or without a usable default
-        model.
-
-        Raises:
-            RefreshRefusedError: the service refused the new state. The served models are unchanged.
-        """
-        async with self._change("refresh"):
-            # These sets contain only names, so Python can free the memory of the old snapshot.
-            accepted, served = self.models.failures.keys() - {DEFAULT}, set(self.models.served)
-            new = await self._load_and_serve(lambda subject: subject not in accepted)
-            return RefreshAnswer(
-                request_id=request_id,
-                default=new.resolve(DEFAULT).reference,
-                added=_names(set(new.served) - served),
-                removed=_names(served - set(new.served)),
-                failures=list(new.failures.values()),
-            )
-
-    async def move_alias(self, alias: str, request: AliasRequest, request_id: str) -> AliasAnswer:
-        """Point an alias at a served version, in the store and in this process.
-
-        Raises:
-            InvalidRequestError: the name is not valid for an alias.
-            UnknownModelError: the service does not serve the model or version.
-            ModelUnusableError: the service refused the version.
-            AliasConflictError: the alias has another target than expected, or a model has the name
-                of the alias.
-            StoreNotWritableError: this process cannot write to the store.
-            StoreBusyError: another process is writing to the store.
-        """
-        async with self._change("alias"):
-            target = self._target(request.model)
-            expected = _expected(request)
-            try:
-                previous = self._store.aliases().get(alias)
-                await asyncio.to_thread(self._store.set_alias, alias, target, expected=expected)
-            except StoreError as error:
-                raise _refusal(error) from None
-            self._serve(self.models.with_alias(alias, target))
-            return AliasAnswer(
-                request_id=request_id,
-                alias=alias,
-                model=str(target),
-                previous=None if previous is None else str(previous),
-            )
-
-    async def _follow_store(self) -> None:
-        """Check the store regularly for changes by other processes, and serve the new state.
+    async def check_store(self, *, always: bool = False) -> None:
+        """Load the state of the store and serve it, if another process has changed the store.
 
         If a new version fails, the service lists this version as refused and serves the other
         changes. If a usable version or alias would become unusable, the service serves no change.
-        """
-        while True:
-            await asyncio.sleep(self._poll)
-            try:
-                async with self._changing:
-                    changed = await asyncio.to_thread(self._store.state) != self._loaded_state
-                if changed:
-                    async with self._change("poll"):
-                        await self._load_and_serve(self.models.usable.__contains__)
-            except errors.RefreshRefusedError as error:
-                for failure in error.failures:
-                    reason = f"{failure.subject}: {failure.reason}: {failure.detail}"
-                    _logger.error("the service refused the changes in the store: %s", reason)
-            except Exception:
-                _logger.exception("the service could not load the changes in the store")
-
-    @asynccontextmanager
-    async def _change(self, change: Change) -> AsyncIterator[None]:
-        """Hold the lock for a change of the served models, and count the outcome of the change."""
-        try:
-            async with self._changing:
-                yield
-        except errors.ServiceError:
-            self.metrics.reloaded(change, "refused")
-            raise
-        except Exception:
-            self.metrics.reloaded(change, "failed")
-            raise
-        self.metrics.reloaded(change, "success")
-
-    async def _load_and_serve(self, is_fatal: Callable[[str], bool]) -> ServedModels:
-        """Load the state of the store and serve it.
+        The log and the metrics contain the outcome.
 
         Args:
-            is_fatal: function from the name of an unusable entry (``name@version``, an alias or
-                "store") to True, if this failure makes the service refuse the new state.
-
-        Raises:
-            RefreshRefusedError: the service refused the new state.
+            always: whether to load an unchanged state, too.
         """
-        # `_load` runs in a thread, so that the event loop can answer from the old snapshot.
-        new = await asyncio.to_thread(self._load)
-        fatal = [failure for subject, failure in new.failures.items() if is_fatal(subject)]
-        if fatal:
-            detail = "The service still serves the previous versions. `failures` gives the reasons."
-            raise errors.RefreshRefusedError(detail, failures=fatal)
-        self._serve(new)
-        return new
+        outcome: Outcome = "failed"
+        try:
+            if not always and await asyncio.to_thread(self._store.state) == self._loaded_state:
+                return
+            # `_load` runs in a thread, so that the event loop can answer from the old snapshot.
+            new = await asyncio.to_thread(self._load)
+            lost = self.models.lost_in(new)
+            outcome = "refused" if lost else "success"
+            if lost:
+                _log_failures("the service refused the changes in the store: ", lost)
+            else:
+                self._serve(new)
+        except Exception:
+            _logger.exception("the service could not load the changes in the store")
+        self.metrics.reloaded(outcome)
+
+    async def _follow_store(self) -> None:
+        """Check the store regularly, and at once after `request_check`."""
+        while True:
+            with suppress(TimeoutError):
+                async with asyncio.timeout(self._poll or None):
+                    await self._requested.wait()
+            is_requested = self._requested.is_set()
+            self._requested.clear()
+            await self.check_store(always=is_requested)
 
     def _serve(self, models: ServedModels) -> None:
         previous, self.models = self.models, models
+        is_first = previous is NO_MODELS
+        known = {} if is_first else previous.failures
+        new = [one for name, one in models.failures.items() if known.get(name) != one]
+        _log_failures("", new)
+        if not is_first:
+            count = len(models.served)
+            _logger.info("the service has loaded the store: %d usable versions", count)
         for alias, target in models.store.aliases.items():
-            if previous is not NO_MODELS and previous.store.aliases.get(alias) != target:
+            if not is_first and previous.store.aliases.get(alias) != target:
                 _logger.info("the alias %s names %s now", alias, target)
         self.metrics.serving(models)
-        if previous is NO_MODELS or previous.served != models.served:
+        if is_first or previous.served != models.served:
             _freeze_memory()
 
     def _load(self) -> ServedModels:
@@ -212,51 +149,10 @@ class Runtime:
         with progress(KERNELS):
             return ServedModels(load_model_set(self._store, self.models.store, warm_up))
 
-    def _target(self, reference: str) -> AliasTarget:
-        try:
-            served = self.models.resolve(reference).reference
-        except (errors.ModelUnavailableError, errors.NotReadyError):
-            raise errors.ModelUnusableError(
-                f"The service refused to load {reference}; GET /models gives the reason."
-            ) from None
-        # If the reference is a name without a version, the alias follows the newest usable version.
-        newest = reference == served.name
-        return AliasTarget(name=served.name, version=None if newest else served.version)
 
-
-def _expected(request: AliasRequest) -> AliasTarget | Literal["any"] | None:
-    if "expected" not in request.model_fields_set:
-        return "any"
-    if request.expected is None:
-        return None
-    try:
-        return AliasTarget.of(request.expected)
-    except ValueError:
-        raise errors.AliasConflictError(
-            "`expected` is not the name of a model or version."
-        ) from None
-
-
-def _refusal(error: StoreError) -> Exception:
-    match error.code:
-        case "alias_conflict":
-            return errors.AliasConflictError("The alias points to another version than expected.")
-        case "name_conflict":
-            return errors.AliasConflictError("A model already has the name of this alias.")
-        case "invalid_reference":
-            return errors.InvalidRequestError([errors.LocatedError((), error.reason)])
-        case "unknown_model" | "unknown_version":
-            return errors.UnknownModelError("The store no longer contains this version.")
-        case "locked":
-            return errors.StoreBusyError("Another process is writing to the store.")
-        case _:
-            return errors.StoreNotWritableError(
-                f"The service cannot write the aliases: {error.reason}."
-            )
-
-
-def _names(keys: Iterable[Key]) -> list[str]:
-    return [f"{name}@{version}" for name, version in sorted(keys)]
+def _log_failures(prefix: str, failures: Iterable[Failure]) -> None:
+    for failure in failures:
+        _logger.error("%s%s: %s: %s", prefix, failure.subject, failure.reason, failure.detail)
 
 
 def _freeze_memory() -> None:

@@ -98,8 +98,6 @@ def machine_sampler(artifact: Artifact) -> Sampler:
                 index,
                 np.zeros(len(index), np.float32),
                 observed=None,
-                held=np.zeros((0, 2), np.int64),
-                held2=np.zeros(0, np.int64),
                 room=room_type if room_type >= 0 and artifact.spec.C else None,
             )
             state = chains.under(conditions).draw(STEPS, random_stream(seed, row))

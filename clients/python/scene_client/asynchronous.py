@@ -28,7 +28,6 @@ class AsyncClient:
         url: base URL of the service.
         timeout: maximum time of a call in seconds, including all retries and pauses.
         api_key: API key, if the service requires an API key.
-        admin_key: admin key of the service, for `refresh` and `promote`.
         model: model for requests without the field ``model``. By default, the service uses its
             default model.
         retries: maximum number of retries of a call. Within the timeout, the client retries after
@@ -55,13 +54,12 @@ class AsyncClient:
         *,
         timeout: float = 10.0,
         api_key: str | None = None,
-        admin_key: str | None = None,
         model: str | None = None,
         retries: int = RETRIES,
         transport: httpx.AsyncBaseTransport | None = None,
         record: str | Path | Recorder | None = None,
     ) -> None:
-        self.options = Options(url, timeout, api_key, admin_key, model, retries)
+        self.options = Options(url, timeout, api_key, model, retries)
         if transport is None:
             transport = async_transport(self.options.ssl_context())
         self._http = httpx.AsyncClient(transport=transport, trust_env=False)
@@ -187,39 +185,6 @@ class AsyncClient:
         """Return the class that a label becomes in a model, and by which rule."""
         path = calls.model_path(name or self.options.model or "default", "vocabulary", word)
         return await self._call(Call("GET", path, schemas.WordAnswer), timeout)
-
-    async def contexts(
-        self, name: str | None = None, *, timeout: float | None = None
-    ) -> schemas.ContextsAnswer:
-        """Return each hidden unit of a model with the classes of its largest weights."""
-        path = calls.model_path(name or self.options.model or "default", "contexts")
-        return await self._call(Call("GET", path, schemas.ContextsAnswer), timeout)
-
-    async def refresh(self, *, timeout: float | None = None) -> schemas.RefreshAnswer:
-        """Make the service load the current state of its store. The call needs the admin key."""
-        call = Call("POST", "/models/refresh", schemas.RefreshAnswer, administers=True)
-        return await self._call(call, timeout)
-
-    async def promote(
-        self,
-        alias: str,
-        model: str,
-        *,
-        timeout: float | None = None,
-        **fields: Unpack[schemas.AliasFields],
-    ) -> schemas.AliasAnswer:
-        """Point an alias at a model or at one version of the model. The call needs the admin key.
-
-        The client does not retry after a connection error, because the service may already have
-        moved the alias.
-
-        Args:
-            alias: ``default``, or any other alias.
-            model: ``name@version``, or ``name`` for the newest usable version.
-            **fields: optional field ``expected``, the required current target of the alias. None
-                means that the alias must not exist yet.
-        """
-        return await self._call(calls.promote(alias, {"model": model, **fields}), timeout)
 
     # --------------------------------------------------------------------------------- health
 

@@ -10,7 +10,6 @@ from random import random
 from typing import Any, Final, Generic, TypeAlias, TypeVar
 from urllib.parse import quote
 
-import httpx
 from pydantic import BaseModel, ValidationError
 
 from scene_client import schemas
@@ -49,8 +48,6 @@ class Call(Generic[T]):
         path: URL-encoded path of the route.
         answer: class of the answer.
         body: body of the request as JSON text. None means a request without a body.
-        administers: whether the request needs the admin key.
-        repeatable: whether the client may send the request again after a connection error.
         scenes: the observed scenes, for a recorder.
     """
 
@@ -58,8 +55,6 @@ class Call(Generic[T]):
     path: str
     answer: type[T]
     body: str | None = None
-    administers: bool = False
-    repeatable: bool = True
     scenes: tuple[schemas.SceneRequest, ...] = ()
 
     def read(self, status: int, headers: Mapping[str, str], body: bytes) -> T:
@@ -101,9 +96,7 @@ class Call(Generic[T]):
         if isinstance(error, ProblemError):
             # The random pause spreads the retries of many clients over time.
             return pause + (error.retry_after or 0.0) if error.status in (429, 503) else None
-        # Without a connection, the service has not received the request.
-        may_have_arrived = not isinstance(error.__cause__, httpx.ConnectError)
-        return pause if self.repeatable or not may_have_arrived else None
+        return pause
 
 
 def model_path(*names: str) -> str:
@@ -168,19 +161,6 @@ MISSING: Final = Question("/missing", schemas.MissingRequest, schemas.MissingAns
 OUTLIERS: Final = Question("/outliers", schemas.OutliersRequest, schemas.OutliersAnswer)
 ROOMS: Final = Question("/rooms", schemas.RoomsRequest, schemas.RoomsAnswer)
 GENERATE: Final = Question("/generate", schemas.GenerateRequest, schemas.GenerateAnswer, False)
-
-
-def promote(alias: str, fields: Mapping[str, Any]) -> Call[schemas.AliasAnswer]:
-    """Build the call that points the alias ``alias`` at a model or a version."""
-    return Call(
-        "PUT",
-        model_path("aliases", alias),
-        schemas.AliasAnswer,
-        _json(validated(schemas.AliasRequest, dict(fields))),
-        administers=True,
-        # If the first attempt has changed the alias, a second attempt with `expected` would fail.
-        repeatable=False,
-    )
 
 
 def _json(request: BaseModel) -> str:

@@ -353,12 +353,6 @@ def vocabulary(context: typer.Context) -> None:
 
 
 @app.command()
-def contexts(context: typer.Context) -> None:
-    """List the hidden units of the model with the classes of their largest weights."""
-    _show(context, Client.contexts, tables.contexts)
-
-
-@app.command()
 def ready(context: typer.Context) -> None:
     """Check that the service is ready. The only output is the exit status."""
     options: Options = context.obj

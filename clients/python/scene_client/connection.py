@@ -58,7 +58,6 @@ class Options:
     url: str
     timeout: float = 10.0
     api_key: str | None = field(default=None, repr=False)
-    admin_key: str | None = field(default=None, repr=False)
     model: str | None = None
     retries: int = RETRIES
 
@@ -68,8 +67,7 @@ class Options:
             raise _refused("the URL must start with http:// or https:// and contain a host")
         if parts.query or parts.fragment:
             raise _refused("the URL must not have a query or a fragment")
-        keys = (self.api_key or "") + (self.admin_key or "")
-        if not all("!" <= letter <= "~" for letter in keys):
+        if not all("!" <= letter <= "~" for letter in self.api_key or ""):
             raise _refused("a key must have only ASCII characters, without spaces or line breaks")
         if self.retries < 0:
             raise _refused("the number of retries must not be negative")
@@ -107,10 +105,7 @@ class Options:
         }
         if call.body is not None:
             headers["Content-Type"] = "application/json"
-        # The client sends the admin key only to administration routes.
-        if call.administers and self.admin_key is not None:
-            headers["X-Admin-Key"] = self.admin_key
-        elif self.api_key is not None:
+        if self.api_key is not None:
             headers["X-API-Key"] = self.api_key
         return headers
 

@@ -14,7 +14,7 @@ from typing import Any, Final
 from pydantic import ValidationError
 from typing_extensions import Self
 
-from scene_client.schemas import Failure, FieldError, Problem
+from scene_client.schemas import FieldError, Problem
 
 
 class ClientError(Exception):
@@ -59,7 +59,6 @@ class ProblemError(ClientError):
         title: short summary. All problems of one type have the same title.
         detail: description of this problem.
         errors: errors in the request. Each error has a location and similar known names.
-        failures: versions and aliases of the model store that a refresh refused, with reasons.
         request_id: id of the request in the log of the service, or "" if the response has no id.
         retry_after: seconds to wait before the next request, or None if the response has no time.
     """
@@ -72,7 +71,6 @@ class ProblemError(ClientError):
         detail: str,
         *,
         errors: Sequence[FieldError] = (),
-        failures: Sequence[Failure] = (),
         request_id: str = "",
         retry_after: float | None = None,
     ) -> None:
@@ -86,7 +84,6 @@ class ProblemError(ClientError):
         self.title = title
         self.detail = detail
         self.errors = list(errors)
-        self.failures = list(failures)
         self.request_id = request_id
         self.retry_after = retry_after
 

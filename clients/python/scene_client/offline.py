@@ -44,12 +44,10 @@ class OfflineClient(Client):
                 "pip install '.[service]' in the repository"
             ) from error
 
-        transport = InProcess(Path(store))
         super().__init__(
             "http://in-process",
             timeout=timeout,
-            admin_key=transport.admin_key,
             model=model,
-            transport=transport,
+            transport=InProcess(Path(store)),
             record=record,
         )

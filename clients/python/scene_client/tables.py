@@ -145,16 +145,6 @@ def models(answer: schemas.ModelList) -> RenderableType:
     )
 
 
-def contexts(answer: schemas.ContextsAnswer) -> RenderableType:
-    """Return a table of the states of hidden units with the classes of their largest weights."""
-    rows = [
-        (layer, str(unit.unit), str(unit.state), *map(_weighted, (unit.objects, unit.room_types)))
-        for layer, units in answer.layers.items()
-        for unit in units
-    ]
-    return _table("layer", "unit", "state", "objects", "room types", rows=rows)
-
-
 def vocabulary(answer: schemas.VocabularyAnswer) -> RenderableType:
     """Return a table of object classes with their aliases."""
     rows = [
@@ -230,7 +220,3 @@ def _placement(placement: schemas.Placement) -> str:
 
 def _reasons(because: Iterable[schemas.Because]) -> str:
     return "\n".join(f"{reason.object} {reason.log_odds_change:+.2f}" for reason in because)
-
-
-def _weighted(labels: Iterable[schemas.WeightedLabel]) -> str:
-    return ", ".join(f"{entry.label} {entry.weight:+.2f}" for entry in labels)

@@ -52,8 +52,6 @@ class Problem(Reply):
     request_id: str
     errors: list[FieldError] | None = None
     """errors in the request, at most 100"""
-    failures: list[Failure] | None = None
-    """versions and aliases that a refresh refused, with reasons"""
 
 
 # ----------------------------------------------------------------------------------- answers

@@ -2,35 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 from typing_extensions import Self
 
 from scene_client.schemas.answers import Answer, Reply
 from scene_client.schemas.requests import (
     Finite,
-    Name,
     Relation,
     SceneFields,
     SceneObject,
     SceneRequest,
-    UnitNumber,
 )
-
-
-def _as_pair(value: Any) -> tuple[Any, Any]:
-    # Strict validation refuses an array in place of a tuple, but JSON has only arrays.
-    if not isinstance(value, list | tuple) or len(value) != 2:
-        raise PydanticCustomError("unit_state", "must be a pair [unit, state], such as [3, 1]")
-    return tuple(value)
-
-
-UnitState = Annotated[tuple[UnitNumber, UnitNumber], BeforeValidator(_as_pair)]
-"""A hidden unit and its state."""
-
 
 MAX_SWEEPS: Final = 32_000
 """Maximum number of Gibbs sweeps of one request: number of scenes times sweeps."""
@@ -48,10 +33,6 @@ class GenerateRequest(SceneRequest):
     # At 2, a scene has 70 objects and 1,000 relations, and 64 scenes take up to 46 s.
     temperature: Annotated[float, Field(ge=0.05, le=1.5, allow_inf_nan=False)] = 1.0
     """sampling temperature, from 0.05 to 1.5; values above 1 give more varied scenes"""
-    context: Annotated[
-        dict[Name, Annotated[list[UnitState], Field(max_length=4096)]] | None, Field(max_length=8)
-    ] = None
-    """states that hidden units keep: maps the name of each layer to pairs [unit, state]"""
 
     @model_validator(mode="after")
     def _has_a_limit(self) -> Self:
@@ -66,16 +47,13 @@ class GeneratedRelation(Relation):
 
 
 class GeneratedScene(Reply):
-    """A sampled scene: labels, relations between the labels, and the states of hidden units."""
+    """A sampled scene: labels, and relations between the labels."""
 
     room_type: str | None = None
     """room type of the scene; absent if it has none"""
     objects: list[str]
     relations: list[GeneratedRelation]
     log_score: Finite
-    context: dict[str, list[tuple[int, int]]]
-    """states of the hidden units: maps the name of each layer to pairs [unit, state]. Units in
-    state 0 are left out"""
 
 
 class GenerateAnswer(Answer):
@@ -94,4 +72,3 @@ class GenerateFields(SceneFields, total=False):
     count: int
     steps: int
     temperature: float
-    context: Mapping[str, Sequence[tuple[int, int]]]

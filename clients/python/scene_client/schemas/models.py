@@ -138,67 +138,6 @@ class WordAnswer(Reply):
     """classes with similar names, if the model does not know the label"""
 
 
-class WeightedLabel(Reply):
-    """An object class or room type, and the weight between it and a hidden unit."""
-
-    label: str
-    weight: Finite
-
-
-class WeightedRelation(Reply):
-    """A relation between two classes, and the weight between it and a hidden unit."""
-
-    subject: str
-    relation: RelationName
-    object: str
-    weight: Finite
-
-
-class ContextUnit(Reply):
-    """A state of a hidden unit with the objects, relations and room types of largest weight."""
-
-    unit: int
-    state: int
-    """state of the unit. State 0 has no weights and is not listed"""
-    name: str
-    """name made of the objects and the relation with the largest weights"""
-    objects: list[WeightedLabel]
-    relations: list[WeightedRelation]
-    """relations of the training scenes. Each weight is the difference from the mean weight of the
-    layer"""
-    room_types: list[WeightedLabel]
-
-
-class ContextsAnswer(Reply):
-    """The hidden units of each layer of a model."""
-
-    model: ModelReference
-    layers: dict[str, list[ContextUnit]]
-
-
-class RefreshAnswer(Reply):
-    """The changes made by a refresh."""
-
-    request_id: str
-    default: ModelReference
-    """model to which the alias `default` refers"""
-    added: list[str]
-    """new versions, as `name@version`"""
-    removed: list[str]
-    """versions no longer served, as `name@version`"""
-    failures: list[Failure] = []
-    """entries of the store that were unusable before and still are"""
-
-
-class AliasAnswer(Reply):
-    """The new and the previous target of an alias."""
-
-    request_id: str
-    alias: str
-    model: str
-    previous: str | None = None
-
-
 # ------------------------------------------------------------------------------------ health
 
 
@@ -206,50 +145,7 @@ class Health(Reply):
     """The status of the service."""
 
     status: Literal["live", "ready"]
+    version: str | None = None
+    """version of the service, in liveness checks"""
     failures: list[Failure] | None = None
     """in readiness checks, up to 10 unusable entries of the store; `GET /models` lists all"""
-
-
-class ServerMetadata(Reply):
-    """Open Inference Protocol: metadata of the server."""
-
-    name: str
-    version: str
-    extensions: list[str]
-
-
-class ServerLive(Reply):
-    """Open Inference Protocol: the process answers."""
-
-    live: bool
-
-
-class ServerReady(Reply):
-    """Open Inference Protocol: the default model is ready."""
-
-    ready: bool
-
-
-class ModelReady(Reply):
-    """Open Inference Protocol: this model is ready."""
-
-    name: str
-    ready: bool
-
-
-class TensorMetadata(Reply):
-    """Open Inference Protocol: metadata of a tensor. The models of this service have no tensors."""
-
-    name: str
-    datatype: str
-    shape: list[int]
-
-
-class ModelMetadata(Reply):
-    """Open Inference Protocol: metadata of a model. The question routes serve the model."""
-
-    name: str
-    versions: list[str]
-    platform: str
-    inputs: list[TensorMetadata] = []
-    outputs: list[TensorMetadata] = []

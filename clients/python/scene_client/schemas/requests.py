@@ -62,7 +62,6 @@ Metres = Annotated[float, Field(ge=-1e8, le=1e8, allow_inf_nan=False)]
 Extent = Annotated[float, Field(ge=0, le=1e4, allow_inf_nan=False)]
 Angle = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)]
 Probability = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
-UnitNumber = Annotated[int, Field(ge=0, le=2**31 - 1)]
 Label = Annotated[str, Field(min_length=1, max_length=100), AfterValidator(_plain_text)]
 Name = Annotated[str, Field(min_length=1, max_length=128), AfterValidator(_plain_text)]
 Id = Annotated[
@@ -319,22 +318,6 @@ class SceneFields(TypedDict, total=False):
     model: str
     seed: int
     unknown_labels: UnknownLabels
-
-
-class AliasRequest(Request):
-    """The new target of an alias."""
-
-    model: ModelSpec
-    """`name@version`, or `name` for the newest usable version"""
-    expected: ModelSpec | None = None
-    """required current target of the alias, as in GET /models. null means that the alias must not
-    exist yet. By default, the service does not check the target"""
-
-
-class AliasFields(TypedDict, total=False):
-    """The fields of `AliasRequest` except the model."""
-
-    expected: str | None
 
 
 RequestT = TypeVar("RequestT", bound=SceneRequest)
