@@ -51,13 +51,21 @@ def _existing(root: str) -> Store:
 
 def _run(options: argparse.Namespace, store: Store) -> None:
     if options.command == "alias":
-        store.set_alias(options.alias, _target(options.target))
-        _print(f"alias '{options.alias}' points at {options.target}")
+        _point(store, options.alias, _target(options.target), options.expected)
     elif options.command == "remove-alias":
         store.remove_alias(options.alias)
         _print(f"alias '{options.alias}' is removed")
     else:
         _list(store)
+
+
+def _point(store: Store, alias: str, target: AliasTarget, expected: str | None) -> None:
+    """Point an alias at a usable version; see `Store.set_alias`."""
+    load_model_set(store).resolve(str(target))
+    before = store.aliases().get(alias)
+    condition = before if expected is None else _target(expected)
+    store.set_alias(alias, target, expected=condition)
+    _print(f"alias '{alias}' points at {target}" + (f", before at {before}" if before else ""))
 
 
 def _keys(store: Store, reference: str | None) -> list[tuple[str, str]]:
@@ -131,6 +139,7 @@ def _parser() -> argparse.ArgumentParser:
     alias = add("alias", "point an alias at a version, for example to roll back")
     alias.add_argument("alias")
     alias.add_argument("target", help="name@version, or name for the newest usable version")
+    alias.add_argument("--expected", metavar="TARGET", help="change only an alias with this target")
     add("remove-alias", "remove an alias").add_argument("alias")
     copy = commands.add_parser(
         "copy",

@@ -17,7 +17,6 @@ SHIPPED = [
     "indoor-gbm",
     "indoor-rbm",
     "indoor-triway",
-    "indoor-triway-deep",
     "open-triway",
 ]
 
