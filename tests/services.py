@@ -24,7 +24,6 @@ from typing import Any
 import httpx
 import pytest
 
-ADMIN_KEY = "correct-horse-battery-staple"
 CONTROL = {"objects": ["bed", "lamp", {"id": "desk_1", "label": "desk"}], "seed": 11}
 NAMED = {"allowed_hosts": ["service"]}
 """Settings of a service in process; its clients use the URL http://service."""
@@ -60,7 +59,7 @@ async def serve(store: Path, **settings: Any) -> AsyncIterator[httpx.AsyncClient
     from app.main import create_app
     from app.settings import Settings
 
-    app = create_app(Settings(store=store, **{"admin_key": ADMIN_KEY, **NAMED, **settings}))
+    app = create_app(Settings(store=store, **{**NAMED, **settings}))
     app.state.runtime.metrics.max_age = 0.0
     # `python -m app` also disables the collector; the runtime enables it after the start.
     gc.disable()
@@ -98,16 +97,14 @@ async def client(shared_store: Path, anyio_backend: str) -> AsyncIterator[httpx.
 
 @pytest.fixture
 async def own(store: Path) -> AsyncIterator[httpx.AsyncClient]:
-    """An administrator's client of a service with the store of this test."""
-    async with serve(store) as client:
-        client.headers["X-Admin-Key"] = ADMIN_KEY
+    """A client of a service with the store of this test, which loads changes on demand."""
+    async with serve(store, store_poll=0) as client:
         yield client
 
 
-@pytest.fixture
-def admin() -> dict[str, str]:
-    """Request headers with the administrator's key."""
-    return {"X-Admin-Key": ADMIN_KEY}
+async def load_changes(client: httpx.AsyncClient) -> None:
+    """Make a service in process load the changes in its store."""
+    await client.app.state.runtime.check_store()  # type: ignore[attr-defined]
 
 
 @pytest.fixture
@@ -227,8 +224,7 @@ def begin(
         name: value for name, value in os.environ.items() if not name.startswith("SCENE_")
     }
     # Without a load balancer, nothing has to notice the end.
-    own = {"SCENE_STORE": str(store), "SCENE_ADMIN_KEY": ADMIN_KEY, "SCENE_DRAIN_SECONDS": "0"}
-    environment |= own | variables
+    environment |= {"SCENE_STORE": str(store), "SCENE_DRAIN_SECONDS": "0"} | variables
     with log.open("w") as stream:
         return subprocess.Popen(
             [sys.executable, *program], env=environment, stderr=stream, text=True

@@ -55,7 +55,7 @@ GARBAGE = [
 ]
 DOCUMENTS = [
     b"GET /metrics HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
-    b"GET /models/default/contexts HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
+    b"GET /models/default/vocabulary HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
 ]
 
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import re
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from playwright.sync_api import Route, expect
 
+from app.registry import AliasTarget, Store
 from tests.browser.driving import Board, OpenBoard
-from tests.services import ADMIN_KEY, LiveService, launch
+from tests.services import LiveService, launch, wait_until
 
 pytestmark = pytest.mark.system
 
@@ -119,12 +121,13 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
 
 
 def promote(service: LiveService, model: str) -> None:
-    headers, body = {"X-Admin-Key": ADMIN_KEY}, {"model": model}
-    response = service.client.put("/models/aliases/default", json=body, headers=headers)
-    assert response.is_success
+    log = service.log.read_text()
+    Store(service.log.parent / "store").set_alias("default", AliasTarget.of(model))
+    service.process.send_signal(signal.SIGHUP)
+    wait_until(lambda: "the alias default names" in service.log.read_text()[len(log) :])
 
 
-# The first test of the service, because an alias cannot be removed over HTTP.
+# The first test of the service, which moves the alias.
 @pytest.mark.parametrize("has_default", [False, True])
 def test_a_model_of_one_s_own_opens_without_errors(
     open_board: OpenBoard, own: LiveService, has_default: bool

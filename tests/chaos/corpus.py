@@ -23,7 +23,6 @@ MARKER: Final = "Zq7 märker"
 NUMBER: Final = "73550861"
 
 BATCHES: Final = tuple(f"/{question.name}/batch" for question in QUESTIONS if not question.samples)
-ALIAS: Final = "/models/aliases/candidate"
 
 _REFUSED: Final = frozenset({400, 404, 409, 413, 415, 422})
 _NOT_JSON: Final = frozenset({400})
@@ -96,8 +95,7 @@ def own_fields(question: Question[Any]) -> dict[str, Any]:
 
 
 VALID: Final[dict[str, dict[str, Any]]] = {
-    **{f"/{question.name}": SCENE | own_fields(question) for question in QUESTIONS},
-    ALIAS: {"model": "home@1.1.0", "expected": "home@1.1.0"},
+    f"/{question.name}": SCENE | own_fields(question) for question in QUESTIONS
 }
 """One request of each kind with every field that it may have."""
 
@@ -182,14 +180,13 @@ def requests() -> Iterator[Hostile]:
     """Every wrong value at every place of every kind of request; members too few or too many."""
     batches = {path: {"scenes": [VALID[path.removesuffix("/batch")]]} for path in BATCHES}
     for path, valid in (VALID | batches).items():
-        method = "PUT" if path == ALIAS else "POST"
         for place in places(valid):
             name = f"{path} /{'/'.join(map(str, place))}"
             for what, (text, expected) in VALUES.items():
                 body, allowed = replaced(valid, place, text), expected or _REFUSED | {200}
-                yield Hostile(f"{name} {what}", path, body, method, allowed)
+                yield Hostile(f"{name} {what}", path, body, expected=allowed)
             if place:
-                yield Hostile(f"{name} left out", path, _without(valid, place), method)
+                yield Hostile(f"{name} left out", path, _without(valid, place))
             if isinstance(reduce(getitem, place, valid), dict):
                 for what, member, expected in (
                     ("unknown member", b'"%s": 1' % _TEXT, _REFUSED | {200}),
@@ -197,4 +194,4 @@ def requests() -> Iterator[Hostile]:
                     ("member twice", b'"a": 1, "a": 1', _NOT_JSON),
                 ):
                     body = _with_member(valid, place, member)
-                    yield Hostile(f"{name} {what}", path, body, method, expected)
+                    yield Hostile(f"{name} {what}", path, body, expected=expected)

@@ -101,7 +101,7 @@ def test_unknown_fields_of_an_answer_are_ignored() -> None:
     assert World((200, {}, b'{"models": [], "aliases": {}, "mood": "fine"}')).run().models == []
     # So are unknown fields of parts that requests have too.
     relation = {"subject": "a", "relation": "left", "object": "b", "probability": 0.5}
-    scene = {"objects": ["bed"], "relations": [relation], "log_score": -1.0, "context": {}}
+    scene = {"objects": ["bed"], "relations": [relation], "log_score": -1.0}
     model = {"name": "a", "version": "1.0.0", "variant": "rbm", "digest": "0"}
     answer = {"model": model, "request_id": "r", "seed": 1, "scenes": [scene | {"mood": "fine"}]}
     read = World((200, {}, json.dumps(answer).encode())).run(Client.generate)

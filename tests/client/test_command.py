@@ -99,7 +99,6 @@ def test_json_is_the_service_s_answer(
     [
         ("models", ("home@1.0.0", "default", "triway", "ready")),
         ("vocabulary", ("garbage bin", "trash can, waste basket", "structure", "homes, shops")),
-        ("contexts", ("layer", "unit", "state")),
         ("outliers bed toilet sink", ("toilet", "because")),
         ("rooms bed", ("room type", "probability", "bedroom")),
         ("relations bed lamp --relations 'lamp on-top bed'", ("expected", "on-top", "observed")),

@@ -20,8 +20,7 @@ from scene_client import (
 from tests.client.callers import Caller
 from tests.client.conftest import EVERY
 from tests.conftest import run_program
-from tests.http.stores import make_store
-from tests.services import ADMIN_KEY, LiveService, launch
+from tests.services import LiveService
 
 every_client = pytest.mark.parametrize("caller", EVERY, indirect=True)
 
@@ -107,7 +106,6 @@ def test_offline_and_online_clients_list_models_alike(url: str, shared_store: Pa
             lambda client: client.vocabulary(),
             lambda client: client.vocabulary("plain"),
             lambda client: client.word("divan/couch"),
-            lambda client: client.contexts("deep@0.1.0"),
             lambda client: client.is_live(),
         ):
             assert ask(online) == ask(offline)
@@ -130,29 +128,3 @@ def test_an_unclosed_offline_client_does_not_block_the_exit(shared_store: Path) 
     command = (sys.executable, "-W", "error", "-c", UNCLOSED, shared_store)
     done = run_program(*command, env=environment)
     assert (done.stdout, done.stderr) == ("late\n", "")
-
-
-@pytest.mark.slow
-def test_promotion_works_alike_online_and_offline(tmp_path: Path) -> None:
-    store = make_store(tmp_path / "store")
-    with launch(store, tmp_path / "log") as service:
-        with Client(f"http://127.0.0.1:{service.port}", admin_key=ADMIN_KEY) as scene:
-            change(scene)
-        with Client(f"http://127.0.0.1:{service.port}") as scene:
-            with pytest.raises(ProblemError) as raised:
-                scene.refresh()
-            assert raised.value.type == "/problems/unauthorized"
-    with OfflineClient(store) as scene:
-        change(scene)
-
-
-def change(scene: Client) -> None:
-    moved = scene.promote("default", "home@1.1.0", expected="home@1.0.0")
-    assert (moved.previous, moved.model) == ("home@1.0.0", "home@1.1.0")
-    assert scene.missing(["bed"]).model.version == "1.1.0"
-    with pytest.raises(ProblemError) as raised:
-        scene.promote("default", "home@1.0.0", expected="home@1.0.0")
-    assert raised.value.type == "/problems/alias-conflict"
-    assert scene.refresh().default.version == "1.1.0"
-    scene.promote("default", "home@1.0.0")
-    assert scene.missing(["bed"]).model.version == "1.0.0"

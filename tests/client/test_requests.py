@@ -159,26 +159,12 @@ def test_invalid_urls_are_refused(url: str) -> None:
             kind(url)
 
 
-def test_keys_go_where_they_are_needed_and_nowhere_else(recorder: Recorder) -> None:
+def test_the_key_is_sent_and_not_shown(recorder: Recorder) -> None:
     transport = httpx.MockTransport(recorder)
-    scene = Client("http://robot", api_key="a" * 16, admin_key="b" * 16, transport=transport)
+    scene = Client("http://robot", api_key="a" * 16, transport=transport)
     scene.missing(["bed"])
     assert recorder.requests[-1].headers["x-api-key"] == "a" * 16
-    assert "x-admin-key" not in recorder.requests[-1].headers
     assert "aaaa" not in repr(scene.options)
-    assert "bbbb" not in repr(scene.options)
-
-
-def test_expected_is_sent_only_if_set() -> None:
-    recorder = Recorder({"request_id": "r", "alias": "a/b", "model": "home"})
-    scene = Client("http://robot", admin_key="b" * 16, transport=httpx.MockTransport(recorder))
-    scene.promote("default", "home")
-    scene.promote("default", "home", expected=None)
-    scene.promote("default", "home", expected="home@1.0.0")
-    bodies = [json.loads(request.content) for request in recorder.requests]
-    expected = [{}, {"expected": None}, {"expected": "home@1.0.0"}]
-    assert bodies == [{"model": "home"} | fields for fields in expected]
-    assert {request.headers["x-admin-key"] for request in recorder.requests} == {"b" * 16}
 
 
 def test_names_are_quoted_in_addresses() -> None:
@@ -200,11 +186,10 @@ MESSAGE = "a key must have only ASCII characters, without spaces or line breaks"
 
 
 @each_key
-@pytest.mark.parametrize("argument", ["api_key", "admin_key"])
 @pytest.mark.parametrize("kind", [Client, AsyncClient])
-def test_an_argument_is_refused(kind: type[Client], argument: str, key: str) -> None:
+def test_an_argument_is_refused(kind: type[Client], key: str) -> None:
     with pytest.raises(InvalidRequestError, match="ASCII") as raised:
-        kind("http://robot", **{argument: key})
+        kind("http://robot", api_key=key)
     assert str(raised.value) == MESSAGE
 
 

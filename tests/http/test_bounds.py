@@ -85,7 +85,7 @@ async def test_requests_for_documents_that_wait_delay_no_question(
         held = hold("outliers")
         large = asyncio.ensure_future(client.post("/outliers", json={"objects": ["bed"] * 40}))
         assert await asyncio.to_thread(held.started.wait, 30)
-        paths = ["/models/default/contexts", "/openapi.json"] * 12
+        paths = ["/models/default/vocabulary/keybaord", "/openapi.json"] * 12
         documents = [asyncio.ensure_future(client.get(path)) for path in paths]
         await asyncio.sleep(0.2)
         assert (await client.post("/missing", json=SCENE)).is_success

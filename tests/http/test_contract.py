@@ -14,16 +14,12 @@ from pydantic import BaseModel, ValidationError
 from app.main import create_app
 from app.questions import QUESTIONS
 from app.settings import Settings
-from scene_client import schemas
 from tests.conftest import REPOSITORY
-from tests.services import ADMIN_KEY, LiveService, live_service
+from tests.services import LiveService
 
 pytestmark = pytest.mark.system
 
-FORMS: dict[str, type[BaseModel]] = {
-    **{f"/{question.name}": question.request for question in QUESTIONS},
-    "/models/aliases/{alias}": schemas.AliasRequest,
-}
+FORMS: dict[str, type[BaseModel]] = {f"/{one.name}": one.request for one in QUESTIONS}
 UNKNOWN_HEADER = "x-schemathesis-unknown-property"
 # Types of validation errors for constraints that JSON Schema cannot express.
 BEYOND_SCHEMAS = {"plain_text", "unit_quaternion", "too_many_sweeps"}
@@ -43,10 +39,9 @@ CONFIGURATION: dict[str, Any] = {
         "not_a_server_error": {"expected-statuses": ["2xx", "3xx", "4xx", "504"]},
     },
     # A batch with an invalid scene has status 200; `bad_scenes_have_problems` checks its entries.
-    # For a refresh, the valid key that `call` sends suffices, even beside an invalid bearer token.
     "operations": [
         {
-            "include-path-regex": "/batch$|^/models/refresh$",
+            "include-path-regex": "/batch$",
             "checks": {"negative_data_rejection": {"expected-statuses": [*NEGATIVE, "200"]}},
         },
     ],
@@ -90,22 +85,16 @@ def bad_scenes_have_problems(_: Any, response: Any, case: Any) -> None:
         assert {entry["status"] for entry in results} != {200}
 
 
-# A service of its own: administration routes change its store.
-service = live_service()
-
-
 @pytest.fixture(scope="module")
-def call(service: LiveService) -> Iterator[Any]:
+def call(live: LiveService) -> Iterator[Any]:
     """Return a function that sends one request and runs all checks on the answer."""
     with requests.Session() as session:
 
         def call(case: schemathesis.Case) -> None:
             if UNKNOWN_HEADER in (case.headers or {}):
                 return  # valid: servers ignore unknown header fields (RFC 9110, section 5.1)
-            # schemathesis takes this key as valid; its checks remove the key or replace it.
-            key = {"X-Admin-Key": ADMIN_KEY}
             checks = [form_is_as_documented, bad_scenes_have_problems]
-            case.call_and_validate(service.url, session, key, additional_checks=checks)
+            case.call_and_validate(live.url, session, additional_checks=checks)
 
         yield call
 

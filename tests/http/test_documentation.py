@@ -101,9 +101,6 @@ async def test_errors_are_problems_and_nothing_else(document: dict[str, Any]) ->
         assert "500" in errors, path
         if method in {"post", "put"} and "requestBody" in operation:
             assert {"400", "413", "415", "422", "503"} <= set(errors), path
-        if "administration" in operation["tags"]:
-            assert "401" in errors
-            assert operation["security"]
         for status, response in errors.items():
             (media_type,) = response["content"]
             assert media_type == "application/problem+json"
@@ -122,12 +119,7 @@ def model_of(content: dict[str, Any]) -> Any:
     return model[getattr(schemas, inner.rstrip("_"))] if inner else model
 
 
-QUESTIONS = [
-    (operation, name)
-    for operation, cases in REQUESTS.items()
-    if operation != "move_alias"
-    for name in cases
-]
+QUESTIONS = [(operation, name) for operation, cases in REQUESTS.items() for name in cases]
 
 
 @pytest.mark.parametrize(("operation", "name"), QUESTIONS)
@@ -151,21 +143,6 @@ async def test_an_example_is_answered_or_refused_as_it_says(
     if name in {"unknown-labels", "contradictory-evidence"}:
         # The problem in the document is the one that this example meets.
         assert shown["value"]["errors"] == found["errors"]
-
-
-@pytest.mark.parametrize("name", REQUESTS["move_alias"])
-async def test_an_example_of_moving_an_alias_does_as_it_says(
-    store: Path, admin: dict[str, str], name: str
-) -> None:
-    case = REQUESTS["move_alias"][name]
-    alias = "mine" if name == "create" else "default"
-    async with serve(store) as client:
-        response = await client.put(f"/models/aliases/{alias}", json=case.value, headers=admin)
-    if case.problem is None:
-        assert response.status_code == 200
-        assert response.json()["model"] == case.value["model"]
-    else:
-        problem(response, ERRORS[case.problem].status, case.problem)
 
 
 async def test_example_answers_have_the_fields_of_real_ones(document: dict[str, Any]) -> None:
@@ -192,7 +169,6 @@ COMPUTED = [
     ("GET", "/health/live", None),
     ("GET", "/openapi.json", None),
     ("POST", "/relations", {"objects": []}),
-    ("POST", "/models/refresh", None),
     ("GET", "/nowhere", None),
     ("GET", "/static/nowhere", None),
     ("DELETE", "/relations", None),

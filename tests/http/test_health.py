@@ -11,32 +11,19 @@ import pytest
 from app import __version__
 from app.main import create_app
 from app.settings import Settings
-from tests.http.stores import corrupt
+from tests.http.stores import corrupt, publish
 from tests.http.test_problems import problem
-from tests.services import NAMED, LiveService, serve
-
-READY = ["/health/ready", "/v2/health/ready", "/v2/models/default/ready"]
+from tests.services import NAMED, LiveService, load_changes, serve
 
 
 async def test_health_of_a_ready_service(client: httpx.AsyncClient) -> None:
     answers = {
-        "/health/live": {"status": "live"},
+        "/health/live": {"status": "live", "version": __version__},
         "/health/ready": {"status": "ready"},
-        "/v2/health/live": {"live": True},
-        "/v2/health/ready": {"ready": True},
-        "/v2/models/candidate/ready": {"name": "home", "ready": True},
     }
     for path, expected in answers.items():
         response = await client.get(path)
         assert (response.status_code, response.json()) == (200, expected)
-
-
-async def test_protocol_metadata(client: httpx.AsyncClient) -> None:
-    server = (await client.get("/v2")).json()
-    assert server == {"name": "scene-boltzmann", "version": __version__, "extensions": []}
-    model = (await client.get("/v2/models/default")).json()
-    described = {"name": "home", "versions": ["1.0.0", "1.1.0"], "platform": "numpy_triway"}
-    assert model == described | {"inputs": [], "outputs": []}
 
 
 async def test_before_its_start_a_service_is_live_and_not_ready(shared_store: Path) -> None:
@@ -44,30 +31,69 @@ async def test_before_its_start_a_service_is_live_and_not_ready(shared_store: Pa
     transport = httpx.ASGITransport(app, raise_app_exceptions=False)
     async with httpx.AsyncClient(transport=transport, base_url="http://service") as client:
         assert (await client.get("/health/live")).status_code == 200
-        for path in (*READY, "/models"):
+        for path in ("/health/ready", "/models"):
             problem(await client.get(path), 503, "not-ready")
         problem(await client.post("/relations", json={"objects": ["bed"]}), 503, "not-ready")
         problem(await client.post("/missing/batch", json={"scenes": [{}]}), 503, "not-ready")
 
 
-async def test_a_broken_default_keeps_the_service_not_ready(store: Path) -> None:
-    corrupt(store, "home", "1.0.0")
+@pytest.mark.parametrize("is_removed", [False, True])
+async def test_the_newest_good_version_replaces_a_broken_default(
+    store: Path, is_removed: bool
+) -> None:
+    publish(store, "home", "0.9.0", seed=3)
+    publish(store, "home", "2.0.0", seed=2, alias="default")
+    corrupt(store, "home", "1.1.0")
+    if is_removed:
+        shutil.rmtree(store / "home" / "2.0.0")
+    else:
+        corrupt(store, "home", "2.0.0")
+    async with serve(store, store_poll=0) as client:
+        answer = await client.post("/relations", json={"objects": ["bed"]})
+        assert answer.json()["model"]["version"] == "1.0.0"
+        ready = await client.get("/health/ready")
+        failures = {entry["subject"]: entry for entry in ready.json()["failures"]}
+        broken = {"home@1.1.0", "default", "candidate", *(() if is_removed else ("home@2.0.0",))}
+        assert (ready.status_code, set(failures)) == (200, broken)
+        reason = "dangling_alias" if is_removed else "checksum_mismatch"
+        assert failures["default"]["reason"] == reason
+        assert failures["default"]["detail"].endswith("; home@1.0.0 answers instead")
+        assert str(store) not in ready.text
+        # Another alias names its own version only.
+        candidate = {"objects": ["bed"], "model": "candidate"}
+        problem(await client.post("/relations", json=candidate), 503, "model-unavailable")
+        # A state without a default model is refused, and a repaired alias is served.
+        for version in ("1.0.0", "0.9.0"):
+            corrupt(store, "home", version)
+        await load_changes(client)
+        assert (await client.get("/health/ready")).status_code == 200
+        shutil.rmtree(store / "home")
+        await load_changes(client)
+        assert (await client.get("/health/ready")).status_code == 200
+        publish(store, "home", "3.0.0", seed=4, alias="default")
+        publish(store, "home", "1.1.0", seed=4)
+        await load_changes(client)
+        assert (await client.get("/health/ready")).json() == {"status": "ready"}
+        answer = await client.post("/relations", json={"objects": ["bed"]})
+        assert answer.json()["model"]["version"] == "3.0.0"
+
+
+async def test_without_a_good_version_the_service_is_not_ready(store: Path) -> None:
+    for version in ("1.0.0", "1.1.0"):
+        corrupt(store, "home", version)
     async with serve(store, retry_after=7) as client:
         assert (await client.get("/health/live")).status_code == 200
-        for path in READY:
-            response = await client.get(path)
-            problem(response, 503, "not-ready")
-            assert response.headers["retry-after"] == "7"
+        response = await client.get("/health/ready")
+        problem(response, 503, "not-ready")
+        assert response.headers["retry-after"] == "7"
         problem(await client.post("/relations", json={"objects": ["bed"]}), 503, "not-ready")
-        # Another version does not replace it, and answers by its own name.
-        body = {"objects": ["bed"], "model": "home@1.1.0"}
+        # Models of other names answer by their names only.
+        body = {"objects": ["bed"], "model": "plain"}
         assert (await client.post("/relations", json=body)).status_code == 200
-        failures = {
-            entry["subject"]: entry for entry in (await client.get("/models")).json()["failures"]
-        }
-        assert set(failures) == {"home@1.0.0", "default"}
-        assert failures["home@1.0.0"]["reason"] == "checksum_mismatch"
-        assert str(store) not in str(failures)
+        failures = (await client.get("/models")).json()["failures"]
+        named = {entry["subject"] for entry in failures}
+        assert named == {"home@1.0.0", "home@1.1.0", "default", "candidate"}
+        assert "instead" not in str(failures)
 
 
 async def test_another_broken_version_is_listed_as_refused(store: Path) -> None:
@@ -77,8 +103,7 @@ async def test_another_broken_version_is_listed_as_refused(store: Path) -> None:
         # An alias to a removed version is unavailable and not unknown.
         body = {"objects": ["bed"], "model": "candidate"}
         problem(await client.post("/relations", json=body), 503, "model-unavailable")
-        for path in READY:
-            assert (await client.get(path)).status_code == 200
+        assert (await client.get("/health/ready")).status_code == 200
         (version,) = (await client.get("/models/plain")).json()["versions"]
         details = (await client.get("/models/plain/versions/1.0.0")).json()
         assert version["status"] == details["status"] == "refused"
@@ -87,15 +112,14 @@ async def test_another_broken_version_is_listed_as_refused(store: Path) -> None:
         assert "card" not in details
         body = {"objects": ["bed"], "model": "plain"}
         problem(await client.post("/relations", json=body), 503, "model-unavailable")
-        for path in ("models/plain/vocabulary", "models/plain/contexts", "v2/models/plain/ready"):
-            problem(await client.get(f"/{path}"), 503, "model-unavailable")
+        path = "/models/plain/vocabulary"
+        problem(await client.get(path), 503, "model-unavailable")
 
 
-async def test_an_empty_store_is_not_ready(tmp_path: Path, admin: dict[str, str]) -> None:
+async def test_an_empty_store_is_not_ready(tmp_path: Path) -> None:
     async with serve(tmp_path) as client:
         problem(await client.get("/health/ready"), 503, "not-ready")
         assert (await client.get("/models")).json()["models"] == []
-        problem(await client.post("/models/refresh", headers=admin), 409, "refresh-refused")
 
 
 @pytest.mark.system
@@ -115,4 +139,3 @@ def test_every_variant_answers_without_torch(live: LiveService) -> None:
         for question in ("relations", "missing", "outliers", "rooms", "generate"):
             answer = client.post(f"/{question}", json=body)
             assert answer.status_code == 200, answer.text
-        assert client.get(f"/models/{entry['name']}/contexts").status_code == 200

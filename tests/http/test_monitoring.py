@@ -20,6 +20,7 @@ from opentelemetry.proto.trace.v1.trace_pb2 import Span
 from prometheus_client.parser import text_string_to_metric_families
 from pydantic import ValidationError
 
+from app.registry import AliasTarget, Store
 from app.settings import Settings
 from tests.conftest import REPOSITORY
 from tests.http.stores import publish
@@ -31,6 +32,7 @@ from tests.services import (
     defect,
     http_server,
     launch,
+    load_changes,
     serve,
     wait_until,
 )
@@ -88,7 +90,6 @@ async def test_requests_are_counted_by_route_method_and_outcome(
         await client.get("/static/icon.svg")
         await client.get("/static/nothing")
         await client.get("/no/such/address")
-        await client.post("/models/refresh")
         await client.request("MADEUP", "/missing")
         await client.request("MADEUP-TOO", "/made-up")
         found = await samples(client)
@@ -104,7 +105,6 @@ async def test_requests_are_counted_by_route_method_and_outcome(
         ("GET", "success", version): 1,
         ("GET", "success", "-"): 1,
         ("GET", "not-found", "-"): 2,
-        ("POST", "unauthorized", "/models/refresh"): 1,
         ("-", "method-not-allowed", "/missing"): 1,
         ("-", "not-found", "-"): 1,
     }
@@ -136,8 +136,9 @@ async def test_metrics_can_be_switched_off(shared_store: Path) -> None:
 # ------------------------------------------------------------------------------- the models
 
 
-async def test_model_info_has_every_alias(own: httpx.AsyncClient) -> None:
-    await own.put("/models/aliases/night", json={"model": "home"})
+async def test_model_info_has_every_alias(own: httpx.AsyncClient, store: Path) -> None:
+    Store(store).set_alias("night", AliasTarget(name="home"))
+    await load_changes(own)
     infos = {key[1:] for key in await samples(own) if key[0] == "scene_model_info"}
     expected = set()
     for alias, name, variant, version in (
@@ -172,14 +173,14 @@ async def test_metrics_of_a_removed_model_disappear(
     late = asyncio.ensure_future(ask("plain", 33))  # on a thread
     assert await asyncio.to_thread(held.started.wait, 30)
     shutil.rmtree(store / "plain")
-    await own.post("/models/refresh")
+    await load_changes(own)
     assert await names("plain") == set()
     assert await names("home") == everything
     held.release.set()
     assert await late == 200
     assert await names("plain") == set()
     publish(store, "plain", "1.0.0", variant="rbm")
-    await own.post("/models/refresh")
+    await load_changes(own)
     assert await ask("plain") == 200
     assert (await samples(own))["scene_batch_rows_count", "plain", "missing", "1.0.0"] == 1
 
@@ -235,7 +236,7 @@ def test_a_request_is_one_line(live: LiveService) -> None:
 
 
 MARKER = "xyzzy"
-UNTRACED = ("/health/live", "/health/ready", "/v2/health/ready", "/metrics", "/static/icon.svg")
+UNTRACED = ("/health/live", "/health/ready", "/metrics", "/static/icon.svg")
 
 
 @pytest.fixture

@@ -191,12 +191,7 @@ INVALID: dict[str, list[tuple[Any, ...]]] = {
         ({"count": 65}, "count"),
         ({"temperature": 0}, "temperature"),
         ({"seed": 2**63}, "seed"),
-        ({"context": {"h9": [[0, 1]]}}, "context/h9", "", "h1"),
-        ({"context": {"h1": [[0, 1], [4, 1]]}}, "context/h1/1", "units 0 to 3"),
-        ({"context": {"h1": [[0, 4]]}}, "context/h1/0", "states 0 to 3"),
-        ({"context": {"h1": [[2, 1], [2, 1], [2, 0]]}}, "context/h1/2", "another state"),
-        ({"context": {"h1": [[-1, 0]]}}, "context/h1/0/0", "0"),
-        ({"context": {"h1": [3]}}, "context/h1/0", "pair [unit, state]"),
+        ({"context": {"h1": [[0, 1]]}}, "context", "unknown field"),
     ],
 }  # fmt: skip
 

@@ -28,7 +28,6 @@ def no_environment(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_defaults_are_safe(tmp_path: Path) -> None:
     settings = Settings(store=tmp_path)
     assert settings.host == "127.0.0.1"
-    assert settings.admin_key is None
     assert settings.api_key is None
     assert settings.cors_origins == ()
     assert settings.max_objects == 256
@@ -39,7 +38,7 @@ def test_settings_come_from_the_environment(
 ) -> None:
     monkeypatch.setenv("SCENE_STORE", str(tmp_path))
     monkeypatch.setenv("SCENE_PORT", "9000")
-    monkeypatch.setenv("SCENE_ADMIN_KEY", "0123456789abcdef")
+    monkeypatch.setenv("SCENE_API_KEY", "0123456789abcdef")
     monkeypatch.setenv("SCENE_LOG_LEVEL", "DEBUG")
     monkeypatch.setenv("SCENE_CORS_ORIGINS", "https://panel.example, http://[::1]:3000")
     settings = Settings()
@@ -48,8 +47,8 @@ def test_settings_come_from_the_environment(
     assert settings.port == 9000
     assert settings.log_level == "debug"
     assert "0123456789abcdef" not in repr(settings)
-    monkeypatch.setenv("SCENE_ADMIN_KEY", "")
-    assert Settings().admin_key is None
+    monkeypatch.setenv("SCENE_API_KEY", "")
+    assert Settings().api_key is None
 
 
 INVALID = {
@@ -57,8 +56,7 @@ INVALID = {
     "port": [-1, 65536, "tcp://10.0.0.1:80"],
     "store_poll": [-1, "nan", 3601],
     "store": ["no/such/directory", __file__],
-    "admin_key": ["too-short", "has spaces in between", "sixteen-chars-é-no"],
-    "api_key": ["too-short", "has spaces in between"],
+    "api_key": ["too-short", "has spaces in between", "sixteen-chars-é-no"],
     "cors_origins": [
         *("*", "null", "https://*.example", "panel.example", "https://panel.example/"),
         *("https://panel.example/path", "https://Panel.example", "https://user@panel.example"),
@@ -89,14 +87,6 @@ def test_invalid_settings_are_refused(tmp_path: Path, name: str, value: object) 
     if name.endswith("_key"):
         assert str(value) not in str(error.value)
         assert f"SCENE_{name.upper()}" in fault["msg"]
-
-
-def test_the_two_keys_differ(tmp_path: Path) -> None:
-    key = "0123456789abcdef"
-    with pytest.raises(ValidationError, match="SCENE_API_KEY must differ") as error:
-        Settings(store=tmp_path, admin_key=key, api_key=key)
-    assert key not in str(error.value)
-    assert Settings(store=tmp_path, admin_key=key, api_key=key + "x").secrets == [key, key + "x"]
 
 
 @pytest.mark.parametrize(
@@ -171,13 +161,11 @@ def test_a_misconfigured_service_says_which_variables_and_exits(tmp_path: Path) 
     wrong = {
         "SCENE_STORE": str(tmp_path / "none"),
         "SCENE_PORT": "many",
-        "SCENE_ADMIN_KEY": "too-short-key",
         "SCENE_API_KEY": "a key that has spaces in it",
     }
     run = run_program(sys.executable, "-m", "app", status=2, env=os.environ | wrong)
     assert sorted(line.partition(":")[0] for line in run.stderr.splitlines()) == sorted(wrong)
-    for name in ("SCENE_ADMIN_KEY", "SCENE_API_KEY"):
-        assert wrong[name] not in run.stdout + run.stderr
+    assert wrong["SCENE_API_KEY"] not in run.stdout + run.stderr
 
 
 @pytest.mark.parametrize("kind", [JSONFormatter, PlainFormatter])

@@ -86,7 +86,6 @@ SCENES = {
     "classes": (scene_of([0, 1, 4]), {}),
     "relations": (scene_of([0, 1, 4], [(2, 1, 0), (0, 2, 1)]), {}),
     "complete": (scene_of([0, 1, 1], [(2, 1, 0), (0, 1, 2)], complete=True), {"temperature": 1.5}),
-    "context": (scene_of([2], room=1), {"context": {"h1": [(1, 3), (4, 0)]}}),
 }
 
 
@@ -114,14 +113,6 @@ def test_generation_stops_at_the_end_of_the_request(artifact):
     assert 0 < len(part) < 32
     assert part == complete[: len(part)]
     assert generate(artifact, scene, count=32, seed=5, stop=lambda: True) == ()
-
-
-def test_a_unit_of_the_second_layer_keeps_the_state_of_the_request():
-    free = generate(ARTIFACTS["gbm"], scene_of([]), count=16, seed=2, steps=5)
-    context = {"h2": [(0, 1)]}
-    held = generate(ARTIFACTS["gbm"], scene_of([]), count=16, seed=2, steps=5, context=context)
-    assert {(0, 1) in scene.context.h2 for scene in free} == {True, False}
-    assert all((0, 1) in scene.context.h2 for scene in held)
 
 
 # Few enough states to enumerate, also two machines with a second layer.
@@ -164,19 +155,15 @@ def label_sets(drawn):
 @pytest.mark.parametrize("evidence", [[], [0]])
 @pytest.mark.parametrize("clamped", [False, True])
 def test_objects_have_the_distribution_of_the_model(name, evidence, clamped):
-    """The frequency of every set of classes; also under a room type, a profile and a context."""
+    """The frequency of every set of classes; also under a room type and a profile."""
     spec = DRAWN[name]
     room = 1 if clamped and spec.C else None
     profile = 1 if clamped and spec.profiles else None
-    state = spec.states - 1
-    context = {"h1": [(1, state)]} if clamped else None
     # The mean base rates depend on the evidence only if the machine has data sources.
     artifact, joint = with_joint(name, room, profile, tuple(evidence) if spec.profiles else ())
     scene = scene_of(evidence, room=room, profile=profile)
-    drawn = label_sets(generate(artifact, scene, count=512, seed=0, steps=40, context=context))
+    drawn = label_sets(generate(artifact, scene, count=512, seed=0, steps=40))
     condition = (joint.v[:, evidence] > 0).all(1)
-    if clamped:
-        condition &= joint.h1[:, (spec.states - 1) + state - 1] > 0
     codes = (joint.v.long() << torch.arange(3)).sum(1)
     for code in range(8):
         classes = frozenset(i for i in range(3) if code >> i & 1)

@@ -140,7 +140,6 @@ def problem_of(
         problem.title,
         problem.detail,
         errors=_quoted(problem, request),
-        failures=problem.failures or (),
         request_id=problem.request_id,
         retry_after=_seconds(headers.get("retry-after", "")),
     )
