@@ -359,7 +359,7 @@ async def test_query_parameters_and_misspelt_paths_are_refused(client: httpx.Asy
         ("DELETE", "/missing", {"POST"}),
         ("POST", "/models", {"GET"}),
         ("POST", "/health/ready", {"GET"}),
-        ("PATCH", "/models/aliases/x", {"PUT"}),
+        ("PATCH", "/models/default", {"GET"}),
         ("BREW", "/generate", {"POST"}),
     ],
 )

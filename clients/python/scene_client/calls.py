@@ -92,7 +92,7 @@ class Call(Generic[T]):
             error: error of the last attempt.
             attempt: number of the last attempt. The first attempt has number 0.
         """
-        pause = min(LONGEST_PAUSE, FIRST_PAUSE * 2**attempt) * random()  # noqa: S311 # nosec B311
+        pause: float = min(LONGEST_PAUSE, FIRST_PAUSE * 2**attempt) * random()  # noqa: S311 # nosec B311
         if isinstance(error, ProblemError):
             # The random pause spreads the retries of many clients over time.
             return pause + (error.retry_after or 0.0) if error.status in (429, 503) else None
