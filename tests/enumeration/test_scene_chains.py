@@ -252,7 +252,7 @@ def test_log_score_is_the_log_probability(name, room):
         logits = np.full(r.shape, -1e4)
         of_units = machine.relation_logits(e, joint.v[n][None], joint.h1[n][None])[0]
         logits[e.relation[0], e.subject[0], e.object[0]] = of_units
-        state = ChainState(every, room, every, every, logits, r)
+        state = ChainState(every, room, logits, r)
         score = chains.log_score(state, v, r)
         between = r[:, v][:, :, v], logits[:, v][:, :, v]
         log_p = np.where(between[0], between[1], 0).sum() - np.logaddexp(0, between[1]).sum()

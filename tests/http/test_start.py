@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
+import pty
 import re
+import signal
 import socket
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,7 +17,8 @@ from pathlib import Path
 import httpx
 import pytest
 
-from tests.services import LiveService, begin, free_port, wait_until
+from tests.http.stores import corrupt, publish
+from tests.services import LiveService, begin, free_port, launch, wait_until
 
 pytestmark = pytest.mark.system
 
@@ -105,3 +110,43 @@ def test_the_log_names_the_page(live: LiveService, starting: Start, log: Path) -
     assert not any("compil" in line for line in messages(log))
     assert any("SCENE_API_KEY is not set" in line for line in messages(log))
     assert not any("SCENE_API_KEY is not set" in line for line in messages(live.log))
+
+
+# ------------------------------------------------------------------------------------------ SIGHUP
+
+
+def test_sighup_loads_the_store_at_once(store: Path, log: Path) -> None:
+    with launch(store, log, SCENE_STORE_POLL="0", SCENE_ADMIN_KEY="a former key") as service:
+        (warning,) = (line for line in messages(log) if "SCENE_ADMIN_KEY" in line)
+        assert "has no effect" in warning
+        publish(store, "home", "2.0.0", seed=2, alias="default")
+        service.process.send_signal(signal.SIGHUP)
+        wait_until(lambda: "the alias default names home@2.0.0 now" in log.read_text(), log)
+        answer = service.client.post("/missing", json={"objects": ["bed"]}).json()
+        assert answer["model"]["version"] == "2.0.0"
+        corrupt(store, "home", "2.0.0")
+        service.process.send_signal(signal.SIGHUP)
+        refused = "the service refused the changes in the store: home@2.0.0: checksum_mismatch"
+        wait_until(lambda: refused in log.read_text(), log)
+        assert service.client.post("/missing", json={"objects": ["bed"]}).is_success
+
+
+def test_a_closed_terminal_ends_the_service(shared_store: Path, log: Path) -> None:
+    terminal, side = pty.openpty()
+    with log.open("w") as stream:
+        environment = {
+            "SCENE_STORE": str(shared_store), "SCENE_PORT": "0", "SCENE_DRAIN_SECONDS": "0"
+        }  # fmt: skip
+        process = subprocess.Popen(
+            [sys.executable, "-m", "app"], env=os.environ | environment, stdin=side, stderr=stream
+        )
+    try:
+        wait_for("ready: ", log, process)
+        process.send_signal(signal.SIGHUP)
+        wait_for("has loaded the store", log, process)
+        os.close(terminal)
+        process.send_signal(signal.SIGHUP)
+        assert process.wait(timeout=30) == -signal.SIGTERM
+    finally:
+        process.kill()
+        os.close(side)

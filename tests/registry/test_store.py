@@ -330,9 +330,18 @@ def test_the_command_changes_the_store_of_the_service_and_creates_none(
     assert main(["alias", "default", "tiny@2.0.0"]) == 1
     assert "store model_store: model 'tiny' does not have" in capsys.readouterr().err
     assert main(alias) == 0
+    assert capsys.readouterr().out == "alias 'default' points at tiny@1.0.0\n"
     publish(store := Store("model_store"), "2.0.0")
+    assert main(["alias", "default", "tiny"]) == 0
+    assert main([*alias, "--expected", "tiny"]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[1] == "alias 'default' points at tiny@1.0.0, before at tiny"
+    assert main(["alias", "default", "tiny", "--expected", "tiny@2.0.0"]) == 1
+    conflict = "alias 'default' points at tiny@1.0.0, not at tiny@2.0.0"
+    assert conflict in capsys.readouterr().err
     (store.root / "tiny" / "2.0.0" / "card.md").unlink()
-    capsys.readouterr()
+    assert main(["alias", "default", "tiny@2.0.0"]) == 1
+    assert "tiny@2.0.0: the artifact has no file card.md" in capsys.readouterr().err
     assert main(["list"]) == 0
     listed = capsys.readouterr().out.splitlines()
     assert listed[0] == "tiny@1.0.0"
