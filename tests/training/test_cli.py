@@ -20,9 +20,9 @@ from tests.questions.answers import generate, missing, outliers, relations
 from tests.registry.small_artifacts import description, state
 from tests.training.commands import invoke, small_config, write_config
 from training.datasets.priors import COLUMNS
-from training.fit.checkpoint import RunError
 from training.fit.offset_statistics import fit_offsets
 from training.runs.config_files import load_config, with_settings
+from training.runs.folder import RunError
 from training.runs.pipeline import prepare
 from training.runs.publish import refit
 
