@@ -54,7 +54,7 @@ class Candidate:
         """Return the scores of this candidate in the classes of the test scenes, `scenes`."""
         if self.artifact is None:
             return _baselines(data, say)
-        model = artifact_model(self.artifact, data.train)
+        model = artifact_model(self.artifact)
         if same_classes(scenes, self.artifact.vocabulary):
             return model
         return Translation.between(scenes, self.artifact.vocabulary).translate(model)

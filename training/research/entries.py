@@ -84,7 +84,7 @@ def baseline_entries(
 
 
 def reference_entries() -> Iterator[Entry]:
-    """Generate the untrained references for the evaluation of generated scenes and densities."""
+    """Generate the untrained references for the evaluation of generated scenes."""
     for name in ("independent classes", "held-out scenes (floor)"):
         yield Entry(name, 0, name, partial(_reference_model, name))
 
@@ -170,7 +170,7 @@ def _machine_model(config: Config, data: TrainingData, folder: Path, say: Progre
     say("calibrating")
     artifact = replace(draft, calibration=calibrate(draft, data, config.objects, seed))
     profiles = ObjectScenes.of(data.train, data.structure, config.objects).sources
-    model = artifact_model(artifact, data.train, seed=seed, profiles=profiles)
+    model = artifact_model(artifact, profiles=profiles)
     zero = sum(machine.get_parameter(name).numel() for name in config.machine.without)
     return replace(model, parameters=machine.parameter_count - zero)
 
