@@ -1,7 +1,7 @@
 """The command line of training, with commands such as init, train, compare, publish and adapt.
 
-If Ctrl-C stops a training run, the checkpoint of the last finished epoch remains on disk. The same
-command then continues the run.
+A new training run replaces the last finished run of its folder when it ends. Ctrl-C keeps the last
+finished run.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from training.domain.gate import MARGIN, NEW, losses, measure_usefulness, served
 from training.domain.init_command import StorePath, example, fail, init
 from training.domain.look import outside_vocabulary
 from training.evaluation.report import Progress
-from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, ConfigError
 from training.fit.trainer import Trainer
 from training.research.ablate import ablate
@@ -35,7 +34,7 @@ from training.research.homes import homes
 from training.research.tune import tune
 from training.runs.config_files import data_folder, load_config, with_settings
 from training.runs.example_scenes import known_examples, read_examples
-from training.runs.folder import FinishedRun, load_run, save_run
+from training.runs.folder import FinishedRun, RunError, load_run, save_run
 from training.runs.live import Display, next_steps, summarise
 from training.runs.pipeline import SplitScenes, prepare
 from training.runs.publish import RefusedError, publish_run, refit
@@ -83,7 +82,6 @@ def train(
     data: Data = None,
     runs: Runs = _RUNS,
     seed: Annotated[int | None, typer.Option(help="seed, overrides the configuration")] = None,
-    fresh: Annotated[bool, typer.Option("--fresh", help="ignore an existing checkpoint")] = False,
     final: Annotated[
         bool,
         typer.Option(
@@ -110,8 +108,6 @@ def train(
             config = with_settings(config, {"data.split": "final"})
             folder = folder.with_name(f"final-{folder.name}")
         scenes = _prepare(config, root)
-        for name in ("checkpoint.pt", "result.json") if fresh else ():
-            (folder / name).unlink(missing_ok=True)
         _train(config, scenes, folder, root)
         if publish is None and not final:
             next_steps(folder, console)
@@ -122,6 +118,9 @@ def train(
         _exit_refused(error)
     except (*(ConfigError, DatasetError, RegistryError, RunError), FloatingPointError) as error:
         fail(error)
+    except KeyboardInterrupt:
+        console.print("stopped; finished runs and published versions stay as they were")
+        raise typer.Exit(130) from None
 
 
 @app.command()
@@ -219,16 +218,10 @@ def _prepare(config: Config, data: Path) -> SplitScenes:
 
 
 def _train(config: Config, scenes: SplitScenes, folder: Path, root: Path) -> None:
-    trainer = Trainer(config, scenes.training_data(), folder)
-    if trainer.resume():
-        console.print(f"resuming after {trainer.position}")
+    trainer = Trainer(config, scenes.training_data())
     console.print(f"{config.name}: {trainer.machine.parameter_count:,} weights")
-    try:
-        with Display(trainer, console) as display:
-            result = trainer.run(display.progress)
-    except KeyboardInterrupt:
-        console.print(f"stopped after {trainer.position}; run the same command to continue")
-        raise typer.Exit(130) from None
+    with Display(trainer, console) as display:
+        result = trainer.run(display.progress)
     save_run(folder, config, result, data=root, scenes=scenes.digest)
     summarise(result, folder, console)
 

@@ -1,15 +1,13 @@
 """Artifacts: the files of one version of a model, and the loaded model.
 
-Every load reads each file once and checks it against its checksum. Later steps parse the bytes that
-were hashed, so a later change of a file has no effect. Symbolic links are not followed.
+Every load reads each file once and checks it against its checksum. Symbolic links are not followed.
 """
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import math
-import os
-import stat
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -27,7 +25,7 @@ from app.inference.weights import layout
 from app.registry.card import render_card
 from app.registry.counts import Counts
 from app.registry.description import Calibration, Description, RelationSlopes
-from app.registry.durable import sync_directory, write_file
+from app.registry.durable import read_file, sync_directory, write_file
 from app.registry.errors import ArtifactError, cause
 from app.registry.manifest import CARD, MANIFEST, WEIGHTS, FileEntry, Manifest
 from app.registry.offsets import Offsets
@@ -182,14 +180,11 @@ def copy_artifact(artifact: Artifact, directory: Path) -> None:
     """Copy the files of a loaded artifact into a new directory, and sync it to disk.
 
     Raises:
-        ArtifactError: a file is invalid, or was altered after the artifact was loaded.
+        ArtifactError: a file is invalid.
         OSError: the operating system could not write a file.
     """
     size = artifact.manifest.files[WEIGHTS].bytes
-    manifest, text, weights, card = read_verified(artifact.path, size)
-    if _digest(text) != artifact.digest:
-        reason = f"{manifest.name}@{manifest.version} was altered during the copy"
-        raise ArtifactError("checksum_mismatch", reason)
+    _, text, weights, card = _read_verified(artifact.path, size)
     _write_files(directory, weights, card.encode(), text)
 
 
@@ -214,7 +209,7 @@ def load_artifact(
     Raises:
         ArtifactError: the artifact is invalid. The exception describes the first error found.
     """
-    manifest, text, stored, card = read_verified(directory, max_weights_bytes)
+    manifest, text, stored, card = _read_verified(directory, max_weights_bytes)
     digest = _digest(text)
     if previous is not None and previous.digest == digest:
         return previous
@@ -270,7 +265,7 @@ def _weights(manifest: Manifest, tensors: Mapping[str, NDArray[Any]]) -> Weights
     return weights
 
 
-def read_verified(directory: Path, max_weights_bytes: int) -> tuple[Manifest, bytes, bytes, str]:
+def _read_verified(directory: Path, max_weights_bytes: int) -> tuple[Manifest, bytes, bytes, str]:
     """Read and verify the files of an artifact; see `load_artifact`.
 
     Returns:
@@ -281,27 +276,22 @@ def read_verified(directory: Path, max_weights_bytes: int) -> tuple[Manifest, by
             or this release cannot read the manifest.
     """
     try:
-        folder = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        if directory.is_symlink():
+            raise OSError(errno.ELOOP, "")
+        extra = {entry.name for entry in directory.iterdir()} - {MANIFEST, WEIGHTS, CARD}
     except FileNotFoundError:
         raise ArtifactError("missing_file", "the artifact's directory does not exist") from None
     except OSError as error:
         raise _unreadable("the artifact's directory", error) from None
-    try:
-        with os.scandir(folder) as entries:
-            extra = {entry.name for entry in entries} - {MANIFEST, WEIGHTS, CARD}
-        if extra:
-            names = ", ".join(sorted(ascii(name) for name in extra)[:8])
-            reason = f"the artifact's directory has unexpected files: {names}"
-            raise ArtifactError("unexpected_file", reason)
-        text = _read(folder, MANIFEST, MAX_MANIFEST_BYTES)
-        _require_size(MANIFEST, len(text), MAX_MANIFEST_BYTES)
-        manifest = Manifest.from_bytes(text)
-        weights = _read_checked(folder, WEIGHTS, manifest.files[WEIGHTS], max_weights_bytes)
-        card = _read_checked(folder, CARD, manifest.files[CARD], MAX_CARD_BYTES)
-    except OSError as error:
-        raise _unreadable("the artifact's directory", error) from None
-    finally:
-        os.close(folder)
+    if extra:
+        names = ", ".join(sorted(ascii(name) for name in extra)[:8])
+        reason = f"the artifact's directory has unexpected files: {names}"
+        raise ArtifactError("unexpected_file", reason)
+    text = _read(directory / MANIFEST, MAX_MANIFEST_BYTES)
+    _require_size(MANIFEST, len(text), MAX_MANIFEST_BYTES)
+    manifest = Manifest.from_bytes(text)
+    weights = _read_checked(directory / WEIGHTS, manifest, max_weights_bytes)
+    card = _read_checked(directory / CARD, manifest, MAX_CARD_BYTES)
     try:
         page = card.decode()
     except UnicodeDecodeError:
@@ -314,34 +304,23 @@ def _require_size(name: str, size: int, limit: int) -> None:
         raise ArtifactError("too_large", f"{name} has more than the maximum of {limit} bytes")
 
 
-def _read(folder: int, name: str, limit: int) -> bytes:
-    """Read at most limit + 1 bytes of a file. The extra byte shows that the file is too long."""
-
-    def opener(path: str, flags: int) -> int:
-        # Without O_NONBLOCK, opening a FIFO in place of the file would block forever.
-        return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=folder)
-
+def _read(path: Path, limit: int) -> bytes:
     try:
-        with open(name, "rb", opener=opener) as file:
-            status = os.fstat(file.fileno())
-            if not stat.S_ISREG(status.st_mode):
-                raise ArtifactError("unreadable", f"{name} is not a regular file")
-            # read() first allocates a buffer for all requested bytes. The argument is at most the
-            # size of the file plus 1, so that the buffer is not larger than needed.
-            return file.read(min(status.st_size, limit) + 1)
+        return read_file(path, limit)
     except FileNotFoundError:
-        raise ArtifactError("missing_file", f"the artifact has no file {name}") from None
+        raise ArtifactError("missing_file", f"the artifact has no file {path.name}") from None
     except OSError as error:
-        raise _unreadable(name, error) from None
+        raise _unreadable(path.name, error) from None
 
 
 def _unreadable(what: str, error: OSError) -> ArtifactError:
     return ArtifactError("unreadable", f"{what} cannot be read: {cause(error)}")
 
 
-def _read_checked(folder: int, name: str, entry: FileEntry, limit: int) -> bytes:
+def _read_checked(path: Path, manifest: Manifest, limit: int) -> bytes:
+    name, entry = path.name, manifest.files[path.name]
     _require_size(name, entry.bytes, limit)
-    data = _read(folder, name, entry.bytes)
+    data = _read(path, entry.bytes)
     if len(data) < entry.bytes:
         raise ArtifactError("truncated", f"{name} has only {len(data)} of {entry.bytes} bytes")
     if _digest(data) != entry.sha256:

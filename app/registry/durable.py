@@ -1,4 +1,4 @@
-"""Writing files so that a crash leaves either the old state or the new state.
+"""Reading regular files, and writing files so that a crash leaves the old state or the new state.
 
 A rename is atomic for readers. To survive a power failure, fsync writes the bytes of a file to disk
 before the rename, and the directory entry after it. A lock lets only one process at a time write.
@@ -6,9 +6,10 @@ before the rename, and the directory entry after it. A lock lets only one proces
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
-import secrets
+import stat
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,14 +18,29 @@ from pathlib import Path
 from app.registry.errors import StoreError
 
 
+def read_file(path: Path, limit: int) -> bytes:
+    """Read at most limit + 1 bytes of a regular file. The extra byte shows that it is too long.
+
+    Raises:
+        OSError: the file cannot be read, or is a link, a FIFO or another special file.
+    """
+    # Without O_NONBLOCK, opening a FIFO would block. A link could lead out of the store.
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
+    with os.fdopen(descriptor, "rb") as file:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError(errno.EINVAL, "it is not a regular file")
+        # read() first allocates a buffer for all requested bytes.
+        return file.read(min(status.st_size, limit) + 1)
+
+
 def write_file(path: Path, data: bytes) -> None:
     """Create a new file and sync its bytes to disk.
 
     Raises:
         FileExistsError: the path already exists.
     """
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-    with os.fdopen(descriptor, "wb") as file:
+    with path.open("xb") as file:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())
@@ -32,7 +48,7 @@ def write_file(path: Path, data: bytes) -> None:
 
 def sync_directory(path: Path) -> None:
     """Sync the entries of a directory to disk."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:
@@ -60,10 +76,10 @@ def rename(source: Path, target: Path) -> None:
 def replace_file(path: Path, data: bytes, *, prefix: str) -> None:
     """Create a file, or replace its contents atomically.
 
-    The function writes a temporary file in the same directory, whose name starts with ``prefix``.
-    Then it renames the temporary file.
+    The function writes a temporary file, whose name is the prefix and the name of the file. Then it
+    renames the temporary file.
     """
-    temporary = path.with_name(f"{prefix}{secrets.token_hex(8)}")
+    temporary = path.with_name(f"{prefix}{path.name}")
     try:
         write_file(temporary, data)
         rename(temporary, path)
@@ -81,7 +97,7 @@ def exclusive(path: Path, timeout: float) -> Iterator[None]:
         StoreError: `locked`, if another process still holds the lock after ``timeout`` seconds.
     """
     deadline = time.monotonic() + timeout
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
     try:
         while True:
             try:

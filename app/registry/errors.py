@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import os
 from typing import Literal
 
 Code = Literal[
@@ -49,4 +48,4 @@ def cause(error: OSError) -> str:
     """
     if error.errno == errno.ELOOP:
         return "the path contains a symbolic link, which the store does not follow"
-    return os.strerror(error.errno) if error.errno is not None else "input/output error"
+    return error.strerror or "input/output error"

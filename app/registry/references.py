@@ -11,7 +11,6 @@ alias replaces the whole file. Format of the file:
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -19,6 +18,7 @@ from typing import Annotated, Final, NamedTuple, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, TypeAdapter, ValidationError
 
+from app.registry.durable import read_file
 from app.registry.errors import StoreError, cause
 
 MAX_ALIASES_BYTES: Final = 256 * 2**10
@@ -134,9 +134,7 @@ def read_aliases(path: Path) -> dict[str, AliasTarget]:
         StoreError: `invalid_aliases` if the file is not a valid table of aliases.
     """
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
-        with os.fdopen(descriptor, "rb") as file:
-            text = file.read(MAX_ALIASES_BYTES + 1)
+        text = read_file(path, MAX_ALIASES_BYTES)
         if len(text) > MAX_ALIASES_BYTES:
             reason = f"{path.name} has more than the maximum of {MAX_ALIASES_BYTES} bytes"
             raise StoreError("invalid_aliases", reason)

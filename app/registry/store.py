@@ -17,7 +17,6 @@ import stat
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from secrets import token_hex
 from types import MappingProxyType
 from typing import Final, Literal, TypeAlias
 
@@ -242,7 +241,7 @@ class Store:
             advice = "Choose a new number, or remove the folder"
             reason = f"{name}/{version} is a folder without a manifest. {advice}"
             raise StoreError("version_exists", reason)
-        temporary = folder / f"{TEMPORARY}{version}-{token_hex(8)}"
+        temporary = folder / f"{TEMPORARY}{version}"
         try:
             write(temporary)
             artifact = load_artifact(temporary, None, self._max_weights_bytes)
@@ -310,11 +309,9 @@ class Store:
             raise StoreError("not_writable", reason) from error
 
     def _clear_leftovers(self) -> None:
-        folders = [self.root, *(self.root / name for name in self.names())]
-        for folder in filter(_is_directory, folders):
-            for entry in folder.iterdir():
-                if not entry.name.startswith(TEMPORARY):
-                    continue
+        folders = (self.root / name for name in self.names())
+        for folder in (self.root, *filter(_is_directory, folders)):
+            for entry in folder.glob(f"{TEMPORARY}*"):
                 if _is_directory(entry):
                     shutil.rmtree(entry)
                 else:

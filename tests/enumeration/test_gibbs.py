@@ -18,8 +18,8 @@ from tests.enumeration.small_machines import (
     enumerate_joint,
     small_machine,
 )
-from training.machines.gibbs import Chains, draw_states, start_chains, sweep
-from training.machines.partition import ais, base_log_partition, reverse_ais
+from training.machines.gibbs import Chains, draw_states, sweep
+from training.machines.partition import ais, base_log_partition
 
 CHAINS = 60_000
 
@@ -93,22 +93,14 @@ def test_the_base_has_an_exact_partition_function(name):
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_forward_and_reverse_bracket_log_z(name):
-    """Both means of log w are bounds in expectation; 5 standard errors of slack each."""
+def test_annealed_importance_sampling_finds_log_z(name):
+    """The mean of log w is a lower bound in expectation; 5 standard errors of slack."""
     machine = small_machine(name)
-    joint = enumerate_joint(machine)
+    exact = enumerate_joint(machine).log_z
     generator = torch.Generator().manual_seed(9)
-    base = BASE[: machine.spec.V]
-    forward = ais(machine, BETAS, AIS_CHAINS, generator, base)
-    pick = joint.draw(AIS_CHAINS, generator)
-    state = start_chains(machine, joint.v[pick], generator)
-    state.h2 = joint.h2[pick]
-    reverse = reverse_ais(machine, BETAS, state, generator, base)
-    slack = 5 * max(forward.standard_error, reverse.standard_error)
-    assert forward.bound <= joint.log_z + slack
-    assert reverse.bound >= joint.log_z - slack
-    assert forward.bound <= forward.log_z
-    assert reverse.log_z <= reverse.bound
-    assert forward.log_z == pytest.approx(joint.log_z, abs=slack)
-    assert reverse.log_z == pytest.approx(joint.log_z, abs=slack)
+    found = ais(machine, BETAS, AIS_CHAINS, generator, BASE[: machine.spec.V])
+    slack = 5 * found.standard_error
+    assert found.bound <= exact + slack
+    assert found.bound <= found.log_z
+    assert found.log_z == pytest.approx(exact, abs=slack)
     assert slack < 0.3

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import shutil
 import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from app.registry import AliasTarget, Artifact, ArtifactError, Store, StoreError
+from app.registry import AliasTarget, ArtifactError, Store, StoreError
 from app.registry.__main__ import main
 from app.registry.durable import exclusive
 from app.registry.references import MAX_ALIASES_BYTES, aliases_to_bytes
@@ -446,23 +445,6 @@ def test_damaged_versions_are_not_copied_nor_taken_for_copies(
     assert "Remove its folder tiny/2.0.0, then copy again" in second
     assert tree(store.root) == before
     assert not [path for path in (store.root / "tiny").iterdir() if path.name.startswith(".")]
-
-
-def test_a_version_that_changes_during_its_copy_is_refused(
-    shipped: Store, store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    load = Store.load
-
-    def load_then_exchange(self: Store, name: str, version: str) -> Artifact:
-        loaded = load(self, name, version)
-        shutil.rmtree(folder := self.root / name / version)
-        (self.root / name / "2.0.0").rename(folder)
-        return loaded
-
-    monkeypatch.setattr(Store, "load", load_then_exchange)
-    with refused("checksum_mismatch"):
-        store.copy(shipped, "tiny", "1.0.0")
-    assert not published(store)
 
 
 def test_a_copy_names_the_store_that_is_missing(

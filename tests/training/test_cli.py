@@ -19,10 +19,11 @@ from app.scene import Scene, SceneObject
 from tests.questions.answers import generate, missing, outliers, relations
 from tests.registry.small_artifacts import description, state
 from tests.training.commands import invoke, small_config, write_config
-from training.datasets.priors import COLUMNS
-from training.fit.checkpoint import RunError
+from training.datasets import read_scenes
+from training.datasets.records import digest_of
 from training.fit.offset_statistics import fit_offsets
 from training.runs.config_files import load_config, with_settings
+from training.runs.folder import RunError
 from training.runs.pipeline import prepare
 from training.runs.publish import refit
 
@@ -145,27 +146,23 @@ def test_errors_are_one_clear_line(arguments, message):
 
 def test_a_stored_model_is_evaluated_on_files(tmp_path):
     store = tmp_path / "store"
-    learnt = {"source": "placing_priors", "scenes": 3, "digest": "0" * 64, "terms": "MIT"}
+    room = '{"objects": ["bed", "lamp", "rug"]}\n'
+    files = []
+    for name, text in (("seen.jsonl", room * 3), ("homes.jsonl", room * 2)):
+        (tmp_path / name).write_text(text)
+        files += ["--file", tmp_path / name]
+    scenes = [replace(scene, source="seen") for scene in read_scenes(tmp_path / "seen.jsonl")]
+    learnt = {"source": "seen", "scenes": 3, "digest": digest_of(scenes), "terms": "MIT"}
     data = [learnt | {"research_only": False}]
     Store(store).publish(description("tiny", data=data), state())
-    places = (
-        "ithor_receptacles\t{}\ton-top\tbed\t1\tbedroom",
-        "my_home\t{}\tinside\tbox\t1\tbedroom",
-    )
-    rows = [place.format(thing) for place in places for thing in ("lamp", "rug")]
-    (tmp_path / "places.tsv").write_text("\n".join(["\t".join(COLUMNS), *rows]))
-    (tmp_path / "homes.jsonl").write_text('{"objects": ["bed", "lamp", "rug"]}\n' * 2)
-    files = [part for name in ("places.tsv", "homes.jsonl") for part in ("--file", tmp_path / name)]
     figures = tmp_path / "figures.json"
     output = invoke("evaluate", "tiny", *files, "--store", store, "--json", figures)
-    assert "tiny: ithor_receptacles is training data of this model" in output
+    assert "tiny: seen is training data of this model" in output
     assert "tiny: 2 of 6 objects are left out, because their labels are unknown" in output
-    assert output.index("places.tsv") < output.index("left out: all receptacles are")
     rows = json.loads(figures.read_text())["tiny"]
     origins = {(Path(row["file"]).name, row["source"], row["in_training"]) for row in rows}
     assert origins == {
-        ("places.tsv", "ithor_receptacles", True),
-        ("places.tsv", "my_home", False),
+        ("seen.jsonl", "seen", True),
         ("homes.jsonl", "homes", False),
     }
     refused = invoke("evaluate", "tiny", *files, "--store", store, "--source", "rooms", code=1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 from app.scene import RELATIONS, label_key
 from training.datasets.files import read_lines
@@ -23,26 +23,14 @@ MAX_ROWS: Final = 2_000_000
 SOURCE: Final = "placing_priors"
 """Source name of all scenes that the reader makes from rows of the table."""
 
-TRAINED: Final = frozenset({"virtualhome_placing", "ithor_receptacles"})
-"""Sources whose rows become training scenes: the places of VirtualHome and AI2-THOR."""
+# Sources whose rows become training scenes: the places of VirtualHome and AI2-THOR.
+_TRAINED: Final = frozenset({"virtualhome_placing", "ithor_receptacles"})
 
 # Other accepted values of the column ``source``: places that people prefer, tables of locations, of
 # votes and of part counts.
-_SOURCES: Final = TRAINED | {
+_SOURCES: Final = _TRAINED | {
     *("tidybot", "conceptnet_atlocation", "housekeep_votes", "vg80k_partof_counts")
 }
-
-_SUPPORTS: Final = frozenset({"on-top", "inside"})
-
-
-class Placing(NamedTuple):
-    """A row about a room: the number of votes for the subject on or inside the receptacle."""
-
-    source: str
-    subject: str
-    receptacle: str
-    votes: int
-    room: str
 
 
 def read_prior_scenes(path: Path) -> list[AnnotatedScene]:
@@ -59,29 +47,11 @@ def read_prior_scenes(path: Path) -> list[AnnotatedScene]:
         ends = subject, anchor
         names = [end.removeprefix("food ").removeprefix("clothes ").strip() for end in ends]
         keys = set(map(label_key, names)) - {""}
-        if source in TRAINED and relation in RELATIONS and len(keys) == 2:
+        if source in _TRAINED and relation in RELATIONS and len(keys) == 2:
             things = tuple(AnnotatedObject(str(index), name) for index, name in enumerate(names))
             listed = ((0, relation, 1),)
             scenes.append(AnnotatedScene(where, SOURCE, " ".join(names), None, things, listed))
     return scenes
-
-
-def read_placings(path: Path) -> list[Placing]:
-    """Read the rows of all sources that have a room and the relation on-top or inside.
-
-    Raises:
-        DatasetError: the file is invalid, or has no such row.
-    """
-    placings = []
-    for where, (source, subject, relation, receptacle, count, room) in _rows(path):
-        if not room or relation not in _SUPPORTS:
-            continue
-        if not (count.isascii() and count.isdigit()):
-            raise DatasetError(path, where, f"count must be a whole number, not {count!r}")
-        placings.append(Placing(source, subject, receptacle, int(count), room))
-    if not placings:
-        raise DatasetError(path, "", "no row has a room and the relation on-top or inside")
-    return placings
 
 
 def _rows(path: Path) -> Iterator[tuple[str, list[str]]]:

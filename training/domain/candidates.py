@@ -23,9 +23,8 @@ from training.evaluation.baselines import EASE, FREQUENCY_TABLE, PLACED, placed_
 from training.evaluation.baselines.fitting import Baseline
 from training.evaluation.model import Model
 from training.evaluation.report import Progress
-from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, ConfigError, source_name
-from training.runs.folder import load_run
+from training.runs.folder import RunError, load_run
 from training.runs.pipeline import prepare
 from training.runs.publish import calibrated_draft
 
@@ -55,7 +54,7 @@ class Candidate:
         """Return the scores of this candidate in the classes of the test scenes, `scenes`."""
         if self.artifact is None:
             return _baselines(data, say)
-        model = artifact_model(self.artifact, data.train)
+        model = artifact_model(self.artifact)
         if same_classes(scenes, self.artifact.vocabulary):
             return model
         return Translation.between(scenes, self.artifact.vocabulary).translate(model)

@@ -29,8 +29,8 @@ from training.evaluation.report import Progress, measure, silent
 from training.evaluation.results import Difference, Results, only, summarise
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import in_words
-from training.fit.checkpoint import RunError
 from training.fit.configuration import ConfigError
+from training.runs.folder import RunError
 from training.runs.pipeline import read_sources, split_and_encode
 
 COMPARED: dict[str, tuple[str, ...]] = {

@@ -19,7 +19,7 @@ from training.datasets.files import DATA
 from training.domain.init_command import StorePath, fail
 from training.evaluation.everyday_task import EVERYDAY
 from training.evaluation.metrics import Figure
-from training.evaluation.outside import OutsideTest, read_test
+from training.evaluation.outside import RoomList, read_test
 from training.evaluation.report import Progress, evaluate
 from training.evaluation.tasks import in_words
 from training.fit.configuration import ConfigError, source_name
@@ -37,8 +37,8 @@ def evaluate_command(
         list[Path] | None,
         typer.Option(
             "--file",
-            help="your own test: a file of scenes (*.jsonl), or a table of places (*.tsv). It "
-            "replaces the scenes of the training split (--data, --source)",
+            help="your own test: a file of scenes (*.jsonl). It replaces the scenes of the "
+            "training split (--data, --source)",
         ),
     ] = None,
     data: Annotated[
@@ -84,7 +84,7 @@ def evaluate_command(
         output.write_text(json.dumps(rows, indent=1), encoding="utf-8")
 
 
-def _ask(test: OutsideTest, artifacts: dict[str, Artifact]) -> Figures:
+def _ask(test: RoomList, artifacts: dict[str, Artifact]) -> Figures:
     """Ask all models the questions of a file, and print the remarks on the figures."""
     figures: Figures = {}
     for name, artifact in artifacts.items():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import cache, partial
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from app.questions.posterior import Posterior
 from app.questions.reading import Triple
 from app.registry import Artifact
 from app.scene import CANONICAL, OPPOSITES, Scene
-from training.datasets.batches import Batch, SceneTensors
+from training.datasets.batches import Batch
 from training.evaluation.asking import (
     flag_outliers,
     instances_of,
@@ -24,7 +24,6 @@ from training.evaluation.asking import (
     score_rooms,
     score_suspicion,
 )
-from training.evaluation.density_task import independent_density, machine_density
 from training.evaluation.generation_task import (
     held_out_halves,
     independent_sampler,
@@ -36,17 +35,9 @@ from training.evaluation.setting import Setting
 from training.machines.arrays import machine_of
 
 
-def artifact_model(
-    artifact: Artifact,
-    train: SceneTensors,
-    seed: int = 0,
-    *,
-    profiles: Sequence[str] = (),
-) -> Model:
+def artifact_model(artifact: Artifact, *, profiles: Sequence[str] = ()) -> Model:
     """Return the answers of a trained model. Requests about rooms may name the `profiles`."""
-    machine = machine_of(artifact.weights)
     sampler = machine_sampler(artifact)
-    density = cache(partial(machine_density, machine, train, seed))
     judges_relations = artifact.calibration.misplaced.judges_relations
     return Model(
         missing=partial(score_missing, artifact),
@@ -59,8 +50,7 @@ def artifact_model(
         misplaced=partial(score_misplaced, artifact) if judges_relations else None,
         rooms=partial(score_rooms, artifact, profiles) if artifact.spec.C else None,
         generate=lambda _: sampler,
-        density=lambda _: density(),
-        parameters=machine.parameter_count,
+        parameters=machine_of(artifact.weights).parameter_count,
         artifact=artifact,
     )
 
@@ -147,6 +137,5 @@ def independent_model(classes: int) -> Model:
     """Return a model that samples classes independently at their training frequencies."""
     return Model(
         generate=lambda s: None if s.train is None else independent_sampler(s.train),
-        density=lambda s: None if s.train is None else independent_density(s.train),
         parameters=classes,
     )

@@ -120,10 +120,7 @@ def canonical_triple(index: Mapping[str, int], entry: Mapping[str, Any]) -> tupl
 
 
 def missing_probabilities(
-    artifact: Artifact,
-    scene: Scene,
-    at: tuple[str, int] | None = None,
-    candidates: Sequence[int] | None = None,
+    artifact: Artifact, scene: Scene, at: tuple[str, int] | None = None
 ) -> Floats:
     """Return the probability that each class is missing, (V,).
 
@@ -131,12 +128,9 @@ def missing_probabilities(
 
     Args:
         at: place of the missing object: its relation to the object with an index.
-        candidates: classes to rank. None means all classes.
     """
     p = np.full(len(artifact.vocabulary), -np.inf)
-    answer = questions.missing(
-        artifact, scene, top_k=len(p), candidates=candidates, at=at, details=False
-    )
+    answer = questions.missing(artifact, scene, top_k=len(p), at=at, details=False)
     for entry in answer["missing"]:
         p[artifact.vocabulary.index(entry["label"])] = entry["probability"]
     return p

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import torch
@@ -54,22 +54,6 @@ MisplacedScore = Callable[[Scene], Sequence[Mapping[str, Any]]]
 
 
 @dataclass(frozen=True, eq=False)
-class ObjectDensity:
-    """A probability distribution over presence vectors, which list the classes of a scene.
-
-    Attributes:
-        log_unnormalised: function from presence (B, V) to its log-likelihood + log Z, (B,).
-        lower, upper: estimates of log Z; equal if log Z is exact.
-        notes: estimates of log Z and their standard errors, by name.
-    """
-
-    log_unnormalised: Callable[[Tensor], Tensor]
-    lower: float
-    upper: float
-    notes: dict[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, eq=False)
 class Drawn:
     """Generated scenes, (scenes, V), and `count_contradictions` of their relations."""
 
@@ -80,9 +64,8 @@ class Drawn:
 # Function that generates scenes from the classes that each scene must contain, (scenes, classes)
 # bool, the room type of each scene, (scenes,) int64 or -1 for any, and a seed.
 Sampler = Callable[[Tensor, Tensor, int], Drawn]
-# Functions of the setting; None if its scenes allow no answer.
+# Function of the setting; None if its scenes allow no answer.
 SamplerOf = Callable[[Setting], Sampler | None]
-DensityOf = Callable[[Setting], ObjectDensity | None]
 
 Parameters: TypeAlias = Mapping[str, float | int | str]
 
@@ -102,7 +85,7 @@ class Model:
             relation, the given triples, or all triples with one false triple.
         misplaced: score of T3c, moved objects.
         rooms: log-probabilities of the room types.
-        generate, density: sampler of T4 and density of objects for a setting.
+        generate: sampler of T4 for a setting.
         artifact: model for Calibration and for all questions to the service.
         parameters: number of trained weights, or None if this number is not meaningful.
     """
@@ -117,7 +100,6 @@ class Model:
     misplaced: MisplacedScore | None = None
     rooms: RoomScore | None = None
     generate: SamplerOf | None = None
-    density: DensityOf | None = None
     artifact: Artifact | None = None
     parameters: int | None = None
 

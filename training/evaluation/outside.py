@@ -1,18 +1,15 @@
 """Outside tests: questions from a file of the user, which no training read.
 
-Two kinds of files are read. A room list contains scenes in any format of `read_scenes`, such as
-JSON lines. A placing table (``*.tsv`` or ``*.tsv.gz``) names the receptacles of objects, see
-`training.evaluation.placing_task`. The labels are read with the vocabulary of the evaluated model.
-
-Intervals come from resampled groups: groups of scenes, or objects of one class.
+The file contains scenes in any format of `read_scenes`, such as JSON lines. The labels are read
+with the vocabulary of the evaluated model. Intervals come from resampled groups of scenes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Final
 
 import torch
 
@@ -23,69 +20,30 @@ from training.datasets import (
     DatasetError,
     annotated_classes,
     encode,
-    priors,
     read_scenes,
 )
 from training.datasets.batches import scene_tensors
-from training.datasets.readers import guess_format
 from training.datasets.records import digest_of
 from training.evaluation.artifact_model import artifact_model
-from training.evaluation.placing_task import TASK, Room, placing_metrics, rooms_of
-from training.evaluation.report import Progress, card_figures, card_rows, measure, silent
+from training.evaluation.report import Progress, card_figures, measure, silent
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import TASKS, WHOLE_SET
 
-ROOM_TASKS: Final = tuple(name for name in TASKS if name not in (*WHOLE_SET, "Density"))
+ROOM_TASKS: Final = tuple(name for name in TASKS if name not in WHOLE_SET)
 """Tasks that a room list is asked. The others compare the answers with training scenes."""
 
-_TABLES: Final = (".tsv", ".tsv.gz")
 
-
-def read_test(path: Path) -> OutsideTest:
-    """Read a room list or a placing table.
+def read_test(path: Path) -> RoomList:
+    """Read the scenes of a file.
 
     Raises:
-        DatasetError: the file has no known format, is invalid or contains no questions.
+        DatasetError: the file has no known format, is invalid or contains no scenes.
     """
-    if path.name.endswith(_TABLES):
-        by_source: dict[str, list[priors.Placing]] = {}
-        for row in priors.read_placings(path):
-            by_source.setdefault(row.source, []).append(row)
-        return PlacingTable({name: rooms_of(rows) for name, rows in sorted(by_source.items())})
-    try:
-        guess_format(path)
-    except DatasetError as error:
-        problem = f"{error.problem}. A placing table is named *.tsv or *.tsv.gz"
-        raise DatasetError(path, "", problem) from None
     name = path.name.partition(".")[0]
     scenes = [replace(scene, source=name) for scene in read_scenes(path)]
     if not scenes:
         raise DatasetError(path, "", "contains no scenes")
     return RoomList(name, scenes)
-
-
-@dataclass(frozen=True, eq=False)
-class PlacingTable:
-    """The rooms of a placing table by source."""
-
-    rooms: Mapping[str, list[Room]]
-
-    def measure(self, artifact: Artifact, progress: Progress = silent) -> list[CardMetric]:
-        """Return the metrics of `placing_metrics` for each source."""
-        figures: list[CardMetric] = []
-        for source, rooms in self.rooms.items():
-            progress(f"{source}: {TASK}")
-            figures += card_rows(TASK, source, placing_metrics(artifact, rooms))
-        return figures
-
-    def trained(self, artifact: Artifact) -> list[str]:
-        """Return the sources whose rows training reads, for a model of the placing priors."""
-        is_trained = any(entry.source == priors.SOURCE for entry in artifact.manifest.data)
-        return sorted(priors.TRAINED & set(self.rooms)) if is_trained else []
-
-    def remark(self, artifact: Artifact) -> str:
-        """Return an empty string, because the figures contain the share of unknown labels."""
-        return ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +67,7 @@ class RoomList:
         scenes = scene_tensors(encoded, annotated, len(vocabulary))
         structure = torch.from_numpy(vocabulary.structure.copy())
         setting = Setting(scenes, structure, train=scenes, limit=None)
-        model = artifact_model(artifact, scenes)
+        model = artifact_model(artifact)
         return card_figures(
             measure(model, setting, self.source, tasks=ROOM_TASKS, progress=progress)
         )
@@ -130,7 +88,3 @@ class RoomList:
         unknown = sum(artifact.vocabulary.index(label) is None for label in labels)
         reason = "objects are left out, because their labels are unknown"
         return f"{unknown:,} of {len(labels):,} {reason}" if unknown else ""
-
-
-OutsideTest: TypeAlias = PlacingTable | RoomList
-"""The questions of one file."""

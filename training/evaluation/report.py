@@ -167,7 +167,7 @@ def evaluate(
         limit: maximum number of scenes per data source in slow tasks, see `Setting`.
         tasks: names of the tasks to measure. None means all tasks of a model card.
     """
-    model = artifact_model(artifact, train)
+    model = artifact_model(artifact)
     selected = [
         name for name, task in EVERY_TASK.items() if task.card and (tasks is None or name in tasks)
     ]

@@ -14,7 +14,6 @@ from training.evaluation import evidence_tasks as evidence
 from training.evaluation import offset_task as offsets
 from training.evaluation.asking import SENSITIVITIES
 from training.evaluation.calibration_task import NAMES, calibration_task
-from training.evaluation.density_task import density_task
 from training.evaluation.everyday_task import LINES, everyday_task
 from training.evaluation.generation_task import generation_task
 from training.evaluation.intruders import LAWS
@@ -147,11 +146,6 @@ TASKS: dict[str, Task] = {
             "on-top cycles, free",
         ),
         ("MMD², free", "pair correlation, free"),
-    ),
-    "Density": _task(
-        *("density of scenes", "density", density_task),
-        ("gain over independent classes, upper log Z",),
-        (),
     ),
     "Calibration": _task(
         *("calibration", "artifact", calibration_task),

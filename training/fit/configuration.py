@@ -208,7 +208,7 @@ class Config(_Section):
 
     @property
     def digest(self) -> str:
-        """The sha256 of the configuration. A checkpoint needs a configuration of equal sha256."""
+        """The sha256 of the configuration."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
 
 

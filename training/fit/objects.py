@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -326,26 +326,6 @@ class ObjectFit:
         couplings = machine.couplings
         if couplings is not None:
             machine.L.copy_(couplings)
-
-    def state(self) -> dict[str, Any]:
-        """Return the state for a checkpoint, without the weights of the machine."""
-        chains = self._chains
-        return {
-            "steps": self.steps,
-            "optimiser": self._optimiser.state_dict(),
-            "generator": self._generator.get_state(),
-            "average": self._average,
-            "chains": None if chains is None else (chains.v, chains.h2),
-        }
-
-    def load_state(self, state: dict[str, Any]) -> None:
-        """Continue from the state of a checkpoint."""
-        self.steps = state["steps"]
-        self._optimiser.load_state_dict(state["optimiser"])
-        self._generator.set_state(state["generator"])
-        self._average = state["average"]
-        if self._chains is not None:
-            self._chains.v, self._chains.h2 = state["chains"]
 
 
 def with_served_rates(rates: Tensor, shows: Tensor, served: Tensor) -> tuple[Tensor, Tensor]:

@@ -34,7 +34,6 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -216,26 +215,6 @@ class RelationFit:
             offsets = self.offsets.detach()
             return with_counted_residuals(machine, self.train, offsets, self._source_weights)
         return machine
-
-    def state(self) -> dict[str, Any]:
-        """Return the state for a checkpoint, without the weights of the machine."""
-        return {
-            "epochs": self.epochs,
-            "updates": self._updates,
-            "offsets": self.offsets.detach(),
-            "average": self._average,
-            "optimiser": self._optimiser.state_dict(),
-            "generator": self._generator.get_state(),
-        }
-
-    def load_state(self, state: dict[str, Any]) -> None:
-        """Continue from the state of a checkpoint."""
-        self.epochs, self._updates = state["epochs"], state["updates"]
-        with torch.no_grad():
-            self.offsets.copy_(state["offsets"])
-        self._average = state["average"]
-        self._optimiser.load_state_dict(state["optimiser"])
-        self._generator.set_state(state["generator"])
 
 
 def _nll(logits: Tensor, r: Tensor, weight: Tensor) -> Tensor:

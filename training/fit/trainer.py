@@ -1,17 +1,15 @@
 """Train a machine in two phases: the object weights, and then the relation weights.
 
 `training.fit.objects` and `training.fit.relations` define the losses. Two runs with the same seed
-and one thread give bit-identical weights, even if a run is interrupted and resumed.
+and one thread give bit-identical weights.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import asdict
+from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -23,15 +21,8 @@ from training.datasets.batches import TrainingData, seen_triples, subset
 from training.evaluation.artifact_model import score_relations
 from training.evaluation.parts import validation_score
 from training.evaluation.relation_tasks import r_precision, score_scenes
-from training.fit.checkpoint import (
-    CurvePoint,
-    TrainingResult,
-    load_checkpoint,
-    save_checkpoint,
-    write_csv,
-    write_plot,
-)
 from training.fit.configuration import Config
+from training.fit.curve import CurvePoint, TrainingResult
 from training.fit.draft import draft_artifact
 from training.fit.objects import ObjectFit, ObjectScenes, start_objects
 from training.fit.relations import SHARED, RelationFit, bake_shared_weights, share_weights
@@ -40,7 +31,7 @@ from training.machines import BoltzmannMachine, MachineSpec, build
 from training.machines.edges import find_triples, triple_keys
 from training.machines.machine import OBJECT_WEIGHTS
 
-_STEPS = 100  # steps of the first phase between two checkpoints
+_STEPS = 100  # steps of the first phase between two points of the curve
 _SCORED = 200  # minimum number of scenes with relations of a validation score
 
 Progress = Callable[[str, float, float], None]
@@ -99,14 +90,15 @@ def _start_relations(machine: BoltzmannMachine, data: TrainingData) -> None:
 class Trainer:
     """Train one configuration on one set of scenes.
 
-    The trainer writes `checkpoint.pt`, `curve.csv` and `curve.png` into the folder, if any.
+    Attributes:
+        curve: points of the training curve so far.
 
     Raises:
         ValueError: no training scene has two classes.
     """
 
-    def __init__(self, config: Config, data: TrainingData, folder: Path | None = None) -> None:
-        self.config, self.data, self.folder = config, data, folder
+    def __init__(self, config: Config, data: TrainingData) -> None:
+        self.config, self.data = config, data
         torch.set_num_threads(config.training.threads)
         self.scenes = ObjectScenes.of(data.train, data.structure, config.objects)
         self.machine = new_machine(config, data, self.scenes)
@@ -115,70 +107,30 @@ class Trainer:
             share_weights(self.machine, words * section.word_weight, data.parents, names)
         self.objects = ObjectFit(self.machine, self.scenes, config.objects, config.training.seed)
         self.curve: list[CurvePoint] = []
-        self.seconds = 0.0
-        self._relations: RelationFit | None = None
-
-    def resume(self) -> bool:
-        """Load the checkpoint in the folder of the run. Return False if there is no checkpoint.
-
-        Raises:
-            RunError: the checkpoint cannot be read or belongs to another configuration.
-        """
-        if self.folder is None:
-            return False
-        state = load_checkpoint(self.folder / "checkpoint.pt", self._digest)
-        if state is None:
-            return False
-        self.curve = [CurvePoint(**row) for row in state["curve"]]
-        self.seconds = state["seconds"]
-        if state["relations"] is None:
-            self.machine.load_state_dict(state["machine"])
-            self.objects.load_state(state["objects"])
-        else:
-            self.objects.steps = self.config.objects.steps
-            relations = self._begin_relations()
-            self.machine.load_state_dict(state["machine"])
-            relations.load_state(state["relations"])
-        return True
-
-    @property
-    def position(self) -> str:
-        """The last checkpoint in words, such as "50% of the objects"."""
-        if not self.curve:
-            return "0% of the objects"
-        return f"{self.curve[-1].done:.0%} of the {self.curve[-1].phase}"
 
     def run(
         self, progress: Progress = lambda *_: None, passed: Passed = lambda _: None
     ) -> TrainingResult:
-        """Run both phases from the state of the trainer.
-
-        After a KeyboardInterrupt, the last checkpoint is on disk.
+        """Run both phases.
 
         Raises:
             FloatingPointError: the training diverged.
         """
-        for point in self._points(progress):
-            self._save([*self.curve, point], self.seconds + point.seconds)
-            self.curve.append(point)
-            self.seconds += point.seconds
-            passed(point)
         began, seed = time.perf_counter(), self.config.training.seed
-        machine = (self._relations or self._begin_relations()).finish(self.data.parents)
+
+        def add(point: CurvePoint) -> None:
+            self.curve.append(point)
+            passed(point)
+
+        while not self.objects.finished:
+            add(self._train_objects(progress))
+        relations = self._begin_relations()
+        while not relations.finished:
+            add(self._train_relations(relations, progress))
+        machine = relations.finish(self.data.parents)
         fit_scene_rates(machine, self.scenes, self.config.objects, seed)
         store_samples(machine, self.scenes, seed)
-        self.seconds += time.perf_counter() - began
-        if self.folder is not None:
-            write_plot(self.folder / "curve.png", self.curve, self.config.name)
-        return TrainingResult(machine, self.curve, self.seconds)
-
-    def _points(self, progress: Progress) -> Iterator[CurvePoint]:
-        """Run the rest of both phases. Yield a point of the curve at each checkpoint."""
-        while not self.objects.finished:
-            yield self._train_objects(progress)
-        fit = self._relations or self._begin_relations()
-        while not fit.finished:
-            yield self._train_relations(fit, progress)
+        return TrainingResult(machine, self.curve, time.perf_counter() - began)
 
     def _train_objects(self, progress: Progress) -> CurvePoint:
         """Run the next steps of the first phase."""
@@ -191,8 +143,6 @@ class Trainer:
         if fit.finished:
             fit.finish()
         score = object_score(self.machine, self.data)
-        if fit.finished:
-            self._begin_relations()
         seconds = time.perf_counter() - began
         return CurvePoint("objects", fit.steps / total, float(np.mean(losses)), score, seconds)
 
@@ -220,28 +170,7 @@ class Trainer:
             if name in OBJECT_WEIGHTS:
                 weight.requires_grad_(False)
         config, seed = self.config.relations, self.config.training.seed
-        self._relations = RelationFit(machine, self.data.train, config, seed)
-        return self._relations
-
-    @property
-    def _digest(self) -> str:
-        return f"{self.config.digest} {self.data.digest}"
-
-    def _save(self, curve: list[CurvePoint], seconds: float) -> None:
-        """Write the checkpoint and the curve."""
-        if self.folder is None:
-            return
-        relations = self._relations
-        state = {
-            "digest": self._digest,
-            "machine": self.machine.state_dict(),
-            "objects": None if relations else self.objects.state(),
-            "relations": relations.state() if relations else None,
-            "curve": [asdict(point) for point in curve],
-            "seconds": seconds,
-        }
-        save_checkpoint(self.folder / "checkpoint.pt", state)
-        write_csv(self.folder / "curve.csv", curve)
+        return RelationFit(machine, self.data.train, config, seed)
 
 
 @torch.no_grad()

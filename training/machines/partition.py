@@ -2,13 +2,11 @@
 
 AIS moves chains from independent objects (beta = 0) to the machine (beta = 1). At beta, all weights
 of the machine are multiplied by beta, and the log-odds of the independent objects by 1 - beta. At
-beta = 0, log Z is exact. For forward runs, the expected log weight is a lower bound:
-E[log w] ≤ log Z. Reverse runs start from samples of the machine and give an upper bound. Relations
-add nothing: the sum over the relations of a scene is 1.
+beta = 0, log Z is exact. The expected log weight is a lower bound: E[log w] ≤ log Z. Relations add
+nothing: the sum over the relations of a scene is 1.
 
 Sources: Neal, "Annealed importance sampling" (2001); Salakhutdinov and Murray, "On the quantitative
-analysis of deep belief networks" (2008); Burda, Grosse and Salakhutdinov, "Accurate and
-conservative estimates of MRF log-likelihood using reverse annealing" (2015).
+analysis of deep belief networks" (2008).
 """
 
 from __future__ import annotations
@@ -31,30 +29,14 @@ class LogPartition:
     """An estimate of log Z.
 
     Attributes:
-        log_z: log of the mean weight w over chains in forward runs, and minus the log of the mean
-            inverse weight in reverse runs.
+        log_z: log of the mean weight w over chains.
         standard_error: standard error of log_z, by the delta method over chains.
-        bound: mean of log w. In expectation, it is a lower bound of log Z for forward runs, and an
-            upper bound for reverse runs.
+        bound: mean of log w. In expectation, it is a lower bound of log Z.
     """
 
     log_z: float
     standard_error: float
     bound: float
-
-    @classmethod
-    def of_weights(cls, base: float, log_weight: Tensor, *, reverse: bool = False) -> LogPartition:
-        """Return the estimate from the accumulated log weight of each run, (chains,).
-
-        Args:
-            base: exact log Z at beta = 0.
-            reverse: True if the runs end at beta = 0, False if they start there.
-        """
-        sign, count = (-1 if reverse else 1), len(log_weight)
-        mean = float(log_weight.logsumexp(0)) - math.log(count)
-        ratio = (log_weight - mean).exp()
-        error = float(ratio.std()) / math.sqrt(count) if count > 1 else math.inf
-        return cls(base + sign * mean, error, base + sign * float(log_weight.mean()))
 
 
 def base_log_partition(machine: BoltzmannMachine, base: Tensor) -> float:
@@ -72,7 +54,7 @@ def ais(
     generator: torch.Generator,
     base: Tensor,
 ) -> LogPartition:
-    """Run forward AIS from objects with the log-odds `base`, (classes,).
+    """Run AIS from objects with the log-odds `base`, (classes,).
 
     The `betas` increase from 0 to 1.
     """
@@ -84,23 +66,10 @@ def ais(
     for warm, cold in pairwise(betas):
         log_weight += _change(machine, state, warm, cold, base)
         sweep(machine, state, generator, beta=cold, base=base)
-    return LogPartition.of_weights(base_log_partition(machine, base), log_weight)
-
-
-@torch.no_grad()
-def reverse_ais(
-    machine: BoltzmannMachine,
-    betas: Sequence[float],
-    state: Chains,
-    generator: torch.Generator,
-    base: Tensor,
-) -> LogPartition:
-    """Run reverse AIS from samples of the machine; `betas` and `base` as in `ais`."""
-    log_weight = torch.zeros(len(state.v), dtype=torch.float64)
-    for cold, warm in pairwise(betas[::-1]):
-        sweep(machine, state, generator, beta=cold, base=base)
-        log_weight += _change(machine, state, cold, warm, base)
-    return LogPartition.of_weights(base_log_partition(machine, base), log_weight, reverse=True)
+    mean = float(log_weight.logsumexp(0)) - math.log(chains)
+    error = float((log_weight - mean).exp().std()) / math.sqrt(chains)
+    exact = base_log_partition(machine, base)
+    return LogPartition(exact + mean, error, exact + float(log_weight.mean()))
 
 
 def _change(

@@ -52,7 +52,7 @@ def ablate(
 
     The command writes results.json and results.md into FOLDER/CONFIGURATION. If the training of
     an ablation diverges, the results contain the error in place of its metrics. After Ctrl-C, run
-    the same command again: it continues from the last checkpoint or task.
+    the same command again: it skips finished models and tasks.
     """
     with resumable(console):
         configs = _configs(configuration, rows, row)

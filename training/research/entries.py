@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -21,16 +22,15 @@ from training.evaluation.baselines.fitting import TRIALS, Baseline
 from training.evaluation.intruders import intruder_weights
 from training.evaluation.model import Model, ObjectScore, suspicion_of
 from training.evaluation.outlier_tasks import first_shares, with_intruders
-from training.evaluation.report import Progress
+from training.evaluation.report import Progress, silent
 from training.fit.calibrate import calibrate
-from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, ObjectsConfig
 from training.fit.draft import placed_draft
 from training.fit.objects import ObjectScenes
 from training.fit.trainer import Trainer
 from training.machines import BoltzmannMachine
 from training.research.baselines import BASELINES
-from training.runs.folder import load_run, save_run
+from training.runs.folder import RunError, load_run, save_run
 
 # Weights of log popularity in the ranking of intruders: scores of baselines have different scales.
 _WEIGHTS = (0.0, *np.geomspace(0.005, 2.0, TRIALS - 1).tolist())
@@ -84,7 +84,7 @@ def baseline_entries(
 
 
 def reference_entries() -> Iterator[Entry]:
-    """Generate the untrained references for the evaluation of generated scenes and densities."""
+    """Generate the untrained references for the evaluation of generated scenes."""
     for name in ("independent classes", "held-out scenes (floor)"):
         yield Entry(name, 0, name, partial(_reference_model, name))
 
@@ -165,23 +165,26 @@ def tuned_suspicion(score: ObjectScore, data: TrainingData, seed: int) -> Object
 
 def _machine_model(config: Config, data: TrainingData, folder: Path, say: Progress) -> Model:
     run, seed = folder / "run", config.training.seed
-    machine = _train_once(config, data, run, say)
+    machine = train_once(config, data, run, say)
     draft = placed_draft(machine, data)
     say("calibrating")
     artifact = replace(draft, calibration=calibrate(draft, data, config.objects, seed))
     profiles = ObjectScenes.of(data.train, data.structure, config.objects).sources
-    model = artifact_model(artifact, data.train, seed=seed, profiles=profiles)
+    model = artifact_model(artifact, profiles=profiles)
     zero = sum(machine.get_parameter(name).numel() for name in config.machine.without)
     return replace(model, parameters=machine.parameter_count - zero)
 
 
-def _train_once(config: Config, data: TrainingData, run: Path, say: Progress) -> BoltzmannMachine:
-    try:
+def train_once(
+    config: Config, data: TrainingData, run: Path, say: Progress = silent
+) -> BoltzmannMachine:
+    """Return the machine of the finished run in a folder. Without such a run, train it."""
+    with suppress(RunError):
         return load_run(run).machine
-    except RunError:
-        run.mkdir(parents=True, exist_ok=True)
-    trainer = Trainer(config, data, run)
-    trainer.resume()
-    result = trainer.run(lambda phase, done, loss: say(f"{phase} {done:.0%}, {loss:.3f}"))
+
+    def progress(phase: str, done: float, loss: float) -> None:
+        say(f"{phase} {done:.0%}, {loss:.3f}")
+
+    result = Trainer(config, data).run(progress)
     save_run(run, config, result)
     return result.machine

@@ -37,12 +37,11 @@ from training.fit.adapt import adapt
 from training.fit.calibrate_objects import calibrate_objects
 from training.fit.draft import placed_draft
 from training.fit.objects import ObjectScenes, served_popularity
-from training.fit.trainer import Trainer
 from training.machines.arrays import machine_of
 from training.research.benchmark import Data, Workers, console
+from training.research.entries import train_once
 from training.research.measure import resumable
 from training.runs.config_files import data_folder, load_config
-from training.runs.folder import load_run, save_run
 from training.runs.pipeline import SplitScenes, prepare
 
 _SOURCE = "matterport_rooms"
@@ -133,12 +132,7 @@ def _parent(
     }
     rest = replace(scenes, parts=parts)
     config, data = load_config(configuration), rest.training_data()
-    if not (folder / "result.json").is_file():
-        folder.mkdir(parents=True, exist_ok=True)
-        trainer = Trainer(config, data, folder)
-        trainer.resume()
-        save_run(folder, config, trainer.run())
-    draft = placed_draft(load_run(folder).machine, data)
+    draft = placed_draft(train_once(config, data, folder), data)
     learnt = ObjectScenes.of(data.train, data.structure, config.objects)
     popularity = served_popularity(learnt, config.objects)
     served = config.objects.served_sources

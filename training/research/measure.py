@@ -48,9 +48,9 @@ from training.evaluation.report import (
 from training.evaluation.results import Reports
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import ONCE, WHOLE_SET
-from training.fit.checkpoint import RunError
 from training.fit.configuration import ConfigError
 from training.research.entries import Entry
+from training.runs.folder import RunError
 
 # Linear algebra libraries read these variables when a process loads them.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")

@@ -1,6 +1,6 @@
 """`python -m training tune`: search for settings on validation scenes with optuna.
 
-<folder>/<configuration>/<digest>/  curve, reports and checkpoint of the settings of a trial
+<folder>/<configuration>/<digest>/  curve and reports of the settings of a trial
                          best.toml  the best configuration
 
 The same seed draws the same settings. So the same command repeats its trials from these folders.
@@ -42,8 +42,8 @@ from training.evaluation.report import (
     settings_by_source,
     write_whole,
 )
-from training.fit.checkpoint import CurvePoint
 from training.fit.configuration import Config, ConfigError, first_error
+from training.fit.curve import CurvePoint
 from training.fit.draft import draft_artifact
 from training.fit.trainer import Trainer
 from training.machines import BoltzmannMachine
@@ -108,7 +108,7 @@ def tune(
     The command first trains the unchanged configuration. Optuna chooses the settings of the trials,
     and stops trials below the median. The command writes the best configuration to
     FOLDER/CONFIGURATION/best.toml. After Ctrl-C, run the same command again: it keeps finished
-    trials and resumes the interrupted trial.
+    trials.
     """
     with resumable(console):
         original = load_config(configuration)
@@ -235,13 +235,9 @@ class Search:
             for values in json.loads(curve.read_text(encoding="utf-8")):
                 passed(CurvePoint(**values))
         else:
-            trainer = Trainer(config, self.data, folder)
-            trainer.resume()
-            for point in trainer.curve:
-                passed(point)
-            self._measure(trainer.run(passed=passed).machine, folder)
-            write_whole(curve, json.dumps([asdict(point) for point in trainer.curve]))
-            (folder / "checkpoint.pt").unlink(missing_ok=True)
+            result = Trainer(config, self.data).run(passed=passed)
+            self._measure(result.machine, folder)
+            write_whole(curve, json.dumps([asdict(point) for point in result.curve]))
         sources = sorted({scene.source for scene in self.data.validation.scenes})
         paths = [folder / f"{source}.json" for source in sources]
         report = pooled([SourceReport.read(path) for path in paths])

@@ -1,7 +1,6 @@
 """The folder of a training run. It contains these files:
 
 config.json        the validated configuration
-checkpoint.pt      training state, to resume an interrupted run
 model.safetensors  trained weights; the header contains the sizes of the machine
 curve.csv, .png    loss and validation score of both phases of the training
 result.json        duration in seconds, data folder and digest of the scenes
@@ -12,14 +11,19 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from safetensors import safe_open
 from safetensors.torch import save_file
 
 from training.datasets.files import DATA
-from training.fit.checkpoint import RunError, TrainingResult
 from training.fit.configuration import Config
+from training.fit.curve import TrainingResult, write_csv, write_plot
 from training.machines import BoltzmannMachine, MachineSpec, build
+
+
+class RunError(RuntimeError):
+    """A folder contains no finished run, or the scenes of the run have changed."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,7 @@ class FinishedRun:
         if self.scenes and self.scenes != scenes:
             raise RunError(
                 "the scenes, vocabulary or split have changed since the training of "
-                f"{self.config.name}: train this configuration again with --fresh"
+                f"{self.config.name}: train this configuration again"
             )
 
 
@@ -54,7 +58,29 @@ def save_run(
     data: Path | None = None,
     scenes: str = "",
 ) -> None:
-    """Write the weights, and then `result.json`, which marks the run as finished."""
+    """Replace the folder by the files of a finished run.
+
+    The function writes the files beside the folder. If it is interrupted, the folder stays as it
+    was.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as beside:
+        new, old = Path(beside, "new"), Path(beside, "old")
+        new.mkdir()
+        _write(new, config, result, data, scenes)
+        try:
+            if folder.exists():
+                folder.rename(old)
+            new.rename(folder)
+        except BaseException:
+            if old.exists() and not folder.exists():
+                old.rename(folder)
+            raise
+
+
+def _write(
+    folder: Path, config: Config, result: TrainingResult, data: Path | None, scenes: str
+) -> None:
     machine = result.machine
     state = {name: tensor.contiguous() for name, tensor in machine.state_dict().items()}
     spec = json.dumps(machine.spec.to_dict())
@@ -63,6 +89,8 @@ def save_run(
     origin = {"data": "" if data is None else str(data.resolve()), "scenes": scenes}
     outcome = {"seconds": round(result.seconds, 1)} | origin
     (folder / "result.json").write_text(json.dumps(outcome), encoding="utf-8")
+    write_csv(folder / "curve.csv", result.curve)
+    write_plot(folder / "curve.png", result.curve, config.name)
 
 
 def load_run(folder: Path) -> FinishedRun:

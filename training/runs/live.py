@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from training.fit.checkpoint import CurvePoint, TrainingResult
+from training.fit.curve import CurvePoint, TrainingResult
 from training.fit.trainer import Trainer
 
 SCORES = {"objects": "MRR", "relations": "R-precision"}

@@ -27,7 +27,6 @@ from training.evaluation.report import Progress, evaluate, silent
 from training.evaluation.tasks import STATISTICS
 from training.fit.calibrate import calibrate
 from training.fit.calibrate_objects import refitted_lines
-from training.fit.checkpoint import RunError
 from training.fit.configuration import DataConfig
 from training.fit.count_statistics import fit_counts
 from training.fit.draft import placed_draft
@@ -41,7 +40,7 @@ from training.runs.config_files import (
     with_settings,
 )
 from training.runs.example_scenes import known_examples, read_examples
-from training.runs.folder import FinishedRun
+from training.runs.folder import FinishedRun, RunError
 from training.runs.pipeline import SplitScenes, read_sources, split_and_encode
 
 # Tasks with results that depend on the alarm lines, and the names of these results.

@@ -30,8 +30,6 @@ from training.datasets.priors import (
     COLUMNS,
     MAX_LINE,
     SOURCE,
-    Placing,
-    read_placings,
     read_prior_scenes,
 )
 from training.datasets.readers import READERS, guess_format
@@ -539,6 +537,7 @@ def test_rows_become_scenes_of_two_objects(tmp_path: Path) -> None:
         "virtualhome_placing\tcup\tinside\tcabinet\t1\t",
         "ithor_receptacles\tcups\ton-top\tcup\t1\t",
         "ithor_receptacles\tbread\tbelow\ttable\t2\t",
+        "housekeep_votes\tcup\tinside\tcabinet\t3\tkitchen",  # votes of people are skipped
     )
     scenes = read_prior_scenes(path)
     assert {scene.source for scene in scenes} == {SOURCE}
@@ -548,35 +547,6 @@ def test_rows_become_scenes_of_two_objects(tmp_path: Path) -> None:
         ("cup cabinet", ((0, "inside", 1),)),
         ("bread table", ((0, "below", 1),)),
     ]
-
-
-def test_placings_are_rows_of_rooms_on_or_inside_a_receptacle(tmp_path: Path) -> None:
-    """Training ignores votes of people."""
-    path = table(
-        tmp_path,
-        "housekeep_votes\tcup\tinside\tcabinet\t3\tkitchen",
-        "housekeep_votes\tcup\ton-top\tdesk\t5\tkitchen",
-        "housekeep_votes\tcup\ton-top\ttable\t1\t",
-        "housekeep_votes\tcup\tunder\ttable\t1\tkitchen",
-    )
-    assert read_placings(path) == [
-        Placing("housekeep_votes", "cup", "cabinet", 3, "kitchen"),
-        Placing("housekeep_votes", "cup", "desk", 5, "kitchen"),
-    ]
-    assert read_prior_scenes(path) == []
-
-
-@pytest.mark.parametrize(
-    ("row", "message"),
-    [
-        ("my_home\tcup\tinside\tcabinet\tmany\tkitchen", "line 2: count must be a whole number"),
-        ("my_home\tcup\tinside\tcabinet\t-1\tkitchen", "not '-1'"),
-        ("my_home\tcup\tinside\tcabinet\t1\t", "no row has a room and the relation on-top or"),
-    ],
-)
-def test_tables_without_placings(tmp_path: Path, row: str, message: str) -> None:
-    with pytest.raises(DatasetError, match=message):
-        read_placings(table(tmp_path, row))
 
 
 @pytest.mark.parametrize(

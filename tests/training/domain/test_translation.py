@@ -30,7 +30,7 @@ def model():
         for parameter in machine.parameters():
             parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.5)
     artifact = draft_artifact(machine.requires_grad_(False).eval(), MODEL)
-    return artifact_model(artifact, None)  # type: ignore[arg-type]
+    return artifact_model(artifact)
 
 
 def batch(classes: list[int], size: int, told: tuple[int, int, int] | None = None) -> Batch:

@@ -112,7 +112,7 @@ def test_a_score_that_follows_the_order_is_caught():
 
 def test_the_service_sees_the_poses_of_a_request():
     artifact = room_model()
-    assert artifact_model(artifact, POSED).misplaced is None
+    assert artifact_model(artifact).misplaced is None
     terms = {"intercept": 0.0, "relation": -1.0, "change": -1.0, "stand": 0.0, "supporter": 0.0}
     unlikely = Judgement(**terms, lines=lines(0.9, 0.8, 0.7))
     judging = artifact.calibration.model_copy(

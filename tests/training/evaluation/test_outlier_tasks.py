@@ -135,7 +135,7 @@ def test_intruders_are_typical_of_another_room_and_foreign_to_this_one():
 
 
 def test_a_published_model_is_judged_as_the_service_ranks():
-    outcome = outliers_task(artifact_model(room_model(), TRAIN), Setting(DATA, STRUCTURE, TRAIN))
+    outcome = outliers_task(artifact_model(room_model()), Setting(DATA, STRUCTURE, TRAIN))
     names = {f"{name}, {law}" for name in ("hit@1", "flagged") for law in LAWS}
     assert set(outcome.metrics) == names
     index, v, intruder = with_intruders(DATA, STRUCTURE, None)

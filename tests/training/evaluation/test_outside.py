@@ -1,8 +1,7 @@
-"""Files of a user as tests: room lists and placing tables, read, asked and marked as learnt."""
+"""Files of a user as tests: read, asked and marked as learnt."""
 
 from __future__ import annotations
 
-import gzip
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -14,26 +13,12 @@ from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, roo
 from training.datasets import DatasetError, annotated_classes, encode, generate_rooms, read_scenes
 from training.datasets.batches import scene_tensors
 from training.datasets.jsonl import write_jsonl
-from training.datasets.priors import COLUMNS, SOURCE
 from training.datasets.records import digest_of
 from training.evaluation.artifact_model import artifact_model
 from training.evaluation.outside import ROOM_TASKS, RoomList, read_test
 from training.evaluation.report import measure
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import TASKS
-
-ROWS = (
-    "tidybot\tlamp\ton-top\tdesk\t1\tbedroom",
-    "tidybot\tbook\tinside\tcabinet\t1\tbedroom",
-    "housekeep_votes\tcup\ton-top\tcounter\t6\tkitchen",
-    "housekeep_votes\tplate\tinside\tdishwasher\t5\tkitchen",
-)
-
-
-def table(folder: Path, *rows: str) -> Path:
-    path = folder / "places.tsv.gz"
-    path.write_bytes(gzip.compress("\n".join(["\t".join(COLUMNS), *rows]).encode()))
-    return path
 
 
 def room_file(folder: Path, scenes) -> Path:
@@ -56,7 +41,7 @@ def test_rooms_are_asked_every_task_that_needs_no_training_scenes(tmp_path):
     annotated = annotated_classes(encoded, VOCABULARY)
     scenes = scene_tensors(encoded, annotated, len(VOCABULARY))
     setting = Setting(scenes, STRUCTURE, train=scenes, limit=None)
-    model = artifact_model(room_model(), scenes)
+    model = artifact_model(room_model())
     outcomes = measure(model, setting, "homes", tasks=ROOM_TASKS).outcomes
     rows = test.measure(room_model())
     assert {row.source for row in rows} == {"homes"}
@@ -91,18 +76,7 @@ def test_one_group_leaves_intervals_over_rooms(tmp_path):
     assert any(row.task == "T2 missing" for row in rows)
 
 
-def test_a_table_has_figures_for_each_source(tmp_path):
-    rows = read_test(table(tmp_path, *ROWS)).measure(room_model())
-    assert list(dict.fromkeys(row.source for row in rows)) == ["housekeep_votes", "tidybot"]
-    assert {row.task for row in rows} == {"Placing"}
-    assert {row.metric: row.n for row in rows if row.source == "tidybot"}["mAP"] == 2
-
-
 def test_training_data_is_no_outside_test(tmp_path):
-    learnable = "ithor_receptacles\tcup\ton-top\ttable\t1\tkitchen"
-    places = read_test(table(tmp_path, *ROWS, learnable))
-    assert places.trained(learnt((SOURCE, 1000, "x"))) == ["ithor_receptacles"]
-    assert places.trained(learnt(("sunrgbd", 1000, "x"))) == []
     scenes = generate_rooms(5, 3)
     path = room_file(tmp_path, scenes)
     # The file may have another name now than in training.
@@ -117,12 +91,10 @@ def test_training_data_is_no_outside_test(tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("rooms.csv", "", r"rename the file to \*.jsonl.* A placing table is named \*.tsv or"),
+        ("rooms.csv", "", r"rename the file to \*.jsonl"),
         ("rooms.jsonl", "", "rooms.jsonl: contains no scenes"),
         ("rooms.jsonl", '{"label": 1}', "line 1: objects: Field required"),
-        ("places.tsv", "", "places.tsv: no row has a room and the relation on-top or inside"),
-        ("places.tsv", "thing\tplace\n", "line 1: must name the columns source, subject"),
-        ("places.tsv", None, "no such file"),
+        ("rooms.jsonl", None, "no such file"),
     ],
 )
 def test_files_that_are_no_test(tmp_path, name, text, message):

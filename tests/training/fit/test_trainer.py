@@ -1,8 +1,7 @@
-"""The trainer on generated rooms: determinism, resuming, the files of a run."""
+"""The trainer on generated rooms: determinism, the curve, the start of the weights."""
 
 from __future__ import annotations
 
-import csv
 import math
 from dataclasses import replace
 
@@ -11,18 +10,16 @@ import pytest
 import torch
 
 from training.fit import samples, trainer
-from training.fit.checkpoint import CurvePoint, RunError, write_plot
 from training.fit.configuration import Config
+from training.fit.curve import CurvePoint, write_plot
 from training.fit.trainer import Trainer
-from training.machines import Triway
 from training.machines.machine import OBJECT_WEIGHTS
 from training.runs.config_files import with_settings
-from training.runs.folder import load_run, save_run
 from training.runs.pipeline import prepare
 
 
 def small_config(**settings) -> Config:
-    """Objects in 10 steps with a checkpoint after 4 each, then relations in 2 epochs."""
+    """Objects in 10 steps with a point of the curve after 4 each, then relations in 2 epochs."""
     config = {
         "name": "small-triway",
         "data": {"sources": ["rooms"], "vocabulary": "rooms", "rooms": 90},
@@ -40,7 +37,7 @@ DEEP = {"machine.coupled": False, "machine.H2": 3, "machine.G": 0}
 
 @pytest.fixture(scope="module", autouse=True)
 def _few_steps():
-    """A checkpoint after 4 steps, and a short fit of the base rates of whole scenes."""
+    """A point of the curve after 4 steps, and a short fit of the base rates of whole scenes."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(trainer, "_STEPS", 4)
         patch.setattr(samples, "_ROUNDS", 3)
@@ -73,44 +70,16 @@ def whole(data):
 
 
 @pytest.mark.parametrize("settings", [{}, DEEP], ids=["coupled", "two layers"])
-def test_a_run_resumes_to_the_same_bits_from_every_checkpoint(data, tmp_path, settings):
-    """Interrupted right after each checkpoint, and once more between two."""
+def test_two_runs_with_the_same_seed_give_the_same_bits(data, settings):
     config = small_config(**settings)
-    expected = state(Trainer(config, data).run().machine)
-    folder = tmp_path / "run"
-
-    def after_a_point(_):
-        raise KeyboardInterrupt
-
-    def within(phase, done, _):
-        if (phase, round(done, 2)) == ("objects", 0.6):
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        Trainer(config, data, folder).run(passed=after_a_point)
-    again = Trainer(config, data, folder)
-    assert again.resume()
-    with pytest.raises(KeyboardInterrupt):
-        again.run(within)
-    for points in range(1, 5):
-        again = Trainer(config, data, folder)
-        assert again.resume()
-        assert len(again.curve) == points
-        with pytest.raises(KeyboardInterrupt):
-            again.run(passed=after_a_point)
-    last = Trainer(config, data, folder)
-    assert last.resume()
-    assert last.position == "100% of the relations"
-    result = last.run()
-    assert same(expected, state(result.machine))
-    assert [(p.phase, p.done) for p in result.curve] == [
+    passed: list[CurvePoint] = []
+    first, second = Trainer(config, data).run(passed=passed.append), Trainer(config, data).run()
+    assert same(state(first.machine), state(second.machine))
+    assert first.curve == passed
+    assert [(p.phase, p.done) for p in passed] == [
         *(("objects", done) for done in (0.4, 0.8, 1.0)),
         *(("relations", done) for done in (0.5, 1.0)),
     ]
-    with (folder / "curve.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert [row["phase"] for row in rows] == ["objects"] * 3 + ["relations"] * 2
-    assert (folder / "curve.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_the_plot_marks_the_score_of_the_kept_weights(tmp_path, monkeypatch):
@@ -178,23 +147,6 @@ def test_a_phase_that_diverges_is_an_error(data, phase):
         Trainer(config, data).run()
 
 
-def test_a_checkpoint_that_is_broken_or_another_configuration_s_is_refused(data, tmp_path):
-    Trainer(small_config(), data, tmp_path).run()
-    with pytest.raises(RunError, match="another configuration"):
-        Trainer(small_config(**{"objects.steps": 11}), data, tmp_path).resume()
-    (tmp_path / "checkpoint.pt").write_bytes(b"not a checkpoint")
-    with pytest.raises(
-        RunError, match=r"checkpoint\.pt: cannot be read: it is damaged.*--fresh"
-    ) as bad:
-        Trainer(small_config(), data, tmp_path).resume()
-    assert "\n" not in str(bad.value)
-    (tmp_path / "checkpoint.pt").unlink()
-    (tmp_path / "checkpoint.pt").mkdir()
-    with pytest.raises(RunError, match=r"checkpoint\.pt: cannot be read: Is a directory$"):
-        Trainer(small_config(), data, tmp_path).resume()
-    assert not Trainer(small_config(), data, tmp_path / "empty").resume()
-
-
 @pytest.mark.parametrize("name", ["M", "n", "Q"])
 def test_weights_can_be_held_at_zero(data, name):
     """The others start as they would have: machines differ by these weights alone."""
@@ -207,15 +159,3 @@ def test_weights_can_be_held_at_zero(data, name):
     trained = state(held.run().machine)
     assert not trained.pop(name).any()
     assert not torch.equal(trained["R"], second["R"])
-
-
-def test_a_finished_run_is_read_back(data, tmp_path, whole):
-    config = small_config()
-    tmp_path.mkdir(exist_ok=True)
-    with pytest.raises(RunError, match="no finished run"):
-        load_run(tmp_path)
-    save_run(tmp_path, config, whole[0])
-    run = load_run(tmp_path)
-    assert run.config == config
-    assert isinstance(run.machine, Triway)
-    assert same(whole[1], state(run.machine))

@@ -24,7 +24,6 @@ from training.evaluation.missing_tasks import leave_one_out_at
 from training.evaluation.model import (
     MisplacedScore,
     Model,
-    ObjectDensity,
     ObjectScore,
     Parameters,
     PlacedScore,
@@ -124,11 +123,6 @@ def named_moved(scenes: SceneTensors, structure: Tensor, score: MisplacedScore) 
     return float(ask_moved(score, cases)[:, 0].mean()) if cases else 0.0
 
 
-def log_likelihood(scenes: SceneTensors, _structure: Tensor, density: ObjectDensity) -> float:
-    """Return a lower estimate of the mean log-likelihood of objects in nats (upper log Z)."""
-    return float(density.log_unnormalised(scenes.v).double().mean()) - density.upper
-
-
 @dataclass(frozen=True)
 class Baseline:
     """One baseline, shown as one row of a result table.
@@ -149,7 +143,7 @@ class Baseline:
     @property
     def learns_relations(self) -> bool:
         """True if the baseline needs scenes with annotated relations."""
-        return self.scores not in (("missing",), ("rooms",), ("density",))
+        return self.scores not in (("missing",), ("rooms",))
 
     def fit(
         self,
@@ -192,7 +186,5 @@ class Baseline:
             except StopIteration:
                 proposal = None
         answers: dict[str, Any] = dict.fromkeys(self.scores, best)
-        if "density" in answers:
-            answers["density"] = lambda _: best
         count = getattr(best, "parameter_count", None) if "missing" in answers else None
         return Model(**answers, parameters=count)

@@ -30,7 +30,6 @@ _EVERY: tuple[Baseline, ...] = (
     EASE,
     Baseline("pairwise logistic", object_models.pairwise),
     Baseline("scikit-learn BernoulliRBM", object_models.bernoulli_rbm, stochastic=True),
-    Baseline("masked transformer", networks.transformer, stochastic=True),
     Baseline("denoising autoencoder", networks.autoencoder, stochastic=True),
     Baseline("most common room type", room_models.most_common, mean_log_p, ("rooms",)),
     Baseline("naive Bayes of rooms", room_models.naive_bayes, mean_log_p, ("rooms",)),
@@ -61,12 +60,6 @@ _EVERY: tuple[Baseline, ...] = (
     Baseline(
         *("frequency table of supporters", supporters.supporter_table, fitting.named_moved),
         ("misplaced",),
-    ),
-    Baseline(
-        "pairwise, by likelihood",
-        object_models.pairwise_densities,
-        fitting.log_likelihood,
-        ("density",),
     ),
 )
 

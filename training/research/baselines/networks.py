@@ -1,9 +1,9 @@
-"""Neural networks over sets of classes: an autoencoder and a transformer with common training."""
+"""A neural network over sets of classes: a denoising autoencoder."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -18,7 +18,7 @@ from training.evaluation.baselines.classes import Lists, training_lists
 from training.evaluation.baselines.fitting import TRIALS, Proposals, drawn_settings, halving
 from training.evaluation.model import ObjectScore, Parameters
 
-# Both networks learn to predict the hidden classes of random parts of scenes, as a machine does.
+# The network learns to predict the hidden classes of random parts of scenes, as a machine does.
 #
 # A step draws scenes by their weights. In 30 % of the scenes, one class is hidden. In the others, a
 # share U(.05, 1) of the classes is listed; at least one is listed and one hidden. The loss is the
@@ -39,7 +39,6 @@ _STEPS = 800
 _OFFERS = (0.6, 0.8, 1.0)  # shares of the steps after which a network is a candidate
 _BATCH = 256
 LOSSES: Final = ("softmax", "binary")
-_SIZES: Final = ("width", "dropout", "layers")
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,88 +155,19 @@ def build_autoencoder(popularity: Tensor, width: int, dropout: float) -> nn.Sequ
 
 
 def autoencoder(train: SceneTensors, structure: Tensor, seed: int) -> Proposals[ObjectScore]:
-    """Yield the score of an autoencoder for each setting and step."""
-    return _networks(build_autoencoder, _AUTOENCODER, _RUNGS, train, structure, seed)
-
-
-# Masked transformer. The classes of a scene are tokens, and one query token predicts the removed
-# class.
-#
-# Sources: A. Vaswani et al., "Attention is all you need", NeurIPS 2017; J. Devlin et al., "BERT",
-# NAACL 2019, for masking. The classes of a scene have no order, so the network has no position
-# embeddings. `train_network` trains the network.
-
-_HEADS = 4
-_SHORT_RUNGS = ((TRIALS, 0.125), (2, 1.0))
-_TRANSFORMER: Final[dict[str, Sequence[Any]]] = {
-    "width": (64, 96),
-    "layers": (1, 2),
-    "dropout": (0.0, 0.1, 0.2),
-    "learning_rate": (2e-3, 5e-3),
-    "weight_decay": (0.05, 0.2),
-}
-
-
-class SetTransformer(nn.Module):
-    """A transformer that predicts the removed class of a scene.
-
-    The log of the share of scenes with each class, (classes,), initialises the output bias.
-    """
-
-    def __init__(self, popularity: Tensor, width: int, dropout: float, layers: int) -> None:
-        super().__init__()
-        V = len(popularity)
-        self.classes = V
-        # Token V is the query token. Token V + 1 is padding.
-        self.embedding = nn.Embedding(V + 2, width)
-        layer = nn.TransformerEncoderLayer(
-            width, _HEADS, 2 * width, dropout, activation="gelu", batch_first=True, norm_first=True
-        )
-        self.encoder = nn.TransformerEncoder(
-            layer, layers, norm=nn.LayerNorm(width), enable_nested_tensor=False
-        )
-        self.bias = nn.Parameter(popularity.log())
-        # The initial values are small, because the embeddings are also weights of the output.
-        nn.init.normal_(self.embedding.weight, std=width**-0.5)
-
-    def forward(self, v: Tensor) -> Tensor:
-        """Return the logits of the removed class, (scenes, classes), from the query token."""
-        most = int((v > 0).sum(1).max())
-        present, token = v.topk(most, dim=1)
-        token = torch.where(present > 0, token, self.classes + 1)
-        token = nn.functional.pad(token, (1, 0), value=self.classes)
-        encoded: Tensor = self.encoder(
-            self.embedding(token), src_key_padding_mask=token == self.classes + 1
-        )
-        return encoded[:, 0] @ self.embedding.weight[: self.classes].T + self.bias
-
-
-def transformer(train: SceneTensors, structure: Tensor, seed: int) -> Proposals[ObjectScore]:
-    """Yield the score of a transformer for each setting and step."""
-    return _networks(SetTransformer, _TRANSFORMER, _SHORT_RUNGS, train, structure, seed)
-
-
-def _networks(
-    build: Callable[..., nn.Module],
-    grid: dict[str, Sequence[Any]],
-    rungs: Sequence[tuple[int, float]],
-    train: SceneTensors,
-    structure: Tensor,
-    seed: int,
-) -> Proposals[ObjectScore]:
-    """Yield the scores of networks for `TRIALS` settings of the grid, losses and sets of scenes."""
+    """Yield the score of an autoencoder for `TRIALS` settings, losses and sets of scenes."""
     lists = dict(training_lists(train, structure))
 
     def fit(setting: dict[str, Any], share: float) -> Iterator[tuple[Parameters, ObjectScore]]:
         chosen, options = lists[setting["scenes"]], setting.copy()
         options.pop("scenes")
-        sizes = {name: options.pop(name) for name in _SIZES if name in options}
+        sizes = {name: options.pop(name) for name in ("width", "dropout")}
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            network = build(chosen.frequency(), **sizes)
+            network = build_autoencoder(chosen.frequency(), **sizes)
         steps = round(share * _STEPS)
         for step, score in train_network(network, chosen, structure, seed, **options, steps=steps):
             yield {"steps": step}, score
 
-    settings = drawn_settings(scenes=tuple(lists), loss=LOSSES, **grid)
-    return halving(settings, fit, rungs)
+    settings = drawn_settings(scenes=tuple(lists), loss=LOSSES, **_AUTOENCODER)
+    return halving(settings, fit, _RUNGS)

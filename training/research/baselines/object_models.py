@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -15,8 +15,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits, embedding_bag,
 from training.datasets.batches import SceneTensors
 from training.evaluation.baselines.classes import LinearScore, Lists, frequency, training_lists
 from training.evaluation.baselines.fitting import TRIALS, Proposals, drawn_settings, halving
-from training.evaluation.density_task import ising_machine, machine_density
-from training.evaluation.model import ObjectDensity, ObjectScore, Parameters
+from training.evaluation.model import ObjectScore, Parameters
 
 # Co-occurrence: Bernoulli naive Bayes, with the present classes as evidence.
 #
@@ -99,7 +98,6 @@ def nearest(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[Obj
 # The problem is convex. L-BFGS finds its optimum.
 
 _PAIRWISE_L2 = (50.0, 30.0, 20.0, 10.0, 5.0, 3.0)
-_DENSITY_L2 = (30.0, 10.0, 3.0)
 _ITERATIONS = 25
 
 
@@ -148,25 +146,6 @@ def pairwise(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[Li
         for l2 in _PAIRWISE_L2:
             score = fit_pairwise(lists, l2, start=score)
             yield {"scenes": name, "l2": l2}, score
-
-
-def pairwise_densities(
-    train: SceneTensors, _structure: Tensor, seed: int
-) -> Proposals[ObjectDensity]:
-    """Yield the joint distribution of a pairwise model of all classes for each L2 penalty.
-
-    The best penalty for the joint distribution differs from the best penalty for the conditionals.
-    With a weak penalty, the fitted joint distribution has a second mode: scenes with very many
-    classes. This mode has no effect on the conditionals of real scenes.
-    """
-    everything = torch.ones(train.v.shape, dtype=torch.bool)
-    weight, index = torch.ones(len(train)), torch.arange(len(train))
-    lists, score = Lists(train.v, everything, weight, index), None
-    for l2 in _DENSITY_L2:
-        score = fit_pairwise(lists, l2, start=score)
-        machine = ising_machine(score.bias, score.weights)
-        density = machine_density(machine, train, seed)
-        yield {"l2": l2}, cast(ObjectDensity, density)  # an Ising machine has one layer
 
 
 # `BernoulliRBM` of scikit-learn, trained on objects only. Each epoch draws scenes by their weights.

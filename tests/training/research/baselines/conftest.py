@@ -6,7 +6,6 @@ import pytest
 
 from tests.training.research.baselines.furnished import furnished
 from training.datasets.batches import SceneTensors
-from training.evaluation import density_task
 from training.research.baselines import networks
 
 
@@ -15,8 +14,6 @@ def _short_courses() -> Iterator[None]:
     """A few steps suffice for two kinds of rooms."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(networks, "_STEPS", 60)
-        for name, value in (("CHAINS", 64), ("TEMPERATURES", 300), ("BURN_IN", 100)):
-            patch.setattr(density_task, name, value)
         yield
 
 

@@ -26,9 +26,7 @@ from training.evaluation.baselines.fitting import (
     Baseline,
     drawn_settings,
     halving,
-    log_likelihood,
 )
-from training.evaluation.density_task import independent_density
 from training.evaluation.missing_tasks import removed_places
 from training.evaluation.moved_task import moved_cases
 from training.evaluation.relation_tasks import telling
@@ -39,7 +37,6 @@ OBJECTS = [one for one in EVERY if one.scores == ("missing",)]
 OF_RELATIONS = [one for one in EVERY if one.scores == RELATIONS]
 COMPLETIONS = [one for one in EVERY if one.scores == ("completion",)]
 OF_ROOMS = [one for one in EVERY if one.scores == ("rooms",)]
-(DENSITY,) = (one for one in EVERY if one.scores == ("density",))
 (SUPPORTERS,) = (one for one in EVERY if one.scores == ("misplaced",))
 
 
@@ -61,8 +58,7 @@ def fitted(baseline: Baseline):
 def value(baseline: Baseline) -> float:
     """The validation metric of `fitted`."""
     score = getattr(fitted(baseline), baseline.scores[0])
-    judged = score(None) if baseline is DENSITY else score
-    return baseline.judge(furnished(60, seed=2), STRUCTURE, judged)
+    return baseline.judge(furnished(60, seed=2), STRUCTURE, score)
 
 
 def answers(baseline: Baseline, score, scenes):
@@ -71,8 +67,6 @@ def answers(baseline: Baseline, score, scenes):
         return score(scenes.v)
     if baseline is PLACED:
         return score(removed_places(scenes, STRUCTURE)[2])
-    if baseline is DENSITY:
-        return score.log_unnormalised(scenes.v)
     if baseline is SUPPORTERS:
         cases = moved_cases(scenes, STRUCTURE)
         return torch.tensor([entry["probability"] for case in cases for entry in score(case.moved)])
@@ -81,8 +75,8 @@ def answers(baseline: Baseline, score, scenes):
     return score(scenes.batch(torch.arange(20)))
 
 
-# These have few settings, or none; the log Z of the density is slow.
-FEW = ("popularity", "most common room type", "relation popularity", "pairwise, by likelihood")
+# These have few settings, or none.
+FEW = ("popularity", "most common room type", "relation popularity")
 
 
 @named(EVERY)
@@ -222,12 +216,6 @@ def test_no_relation_to_learn_from_is_an_error(baseline, validation):
     bare = tensors([scene([0, 1], annotated=False)])
     with pytest.raises(ValueError, match="the 1 training scenes contain no observed relation"):
         baseline.fit(bare, validation, STRUCTURE)
-
-
-def test_densities_beat_independent_classes(train, validation):
-    """Which knows nothing of rooms: one bit a scene, .69 nats, and what follows from it."""
-    independent = log_likelihood(validation, STRUCTURE, independent_density(train))
-    assert value(DENSITY) > independent + 0.69
 
 
 def test_a_score_that_is_no_number_is_an_error(train, validation):

@@ -1,23 +1,15 @@
-"""Checkpoints and curves of a training run."""
+"""The result of a training: the machine and its curve."""
 
 from __future__ import annotations
 
 import csv
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-import torch
-
-from training.datasets import DatasetError
 from training.machines import BoltzmannMachine
-
-
-class RunError(RuntimeError):
-    """A folder contains no finished run, or a run cannot be resumed from its checkpoint."""
 
 
 @dataclass(frozen=True)
@@ -46,41 +38,6 @@ class TrainingResult:
     machine: BoltzmannMachine
     curve: list[CurvePoint]
     seconds: float
-
-
-def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Write a checkpoint atomically. After a crash, the previous checkpoint remains."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
-    with temporary.open("wb") as file:
-        torch.save(state, file)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
-
-
-def load_checkpoint(path: Path, digest: str) -> dict[str, Any] | None:
-    """Read a checkpoint. Return None if the file does not exist.
-
-    Raises:
-        RunError: the file cannot be read, or belongs to another configuration or other scenes.
-    """
-    if not path.exists():
-        return None
-    try:
-        state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-    except OSError as error:
-        raise RunError(str(DatasetError.unreadable(path, error))) from error
-    except Exception as error:
-        # The messages of torch have several lines, and advise to load the file without checks.
-        raise RunError(
-            f"{path}: cannot be read: it is damaged or no checkpoint; use --fresh to start over"
-        ) from error
-    if state.get("digest") != digest:
-        raise RunError(
-            f"{path}: belongs to another configuration or other scenes; use --fresh to start over"
-        )
-    return state
 
 
 def write_csv(path: Path, curve: Sequence[CurvePoint]) -> None:
