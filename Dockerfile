@@ -79,9 +79,9 @@ FROM base AS runtime
 COPY --from=service-packages /opt/venv /opt/venv
 COPY clients/python/scene_client ./scene_client
 COPY app ./app
-# Owned by the user, so that a volume mounted here is writable: `python -m app.registry`.
+# A volume mounted here belongs to the service, so `python -m app.registry` can change it.
 COPY --chown=10001:10001 model_store ./model_store
-# A volume mounted here belongs to the service. docker-compose.yml copies the shipped models into it.
+# docker-compose.yml mounts its volume here, and copies the shipped models into it.
 RUN install -d -o 10001 -g 10001 models
 # Compiled for any CPU of the architecture, so that no start compiles. Answers take 10 to 25 % longer
 # than with loops for the own CPU, which `env -u NUMBA_CPU_NAME -u NUMBA_CPU_FEATURES` compiles.

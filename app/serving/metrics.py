@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Iterable
 from functools import partial
 from time import monotonic
 from typing import Final, Literal, get_args
@@ -33,7 +32,6 @@ CONTENT_TYPE: Final = CONTENT_TYPE_PLAIN_0_0_4
 
 Change = Literal["refresh", "alias", "poll"]
 Outcome = Literal["success", "refused", "failed"]
-Info = tuple[str, str, str, str, str]
 
 _SECONDS: Final = (
     *(0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025),
@@ -119,7 +117,7 @@ class Metrics:
         self.max_age = 1.0
         self._written_at = 0.0
         self._text: asyncio.Future[bytes] | None = None
-        self._infos: set[Info] = set()
+        self._infos: set[tuple[str, ...]] = set()
         self._is_ready = False
         # Look-ups of series by label values take a tenth of a request's time in the library. So the
         # series are kept here: of requests, and of the questions of each served model.
@@ -142,7 +140,12 @@ class Metrics:
             for counter, values in zip(findings, _FINDINGS, strict=True):
                 for value in values:
                     counter.labels(*key, value)
-        infos = set(_infos(models))
+        # A model without alias has the alias "".
+        infos = {
+            (*key, model.reference.variant, model.reference.digest, alias)
+            for key, model in models.served.items()
+            for alias in models.aliases[key] or [""]
+        }
         for info in self._infos - infos:
             self._info.remove(*info)
         for info in infos - self._infos:
@@ -228,11 +231,3 @@ class Metrics:
             self._written_at = monotonic()
             self._text = asyncio.ensure_future(asyncio.to_thread(generate_latest, self.registry))
         return await asyncio.shield(self._text)
-
-
-def _infos(models: ServedModels) -> Iterable[Info]:
-    """Yield label values for each pair of model and alias. A model without alias has alias ""."""
-    for key, model in models.served.items():
-        reference = model.reference
-        for alias in models.aliases[key] or [""]:
-            yield (*key, reference.variant, reference.digest, alias)
