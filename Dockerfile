@@ -39,10 +39,16 @@ COPY clients/python/scene_client ./scene_client
 COPY app ./app
 COPY training ./training
 COPY --chown=10001:10001 model_store ./model_store
-# The only writable home under a read-only root is /tmp.
+# Commands run in this folder. A volume mounted here belongs to the user.
+RUN install -d -o 10001 -g 10001 /work
+# Under a read-only root, only /tmp and volumes are writable.
 ENV HOME=/tmp \
-    MPLCONFIGDIR=/tmp/matplotlib
+    MPLCONFIGDIR=/tmp/matplotlib \
+    NUMBA_CACHE_DIR=/work/.compiled \
+    PYTHONPATH=/srv/scene \
+    SCENE_STORE=/srv/scene/model_store
 USER 10001:10001
+WORKDIR /work
 ENTRYPOINT ["python", "-m", "training"]
 CMD ["--help"]
 
@@ -73,9 +79,9 @@ FROM base AS runtime
 COPY --from=service-packages /opt/venv /opt/venv
 COPY clients/python/scene_client ./scene_client
 COPY app ./app
-# Owned by the service, which moves aliases; publishing adds versions beside those shipped.
+# A volume mounted here belongs to the service, so `python -m app.registry` can change it.
 COPY --chown=10001:10001 model_store ./model_store
-# A volume mounted here belongs to the service. docker-compose.yml copies the shipped models into it.
+# docker-compose.yml mounts its volume here, and copies the shipped models into it.
 RUN install -d -o 10001 -g 10001 models
 # Compiled for any CPU of the architecture, so that no start compiles. Answers take 10 to 25 % longer
 # than with loops for the own CPU, which `env -u NUMBA_CPU_NAME -u NUMBA_CPU_FEATURES` compiles.

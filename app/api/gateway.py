@@ -55,8 +55,7 @@ _REQUEST_ID: Final = re.compile(rb"[A-Za-z0-9._~:-]{1,128}")
 _TIMEOUT: Final = re.compile(rb"[1-9][0-9]{0,5}")
 _HOST: Final = re.compile(rb"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(:[0-9]{1,5})?")
 _WITH_BODY: Final = frozenset(("POST", "PUT", "PATCH"))
-# HTTP methods of RFC 9110 and RFC 5789. The metrics count all other methods as "-". Otherwise,
-# clients could create any number of series by inventing methods.
+# HTTP methods of RFC 9110 and RFC 5789. The log shows all other methods as "-".
 _METHODS: Final = frozenset(
     ("GET", "HEAD", "POST", "PUT", "DELETE", "CONNECT", "OPTIONS", "TRACE", "PATCH")
 )
@@ -116,7 +115,7 @@ class Gateway:
 
         async def send_completed(message: Message) -> None:
             if message["type"] == "http.response.start":
-                record.begin(message["status"])
+                record.status = message["status"]
                 if (ticket := state.get("ticket")) is not None:
                     ticket.leave()
                 message["headers"] = _with_defaults(message.get("headers", ()), request_id)
@@ -231,7 +230,7 @@ class Gateway:
         method = scope["method"] if scope["method"] in _METHODS else "-"
         # The log contains the template of the route, because a raw path may contain private data.
         route = getattr(scope.get("route"), "path", "-")
-        self._metrics.answered(route, method, record.outcome, seconds, record.serialise_seconds)
+        self._metrics.answered(route, record.outcome, seconds)
         if self._settings.access_log and _access.isEnabledFor(logging.INFO):
             entry = {
                 "request_id": scope["state"]["request_id"],

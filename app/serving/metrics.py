@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Iterable
 from functools import partial
 from time import monotonic
 from typing import Final, Literal, get_args
@@ -24,20 +23,22 @@ from prometheus_client import (
     generate_latest,
 )
 
+from app.questions.answer import Fields
 from app.serving.admission import Admission
 from app.serving.models import DEFAULT, Key, ServedModels
+from scene_client.schemas.answers import WarningCode
 
 CONTENT_TYPE: Final = CONTENT_TYPE_PLAIN_0_0_4
 
 Outcome = Literal["success", "refused", "failed"]
-Info = tuple[str, str, str, str, str]
 
 _SECONDS: Final = (
     *(0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025),
     *(0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0),
 )
-_ROWS: Final = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 _MODEL: Final = ("model", "version")
+_FINDINGS: Final = (("outlier", "misplaced"), ("ignored", "guessed"), get_args(WarningCode))
+_GUESSES: Final = ("spelling", "head")  # the other rules of `scene_client.schemas.Rule` are certain
 
 # By default, the library adds a second series to each counter, the creation time. Prometheus does
 # not need this series, because it detects restarts itself.
@@ -60,9 +61,7 @@ class Metrics:
         counter = partial(Counter, registry=self.registry)
         gauge = partial(Gauge, registry=self.registry)
         histogram = partial(Histogram, registry=self.registry, buckets=_SECONDS)
-        self._requests = counter(
-            "scene_requests_total", "Requests answered", ("route", "method", "outcome")
-        )
+        self._requests = counter("scene_requests_total", "Requests answered", ("route", "outcome"))
         self._latency = histogram(
             "scene_request_duration_seconds",
             "Seconds from the first byte of the request to the last byte of the response",
@@ -81,16 +80,18 @@ class Metrics:
             "Seconds that a model computed for one question",
             (*_MODEL, "question"),
         )
-        self._rows = histogram(
-            "scene_batch_rows",
-            "Scenes computed for one question: 1, or the number of generated scenes",
-            (*_MODEL, "question"),
-            buckets=_ROWS,
+        self._objects = counter(
+            "scene_objects_total", "Objects of the answered scenes", (*_MODEL, "question")
         )
-        self._serialisation = histogram(
-            "scene_serialisation_duration_seconds",
-            "Seconds from the last answer of a model to the first byte of the response",
+        self._alarms = counter(
+            "scene_alarms_total", "Outliers and misplaced relations in answers", (*_MODEL, "alarm")
         )
+        self._unknown = counter(
+            "scene_unknown_labels_total",
+            "Labels outside the vocabulary that the service ignored or guessed",
+            (*_MODEL, "reading"),
+        )
+        self._warnings = counter("scene_warnings_total", "Warnings in answers", (*_MODEL, "code"))
         pending = gauge(
             "scene_pending", "Weight of the requests that wait or run in each lane", ("lane",)
         )
@@ -113,26 +114,34 @@ class Metrics:
         self.max_age = 1.0
         self._written_at = 0.0
         self._text: asyncio.Future[bytes] | None = None
-        self._infos: set[Info] = set()
+        self._infos: set[tuple[str, ...]] = set()
         self._is_ready = False
         # Look-ups of series by label values take a tenth of a request's time in the library. So the
         # series are kept here: of requests, and of the questions of each served model.
-        self._of_requests: dict[tuple[str, str, str], tuple[Counter, Histogram]] = {}
-        self._of_model: dict[Key, dict[str, tuple[Histogram, Histogram, Histogram]]] = {}
+        self._of_requests: dict[tuple[str, str], tuple[Counter, Histogram]] = {}
+        self._of_model: dict[Key, dict[str, tuple[Histogram, Histogram, Counter]]] = {}
         for outcome in get_args(Outcome):
             self._reloads.labels(outcome)
 
     def serving(self, models: ServedModels) -> None:
         """Report these models as served, and remove the series of all other models."""
+        findings = self._alarms, self._unknown, self._warnings
         for key in self._of_model.keys() - models.served.keys():
-            for question in self._of_model.pop(key):
-                self._compute.remove(*key, question)
-                self._rows.remove(*key, question)
-            self._queue.remove(*key)
-        for key in models.served:
-            self._of_model.setdefault(key, {})
-            self._queue.labels(*key)
-        infos = set(_infos(models))
+            del self._of_model[key]
+            for metric in (self._queue, self._compute, self._objects, *findings):
+                metric.remove_by_labels(dict(zip(_MODEL, key, strict=True)))
+        for key in models.served.keys() - self._of_model.keys():
+            self._of_model[key] = {}
+            # A rate misses the first increase of a series that did not exist before.
+            for counter, values in zip(findings, _FINDINGS, strict=True):
+                for value in values:
+                    counter.labels(*key, value)
+        # A model without alias has the alias "".
+        infos = {
+            (*key, model.reference.variant, model.reference.digest, alias)
+            for key, model in models.served.items()
+            for alias in models.aliases[key] or [""]
+        }
         for info in self._infos - infos:
             self._info.remove(*info)
         for info in infos - self._infos:
@@ -146,34 +155,30 @@ class Metrics:
         """Count one attempt to load changes in the store, with its outcome."""
         self._reloads.labels(outcome).inc()
 
-    def answered(
-        self, route: str, method: str, outcome: str, seconds: float, serialised: float | None = None
-    ) -> None:
+    def answered(self, route: str, outcome: str, seconds: float) -> None:
         """Count one answered request.
 
         Args:
             route: template of the route, or "-" if no route has the requested path.
-            method: HTTP method, or "-" for a method that HTTP does not define.
             outcome: "success" or the slug (short name) of the problem type.
             seconds: duration of the request in seconds.
-            serialised: see `Record.serialise_seconds`.
         """
-        series = self._of_requests.get((route, method, outcome))
+        series = self._of_requests.get((route, outcome))
         if series is None:
-            series = self._requests.labels(route, method, outcome), self._latency.labels(route)
-            self._of_requests[route, method, outcome] = series
+            series = self._requests.labels(route, outcome), self._latency.labels(route)
+            self._of_requests[route, outcome] = series
         requests, latency = series
         requests.inc()
         latency.observe(seconds)
-        if serialised is not None:
-            self._serialisation.observe(serialised)
 
     def entry_answered(self, question: str, outcome: str) -> None:
         """Count one scene of a batch. Its outcome is "success" or the slug of the problem type."""
         self._entries.labels(question, outcome).inc()
 
-    def computed(self, key: Key, question: str, rows: int, waited: float, seconds: float) -> None:
-        """Record one question that a model has computed.
+    def computed(
+        self, key: Key, question: str, waited: float, seconds: float, objects: int, answer: Fields
+    ) -> None:
+        """Record one question that a model has answered.
 
         The method does nothing for a model that is no longer served. Otherwise the removed series
         of this model would appear again.
@@ -181,8 +186,9 @@ class Metrics:
         Args:
             key: name and version of the model.
             question: name of the question.
-            rows: number of scenes of the question. It is 1, or the number of generated scenes.
             waited, seconds: time in seconds before the computation, and of the computation.
+            objects: number of objects in the request.
+            answer: the fields of the answer.
         """
         questions = self._of_model.get(key)
         if questions is None:
@@ -192,10 +198,25 @@ class Metrics:
             series = questions[question] = (
                 self._queue.labels(*key),
                 self._compute.labels(*key, question),
-                self._rows.labels(*key, question),
+                self._objects.labels(*key, question),
             )
-        for histogram, value in zip(series, (waited, seconds, rows), strict=True):
-            histogram.observe(value)
+        queue, compute, asked = series
+        queue.observe(waited)
+        compute.observe(seconds)
+        asked.inc(objects)
+        outliers = [entry["is_outlier"] for entry in answer.get("outliers", ())]
+        misplaced = [entry["is_misplaced"] for entry in answer.get("misplaced", ())]
+        guessed = [mapped.rule in _GUESSES for mapped in answer["mapped"]]
+        for counter, value, number in (
+            (self._alarms, "outlier", sum(outliers)),
+            (self._alarms, "misplaced", sum(misplaced)),
+            (self._unknown, "ignored", len(answer["ignored"])),
+            (self._unknown, "guessed", sum(guessed)),
+        ):
+            if number:
+                counter.labels(*key, value).inc(number)
+        for warning in answer["warnings"]:
+            self._warnings.labels(*key, warning.code).inc()
 
     async def exposition(self) -> bytes:
         """Return all metrics in the text format of Prometheus, at most `max_age` old.
@@ -206,11 +227,3 @@ class Metrics:
             self._written_at = monotonic()
             self._text = asyncio.ensure_future(asyncio.to_thread(generate_latest, self.registry))
         return await asyncio.shield(self._text)
-
-
-def _infos(models: ServedModels) -> Iterable[Info]:
-    """Yield label values for each pair of model and alias. A model without alias has alias ""."""
-    for key, model in models.served.items():
-        reference = model.reference
-        for alias in models.aliases[key] or [""]:
-            yield (*key, reference.variant, reference.digest, alias)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
-from time import monotonic, perf_counter
+from time import monotonic
 from typing import Final, TypeVar
 
 from app.questions.answer import Fields, SizeLimit, envelope
@@ -35,8 +35,6 @@ class Record:
             request used no model.
         compute_seconds: total computation time of the models in seconds, or None if the request
             used no model.
-        answered_at: time of the last answer of a model, as a value of `time.perf_counter`.
-        serialise_seconds: time in seconds from the last answer of a model to the response.
     """
 
     outcome: str = SUCCESS
@@ -44,14 +42,6 @@ class Record:
     models: set[Key] = field(default_factory=set)
     queue_seconds: float | None = None
     compute_seconds: float | None = None
-    answered_at: float | None = None
-    serialise_seconds: float | None = None
-
-    def begin(self, status: int) -> None:
-        """Record that the response starts."""
-        self.status = status
-        if self.answered_at is not None and status < 400:
-            self.serialise_seconds = perf_counter() - self.answered_at
 
     def log_fields(self) -> dict[str, str | float]:
         """Return the fields for the access log line, with times in milliseconds.
@@ -126,7 +116,7 @@ class Request:
             reading, call = read()
             return reading, call()
 
-        rows, is_small = 1, is_quick(scene)
+        is_small = is_quick(scene)
         if not is_small and ticket.lane is not admission.slow:
             await ticket.enter(admission.slow, 1)
         if question.samples:
@@ -134,8 +124,7 @@ class Request:
                 reading, ask = read()
             else:
                 (reading, ask), _ = await in_thread(lambda _: read(), ticket, admission.worker)
-            rows = ask.keywords["count"]
-            weight = rows * (ask.keywords["steps"] or STEPS)
+            weight = ask.keywords["count"] * (ask.keywords["steps"] or STEPS)
             # The models of a client take turns, too.
             await ticket.enter(admission.draws, weight, line=(ticket.client, artifact.key))
             fields, seconds = await in_thread(
@@ -150,19 +139,17 @@ class Request:
         else:
             answered, seconds = await in_thread(lambda _: compute(), ticket, admission.worker)
             reading, fields = answered
-        self._record(artifact.key, question.name, rows, seconds)
         answer = envelope(scene, self.id, artifact.reference, reading)
         warnings = [*reading.warnings, *fields.pop("warnings", ())]
-        return answer | fields | {"warnings": warnings}
-
-    def _record(self, model: Key, name: str, rows: int, seconds: float) -> None:
-        """Record the times of a computation, for log and metrics."""
-        record, waited = self.record, self.ticket.waited
+        answer |= fields | {"warnings": warnings}
+        record, waited = self.record, ticket.waited
         new = waited - (record.queue_seconds or 0.0)
         record.queue_seconds = waited
         record.compute_seconds = (record.compute_seconds or 0.0) + seconds
-        record.answered_at = perf_counter()
-        self.runtime.metrics.computed(model, name, rows, new, seconds)
+        self.runtime.metrics.computed(
+            artifact.key, question.name, new, seconds, len(scene.objects), answer
+        )
+        return answer
 
 
 QUICK_OBJECTS: Final = 32

@@ -141,34 +141,21 @@ def test_variables_are_settings_with_valid_values(
     monkeypatch: pytest.MonkeyPatch, repository: Path, overlay: Overlay
 ) -> None:
     assert set(re.findall(r"\bSCENE_[A-Z0-9_]+", overlay.text)) <= SETTINGS
-    environment = environment_of(overlay)
-    assert environment["SCENE_STORE"] in {"/srv/scene/model_store", "/srv/scene/models"}
-    environment["SCENE_STORE"] = str(repository / "model_store")
+    assert overlay.config["SCENE_STORE"] in {"/srv/scene/model_store", "/srv/scene/models"}
+    # Kubernetes inserts only variables that stand earlier in `env`, so the hosts are last.
+    *earlier, hosts = overlay.container["env"]
+    value = hosts["value"]
+    for name, inserted in (("NAMESPACE", "robots"), ("FURTHER_HOSTS", "robot.example")):
+        assert name in {variable["name"] for variable in earlier}
+        value = value.replace(f"$({name})", inserted)
+    store = str(repository / "model_store")
+    environment = overlay.config | {hosts["name"]: value, "SCENE_STORE": store}
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
-    settings = Settings()
-    assert settings.accepted_hosts == {
+    assert Settings().accepted_hosts == {
         *("scene", "scene.robots", "scene.robots.svc", "scene.robots.svc.cluster.local"),
-        *("[fd00::7]", "127.0.0.1", "localhost"),
+        *("localhost", "robot.example"),
     }
-
-
-def environment_of(overlay: Overlay) -> dict[str, str]:
-    """The environment that Kubernetes would give to the container, without Secrets."""
-    data = overlay.config
-    fields = {"metadata.namespace": "robots", "status.podIP": "fd00::7"}
-    # Kubernetes inserts only variables that stand earlier in `env`.
-    known: dict[str, str] = {}
-    for variable in overlay.container["env"]:
-        source = variable.get("valueFrom", {})
-        if "fieldRef" in source:
-            known[variable["name"]] = fields[source["fieldRef"]["fieldPath"]]
-        elif "configMapKeyRef" in source:
-            known[variable["name"]] = data[source["configMapKeyRef"]["key"]]
-        elif "value" in variable:
-            value = re.sub(r"\$\((\w+)\)", lambda match: known[match[1]], variable["value"])
-            known[variable["name"]] = value
-    return data | known
 
 
 def test_the_grace_period_covers_the_end_of_the_service(overlay: Overlay) -> None:

@@ -22,6 +22,7 @@ pytestmark = pytest.mark.system
     "command",
     [
         "promtool check rules deploy/monitoring/rules.yml",
+        "promtool test rules tests/deploy/alerts.yml",
         "promtool check config --syntax-only deploy/monitoring/prometheus.yml",
         "promtool check config --syntax-only deploy/kubernetes/monitoring/scrape.yaml",
         "haproxy -c -dW -f deploy/haproxy/haproxy.cfg",  # -dW: a warning is an error

@@ -38,7 +38,7 @@ from tests.services import (
 )
 
 SCENE = {"objects": ["bed", "lamp"]}
-QUESTIONS = ("relations", "missing", "outliers", "rooms", "generate")
+FINDINGS = {f"scene_{name}_total" for name in ("objects", "alarms", "unknown_labels", "warnings")}
 OPERATIONS = (REPOSITORY / "docs" / "operations.md").read_text("utf-8")
 
 
@@ -66,15 +66,15 @@ async def samples(client: httpx.AsyncClient) -> dict[tuple[str, ...], float]:
 
 
 def requests(found: dict[tuple[str, ...], float]) -> dict[tuple[str, ...], float]:
-    """(method, outcome, route) → count, without those for the metrics themselves."""
+    """(outcome, route) → count, without those for the metrics themselves."""
     return {
         key[1:]: value
         for key, value in found.items()
-        if key[0] == "scene_requests_total" and key[3] != "/metrics"
+        if key[0] == "scene_requests_total" and key[2] != "/metrics"
     }
 
 
-async def test_requests_are_counted_by_route_method_and_outcome(
+async def test_requests_are_counted_by_route_and_outcome(
     shared_store: Path, replace: Replace
 ) -> None:
     async with serve(shared_store) as client:
@@ -95,18 +95,17 @@ async def test_requests_are_counted_by_route_method_and_outcome(
         found = await samples(client)
     version = "/models/{name}/versions/{version}"
     assert requests(found) == {
-        ("POST", "internal-error", "/outliers"): 1,
-        ("POST", "success", "/missing"): 2,
-        ("POST", "unknown-labels", "/missing"): 1,
-        ("POST", "not-json", "/missing"): 1,
+        ("internal-error", "/outliers"): 1,
+        ("success", "/missing"): 2,
+        ("unknown-labels", "/missing"): 1,
+        ("not-json", "/missing"): 1,
         # Refused before any route was looked for.
-        ("POST", "body-too-large", "-"): 1,
-        ("GET", "model-not-found", version): 1,
-        ("GET", "success", version): 1,
-        ("GET", "success", "-"): 1,
-        ("GET", "not-found", "-"): 2,
-        ("-", "method-not-allowed", "/missing"): 1,
-        ("-", "not-found", "-"): 1,
+        ("body-too-large", "-"): 1,
+        ("model-not-found", version): 1,
+        ("success", version): 1,
+        ("success", "-"): 1,
+        ("not-found", "-"): 3,
+        ("method-not-allowed", "/missing"): 1,
     }
     assert found["scene_request_duration_seconds_count", "/missing"] == 5
 
@@ -124,6 +123,46 @@ async def test_unknown_paths_and_methods_add_no_metrics(client: httpx.AsyncClien
     for number in range(1, 20):
         await ask(number)
     assert set(await samples(client)) == before
+
+
+async def test_alarms_unknown_labels_and_warnings_are_counted(tmp_path: Path) -> None:
+    """As the answers list them, to single questions and to batches."""
+    publish(tmp_path, "home", "1.0.0", alias="default")
+    publish(tmp_path, "unsure", "1.0.0", judges=False)
+    labels = ["sofa", "nightstand", "nigthstand", "toilet", "bed lamp", "flux capacitor"]
+    relations = [{"subject": "sofa", "relation": "front", "object": "nightstand"}]
+    scene = {"objects": labels, "relations": relations, "unknown_labels": "nearest-or-ignore"}
+    async with serve(tmp_path) as client:
+
+        async def ask(path: str, body: dict[str, Any]) -> dict[str, Any]:
+            answer = await client.post(path, json=body)
+            assert answer.status_code == 200
+            return answer.json()
+
+        alarming = scene | {"threshold": 0.0, "sensitivity": "high"}
+        batch = await ask("/outliers/batch", {"scenes": [alarming, {"objects": ["nonsense"]}]})
+        answers = [batch["results"][0]["result"], await ask("/outliers", alarming)]
+        await ask("/rooms", scene)
+        unsure = await ask("/outliers", {"objects": ["bed"], "model": "unsure"})
+        found = await samples(client)
+    alarms = {
+        "outlier": sum(entry["is_outlier"] for one in answers for entry in one["outliers"]),
+        "misplaced": sum(entry["is_misplaced"] for one in answers for entry in one["misplaced"]),
+    }
+    assert all(alarms.values())
+    assert [warning["code"] for warning in unsure["warnings"]] == ["not-judged"]
+    counted = {key: value for key, value in found.items() if value and key[0] in FINDINGS}
+    assert counted == {
+        ("scene_objects_total", "home", "outliers", "1.0.0"): 12,
+        ("scene_objects_total", "home", "rooms", "1.0.0"): 6,
+        ("scene_objects_total", "unsure", "outliers", "1.0.0"): 1,
+        **{("scene_alarms_total", kind, "home", "1.0.0"): n for kind, n in alarms.items()},
+        ("scene_unknown_labels_total", "home", "ignored", "1.0.0"): 3,
+        ("scene_unknown_labels_total", "home", "guessed", "1.0.0"): 6,
+        ("scene_warnings_total", "not-judged", "unsure", "1.0.0"): 1,
+    }
+    # Prometheus needs the zero before the first alarm.
+    assert found["scene_alarms_total", "misplaced", "unsure", "1.0.0"] == 0
 
 
 async def test_metrics_can_be_switched_off(shared_store: Path) -> None:
@@ -166,7 +205,7 @@ async def test_metrics_of_a_removed_model_disappear(
 
     assert await ask("plain") == await ask("home@1.0.0") == 200
     everything = await names("home")
-    assert {"scene_batch_rows_sum", "scene_model_info"} <= everything
+    assert {"scene_objects_total", "scene_alarms_total", "scene_model_info"} <= everything
     assert await names("plain") == everything
     # A request that still holds the old snapshot reports late.
     held = hold("missing", lambda manifest: manifest.name == "plain")
@@ -182,7 +221,7 @@ async def test_metrics_of_a_removed_model_disappear(
     publish(store, "plain", "1.0.0", variant="rbm")
     await load_changes(own)
     assert await ask("plain") == 200
-    assert (await samples(own))["scene_batch_rows_count", "plain", "missing", "1.0.0"] == 1
+    assert (await samples(own))["scene_objects_total", "plain", "missing", "1.0.0"] == 2
 
 
 @pytest.mark.system

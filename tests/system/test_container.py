@@ -71,6 +71,34 @@ def test_services_are_confined(compose: dict[str, Any], name: str) -> None:
     assert all("/var/run" not in volume for volume in service["volumes"])
 
 
+def test_training_works_in_volumes_that_belong_to_its_user(
+    stages: dict[str, str], compose: dict[str, Any]
+) -> None:
+    """Under a read-only root, a command can write to volumes and to /tmp only."""
+    stage = stages["train"]
+    mounted = {mount.split(":")[-2 if mount.endswith(":ro") else -1]: mount.endswith(":ro")
+               for mount in compose["services"]["train"]["volumes"]}  # fmt: skip
+    settings = dict(re.findall(r"([A-Z_]+)=(\S+)", stage.split("ENV ")[1]))
+    (folder,) = re.findall(r"^WORKDIR (\S+)$", stage, re.MULTILINE)
+    assert mounted == {folder: False, settings["SCENE_STORE"]: False, "/data": True}
+    assert f"install -d -o 10001 -g 10001 {folder}\n" in stage
+    assert "COPY --chown=10001:10001 model_store ./model_store\n" in stage
+    assert settings["NUMBA_CACHE_DIR"].startswith(f"{folder}/")
+    assert settings["PYTHONPATH"] == "/srv/scene"  # `python -m training` from another folder
+
+
+def test_the_context_has_every_file_that_a_stage_copies(
+    stages: dict[str, str], repository: Path
+) -> None:
+    ignored, *included = (repository / ".dockerignore").read_text("utf-8").split("\n!")
+    included[-1] = included[-1].partition("\n")[0]
+    assert ignored.endswith("*")
+    copied = re.findall(
+        r"^COPY (?!--from)(?:--\S+ )?(.+) \S+$", "".join(stages.values()), re.MULTILINE
+    )
+    assert {file for files in copied for file in files.split()} == set(included)
+
+
 def test_ports_are_published_on_this_machine_only(compose: dict[str, Any]) -> None:
     ports = {name: service.get("ports", []) for name, service in compose["services"].items()}
     assert ports["scene"] == ports["train"] == []

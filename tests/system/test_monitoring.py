@@ -38,16 +38,23 @@ def test_queries_use_metrics_and_outcomes_of_the_service(path: Path) -> None:
         assert {*outcomes.split("|")} <= OUTCOMES
 
 
-def test_the_dashboard_shows_every_metric() -> None:
-    assert metrics_of(DASHBOARD.read_text("utf-8")) == documented_metrics().keys()
+def test_the_dashboard_shows_every_metric_and_label() -> None:
+    text = DASHBOARD.read_text("utf-8")
+    assert metrics_of(text) == documented_metrics().keys()
+    labels = set().union(*(labels for _, labels, _ in documented_metrics().values()))
+    assert labels <= set(re.findall(r"\w+", text))
 
 
 def test_the_pieces_of_the_profile_find_each_other(compose: dict[str, Any]) -> None:
     services = compose["services"]
     config = yaml.safe_load((FOLDER / "prometheus.yml").read_text("utf-8"))
     (scraped,) = config["scrape_configs"]
+    (search,) = scraped["dns_sd_configs"]
+    # The name of a service has the addresses of all its containers.
+    assert search["names"] == ["scene"]
+    assert search["names"][0] in services
     port = services["scene"]["environment"]["SCENE_PORT"]
-    assert scraped["static_configs"] == [{"targets": [f"scene:{port}"]}]
+    assert (search["type"], str(search["port"])) == ("A", port)
     key = scraped["authorization"]["credentials_file"]
     assert f"${{API_KEY_FILE:-/dev/null}}:{key}:ro" in services["prometheus"]["volumes"]
 
