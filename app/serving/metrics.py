@@ -114,7 +114,7 @@ class Metrics:
         self.max_age = 1.0
         self._written_at = 0.0
         self._text: asyncio.Future[bytes] | None = None
-        self._infos: set[tuple[str, ...]] = set()
+        self._infos: set[tuple[str, str, str, str, str]] = set()
         self._is_ready = False
         # Look-ups of series by label values take a tenth of a request's time in the library. So the
         # series are kept here: of requests, and of the questions of each served model.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import sys
@@ -41,6 +42,17 @@ def test_a_configuration_has_no_lint(
     monkeypatch.setenv("PROXY_BACKEND", "127.0.0.1:8000")
     program, *arguments = command.split()
     run_program(require_system_tool(program), *arguments)
+
+
+def test_the_queries_of_the_dashboard_can_be_parsed(
+    require_system_tool: Callable[[str], Path], repository: Path, tmp_path: Path
+) -> None:
+    dashboard = (repository / "deploy/monitoring/grafana/dashboards/scene.json").read_text("utf-8")
+    panels = json.loads(dashboard.replace("$__rate_interval", "1m"))["panels"]
+    queries = [target["expr"] for panel in panels for target in panel.get("targets", ())]
+    rules = [{"record": f"query{n}", "expr": query} for n, query in enumerate(queries)]
+    (tmp_path / "rules.yml").write_text(yaml.dump({"groups": [{"name": "all", "rules": rules}]}))
+    run_program(require_system_tool("promtool"), "check", "rules", tmp_path / "rules.yml")
 
 
 def test_workflows_run_every_python_of_the_packages(repository: Path) -> None:

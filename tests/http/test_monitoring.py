@@ -166,7 +166,7 @@ async def test_alarms_unknown_labels_and_warnings_are_counted(tmp_path: Path) ->
 
 
 async def test_metrics_can_be_switched_off(shared_store: Path) -> None:
-    async with serve(shared_store, metrics=False) as client:
+    async with serve(shared_store, metrics=False, request_timeout_ms=60_000) as client:
         assert (await client.post("/missing", json=SCENE)).status_code == 200
         problem(await client.get("/metrics"), 404, "not-found")
         assert "/metrics" not in (await client.get("/openapi.json")).json()["paths"]
