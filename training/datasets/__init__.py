@@ -4,7 +4,6 @@ from training.datasets.encoding import EncodedScene, annotated_classes, encode
 from training.datasets.readers import read_scenes
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
 from training.datasets.rooms import generate_rooms, rooms_vocabulary
-from training.datasets.shuffling import shuffle_objects
 from training.datasets.splits import split
 from training.datasets.vocabulary import source_vocabulary
 
@@ -18,7 +17,6 @@ __all__ = [
     "generate_rooms",
     "read_scenes",
     "rooms_vocabulary",
-    "shuffle_objects",
     "source_vocabulary",
     "split",
 ]

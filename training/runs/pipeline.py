@@ -23,7 +23,6 @@ from training.datasets import (
     priors,
     read_scenes,
     rooms_vocabulary,
-    shuffle_objects,
     source_vocabulary,
     split,
 )
@@ -45,18 +44,16 @@ class SplitScenes:
     parts: dict[str, list[EncodedScene]]
     counts: dict[str, int]  # number of scenes, by source
     digests: dict[str, str]  # sha256 of the contents of the scenes, by source
-    shuffle: int | None = None  # seed of the permutation of objects, if they are permuted
     words: torch.Tensor | None = None  # (V, D) unit word vectors of the classes
     examples: tuple[Example, ...] = ()  # for the artifact
 
     @property
     def digest(self) -> str:
-        """The sha256 of the training input: scenes, vocabulary, split and permutation."""
+        """The sha256 of the training input: scenes, vocabulary and split."""
         decisive = {
             "data": self.data.model_dump(mode="json"),
             "contents": self.digests,
             "vocabulary": self.vocabulary.to_dict(),
-            "shuffle": self.shuffle,
         }
         return hashlib.sha256(json.dumps(decisive).encode()).hexdigest()
 
@@ -98,14 +95,6 @@ class SplitScenes:
                     f"the {part} part contains no scenes: provide more scenes or more groups"
                 )
         return self.training_data()
-
-    def shuffled(self, seed: int) -> SplitScenes:
-        """Return a copy in which objects are permuted between scenes, except in test scenes."""
-        permuted = {
-            part: shuffle_objects(self.parts[part], self.vocabulary.structure, seed)
-            for part in ("train", "validation")
-        }
-        return replace(self, parts=self.parts | permuted, shuffle=seed)
 
 
 def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]]:

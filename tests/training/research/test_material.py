@@ -50,8 +50,6 @@ def test_all_that_decides_what_is_learnt_is_in_the_digest(tmp_path):
         material(tmp_path, split="stable"),
         material(tmp_path, split_seed=1),
         material(tmp_path, limit=40),
-        scenes.shuffled(0),
-        scenes.shuffled(1),
     ]
     write_scenes(tmp_path, "flats", seed=1)
     others.append(material(tmp_path))
