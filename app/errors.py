@@ -29,6 +29,7 @@ Step = Literal[
     "readiness",  # readiness checks
     "route",  # all routes
     "scene",  # routes that answer a question about one scene
+    "word",  # routes with a label in their path
     "http",  # errors of Starlette: `HTTPException` with the same status
 ]
 """A step of a request. The steps of a route determine the errors in its documentation."""
@@ -250,12 +251,12 @@ class UnsupportedMediaTypeError(
     """
 
 
-class InvalidRequestError(RequestError, slug="invalid-request", status=422, steps=("body",)):
+class InvalidRequestError(RequestError, slug="invalid-request", status=422, steps=("body", "word")):
     """The request is not valid for this route.
 
     The body is JSON, but does not match the schema of this route. `errors` lists the errors. The
     `pointer` of an error is a JSON pointer into the body. `suggestions` lists the nearest valid
-    names.
+    names. A label in a path has at most 100 characters.
     """
 
     example = _example("#/objects/1/confidence", "must be greater than 0")

@@ -112,7 +112,7 @@ class _Environment(EnvSettingsSource):
             name = variable.upper().removeprefix(_PREFIX)
             if name == variable.upper() or not value or name in known:
                 continue
-            if _SERVICE_LINK.fullmatch(f"{name}={value}"):
+            if _SERVICE_LINK.fullmatch(f"{name}={value}"[:256]):
                 continue
             message = "unknown setting; docs/operations.md lists the settings"
             if name in _REMOVED:

@@ -15,12 +15,14 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from app.api.openapi import error_responses
+from app.errors import InvalidRequestError
 from app.registry import Artifact
 from app.scene.relations import relation_names
 from app.scene.vocabulary import ObjectClass
 from app.serving.models import ServedModels
 from app.serving.runtime import Runtime
 from scene_client import schemas
+from scene_client.schemas.requests import MAX_LABEL
 
 _ERRORS: Final = error_responses("admission", "models", "name")
 _LOADED_ERRORS: Final = error_responses("admission", "models", "name", "model")
@@ -35,7 +37,7 @@ Reference = Annotated[
 Word = Annotated[
     str,
     Path(
-        description="a label of an object, as a detector writes it",
+        description=f"a label of an object with at most {MAX_LABEL} characters",
         openapi_examples={"alias": {"summary": "an alias", "value": "bedside cabinet"}},
     ),
 ]
@@ -117,13 +119,15 @@ async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> Response:
 @router.get(
     "/{name}/vocabulary/{word:path}",
     summary="The class of a label",
-    responses=_LOADED_ERRORS,
+    responses=_LOADED_ERRORS | {422: error_responses("word")[422]},
     response_model_exclude_none=True,
 )
 async def show_word(
     http: Request, name: Reference, word: Word, runtime: RuntimeDep
 ) -> schemas.WordAnswer:
     """Return the class that a label of an object becomes, and by which rule."""
+    if len(word) > MAX_LABEL:
+        raise InvalidRequestError(detail=f"A label has at most {MAX_LABEL} characters.")
     served = runtime.models.resolve(name)
     vocabulary = served.vocabulary
 
@@ -134,7 +138,7 @@ async def show_word(
             matches = vocabulary.nearest(word)
             return answer(suggestions=[vocabulary.labels[match.entry] for match in matches])
         entry = _class(vocabulary.objects[reading.entry])
-        return answer(class_=entry, rule=reading.rule, certain=reading.certain)
+        return answer(class_=entry, rule=reading.rule, certain=reading.is_certain)
 
     # A guess compares the label with all names, which takes milliseconds.
     return await runtime.admission.in_worker(http.state.ticket, look_up)

@@ -7,7 +7,6 @@ correct all errors at once.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final
@@ -21,19 +20,40 @@ from app.errors import (
     some_of,
 )
 from app.scene.labels import label_key
-from app.scene.nearest import Guess, Match, spelt_alike
+from app.scene.nearest import spelt_alike
 from app.scene.scene import SceneObject
 from app.scene.vocabulary import Vocabulary
-from scene_client.schemas import Mapped, UnknownLabels
+from scene_client.schemas import Mapped, RoomsRequest, SceneRequest, UnknownLabels
 from scene_client.validation import MAX_ERRORS, PLAIN
 
 MAX_SUGGESTED: Final = 32
-"""Maximum number of searches for classes similar to an unknown label, per scene.
+"""Maximum number of unknown labels that the service maps to the nearest class, per scene.
 
-The same number limits the errors with suggestions per request.
+The same number limits the errors with suggestions, per request.
 """
 MAX_MAPPED: Final = 256
 """Maximum number of unknown labels per request that the service maps to the nearest class."""
+# Rules for the spellings of a name that the vocabulary lists.
+_SPELLINGS: Final = ("label", "alias", "phrase")
+_SEARCHES: Final[dict[UnknownLabels, tuple[str, ...]]] = {
+    "error": ("read", "nearest"),
+    "ignore": ("read",),
+    "nearest": ("read", "guess", "nearest"),
+    "nearest-or-ignore": ("read", "guess"),
+}
+"""Names of the methods of `Vocabulary` that search for a label, for each treatment."""
+
+
+def new_labels(request: SceneRequest, vocabulary: Vocabulary) -> int:
+    """Return how many labels of objects and candidates need a search, which takes up to 1 ms."""
+    searches = _SEARCHES[request.unknown_labels]
+    labels = [entry if isinstance(entry, str) else entry.label for entry in request.objects]
+    new = sum(not vocabulary.remembers(label, searches) for label in labels)
+    is_room = isinstance(request, RoomsRequest)
+    candidates: Sequence[str] = getattr(request, "candidates", None) or ()
+    return new + sum(
+        not vocabulary.remembers(label, searches, is_room=is_room) for label in candidates
+    )
 
 
 @dataclass(slots=True)
@@ -82,39 +102,18 @@ _Key = tuple[int, str, bool]
 
 @dataclass(slots=True)
 class LookUps:
-    """Searches for classes similar to unknown labels, shared by all scenes of one request.
-
-    This class limits the number of searches, because a search takes 0.2 ms, and a batch may contain
-    10,000 unknown labels.
+    """Searches for names similar to unknown labels. The scenes of a request share their limits.
 
     Attributes:
-        suggestions: number of errors of the request that already have suggestions, or for which the
-            service has looked for similar ids.
+        suggestions: number of errors that already have suggestions, or for which the service has
+            searched similar ids.
+        searched: labels for which the service has searched similar names.
+        guessed: labels for which the service has searched the nearest class.
     """
 
     suggestions: int = 0
-    _guesses: dict[_Key, Guess | None] = field(default_factory=dict)
-    _similar: dict[_Key, tuple[Match, ...]] = field(default_factory=dict)
-
-    def guess(self, vocabulary: Vocabulary, label: str, *, is_room: bool) -> Guess | None:
-        """Return what an unknown label probably stands for.
-
-        Raises:
-            OverflowError: the request has had `MAX_MAPPED` guesses.
-        """
-        key = id(vocabulary), label, is_room
-        if key not in self._guesses and len(self._guesses) >= MAX_MAPPED:
-            raise OverflowError
-        if key not in self._guesses:
-            self._guesses[key] = vocabulary.guess(label, is_room=is_room)
-        return self._guesses[key]
-
-    def similar(self, vocabulary: Vocabulary, label: str, *, is_room: bool) -> tuple[Match, ...]:
-        """Return the names most similar to a label, or none after `MAX_SUGGESTED` searches."""
-        key = id(vocabulary), label, is_room
-        if key not in self._similar and len(self._similar) < MAX_SUGGESTED:
-            self._similar[key] = vocabulary.nearest(label, is_room=is_room)
-        return self._similar.get(key, ())
+    searched: set[_Key] = field(default_factory=set)
+    guessed: set[_Key] = field(default_factory=set)
 
 
 @dataclass(slots=True)
@@ -128,6 +127,7 @@ class Unknown:
         ignored: names of the ignored objects.
         mapped: the class that replaces each label, also for aliases of candidates and room types. A
             key consists of the label and whether it is a room type.
+        guessed: labels for which the service has searched the nearest class.
     """
 
     vocabulary: Vocabulary
@@ -135,7 +135,7 @@ class Unknown:
     look_ups: LookUps
     ignored: list[str] = field(default_factory=list)
     mapped: dict[tuple[str, bool], Mapped] = field(default_factory=dict)
-    _guesses: dict[tuple[str, bool], Guess | None] = field(default_factory=dict)
+    guessed: set[_Key] = field(default_factory=set)
 
     def resolve(
         self, label: str, name: str, location: Location, errors: ErrorList, *, is_room: bool = False
@@ -154,53 +154,46 @@ class Unknown:
         Returns:
             Index of the class or room type. None means that the label is ignored or refused.
         """
-        vocabulary = self.vocabulary
-        index = vocabulary.room_index(label) if is_room else vocabulary.index(label)
-        if index is not None:
-            # Answers name objects by id, but room types and candidates by their canonical names.
-            if location[0] != "objects":
-                self._list_alias(label, index, is_room=is_room)
-            return index
-        match = vocabulary.read(label, is_room=is_room)
-        if match is None and self.treatment.startswith("nearest"):
-            match = self._guess(label, is_room=is_room)
-        if match is not None:
-            self._list(label, match, is_room=is_room)
-            return match.entry
-        if self.treatment.endswith("ignore"):
+        found = self.vocabulary.read(label, is_room=is_room)
+        if found is None and self._may_guess(label, is_room=is_room):
+            found = self.vocabulary.guess(label, is_room=is_room)
+        if found is None and self.treatment.endswith("ignore"):
             self.ignored.append(name)
-        else:
+        elif found is None:
             self._refuse(label, location, errors, is_room=is_room)
-        return None
+        # Answers name objects by id, but room types and candidates by their canonical names.
+        elif found.rule not in (_SPELLINGS if location[0] == "objects" else ("label",)):
+            names = self.vocabulary.room_types if is_room else self.vocabulary.labels
+            self.mapped[label, is_room] = Mapped(
+                label=label,
+                class_=names[found.entry],
+                similarity=found.similarity,
+                rule=found.rule,  # type: ignore[arg-type]
+            )
+        return None if found is None else found.entry
 
     def resolve_all(
         self, labels: Sequence[str], field: str, errors: ErrorList, *, is_room: bool = False
     ) -> list[int]:
         """Return the different classes or room types of the labels in a field of the request."""
-        indices = [
-            self.resolve(label, label, (field, position), errors, is_room=is_room)
-            for position, label in enumerate(labels)
-        ]
-        return list(dict.fromkeys(index for index in indices if index is not None))
+        indices: dict[int | None, None] = {}
+        for position, label in enumerate(labels):
+            indices[self.resolve(label, label, (field, position), errors, is_room=is_room)] = None
+            if errors.by_class and errors.are_many:
+                break
+        return [index for index in indices if index is not None]
 
-    def _list_alias(self, label: str, index: int, *, is_room: bool) -> None:
-        rule = self.vocabulary.rule_of(label, index, is_room=is_room)
-        if rule != "label":
-            self._list(label, Guess(index, 1.0, rule), is_room=is_room)
-
-    def _list(self, label: str, match: Guess, *, is_room: bool) -> None:
-        entry, similarity, rule = match
-        names = self.vocabulary.room_types if is_room else self.vocabulary.labels
-        mapped = Mapped(label=label, class_=names[entry], similarity=similarity, rule=rule)
-        self.mapped[label, is_room] = mapped
-
-    def _guess(self, label: str, *, is_room: bool) -> Guess | None:
-        key = label, is_room
-        if key in self._guesses or len(self._guesses) < MAX_SUGGESTED:
-            with suppress(OverflowError):
-                guess = self.look_ups.guess(self.vocabulary, label, is_room=is_room)
-                return self._guesses.setdefault(key, guess)
-        return None
+    def _may_guess(self, label: str, *, is_room: bool) -> bool:
+        """Return whether the service may search the class nearest to a label, and count it."""
+        if not self.treatment.startswith("nearest"):
+            return False
+        key = id(self.vocabulary), label, is_room
+        limits = ((self.guessed, MAX_SUGGESTED), (self.look_ups.guessed, MAX_MAPPED))
+        if any(key not in guessed and len(guessed) >= most for guessed, most in limits):
+            return False
+        for guessed, _ in limits:
+            guessed.add(key)
+        return True
 
     def _refuse(self, label: str, location: Location, errors: ErrorList, *, is_room: bool) -> None:
         names = self.vocabulary.room_types if is_room else self.vocabulary.labels
@@ -211,14 +204,18 @@ class Unknown:
             message = "this model does not have room types"
             if names:
                 message = f"the model does not know this room type; it knows {some_of(names)}"
-        if self.treatment == "nearest" and (label, is_room) not in self._guesses:
+        key = id(self.vocabulary), label, is_room
+        if self.treatment == "nearest" and key not in self.guessed:
             message += (
                 f"; the service maps at most {MAX_SUGGESTED} unknown labels per scene and "
                 f"{MAX_MAPPED} per batch to the nearest class"
             )
         suggestions: list[str] = []
-        if self.look_ups.suggestions < MAX_SUGGESTED:
-            matches = self.look_ups.similar(self.vocabulary, label, is_room=is_room)
+        searched = self.look_ups.searched
+        may_search = key in searched or len(searched) < MAX_SUGGESTED
+        if may_search and self.look_ups.suggestions < MAX_SUGGESTED:
+            searched.add(key)
+            matches = self.vocabulary.nearest(label, is_room=is_room)
             suggestions = [names[match.entry] for match in matches]
         self.look_ups.suggestions += bool(suggestions)
         errors.add(UnknownLabelsError, location, message, suggestions)

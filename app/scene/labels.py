@@ -14,11 +14,13 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import lru_cache
-from typing import Final, Literal
+from itertools import islice
+from typing import Final, Literal, NamedTuple
 
 Rule = Literal[
+    "label",
     "alias",
     "phrase",
     "qualifier",
@@ -31,6 +33,29 @@ Rule = Literal[
 ]
 """How a label was read. The rules "spelling" and "head" are guesses of `app.scene.nearest`."""
 
+
+class LookUp(NamedTuple):
+    """The index of the class or room type that a label becomes, and the rule.
+
+    Attributes:
+        similarity: similarity of both names, from 0 to 1.
+    """
+
+    entry: int
+    similarity: float
+    rule: Rule
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether every request accepts the label. Other labels need `unknown_labels: nearest`."""
+        return self.rule not in ("spelling", "head")
+
+
+LONGEST: Final = 256
+"""Maximum length of a name after Unicode normalisation, which can turn one character into 18."""
+
+# The time of each pattern grows linearly with the length of a label: two repetitions that follow
+# each other never match the same character.
 _SEPARATORS: Final = re.compile(r"[\s_\-./'’‐-―]+")
 
 # Words with these endings stay unchanged. Such words are not plurals, or their singular has another
@@ -67,7 +92,7 @@ _IRREGULAR: Final = {
 }
 _IRREGULAR_ENDINGS: Final = tuple(_IRREGULAR)
 
-_OF: Final = re.compile(r"[\s_\-.]+of[\s_\-.]+", re.IGNORECASE)
+_OF: Final = re.compile(r"[\s_\-.]of[\s_\-.]+", re.IGNORECASE)
 # The phrase "bottle of milk" means the container, a bottle. "pile of books" means the members,
 # books.
 _CONTAINERS: Final = frozenset(
@@ -127,7 +152,8 @@ def label_key(label: str) -> str:
 
     The key ignores case, Unicode compatibility variants, separators (whitespace, ``_ - . / '``) and
     a final plural: "Night-Stands", "night_stand" and "nightstand" have the key "nightstand". A
-    label that contains only separators has the empty key. The key of a key is the same key.
+    label that contains only separators has the empty key. The key of a key is the same key. A label
+    with more than `LONGEST` characters after Unicode normalisation is its own key.
     """
     if label.isascii():
         return singular(_SEPARATORS.sub("", label.casefold()))
@@ -139,59 +165,89 @@ def label_key(label: str) -> str:
 
 
 def split_words(label: str) -> tuple[str, ...]:
-    """Return the words of a label in lower case and in the singular."""
-    folded = unicodedata.normalize("NFKC", label).casefold()
-    return tuple(singular(word) for word in _SEPARATORS.split(folded) if word)
+    """Return the words of a label in lower case and in the singular.
+
+    A label with more than `LONGEST` characters after Unicode normalisation has no words.
+    """
+    folded = unicodedata.normalize("NFKC", label)
+    if len(folded) > LONGEST:
+        return ()
+    return tuple(singular(word) for word in _SEPARATORS.split(folded.casefold()) if word)
 
 
 def _fold_unicode(label: str) -> str:
-    composed = unicodedata.normalize("NFKC", label).casefold()
-    return singular(_SEPARATORS.sub("", unicodedata.normalize("NFKC", composed)))
+    composed = unicodedata.normalize("NFKC", label)
+    if len(composed) > LONGEST:
+        return label
+    composed = unicodedata.normalize("NFKC", composed.casefold())
+    return singular(_SEPARATORS.sub("", composed))
 
 
 # ------------------------------------------------------------------------------------ syntax
 
-_QUALIFIED: Final = re.compile(r"(.*?[^\W_])[\s_]*\(([^()]*)\).*")
+# Labels of real detectors need at most four readings.
+_MOST_READINGS: Final = 5
+_MOST_READ_AGAIN: Final = 2
+
+_QUALIFIED: Final = re.compile(r"([^\W_])[\s_]*\(([^()]*)\)")
 _OR: Final = re.compile(r"[/\\,;]+")
-_MOST_ALTERNATIVES: Final = 8
-_ARTICLE: Final = re.compile(r"(?:an?|the)[\s_]+(.+)", re.IGNORECASE)
-# Suffixes: coordinates ("Bed|-01.0|+00.0"), numbers ("chair_12", "cup.001", "chair12") and
-# hexadecimal ids that contain a digit ("Mug_b045e42b"). Prefixes: numbers ("011_banana").
-_INSTANCE: Final = re.compile(
-    r"(?:\d+_)?(.*?[^\W\d_])(?:\|.*|\d+|(?:[\s_\-#.:]+(?=[a-f]*\d)[\da-f]+%?)*)", re.IGNORECASE
-)
+_ARTICLE: Final = re.compile(r"(?:an?|the)[\s_]+", re.IGNORECASE)
 _PROMPT: Final = re.compile(
-    r"(?:an?|the)[\s_](?:[\w-]+[\s_]){0,2}(?:photo|photograph|picture|image)[\s_]of[\s_]"
-    r"(?:(?:an?|the|some|one)[\s_])?(.+)",
+    r"(?:an?|the)[\s_](?:[^\s_]+[\s_]){0,2}(?:photo|photograph|picture|image)[\s_]of[\s_]"
+    r"(?:(?:an?|the|some|one)[\s_])?",
     re.IGNORECASE,
 )
+# Prefixes of instances: numbers ("011_banana"). Suffixes: coordinates ("Bed|-01.0|+00.0"), numbers
+# ("chair_12", "cup.001", "chair12") and hexadecimal ids that contain a digit ("Mug_b045e42b").
+_NUMBER: Final = re.compile(r"\d+_")
+_COORDINATES: Final = re.compile(r"[^\W\d_]\|")
+# This pattern matches the reversed label. A search from the front would start at each letter.
+_IDS: Final = re.compile(
+    r"(?:(?:%?(?=[a-f]*\d)[\da-f]+[\s_\-#.:]+)+|\d*)(?=[^\W\d_])", re.IGNORECASE
+)
 
 
-def readings(label: str, depth: int = 2) -> Iterator[tuple[Rule, str]]:
+def readings(label: str) -> Iterator[tuple[Rule, str]]:
     """Yield pairs (rule, name) of the names in a detector's label, most certain name first.
 
-    Args:
-        depth: maximum number of rules in sequence. For example, "a photo of a sofa/couch" needs
-            two rules. The pair contains the first rule.
+    A name can need two rules: "a photo of a sofa/couch". Its pair contains the first rule. The
+    function yields at most `_MOST_READINGS` pairs.
     """
-    pairs = [(rule, name) for rule, read in _RULES.items() for name in read(label)]
+    return islice(_readings(label), _MOST_READINGS)
+
+
+def _readings(label: str) -> Iterator[tuple[Rule, str]]:
+    pairs = _by_one_rule(label)
     yield from pairs
-    if depth > 1:
-        for rule, name in pairs:
-            yield from ((rule, inner) for _, inner in readings(name, depth - 1))
+    parts = [pair for pair in pairs if pair[1] in label]  # without combinations of parts
+    for first, name in parts[:_MOST_READ_AGAIN]:
+        for rule, inner in _by_one_rule(name):
+            if rule != first:
+                yield first, inner
 
 
-def _qualifier(label: str) -> list[str]:
-    """Return name and qualifier together in both orders, and the name alone."""
-    if (match := _QUALIFIED.fullmatch(label)) is None:
-        return []
-    name, qualifier = match.groups()
-    return [f"{qualifier} {name}", f"{name} {qualifier}", name]
+def _by_one_rule(label: str) -> list[tuple[Rule, str]]:
+    """Return the readings by a single rule."""
+    pairs: list[tuple[Rule, str]] = []
+    if (match := _QUALIFIED.search(label)) is not None:
+        name, qualifier = label[: match.end(1)], match[2]
+        # The vocabulary can have a class for name and qualifier together.
+        names = (f"{qualifier} {name}", f"{name} {qualifier}", name)
+        pairs += [("qualifier", one) for one in names]
+    pairs += [("alternative", part) for part in _alternatives(label)]
+    prompt, article = _PROMPT.match(label), _ARTICLE.match(label)
+    if prompt is None and article is not None:
+        pairs.append(("article", label[article.end() :]))
+    if (name := _without_instance(label)) != label:
+        pairs.append(("instance", name))
+    if prompt is not None:
+        pairs.append(("prompt", label[prompt.end() :]))
+    return pairs
 
 
-def _alternative(label: str) -> list[str]:
+def _alternatives(label: str) -> list[str]:
     """Return the alternatives. In "coffee/side table", the alternatives share the last word."""
-    parts = [part for part in map(str.strip, _OR.split(label, _MOST_ALTERNATIVES)) if part]
+    parts = [part for part in map(str.strip, _OR.split(label, _MOST_READINGS)) if part]
     if len(parts) < 2:
         return []
     last_words = parts[-1].split()
@@ -200,20 +256,11 @@ def _alternative(label: str) -> list[str]:
     return parts
 
 
-def _matched(pattern: re.Pattern[str]) -> Callable[[str], list[str]]:
-    """Return a function that returns group 1 of the pattern, unless it is the whole label."""
-
-    def read(label: str) -> list[str]:
-        match = pattern.fullmatch(label)
-        return [] if match is None or match[1] == label else [match[1]]
-
-    return read
-
-
-_RULES: Final[dict[Rule, Callable[[str], list[str]]]] = {
-    "qualifier": _qualifier,
-    "alternative": _alternative,
-    "article": _matched(_ARTICLE),
-    "instance": _matched(_INSTANCE),
-    "prompt": _matched(_PROMPT),
-}
+def _without_instance(label: str) -> str:
+    """Return the label without the number, coordinates and ids of an instance."""
+    number = _NUMBER.match(label)
+    name = label if number is None else label[number.end() :]
+    if (coordinates := _COORDINATES.search(name)) is not None:
+        return name[: coordinates.start() + 1]
+    ids = _IDS.match(name[::-1])
+    return label if ids is None else name[: len(name) - ids.end()]

@@ -23,7 +23,7 @@ from typing import Final, NamedTuple
 from rapidfuzz import process
 from rapidfuzz.distance import OSA, Levenshtein
 
-from app.scene.labels import Rule, head_of, split_words
+from app.scene.labels import LookUp, head_of, split_words
 
 LONGEST: Final = 64
 """Maximum length of a name whose spelling the search compares, in characters.
@@ -92,14 +92,6 @@ class Match(NamedTuple):
     similarity: float
 
 
-class Guess(NamedTuple):
-    """The entry that an unknown name probably stands for."""
-
-    entry: int
-    similarity: float
-    rule: Rule
-
-
 class NameIndex:
     """Search for entries, such as object classes, with names similar to an unknown name.
 
@@ -120,7 +112,7 @@ class NameIndex:
         for word in sorted({*self._known_words, *self._keys}):
             self._lexicon.setdefault(len(word), []).append(word)
 
-    def guess(self, name: str) -> Guess | None:
+    def guess(self, name: str) -> LookUp | None:
         """Return the entry that a name probably stands for, or None.
 
         The function first compares the spelling of the whole name, and then its last words.
@@ -142,7 +134,7 @@ class NameIndex:
             return None
         return self._by_head_words(words[:end])
 
-    def _by_head_words(self, words: Sequence[str]) -> Guess | None:
+    def _by_head_words(self, words: Sequence[str]) -> LookUp | None:
         """Return the entry whose name is the longest end of a phrase, or None.
 
         A phrase with an imitation, such as "toy trailer", stands for the imitation ("toy").
@@ -153,12 +145,12 @@ class NameIndex:
             if start and len(head) == 1 and head[0] in _AMBIGUOUS:
                 return None
             if (entry := self._by_key.get("".join(head))) is not None:
-                return Guess(entry, _BY_HEAD, "head")
+                return LookUp(entry, _BY_HEAD, "head")
         return None
 
     def _by_corrections(
         self, words: Sequence[str], corrections: Mapping[str, Sequence[tuple[str, int]]]
-    ) -> Guess | None:
+    ) -> LookUp | None:
         """Return the entry whose name is the phrase, perhaps with misspelt words.
 
         The result is None if the edits cost too much, or if another entry costs about the same.
@@ -182,7 +174,7 @@ class NameIndex:
         second_cost = others[0][1][0] if others else math.inf
         if cost > max_cost or second_cost - cost <= _MARGIN:
             return None
-        return Guess(entry, round(1 - cost / 10 / len("".join(words)), 3), "spelling")
+        return LookUp(entry, round(1 - cost / 10 / len("".join(words)), 3), "spelling")
 
     def _corrections(self, word: str) -> list[tuple[str, int]]:
         """Return the known words with a similar spelling, as pairs (known word, cost of the edits).

@@ -4,21 +4,44 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any, ClassVar, Final, Literal, NamedTuple
+from functools import cached_property, wraps
+from typing import Any, ClassVar, Final, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from app.scene.labels import Rule, head_of, label_key, readings
-from app.scene.nearest import Guess, Match, NameIndex
+from app.scene.labels import LookUp, Rule, head_of, label_key, readings
+from app.scene.nearest import Match, NameIndex
 from app.scene.scene import SceneObject
 
 Extents = tuple[float, float, float]
 
 _TIGHT: Final = 1.2  # ratio of extents up to which a box fits into another box
+_MOST_REMEMBERED: Final = 4096  # results of searches
+_LONGEST: Final = 100  # characters of a remembered label, the maximum in a request
+_MOST_GUESSED: Final = 3  # alternatives of a label
+
+SearchT = TypeVar("SearchT", bound=Callable[..., Any])
+
+
+def _remembered(search: SearchT) -> SearchT:
+    """Return a method of `Vocabulary` that remembers the results of another one."""
+
+    @wraps(search)
+    def recall(self: Vocabulary, label: str, *, is_room: bool = False) -> Any:
+        memory, key = self._memory, (search.__name__, label, is_room)
+        found = memory.get(key, memory)  # a result may be None
+        if found is memory:
+            found = search(self, label, is_room=is_room)
+            if len(memory) >= _MOST_REMEMBERED:
+                memory.clear()  # in one step, because other threads read the memory
+            if len(label) <= _LONGEST:
+                memory[key] = found
+        return found
+
+    return cast("SearchT", recall)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,14 +81,6 @@ class ObjectClass:
             )
 
 
-class LookUp(NamedTuple):
-    """The index of the class that a label becomes, and the rule."""
-
-    entry: int
-    rule: Literal["label"] | Rule
-    certain: bool
-
-
 @dataclass(unsafe_hash=True, repr=False)
 class Vocabulary:
     """The V object classes and C room types of a model, in a fixed order. Do not change it.
@@ -103,6 +118,7 @@ class Vocabulary:
         names = [(room, *self.room_aliases.get(room, ())) for room in self.room_types]
         clash = "room types {first!r} and {second!r} have the same name"
         self._room_by_spelling, self._room_by_key = _tables(names, "a room type", clash)
+        self._memory: dict[tuple[str, str, bool], Any] = {}
 
     def _parent_indices(self) -> NDArray[np.int64]:
         index_of = {entry.label: index for index, entry in enumerate(self.objects)}
@@ -182,33 +198,25 @@ class Vocabulary:
             index = self._by_key.get(label_key(head))
         return index
 
-    def read(self, label: str, *, is_room: bool = False) -> Guess | None:
-        """Return the class or room type that a detector's label names for certain, or None.
+    def look_up(self, label: str) -> LookUp | None:
+        """Return the class that a label names or probably stands for, or None."""
+        return self.read(label) or self.guess(label)
+
+    @_remembered
+    def read(self, label: str, *, is_room: bool = False) -> LookUp | None:
+        """Return the class or room type that a label names for certain, or None.
 
         The method reads the syntax of detectors (`readings`) if `index` does not know the label.
         """
         index_of = self.room_index if is_room else self.index
+        if (index := index_of(label)) is not None:
+            return LookUp(index, 1.0, self._rule_of(label, index, is_room=is_room))
         for rule, name in readings(label):
             if (index := index_of(name)) is not None:
-                return Guess(index, 1.0, rule)
+                return LookUp(index, 1.0, rule)
         return None
 
-    def look_up(self, label: str) -> LookUp | None:
-        """Return the class that a label becomes, and the rule, or None for an unknown label.
-
-        A label is accepted in every request by `index` or `read`, or needs `guess`.
-        """
-        if (index := self.index(label)) is not None:
-            return LookUp(index, self.rule_of(label, index), certain=True)
-        if (reading := self.read(label)) is not None:
-            return LookUp(reading.entry, reading.rule, certain=True)
-        if (guess := self.guess(label)) is not None:
-            return LookUp(guess.entry, guess.rule, certain=False)
-        return None
-
-    def rule_of(
-        self, label: str, index: int, *, is_room: bool = False
-    ) -> Literal["label", "alias", "phrase"]:
+    def _rule_of(self, label: str, index: int, *, is_room: bool) -> Rule:
         """Return why `index` or `room_index` gives this index for a label."""
         key = label_key(label)
         if key == label_key((self.room_types if is_room else self.labels)[index]):
@@ -230,25 +238,40 @@ class Vocabulary:
     def _room_names(self) -> NameIndex:
         return NameIndex(list(self._room_by_spelling.items()))
 
-    def nearest(self, label: str, limit: int = 3, *, is_room: bool = False) -> tuple[Match, ...]:
-        """Return plausible classes or room types with similar names, most similar first.
+    @_remembered
+    def nearest(self, label: str, *, is_room: bool = False) -> tuple[Match, ...]:
+        """Return up to three plausible classes or room types, most similar name first.
 
         The method compares ``label`` with every label and alias, so it is much slower than `index`.
         """
-        return (self._room_names if is_room else self._names).nearest(label, limit)
+        return (self._room_names if is_room else self._names).nearest(label, 3)
 
-    def guess(self, label: str, *, is_room: bool = False) -> Guess | None:
+    @_remembered
+    def guess(self, label: str, *, is_room: bool = False) -> LookUp | None:
         """Return the class or room type that an unknown label probably stands for, or None.
 
-        The method guesses each alternative of a label, or the name in the syntax of detectors.
+        The method guesses the first alternatives of a label, or the name in the syntax of
+        detectors.
         """
         names = self._room_names if is_room else self._names
         pairs = list(readings(label))
         alternatives = [name for rule, name in pairs if rule == "alternative"]
-        for name in alternatives or [name for _, name in pairs][-1:] or [label]:
+        for name in alternatives[:_MOST_GUESSED] or [name for _, name in pairs][-1:] or [label]:
             if (guess := names.guess(name)) is not None:
                 return guess
         return None
+
+    def remembers(self, label: str, searches: Sequence[str], *, is_room: bool = False) -> bool:
+        """Return whether the class of a label is known without a new search.
+
+        Args:
+            searches: names of the methods that search for the label, until one of them finds
+                something.
+        """
+        if label in (self._room_by_spelling if is_room else self._by_spelling):
+            return True
+        keys = [(search, label, is_room) for search in searches]
+        return keys[-1] in self._memory or any(map(self._memory.get, keys))
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-compatible values, without absent parents and flags."""

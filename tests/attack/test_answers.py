@@ -13,7 +13,6 @@ import httpx
 import pytest
 
 from app.questions import names
-from app.scene.labels import readings
 from app.scene.vocabulary import Vocabulary
 from scene_client.schemas import MAX_BATCH
 from scene_client.validation import MAX_ERRORS
@@ -203,8 +202,3 @@ async def test_a_scene_of_unknown_labels_stops_early(
     answer = await client.post("/missing", json={"objects": objects})
     assert len(answer.json()["errors"]) == MAX_ERRORS
     assert calls["read"] == MAX_ERRORS
-
-
-def test_a_label_has_few_readings() -> None:
-    worst = ["a/" * 50, "the a_1/" * 12, "x_(" * 33, "a photo of " * 9, "a 1 " * 25, "1|" * 50]
-    assert max(len(list(readings(label))) for label in worst) <= 100

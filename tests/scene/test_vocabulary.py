@@ -220,8 +220,7 @@ def test_only_plausible_names_are_suggested_best_first() -> None:
     assert suggest("fridgee") == ["fridge"]
     assert suggest("swivel chair")[0] == "chair"
     assert suggest("droid") == []
-    assert len(SIMILAR.nearest("chair of fridge", limit=1)) <= 1
-    similarities = [match.similarity for match in SIMILAR.nearest("desk chairs x", limit=9)]
+    similarities = [match.similarity for match in SIMILAR.nearest("desk chairs x")]
     assert similarities == sorted(similarities, reverse=True)
     assert all(0 <= similarity <= 1 for similarity in similarities)
 

@@ -100,10 +100,12 @@ def _names(text: str) -> Any:
         _, is_yaml, block = f"\n{text}".partition("\nnames:")
         if not is_yaml:
             return text.splitlines()
-        entries = re.findall(r"^[ \t]*(?:-|(\d+):)[ \t]*(.+?)[ \t]*$", block, re.MULTILINE)
+        entries = re.findall(r"^[ \t]*(?:-|(\d+):)(.+)$", block, re.MULTILINE)
         if inline := re.match(r"[ \t]*\[([^\]]*)\]", block):
-            entries = [("", name.strip()) for name in inline[1].split(",")]
-        return {key or n: name.strip("'\"") for n, (key, name) in enumerate(entries)} or None
+            entries = [("", name) for name in inline[1].split(",")]
+        return {
+            key or n: name.strip().strip("'\"") for n, (key, name) in enumerate(entries)
+        } or None
     names = names.get("categories", names) if isinstance(names, dict) else names
     if isinstance(names, list) and isinstance(names[0], dict):
         return {entry["id"]: entry["name"] for entry in names}

@@ -30,6 +30,8 @@ from pydantic_core.core_schema import CoreSchema, no_info_before_validator_funct
 from typing_extensions import Self, TypedDict
 
 MAX_BATCH = 256
+MAX_LABEL = 100
+"""Maximum length of a label in characters."""
 MAX_SEED = 2**63 - 1
 _MAX_ID = 2**53
 MAX_RELATIONS = 65536
@@ -62,7 +64,7 @@ Metres = Annotated[float, Field(ge=-1e8, le=1e8, allow_inf_nan=False)]
 Extent = Annotated[float, Field(ge=0, le=1e4, allow_inf_nan=False)]
 Angle = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)]
 Probability = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
-Label = Annotated[str, Field(min_length=1, max_length=100), AfterValidator(_plain_text)]
+Label = Annotated[str, Field(min_length=1, max_length=MAX_LABEL), AfterValidator(_plain_text)]
 Name = Annotated[str, Field(min_length=1, max_length=128), AfterValidator(_plain_text)]
 Id = Annotated[
     Name,
