@@ -27,14 +27,7 @@ from app.inference import MachineSpec
 from app.inference.chains import ChainState, ConditionedChains, Conditions, random_stream
 from app.inference.kernels import select_consistent
 from app.inference.posterior import context_of
-from app.questions.answer import (
-    OBJECT_BYTES,
-    RELATION_BYTES,
-    Fields,
-    SizeLimit,
-    lengths,
-    rounded_number,
-)
+from app.questions.answer import Fields, rounded_number
 from app.questions.names import ErrorList
 from app.questions.outliers import intruders
 from app.questions.posterior import given_relations, present
@@ -58,8 +51,6 @@ DRAWN_SEED_BITS: Final = 53
 A JSON reader may store numbers as doubles. A double represents an integer of 53 bits exactly.
 """
 
-_UNIT_BYTES: Final = 20  # maximum size in bytes of the pair of one hidden unit
-
 
 def generate(
     artifact: Artifact,
@@ -71,7 +62,6 @@ def generate(
     temperature: float = 1.0,
     context: Mapping[str, Sequence[tuple[int, int]]] | None = None,
     stop: Callable[[], bool] = lambda: False,
-    size_limit: SizeLimit | None = None,
 ) -> Fields:
     """Draw scenes that contain the evidence, by Gibbs chains.
 
@@ -96,7 +86,6 @@ def generate(
             keep their state.
         stop: function called between draws. After it returns True, `generate` returns the scenes
             drawn so far.
-        size_limit: limit on the size of the answer, or None.
 
     Returns:
         The fields `seed` and `scenes` of `scene_client.schemas.GenerateAnswer`. For `log_score`,
@@ -105,7 +94,6 @@ def generate(
 
     Raises:
         ValueError: a number is out of range, or `context` has an invalid layer, unit or state.
-        RequestError: the answer would exceed `size_limit`.
     """
     steps = STEPS if steps is None else steps
     if count < 1:
@@ -133,15 +121,6 @@ def generate(
             if _is_plausible(artifact, scene, classes, state.room) or stop() or is_last:
                 scenes.append(_scene(artifact, chains, state, is_shown, evidence))
                 break
-    if size_limit is not None:
-        units = sum([len(layer) for scene in scenes for layer in scene["context"].values()])
-        size_limit.check(
-            "count",
-            (len(scenes), OBJECT_BYTES, 0),
-            (lengths(scenes, "objects"), 0, 1),
-            (lengths(scenes, "relations"), RELATION_BYTES, 2),
-            (units, _UNIT_BYTES, 0),
-        )
     return {"seed": seed, "scenes": scenes}
 
 

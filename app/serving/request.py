@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from time import monotonic, perf_counter
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
-from app.questions.answer import Fields, SizeLimit, envelope
+from app.errors import AnswerTooLargeError, LocatedError
+from app.questions.answer import Fields, envelope, written
 from app.questions.generate import STEPS
 from app.questions.names import LookUps
 from app.questions.question import Question
@@ -91,8 +93,8 @@ class Request:
 
     async def answer(
         self, question: Question[RequestT], scene: RequestT, most_bytes: int | None = None
-    ) -> Fields:
-        """Ask the model in the field `model` of a scene one question.
+    ) -> bytes:
+        """Ask the model in the field `model` of a scene one question. Return the answer as JSON.
 
         The answer has the fields of `scene_client.schemas.Answer` and of the question, and at most
         ``most_bytes`` bytes. By default, this limit is the limit of the service.
@@ -118,15 +120,21 @@ class Request:
                 may_be_empty=question.samples,
             )
             options = question.read(scene, artifact, reading)
-            limit = SizeLimit(reading, limits.answer_bytes if most_bytes is None else most_bytes)
-            call = partial(question.answer, artifact, reading.scene, **options, size_limit=limit)
-            return reading, call
+            return reading, partial(question.answer, artifact, reading.scene, **options)
 
         def compute() -> tuple[Reading, Fields]:
             reading, call = read()
             return reading, call()
 
-        rows, is_small = 1, is_quick(scene)
+        def write() -> bytes:
+            answer = envelope(scene, self.id, artifact.reference, reading) | fields
+            answer["warnings"] = [*reading.warnings, *fields.get("warnings", ())]
+            body, most = written(answer), limits.answer_bytes if most_bytes is None else most_bytes
+            if len(body) > most:
+                raise _too_large(question, len(body), most)
+            return body
+
+        rows, is_small, executor = 1, is_quick(scene.__dict__), admission.worker
         if not is_small and ticket.lane is not admission.slow:
             await ticket.enter(admission.slow, 1)
         if question.samples:
@@ -138,9 +146,8 @@ class Request:
             weight = rows * (ask.keywords["steps"] or STEPS)
             # The models of a client take turns, too.
             await ticket.enter(admission.draws, weight, line=(ticket.client, artifact.key))
-            fields, seconds = await in_thread(
-                lambda stop: ask(stop=stop), ticket, admission.drawing
-            )
+            executor = admission.drawing
+            fields, seconds = await in_thread(lambda stop: ask(stop=stop), ticket, executor)
         elif is_small:
             ticket.check()
             began = monotonic()
@@ -148,12 +155,11 @@ class Request:
             seconds = monotonic() - began
             ticket.check()
         else:
-            answered, seconds = await in_thread(lambda _: compute(), ticket, admission.worker)
-            reading, fields = answered
+            (reading, fields), seconds = await in_thread(lambda _: compute(), ticket, executor)
         self._record(artifact.key, question.name, rows, seconds)
-        answer = envelope(scene, self.id, artifact.reference, reading)
-        warnings = [*reading.warnings, *fields.pop("warnings", ())]
-        return answer | fields | {"warnings": warnings}
+        if is_small and not question.samples:
+            return write()
+        return (await in_thread(lambda _: write(), ticket, executor))[0]
 
     def _record(self, model: Key, name: str, rows: int, seconds: float) -> None:
         """Record the times of a computation, for log and metrics."""
@@ -165,13 +171,32 @@ class Request:
         self.runtime.metrics.computed(model, name, rows, new, seconds)
 
 
+def _too_large(question: Question[Any], size: int, most: int) -> AnswerTooLargeError:
+    """Return the error for an answer of too many bytes. It names the parameter to lower."""
+    fields = question.request.model_fields
+    field = next(name for name in ("count", "top_k", "objects") if name in fields)
+    message = (
+        f"the answer has {size} bytes, but SCENE_MAX_ANSWER_BYTES allows only {most} bytes here. "
+        f"Lower `{field}`, send fewer objects, relations or scenes, or use shorter ids"
+    )
+    return AnswerTooLargeError([LocatedError((field,), message)])
+
+
 QUICK_OBJECTS: Final = 32
 QUICK_ENTRIES: Final = 256
 """Largest scene and lists of a question that the event loop computes: it takes about 2 ms."""
 
 
-def is_quick(scene: SceneRequest) -> bool:
-    """Return whether the event loop may compute a question about a scene."""
-    if len(scene.objects) > QUICK_OBJECTS or len(scene.relations or ()) > QUICK_ENTRIES:
-        return False
-    return getattr(scene, "top_k", 0) <= QUICK_ENTRIES
+def is_quick(scene: Mapping[str, Any]) -> bool:
+    """Return whether the event loop may validate and compute a question about a scene.
+
+    Args:
+        scene: the fields of the request, validated or not.
+    """
+    for name, value in scene.items():
+        if isinstance(value, list):
+            if len(value) > (QUICK_OBJECTS if name == "objects" else QUICK_ENTRIES):
+                return False
+        elif name == "top_k" and isinstance(value, int) and value > QUICK_ENTRIES:
+            return False
+    return True
