@@ -114,16 +114,17 @@ def parse(body: bytes, most: int) -> Any:
 def _check_density(body: bytes, most: int) -> None:
     """Check that no part of a body has too many arrays and objects, before their creation.
 
-    Each part of ``most`` bytes may have one array or object for eight bytes. The shortest sensible
-    array is `[1,2,3],`.
+    Each part of at most ``most`` bytes may have one of them for every five bytes. The shortest
+    sensible one is the array of a pair, such as `[1,2],`.
 
     Raises:
         InvalidRequestError: a part has more arrays and objects.
     """
     for start in range(0, len(body), most) if len(body) > SMALL else ():
-        part = start, start + most
-        if body.count(b"[", *part) + body.count(b"{", *part) > most // 8:
-            detail = f"{most} bytes of the body have more than {most // 8} arrays and objects."
+        part = start, min(start + most, len(body))
+        size = part[1] - start
+        if body.count(b"[", *part) + body.count(b"{", *part) > size // 5:
+            detail = f"{size} bytes of the body have more than {size // 5} arrays and objects."
             raise _invalid(detail)
 
 
@@ -262,7 +263,12 @@ def _members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return members
 
 
-_DECODER: Final = json.JSONDecoder(object_pairs_hook=_members)
+# Python functions read the numbers: between two of them, another thread may take the interpreter.
+_DECODER: Final = json.JSONDecoder(
+    object_pairs_hook=_members,
+    parse_int=lambda text: int(text),
+    parse_float=lambda text: float(text),
+)
 _LENIENT: Final = json.JSONDecoder(object_pairs_hook=_members, parse_constant=_Constant)
 
 
