@@ -85,9 +85,28 @@ def attacks(labels: list[str]) -> Iterator[tuple[str, bytes]]:
         yield f"scene of {name}", sent("/missing", filled(entry, _SCENE, b'{"objects":['))
         text = filled(entry, _TEXT, b'{"scenes":[')
         yield f"small batch of {name}", sent("/missing/batch", text)
+    scene_of_12 = {"objects": labels[:12]}
+    yield "batch of questions", prepared("/missing/batch", {"scenes": [scene_of_12] * 256})
+    yield "draws", prepared("/generate", {**scene_of_12, "count": 16, "steps": 500})
+    yield "unknown labels", prepared("/missing", {"objects": [f"nonsuch {k}" for k in range(256)]})
+    yield "largest answer", prepared("/relations", largest(labels))
     yield "batch of relations", sent("/missing/batch", filled(related, _BATCH, b'{"scenes":['))
     yield "batch of poses", prepared("/outliers/batch", {"scenes": [{"objects": [bed] * 40}] * 256})
     yield "candidates", sent("/missing", filled(b'"x y z"', _SCENE // 8, scene % b"candidates"))
+
+
+def largest(labels: list[str]) -> dict[str, Any]:
+    """Return the body of the question with the longest answer: objects near to each other."""
+    objects = [
+        {
+            "id": f"{place:128}".replace(" ", "\U0001f600"),
+            "label": labels[place % len(labels)],
+            "position": [place % 16 * 0.02, place // 16 * 0.02, 0],
+            "size": [0.5, 0.5, 0.01],
+        }
+        for place in range(256)
+    ]
+    return {"objects": objects, "top_k": 4096, "include_opposites": True}
 
 
 def filled(entry: bytes, size: int, head: bytes) -> bytes:

@@ -29,6 +29,7 @@ REASONS: Final = 3
 EXPLAINED: Final = 32
 """Maximum number of entries with reasons in an answer. The first entries have reasons."""
 
+_PART: Final = 512  # number of entries that `written_within` writes in a step
 _ROUNDING: Final = 1e-6  # a smaller change of log-odds is a rounding error
 
 
@@ -93,6 +94,23 @@ def significant(numbers: NDArray[np.floating[Any]]) -> list[float]:
 def rounded_number(number: float) -> float:
     """Round one number to `DIGITS` significant digits. Use `significant` for many numbers."""
     return float(f"{number:.{DIGITS}g}")
+
+
+def written_within(answer: Fields, most: int) -> bytes | None:
+    """Return an answer as JSON, or None if it has more than ``most`` bytes.
+
+    The longest lists could have 64 MiB. So the function writes parts of them first, and stops when
+    these have more than ``most`` bytes.
+    """
+    size = 0
+    for entries in answer.values():
+        if isinstance(entries, list) and len(entries) > _PART:
+            for start in range(0, len(entries), _PART):
+                size += len(written(entries[start : start + _PART]))
+                if size > most:
+                    return None
+    body = written(answer)
+    return body if len(body) <= most else None
 
 
 def written(answer: Any) -> bytes:

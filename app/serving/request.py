@@ -9,7 +9,7 @@ from time import monotonic, perf_counter
 from typing import Any, Final, TypeVar
 
 from app.errors import AnswerTooLargeError, LocatedError
-from app.questions.answer import Fields, envelope, written
+from app.questions.answer import Fields, envelope, written_within
 from app.questions.generate import STEPS
 from app.questions.names import LookUps
 from app.questions.question import Question
@@ -129,9 +129,9 @@ class Request:
         def write() -> bytes:
             answer = envelope(scene, self.id, artifact.reference, reading) | fields
             answer["warnings"] = [*reading.warnings, *fields.get("warnings", ())]
-            body, most = written(answer), limits.answer_bytes if most_bytes is None else most_bytes
-            if len(body) > most:
-                raise _too_large(question, len(body), most)
+            most = limits.answer_bytes if most_bytes is None else most_bytes
+            if (body := written_within(answer, most)) is None:
+                raise _too_large(question, most)
             return body
 
         rows, is_small, executor = 1, is_quick(scene.__dict__), admission.worker
@@ -171,12 +171,12 @@ class Request:
         self.runtime.metrics.computed(model, name, rows, new, seconds)
 
 
-def _too_large(question: Question[Any], size: int, most: int) -> AnswerTooLargeError:
+def _too_large(question: Question[Any], most: int) -> AnswerTooLargeError:
     """Return the error for an answer of too many bytes. It names the parameter to lower."""
     fields = question.request.model_fields
     field = next(name for name in ("count", "top_k", "objects") if name in fields)
     message = (
-        f"the answer has {size} bytes, but SCENE_MAX_ANSWER_BYTES allows only {most} bytes here. "
+        f"the answer would have more than {most} bytes, the limit of SCENE_MAX_ANSWER_BYTES here. "
         f"Lower `{field}`, send fewer objects, relations or scenes, or use shorter ids"
     )
     return AnswerTooLargeError([LocatedError((field,), message)])
