@@ -69,17 +69,9 @@ def missing(
 
     Returns:
         The fields `coverage`, `missing` and `more` of `scene_client.schemas.MissingAnswer`.
-
-    Raises:
-        ValueError: top_k is below 1, the coverage is outside [0, 1], a candidate is outside the
-            vocabulary, the relation is unknown, or the anchor is outside the scene.
     """
-    if top_k < 1:
-        raise ValueError(f"top_k must be at least 1, not {top_k}")
     used_coverage = artifact.calibration.coverage if coverage is None else coverage
-    if not 0 <= used_coverage <= 1:
-        raise ValueError(f"coverage must be in [0, 1], not {used_coverage}")
-    place = None if at is None else Place.of(scene, artifact.spec.A, *at)
+    place = None if at is None else Place.of(*at)
     posterior = Posterior(artifact, scene)
     classes, probabilities, log_odds = _ranked(
         artifact, posterior, top_k, candidates, place, used_coverage
@@ -129,12 +121,6 @@ def _ranked(
     if candidates is None:
         usable &= ~is_listed[artifact.vocabulary.parents]
     else:
-        for index in candidates:
-            if not 0 <= index < len(usable):
-                raise ValueError(
-                    f"candidate {index} is not a class index; class indices are below V = "
-                    f"{len(usable)}"
-                )
         chosen = np.zeros_like(usable)
         chosen[list(candidates)] = True
         usable &= chosen

@@ -87,12 +87,7 @@ def outliers(
         A list is empty if the model gives no such judgement. `warnings` names this case, and the
         objects of rare classes that reach the threshold.
         `threshold` is left out if the model judges no object and the caller states no threshold.
-
-    Raises:
-        ValueError: the threshold is outside [0, 1].
     """
-    if threshold is not None and not 0 <= threshold <= 1:
-        raise ValueError(f"threshold must be in [0, 1], not {threshold}")
     entry, lines = artifact.calibration.outlier, artifact.calibration.outlier_lines
     can_alarm = ~artifact.rarely_shown
     if threshold is not None:

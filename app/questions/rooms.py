@@ -45,16 +45,9 @@ def rooms(
     Returns:
         The field `room_types` of `scene_client.schemas.RoomsAnswer`. The list is empty if the model
         has no room types. Then the field `warnings` says so.
-
-    Raises:
-        ValueError: top_k is below 1, or a candidate is not a room type.
     """
-    if top_k < 1:
-        raise ValueError(f"top_k must be at least 1, not {top_k}")
     C = artifact.spec.C
     among = np.arange(C) if candidates is None else np.array(candidates, dtype=np.int64)
-    if ((among < 0) | (among >= C)).any():
-        raise ValueError(f"a candidate is not a room type; indices are below C = {C}")
     if not len(among):
         return {"warnings": [] if C else [_NO_ROOM_TYPES], "room_types": []}
     posterior = Posterior(artifact, replace(scene, room_type=None))
