@@ -20,21 +20,21 @@ LONG = {"X-Request-Timeout-Ms": "60000"}
 
 
 async def test_a_deadline_is_a_whole_number_within_the_limit(shared_store: Path) -> None:
-    async with serve(shared_store, max_request_timeout_ms=20_000) as client:
-        for value in ("0", "-1", "1.5", "", "soon", "NaN", b"\xff", "9" * 400, "20001", "20000"):
+    async with serve(shared_store, max_request_timeout_ms=600_000) as client:
+        for value in ("0", "-1", "1.5", "", "soon", "NaN", b"\xff", "9" * 400, "600001", "600000"):
             headers: Any = {"X-Request-Timeout-Ms": value}
             for path, body in (("/relations", SCENE), ("/missing/batch", {"scenes": [SCENE]})):
                 response = await client.post(path, json=body, headers=headers)
-                if value == "20000":
+                if value == "600000":
                     assert response.status_code == 200
                 else:
                     document = problem(response, 400, "bad-request")
-                    assert "from 1 to 20000" in document["detail"]
+                    assert "from 1 to 600000" in document["detail"]
             # Health checks ignore the header.
             assert (await client.get("/health/ready", headers=headers)).is_success
-        document = (await client.get("/openapi.json")).json()
+        document = (await client.get("/openapi.json", headers=headers)).json()
     parameters = document["paths"]["/missing"]["post"]["parameters"]
-    assert [p["schema"]["maximum"] for p in parameters if "Timeout" in p["name"]] == [20_000]
+    assert [p["schema"]["maximum"] for p in parameters if "Timeout" in p["name"]] == [600_000]
 
 
 async def test_generate_past_its_deadline_gets_504_and_delays_no_request(
