@@ -312,7 +312,8 @@ class AnswerTooLargeError(RequestError, slug="answer-too-large", status=422, ste
 
     The answer would exceed SCENE_MAX_ANSWER_BYTES. `errors` points at the parameter to lower:
     `top_k`, `count` or the number of `objects`. Shorter ids also make the answer smaller. All
-    scenes of a batch share one limit. Send the refused scenes in another request.
+    scenes of a batch share one limit, and a batch stops at the first answer beyond it. Send the
+    refused scenes in another request.
     """
 
 

@@ -192,7 +192,7 @@ class LiveService:
         answers = {}
         for question in ("relations", "missing", "outliers", "rooms", "generate"):
             body = CONTROL | ({"steps": 8} if question == "generate" else {})
-            headers = {"X-Request-Id": "control"}
+            headers = {"X-Request-Id": "control", "X-Request-Timeout-Ms": "30000"}
             response = self.client.post(f"/{question}", json=body, headers=headers)
             assert response.status_code == 200, response.text
             answers[question] = response.content

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
@@ -21,7 +22,7 @@ from starlette.types import Receive, Scope, Send
 from app import errors
 from app.serving.admission import SMALL, Bodies, in_thread
 from app.serving.runtime import Runtime
-from scene_client.schemas import FieldError
+from scene_client.schemas import MAX_BATCH, FieldError
 from scene_client.schemas import Request as Form
 from scene_client.validation import MAX_ERRORS, PLAIN, field_errors, pointer
 
@@ -71,8 +72,10 @@ def _most_entries(form: type[Form]) -> dict[str, int]:
     }
 
 
-def parse(body: bytes) -> Any:
+def parse(body: bytes, most: int) -> Any:
     """Parse one JSON value. Refuse texts that different JSON parsers read in different ways.
+
+    A body of more than ``most`` bytes must be an object. It is parsed value by value.
 
     The function refuses encodings other than UTF-8, a byte order mark, NaN and Infinity, lone
     surrogates, nesting deeper than 200 levels, integers of more than 4,300 digits, and duplicate
@@ -80,16 +83,18 @@ def parse(body: bytes) -> Any:
 
     Raises:
         NotJSONError: the function refuses the text.
-        InvalidRequestError: an object has more than `MAX_MEMBERS` members.
+        InvalidRequestError: the body has too many arrays or objects, an object has more than
+            `MAX_MEMBERS` members, or a list of a large body has more than `MAX_BATCH` entries.
     """
+    _check_density(body, most)
     try:
+        if len(body) > most:
+            return _Pieces(body.decode(), most).read()
         # from_json() is strict, but only the decoder of the standard library finds duplicate names.
         from_json(body, allow_inf_nan=False)
         return _DECODER.decode(body.decode())
     except _TooManyMembersError:
-        detail = f"A JSON object has more than {MAX_MEMBERS} members."
-        too_many = [FieldError(pointer="#", message=detail)]
-        raise errors.InvalidRequestError(errors=too_many, detail=detail) from None
+        raise _invalid(f"A JSON object has more than {MAX_MEMBERS} members.") from None
     except _RepeatedNameError as error:
         detail = f"A JSON object has two members with the same name{error}."
         raise errors.NotJSONError(detail) from None
@@ -103,6 +108,29 @@ def parse(body: bytes) -> Any:
                 "Comments, trailing commas, NaN, None and True are not JSON."
             )
         raise errors.NotJSONError(detail, errors=not_finite) from None
+
+
+def _check_density(body: bytes, most: int) -> None:
+    """Check that no part of a body has too many arrays and objects, before their creation.
+
+    Each part of at most ``most`` bytes may have one of them for every five bytes. The shortest
+    sensible one is the array of a pair, such as `[1,2],`.
+
+    Raises:
+        InvalidRequestError: a part has more arrays and objects.
+    """
+    for start in range(0, len(body), most) if len(body) > SMALL else ():
+        part = start, min(start + most, len(body))
+        size = part[1] - start
+        if body.count(b"[", *part) + body.count(b"{", *part) > size // 5:
+            detail = f"{size} bytes of the body have more than {size // 5} arrays and objects."
+            raise _invalid(detail)
+
+
+def _invalid(detail: str, at: errors.Location = ()) -> errors.InvalidRequestError:
+    return errors.InvalidRequestError(
+        errors=[FieldError(pointer=pointer(at), message=detail)], detail=detail
+    )
 
 
 def _not_finite(body: bytes) -> list[FieldError]:
@@ -120,6 +148,84 @@ def _not_finite(body: bytes) -> list[FieldError]:
         ]
     except (ValueError, RecursionError):
         return []
+
+
+class _Pieces:
+    """A large JSON object, parsed in short steps.
+
+    A step parses one member, or one entry of a member that is a list. The parsers hold the
+    interpreter during a step, so all other requests wait. A step reads one text, or at most
+    ``most`` characters.
+    """
+
+    def __init__(self, text: str, most: int) -> None:
+        self._text, self._most, self._at = text, most, 0
+
+    def read(self) -> dict[str, Any]:
+        """Return the object.
+
+        Raises:
+            ValueError: the text is not a JSON object, or a value has too many characters.
+            InvalidRequestError: a list has too many entries.
+        """
+        members: list[tuple[str, Any]] = []
+        mark = self._mark("{")
+        while mark != "}" and len(members) <= MAX_MEMBERS:
+            name = self._value()
+            if not isinstance(name, str):
+                raise ValueError(f"expected a name before character {self._at}")
+            self._mark(":")
+            members.append((name, self._entries(name) if self._peek() == "[" else self._value()))
+            mark = self._mark(",}")
+        if mark == "}" and self._peek():
+            raise ValueError(f"trailing characters at character {self._at}")
+        return _members(members)
+
+    def _entries(self, name: str) -> list[Any]:
+        entries: list[Any] = []
+        self._mark("[")
+        mark = self._mark("]") if self._peek() == "]" else ","
+        while mark != "]":
+            if len(entries) == MAX_BATCH:
+                message = f"must have at most {MAX_BATCH} entries"
+                too_long = FieldError(pointer=pointer((name,)), message=message)
+                raise errors.InvalidRequestError(errors=[too_long])
+            entries.append(self._value())
+            mark = self._mark(",]")
+        return entries
+
+    def _value(self) -> Any:
+        # The parsers would read the rest of the body, so the slice bounds the step.
+        is_text = self._peek() == '"'
+        text, start = self._text, self._at
+        if not is_text:
+            text, start = text[start : start + self._most], 0
+        try:
+            value, end = _DECODER.raw_decode(text, start)
+            from_json(text[start:end], allow_inf_nan=False)
+        except (ValueError, RecursionError) as error:
+            if isinstance(error, _TooManyMembersError | _RepeatedNameError):
+                raise
+            message = f"the value at character {self._at} is invalid or too long: {error}"
+            raise ValueError(message) from None
+        self._at += end - start
+        return value
+
+    def _peek(self) -> str:
+        """Return the next character that is no white space, or an empty text at the end."""
+        self._at = _SPACE.match(self._text, self._at).end()  # type: ignore[union-attr]
+        return self._text[self._at : self._at + 1]
+
+    def _mark(self, expected: str) -> str:
+        """Read one of the expected characters, and return it."""
+        mark = self._peek()
+        if not mark or mark not in expected:
+            raise ValueError(f"expected one of {expected} at character {self._at}")
+        self._at += 1
+        return mark
+
+
+_SPACE: Final = re.compile(r"[ \t\n\r]*")
 
 
 class _Constant(str):
@@ -156,7 +262,12 @@ def _members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return members
 
 
-_DECODER: Final = json.JSONDecoder(object_pairs_hook=_members)
+# Python functions read the numbers: between two of them, another thread may take the interpreter.
+_DECODER: Final = json.JSONDecoder(
+    object_pairs_hook=_members,
+    parse_int=lambda text: int(text),
+    parse_float=lambda text: float(text),
+)
 _LENIENT: Final = json.JSONDecoder(object_pairs_hook=_members, parse_constant=_Constant)
 
 
@@ -213,9 +324,10 @@ class JSONRoute(APIRoute):
             raise errors.NotJSONError("The body is empty.")
         runtime: Runtime = scope["app"].state.runtime
         schema: Any = self.body_field.field_info.annotation  # type: ignore[union-attr]
+        most = http.app.state.settings.max_scene_bytes
 
         def read(_: object) -> tuple[Any, Any]:
-            value = parse(body)
+            value = parse(body, most)
             return value, validated(value, schema)
 
         ticket = scope["state"]["ticket"]

@@ -15,14 +15,16 @@ from starlette.requests import Request
 from app.api.body import JSONRoute, validated
 from app.api.openapi import error_responses, operation_id
 from app.api.problems import from_exception
-from app.errors import RequestError
+from app.errors import AnswerTooLargeError, LocatedError, RequestError
 from app.questions import QUESTIONS, Question
-from app.questions.answer import written
 from app.serving import request as serving
+from app.serving.admission import in_thread
 from scene_client.schemas import MAX_BATCH, BatchAnswer, BatchRequest, SceneRequest
 
 RequestT = TypeVar("RequestT", bound=SceneRequest)
 _Endpoint = Callable[..., Awaitable[bytes]]
+
+_FULL = "the batch has reached SCENE_MAX_ANSWER_BYTES. Send this scene in another request"
 
 router = APIRouter(
     tags=["questions"],
@@ -54,23 +56,40 @@ async def _answer_each(
 ) -> bytes:
     request = serving_request(http)
     results: list[bytes] = []
-    left, admission = request.runtime.limits.answer_bytes, request.runtime.admission
+    admission = request.runtime.admission
+    # The rest is for the problems of the scenes that the batch does not answer.
+    left = request.runtime.limits.answer_bytes // 16 * 15
     await request.ticket.enter(admission.slow, len(batch.scenes))
     for number, scene in enumerate(batch.scenes):
         try:
+            if left <= 0:
+                raise AnswerTooLargeError([LocatedError((), _FULL)])
             request.ticket.check()
-            # Only this validation may fail because of the client. Any later validation error is a
-            # defect of the service.
-            data = validated(scene, question.request, at=("scenes", number))
-            answer = written(await request.answer(question, data, left))
+            data = await _validated(scene, question, number, request)
+            answer = await request.answer(question, data, left)
             outcome, result = serving.SUCCESS, b'{"status":200,"result":%b}' % answer
         except Exception as error:  # noqa: BLE001 — any error fails only this scene
             outcome, result = _failed(error, number, scene, request.id)
         request.runtime.metrics.entry_answered(question.name, outcome)
         results.append(result)
-        left = max(0, left - len(result))
+        # After the first answer that is too large, the batch stops.
+        left = 0 if outcome == AnswerTooLargeError.slug else left - len(result)
         await admission.quick.let_pass()
     return b'{"request_id":%b,"results":[%b]}' % (to_json(request.id), b",".join(results))
+
+
+async def _validated(
+    scene: Any, question: Question[RequestT], number: int, request: serving.Request
+) -> RequestT:
+    """Validate a scene of a batch. The worker thread validates large scenes."""
+
+    def validate(_: object) -> RequestT:
+        return validated(scene, question.request, at=("scenes", number))
+
+    if not isinstance(scene, dict) or serving.is_small(scene):
+        return validate(None)
+    admission = request.runtime.admission
+    return (await in_thread(validate, request.ticket, admission.worker))[0]
 
 
 def _failed(error: Exception, number: int, scene: Any, request_id: str) -> tuple[str, bytes]:
@@ -90,7 +109,7 @@ def _endpoints(question: Question[Any]) -> tuple[_Endpoint, _Endpoint]:
     """Create the endpoint functions of a question: for one scene, and for a batch."""
 
     async def answer(data: Any, http: Request) -> bytes:
-        return written(await serving_request(http).answer(question, data))
+        return await serving_request(http).answer(question, data)
 
     async def answer_batch(data: Any, http: Request) -> bytes:
         return await _answer_each(http, data, question)

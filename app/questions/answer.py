@@ -1,4 +1,4 @@
-"""Parts of all answers: common fields, rounded numbers, reasons, the size limit, and JSON.
+"""Parts of all answers: common fields, rounded numbers, reasons, and JSON.
 
 The schemas of `scene_client.schemas` describe the answers. An answer contains its fields in the
 order of the schema, without null fields. Answers are dictionaries, because pydantic objects would
@@ -7,7 +7,6 @@ take twice the time (docs/decisions/http.md).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -15,7 +14,6 @@ import orjson
 from numpy.typing import NDArray
 from pydantic_core import from_json, to_json, to_jsonable_python
 
-from app.errors import AnswerTooLargeError, LocatedError
 from app.inference.kernels import DIGITS, round_to_digits, strongest
 from app.questions.posterior import Present
 from app.questions.reading import Reading
@@ -31,16 +29,8 @@ REASONS: Final = 3
 EXPLAINED: Final = 32
 """Maximum number of entries with reasons in an answer. The first entries have reasons."""
 
+_PART: Final = 512  # number of entries that `written_within` writes in a step
 _ROUNDING: Final = 1e-6  # a smaller change of log-odds is a rounding error
-
-# Upper bounds in bytes on the sizes of parts of an answer. Ids and labels are not included.
-RELATION_BYTES: Final = 120
-CAUSE_BYTES: Final = 60
-OBJECT_BYTES: Final = 200  # one entry about one object
-_ENVELOPE_BYTES: Final = 4096
-_WARNING_BYTES: Final = 400
-# Size in bytes of the longest id: 128 characters of at most four bytes, two quotes and a comma.
-_LONGEST_NAME: Final = 4 * 128 + 3
 
 
 def envelope(
@@ -106,56 +96,21 @@ def rounded_number(number: float) -> float:
     return float(f"{number:.{DIGITS}g}")
 
 
-def lengths(entries: Iterable[Fields], *fields: str) -> int:
-    """Return the total length of lists in entries of an answer."""
-    return sum([len(entry.get(field, ())) for entry in entries for field in fields])
+def written_within(answer: Fields, most: int) -> bytes | None:
+    """Return an answer as JSON, or None if it has more than ``most`` bytes.
 
-
-class SizeLimit:
-    """Limit on the size of the answer to one request.
-
-    Args:
-        reading: the scene of the request.
-        most: maximum size of the answer in bytes.
+    The longest lists could have 64 MiB. So the function writes parts of them first, and stops when
+    these have more than ``most`` bytes.
     """
-
-    def __init__(self, reading: Reading, most: int) -> None:
-        self._reading, self._most = reading, most
-
-    def check(self, field: str, *parts: tuple[int, int, int]) -> None:
-        """Check that the answer is not too large.
-
-        Args:
-            field: name of the request's field that the client can lower for a smaller answer.
-            parts: parts of the question's own fields: the number of such parts, the size of one
-                part in bytes without ids and labels, and the number of its ids and labels.
-
-        Raises:
-            RequestError: the answer is too large.
-        """
-        fixed = sum(count * size for count, size, _ in parts)
-        names = sum(count * names for count, _, names in parts)
-        longest = max(_LONGEST_NAME, self._reading.unknown.vocabulary.longest_label + 1)
-        if self._size(fixed, names, longest) <= self._most:
-            return
-        exact = self._size(fixed, names, self._reading.longest_name())
-        if exact > self._most:
-            message = (
-                f"the answer could have {exact} bytes, but SCENE_MAX_ANSWER_BYTES allows only "
-                f"{self._most} bytes here. Lower `{field}`, send fewer objects, relations or "
-                "scenes, or use shorter ids"
-            )
-            raise AnswerTooLargeError([LocatedError((field,), message)])
-
-    def _size(self, fixed: int, names: int, name: int) -> int:
-        """Return the size in bytes of the answer if the longest id or label has `name` bytes."""
-        reading, unknown = self._reading, self._reading.unknown
-        size = _ENVELOPE_BYTES + fixed + names * name
-        if not (unknown.ignored or unknown.mapped or reading.observed or reading.warnings):
-            return size
-        size += len(to_json(unknown.ignored)) + len(unknown.mapped) * _WARNING_BYTES
-        size += len(reading.observed or ()) * (RELATION_BYTES + 2 * name)
-        return size + len(reading.warnings) * (_WARNING_BYTES + len(reading.scene.objects) * name)
+    size = 0
+    for entries in answer.values():
+        if isinstance(entries, list) and len(entries) > _PART:
+            for start in range(0, len(entries), _PART):
+                size += len(written(entries[start : start + _PART]))
+                if size > most:
+                    return None
+    body = written(answer)
+    return body if len(body) <= most else None
 
 
 def written(answer: Any) -> bytes:

@@ -26,14 +26,7 @@ from app.errors import RareRoomTypeError
 from app.inference.chains import ChainState, ConditionedChains, Conditions, random_stream
 from app.inference.kernels import select_consistent
 from app.inference.posterior import context_of
-from app.questions.answer import (
-    OBJECT_BYTES,
-    RELATION_BYTES,
-    Fields,
-    SizeLimit,
-    lengths,
-    rounded_number,
-)
+from app.questions.answer import Fields, rounded_number
 from app.questions.names import ErrorList
 from app.questions.outliers import intruders
 from app.questions.posterior import given_relations, present
@@ -67,7 +60,6 @@ def generate(
     steps: int | None = None,
     temperature: float = 1.0,
     stop: Callable[[], bool] = lambda: False,
-    size_limit: SizeLimit | None = None,
 ) -> Fields:
     """Draw scenes that contain the evidence, by Gibbs chains.
 
@@ -90,7 +82,6 @@ def generate(
         temperature: temperature of the chains. Above 1, the scenes are more varied.
         stop: function called between draws. After it returns True, `generate` returns the scenes
             drawn so far.
-        size_limit: limit on the size of the answer, or None.
 
     Returns:
         The fields `seed` and `scenes` of `scene_client.schemas.GenerateAnswer`. For `log_score`,
@@ -99,7 +90,6 @@ def generate(
 
     Raises:
         ValueError: a number is out of range.
-        RequestError: the answer would exceed `size_limit`.
     """
     steps = STEPS if steps is None else steps
     if count < 1:
@@ -127,13 +117,6 @@ def generate(
             if _is_plausible(artifact, scene, classes, state.room) or stop() or is_last:
                 scenes.append(_scene(artifact, chains, state, is_shown, evidence))
                 break
-    if size_limit is not None:
-        size_limit.check(
-            "count",
-            (len(scenes), OBJECT_BYTES, 0),
-            (lengths(scenes, "objects"), 0, 1),
-            (lengths(scenes, "relations"), RELATION_BYTES, 2),
-        )
     return {"seed": seed, "scenes": scenes}
 
 

@@ -16,17 +16,7 @@ from numpy.typing import NDArray
 
 from app.errors import InvalidRequestError
 from app.inference.kernels import best
-from app.questions.answer import (
-    CAUSE_BYTES,
-    EXPLAINED,
-    OBJECT_BYTES,
-    RELATION_BYTES,
-    Fields,
-    SizeLimit,
-    lengths,
-    reasons,
-    significant,
-)
+from app.questions.answer import EXPLAINED, Fields, reasons, significant
 from app.questions.counts import more
 from app.questions.names import ErrorList
 from app.questions.placements import Place, place_log_p, placements
@@ -43,7 +33,6 @@ VIEWER = viewer_axes()
 """Axes of a viewer who looks along the x axis of the frame."""
 
 _BLOCK: Final = 32
-_OFFSET_BYTES: Final = 250
 
 
 def missing(
@@ -56,7 +45,6 @@ def missing(
     coverage: float | None = None,
     axes: Axes | None = VIEWER,
     details: bool = True,
-    size_limit: SizeLimit | None = None,
 ) -> Fields:
     """Rank the unlisted classes by the probability that they are present, likeliest first.
 
@@ -78,22 +66,12 @@ def missing(
         axes: viewer's axes in the frame of the offsets; see `viewer_axes`. None means that the
             viewing direction is unknown.
         details: whether the answer contains `placements` and `because`.
-        size_limit: limit on the size of the answer, or None.
 
     Returns:
         The fields `coverage`, `missing` and `more` of `scene_client.schemas.MissingAnswer`.
-
-    Raises:
-        ValueError: top_k is below 1, the coverage is outside [0, 1], a candidate is outside the
-            vocabulary, the relation is unknown, or the anchor is outside the scene.
-        RequestError: the answer would exceed `size_limit`.
     """
-    if top_k < 1:
-        raise ValueError(f"top_k must be at least 1, not {top_k}")
     used_coverage = artifact.calibration.coverage if coverage is None else coverage
-    if not 0 <= used_coverage <= 1:
-        raise ValueError(f"coverage must be in [0, 1], not {used_coverage}")
-    place = None if at is None else Place.of(scene, artifact.spec.A, *at)
+    place = None if at is None else Place.of(*at)
     posterior = Posterior(artifact, scene)
     classes, probabilities, log_odds = _ranked(
         artifact, posterior, top_k, candidates, place, used_coverage
@@ -120,13 +98,6 @@ def missing(
         further = more(
             artifact, listing, room, top_k=top_k, candidates=candidates, coverage=coverage
         )
-    if size_limit is not None:
-        size_limit.check(
-            "top_k",
-            (lengths(entries, "placements"), RELATION_BYTES + _OFFSET_BYTES, 1),
-            (lengths(entries, "because"), CAUSE_BYTES, 1),
-            (len(entries) + len(further), OBJECT_BYTES, 1),
-        )
     return {"coverage": used_coverage, "missing": entries, "more": further}
 
 
@@ -150,12 +121,6 @@ def _ranked(
     if candidates is None:
         usable &= ~is_listed[artifact.vocabulary.parents]
     else:
-        for index in candidates:
-            if not 0 <= index < len(usable):
-                raise ValueError(
-                    f"candidate {index} is not a class index; class indices are below V = "
-                    f"{len(usable)}"
-                )
         chosen = np.zeros_like(usable)
         chosen[list(candidates)] = True
         usable &= chosen

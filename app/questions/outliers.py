@@ -21,18 +21,7 @@ from numpy.typing import NDArray
 
 from app.inference.elementary import sigmoid
 from app.inference.kernels import companions
-from app.questions.answer import (
-    CAUSE_BYTES,
-    EXPLAINED,
-    OBJECT_BYTES,
-    RELATION_BYTES,
-    Fields,
-    SizeLimit,
-    lengths,
-    reasons,
-    rounded_number,
-    significant,
-)
+from app.questions.answer import EXPLAINED, Fields, reasons, rounded_number, significant
 from app.questions.misplaced import misplaced_fields
 from app.questions.posterior import Posterior, calibrated
 from app.questions.question import REFUSED, SCENES, WITH_TOILET, Example, Options, Question
@@ -66,7 +55,6 @@ def outliers(
     threshold: float | None = None,
     details: bool = True,
     flipped: Collection[Triple] = (),
-    size_limit: SizeLimit | None = None,
 ) -> Fields:
     """Judge every object and every stated relation of a scene.
 
@@ -93,20 +81,13 @@ def outliers(
         details: whether the answer contains `because` and `usually_with`.
         flipped: relations of the scene that the request states by their opposite. The answer uses
             the words of the request.
-        size_limit: limit on the size of the answer, or None.
 
     Returns:
         The fields `threshold`, `outliers` and `misplaced` of `scene_client.schemas.OutliersAnswer`.
         A list is empty if the model gives no such judgement. `warnings` names this case, and the
         objects of rare classes that reach the threshold.
         `threshold` is left out if the model judges no object and the caller states no threshold.
-
-    Raises:
-        ValueError: the threshold is outside [0, 1].
-        RequestError: the answer would exceed `size_limit`.
     """
-    if threshold is not None and not 0 <= threshold <= 1:
-        raise ValueError(f"threshold must be in [0, 1], not {threshold}")
     entry, lines = artifact.calibration.outlier, artifact.calibration.outlier_lines
     can_alarm = ~artifact.rarely_shown
     if threshold is not None:
@@ -124,13 +105,6 @@ def outliers(
             alarms = _Alarms(threshold, can_alarm)
             judged, unsure = _judged(artifact, entry, posterior, scene, alarms, details=details)
             warnings += _too_rare(unsure)
-    if size_limit is not None:
-        size_limit.check(
-            "objects",
-            (len(judged), OBJECT_BYTES, 2),
-            (lengths(judged, "because", "usually_with"), CAUSE_BYTES, 1),
-            (len(wrong), RELATION_BYTES, 2),
-        )
     fields: Fields = {"warnings": warnings}
     if threshold is not None:
         fields["threshold"] = rounded_number(threshold)

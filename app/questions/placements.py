@@ -19,7 +19,6 @@ from app.questions.posterior import Posterior
 from app.registry.artifact import Artifact
 from app.registry.offsets import Offsets
 from app.scene.relations import (
-    CANONICAL,
     INSIDE,
     ON_TOP,
     RELATIONS,
@@ -56,28 +55,9 @@ class Place(NamedTuple):
     outgoing: bool
 
     @classmethod
-    def of(cls, scene: Scene, relations: int, name: str, anchor: int) -> Place:
-        """Return the place with the relation ``name`` from the missing object to the anchor.
-
-        Args:
-            scene: the listed objects.
-            relations: number of canonical relations that the model knows.
-            name: name of the relation.
-            anchor: index of the anchor.
-
-        Raises:
-            ValueError: the model does not know the relation, or the anchor is outside the scene.
-        """
-        if not 0 <= anchor < len(scene.objects):
-            raise ValueError(
-                f"anchor {anchor} is not the index of one of the {len(scene.objects)} objects"
-            )
+    def of(cls, name: str, anchor: int) -> Place:
+        """Return the place with the relation ``name`` from the missing object to the anchor."""
         relation, subject, _ = canonicalise("missing", name, "anchor")
-        if relation >= relations:
-            raise ValueError(
-                f"the model does not know the relation {name!r}; it knows only "
-                f"{CANONICAL[:relations]} and their opposites"
-            )
         return cls(relation, anchor, subject == "missing")
 
 

@@ -42,7 +42,7 @@ class Question(Generic[RequestT]):
     Attributes:
         answer: function of a model, a scene and keyword arguments. It returns the fields of the
             answer that are not common to all answers. The name of this function is the name of the
-            question. If the answer could be too large, the argument ``size_limit`` raises an error.
+            question.
         read: function that returns the keyword arguments of ``answer`` for a request. It raises
             `RequestError` if a field of the request is wrong.
         request, response: schemas of the request and of the answer.

@@ -14,8 +14,6 @@ from difflib import get_close_matches
 from functools import cached_property
 from itertools import compress, count
 
-from pydantic_core import to_json
-
 from app.errors import ContradictionError, InvalidRequestError, Location
 from app.questions.names import ErrorList, LookUps, Names, Unknown
 from app.questions.scene_warnings import scene_warnings
@@ -76,11 +74,6 @@ class Reading:
     def names(self) -> Names:
         """Look-up of objects by id or label. The first access builds the look-up tables."""
         return Names(self.scene.objects, self.unknown, self.left_out)
-
-    def longest_name(self) -> int:
-        """Return the maximum size in bytes of an id or label in the JSON text of the answer."""
-        longest = max((len(to_json(thing.id)) for thing in self.scene.objects), default=0)
-        return max(longest, self.unknown.vocabulary.longest_label) + 1
 
 
 def read_scene(

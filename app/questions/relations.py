@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from app.errors import InvalidRequestError, Location
 from app.inference.kernels import EXCLUDED, disagreeing, likeliest_relations, observed_pairs
-from app.questions.answer import RELATION_BYTES, Fields, SizeLimit, significant
+from app.questions.answer import Fields, significant
 from app.questions.names import ErrorList
 from app.questions.placements import held_objects
 from app.questions.posterior import Posterior, Present, relations_given
@@ -49,7 +49,6 @@ def relations(
     pairs: Sequence[tuple[int, int]] | None = None,
     include_opposites: bool = False,
     flipped: Collection[Triple] = (),
-    size_limit: SizeLimit | None = None,
 ) -> Fields:
     """Return the likeliest relations between the objects of a scene, and the disagreements.
 
@@ -70,7 +69,6 @@ def relations(
             left(x, y).
         flipped: relations of the scene that the request states by their opposite. Disagreements
             use the words of the request.
-        size_limit: limit on the size of the answer, or None.
 
     Returns:
         The fields `relations` and `disagreements` of `scene_client.schemas.RelationsAnswer`. The
@@ -78,16 +76,7 @@ def relations(
         `observed_probability` comes first. Entries with equal values are ordered by their indices.
         If the training scenes of the model have no relations, the answer lists observed relations
         only. Then the field `warnings` says so.
-
-    Raises:
-        ValueError: top_k is below 1, the probability is outside [0, 1], or a pair does not consist
-            of two different objects of the scene.
-        RequestError: the answer would exceed `size_limit`.
     """
-    if top_k < 1:
-        raise ValueError(f"top_k must be at least 1, not {top_k}")
-    if not 0 <= min_probability <= 1:
-        raise ValueError(f"min_probability must be in [0, 1], not {min_probability}")
     if not scene.objects:
         return {"relations": [], "disagreements": []}
     posterior, A = Posterior(artifact, scene), artifact.spec.A
@@ -107,9 +96,6 @@ def relations(
     disagreements = _disagreements(
         artifact, scene, posterior, judged, flipped, top_k=top_k, least=least
     )
-    if size_limit is not None:
-        count = len(p) + 2 * len(disagreements)
-        size_limit.check("top_k", (count, RELATION_BYTES, 2))
     names, observed, things = relation_names(A), set(scene.relations or ()), scene.objects
     judges = artifact.spec.judges_relations
     entries: list[Fields] = []
@@ -169,11 +155,6 @@ def _judged(
         return things[:, None] & things & ~np.eye(size, dtype=np.bool_)
     judged = np.zeros((size, size), dtype=np.bool_)
     for subject, object_ in pairs:
-        if subject == object_ or not (0 <= subject < size and 0 <= object_ < size):
-            raise ValueError(
-                f"pair ({subject}, {object_}) must have the indices of two different objects; the "
-                f"scene has {size} objects"
-            )
         judged[subject, object_] = True
     return judged
 

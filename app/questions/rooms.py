@@ -15,15 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from app.inference.elementary import softmax
-from app.questions.answer import (
-    CAUSE_BYTES,
-    OBJECT_BYTES,
-    Fields,
-    SizeLimit,
-    lengths,
-    reasons,
-    significant,
-)
+from app.questions.answer import Fields, reasons, significant
 from app.questions.names import ErrorList
 from app.questions.posterior import LEAST_CHANGE, Posterior
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
@@ -40,7 +32,6 @@ def rooms(
     top_k: int = 5,
     candidates: Sequence[int] | None = None,
     details: bool = True,
-    size_limit: SizeLimit | None = None,
 ) -> Fields:
     """Rank the room types by their probability, likeliest first.
 
@@ -50,22 +41,13 @@ def rooms(
         candidates: indices of the possible room types; their probabilities sum to 1. None means all
             room types.
         details: whether the answer contains `because`.
-        size_limit: limit on the size of the answer, or None.
 
     Returns:
         The field `room_types` of `scene_client.schemas.RoomsAnswer`. The list is empty if the model
         has no room types. Then the field `warnings` says so.
-
-    Raises:
-        ValueError: top_k is below 1, or a candidate is not a room type.
-        RequestError: the answer would exceed `size_limit`.
     """
-    if top_k < 1:
-        raise ValueError(f"top_k must be at least 1, not {top_k}")
     C = artifact.spec.C
     among = np.arange(C) if candidates is None else np.array(candidates, dtype=np.int64)
-    if ((among < 0) | (among >= C)).any():
-        raise ValueError(f"a candidate is not a room type; indices are below C = {C}")
     if not len(among):
         return {"warnings": [] if C else [_NO_ROOM_TYPES], "room_types": []}
     posterior = Posterior(artifact, replace(scene, room_type=None))
@@ -82,9 +64,6 @@ def rooms(
         causes = reasons(scene, posterior.present, change, least=LEAST_CHANGE)
         for entry, because in zip(entries, causes, strict=True):
             entry["because"] = because
-    if size_limit is not None:
-        count = lengths(entries, "because")
-        size_limit.check("top_k", (len(entries), OBJECT_BYTES, 1), (count, CAUSE_BYTES, 1))
     return {"room_types": entries}
 
 

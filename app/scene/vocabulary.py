@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -143,12 +142,6 @@ class Vocabulary:
     def labels(self) -> tuple[str, ...]:
         """The canonical labels in the order of the class indices."""
         return tuple(entry.label for entry in self.objects)
-
-    @cached_property
-    def longest_label(self) -> int:
-        """Size in bytes of the longest label or room type in JSON."""
-        names = [*self.labels, *self.room_types]
-        return max(len(json.dumps(name, ensure_ascii=False).encode()) for name in names)
 
     # The arrays are read-only.
 

@@ -55,7 +55,7 @@ The service accepts such a body if it arrives in one piece, also when other bodi
 
 # Time in seconds between two checks of the client's connection during a computation in a thread.
 _LOOK: Final = 0.25
-# Priority of worker threads, from 0 (like the event loop) to 19 (lowest).
+# Difference in niceness between the worker threads and the event loop.
 _NICE: Final = 5
 
 
@@ -242,9 +242,10 @@ class Admission:
 
 
 def _lower_priority() -> None:
-    # Linux gives each thread a priority of its own.
+    # Linux gives each thread a priority of its own. A new thread has the priority of the process.
     with suppress(OSError, AttributeError):
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+        of_thread = os.PRIO_PROCESS, threading.get_native_id()
+        os.setpriority(*of_thread, os.getpriority(*of_thread) + _NICE)
 
 
 async def in_thread(

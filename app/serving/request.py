@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from time import monotonic
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
-from app.questions.answer import Fields, SizeLimit, envelope
+from app.errors import AnswerTooLargeError, LocatedError
+from app.questions.answer import Fields, envelope, written_within
 from app.questions.generate import STEPS
 from app.questions.names import LookUps, new_labels
 from app.questions.question import Question
@@ -82,8 +84,8 @@ class Request:
 
     async def answer(
         self, question: Question[RequestT], scene: RequestT, most_bytes: int | None = None
-    ) -> Fields:
-        """Ask the model in the field `model` of a scene one question.
+    ) -> bytes:
+        """Ask the model in the field `model` of a scene one question. Return the answer as JSON.
 
         The answer has the fields of `scene_client.schemas.Answer` and of the question, and at most
         ``most_bytes`` bytes. By default, this limit is the limit of the service.
@@ -109,40 +111,35 @@ class Request:
                 may_be_empty=question.samples,
             )
             options = question.read(scene, artifact, reading)
-            limit = SizeLimit(reading, limits.answer_bytes if most_bytes is None else most_bytes)
-            call = partial(question.answer, artifact, reading.scene, **options, size_limit=limit)
-            return reading, call
+            return reading, partial(question.answer, artifact, reading.scene, **options)
 
         def compute() -> tuple[Reading, Fields]:
             reading, call = read()
             return reading, call()
 
-        is_small = is_quick(scene, artifact.vocabulary)
-        if not is_small and ticket.lane is not admission.slow:
+        is_fast, executor = is_quick(scene, artifact.vocabulary), admission.worker
+        if not is_fast and ticket.lane is not admission.slow:
             await ticket.enter(admission.slow, 1)
         if question.samples:
-            if is_small:
+            if is_fast:
                 reading, ask = read()
             else:
                 (reading, ask), _ = await in_thread(lambda _: read(), ticket, admission.worker)
             weight = ask.keywords["count"] * (ask.keywords["steps"] or STEPS)
             # The models of a client take turns, too.
             await ticket.enter(admission.draws, weight, line=(ticket.client, artifact.key))
-            fields, seconds = await in_thread(
-                lambda stop: ask(stop=stop), ticket, admission.drawing
-            )
-        elif is_small:
+            executor = admission.drawing
+            fields, seconds = await in_thread(lambda stop: ask(stop=stop), ticket, executor)
+        elif is_fast:
             ticket.check()
             began = monotonic()
             reading, fields = compute()
             seconds = monotonic() - began
             ticket.check()
         else:
-            answered, seconds = await in_thread(lambda _: compute(), ticket, admission.worker)
-            reading, fields = answered
-        answer = envelope(scene, self.id, artifact.reference, reading)
-        warnings = [*reading.warnings, *fields.pop("warnings", ())]
-        answer |= fields | {"warnings": warnings}
+            (reading, fields), seconds = await in_thread(lambda _: compute(), ticket, executor)
+        answer = envelope(scene, self.id, artifact.reference, reading) | fields
+        answer["warnings"] = [*reading.warnings, *fields.get("warnings", ())]
         record, waited = self.record, ticket.waited
         new = waited - (record.queue_seconds or 0.0)
         record.queue_seconds = waited
@@ -150,7 +147,27 @@ class Request:
         self.runtime.metrics.computed(
             artifact.key, question.name, new, seconds, len(scene.objects), answer
         )
-        return answer
+
+        def write() -> bytes:
+            most = limits.answer_bytes if most_bytes is None else most_bytes
+            if (body := written_within(answer, most)) is None:
+                raise _too_large(question, most)
+            return body
+
+        if is_fast and not question.samples:
+            return write()
+        return (await in_thread(lambda _: write(), ticket, executor))[0]
+
+
+def _too_large(question: Question[Any], most: int) -> AnswerTooLargeError:
+    """Return the error for an answer of too many bytes. It names the parameter to lower."""
+    fields = question.request.model_fields
+    field = next(name for name in ("count", "top_k", "objects") if name in fields)
+    message = (
+        f"the answer would have more than {most} bytes, the limit of SCENE_MAX_ANSWER_BYTES here. "
+        f"Lower `{field}`, send fewer objects, relations or scenes, or use shorter ids"
+    )
+    return AnswerTooLargeError([LocatedError((field,), message)])
 
 
 QUICK_OBJECTS: Final = 32
@@ -164,9 +181,19 @@ Such a question takes about 2 ms.
 
 def is_quick(scene: SceneRequest, vocabulary: Vocabulary) -> bool:
     """Return whether the event loop may compute a question about a scene."""
-    lists = (scene.relations, getattr(scene, "candidates", None))
-    if len(scene.objects) > QUICK_OBJECTS or any(len(one or ()) > QUICK_ENTRIES for one in lists):
-        return False
-    if getattr(scene, "top_k", 0) > QUICK_ENTRIES:
-        return False
-    return new_labels(scene, vocabulary) <= QUICK_LABELS
+    return is_small(vars(scene)) and new_labels(scene, vocabulary) <= QUICK_LABELS
+
+
+def is_small(scene: Mapping[str, Any]) -> bool:
+    """Return whether the event loop may validate a scene.
+
+    Args:
+        scene: the fields of the request, validated or not.
+    """
+    for name, value in scene.items():
+        if isinstance(value, list):
+            if len(value) > (QUICK_OBJECTS if name == "objects" else QUICK_ENTRIES):
+                return False
+        elif name == "top_k" and isinstance(value, int) and value > QUICK_ENTRIES:
+            return False
+    return True

@@ -79,9 +79,12 @@ class Connection(asyncio.Protocol):
 
 
 async def connect(
-    port: int, count: int, on_answer: Callable[[Connection, int, bytes], None]
+    port: int,
+    count: int,
+    on_answer: Callable[[Connection, int, bytes], None],
+    address: str = "127.0.0.1",
 ) -> list[Connection]:
-    """Open ``count`` connections to a port on this machine.
+    """Open ``count`` connections to a port on this machine, from one of its loopback addresses.
 
     Raises:
         OSError: the connection was refused.
@@ -90,7 +93,7 @@ async def connect(
     made = []
     for _ in range(count):
         _, connection = await loop.create_connection(
-            lambda: Connection(on_answer), "127.0.0.1", port
+            lambda: Connection(on_answer), "127.0.0.1", port, local_addr=(address, 0)
         )
         made.append(connection)
     return made

@@ -59,9 +59,17 @@ def joined(windows: Sequence[Window]) -> Window:
 
 
 async def at_concurrency(
-    port: int, requests: Sequence[bytes], connections: int, seconds: float
+    port: int,
+    requests: Sequence[bytes],
+    connections: int,
+    seconds: float,
+    address: str = "127.0.0.1",
 ) -> Window:
-    """Run a window in which each connection sends its next request directly after an answer."""
+    """Run a window in which each connection sends its next request directly after an answer.
+
+    Args:
+        address: loopback address of the client. The service tells clients apart by it.
+    """
     latency: list[float] = []
     statuses: Counter[int] = Counter()
     began: dict[Connection, float] = {}
@@ -84,7 +92,7 @@ async def at_concurrency(
         elif not began:
             finished.set()
 
-    pool = await connect(port, connections, answered)
+    pool = await connect(port, connections, answered, address)
     start = perf_counter()
     end = start + seconds
     for connection in pool:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import string
 from collections import Counter
-from collections.abc import Awaitable, Callable
 from itertools import cycle, islice
+from pathlib import Path
 from random import Random
 from typing import Any
 
@@ -18,7 +18,7 @@ from scene_client.schemas import MAX_BATCH
 from scene_client.validation import MAX_ERRORS
 from tests.http.stores import VOCABULARY
 from tests.http.test_problems import problem
-from tests.services import client_of_service
+from tests.services import Replace, client_of_service, serve
 
 LABELS = [entry.label for entry in VOCABULARY.objects if not entry.structure]
 LIMIT = 4 * 2**20
@@ -42,18 +42,35 @@ LARGEST = {"top_k": 4096, "include_opposites": True}
 BATCH = {"scenes": [scene(23, **LARGEST)] * MAX_BATCH}
 
 
-async def test_the_answer_to_a_batch_has_a_limit(client: httpx.AsyncClient) -> None:
-    """It had 319 MB."""
-    answer = await client.post("/relations/batch", json=BATCH)
+async def test_the_answer_to_a_batch_has_a_limit(shared_store: Path, replace: Replace) -> None:
+    """It had 319 MB. The batch stops at the first answer that is too large."""
+    computed = 0
+
+    def counted(relations: Any, *args: Any, **options: Any) -> Any:
+        nonlocal computed
+        computed += 1
+        return relations(*args, **options)
+
+    async with serve(shared_store) as client:
+        replace("relations", counted)
+        headers = {"X-Request-Timeout-Ms": "60000"}
+        answer = await client.post("/relations/batch", json=BATCH, headers=headers)
     assert answer.status_code == 200
     assert len(answer.content) <= LIMIT
     results = answer.json()["results"]
-    assert [entry["status"] for entry in results[:2]] == [200] * 2
-    assert {entry["status"] for entry in results[4:]} == {422}
-    last = results[-1]["problem"]
-    assert last["type"] == "/problems/answer-too-large"
-    assert last["errors"][0]["pointer"] == f"#/scenes/{MAX_BATCH - 1}/top_k"
-    assert "Lower `top_k`" in last["errors"][0]["message"]
+    statuses = [entry["status"] for entry in results]
+    assert statuses == [200] * (computed - 1) + [422] * (MAX_BATCH + 1 - computed)
+    assert len(answer.content) > LIMIT / 2
+    first, second = (
+        entry["problem"]["errors"][0] for entry in results[computed - 1 : computed + 1]
+    )
+    assert first["pointer"] == f"#/scenes/{computed - 1}/top_k"
+    assert "Lower `top_k`" in first["message"]
+    assert second["pointer"] == f"#/scenes/{computed}"
+    assert "another request" in second["message"]
+    assert {entry["problem"]["type"] for entry in results[computed - 1 :]} == {
+        "/problems/answer-too-large"
+    }
 
 
 def crowd(objects: int, letter: str = "😀") -> dict[str, Any]:
@@ -65,56 +82,32 @@ def crowd(objects: int, letter: str = "😀") -> dict[str, Any]:
     return found
 
 
+DRAWN = {"objects": LABELS[:8], "steps": 2, "seed": 0}
+
+
 @pytest.mark.parametrize(
-    ("question", "letter", "options", "parameter"),
+    ("question", "bodies", "parameter"),
     [
-        ("relations", "😀", LARGEST, "top_k"),
-        ("missing", "😀", {}, "top_k"),
-        ("outliers", "😀", {}, "objects"),
-        ("outliers", "x", {"frame_id": "f" * 256}, "objects"),
+        ("relations", [crowd(size) | LARGEST for size in (2, 16)], "top_k"),
+        ("missing", [crowd(size) for size in (2, 64)], "top_k"),
+        ("outliers", [crowd(size) for size in (2, 64)], "objects"),
+        ("generate", [DRAWN | {"count": count} for count in (1, 64)], "count"),
     ],
 )
 async def test_single_answers_have_the_same_limit(
+    client: httpx.AsyncClient,
     limited: httpx.AsyncClient,
     question: str,
-    letter: str,
-    options: dict[str, Any],
+    bodies: list[dict[str, Any]],
     parameter: str,
 ) -> None:
-    """Whatever it is made of: the largest scene that is answered has an answer within the limit."""
-
-    async def ask(objects: int) -> httpx.Response:
-        return await limited.post(f"/{question}", json=crowd(objects, letter) | options)
-
-    await check_the_largest(ask, 128, parameter)
-
-
-async def test_drawn_scenes_have_the_same_limit(limited: httpx.AsyncClient) -> None:
-    async def ask(count: int) -> httpx.Response:
-        body = {"objects": LABELS[:8], "count": count, "steps": 2, "seed": 0}
-        return await limited.post("/generate", json=body)
-
-    await check_the_largest(ask, 64, "count")
-
-
-async def check_the_largest(
-    ask: Callable[[int], Awaitable[httpx.Response]], refused: int, parameter: str
-) -> None:
-    """Of a size that is answered has an answer within the limit, and not far below it."""
-    document = problem(await ask(refused), 422, "answer-too-large")
-    assert document["errors"][0]["pointer"] == f"#/{parameter}"
-    answered, largest = 1, await ask(1)
-    while refused - answered > 1:
-        middle = (answered + refused) // 2
-        answer = await ask(middle)
-        if answer.is_success:
-            answered, largest = middle, answer
-        else:
-            problem(answer, 422, "answer-too-large")
-            assert len(answer.content) < 2**12
-            refused = middle
-    assert largest.is_success
-    assert SMALL / 8 < len(largest.content) <= SMALL
+    small, large = [(await client.post(f"/{question}", json=body)).content for body in bodies]
+    assert len(small) <= SMALL < len(large)
+    assert len((await limited.post(f"/{question}", json=bodies[0])).content) == len(small)
+    answer = await limited.post(f"/{question}", json=bodies[1])
+    (error,) = problem(answer, 422, "answer-too-large")["errors"]
+    assert error["pointer"] == f"#/{parameter}"
+    assert f"more than {SMALL} bytes" in error["message"]
 
 
 # ----------------------------------------------------------------------------------- unknown labels

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import socket
 import threading
 from pathlib import Path
@@ -9,8 +10,12 @@ from typing import Any
 
 import httpx
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from pydantic import ValidationError
+from pydantic_core import from_json
 
+from app.api.body import parse
 from app.questions.reading import read_scene
 from scene_client.schemas import MissingRequest
 from tests.http.test_problems import problem
@@ -29,7 +34,7 @@ locked = live_service(SCENE_API_KEY=API_KEY)
         ("missing", "objects", {}, 256),
         ("missing", "candidates", 7, 4096),
         ("relations", "pairs", [], 4096),
-        ("outliers", "relations", [], 65536),
+        ("outliers", "relations", 7, 65536),
         ("outliers/batch", "scenes", {}, 256),
     ],
 )
@@ -42,6 +47,68 @@ async def test_entries_are_counted_before_they_are_validated(
     assert [(error["pointer"], error["message"]) for error in document["errors"]] == [
         (f"#/{field}", f"must have at most {most} entries")
     ]
+
+
+@pytest.fixture
+def parsed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The length of each text that the JSON parser reads."""
+    lengths = list[int]()
+
+    def counted(text: str | bytes, **options: Any) -> Any:
+        lengths.append(len(text))
+        return from_json(text, **options)
+
+    monkeypatch.setattr("app.api.body.from_json", counted)
+    return lengths
+
+
+def batch(entry: bytes, size: int = 2**21) -> bytes:
+    return b'{"scenes":[' + b",".join([entry] * (size // (len(entry) + 1) - 12)) + b"]}"
+
+
+@pytest.mark.parametrize("entry", [b"[]", b"{}", b"[" * 99 + b"]" * 99])
+async def test_arrays_and_objects_are_counted_before_they_are_parsed(
+    client: httpx.AsyncClient, parsed: list[int], entry: bytes
+) -> None:
+    """They stopped the service for a second."""
+    dense = b'{"scenes":[{"objects":["bed"],"candidates":[%b]}]}' % b",".join([entry] * 2**17)
+    for body in (batch(entry), dense[: 2**21]):
+        response = await client.post("/missing/batch", content=body, headers=JSON)
+        assert "arrays and objects" in problem(response, 422, "invalid-request")["detail"]
+    assert parsed == []
+
+
+@pytest.mark.parametrize("entry", [b"1", b'""', b"9" * 4000])
+async def test_a_large_batch_is_parsed_scene_by_scene(
+    client: httpx.AsyncClient, parsed: list[int], entry: bytes
+) -> None:
+    response = await client.post("/missing/batch", content=batch(entry), headers=JSON)
+    document = problem(response, 422, "invalid-request")
+    assert document["errors"][0]["message"] == "must have at most 256 entries"
+    assert len(parsed) == 257
+    parsed.clear()
+    scene = b'{"objects":["bed"]%b}'
+    scenes = [scene % b""] * 199 + [scene % (b" " * 250_000)] * 5
+    body = b' {"scenes": [ %b ] } ' % b" , ".join(scenes)
+    response = await client.post("/missing/batch", content=body, headers=JSON)
+    assert [entry["status"] for entry in response.json()["results"]] == [200] * 204
+    assert max(parsed) < 2**18
+    parsed.clear()
+    body = b'{"scenes":[%b,%b]}' % (scene % b"", scene % (b" " * 2**18))
+    problem(await client.post("/missing/batch", content=body, headers=JSON), 400, "not-json")
+    assert parsed == [len(b'"scenes"'), len(scene % b"")]
+
+
+SHORT = st.text(max_size=9)
+
+
+@given(
+    st.dictionaries(SHORT, st.lists(SHORT) | SHORT | st.dictionaries(SHORT, st.none(), max_size=1)),
+    st.sampled_from([None, 0, "\t"]),
+)
+def test_a_body_in_pieces_is_the_same_body(value: dict[str, Any], indent: Any) -> None:
+    body = json.dumps(value, indent=indent).encode()
+    assert parse(body, 120) == json.loads(body)
 
 
 async def test_the_body_of_one_scene_has_a_limit_of_its_own(client: httpx.AsyncClient) -> None:

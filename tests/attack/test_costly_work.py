@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import gc
 import json
-import os
+import threading
 import time
-from contextlib import suppress
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,30 +19,32 @@ from pydantic import ValidationError
 from app.settings import Settings
 from tests.http.stores import VOCABULARY
 from tests.http.test_problems import problem
-from tests.services import Hold, LiveService, Replace, serve
+from tests.services import Hold, Replace, serve
 
 LABELS = [entry.label for entry in VOCABULARY.objects if not entry.structure]
 HOME = {"objects": LABELS[:4]}
+LONG = {"X-Request-Timeout-Ms": "60000"}
 
 
 async def test_quick_questions_pass_large_scenes_and_batches(
     shared_store: Path, hold: Hold
 ) -> None:
     async with serve(shared_store) as client:
-        release = hold("outliers").release
+        client.headers.update(LONG)
+        held = hold("outliers")
         large = {"objects": [LABELS[0]] * 33, "model": "deep"}
         costly = [
             *(asyncio.ensure_future(client.post("/outliers", json=large)) for _ in range(4)),
             asyncio.ensure_future(client.post("/outliers/batch", json={"scenes": [large] * 4})),
         ]
-        await asyncio.sleep(0.1)
+        assert await asyncio.to_thread(held.started.wait, 60)
         for size in range(1, 14):
             body = {"objects": LABELS[:size]}
             assert (await client.post("/missing", json=body)).is_success
             assert (await client.post("/relations", json=body)).is_success
             assert (await client.get("/health/live")).is_success
         assert not any(job.done() for job in costly)
-        release.set()
+        held.release.set()
         assert all(answer.is_success for answer in await asyncio.gather(*costly))
 
 
@@ -51,28 +53,22 @@ def test_the_longest_deadline_is_no_shorter_than_the_default(shared_store: Path)
         Settings(store=shared_store, request_timeout_ms=2_000, max_request_timeout_ms=1_000)
 
 
-@pytest.mark.slow
-def test_work_of_a_departed_client_ends(shipped: LiveService) -> None:
-    body = {"objects": ["bed"], "count": 64, "steps": 500, "temperature": 1.5}
-    costs = []
-    for patience in (60, 0.1):
-        before = used(shipped.process.pid)
-        with suppress(httpx.TimeoutException):
-            shipped.client.post("/generate", json=body, timeout=patience)
-        if patience < 1:
-            time.sleep(5)  # more than the question takes
-        costs.append(used(shipped.process.pid) - before)
-    whole, begun = costs
-    # The service looks every quarter of a second whether the client is there, and ends the
-    # question between two scenes.
-    assert begun < 0.6 * whole
-    assert shipped.client.post("/outliers", json=HOME).is_success
+async def test_work_of_a_departed_client_ends(shared_store: Path, replace: Replace) -> None:
+    begun, ended = threading.Event(), threading.Event()
 
+    def endless(generate: Any, *args: Any, stop: Callable[[], bool], **options: Any) -> Any:
+        begun.set()
+        while not stop():
+            time.sleep(0.001)
+        ended.set()
+        return generate(*args, stop=stop, **options)
 
-def used(pid: int) -> float:
-    """Processor seconds that a process has used."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    async with serve(shared_store) as client:
+        replace("generate", endless)
+        drawing = asyncio.ensure_future(client.post("/generate", json=HOME, headers=LONG))
+        assert await asyncio.to_thread(begun.wait, 60)
+        drawing.cancel()
+        assert await asyncio.to_thread(ended.wait, 60)
 
 
 async def test_a_request_without_enough_memory_gets_503(

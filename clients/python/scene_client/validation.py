@@ -84,7 +84,7 @@ def _all_errors(error: ValidationError, body: Any, form: type[Request]) -> list[
     """Return pydantic's errors of a request, the errors of objects first, as in the schema.
 
     Pydantic reports the errors of the first invalid object only. So the function replaces this
-    object by a valid one and validates the request again, until it has `MAX_ERRORS` errors.
+    object by a valid one and validates the objects again, until it has `MAX_ERRORS` errors.
     """
     errors = newest_errors = error.errors(include_url=False)
     while len(errors) < MAX_ERRORS:
@@ -93,7 +93,7 @@ def _all_errors(error: ValidationError, body: Any, form: type[Request]) -> list[
             break
         objects = [*body["objects"]]
         objects[index] = "valid"
-        body = {**body, "objects": objects}
+        body = {"objects": objects}
         try:
             form.model_validate(body)
             break
