@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import gzip
+import struct
 import tracemalloc
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from training.datasets import DatasetError, files, read_scenes
+from training.datasets import DatasetError, files, read_scenes, sunrgbd_mat
 from training.datasets.jsonl import MAX_LINE
 from training.datasets.priors import read_prior_scenes
 
@@ -62,6 +64,66 @@ def test_a_text_file_has_a_limit_after_decompression(
     content *= 2**20 // len(content) + 1
     path.write_bytes(gzip.compress(content) if path.suffix == ".gz" else content)
     assert refused(path)[0] == f"{path}: is larger than 1 MiB after decompression"
+
+
+def element(kind: int, body: bytes) -> bytes:
+    return struct.pack("<II", kind, len(body)) + body + bytes(-len(body) % 8)
+
+
+def array(kind: int, count: int, *parts: bytes) -> bytes:
+    """A MATLAB array that announces so many entries."""
+    header = element(6, struct.pack("<II", kind, 0)) + element(5, struct.pack("<ii", 1, count))
+    return element(14, header + element(1, b"SUNRGBDMeta") + b"".join(parts))
+
+
+FIELDS = struct.pack("<HHi", 5, 4, 8) + element(1, b"a".ljust(8, b"\0") + b"b".ljust(8, b"\0"))
+
+
+def nested(depth: int) -> bytes:
+    found = b""
+    for _ in range(depth):
+        found = array(1, 1, found)
+    return found
+
+
+@pytest.mark.parametrize("packed", [False, True], ids=["plain", "compressed"])
+@pytest.mark.parametrize(
+    ("variable", "problem"),
+    [
+        (lambda: array(4, 2**24, element(1, bytes(2**24))), "is larger than 16 MiB after"),
+        (lambda: array(1, 2**25), "is larger than 16 MiB after"),  # 180 bytes took 4.1 GB
+        (lambda: array(2, 2**23, FIELDS), "is larger than 16 MiB after"),
+        (lambda: array(1, 1, array(2, 2**23, FIELDS)), "is larger than 16 MiB after"),
+        (lambda: nested(2000), "the arrays are nested too deeply"),
+        (lambda: b"\x0e\0\0\0\x08\0\0\0\x06\0\0\0\0\0\0\0", "is not a MATLAB 5 file"),
+    ],
+    ids=["text", "cells", "structs", "nested structs", "deep", "torn"],
+)
+def test_a_mat_file_is_measured_before_it_is_unpacked(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    variable: Callable[[], bytes],
+    problem: str,
+    packed: bool,
+) -> None:
+    monkeypatch.setattr(sunrgbd_mat, "MAX_BYTES", 2**24)
+    content = variable()
+    if packed:
+        content = zlib.compress(content)
+        content = struct.pack("<II", 15, len(content)) + content
+    path = tmp_path / "SUNRGBDMeta3DBB_v2.mat"
+    path.write_bytes(b"MATLAB 5.0 MAT-file".ljust(124) + b"\0\1IM" + content)
+    del content
+    message, memory = refused(path)
+    assert message.startswith(f"{path}: {problem}")
+    assert memory < 3 * sunrgbd_mat.MAX_BYTES
+
+
+def test_a_newer_mat_file_is_refused_unread(tmp_path: Path) -> None:
+    """Version 7.3 is HDF5, which unpacks chunks as it likes."""
+    path = tmp_path / "SUNRGBDMeta3DBB_v2.mat"
+    path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\0\2IM" + bytes(512))
+    assert refused(path)[0] == (f"{path}: is not a MATLAB 5 file: its header names another version")
 
 
 @pytest.mark.parametrize(

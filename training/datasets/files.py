@@ -36,7 +36,7 @@ def read_lines(path: Path, limit: int) -> Iterator[bytes]:
             number = size = 0
             while line := file.readline(limit + 1):
                 number, size = number + 1, size + len(line)
-                _check_size(path, size)
+                check_size(path, size, MAX_BYTES)
                 if len(line) > limit:
                     raise DatasetError(
                         path, f"line {number}", f"the line is longer than {limit} bytes"
@@ -46,11 +46,10 @@ def read_lines(path: Path, limit: int) -> Iterator[bytes]:
         raise DatasetError.unreadable(path, error) from error
 
 
-def _check_size(path: Path, size: int) -> None:
+def check_size(path: Path, size: int, limit: int) -> None:
     """Raise DatasetError if a file has more bytes than the limit, after decompression."""
-    if size > MAX_BYTES:
-        limit = f"{MAX_BYTES // 2**20} MiB"
-        raise DatasetError(path, "", f"is larger than {limit} after decompression")
+    if size > limit:
+        raise DatasetError(path, "", f"is larger than {limit // 2**20} MiB after decompression")
 
 
 def read_json(path: Path, content: type[T]) -> T:
@@ -61,7 +60,7 @@ def read_json(path: Path, content: type[T]) -> T:
             error has the position of the first such value, such as ``scans.3.objects``.
     """
     try:
-        _check_size(path, path.stat().st_size)
+        check_size(path, path.stat().st_size, MAX_BYTES)
         return TypeAdapter(content).validate_json(path.read_bytes())
     except OSError as error:
         raise DatasetError.unreadable(path, error) from error

@@ -1,7 +1,14 @@
-"""The readers of scene files by the name of the format: JSON lines, and COCO instance annotations.
+"""The readers of scene files by the name of the format, and the readers of 3DSSG and COCO.
 
-``instances*.json`` are annotations of COCO (Lin et al., ECCV 2014). A reader raises a DatasetError
-if a file is missing or does not have the official format.
+3DSSG scene graphs (Wald et al., CVPR 2020): the whole data set consists of ``relationships.json``
+and of ``objects.json``, which contains the labels. The subset consists of
+``relationships_train.json`` and ``relationships_validation.json``. The files of the subset include
+the labels and divide scans into splits of at most nine objects. ``3RScan.json`` in the same folder
+lists the scans of each room.
+
+COCO instance annotations (Lin et al., ECCV 2014): ``instances*.json``.
+
+A reader raises a DatasetError if a file is missing or does not have the official format.
 """
 
 from __future__ import annotations
@@ -9,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Any, Final
 
 from pydantic import BaseModel
 
@@ -19,10 +26,85 @@ from training.datasets.records import (
     AnnotatedObject,
     AnnotatedScene,
     DatasetError,
+    Id,
     Length,
     Number,
     Text,
 )
+from training.datasets.sources import relations_of, supported_subjects
+from training.datasets.sunrgbd_mat import read_sunrgbd_mat
+
+
+class _Scan(BaseModel):
+    scan: str
+    split: int | str | None = None
+    objects: dict[str, Text] | None = None  # labels by object; None: see objects.json
+    relationships: list[tuple[Id, Id, Any, str]]  # subject, object, id and name of the predicate
+
+
+class _Scans(BaseModel):
+    scans: list[_Scan]
+
+
+class _Thing(BaseModel):
+    id: Id
+    label: Text
+
+
+class _LabelledScan(BaseModel):
+    scan: str
+    objects: list[_Thing]
+
+
+class _LabelledScans(BaseModel):
+    scans: list[_LabelledScan]
+
+
+class _Room(BaseModel):
+    reference: str
+    scans: list[_Room] = []  # of the same room
+
+
+def read_3dssg(path: Path) -> list[AnnotatedScene]:
+    """Read the scans, or splits of scans, in a relationships file of 3DSSG as scenes.
+
+    All scans of a room are in one group. The official files contain no room types and no poses.
+    """
+    scans = read_json(path, _Scans).scans
+    rooms = read_json(path.with_name("3RScan.json"), list[_Room])
+    room_of = {scan.reference: room.reference for room in rooms for scan in (room, *room.scans)}
+    labels_of: dict[str, dict[str, str]] = {}
+    if any(scan.objects is None for scan in scans):
+        for labelled in read_json(path.with_name("objects.json"), _LabelledScans).scans:
+            labels = {thing.id: thing.label for thing in labelled.objects}
+            labels_of.setdefault(labelled.scan, {}).update(labels)
+    scenes: dict[str, AnnotatedScene] = {}
+    for number, scan in enumerate(scans):
+        name, labels = scan.scan, scan.objects or labels_of.get(scan.scan, {})
+        scene_id = f"3dssg-{name}" if scan.split is None else f"3dssg-{name}-{scan.split}"
+        index_of = {key: index for index, key in enumerate(labels)}
+        problems = {
+            f"scan {name} is not in 3RScan.json": name not in room_of,
+            f"scan {name} is not in objects.json": scan.objects is None and name not in labels_of,
+            f"scene {scene_id} is listed twice": scene_id in scenes,
+            "a relationship names an object that is not in the scan": any(
+                not {subject, anchor} <= labels.keys() for subject, anchor, *_ in scan.relationships
+            ),
+        }
+        for problem, is_found in problems.items():
+            if is_found:
+                raise DatasetError(path, f"scans.{number}", problem)
+        triples = [(index_of[i], name, index_of[j]) for i, j, _, name in scan.relationships]
+        scenes[scene_id] = AnnotatedScene(
+            scene_id=scene_id,
+            source="3dssg",
+            group=f"3rscan-{room_of[name]}",
+            room_type=None,
+            objects=tuple(AnnotatedObject(key, label) for key, label in labels.items()),
+            relations=relations_of("3dssg", triples),
+            supported=supported_subjects("3dssg", triples),
+        )
+    return list(scenes.values())
 
 
 class _Annotation(BaseModel):
@@ -80,30 +162,37 @@ def read_coco(path: Path) -> list[AnnotatedScene]:
     ]
 
 
-Reader: TypeAlias = Callable[[Path], list[AnnotatedScene]]
-
-READERS: Final[dict[str, Reader]] = {
-    "*.jsonl": read_jsonl,
-    "*.jsonl.gz": read_jsonl,
-    "instances*.json": read_coco,
+READERS: Final[dict[str, Callable[[Path], list[AnnotatedScene]]]] = {
+    "jsonl": read_jsonl,
+    "3dssg": read_3dssg,
+    "sunrgbd-mat": read_sunrgbd_mat,
+    "coco": read_coco,
 }
-"""The reader of each known format, by the pattern of its file names."""
 
 
-def reader_of(path: Path) -> Reader:
-    """Return the reader of a file, derived from the file name.
+_PATTERNS: Final = {
+    "*.jsonl": "jsonl",
+    "*.jsonl.gz": "jsonl",
+    "*.mat": "sunrgbd-mat",
+    "relationships*.json": "3dssg",
+    "instances*.json": "coco",
+}
+
+
+def guess_format(path: Path) -> str:
+    """Return the name of a file's format, derived from the file name.
 
     Raises:
         DatasetError: the name matches no known format.
     """
-    for pattern, reader in READERS.items():
+    for pattern, name in _PATTERNS.items():
         if fnmatchcase(path.name, pattern):
-            return reader
-    *patterns, last = READERS
+            return name
+    *patterns, last = _PATTERNS
     problem = "the file name fits no known format; rename the file to "
     raise DatasetError(path, "", f"{problem}{', '.join(patterns)} or {last}")
 
 
 def read_scenes(path: Path) -> list[AnnotatedScene]:
-    """Read the scenes of a file with the reader of `reader_of`, or raise its error."""
-    return reader_of(path)(path)
+    """Read the scenes of a file in the format that `guess_format` returns, or raise its error."""
+    return READERS[guess_format(path)](path)

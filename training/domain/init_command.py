@@ -15,8 +15,8 @@ from rich.markup import escape
 from app.registry import RegistryError
 from app.scene import label_key
 from training.datasets import AnnotatedScene, DatasetError, generate_rooms
-from training.datasets.jsonl import read_jsonl, scan_jsonl, write_jsonl
-from training.datasets.readers import read_scenes, reader_of
+from training.datasets.jsonl import scan_jsonl, write_jsonl
+from training.datasets.readers import guess_format, read_scenes
 from training.datasets.rooms import DOMAINS
 from training.datasets.vocabulary import vocabulary_json
 from training.domain.look import Label
@@ -156,7 +156,7 @@ def read_or_exit(path: Path, *, recorded: bool = False) -> list[AnnotatedScene]:
 
     A recorded file is JSONL, whatever its name.
     """
-    is_jsonl = recorded or reader_of(path) is read_jsonl
+    is_jsonl = recorded or guess_format(path) == "jsonl"
     lines = list(scan_jsonl(path) if is_jsonl else read_scenes(path))
     errors = [line for line in lines if isinstance(line, DatasetError)]
     if errors:

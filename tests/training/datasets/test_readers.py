@@ -1,19 +1,21 @@
 """Every reader, on small files of the official layout written here.
 
-A reader is tested by being listed: `LAYOUTS` has a file of every reader in `READERS`.
+A reader is tested by being listed: `LAYOUTS` must name every format of `READERS`.
 """
 
 from __future__ import annotations
 
 import gzip
+import itertools
 import json
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from scipy.io import savemat
 
 from tests.training.scenes import scene
 from training.datasets import (
@@ -23,7 +25,6 @@ from training.datasets import (
     generate_rooms,
     jsonl,
     read_scenes,
-    readers,
 )
 from training.datasets.priors import (
     COLUMNS,
@@ -31,6 +32,7 @@ from training.datasets.priors import (
     SOURCE,
     read_prior_scenes,
 )
+from training.datasets.readers import READERS, guess_format
 from training.fit.configuration import ConfigError, DataConfig
 from training.runs.pipeline import read_sources
 
@@ -79,7 +81,7 @@ def test_jsonl(tmp_path: Path) -> None:
     cup = AnnotatedObject("x", "cup", box2d=(1.0, 2.0, 3.0, 4.0), count=3)
     relations, denied = ((1, "on-top", 0), (2, "right", 1)), ((0, "behind", 2),)
     bed = (AnnotatedObject("0", "bed"),)
-    assert read_scenes(write_jsonl(tmp_path)) == [
+    assert READERS["jsonl"](write_jsonl(tmp_path)) == [
         AnnotatedScene(
             "a", "robot", "lab", "office", (desk, monitor, cup), relations, True, denied
         ),
@@ -233,6 +235,191 @@ def test_malformed_jsonl(tmp_path: Path, line: Any, message: str) -> None:
     check_malformed(path, message, "line 2")
 
 
+# ------------------------------------------------------------------------------- 3DSSG
+
+RESCANS = [
+    {"reference": "room-1", "type": "train", "scans": [{"reference": "room-1b", "removed": []}]},
+    {"reference": "room-2", "type": "validation", "scans": []},
+]
+SCAN = {
+    "scan": "room-1b",
+    "split": 2,
+    "objects": {"1": "floor", "4": "bed", "7": "pillow"},
+    "relationships": [
+        [7, 4, 15, "lying on"], [4, 1, 14, "standing on"], [7, 4, 1, "left"],
+        [4, 7, 2, "right"], [7, 4, 5, "close by"], [7, 7, 9, "bigger than"],
+    ],
+}  # fmt: skip
+WHOLE = {"scans": [{"scan": "room-2", "relationships": [["3", "2", 11, "higher than"]]}]}
+THINGS = [
+    {"global_id": "6", "label": "shelf", "id": "2", "ply_color": "#aec7e8"},
+    {"global_id": "7", "label": "picture", "id": "3", "attributes": {}},
+]
+OBJECTS = {"scans": [{"scan": "room-2", "objects": THINGS}]}
+
+
+def write_3dssg(folder: Path) -> Path:
+    write_json(folder / "3RScan.json", RESCANS)
+    return write_json(folder / "relationships_train.json", {"scans": [SCAN]})
+
+
+def test_3dssg_splits(tmp_path: Path) -> None:
+    (scene,) = READERS["3dssg"](write_3dssg(tmp_path))
+    assert (scene.scene_id, scene.group) == ("3dssg-room-1b-2", "3rscan-room-1")
+    things = [(thing.id, thing.label) for thing in scene.objects]
+    assert things == [("1", "floor"), ("4", "bed"), ("7", "pillow")]
+    on_top, left = ((2, "on-top", 1), (1, "on-top", 0)), ((2, "left", 1), (1, "right", 2))
+    assert scene.relations == on_top + left
+
+
+def test_3dssg_whole(tmp_path: Path) -> None:
+    write_3dssg(tmp_path)
+    write_json(tmp_path / "objects.json", OBJECTS)
+    (scene,) = read_scenes(write_json(tmp_path / "relationships.json", WHOLE))
+    assert (scene.scene_id, scene.group) == ("3dssg-room-2", "3rscan-room-2")
+    assert [thing.label for thing in scene.objects] == ["shelf", "picture"]
+    assert scene.relations == ((1, "above", 0),)
+
+
+def test_3dssg_needs_its_other_files(tmp_path: Path) -> None:
+    path = write_json(tmp_path / "relationships.json", WHOLE)
+    for file, content, message in (
+        ("other.json", [], r"3RScan\.json: no such file"),
+        ("3RScan.json", RESCANS, r"objects\.json: no such file"),
+        ("objects.json", {"scans": []}, r"scans\.0: scan room-2 is not in objects\.json"),
+        ("objects.json", OBJECTS, None),
+        ("3RScan.json", RESCANS[:1], r"scans\.0: scan room-2 is not in 3RScan\.json"),
+    ):
+        write_json(tmp_path / file, content)
+        if message:
+            with pytest.raises(DatasetError, match=message):
+                read_scenes(path)
+
+
+MALFORMED_3DSSG = [
+    ({}, "scans: Field required"),
+    *(
+        ({"scans": [SCAN | fields]}, message)
+        for fields, message in (
+            ({"objects": {"1": ""}, "relationships": []}, r"scans\.0\.objects\.1: "),
+            ({"relationships": [[7, 4]]}, r"scans\.0\.relationships\.0\.2: "),
+            ({"relationships": [[9, 4, 1, "left"]]}, r"scans\.0: .* not in the scan"),
+        )
+    ),
+    ({"scans": [SCAN, SCAN]}, r"scans\.1: scene 3dssg-room-1b-2 is listed twice"),
+]
+
+
+# ------------------------------------------------------------------------------- SUN RGB-D
+
+TURN = math.radians(30)
+COS, SIN = math.cos(TURN), math.sin(TURN)
+
+
+def box(classname: str, basis: Any, coeffs: list[float], centroid: list[float]) -> dict[str, Any]:
+    half, centre = np.array([coeffs]), np.array([centroid])
+    extra = {"orientation": np.array([[0.0, -1.0, 0.0]]), "label": np.array([[1]])}
+    values = {"basis": np.array(basis), "coeffs": half, "centroid": centre}
+    return values | {"classname": classname} | extra
+
+
+BOXES = [
+    box("bed", np.eye(3), [1.0, 0.5, 0.4], [0.5, 3.0, -0.6]),
+    # Turned by 30 degrees against the clock, seen from above; a negative half extent occurs.
+    box(
+        "night_stand",
+        [[COS, SIN, 0.0], [-SIN, COS, 0.0], [0.0, 0.0, 1.0]],
+        [-0.2, 0.3, 0.25],
+        [1.2, 2.5, -0.7],
+    ),
+]
+
+
+def struct_array(entries: list[dict[str, Any]]) -> np.ndarray:
+    """A 1 x n MATLAB struct array."""
+    if not entries:
+        return np.zeros((0, 0))
+    array = np.empty((1, len(entries)), dtype=[(name, object) for name in entries[0]])
+    for column, entry in enumerate(entries):
+        array[0, column] = tuple(entry.values())
+    return array
+
+
+def frame(name: str, boxes: list[dict[str, Any]]) -> dict[str, Any]:
+    extra = {"Rtilt": np.eye(3), "K": np.eye(3), "sensorType": "kv2", "valid": np.array([[1]])}
+    return {"sequenceName": name, "groundtruth3DBB": struct_array(boxes)} | extra
+
+
+def write_mat(folder: Path) -> Path:
+    path = folder / "SUNRGBDMeta3DBB_v2.mat"
+    frames = [
+        frame("SUNRGBD/kv2/kinect2data/0001", BOXES),
+        frame("SUNRGBD/kv2/kinect2data/0002", []),
+        frame("SUNRGBD/kv2/kinect2data/0003", BOXES[:1]),
+        frame("SUNRGBD/xtion/sun3ddata/brown_1/f1/", BOXES[:1]),
+        frame("SUNRGBD/xtion/sun3ddata/brown_1/f2/", BOXES[:1]),
+    ]
+    room = folder / "SUNRGBD/kv2/kinect2data/0001"
+    room.mkdir(parents=True, exist_ok=True)
+    (room / "scene.txt").write_text("bedroom")
+    savemat(path, {"SUNRGBDMeta": struct_array(frames)})
+    return path
+
+
+def test_sunrgbd_mat(tmp_path: Path) -> None:
+    scenes = READERS["sunrgbd-mat"](write_mat(tmp_path))
+    assert [scene.scene_id.rpartition("/")[2] for scene in scenes] == ["0001", "0003", "f1", "f2"]
+    assert [scene.room_type for scene in scenes] == ["bedroom", None, None, None]
+    first, second, brown, brown_again = (scene.group for scene in scenes)
+    assert first == second != brown == brown_again
+    assert all(scene.viewer_frame for scene in scenes)
+    bed, stand = scenes[0].objects
+    assert (bed.label, stand.label) == ("bed", "night_stand")
+    # 3 m away and half a metre to the right: x away, y left.
+    assert bed.position == (3.0, -0.5, -0.6)
+    assert stand.size == pytest.approx((0.4, 0.6, 0.5))
+    assert [corners(bed), corners(stand)] == [expected_corners(box) for box in BOXES]
+
+
+SIGNS = np.array(list(itertools.product((-1, 1), repeat=2)))
+
+
+def corners(thing: Any) -> list[list[float]]:
+    cos, sin = math.cos(thing.yaw), math.sin(thing.yaw)
+    points = SIGNS * thing.size[:2] / 2 @ [[cos, sin], [-sin, cos]] + thing.position[:2]
+    return sorted(points.round(6).tolist())
+
+
+def expected_corners(box: dict[str, Any]) -> list[list[float]]:
+    """Centroid plus signed half extents along the basis; x is away from the viewer, y left."""
+    points = box["centroid"][0] + np.c_[SIGNS, np.zeros(4)] * box["coeffs"][0] @ box["basis"]
+    return sorted(np.c_[points[:, 1], -points[:, 0]].round(6).tolist())
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("coeffs", np.array([[1.0, 0.5]])),
+        ("centroid", np.array([[1.0, math.nan, 0.0]])),
+        ("basis", "none"),
+        ("classname", ""),
+    ],
+)
+def test_malformed_sunrgbd_mat(tmp_path: Path, field: str, value: Any) -> None:
+    path = tmp_path / "SUNRGBDMeta3DBB_v2.mat"
+    boxes = [BOXES[0] | {field: value}]
+    savemat(path, {"SUNRGBDMeta": struct_array([frame("SUNRGBD/kv2/a/1", boxes)])})
+    check_malformed(path, field, f"0.groundtruth3DBB.0.{field}")
+
+
+def test_mat_files_of_other_content(tmp_path: Path) -> None:
+    path = tmp_path / "other.mat"
+    savemat(path, {"data": np.eye(2)})
+    check_malformed(path, "lacks the variable SUNRGBDMeta")
+    savemat(path, {"SUNRGBDMeta": struct_array([{"K": np.eye(3)}])})
+    check_malformed(path, "Field required", "0.sequenceName")
+
+
 # ------------------------------------------------------------------------------- COCO
 
 COCO: dict[str, Any] = {
@@ -251,7 +438,7 @@ def write_coco(folder: Path) -> Path:
 
 
 def test_coco(tmp_path: Path) -> None:
-    (scene,) = read_scenes(write_coco(tmp_path))
+    (scene,) = READERS["coco"](write_coco(tmp_path))
     assert (scene.scene_id, scene.relations) == ("coco-9", None)
     assert [(thing.label, thing.box2d) for thing in scene.objects] == [
         ("chair", (10.0, 100.0, 60.0, 180.0)),
@@ -271,9 +458,15 @@ MALFORMED_COCO = [
 ]
 
 
-@pytest.mark.parametrize(("content", "message"), MALFORMED_COCO)
-def test_malformed_coco(tmp_path: Path, content: Any, message: str) -> None:
-    check_malformed(write_json(write_coco(tmp_path), content), message)
+@pytest.mark.parametrize(
+    ("write", "content", "message"),
+    [
+        *((write_3dssg, *case) for case in MALFORMED_3DSSG),
+        *((write_coco, *case) for case in MALFORMED_COCO),
+    ],
+)
+def test_malformed_json(tmp_path: Path, write: Any, content: Any, message: str) -> None:
+    check_malformed(write_json(write(tmp_path), content), message)
 
 
 # ------------------------------------------------------------------------------- all of them
@@ -286,29 +479,31 @@ def test_relations_of_unknown_objects_are_refused(triple: tuple[int, str, int]) 
         AnnotatedScene("s", "t", "g", None, (AnnotatedObject("0", "bed"),), (triple,))
 
 
-LAYOUTS = {jsonl.read_jsonl: write_jsonl, readers.read_coco: write_coco}
+LAYOUTS = {
+    "jsonl": write_jsonl,
+    "3dssg": write_3dssg,
+    "sunrgbd-mat": write_mat,
+    "coco": write_coco,
+}
 
 
-@pytest.mark.parametrize("reader", LAYOUTS, ids=["jsonl", "coco"])
-def test_readers_are_found_by_file_name(reader: Any, tmp_path: Path) -> None:
-    assert set(LAYOUTS) == set(readers.READERS.values())
-    path = LAYOUTS[reader](tmp_path)
-    assert readers.reader_of(path) is reader
+@pytest.mark.parametrize("name", READERS)
+def test_readers_are_found_by_file_name(name: str, tmp_path: Path) -> None:
+    path = LAYOUTS[name](tmp_path)
+    assert guess_format(path) == name
     scenes = read_scenes(path)
     assert scenes
-    assert scenes == reader(path)
+    assert scenes == READERS[name](path)
     assert len({(scene.source, scene.scene_id) for scene in scenes}) == len(scenes)
     assert all(scene.group for scene in scenes)
 
 
-@pytest.mark.parametrize("write", LAYOUTS.values())
+@pytest.mark.parametrize("name", READERS)
 @pytest.mark.parametrize("content", [None, b"", b"\x00\xff\xfe nonsense", b"[1, 2"])
-def test_missing_and_malformed_files(
-    write: Callable[[Path], Path], content: bytes | None, tmp_path: Path
-) -> None:
-    path = write(tmp_path)
+def test_missing_and_malformed_files(name: str, content: bytes | None, tmp_path: Path) -> None:
+    path = LAYOUTS[name](tmp_path)
     path.unlink() if content is None else path.write_bytes(content)
-    if write is write_jsonl and content == b"":
+    if name == "jsonl" and content == b"":
         assert read_scenes(path) == []
         return
     with pytest.raises(DatasetError, match="(?i)" + path.name) as caught:
