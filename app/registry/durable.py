@@ -24,10 +24,13 @@ def read_file(path: Path, limit: int) -> bytes:
     Raises:
         OSError: the file cannot be read, or is a link, a FIFO or another special file.
     """
-    # Without O_NONBLOCK, opening a FIFO would block. A link could lead out of the store.
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
-    with os.fdopen(descriptor, "rb") as file:
-        status = os.fstat(descriptor)
+
+    def opener(name: str, flags: int) -> int:
+        # Without O_NONBLOCK, opening a FIFO would block. A link could lead out of the store.
+        return os.open(name, flags | os.O_NONBLOCK | os.O_NOFOLLOW)
+
+    with open(str(path), "rb", opener=opener) as file:
+        status = os.fstat(file.fileno())
         if not stat.S_ISREG(status.st_mode):
             raise OSError(errno.EINVAL, "it is not a regular file")
         # read() first allocates a buffer for all requested bytes.

@@ -188,7 +188,9 @@ def test_refuses_links_folders_and_pipes(kind: str, written: Path, tmp_path: Pat
     make: dict[str, Any] = {"folder": Path.mkdir, "pipe": os.mkfifo}
     card = (written / CARD).rename(tmp_path / "moved.md")
     make.get(kind, lambda place: place.symlink_to(card))(written / CARD)
+    before = sorted(Path("/proc/self/fd").iterdir())
     assert refusal(written).code == "unreadable"
+    assert sorted(Path("/proc/self/fd").iterdir()) == before, "no descriptor stays open"
 
 
 # -- other contents with valid checksums --------------------------------------------------------
