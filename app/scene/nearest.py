@@ -21,7 +21,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
 from rapidfuzz import process
-from rapidfuzz.distance import OSA, Levenshtein
+from rapidfuzz.distance import OSA, Indel
 
 from app.scene.labels import LookUp, head_of, split_words
 
@@ -37,28 +37,16 @@ _BY_REST: Final = 0.9  # factor if the first letters differ, because people rare
 _SAME_HEAD: Final = 0.5  # minimum similarity of names with the same last word
 _FARTHER: Final = 0.1  # maximum difference of similarity between a suggestion and the best one
 
-# Costs of edits, in tenths. Typing errors and confused vowels are frequent; other letters rarely
-# change.
-_SLIP: Final = 4  # two exchanged letters, or a letter twice instead of once
-_VOWEL: Final = 5  # another vowel
-_EDIT: Final = 8  # a letter too many or too few, or the neighbour on the keyboard
-_OTHER: Final = 15  # any other letter
-_FIRST: Final = 20  # another first letter, because people rarely mistype it
-_BY_PHRASE: Final = 11  # additional cost if the other words of the phrase agree
-_MARGIN: Final = 5  # two entries with costs as close as this make a name ambiguous
+# Costs of edits: 1 for a letter too many or too few, or another first letter, which people rarely
+# mistype; 2 for another letter, or two exchanged letters.
+_BY_PHRASE: Final = 1  # additional cost if the other words of the phrase agree
+_MARGIN: Final = 1  # two entries with costs as close as this make a name ambiguous
 _MOST_EDITS: Final = 2
 _MOST_CORRECTIONS: Final = 6
 _MOST_WORDS: Final = 8
 _MOST_MISSPELT: Final = 2  # number of words of a phrase
 _SHORTEST: Final = 4  # number of letters; a shorter word with a mistake can be anything
 _BY_HEAD: Final = 0.9  # factor if modifiers are unknown
-_VOWELS: Final = frozenset("aeiouy")
-_KEYS: Final = ("qwertyuiop", "asdfghjkl", "zxcvbnm")
-_NEIGHBOURS: Final = frozenset(
-    pair
-    for row, below in itertools.zip_longest(_KEYS, _KEYS[1:], fillvalue="")
-    for pair in (*itertools.pairwise(row), *zip(row, below), *zip(row[1:], below))  # noqa: B905
-)
 
 _PREPOSITIONS: Final = frozenset(
     ("of", "with", "on", "in", "for", "behind", "under", "below", "above", "over", "near", "beside")
@@ -158,7 +146,7 @@ class NameIndex:
         Args:
             corrections: for each word, pairs (known word, cost of the edits); see `_corrections`.
         """
-        costs: dict[int, tuple[int, int]] = {}  # by entry: cost and maximum cost, in tenths
+        costs: dict[int, tuple[int, int]] = {}  # by entry: cost and maximum cost
         for spelling in itertools.product(*(corrections[word] for word in words)):
             entry = self._by_key.get("".join(known for known, _ in spelling))
             if entry is None:
@@ -174,7 +162,7 @@ class NameIndex:
         second_cost = others[0][1][0] if others else math.inf
         if cost > max_cost or second_cost - cost <= _MARGIN:
             return None
-        return LookUp(entry, round(1 - cost / 10 / len("".join(words)), 3), "spelling")
+        return LookUp(entry, round(1 - cost / 2 / len("".join(words)), 3), "spelling")
 
     def _corrections(self, word: str) -> list[tuple[str, int]]:
         """Return the known words with a similar spelling, as pairs (known word, cost of the edits).
@@ -184,13 +172,13 @@ class NameIndex:
         """
         if len(word) < _SHORTEST:
             return [(word, 0)]
-        # An edit changes the length by at most 1, so only words of these lengths can be similar.
         lengths = range(max(_SHORTEST, len(word) - _MOST_EDITS), len(word) + _MOST_EDITS + 1)
         candidates = [known for length in lengths for known in self._lexicon.get(length, ())]
+        most = _MOST_EDITS + _BY_PHRASE
         matches = process.extract(
-            word, candidates, scorer=OSA.distance, limit=None, score_cutoff=_MOST_EDITS
+            word, candidates, scorer=Indel.distance, limit=None, score_cutoff=most
         )
-        corrections = [(known, _cost(word, known, distance)) for known, distance, _ in matches]
+        corrections = [(known, cost + (known[0] != word[0])) for known, cost, _ in matches]
         cheapest = sorted(corrections, key=lambda correction: correction[1])[:_MOST_CORRECTIONS]
         return cheapest or [(word, 0)]
 
@@ -244,27 +232,5 @@ def _alike(
 
 
 def _max_cost(known: str) -> int:
-    """Return the maximum cost of the edits that lead to a known word, in tenths."""
-    return _SLIP if len(known) < 5 else _EDIT if len(known) < 8 else _EDIT + _SLIP
-
-
-def _cost(word: str, known: str, distance: int) -> int:
-    """Return the cost of the edits that turn a word into a known word, in tenths."""
-    edits = Levenshtein.editops(word, known)
-    if (swaps := len(edits) - distance) > 0:
-        return _SLIP * swaps + _EDIT * (distance - swaps)
-    return sum(_edit_cost(word, known, *edit) for edit in edits.as_list())
-
-
-def _edit_cost(word: str, known: str, kind: str, word_index: int, known_index: int) -> int:
-    """Return the cost of one edit: replace a letter, delete it from ``word``, or insert it."""
-    if kind == "replace":
-        old, new = word[word_index], known[known_index]
-        if {old, new} <= _VOWELS:
-            return _VOWEL
-        if not word_index:
-            return _FIRST
-        return _EDIT if {(old, new), (new, old)} & _NEIGHBOURS else _OTHER
-    text, at = (word, word_index) if kind == "delete" else (known, known_index)
-    is_double = text[at] in (text[at - 1 : at], text[at + 1 : at + 2])
-    return _SLIP if is_double else _EDIT if at else _OTHER
+    """Return the maximum cost of the edits that lead to a known word."""
+    return 1 if len(known) < 5 else _MOST_EDITS
