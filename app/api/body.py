@@ -127,10 +127,10 @@ def _check_density(body: bytes, most: int) -> None:
             raise _invalid(detail)
 
 
-def _invalid(detail: str, at: errors.Location = ()) -> errors.InvalidRequestError:
-    return errors.InvalidRequestError(
-        errors=[FieldError(pointer=pointer(at), message=detail)], detail=detail
-    )
+def _invalid(detail: str) -> errors.InvalidRequestError:
+    """Return an error about the whole body."""
+    whole = FieldError(pointer="#", message=detail)
+    return errors.InvalidRequestError(errors=[whole], detail=detail)
 
 
 def _not_finite(body: bytes) -> list[FieldError]:
