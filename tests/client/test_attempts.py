@@ -169,19 +169,11 @@ def test_status_504_is_a_deadline_error() -> None:
 
 
 def test_a_broken_connection_is_tried_again_with_growing_pauses() -> None:
-    world = World(REFUSED)
+    world = World(BROKEN, REFUSED)
     with pytest.raises(UnreachableError, match="refused"):
         world.run(timeout=600.0, jitter=1.0, retries=8)
     assert len(world.told) == 9
     assert world.pauses == [0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 2.0, 2.0]
-
-
-@pytest.mark.parametrize(("error", "attempts"), [(BROKEN, 1), (REFUSED, RETRIES + 1)])
-def test_a_promotion_is_retried_only_if_it_was_not_sent(error: Exception, attempts: int) -> None:
-    world = World(error)
-    with pytest.raises(UnreachableError):
-        world.run(lambda client: client.promote("default", "home"))
-    assert len(world.told) == attempts
 
 
 failures = [refusal(429, "1"), refusal(503), refusal(503, "0"), REFUSED, BROKEN]

@@ -140,7 +140,6 @@ def test_the_client_s_model_is_asked_where_a_request_names_none(recorder: Record
         (lambda scene: scene.missing(["bed"], timeout=0.0), "#", "timeout"),
         (lambda scene: scene.vocabulary(".."), "#", "name"),
         (lambda scene: scene.model("home", ""), "#", "name"),
-        (lambda scene: scene.promote("default", ""), "#/model", "empty"),
     ],
 )
 def test_invalid_requests_are_not_sent(

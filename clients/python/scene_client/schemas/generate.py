@@ -9,13 +9,7 @@ from pydantic_core import PydanticCustomError
 from typing_extensions import Self
 
 from scene_client.schemas.answers import Answer, Reply
-from scene_client.schemas.requests import (
-    Finite,
-    Relation,
-    SceneFields,
-    SceneObject,
-    SceneRequest,
-)
+from scene_client.schemas.requests import Finite, Relation, SceneFields, SceneObject, SceneRequest
 
 MAX_SWEEPS: Final = 32_000
 """Maximum number of Gibbs sweeps of one request: number of scenes times sweeps."""
