@@ -65,9 +65,13 @@ async def answer(error: ServiceError, scope: Scope, receive: Receive, send: Send
 async def _handle(request: Request, error: Exception) -> Response:
     problem = from_exception(error, request.scope["state"]["request_id"])
     if problem is not error and isinstance(problem, NotFoundError):
-        path = request.scope["path"][:64].lower()
-        similar = get_close_matches(path, request.app.state.paths)
-        if similar:
+        path, paths = request.scope["path"][:64].lower(), request.app.state.paths
+        if any(path.endswith(known) for known in paths if len(known) > 1):
+            problem.detail += (
+                " The path ends with a route of the service. If a proxy adds a prefix, the proxy "
+                "must strip it, and SCENE_ROOT_PATH must name it."
+            )
+        elif similar := get_close_matches(path, paths):
             problem.detail += f" Similar paths: {', '.join(similar)}."
     return respond(request, problem)
 
@@ -75,7 +79,7 @@ async def _handle(request: Request, error: Exception) -> Response:
 def install(app: FastAPI) -> None:
     """Replace the exception handlers of FastAPI by handlers that answer with problems.
 
-    `app.api.gateway.Gateway` answers unexpected exceptions. FastAPI would answer an unexpected
+    `app.api.gateway.Failures` answers unexpected exceptions. FastAPI would answer an unexpected
     exception and then raise the exception again. The server would then close the connection.
     """
     app.add_exception_handler(HTTPException, _handle)

@@ -16,7 +16,7 @@ from app import __version__
 
 # Orchestrators and Prometheus poll these paths every few seconds, and pages load static files.
 # So spans of these requests would be more numerous than all other spans.
-_UNTRACED: Final = ("/health", "/v2/health", "/metrics", "/static")
+_UNTRACED: Final = ("/health", "/metrics", "/static")
 # FastAPI copies these span attributes from the request, so they may contain private data.
 _MADE_UP: Final = ("url.path", "url.query", "http.request.method_original")
 
