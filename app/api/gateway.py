@@ -124,7 +124,7 @@ class Recorded:
             message = f"{method} {route} {status} {seconds * 1e3:.2f} ms"
             # `_access.info` would search the stack for its caller, which no format shows.
             line = logging.LogRecord(_access.name, logging.INFO, "", 0, message, None, None)
-            line.__dict__ |= {
+            line.entry = {
                 "request_id": scope["state"]["request_id"],
                 "method": method,
                 "route": route,

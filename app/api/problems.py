@@ -37,7 +37,7 @@ def from_exception(error: Exception, request_id: str) -> ServiceError:
         headers = error.headers or {}
         detail = f"This route accepts only {headers['Allow']}." if "Allow" in headers else ""
         return _OF_STATUS[error.status_code](detail, headers=headers)
-    _logger.error("request failed", exc_info=error, extra={"request_id": request_id})
+    _logger.error("request failed", exc_info=error, extra={"entry": {"request_id": request_id}})
     return InternalError("The service failed. Its log contains the error.")
 
 

@@ -5,35 +5,38 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from typing import Any, Final, Literal
 
-from pythonjsonlogger.core import RESERVED_ATTRS
-from pythonjsonlogger.orjson import OrjsonFormatter
+import orjson
 
 _MASK: Final = "**********"
+_PLAIN: Final = logging.Formatter("%(asctime)s %(levelname)-8s %(process)d %(name)s: %(message)s")
 
 # No format shows the thread or the program of a record, and each takes time to find out.
 logging.logThreads = logging.logMultiprocessing = False
 
 
-class _Lines(OrjsonFormatter):
-    """One JSON object per line: time, level, process, logger, message and fields of the record."""
-
-    def __init__(self) -> None:
-        super().__init__(
-            ("levelname", "process", "name", "message"),
-            rename_fields={"levelname": "level", "name": "logger", "exc_info": "exception"},
-            reserved_attrs=(*RESERVED_ATTRS, "color_message"),  # of uvicorn
-            timestamp="time",
-        )
-
-    def process_log_record(self, log_data: dict[str, Any]) -> dict[str, Any]:
-        log_data["level"] = log_data["level"].lower()
-        return log_data
+def _json(record: logging.LogRecord) -> str:
+    """Return a log record as a JSON object. Its attribute ``entry`` contains further fields."""
+    entry: dict[str, Any] = {
+        "time": datetime.fromtimestamp(record.created, UTC),
+        "level": record.levelname.lower(),
+        "process": record.process,
+        "logger": record.name,
+        "message": record.getMessage(),
+        **getattr(record, "entry", {}),
+    }
+    if record.exc_info:
+        entry["exception"] = _PLAIN.formatException(record.exc_info)
+    try:
+        return orjson.dumps(entry).decode()
+    except TypeError:  # a text that is not valid Unicode
+        return json.dumps(entry, default=str)
 
 
 class Masked(logging.Formatter):
-    """Mask the keys in every line of a format. An exception message may contain a key.
+    """Write log records, and mask the keys. An exception message may contain a key.
 
     Args:
         style: `json` for one JSON object per line, or `plain` for text.
@@ -42,18 +45,13 @@ class Masked(logging.Formatter):
 
     def __init__(self, style: Literal["json", "plain"], secrets: Sequence[str] = ()) -> None:
         super().__init__()
-        if style == "json":
-            self._format = _Lines().format
-            # In a JSON line, a secret has the escaped form of a JSON string.
-            self._secrets = [json.dumps(secret)[1:-1] for secret in secrets]
-        else:
-            layout = "%(asctime)s %(levelname)-8s %(process)d %(name)s: %(message)s"
-            self._format = logging.Formatter(layout).format
-            self._secrets = list(secrets)
+        self._write = _json if style == "json" else _PLAIN.format
+        # In a JSON line, a secret has the escaped form of a JSON string.
+        self._secrets = [json.dumps(key)[1:-1] if style == "json" else key for key in secrets]
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the log record as text, with the keys masked."""
-        text = self._format(record)
+        text = self._write(record)
         for secret in self._secrets:
             text = text.replace(secret, _MASK)
         return text

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -11,11 +10,11 @@ import pytest
 
 from tests.http.test_documentation import operations
 from tests.http.test_problems import problem
-from tests.services import ADMIN_KEY, client_of_service, serve
+from tests.services import client_of_service
 
 API_KEY = "incorrect-zebra-capacitor-nail"
 # Listed here too, so that a route is opened on purpose or not at all.
-OPEN_OPERATIONS = {"/health/live", "/health/ready", "/v2/health/live", "/v2/health/ready"}
+OPEN_OPERATIONS = {"/health/live", "/health/ready"}
 SCENE = {"objects": ["bed", "lamp"]}
 
 
@@ -53,7 +52,7 @@ async def test_every_operation_but_health_needs_a_key(
         (
             401,
             "/nowhere /metrics //health/live /health/live/ /health/live/../../models /health "
-            "/Health/live /v2/models/default/ready /static /docsx /openapi.json/x",
+            "/Health/live /models/default/health/live /static /docsx /openapi.json/x",
         ),
         # Dots are encoded, or the client would resolve them before it asks.
         (
@@ -61,7 +60,7 @@ async def test_every_operation_but_health_needs_a_key(
             " ".join(
                 f"{folder}/{path}"
                 for folder in ("/static/%2e%2e", "/docs/%2e%2e", "/problems/%2e%2e", "/static//")
-                for path in ("models", "relations", "v2/models/default")
+                for path in ("models", "relations")
             ),
         ),
         (404, "/redoc/./models"),
@@ -81,7 +80,6 @@ async def test_only_pages_need_no_key(guarded: httpx.AsyncClient, status: int, p
         {"X-API-Key": API_KEY[:-1]},
         {"X-API-Key": API_KEY + "x"},
         {"X-API-Key": "é".encode()},
-        {"X-API-Key": ADMIN_KEY},
         {"X-Admin-Key": API_KEY},
         {"Authorization": API_KEY},
         {"Authorization": f"Basic {API_KEY}"},
@@ -101,34 +99,11 @@ async def test_other_keys_are_refused(guarded: httpx.AsyncClient, headers: Any) 
         {"X-API-Key": API_KEY},
         {"Authorization": f"Bearer {API_KEY}"},
         {"Authorization": f"bearer {API_KEY}"},
-        {"X-Admin-Key": ADMIN_KEY},
-        {"Authorization": f"Bearer {ADMIN_KEY}"},
     ],
 )
-async def test_either_key_opens_questions(guarded: httpx.AsyncClient, headers: Any) -> None:
+async def test_the_key_opens_questions(guarded: httpx.AsyncClient, headers: Any) -> None:
     assert (await guarded.post("/relations", json=SCENE, headers=headers)).status_code == 200
     assert (await guarded.get("/models", headers=headers)).status_code == 200
-
-
-async def test_administration_needs_the_admin_key_and_no_other(
-    guarded: httpx.AsyncClient,
-) -> None:
-    api = {"X-API-Key": API_KEY}
-    bearer = {"Authorization": f"Bearer {ADMIN_KEY}"}
-    for headers in (api, {"Authorization": f"Bearer {API_KEY}"}):
-        problem(await guarded.post("/models/refresh", headers=headers), 401, "unauthorized")
-    for headers in ({"X-Admin-Key": ADMIN_KEY}, bearer, api | bearer):
-        assert (await guarded.post("/models/refresh", headers=headers)).status_code == 200
-
-
-@pytest.mark.parametrize("api_key", [None, API_KEY])
-async def test_without_an_admin_key_no_key_administers(
-    shared_store: Path, api_key: str | None
-) -> None:
-    async with serve(shared_store, api_key=api_key, admin_key=None) as client:
-        for headers in ({}, {"X-Admin-Key": ""}, {"X-API-Key": API_KEY}, {"X-Admin-Key": "None"}):
-            response = await client.post("/models/refresh", headers=headers)
-            problem(response, 401, "unauthorized")
 
 
 async def test_a_body_without_a_key_is_not_read(guarded: httpx.AsyncClient) -> None:
@@ -137,12 +112,9 @@ async def test_a_body_without_a_key_is_not_read(guarded: httpx.AsyncClient) -> N
         read = True
         yield b"{"
 
-    for path in ("/relations", "/models/aliases/default"):
-        read = False
-        method = "PUT" if "aliases" in path else "POST"
-        response = await guarded.request(method, path, content=body())
-        problem(response, 401, "unauthorized")
-        assert not read
+    read = False
+    problem(await guarded.post("/relations", content=body()), 401, "unauthorized")
+    assert not read
     # The key comes before the size.
     headers = {"Content-Length": "999999999"}
     response = await guarded.post("/relations", content=b"", headers=headers)
@@ -167,8 +139,7 @@ async def test_the_document_tells_where_a_key_is_needed(document: dict[str, Any]
             assert named == set()
             assert "401" not in operation["responses"]
             continue
-        administration = "administration" in operation["tags"]
-        kind = "admin-key" if administration else "api-key"
-        assert named == {kind, f"{kind}-as-bearer-token"}, path
+        if "administration" not in operation["tags"]:
+            assert named == {"api-key", "api-key-as-bearer-token"}, path
         (content,) = operation["responses"]["401"]["content"].values()
         assert "unauthorized" in content["examples"]

@@ -62,7 +62,6 @@ def on(machine: str, script: str) -> list[str]:
     [
         ("0.0.0.0", ["http://192.168.1.20:8000"]),
         ("::", ["http://192.168.1.20:8000", "http://[fd00::20]:8000"]),
-        ("[fd00::20]", ["http://[fd00::20]:8000"]),
     ],
 )
 def test_a_robot_is_answered(tmp_path: Path, host: str, urls: list[str]) -> None:
@@ -72,9 +71,7 @@ def test_a_robot_is_answered(tmp_path: Path, host: str, urls: list[str]) -> None
     serve = serve.replace(".venv/bin/python", f"exec {sys.executable}")
     ask, log = command("scene missing"), tmp_path / "log"
     with log.open("w") as stream:
-        service = subprocess.Popen(
-            on(PC, serve), cwd=REPOSITORY, env=environment, stderr=stream
-        )
+        service = subprocess.Popen(on(PC, serve), cwd=REPOSITORY, env=environment, stderr=stream)
     try:
         wait_until(lambda: "ready: " in log.read_text() or service.poll() is not None, log)
         wait_until(lambda: "from other machines: " in log.read_text(), log)
