@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from socket import gethostname
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import httpx
 import pytest
 
+from app.api.access import HEALTH
 from app.settings import Settings
 from tests.http.test_problems import problem
 from tests.services import Replace, client_of_service, defect, serve
@@ -62,6 +64,33 @@ async def test_requests_for_another_host_are_refused(shared_store: Path) -> None
                 assert (await client.get(path, headers=headers)).status_code == 200
         twice = [("Host", "localhost"), ("Host", "localhost")]
         problem(await client.get("/models", headers=twice), 421, "host-refused")
+
+
+async def test_only_health_checks_take_no_turn_and_accept_every_host(
+    shared_store: Path,
+) -> None:
+    """A path is matched whole: no route below another one becomes a health check."""
+    async with serve(shared_store) as client:
+        paths = client.app.state.paths  # type: ignore[attr-defined]
+        assert set(HEALTH) <= paths
+        # The words of a vocabulary may contain slashes.
+        words = {f"/models/default/vocabulary/x{path}" for path in HEALTH}
+        nested = {f"{path}{check}" for path in paths if path != "/" for check in HEALTH}
+        for template in paths | words | nested:
+            path = re.sub(r"{\w+(:path)?}", "default", template)
+            for method in ("GET", "POST"):
+                response = await client.request(method, path, headers={"Host": "evil.example"})
+                if path in HEALTH:
+                    assert response.status_code in (200, 405)
+                else:
+                    problem(response, 421, "host-refused")
+        for word in words:
+            assert (await client.get(word)).status_code in (200, 404)
+
+
+async def test_a_prefix_that_stays_in_the_path_names_its_setting(client: httpx.AsyncClient) -> None:
+    document = problem(await client.post("/scene/missing", json=SCENE), 404, "not-found")
+    assert "SCENE_ROOT_PATH" in document["detail"]
 
 
 # ------------------------------------------------------------------------------------------ origins
