@@ -66,13 +66,13 @@ async def _handle(request: Request, error: Exception) -> Response:
     problem = from_exception(error, request.scope["state"]["request_id"])
     if problem is not error and isinstance(problem, NotFoundError):
         path, paths = request.scope["path"][:64].lower(), request.app.state.paths
+        if similar := get_close_matches(path, paths):
+            problem.detail += f" Similar paths: {', '.join(similar)}."
         if any(path.endswith(known) for known in paths if len(known) > 1):
             problem.detail += (
-                " The path ends with a route of the service. If a proxy adds a prefix, the proxy "
-                "must strip it, and SCENE_ROOT_PATH must name it."
+                " If a proxy adds a prefix to paths, the proxy must strip it, and SCENE_ROOT_PATH "
+                "must name it."
             )
-        elif similar := get_close_matches(path, paths):
-            problem.detail += f" Similar paths: {', '.join(similar)}."
     return respond(request, problem)
 
 

@@ -149,7 +149,7 @@ def test_variables_are_settings_with_valid_values(
     settings = Settings()
     assert settings.accepted_hosts == {
         *("scene", "scene.robots", "scene.robots.svc", "scene.robots.svc.cluster.local"),
-        *("[fd00::7]", "127.0.0.1", "localhost"),
+        *("fd00::7", "127.0.0.1", "localhost"),
     }
 
 

@@ -235,7 +235,7 @@ def test_a_request_is_one_line(live: LiveService) -> None:
 
 
 MARKER = "xyzzy"
-UNTRACED = ("/health/live", "/health/ready", "/v2/health/ready", "/metrics", "/static/icon.svg")
+UNTRACED = ("/health/live", "/health/ready", "/metrics", "/static/icon.svg")
 
 
 @pytest.fixture
