@@ -7,18 +7,20 @@ import ctypes
 import errno
 import gc
 import os
+import signal
 import socket
 import sys
-from contextlib import suppress
 from time import monotonic
+from typing import TYPE_CHECKING
 
-from pydantic import ValidationError
-
-from app.settings import Settings
+if TYPE_CHECKING:
+    from app.settings import Settings
 
 
 def _refuse_arguments(arguments: list[str] | None) -> None:
     """Exit with status 2 after unknown arguments. After --help, print the settings and exit."""
+    from app.settings import Settings
+
     lines = []
     for name, field in Settings.model_fields.items():
         default = field.get_default(call_default_factory=True)
@@ -49,6 +51,10 @@ def main(arguments: list[str] | None = None) -> int:
         SystemExit: there are arguments.
     """
     began = monotonic()
+    from pydantic import ValidationError
+
+    from app.settings import Settings
+
     _refuse_arguments(arguments)
     try:
         settings = Settings()
@@ -89,7 +95,7 @@ def tune() -> None:
 
 
 def _bind(host: str, port: int, send_timeout: float) -> list[socket.socket]:
-    """Bind sockets to all addresses of a host, without listening.
+    """Bind sockets to all addresses of a host, without listening; `::` means IPv4 and IPv6.
 
     Linux closes a connection whose client does not acknowledge the bytes sent within
     ``send_timeout`` seconds. On other operating systems, only a proxy can limit this time.
@@ -99,8 +105,9 @@ def _bind(host: str, port: int, send_timeout: float) -> list[socket.socket]:
     """
     bound: list[socket.socket] = []
     problem: OSError | None = None
-    addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-    for family, kind, protocol, _, address in dict.fromkeys(addresses):
+    every = None if host == "::" else host
+    addresses = socket.getaddrinfo(every, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    for family, kind, protocol, _, (name, *rest) in dict.fromkeys(addresses):
         try:
             listener = socket.socket(family, kind, protocol)
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -109,9 +116,11 @@ def _bind(host: str, port: int, send_timeout: float) -> list[socket.socket]:
             if hasattr(socket, "TCP_USER_TIMEOUT"):  # accepted connections inherit the option
                 milliseconds = int(send_timeout * 1e3)
                 listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, milliseconds)
-            listener.bind(address)
+            # A free port for the first address serves all addresses.
+            number = bound[0].getsockname()[1] if bound else port
+            listener.bind((name, number, *rest[1:]))
         except OSError as error:
-            # A name such as localhost may have an IPv6 address although the machine lacks IPv6.
+            # The machine may lack IPv6 although its name has an IPv6 address.
             if error.errno not in {errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT}:
                 raise
             problem = error
@@ -148,17 +157,17 @@ def serve(settings: Settings, began: float) -> int:
     from app.server import build
 
     server = build(settings, began)
-    # On Ctrl-C, the server finishes its shutdown and then raises KeyboardInterrupt.
-    with suppress(KeyboardInterrupt):
-        try:
-            server.run(sockets)
-        except OSError as error:
-            # Two services that start together can both bind, but only one of them can listen.
-            if server.started or error.errno != errno.EADDRINUSE:
-                raise
-            return _refuse_address(settings, error)
+    try:
+        server.run(sockets)
+    except OSError as error:
+        # Two services that start together can both bind, but only one of them can listen.
+        if server.started or error.errno != errno.EADDRINUSE:
+            raise
+        return _refuse_address(settings, error)
     return 0 if server.started else 3
 
 
 if __name__ == "__main__":
+    # Ctrl-C during the start ends the process at once, without a traceback.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     sys.exit(main())

@@ -80,7 +80,9 @@ def check_cache() -> None:
     """Log a warning without a cache directory, and an info if it is not the preferred directory."""
     if FOLDER is None:
         _logger.warning(
-            "each start compiles the loops, because no cache directory is usable: %s", _PROBLEM
+            "each start compiles the loops, because no cache directory is usable: %s; set "
+            "NUMBA_CACHE_DIR to a folder that only this user can write to",
+            _PROBLEM,
         )
     elif _PROBLEM:
         _logger.info("compiled loops are stored in %s: %s", FOLDER, _PROBLEM)

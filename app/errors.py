@@ -320,10 +320,10 @@ class AnswerTooLargeError(RequestError, slug="answer-too-large", status=422, ste
 class HostRefusedError(ServiceError, slug="host-refused", status=421, steps=("host",)):
     """The service does not answer to this host name.
 
-    The Host header must contain one of the names in SCENE_ALLOWED_HOSTS. The service ignores the
-    port in this header. The default names are 127.0.0.1, localhost, [::1] and the address in
-    SCENE_HOST. If clients use another name, add this name to SCENE_ALLOWED_HOSTS. Health checks
-    accept every host name.
+    The Host header must contain an IP address or one of the names in SCENE_ALLOWED_HOSTS. The
+    service ignores the port in this header. The default names are localhost, the host name of the
+    machine, and this name with .local. If clients use another name, add this name to
+    SCENE_ALLOWED_HOSTS. Health checks accept every host name.
     """
 
 

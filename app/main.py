@@ -10,7 +10,7 @@ from fastapi import FastAPI
 
 from app import __version__
 from app.api import health, models, openapi, pages, problems, questions, telemetry
-from app.api.gateway import Gateway
+from app.api.gateway import gateway
 from app.serving.runtime import Runtime
 from app.settings import Settings
 
@@ -57,7 +57,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.settings = settings
     app.state.runtime = runtime
     problems.install(app)
-    app.add_middleware(Gateway, settings=settings, runtime=runtime)
+    app.add_middleware(gateway, settings=settings, runtime=runtime)
     _add_routes(app, settings)
     return app
 

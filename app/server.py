@@ -4,17 +4,27 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import fcntl
 import logging
 import os
-import resource
 import signal
-from socket import SO_ACCEPTCONN, SOL_SOCKET, socket
+import struct
+from contextlib import suppress
+from socket import (
+    AF_INET,
+    SO_ACCEPTCONN,
+    SOCK_DGRAM,
+    SOL_SOCKET,
+    gethostname,
+    if_nameindex,
+    inet_ntoa,
+    socket,
+)
 from time import monotonic
 from types import FrameType
-from typing import ClassVar, Final
+from typing import Final
 
 import uvicorn
-from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from app.errors import ServiceError
 from app.main import create_app
@@ -26,73 +36,13 @@ from app.settings import Settings, warnings
 # connections earlier. Otherwise the proxy may send a request while the server closes the
 # connection.
 KEEP_ALIVE: Final = 20
-# The server closes a connection that sends no request in this time in seconds.
-SILENT: Final = 10
-# uvicorn refuses requests above its limit of connections. So this limit leaves room for connections
-# that the service is closing in the same iteration of the event loop.
-_CLOSING: Final = 32
-# Number of file descriptors for other purposes: closing connections, models, logs, event loop.
-_OTHER_FILES: Final = 64
+
+# A socket with one of these addresses listens on every address of the machine.
+_ANY: Final = frozenset(("0.0.0.0", "::"))  # noqa: S104 # nosec B104
+# Request to the kernel of Linux for the address of a network interface; see netdevice(7).
+_SIOCGIFADDR: Final = 0x8915
 
 _logger = logging.getLogger("app.server")
-
-
-class Connection(HttpToolsProtocol):
-    """An HTTP connection that ignores the trailers of chunked bodies, and never blocks a new one.
-
-    uvicorn appends trailers to the headers of the request, so a trailer could replace a header that
-    a proxy has checked or removed.
-
-    If the service has its maximum number of connections, a new connection closes the one that has
-    been idle for the longest time. So idle connections cannot keep health checks out.
-
-    Attributes:
-        idle: connections without a request in progress, the longest idle first, and since when.
-        has_asked: whether the connection has sent a request.
-    """
-
-    idle: ClassVar[dict[Connection, float]] = {}
-    has_asked = False
-
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Make room for the connection."""
-        super().connection_made(transport)
-        if len(self.connections) > (self.limit_concurrency or 0) - _CLOSING:
-            for connection in Connection.idle:
-                connection.close()
-                break
-        Connection.idle[self] = monotonic()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """Forget the connection."""
-        Connection.idle.pop(self, None)
-        super().connection_lost(exc)
-
-    def on_headers_complete(self) -> None:
-        """Start the request with the headers so far. The parser adds trailers to `self.headers`."""
-        Connection.idle.pop(self, None)
-        self.has_asked = True
-        super().on_headers_complete()
-        self.scope["headers"] = self.headers.copy()
-
-    def on_response_complete(self) -> None:
-        """Start the next pipelined request, or wait for one."""
-        super().on_response_complete()
-        if self.cycle.response_complete:
-            Connection.idle[self] = monotonic()
-
-    def close(self) -> None:
-        """Close the connection, which is idle."""
-        Connection.idle.pop(self, None)
-        self.transport.close()
-
-    @classmethod
-    def close_silent(cls) -> None:
-        """Close connections that have been open for `SILENT` seconds without a request."""
-        began = monotonic() - SILENT
-        for connection, since in list(cls.idle.items()):
-            if since < began and not connection.has_asked:
-                connection.close()
 
 
 class Server(uvicorn.Server):
@@ -107,16 +57,16 @@ class Server(uvicorn.Server):
     Args:
         config: configuration of uvicorn.
         runtime: the runtime of the service. It is not ready during the shutdown.
-        drain_seconds: time in seconds from SIGTERM until the server closes the listening socket.
+        settings: the settings of the service.
         began: `time.monotonic()` at the start of the process.
     """
 
     def __init__(
-        self, config: uvicorn.Config, runtime: Runtime, drain_seconds: float, began: float
+        self, config: uvicorn.Config, runtime: Runtime, settings: Settings, began: float
     ) -> None:
         super().__init__(config)
         self._runtime = runtime
-        self._drain_seconds = drain_seconds
+        self._settings = settings
         self._closing_at: float | None = None
         self._began = began
         self._has_terminal = os.isatty(0)
@@ -147,8 +97,10 @@ class Server(uvicorn.Server):
             self._runtime.request_check()
 
     def _log_addresses(self, sockets: list[socket]) -> None:
-        addresses = [listener.getsockname() for listener in sockets]
-        pages = ", ".join(_page(host, port) for host, port, *_ in addresses)
+        port = sockets[0].getsockname()[1]
+        hosts = dict.fromkeys(listener.getsockname()[0] for listener in sockets)
+        others = [host for host in hosts if host not in _ANY]
+        pages = ", ".join(_page(host, port) for host in others or ["127.0.0.1"])
         count = len(self._runtime.models.served)
         models = "1 model" if count == 1 else f"{count} models"
         details = f"{pages} ({models}, {monotonic() - self._began:.1f} s)"
@@ -158,19 +110,34 @@ class Server(uvicorn.Server):
             _logger.warning("not ready: %s: %s", details, error)
         else:
             _logger.info("ready: %s", details)
+        if not self._settings.serves_network:
+            return
+        if not others:
+            pages = ", ".join(_page(host, port) for host in _lan_addresses())
+        _logger.info("from other machines: %s (docs/network.md)", pages)
+        if self._settings.api_key is None:
+            _logger.warning(
+                "every machine that reaches port %d can use the service: SCENE_API_KEY is not set; "
+                "set it to at least 16 characters",
+                port,
+            )
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Start the shutdown. A second signal ends the first step of the shutdown at once."""
+        """Start the shutdown. A second signal ends the first step of the shutdown at once.
+
+        During the start, the signal ends the process at once.
+        """
+        if not self.started:
+            signal.signal(sig, signal.SIG_DFL)
+            signal.raise_signal(sig)
         is_first, self._runtime.draining = not self._runtime.draining, True
         if sig == signal.SIGTERM and is_first:
-            self._closing_at = monotonic() + self._drain_seconds
+            self._closing_at = monotonic() + self._settings.drain_seconds
         else:
             super().handle_exit(sig, frame)
 
     async def on_tick(self, counter: int) -> bool:
         """Return whether the server must stop. uvicorn calls this method ten times per second."""
-        if counter % 10 == 0:
-            Connection.close_silent()
         if self._closing_at is not None and monotonic() >= self._closing_at:
             self._closing_at = None
             super().handle_exit(signal.SIGTERM, None)
@@ -185,28 +152,28 @@ def _listens(listener: socket) -> bool:
 
 
 def _page(host: str, port: int) -> str:
-    """Return the URL of the service for a browser on the same machine."""
-    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104 # nosec B104
+    """Return the URL of the service at one of its addresses."""
     return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
 
 
-def most_connections(wanted: int) -> int:
-    """Return the number of connections for which the process may open files."""
-    files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-    if files == resource.RLIM_INFINITY:
-        return wanted
-    most = max(files - _OTHER_FILES, _OTHER_FILES)
-    if wanted > most:
-        _logger.warning(
-            "the service accepts %d connections, not SCENE_MAX_CONNECTIONS=%d, because it may open "
-            "only %d files (ulimit -n)",
-            *(most, wanted, most + _OTHER_FILES),
-        )
-    return min(wanted, most)
+def _lan_addresses() -> list[str]:
+    """Return the IPv4 addresses of this machine's network interfaces, except the loopback.
+
+    Without such an address, and on other systems than Linux, the list contains the machine's name
+    in multicast DNS.
+    """
+    found = []
+    with socket(AF_INET, SOCK_DGRAM) as probe:
+        for _, name in if_nameindex():
+            with suppress(OSError):  # the interface has no address
+                answer = fcntl.ioctl(probe, _SIOCGIFADDR, struct.pack("256s", name.encode()))
+                found.append(inet_ntoa(answer[20:24]))
+    name = f"{gethostname().partition('.')[0]}.local"
+    return [address for address in found if not address.startswith("127.")] or [name]
 
 
 def build(settings: Settings, began: float) -> Server:
-    """Return the server, not yet started. Warn if other machines can use it without a key.
+    """Return the server, not yet started.
 
     ``began`` is `time.monotonic()` at the start of the process.
     """
@@ -216,9 +183,9 @@ def build(settings: Settings, began: float) -> Server:
         host=settings.host,
         port=settings.port,
         root_path=settings.root_path,
-        http=Connection,
+        http="httptools",
         ws="none",
-        limit_concurrency=most_connections(settings.max_connections) + _CLOSING,
+        limit_concurrency=settings.max_connections,
         timeout_keep_alive=KEEP_ALIVE,
         log_config=log_config(settings.log_level, settings.log_format, settings.secrets),
         access_log=False,
@@ -230,10 +197,4 @@ def build(settings: Settings, began: float) -> Server:
     )
     for warning in warnings():
         _logger.warning(warning)
-    if settings.is_open:
-        _logger.warning(
-            "SCENE_HOST gives other machines access and SCENE_API_KEY is not set, so every machine "
-            "that reaches port %d can use the service",
-            settings.port,
-        )
-    return Server(config, app.state.runtime, settings.drain_seconds, began)
+    return Server(config, app.state.runtime, settings, began)

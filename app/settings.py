@@ -9,6 +9,7 @@ from difflib import get_close_matches
 from importlib.util import find_spec
 from ipaddress import IPv6Address, ip_address
 from pathlib import Path
+from socket import gethostname
 from typing import Annotated, Any, ClassVar, Final, Literal
 
 from pydantic import (
@@ -66,15 +67,12 @@ def _words(value: object) -> object:
 
 _Words = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_words)]
 
-LOOPBACK: Final = frozenset(("127.0.0.1", "localhost", "[::1]"))
-"""Values of a Host header that mean the local machine."""
-
 _ANY_HOST: Final = "*"
 _HOST: Final = re.compile(r"[a-z0-9_]([a-z0-9._-]*[a-z0-9_])?")
 
 
-def _in_host_header(text: str) -> str:
-    """Convert a host name or an IP address to the spelling of a Host header.
+def _host(text: str) -> str:
+    """Return a host name in lower case, or an IP address without brackets.
 
     Raises:
         ValueError: the text is neither a host name nor an IP address.
@@ -82,7 +80,14 @@ def _in_host_header(text: str) -> str:
     name = text.lower()
     if _HOST.fullmatch(name):
         return name
-    return f"[{IPv6Address(name.removeprefix('[').removesuffix(']'))}]"
+    return str(IPv6Address(name[1:-1] if name.startswith("[") and name.endswith("]") else name))
+
+
+def _names_of_this_machine() -> set[str]:
+    """Return the host names of this machine, including the one of multicast DNS (`.local`)."""
+    name = gethostname().lower()
+    names = {"localhost", name, f"{name.partition('.')[0]}.local"}
+    return {name for name in names if _HOST.fullmatch(name)}
 
 
 _ORIGIN: Final = re.compile(r"(https?)://([\w.-]+|\[[0-9a-f:.]+\])(:[1-9][0-9]{0,4})?")
@@ -169,14 +174,13 @@ class Settings(BaseSettings):
     """Web origins whose pages may use the service, separated by commas, such as
     `https://panel.example:8443`; none by default."""
     allowed_hosts: _Words = ()
-    """Host names and addresses that clients may use for this service, separated by commas, without
-    ports; `*` allows all; default: the names of this machine, and SCENE_HOST if it is a single
-    address."""
+    """Host names that clients may use for this service, separated by commas, without ports; `*`
+    allows all; default: the names of this machine. Every IP address is allowed."""
     trusted_proxies: _Words = ()
     """Addresses of proxies, separated by commas, whose X-Forwarded-For header names the client; `*`
     trusts every address; none by default."""
     max_connections: Annotated[int, Field(ge=1, le=2**20)] = 1024
-    """Maximum number of connections; the service answers further ones with 503."""
+    """Number of connections from which the service answers every request with 503."""
     max_body_bytes: Annotated[int, Field(ge=1024, le=64 * 2**20)] = 2 * 2**20
     """Maximum size of a request body in bytes."""
     max_scene_bytes: Annotated[int, Field(ge=1024, le=64 * 2**20)] = 256 * 2**10
@@ -244,44 +248,39 @@ class Settings(BaseSettings):
 
     @property
     def accepted_hosts(self) -> frozenset[str] | None:
-        """Allowed names in a Host header, without ports, or None if every name is allowed."""
+        """Accepted names in a Host header, without ports, or None if every name is accepted.
+
+        Every IP address is accepted, too.
+        """
         if _ANY_HOST in self.allowed_hosts:
             return None
-        if self.allowed_hosts:
-            return frozenset(self.allowed_hosts)
-        return LOOPBACK if self._listens_everywhere else LOOPBACK | {_in_host_header(self.host)}
+        return frozenset(self.allowed_hosts or (*_names_of_this_machine(), self.host))
 
     @property
-    def is_open(self) -> bool:
-        """Whether other machines can use the service without a key."""
-        is_local = self.host.startswith("127.") or self.host in {"localhost", "::1"}
-        return self.api_key is None and not is_local
-
-    @property
-    def _listens_everywhere(self) -> bool:
+    def serves_network(self) -> bool:
+        """Whether other machines can reach the service."""
         try:
-            return ip_address(self.host).is_unspecified
+            return not ip_address(self.host).is_loopback
         except ValueError:  # the host is a name, not an address
-            return False
+            return self.host != "localhost"
 
     @field_validator("host")
     @classmethod
     def _is_host(cls, value: str) -> str:
         try:
-            _in_host_header(value)
+            return _host(value)
         except ValueError:
             raise ValueError("SCENE_HOST must be a name or an IP address") from None
-        return value
 
     @field_validator("allowed_hosts")
     @classmethod
     def _are_hosts(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         try:
-            return tuple(name if name == _ANY_HOST else _in_host_header(name) for name in value)
+            return tuple(name if name == _ANY_HOST else _host(name) for name in value)
         except ValueError:
             raise ValueError(
-                "SCENE_ALLOWED_HOSTS must be * or a list of names and addresses; a name must not "
-                "contain a scheme, a port or a wildcard"
+                "SCENE_ALLOWED_HOSTS must be * or a list of names; a name must not contain a "
+                "scheme, a port or a wildcard"
             ) from None
 
     @field_validator("store")

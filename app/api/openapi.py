@@ -10,7 +10,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
 from app.api import examples
-from app.api.gateway import API_KEY, HEALTH, OPEN_ROUTES, TIMEOUT_HEADER
+from app.api.access import API_KEY, HEALTH, OPEN_ROUTES, TIMEOUT_HEADER
 from app.api.problems import MEDIA_TYPE
 from app.errors import ERRORS, Step
 from app.questions.question import Example
@@ -139,7 +139,7 @@ def _complete_operation(operation: dict[str, Any], path: str, settings: Settings
     if settings.api_key is not None and path not in OPEN_ROUTES:
         operation["security"] = [{scheme: []} for scheme in _KEY_SCHEMES]
         responses["401"] = error_responses("key")[401]
-    if settings.accepted_hosts is not None and not path.endswith(HEALTH):
+    if settings.accepted_hosts is not None and path not in HEALTH:
         responses["421"] = error_responses("host")[421]
 
 

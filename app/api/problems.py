@@ -37,7 +37,7 @@ def from_exception(error: Exception, request_id: str) -> ServiceError:
         headers = error.headers or {}
         detail = f"This route accepts only {headers['Allow']}." if "Allow" in headers else ""
         return _OF_STATUS[error.status_code](detail, headers=headers)
-    _logger.error("request failed", exc_info=error, extra={"request_id": request_id})
+    _logger.error("request failed", exc_info=error, extra={"entry": {"request_id": request_id}})
     return InternalError("The service failed. Its log contains the error.")
 
 
@@ -65,17 +65,21 @@ async def answer(error: ServiceError, scope: Scope, receive: Receive, send: Send
 async def _handle(request: Request, error: Exception) -> Response:
     problem = from_exception(error, request.scope["state"]["request_id"])
     if problem is not error and isinstance(problem, NotFoundError):
-        path = request.scope["path"][:64].lower()
-        similar = get_close_matches(path, request.app.state.paths)
-        if similar:
+        path, paths = request.scope["path"][:64].lower(), request.app.state.paths
+        if similar := get_close_matches(path, paths):
             problem.detail += f" Similar paths: {', '.join(similar)}."
+        if any(path.endswith(known) for known in paths if len(known) > 1):
+            problem.detail += (
+                " If a proxy adds a prefix to paths, the proxy must strip it, and SCENE_ROOT_PATH "
+                "must name it."
+            )
     return respond(request, problem)
 
 
 def install(app: FastAPI) -> None:
     """Replace the exception handlers of FastAPI by handlers that answer with problems.
 
-    `app.api.gateway.Gateway` answers unexpected exceptions. FastAPI would answer an unexpected
+    `app.api.gateway.Failures` answers unexpected exceptions. FastAPI would answer an unexpected
     exception and then raise the exception again. The server would then close the connection.
     """
     app.add_exception_handler(HTTPException, _handle)

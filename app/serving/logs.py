@@ -6,78 +6,55 @@ import json
 import logging
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from functools import lru_cache
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import orjson
 
-_MASK = "**********"
-
+_MASK: Final = "**********"
+_PLAIN: Final = logging.Formatter("%(asctime)s %(levelname)-8s %(process)d %(name)s: %(message)s")
 
 # No format shows the thread or the program of a record, and each takes time to find out.
 logging.logThreads = logging.logMultiprocessing = False
 
 
-@lru_cache(maxsize=2)
-def _utc(second: int) -> str:
-    """Return the time of a Unix time in seconds in the form of ISO 8601, without a time zone."""
-    return datetime.fromtimestamp(second, UTC).replace(tzinfo=None).isoformat()
+def _json(record: logging.LogRecord) -> str:
+    """Return a log record as a JSON object. Its attribute ``entry`` contains further fields."""
+    entry: dict[str, Any] = {
+        "time": datetime.fromtimestamp(record.created, UTC),
+        "level": record.levelname.lower(),
+        "process": record.process,
+        "logger": record.name,
+        "message": record.getMessage(),
+        **getattr(record, "entry", {}),
+    }
+    if record.exc_info:
+        entry["exception"] = _PLAIN.formatException(record.exc_info)
+    try:
+        return orjson.dumps(entry).decode()
+    except TypeError:  # a text that is not valid Unicode
+        return json.dumps(entry, default=str)
 
 
-def _masked(line: str, secrets: Sequence[str]) -> str:
-    for secret in secrets:
-        line = line.replace(secret, _MASK)
-    return line
-
-
-class JSONFormatter(logging.Formatter):
-    """Write one JSON object per line: time, level, process, logger, message and request fields.
-
-    Two optional attributes of a log record add fields to the JSON object. The attribute ``entry``
-    contains the fields of an access log line. The attribute ``request_id`` is the id of the request
-    that caused an internal error.
+class Masked(logging.Formatter):
+    """Write log records, and mask the keys. An exception message may contain a key.
 
     Args:
-        secrets: keys to mask in every line. An exception message may contain a key.
+        style: `json` for one JSON object per line, or `plain` for text.
+        secrets: the keys.
     """
 
-    def __init__(self, secrets: Sequence[str] = ()) -> None:
+    def __init__(self, style: Literal["json", "plain"], secrets: Sequence[str] = ()) -> None:
         super().__init__()
+        self._write = _json if style == "json" else _PLAIN.format
         # In a JSON line, a secret has the escaped form of a JSON string.
-        self.secrets = [json.dumps(secret)[1:-1] for secret in secrets]
+        self._secrets = [json.dumps(key)[1:-1] if style == "json" else key for key in secrets]
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the log record as one line of JSON."""
-        second, milliseconds = divmod(int(record.created * 1e3), 1000)
-        entry: dict[str, Any] = {
-            "time": f"{_utc(second)}.{milliseconds:03}+00:00",
-            "level": record.levelname.lower(),
-            "process": record.process,
-            "logger": record.name,
-            "message": record.getMessage(),
-        }
-        if hasattr(record, "request_id"):
-            entry["request_id"] = record.request_id
-        entry |= getattr(record, "entry", {})
-        if record.exc_info:
-            entry["exception"] = self.formatException(record.exc_info)
-        try:
-            line = orjson.dumps(entry).decode()
-        except TypeError:  # a text that is not valid Unicode
-            line = json.dumps(entry)
-        return _masked(line, self.secrets)
-
-
-class PlainFormatter(logging.Formatter):
-    """Write records as plain text, with secrets masked."""
-
-    def __init__(self, secrets: Sequence[str] = ()) -> None:
-        super().__init__("%(asctime)s %(levelname)-8s %(process)d %(name)s: %(message)s")
-        self.secrets = secrets
-
-    def format(self, record: logging.LogRecord) -> str:
-        """Return the log record as one or several lines of text."""
-        return _masked(super().format(record), self.secrets)
+        """Return the log record as text, with the keys masked."""
+        text = self._write(record)
+        for secret in self._secrets:
+            text = text.replace(secret, _MASK)
+        return text
 
 
 def _is_useful(record: logging.LogRecord) -> bool:
@@ -97,21 +74,19 @@ def log_config(
     access log. The log level of libraries is at least `info`, because at `debug` numba would log
     each step of a compilation. Every line masks the secrets.
     """
-    levels = logging.getLevelNamesMapping()
+    level = level.upper()
+    libraries = max(logging.getLevelNamesMapping()[level], logging.INFO)
     return {
         "version": 1,
         "disable_existing_loggers": False,
-        "formatters": {
-            "json": {"()": JSONFormatter, "secrets": secrets},
-            "plain": {"()": PlainFormatter, "secrets": secrets},
-        },
+        "formatters": {"masked": {"()": Masked, "style": style, "secrets": secrets}},
         "handlers": {
             "stderr": {
                 "class": "logging.StreamHandler",
-                "formatter": style,
+                "formatter": "masked",
                 "filters": [_is_useful],
             }
         },
-        "root": {"handlers": ["stderr"], "level": max(levels[level.upper()], logging.INFO)},
-        "loggers": {"app": {"level": level.upper()}, "uvicorn.access": {"level": "CRITICAL"}},
+        "root": {"handlers": ["stderr"], "level": libraries},
+        "loggers": {"app": {"level": level}, "uvicorn.access": {"level": "CRITICAL"}},
     }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 import threading
 from pathlib import Path
 from typing import Any
@@ -19,13 +18,9 @@ from app.api.body import parse
 from app.questions.reading import read_scene
 from scene_client.schemas import MissingRequest
 from tests.http.test_problems import problem
-from tests.services import LiveService, live_service, serve
+from tests.services import serve
 
-API_KEY = "0123456789abcdef"
 JSON = {"Content-Type": "application/json"}
-
-
-locked = live_service(SCENE_API_KEY=API_KEY)
 
 
 @pytest.mark.parametrize(
@@ -120,29 +115,6 @@ async def test_the_body_of_one_scene_has_a_limit_of_its_own(client: httpx.AsyncC
     batch = b'{"scenes":[%b]}' % scene
     response = await client.post("/missing/batch", content=batch.ljust(2**21), headers=JSON)
     assert response.status_code == 200
-
-
-@pytest.mark.parametrize(
-    ("left_out", "status"),
-    [
-        (b"", 200),
-        (b"X-API-Key: 0123456789abcdef\r\n", 401),
-        (b"Content-Type: application/json\r\n", 415),
-        (b"Host: 127.0.0.1\r\n", 421),
-    ],
-)
-def test_trailers_are_no_headers(locked: LiveService, left_out: bytes, status: int) -> None:
-    """A trailer with the key opened the service."""
-    headers = (
-        b"Host: 127.0.0.1\r\nX-API-Key: 0123456789abcdef\r\nContent-Type: application/json\r\n"
-    ).replace(left_out, b"")
-    body = b'{"objects":["bed"]}'
-    with socket.create_connection(("127.0.0.1", locked.port), timeout=10) as connection:
-        connection.sendall(
-            b"POST /missing HTTP/1.1\r\n%bTransfer-Encoding: chunked\r\n\r\n" % headers
-            + b"%x\r\n%b\r\n0\r\n%b\r\n" % (len(body), body, left_out or b"X-Note: a\r\n")
-        )
-        assert connection.recv(64).startswith(b"HTTP/1.1 %d " % status)
 
 
 UNKNOWN = {f"u{k}": 0 for k in range(30)}

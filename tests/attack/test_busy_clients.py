@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import resource
 import socket
 import time
 from collections import Counter
@@ -13,15 +12,12 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from http.client import HTTPConnection
 from itertools import cycle, repeat
-from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 
 from benchmarks.load.windows import at_concurrency, at_rate
-from tests.http.stores import make_store
-from tests.services import LiveService, launch, live_service, wait_until
+from tests.services import LiveService, live_service, wait_until
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 
@@ -127,41 +123,6 @@ def test_memory_stays_bounded_when_answers_are_not_read(service: LiveService) ->
             assert service.memory - before < 100 * 2**20
             assert service.control() == answers
     wait_until(lambda: service.memory - before < 50 * 2**20)
-
-
-def silent(count: int, port: int) -> ExitStack:
-    """Open connections that send nothing."""
-    held = ExitStack()
-    for _ in range(count):
-        held.enter_context(socket.create_connection(("127.0.0.1", port), timeout=5))
-    return held
-
-
-def test_silent_connections_do_not_keep_health_checks_out(tmp_path: Path) -> None:
-    store = make_store(tmp_path / "store")
-    with (
-        launch(store, tmp_path / "log", SCENE_MAX_CONNECTIONS="64") as service,
-        silent(80, service.port),
-    ):
-        wait_until(lambda: service.descriptors > 64)
-        for _ in range(20):
-            assert httpx.get(f"{service.url}/health/live").status_code == 200
-        # After ten seconds without a request, the service closes them.
-        wait_until(lambda: service.descriptors < 32)
-
-
-def test_few_files_limit_the_connections(tmp_path: Path) -> None:
-    """300 connections at `ulimit -n 256`: the service keeps 64 files for other purposes."""
-    store, (soft, hard) = make_store(tmp_path / "store"), resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
-    try:
-        service = launch(store, tmp_path / "log")
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-    with service, silent(300, service.port):
-        for _ in range(20):
-            assert httpx.get(f"{service.url}/health/live").status_code == 200
-        assert "accepts 192 connections" in service.log.read_text()
 
 
 behind_proxy = live_service(SCENE_TRUSTED_PROXIES="127.0.0.1")

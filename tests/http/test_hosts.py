@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
+from socket import gethostname
 from typing import Any
 
 import httpx
 import pytest
 
+from app.api.access import HEALTH
 from app.settings import Settings
 from tests.http.test_problems import problem
 from tests.services import Replace, client_of_service, defect, serve
 
 SCENE = {"objects": ["bed"]}
-LOCAL = {"127.0.0.1", "localhost", "[::1]"}
+LOCAL = {"localhost", "pc-7.lab", "pc-7.local"}
 
 
 @pytest.fixture(autouse=True)
@@ -25,27 +28,28 @@ def no_environment(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [
-        ({}, LOCAL),
-        ({"host": "0.0.0.0"}, LOCAL),
-        ({"host": "::"}, LOCAL),
-        ({"host": "10.0.0.7"}, {*LOCAL, "10.0.0.7"}),
-        ({"host": "fd00::7"}, {*LOCAL, "[fd00::7]"}),
+        ({}, {*LOCAL, "127.0.0.1"}),
+        ({"host": "[FD00::7]"}, {*LOCAL, "fd00::7"}),
         ({"host": "Robot.local"}, {*LOCAL, "robot.local"}),
-        ({"allowed_hosts": "scene, Robot.local [fd00::7]"}, {"scene", "robot.local", "[fd00::7]"}),
-        ({"allowed_hosts": "::1"}, {"[::1]"}),
+        ({"allowed_hosts": "scene, Robot.local [fd00::7]"}, {"scene", "robot.local", "fd00::7"}),
         ({"allowed_hosts": "scene,*"}, None),
     ],
 )
 def test_names_are_those_of_this_machine_or_listed(
-    tmp_path: Path, settings: dict[str, Any], expected: set[str] | None
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    settings: dict[str, Any],
+    expected: set[str] | None,
 ) -> None:
+    monkeypatch.setattr("app.settings.gethostname", lambda: "PC-7.lab")
     assert Settings(store=tmp_path, **settings).accepted_hosts == expected
 
 
 async def test_requests_for_another_host_are_refused(shared_store: Path) -> None:
-    accepted = ("127.0.0.1", "127.0.0.1:8000", "LOCALHOST:1", "[::1]:8000")
-    others = ("evil.example", "127.0.0.1.evil.example", "localhost@evil.example")
-    malformed = ("localhost:80:80", "localhost:port", "::1", "")
+    addresses = ("127.0.0.1", "192.168.1.20:8000", "[::1]:8000", "[FD00::7]")
+    accepted = (*addresses, "LOCALHOST:1", f"{gethostname()}:8000")
+    others = ("evil.example", "127.0.0.1.evil.example", "localhost@evil.example", "1.2.3.4.5")
+    malformed = ("localhost:80:80", "localhost:port", "::1", "[::1", "1.2.3", "")
     async with serve(shared_store, allowed_hosts=()) as client:
         for host in (*accepted, *others, *malformed):
             headers = {"Host": host}
@@ -53,12 +57,40 @@ async def test_requests_for_another_host_are_refused(shared_store: Path) -> None
             if host in accepted:
                 assert response.status_code == 200, host
             else:
-                problem(response, 421, "host-refused")
+                document = problem(response, 421, "host-refused")
+                assert "SCENE_ALLOWED_HOSTS (docs/network.md)" in document["detail"]
             # Orchestrators ask by the address of a replica.
             for path in ("/health/live", "/health/ready"):
                 assert (await client.get(path, headers=headers)).status_code == 200
         twice = [("Host", "localhost"), ("Host", "localhost")]
         problem(await client.get("/models", headers=twice), 421, "host-refused")
+
+
+async def test_only_health_checks_take_no_turn_and_accept_every_host(
+    shared_store: Path,
+) -> None:
+    """A path is matched whole: no route below another one becomes a health check."""
+    async with serve(shared_store) as client:
+        paths = client.app.state.paths  # type: ignore[attr-defined]
+        assert set(HEALTH) <= paths
+        # The words of a vocabulary may contain slashes.
+        words = {f"/models/default/vocabulary/x{path}" for path in HEALTH}
+        nested = {f"{path}{check}" for path in paths if path != "/" for check in HEALTH}
+        for template in paths | words | nested:
+            path = re.sub(r"{\w+(:path)?}", "default", template)
+            for method in ("GET", "POST"):
+                response = await client.request(method, path, headers={"Host": "evil.example"})
+                if path in HEALTH:
+                    assert response.status_code in (200, 405)
+                else:
+                    problem(response, 421, "host-refused")
+        for word in words:
+            assert (await client.get(word)).status_code in (200, 404)
+
+
+async def test_a_prefix_that_stays_in_the_path_names_its_setting(client: httpx.AsyncClient) -> None:
+    document = problem(await client.post("/scene/missing", json=SCENE), 404, "not-found")
+    assert "SCENE_ROOT_PATH" in document["detail"]
 
 
 # ------------------------------------------------------------------------------------------ origins

@@ -418,7 +418,7 @@ async def test_a_defect_is_a_problem_without_details(
     # The log has what the client is not told, under the same id.
     (record,) = [record for record in caplog.records if record.name == "app.api"]
     assert record.exc_info is not None
-    assert record.request_id == document["request_id"]
+    assert record.entry["request_id"] == document["request_id"]
 
 
 async def test_an_answer_that_is_not_finite_is_a_defect(

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import re
 import sys
-from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
+from typing import Literal
 
 import pytest
 from pydantic import ValidationError
 
 from app.__main__ import main
-from app.serving.logs import JSONFormatter, PlainFormatter
+from app.serving.logs import Masked
 from app.settings import Settings
 from tests.conftest import run_program
 
@@ -52,7 +54,7 @@ def test_settings_come_from_the_environment(
 
 
 INVALID = {
-    "host": [""],
+    "host": ["", "http://127.0.0.1", "[::1", "127.0.0.1:8000"],
     "port": [-1, 65536, "tcp://10.0.0.1:80"],
     "store_poll": [-1, "nan", 3601],
     "store": ["no/such/directory", __file__],
@@ -168,13 +170,29 @@ def test_a_misconfigured_service_says_which_variables_and_exits(tmp_path: Path) 
     assert wrong["SCENE_API_KEY"] not in run.stdout + run.stderr
 
 
-@pytest.mark.parametrize("kind", [JSONFormatter, PlainFormatter])
-def test_a_key_is_masked_in_any_spelling(kind: Callable[[list[str]], logging.Formatter]) -> None:
+@pytest.mark.parametrize("style", ["json", "plain"])
+def test_a_key_is_masked_in_any_spelling(style: Literal["json", "plain"]) -> None:
     secret = 'quote"and\\backslash'
-    record = logging.LogRecord("app", logging.ERROR, "file", 1, "it was %s", (secret,), None)
-    line = kind([secret]).format(record)
+    try:
+        raise ValueError(secret)
+    except ValueError:
+        reason = sys.exc_info()
+    record = logging.LogRecord("app", logging.ERROR, "file", 1, "it was %s", (secret,), reason)
+    record.entry = {"note": secret}
+    line = Masked(style, [secret]).format(record)
     assert "it was **********" in line
+    assert "ValueError: **********" in line
     assert "backslash" not in line
+
+
+def test_a_json_line_has_the_documented_fields() -> None:
+    record = logging.LogRecord("app", logging.ERROR, "file", 1, "a \udc80", (), None)
+    record.entry = {"request_id": "r1"}
+    entry = json.loads(Masked("json").format(record))
+    assert datetime.fromisoformat(entry.pop("time")).timestamp() == pytest.approx(record.created)
+    assert entry.pop("message").startswith("a ")
+    expected = {"level": "error", "process": record.process, "logger": "app", "request_id": "r1"}
+    assert entry == expected
 
 
 def in_words(name: str, default: object) -> str:

