@@ -178,7 +178,7 @@ class Gateway:
         body = b""
         if scope["method"] in _WITH_BODY:
             limit = self._settings.max_body_bytes
-            if not scope["path"].endswith("/batch"):
+            if not scope["path"].endswith(("/batch", "/scenes")):
                 limit = min(self._settings.max_scene_bytes, limit)
             body = await self._runtime.bodies.read(receive, client, limit, length)
         scope["state"] |= {"body": body, "ticket": ticket}

@@ -1,7 +1,7 @@
 """Small files in the layouts of detectors, annotation tools and simulators, with their scenes.
 
-The command, the Python functions and the page read the same files: tests/client/test_files.py and
-tests/browser/test_files.py.
+The command and the Python functions (tests/client/test_files.py) and the service
+(tests/http/test_scenes.py) read the same files.
 """
 
 from __future__ import annotations
@@ -645,50 +645,44 @@ EXAMPLES: dict[str, Example] = {
 
 _IDS = "class ids are numbers"
 
-REFUSED: dict[str, tuple[str, str, str]] = {
-    # File: content, words of the error in Python and of the command, words of the page.
-    "results.json": (_json(_RESULTS), _IDS, _IDS),
-    "yolo.txt": (EXAMPLES["yolo.txt"].text, _IDS, _IDS),
-    "numeric.json": (_json({"detections": [_vision("56")]}), _IDS, _IDS),
-    "numbers.json": ('["56"]', "class id instead of a label", "class id instead of a label"),
-    "coco.json": (_json(_COCO), "2 scenes (7, 9): choose one", "Scene 1 of 2: 7"),
-    "rooms.json": (_json(_HYDRA), "2 scenes (R(0), R(1)): choose one", "Scene 1 of 2: R(0)"),
-    "lines.jsonl": ('{"objects": []}\n{"objects": []}', "has 2 lines: choose one", "of 2: 1"),
+REFUSED: dict[str, tuple[str, str]] = {
+    "results.json": (_json(_RESULTS), _IDS),
+    "yolo.txt": (EXAMPLES["yolo.txt"].text, _IDS),
+    "numeric.json": (_json({"detections": [_vision("56")]}), _IDS),
+    "numbers.json": ('["56"]', "class id instead of a label"),
+    "coco.json": (_json(_COCO), "2 scenes (7, 9): choose one"),
+    "rooms.json": (_json(_HYDRA), "2 scenes (R(0), R(1)): choose one"),
+    "lines.jsonl": ('{"objects": []}\n{"objects": []}', "2 scenes (1, 2): choose one"),
     "captions.json": (
         _json({"images": [], "annotations": [{"id": 1, "image_id": 1, "caption": "A bed."}]}),
-        "instances_",
         "instances_",
     ),
     "classes.json": (
         _json([{"name": "bed", "class": 1, "confidence": 0.9}]),
         "classifier",
-        "classifier",
     ),
-    "truncated.json": (_json(_HYDRA)[:-200], "not JSON", "neither JSON"),
-    "truncated.xml": (_CVAT[:-30], "not XML", "not XML"),
-    "deep.json": ("[" * 200_000 + "]" * 200_000, "", ""),
+    "truncated.json": (_json(_HYDRA)[:-200], "not JSON"),
+    "truncated.xml": (_CVAT[:-30], "not XML"),
+    "deep.json": ("[" * 200_000 + "]" * 200_000, ""),
     "bomb.xml": (
         '<!DOCTYPE a [<!ENTITY b "bbbbbbbbbb">]><annotations>&b;</annotations>',
         "document type",
-        "document type",
     ),
-    "page.xml": ("<html><body/></html>", "root <html>", "root <html>"),
-    "echo.txt": ("header:\n  stamp:\n    sec: 1\ndetections: []\n", "YAML", "YAML"),
-    "no_header.csv": ("desk,2.0,0.0,0.37\n", "not JSON", "neither JSON"),
-    "words.csv": ("label,x,y,z\ndesk,two,0,0\n", "line 2, column x: 'two'", "Line 2, column x"),
-    "unknown.json": ('{"shapes": [], "version": "5.0"}', "shapes, version", "shapes, version"),
-    "value.json": ("3", "a JSON value", "A JSON value"),
-    "empty.json": ("", "not JSON", "neither JSON"),
+    "page.xml": ("<html><body/></html>", "root <html>"),
+    "echo.txt": ("header:\n  stamp:\n    sec: 1\ndetections: []\n", "YAML"),
+    "no_header.csv": ("desk,2.0,0.0,0.37\n", "not JSON"),
+    "words.csv": ("label,x,y,z\ndesk,two,0,0\n", "line 2, column x: 'two'"),
+    "unknown.json": ('{"shapes": [], "version": "5.0"}', "shapes, version"),
+    "value.json": ("3", "a JSON value"),
+    "empty.json": ("", "not JSON"),
     "twins.json": (
         _json({"objects": [{"id": 1, "label": "bed"}] * 2}),
-        "training format",
         "training format",
     ),
     "no_type.json": (
         _json({"objects": [{"objectType": "Bed", "position": {"x": 1}}]}),
         "looks like AI2-THOR",
-        "looks like AI2-THOR",
     ),
-    "empty.csv": ("label,x,y,z\n", "no objects", "no objects"),
+    "empty.csv": ("label,x,y,z\n", "no objects"),
 }
-"""Files without a scene, or with several."""
+"""Files without a scene, or with several: the content and words of the error."""

@@ -39,7 +39,7 @@ class Table(list[dict[str, str]]):
 LABEL_COLUMNS: Final = ("label", "name", "class_name", "class", "class_id")
 _IMAGE_COLUMNS: Final = ("image", "image_id", "filename", "file_name", "frame")
 _CORNERS: Final = ("xmin", "ymin", "xmax", "ymax")
-_NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_NUMBER: Final = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
 
 
 def table_parts(rows: Table) -> Parts:
