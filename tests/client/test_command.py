@@ -102,7 +102,7 @@ def test_json_is_the_service_s_answer(
         ("contexts", ("layer", "unit", "state")),
         ("outliers bed toilet sink", ("toilet", "because")),
         ("rooms bed", ("room type", "probability", "bedroom")),
-        ("relations bed lamp --relations 'lamp on-top bed'", ("expected", "on-top", "observed")),
+        ("relations bed lamp --relations 'lamp on-top bed'", ("if not observed", "on-top")),
         ("outliers bed lamp --relations 'lamp on-top bed'", ("on-top", "bed")),
     ],
 )
