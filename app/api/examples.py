@@ -55,7 +55,7 @@ def _batch(result: dict[str, Any]) -> dict[str, Any]:
 REQUESTS: Final[dict[str, dict[str, Example]]] = {
     **{question.name: dict(question.examples) for question in QUESTIONS},
     **{f"{question.name}_batch": BATCH for question in QUESTIONS if not question.samples},
-    "read_scenes": {
+    "scenes": {
         "table": Example(
             "a table of detections",
             {"name": "detections.csv", "text": "label,x,y,z\ndesk,2.0,0.0,0.37\n"},
@@ -96,7 +96,7 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
         for question in QUESTIONS
         if not question.samples
     },
-    "read_scenes": {
+    "scenes": {
         "request_id": REQUEST_ID,
         "scenes": [
             {

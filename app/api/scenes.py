@@ -43,7 +43,7 @@ router = APIRouter(
 
 
 @router.post("/scenes", summary="The scenes of a file", response_model=ScenesAnswer)
-async def read_scenes(data: ScenesRequest, http: Request) -> bytes:
+async def scenes(data: ScenesRequest, http: Request) -> bytes:
     """Convert a file of a detector, an annotation tool or a simulator to the fields of requests.
 
     The answer has the first 256 scenes of the file. The service stores nothing.
@@ -76,7 +76,7 @@ def _read(data: ScenesRequest, request_id: str, limit: int, stop: Callable[[], b
         readers = scenes_of(content, data.name, labels)
     except MessageError as error:
         raise UnreadableFileError(detail=_in_one_line(str(error))) from None
-    scenes: list[bytes] = []
+    found: list[bytes] = []
     notes: list[FileNote] = []
     size = 0
     for number, (name, read) in enumerate(readers.items()):
@@ -99,13 +99,13 @@ def _read(data: ScenesRequest, request_id: str, limit: int, stop: Callable[[], b
             continue
         for place, reason, words in fields.notes[:_MOST_NOTES]:
             detail = _in_one_line(words)
-            note = FileNote(scene=len(scenes), detection=place, reason=reason, detail=detail)
+            note = FileNote(scene=len(found), detection=place, reason=reason, detail=detail)
             notes.append(note)
-        scenes.append(scene)
-    if not scenes:
+        found.append(scene)
+    if not found:
         raise UnreadableFileError(detail=notes[0].detail if notes else "The file is empty.")
     return b'{"request_id":%b,"scenes":[%b],"notes":%b}' % (
-        to_json(request_id), b",".join(scenes), to_json(notes),
+        to_json(request_id), b",".join(found), to_json(notes),
     )  # fmt: skip
 
 

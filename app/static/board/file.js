@@ -23,7 +23,7 @@ export function fileDialog(store, records, recorded, put, say) {
     ['file', 'json', 'json-error', 'share-done', 'which', 'label-map', 'label-names'].map(get);
   const scene = () => toScene(store.get(), sizesOf(store.get(), store.get().models[0]));
   let found = null; // the scenes of the text; null before the service has read it
-  let name = ''; // of the file in the text area
+  let name = ''; // of the file in the text area; empty for a pasted text
   let opened = {}; // scenes and name of the text whose scene was put on the board last
   let hidden = ''; // text of a large file, which the text area does not show
   const source = () => hidden || area.value;
@@ -60,7 +60,7 @@ export function fileDialog(store, records, recorded, put, say) {
   /** The scenes of a text in another format than that of requests. The service reads it and stores nothing. */
   async function readByService(text) {
     const labels = map.value === 'own' ? names.value : map.value;
-    const { scenes, notes } = await call('scenes', { text, name: name.slice(-255), ...(labels && { label_map: labels }) });
+    const { scenes, notes } = await call('scenes', { text, name: name.slice(-255) || 'text', ...(labels && { label_map: labels }) });
     const about = (index) => notes.filter((note) => note.scene === index);
     return scenes.map((one, index) => ({ ...one, notes: [...about(null), ...about(index)] }));
   }
@@ -82,7 +82,7 @@ export function fileDialog(store, records, recorded, put, say) {
 
   function show(text, file = null) {
     const isLarge = file && file.size > MOST_SHOWN;
-    name = file?.name ?? 'scenes.jsonl';
+    name = file?.name ?? '';
     hidden = isLarge ? text : '';
     area.value = isLarge ? '' : text;
     done.textContent = isLarge ? `${file.name} is open. It is too large to be shown here.` : '';
@@ -105,6 +105,7 @@ export function fileDialog(store, records, recorded, put, say) {
     listRecords();
     dialog.showModal();
     area.focus();
+    area.setSelectionRange(0, 0);
   });
   get('close-file').addEventListener('click', () => dialog.close());
   get('import').addEventListener('click', async ({ target }) => {
@@ -121,7 +122,7 @@ export function fileDialog(store, records, recorded, put, say) {
         which.focus();
         return;
       }
-      place(chosen(), { scenes, name });
+      place(chosen(), { scenes, name: name || 'scenes.jsonl' });
       dialog.close();
     } catch (problem) {
       if (!(problem instanceof SceneError || problem instanceof ProblemError || problem instanceof UnreachableError)) throw problem;

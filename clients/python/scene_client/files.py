@@ -116,11 +116,13 @@ def label_map_of(option: str) -> dict[str, str | None]:
 def labels_in(text: str) -> dict[str, str | None]:
     """Return the labels of class ids in JSON, in YAML with `names:`, or of one label a line.
 
+    The name of a known list, such as coco80, stands for its labels.
+
     Raises:
         MessageError: the text does not contain labels.
     """
     try:
-        return read_label_map(_names(text))
+        return read_label_map(text if text in WELL_KNOWN else _names(text))
     except (LookupError, TypeError, ValueError, RecursionError):
         raise MessageError("the label map does not contain labels") from None
 
