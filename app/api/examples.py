@@ -62,11 +62,7 @@ REQUESTS: Final[dict[str, dict[str, Example]]] = {
         ),
         "class-ids": Example(
             "boxes of a detector with class ids",
-            {
-                "name": "results.txt",
-                "text": "56 0.5 0.5 0.2 0.4\n60 0.3 0.6 0.1 0.3\n",
-                "label_map": "coco80",
-            },
+            {"name": "a.txt", "text": "56 0.5 0.5 0.2 0.4\n", "label_map": "coco80"},
         ),
         "unreadable-file": Example(
             "a file without a known format", {"name": "a.txt", "text": "{}"}, "unreadable-file"
@@ -98,22 +94,7 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
     },
     "scenes": {
         "request_id": REQUEST_ID,
-        "scenes": [
-            {
-                "name": "",
-                "scene": {
-                    "objects": [
-                        {
-                            "id": "desk_1",
-                            "label": "desk",
-                            "confidence": 1.0,
-                            "position": {"x": 2.0, "y": 0.0, "z": 0.37},
-                        }
-                    ],
-                    "unknown_labels": "nearest-or-ignore",
-                },
-            }
-        ],
+        "scenes": [{"name": "42", "scene": {"objects": [{"id": "desk_1", "label": "desk"}]}}],
         "notes": [
             {"scene": 0, "detection": 1, "reason": "no-label", "detail": "class '12' has no label"}
         ],

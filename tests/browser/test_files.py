@@ -141,17 +141,3 @@ def test_a_large_file_is_read_without_showing_it(open_board: OpenBoard, tmp_path
     assert board.things == ["bed", "lamp"]
     choose(board, path)
     expect(page.locator("#json-error")).to_contain_text("more than 64 MiB")
-
-
-def test_a_table_stands_on_the_board_where_the_file_says(
-    open_board: OpenBoard, tmp_path: Path
-) -> None:
-    board = open_board()
-    path = tmp_path / "detections.csv"
-    path.write_text(EXAMPLES["detections.csv"].text)
-    choose(board, path)
-    board.click("Put on the board")
-    first, second = board.scene["objects"]
-    assert first["position"] == {"x": 2, "y": 0, "z": 0.37}
-    assert first["size"] == {"x": 0.8, "y": 1.6, "z": 0.74}
-    assert second["position"]["x"] == 2.2
