@@ -15,7 +15,7 @@ from starlette.requests import Request
 
 from app.api.body import JSONRoute
 from app.api.openapi import error_responses, operation_id
-from app.errors import DeadlinePassedError, InvalidRequestError, UnreadableFileError
+from app.errors import InvalidRequestError, UnreadableFileError
 from app.serving.admission import in_thread
 from app.serving.runtime import Runtime
 from scene_client.files import labels_in, scenes_of
@@ -60,12 +60,13 @@ async def scenes(data: ScenesRequest, http: Request) -> bytes:
 
 
 def _read(data: ScenesRequest, request_id: str, limit: int, stop: Callable[[], bool]) -> bytes:
-    """Return the answer as JSON. Its scenes have at most ``limit`` bytes.
+    """Return the answer as JSON. Its scenes have at most ``limit`` bytes in total.
+
+    ``stop`` returns whether the request has ended.
 
     Raises:
         InvalidRequestError: `base64` is not Base64.
         UnreadableFileError: the file contains no scene that can be read.
-        DeadlinePassedError: the request has ended.
     """
     content = _content(data)
     if any(content.count(mark) > most * MOST_PARTS for mark, most in _MARKS.items()):
@@ -79,12 +80,15 @@ def _read(data: ScenesRequest, request_id: str, limit: int, stop: Callable[[], b
     found: list[bytes] = []
     notes: list[FileNote] = []
     size = 0
+
+    def note(scene: int | None, detection: int | None, reason: str, detail: str) -> None:
+        detail = _in_one_line(detail)
+        notes.append(FileNote(scene=scene, detection=detection, reason=reason, detail=detail))
+
     for number, (name, read) in enumerate(readers.items()):
-        if stop():
-            raise DeadlinePassedError("The request ended before the file was read.")
-        if number == MAX_BATCH or size > limit:
-            detail = f"the answer leaves out {len(readers) - number} of {len(readers)} scenes"
-            notes.append(FileNote(scene=None, detection=None, reason="too-many", detail=detail))
+        if number == MAX_BATCH or size > limit or stop():
+            left = f"the answer leaves out {len(readers) - number} of {len(readers)} scenes"
+            note(None, None, "too-many", left)
             break
         try:
             fields = read()
@@ -94,19 +98,18 @@ def _read(data: ScenesRequest, request_id: str, limit: int, stop: Callable[[], b
                 raise MessageError(f"the answer has no room for this scene: {limit} bytes at most")
         except (ValueError, RecursionError) as error:
             words = str(error) if isinstance(error, MessageError) else "a value is not valid JSON"
-            detail = _in_one_line(f"{name}: {words}" if name else words)
-            notes.append(FileNote(scene=None, detection=None, reason="refused", detail=detail))
+            note(None, None, "refused", f"{name}: {words}" if name else words)
             continue
-        for place, reason, words in fields.notes[:_MOST_NOTES]:
-            detail = _in_one_line(words)
-            note = FileNote(scene=len(found), detection=place, reason=reason, detail=detail)
-            notes.append(note)
+        for place, reason, detail in fields.notes[:_MOST_NOTES]:
+            note(len(found), place, reason, detail)
         found.append(scene)
     if not found:
         raise UnreadableFileError(detail=notes[0].detail if notes else "The file is empty.")
     return b'{"request_id":%b,"scenes":[%b],"notes":%b}' % (
-        to_json(request_id), b",".join(found), to_json(notes),
-    )  # fmt: skip
+        to_json(request_id),
+        b",".join(found),
+        to_json(notes),
+    )
 
 
 def _content(data: ScenesRequest) -> bytes:
