@@ -134,7 +134,7 @@ def _names(text: str) -> Any:
         _, is_yaml, block = f"\n{text}".partition("\nnames:")
         if not is_yaml:
             return text.splitlines()
-        entries = re.findall(r"^[ \t]*(?:-|(\d+):)(.*)$", block, re.MULTILINE)
+        entries = re.findall(r"^[ \t]*(?:-|(\d+):)[ \t]*(\S.*)$", block, re.MULTILINE)
         if inline := re.match(r"[ \t]*\[([^\]]*)\]", block):
             entries = [("", name) for name in inline[1].split(",")]
         return {
