@@ -21,6 +21,7 @@ Location = tuple[str | int, ...]
 Step = Literal[
     "admission",  # all routes except health checks and metrics
     "body",  # routes that read a JSON body
+    "file",  # the route that reads files of other programs
     "host",  # the check of the Host header, if SCENE_ALLOWED_HOSTS is not *
     "key",  # the check of the API key, if SCENE_API_KEY is set
     "model",  # routes that use a loaded model
@@ -260,6 +261,15 @@ class InvalidRequestError(RequestError, slug="invalid-request", status=422, step
     """
 
     example = _example("#/objects/1/confidence", "must be greater than 0")
+
+
+class UnreadableFileError(RequestError, slug="unreadable-file", status=422, steps=("file",)):
+    """The file contains no scene that can be read.
+
+    `detail` gives the reason. docs/clients.md lists the formats. POST /scenes reads files with at
+    most 32,768 lines, lists, objects, elements or attributes. The command `scene` reads larger
+    files. Numeric class ids need the field `label_map`.
+    """
 
 
 class UnknownLabelsError(RequestError, slug="unknown-labels", status=422, steps=("scene",)):

@@ -9,7 +9,7 @@ from contextlib import asynccontextmanager
 from fastapi import FastAPI
 
 from app import __version__
-from app.api import health, models, openapi, pages, problems, questions, telemetry
+from app.api import health, models, openapi, pages, problems, questions, scenes, telemetry
 from app.api.gateway import gateway
 from app.serving.runtime import Runtime
 from app.settings import Settings
@@ -63,7 +63,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
 
 def _add_routes(app: FastAPI, settings: Settings) -> None:
-    app.router.routes.extend((*questions.router.routes, *questions.batches.routes))
+    app.router.routes.extend(
+        (*questions.router.routes, *questions.batches.routes, *scenes.router.routes)
+    )
     routers = [
         models.router,
         health.router,

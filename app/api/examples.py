@@ -55,6 +55,19 @@ def _batch(result: dict[str, Any]) -> dict[str, Any]:
 REQUESTS: Final[dict[str, dict[str, Example]]] = {
     **{question.name: dict(question.examples) for question in QUESTIONS},
     **{f"{question.name}_batch": BATCH for question in QUESTIONS if not question.samples},
+    "scenes": {
+        "table": Example(
+            "a table of detections",
+            {"name": "detections.csv", "text": "label,x,y,z\ndesk,2.0,0.0,0.37\n"},
+        ),
+        "class-ids": Example(
+            "boxes of a detector with class ids",
+            {"name": "a.txt", "text": "56 0.5 0.5 0.2 0.4\n", "label_map": "coco80"},
+        ),
+        "unreadable-file": Example(
+            "a file without a known format", {"name": "a.txt", "text": "{}"}, "unreadable-file"
+        ),
+    },
 }
 _OF_QUESTIONS: Final = {
     question.name: {**_ENVELOPE, **question.example_answer} for question in QUESTIONS
@@ -65,6 +78,13 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
         f"{question.name}_batch": _batch(_OF_QUESTIONS[question.name])
         for question in QUESTIONS
         if not question.samples
+    },
+    "scenes": {
+        "request_id": REQUEST_ID,
+        "scenes": [{"name": "42", "scene": {"objects": [{"id": "desk_1", "label": "desk"}]}}],
+        "notes": [
+            {"scene": 0, "detection": 1, "reason": "no-label", "detail": "class '12' has no label"}
+        ],
     },
     "list_models": {
         "generation": "3f6d0f4be1a25c77",

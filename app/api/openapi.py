@@ -29,6 +29,7 @@ _KEY_SCHEMES: Final = {
 TAGS: Final = [
     {"name": "questions", "description": "The five questions about one scene."},
     {"name": "batches", "description": "The same questions about many scenes in one request."},
+    {"name": "files", "description": "Scenes from files of detectors, tools and simulators."},
     {"name": "models", "description": "The models, their versions and their vocabularies."},
     {"name": "health", "description": "Health checks for orchestrators."},
     {"name": "monitoring", "description": "Metrics for Prometheus."},

@@ -20,7 +20,7 @@ from app.settings import Settings
 _TIMEOUT: Final = re.compile(rb"[1-9][0-9]{0,5}")
 _WITH_BODY: Final = frozenset(("POST", "PUT", "PATCH"))
 # Routes whose bodies may be larger than one scene.
-_LARGE: Final = frozenset(f"/{question.name}/batch" for question in QUESTIONS)
+_LARGE: Final = frozenset(("/scenes", *(f"/{question.name}/batch" for question in QUESTIONS)))
 
 
 class Deadline:

@@ -5,7 +5,7 @@ Requests of different cost wait in different lanes:
 | lane | requests | weight of a request | requests at a time |
 |---|---|---|---|
 | quick | all at their start | 1 | 8 |
-| slow | batches, large bodies and scenes, words, documents | number of scenes | 2 |
+| slow | batches, large bodies and scenes, words, documents, files | number of scenes | 2 |
 | draws | `/generate` | number of scenes x sweeps | 1 |
 
 A lane bounds the total weight of its requests. One client holds at most a quarter of a lane, and

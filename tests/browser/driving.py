@@ -21,7 +21,9 @@ class Board:
 
     def settle(self) -> None:
         """Wait until everything that changed has been asked and answered."""
-        expect(self.page.locator("main[aria-busy=true]")).to_have_count(0, timeout=20_000)
+        expect(self.page.locator("main[aria-busy=true], #import:disabled")).to_have_count(
+            0, timeout=20_000
+        )
         self.page.evaluate("window.quiet()")
         busy = self.page.locator("article:not([hidden])[aria-busy=true], #drawn[aria-busy=true]")
         expect(busy).to_have_count(0, timeout=20_000)

@@ -194,7 +194,7 @@ def test_relations_are_edges_and_those_that_hold_are_told_apart(
     kinds = {"disagrees"} if odd else set()
     for row, one in zip(rows, answer["relations"], strict=True):
         assert row.startswith(f"{one['subject']} {SPOKEN[one['relation']]} {one['object']}")
-        expected = f" expected: {percent(one['expected'])}" if one.get("expected") else ""
+        expected = f" if not observed: {percent(one['expected'])}" if one.get("expected") else ""
         assert row.endswith(percent(one["probability"]) + expected)
         assert ("observed" in row) == one["observed"]
         kinds.add("holds" if one["observed"] else "expected")

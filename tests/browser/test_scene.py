@@ -5,14 +5,12 @@ from __future__ import annotations
 import base64
 import json
 import zlib
-from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 from playwright.sync_api import expect
 
-from scene_client.vision_msgs import from_message
 from tests.browser.driving import Board, OpenBoard
 
 pytestmark = pytest.mark.system
@@ -100,11 +98,9 @@ def test_numbers_can_be_typed(open_board: OpenBoard) -> None:
 
 
 NO_SCENES: list[tuple[Any, str]] = [
-    ("{", "neither JSON nor a list"),
-    ('{"objects": ["bed"]\n{"objects": ', "neither JSON nor a list"),
+    ("{", "neither JSON nor JSON lines"),
+    ('{"objects": ["bed"]\n{"objects": ', "neither JSON nor JSON lines"),
     ({"detections": [None]}, "no hypothesis with a score"),
-    ({"detections": []}, "no detection with a class"),
-    (3, "A JSON value is neither a scene"),
     ({"objects": [{"label": "bed", "size": [-1, 1, 1]}]}, "numbers x, y, z from 0"),
     ({"objects": [{"id": "a", "label": "bed"}] * 2}, "another object"),
     ({"objects": [{"label": "bed", "position": [1e9, 0, 0]}]}, "100 000 km"),
@@ -118,7 +114,7 @@ NO_SCENES: list[tuple[Any, str]] = [
 
 @pytest.mark.slow
 def test_invalid_scenes_are_refused_with_a_reason(open_board: OpenBoard) -> None:
-    board = open_board()
+    board = open_board(allow=("422",))
     page = board.page
     for scene, words in NO_SCENES:
         text = scene if isinstance(scene, str) else json.dumps(scene)
@@ -205,35 +201,7 @@ def test_positions_that_the_page_chose_do_not_count(open_board: OpenBoard) -> No
 # ------------------------------------------------------------------------- imported scenes
 
 
-def rounded(value: Any) -> Any:
-    """A scene with numbers rounded to centimetres."""
-    if isinstance(value, dict):
-        return {name: rounded(part) for name, part in value.items()}
-    return round(value, 2) if isinstance(value, float) else value
-
-
-def test_detections_are_read_as_the_client_reads_them(
-    open_board: OpenBoard, repository: Path
-) -> None:
-    file = repository / "clients" / "ros2" / "detections.json"
-    fields = from_message(json.loads(file.read_text("utf-8")))
-    board = open_board()
-    page = board.page
-    page.get_by_role("button", name="Import, export").click()
-    page.get_by_label("Open a file").set_input_files(file)
-    expect(page.get_by_label("Scene, JSON")).to_have_value(file.read_text("utf-8"))
-    board.click("Put on the board")
-    shown = {thing["id"]: thing for thing in board.scene["objects"]}
-    assert list(shown) == [thing["id"] for thing in fields["objects"]]
-    for thing in fields["objects"]:
-        for name in ("label", "confidence", "position"):
-            assert rounded(shown[thing["id"]].get(name)) == rounded(thing.get(name))
-        if "size" in thing:
-            assert rounded(shown[thing["id"]]["size"]) == rounded(thing["size"])
-    assert page.get_by_label("Positions count as evidence").is_checked()
-
-
-def test_labels_supports_and_flat_detections_are_read(open_board: OpenBoard) -> None:
+def test_labels_and_supports_are_read(open_board: OpenBoard) -> None:
     board = open_board()
     for text in ("bed, lamp, mug", "bed\nlamp\nmug\n"):
         board.put(text)
@@ -246,10 +214,5 @@ def test_labels_supports_and_flat_detections_are_read(open_board: OpenBoard) -> 
     objects = [{"id": 0, "label": "table"}, {"id": 1, "label": "mug", "supported_by": 0}]
     for relations in ([], [[1, "on-top", 0]]):
         board.put(json.dumps({"scene_id": "one", "objects": objects, "relations": relations}))
-        stated = {"subject": "mug", "relation": "on-top", "object": "table"}
+        stated = {"subject": "1", "relation": "on-top", "object": "0"}
         assert board.scene["relations"] == [stated]
-    seen = {"results": [{"hypothesis": {"class_id": "mug", "score": 0.5}}], "bbox": {"size_x": 9}}
-    board.put(json.dumps({"detections": [seen, seen]}))
-    assert board.scene["objects"] == [
-        {"id": f"mug_{number}", "label": "mug", "confidence": 0.5} for number in (1, 2)
-    ]

@@ -61,7 +61,7 @@ def test_orientations_are_about_the_vertical_axis() -> None:
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_a_file_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
-    content, words, _ = REFUSED[name]
+    content, words = REFUSED[name]
     path = tmp_path / name
     path.write_text(content, "utf-8")
     with pytest.raises(MessageError) as refused:

@@ -115,7 +115,7 @@ const ROWS = {
     ...relations.map((one) =>
       row('relations', el('b', {}, spoken(one, name)), one.probability,
         one.observed ? { kind: 'holds', words: 'observed' } : { kind: 'expected' },
-        one.expected == null ? null : el('p', { class: 'quiet' }, `expected: ${percent(one.expected)}`))),
+        one.expected == null ? null : el('p', { class: 'quiet' }, `if not observed: ${percent(one.expected)}`))),
   ],
 };
 

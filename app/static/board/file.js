@@ -1,17 +1,19 @@
 /** The dialog with the scene as text, to copy it, store it in a file or share it as a link. */
 
-import { labelsOf } from './class_ids.js';
+import { call, ProblemError, UnreachableError } from './api.js';
 import { copy } from './dom.js';
-import { MOST_BYTES, scenesIn } from './importing.js';
-import { linesIn } from './records.js';
+import { asRequest, ownScenes } from './importing.js';
+import { linesOf } from './records.js';
 import { sizesOf } from './questions.js';
 import { SceneError, toScene } from './scene.js';
 import { toHash } from './share.js';
 
 const SOME = 3; // notes that the page shows
+const MOST_BYTES = 64 * 2 ** 20; // of a file
 const MOST_SHOWN = 2 ** 20; // bytes; a browser needs a minute to show a text of 50 MB
 
 /**
+ * @typedef {{name: string, scene: object, notes?: object[]}} Found a scene of a text. Only scenes that the service has read have notes
  * @param {(scene: object, notes: string, line: object | undefined) => void} put puts a scene on the board; throws SceneError
  * @returns {{place: (index: number) => void}} puts another scene of the opened text on the board
  */
@@ -20,36 +22,53 @@ export function fileDialog(store, records, recorded, put, say) {
   const [dialog, area, error, done, which, map, names] =
     ['file', 'json', 'json-error', 'share-done', 'which', 'label-map', 'label-names'].map(get);
   const scene = () => toScene(store.get(), sizesOf(store.get(), store.get().models[0]));
-  const chosen = (count) => Math.min(count, Math.max(1, Number(which.value))) - 1;
-  let found = [];
-  let name = ''; // of the file in the text area
-  let opened = []; // text and name of the file whose scene was put on the board last
+  let found = null; // the scenes of the text; null before the service has read it
+  let name = ''; // of the file in the text area; empty for a pasted text
+  let opened = {}; // scenes and name of the text whose scene was put on the board last
   let hidden = ''; // text of a large file, which the text area does not show
   const source = () => hidden || area.value;
+  const chosen = () => Math.min(found.length, Math.max(1, Number(which.value))) - 1;
 
-  /** Lets the user choose a scene if the text has several: lines, images, frames or rooms. */
-  function count() {
-    found = [];
+  /** Finds the scenes of the text, or says that the text goes to the service. */
+  function look() {
+    let travels = false;
+    found = null;
+    error.textContent = '';
     try {
-      found = scenesIn(source()).names;
+      found = ownScenes(source());
+      travels = !found;
     } catch (problem) {
       // The button “Put on the board” shows the error.
       if (!(problem instanceof SceneError)) throw problem;
     }
-    which.max = found.length;
+    get('travels').hidden = !travels;
+    listScenes();
+  }
+
+  /** Lets the user choose a scene if the text has several: lines, images, frames or rooms. */
+  function listScenes() {
+    which.max = found?.length;
     which.value = 1;
-    which.parentElement.hidden = found.length < 2;
+    which.parentElement.hidden = !(found?.length > 1);
     nameScene();
   }
 
   function nameScene() {
-    get('scenes').textContent = `of ${found.length}: ${found[chosen(found.length)] ?? ''}`;
+    get('scenes').textContent = found ? `of ${found.length}: ${found[chosen()].name}` : '';
+  }
+
+  /** The scenes of a text in another format than that of requests. The service reads it and stores nothing. */
+  async function readByService(text) {
+    const labels = map.value === 'own' ? names.value : map.value;
+    const { scenes, notes } = await call('scenes', { text, name: name.slice(-255) || 'text', ...(labels && { label_map: labels }) });
+    const about = (index) => notes.filter((note) => note.scene === index);
+    return scenes.map((one, index) => ({ ...one, notes: [...about(null), ...about(index)] }));
   }
 
   /** The text of the notes on values that the scene leaves out. */
   function inWords(notes) {
-    const words = notes.slice(0, SOME).map(([index, , reason]) => (index === null ? reason : `detection ${index}: ${reason}`));
-    return words.length ? `The file was read with notes: ${words.join('; ')}${notes.length > SOME ? `; and ${notes.length - SOME} more` : ''}.` : '';
+    const words = notes.slice(0, SOME).map(({ detection, detail }) => (detection === null ? detail : `detection ${detection}: ${detail}`));
+    return words.length ? `The file was read with notes: ${words.join('; ')}${notes.length > SOME ? '; …' : '.'}` : '';
   }
 
   /** Shows the buttons of the confirmed scenes if there are any. */
@@ -63,53 +82,67 @@ export function fileDialog(store, records, recorded, put, say) {
 
   function show(text, file = null) {
     const isLarge = file && file.size > MOST_SHOWN;
-    name = file?.name ?? 'scenes.jsonl';
+    name = file?.name ?? '';
     hidden = isLarge ? text : '';
     area.value = isLarge ? '' : text;
-    error.textContent = '';
     done.textContent = isLarge ? `${file.name} is open. It is too large to be shown here.` : '';
-    count();
+    look();
   }
 
   area.addEventListener('input', () => {
     hidden = '';
     done.textContent = '';
-    count();
+    look();
   });
   which.addEventListener('input', nameScene);
-  map.addEventListener('change', () => (names.parentElement.hidden = map.value !== 'own'));
+  map.addEventListener('change', () => {
+    names.parentElement.hidden = map.value !== 'own';
+    look();
+  });
+  names.addEventListener('input', look);
   get('open-file').addEventListener('click', () => {
     show(JSON.stringify(scene(), null, 1));
     listRecords();
     dialog.showModal();
     area.focus();
+    area.setSelectionRange(0, 0);
   });
   get('close-file').addEventListener('click', () => dialog.close());
-  get('import').addEventListener('click', () => {
+  get('import').addEventListener('click', async ({ target }) => {
+    target.disabled = true; // a second click would send the file twice
     try {
-      place(chosen(found.length), source(), name);
+      const text = source();
+      const scenes = found ?? ownScenes(text) ?? await readByService(text);
+      if (text !== source()) return; // the user has opened another file in the meantime
+      const isNew = !found;
+      found = scenes;
+      if (isNew && found.length > 1) {
+        listScenes();
+        done.textContent = `The file has ${found.length} scenes: choose one.`;
+        which.focus();
+        return;
+      }
+      place(chosen(), { scenes, name: name || 'scenes.jsonl' });
       dialog.close();
     } catch (problem) {
-      if (!(problem instanceof SceneError)) throw problem;
-      error.textContent = problem.message;
+      if (!(problem instanceof SceneError || problem instanceof ProblemError || problem instanceof UnreachableError)) throw problem;
+      error.textContent = problem.problem?.detail ?? problem.message;
+    } finally {
+      target.disabled = false;
     }
   });
   /** Puts a scene of a text on the board. Throws SceneError. */
-  function place(index, text, of) {
-    const scenes = scenesIn(text);
-    const labels = labelsOf(map.value, names.value);
-    const given = scenes.read(index, labels);
-    if (given.notes && !given.scene.objects.length) {
-      throw new SceneError(`The file has no object for a scene: ${given.notes[0]?.[2] ?? 'it lists no detection with a class'}.`);
+  function place(index, text) {
+    const { scene: given, notes } = text.scenes[index];
+    if (notes && !given.objects.length) {
+      throw new SceneError(`The file has no object for a scene: ${notes[0]?.detail ?? 'it lists no detection with a class'}.`);
     }
-    // Only requests and training scenes have no notes.
-    const lines = given.notes ? [] : linesIn(text, of);
-    const line = lines.length ? records.open(lines, of)[index] : undefined;
-    const { scene: read } = line ? scenesIn(JSON.stringify(line)).read(0, labels) : given;
-    put(read, inWords(given.notes ?? []), line);
-    opened = [text, of];
-    const count = lines.length;
+    const lines = notes ? [] : linesOf(text.scenes, text.name);
+    const line = lines.length ? records.open(lines, text.name)[index] : undefined;
+    put(asRequest(line ?? given), inWords(notes ?? []), line);
+    opened = text;
     recorded.open(lines, index);
+    const count = text.scenes.length;
     say(count > 1 ? `Scene ${index + 1} of ${count} is on the board.` : 'The scene is on the board.');
   }
   get('download').addEventListener('click', () => save(source(), 'scene.json'));
@@ -131,7 +164,7 @@ export function fileDialog(store, records, recorded, put, say) {
     await copy(location.href);
     done.textContent = 'The link is copied. It contains the whole scene, and browsers do not send this part to a server.';
   });
-  return { place: (index) => place(index, ...opened) };
+  return { place: (index) => place(index, opened) };
 }
 
 /** Saves a text as a file. */

@@ -5,7 +5,7 @@
 
 import { call } from './api.js';
 import { el } from './dom.js';
-import { scenesIn } from './importing.js';
+import { asRequest } from './importing.js';
 import { sizesOf } from './questions.js';
 import { fromScene, toScene } from './scene.js';
 import { changed } from './store.js';
@@ -50,7 +50,7 @@ export function createRecorded(store, records, go) {
     const { models: [model], sensitivity } = store.get();
     const sizes = sizesOf(store.get(), model);
     try {
-      const board = fromScene(scenesIn(JSON.stringify(line)).read(0).scene, sizes);
+      const board = fromScene(asRequest(line), sizes);
       if (!board.things.length) return null;
       const posed = !board.relations.length && board.things.some(({ placed }) => placed);
       return { ...toScene({ ...board, posed }, sizes), model, sensitivity, unknown_labels: 'nearest-or-ignore', detail: 'scores' };

@@ -23,16 +23,11 @@ export function newLine(now = new Date()) {
   return { scene_id: `${hour}-${random.join('')}`, group: hour, stamp: { sec: seconds, nanosec: (now.getTime() % 1000) * 1e6 } };
 }
 
-/** The scenes of a file with recorded scenes, or [] for another text. A scene without id is named as in the training. */
-export function linesIn(text, file) {
-  try {
-    const lines = text.split('\n').flatMap((line, index) => (line.trim() ? [[JSON.parse(line), index + 1]] : []));
-    const named = lines.map(([line, number]) => ({ scene_id: `${file}:${number}`, ...line }));
-    const are = (line) => Array.isArray(line.objects) && (lines.length > 1 || lines[0][0].scene_id);
-    return named.every(are) ? named : [];
-  } catch {
-    return [];
-  }
+/** The scenes of a file as recorded scenes, or [] for another file. A scene without id is named as in the training. */
+export function linesOf(scenes, file) {
+  const lines = scenes.map(({ name, scene }) => ({ scene_id: `${file}:${name}`, ...scene }));
+  const isRecording = lines.length > 1 || scenes[0].scene.scene_id;
+  return isRecording && lines.every(({ objects }) => Array.isArray(objects)) ? lines : [];
 }
 
 /** Remembers the objects of a line at the objects of the board. Unchanged objects stay as they are in the file. */

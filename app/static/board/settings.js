@@ -16,7 +16,7 @@ const get = (id) => document.getElementById(id);
 const SYMBOLS = {
   robot: 'robot and the direction it looks in', selected: 'selected', outlier: 'does not belong',
   unknown: 'not known to the model, left out', guess: 'size not known', loose: 'position not given', anchor: 'place of the question', ghost: 'suggestion: click to add it',
-  misplaced: 'probably in the wrong place', holds: 'expected and observed', expected: 'expected',
+  misplaced: 'probably in the wrong place', holds: 'observed', expected: 'expected',
   disagrees: 'expected instead of what is observed', fresh: 'generated', drawn: 'relation',
 };
 

@@ -7,11 +7,12 @@ import json
 import os
 import re
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 from xml.etree import ElementTree
 
-from scene_client.formats import from_data
+from scene_client.formats import Reader, chosen, from_data, scenes_in
 from scene_client.image_formats import Lines
 from scene_client.ros_fields import WELL_KNOWN, LabelMap, MessageError, read_label_map
 from scene_client.vision_msgs import SceneFields
@@ -27,10 +28,13 @@ _FILE: Final = re.compile(
 _PATH_STARTS: Final = (".", "~", os.sep)
 
 _YAML: Final = (
-    "is YAML, as `ros2 topic echo` prints it: convert it to JSON, for example by "
+    "this is YAML, as `ros2 topic echo` prints it: convert it to JSON, for example by "
     "python -c 'import json, sys, yaml; print(json.dumps(next(yaml.safe_load_all(sys.stdin))))'"
 )
-_PACKED: Final = "is compressed: extract it, and choose one of its .json, .xml, .csv or .txt files"
+_PART: Final = 2**16  # characters of XML
+_PACKED: Final = (
+    "this is compressed: extract it, and choose one of its .json, .xml, .csv or .txt files"
+)
 
 
 def is_file(argument: str) -> bool:
@@ -62,18 +66,36 @@ def from_file(
         labels = label_map_of(labels)
     if scene is None and not Path(name).exists() and (parts := _FILE.fullmatch(name)):
         name, scene = parts["file"], parts["scene"]
-    text = _text(name, _bytes(name))
-    if (lines := _json_lines(name, text)) is not None:
-        text, scene = _line(name, lines, scene), None
+    content = _bytes(name)
     try:
-        data = _parsed(text)
-    except RecursionError:
-        raise MessageError(
-            f"{name} is not JSON that can be read: its nesting is too deep"
-        ) from None
-    except ValueError as error:
-        raise MessageError(f"{name} {error}") from None
-    return from_data(data, labels, scene=scene, name=name)
+        return chosen(scenes_of(content, name, labels), scene, name)()
+    except MessageError as error:
+        raise MessageError(f"{name}: {error}") from None
+
+
+def scenes_of(content: bytes, name: str, label_map: LabelMap | None = None) -> dict[str, Reader]:
+    """Return the readers of all scenes in a file by the names of the scenes.
+
+    Args:
+        content: the content of the file.
+        name: name of the file. Only its suffix ``.jsonl`` counts.
+        label_map: labels of numeric class ids; see `read_label_map`.
+
+    Raises:
+        MessageError: the content has an unknown format, or contains no objects.
+    """
+    text = _text(content)
+    if (lines := _json_lines(name, text)) is not None:
+        return {
+            str(number): partial(_read_line, line, label_map)
+            for number, line in enumerate(lines, 1)
+            if line.strip()
+        }
+    return scenes_in(_parsed(text), label_map)
+
+
+def _read_line(line: str, label_map: LabelMap | None) -> SceneFields:
+    return from_data(_parsed(line), label_map)
 
 
 def label_map_of(option: str) -> dict[str, str | None]:
@@ -84,16 +106,28 @@ def label_map_of(option: str) -> dict[str, str | None]:
     """
     if option in WELL_KNOWN:
         return read_label_map(option)
+    content = _bytes(option)
     try:
-        return read_label_map(_names(_bytes(option).decode()))
-    except (LookupError, TypeError, ValueError, RecursionError) as error:
-        if isinstance(error, MessageError) and "cannot read" in str(error):
-            raise
+        return labels_in(content.decode())
+    except ValueError:
         raise MessageError(f"--label-map: {option} does not contain labels") from None
 
 
+def labels_in(text: str) -> dict[str, str | None]:
+    """Return the labels of class ids in JSON, in YAML with `names:`, or of one label a line.
+
+    The name of a known list, such as coco80, stands for its labels.
+
+    Raises:
+        MessageError: the text does not contain labels.
+    """
+    try:
+        return read_label_map(text if text in WELL_KNOWN else _names(text))
+    except (LookupError, TypeError, ValueError, RecursionError):
+        raise MessageError("the label map does not contain labels") from None
+
+
 def _names(text: str) -> Any:
-    """Return the labels of class ids: JSON, YAML with `names:`, or one label a line."""
     try:
         names: Any = json.loads(text)
     except json.JSONDecodeError:
@@ -128,13 +162,13 @@ def _bytes(name: str) -> bytes:
     return text
 
 
-def _text(name: str, content: bytes) -> str:
+def _text(content: bytes) -> str:
     if content.startswith((b"PK\x03\x04", b"\x1f\x8b")):  # ZIP and gzip
-        raise MessageError(f"{name} {_PACKED}")
+        raise MessageError(_PACKED)
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise MessageError(f"{name} is not JSON and no other text in UTF-8") from None
+        raise MessageError("this is not JSON and no other text in UTF-8") from None
 
 
 def _json_lines(name: str, text: str) -> list[str] | None:
@@ -149,22 +183,11 @@ def _json_lines(name: str, text: str) -> list[str] | None:
     return text.split("\n")
 
 
-def _line(name: str, lines: list[str], scene: object) -> str:
-    """Return one line of a file with one scene per line."""
-    full = [number for number, line in enumerate(lines, 1) if line.strip()]
-    if scene is None and len(full) != 1:
-        raise MessageError(f"{name} has {len(full)} lines: choose one, such as {name}:1")
-    number = full[0] if scene is None else int(str(scene)) if str(scene).isdecimal() else 0
-    if not 1 <= number <= len(lines):
-        raise MessageError(f"{name} has {len(lines)} lines; it has no line {scene}")
-    return lines[number - 1]
-
-
 def _parsed(text: str) -> Any:
     """Return the data in a text.
 
     Raises:
-        ValueError: the text has an unknown format. The message continues the name of the file.
+        MessageError: the text has an unknown format.
     """
     start = text.lstrip()[:1]
     if start == "<":
@@ -177,14 +200,16 @@ def _parsed(text: str) -> Any:
         if all(len(line) >= 5 and all(map(_is_number, line)) for line in words):
             return Lines(words)
         if re.match(r"---\s|[\w.-]+:(\s|$)", text):
-            raise ValueError(_YAML)
+            raise MessageError(_YAML)
         labels = [label.strip() for line in lines for label in line.split(",") if label.strip()]
         if labels and not re.search(r'[{}[\]":<]', text) and not any(map(_is_number, labels)):
             return labels
     try:
         return json.loads(text)
-    except json.JSONDecodeError as error:
-        raise ValueError(f"is not JSON, and no other known format: {error}") from None
+    except RecursionError:
+        raise MessageError("this is not JSON that can be read: its nesting is too deep") from None
+    except ValueError as error:
+        raise MessageError(f"this is not JSON, and no other known format: {error}") from None
 
 
 def _is_number(word: str) -> bool:
@@ -203,22 +228,28 @@ def _table(lines: list[str]) -> Table | None:
     if len(names) < 2 or not set(LABEL_COLUMNS) & set(names):
         return None
     if len(set(names)) < len(names):
-        raise ValueError("is a table with two columns of the same name")
+        raise MessageError("this is a table with two columns of the same name")
     rows = csv.reader(lines[1:], delimiter=delimiter, strict=True)
     try:
         return Table(dict(zip(names, map(str.strip, row), strict=False)) for row in rows)
     except csv.Error as error:
-        raise ValueError(f"is not a table that can be read: {error}") from None
+        raise MessageError(f"this is not a table that can be read: {error}") from None
 
 
 def _xml(text: str) -> ElementTree.Element:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise ValueError("is XML with a document type, which this program does not read")
+        raise MessageError("this is XML with a document type, which this program does not read")
     try:
-        # Expat bounds the expansion of entities, and a document type is refused above.
-        root = ElementTree.fromstring(text)  # noqa: S314
+        # Expat bounds the expansion of entities, and a document type is refused above. Between two
+        # parts of the text, other threads run.
+        parser, step = ElementTree.XMLParser(), max(_PART, len(text) // 32)  # noqa: S314
+        for at in range(0, len(text), step):
+            parser.feed(text[at : at + step])
+        root = parser.close()
     except ElementTree.ParseError as error:
-        raise ValueError(f"is not XML that can be read: {error}") from None
+        raise MessageError(f"this is not XML that can be read: {error}") from None
     if root.tag != "annotations":
-        raise ValueError(f"is XML with the root <{root.tag[:40]}>; only exports of CVAT are read")
+        raise MessageError(
+            f"this is XML with the root <{root.tag[:40]}>; only exports of CVAT are read"
+        )
     return root

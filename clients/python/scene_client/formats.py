@@ -10,16 +10,19 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
+from functools import partial
 from itertools import islice
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 from scene_client import image_formats, world_formats
 from scene_client.image_formats import Lines, Parts
 from scene_client.image_plane import left_pairs
 from scene_client.ros_fields import REMEDY, LabelMap, MessageError, read_label_map, unwrapped
 from scene_client.sightings import Message
-from scene_client.vision_msgs import SceneFields, from_message, is_message
+from scene_client.vision_msgs import MAX_OBJECTS, SceneFields, from_message, is_message
 from scene_client.world_formats import Table
+
+T = TypeVar("T")
 
 
 class Format(NamedTuple):
@@ -65,9 +68,11 @@ FORMATS: Final = (
 )  # fmt: skip
 
 
-def from_data(
-    data: Any, label_map: LabelMap | None = None, *, scene: object = None, name: str = ""
-) -> SceneFields:
+Reader = Callable[[], SceneFields]
+"""A function that converts one scene. It raises `MessageError`."""
+
+
+def from_data(data: Any, label_map: LabelMap | None = None, *, scene: object = None) -> SceneFields:
     """Convert a message, or the parsed contents of a file, to the fields of a request.
 
     Args:
@@ -76,62 +81,73 @@ def from_data(
         label_map: labels of numeric class ids; see `read_label_map`.
         scene: name of the scene (id of an image or task, number of a frame, name of a room), if the
             data has several.
-        name: name of the file for the text of errors.
 
     Raises:
         MessageError: the data has an unknown format, has several scenes, or lacks labels.
     """
+    return chosen(scenes_in(data, label_map), scene)()
+
+
+def scenes_in(data: Any, label_map: LabelMap | None = None) -> dict[str, Reader]:
+    """Return the readers of all scenes in data by the names of the scenes; see `from_data`.
+
+    The name of an only scene may be empty.
+
+    Raises:
+        MessageError: the data has an unknown format, or contains no objects.
+    """
     data = unwrapped(data)
-    try:
-        if is_message(data):
-            _check_single(scene)
-            return from_message(data, label_map)
-        form = next((form for form in FORMATS if form.matches(data)), None)
-        if form is None:
-            _check_single(scene)
-            return SceneFields(_with_labels(_request(data), read_label_map(label_map)))
-        return _converted(form, data, label_map, scene, name)
-    except MessageError as error:
-        raise MessageError(f"{name}: {error}" if name else str(error)) from None
+    if is_message(data):
+        return {"": partial(from_message, data, label_map)}
+    form = next((form for form in FORMATS if form.matches(data)), None)
+    if form is None:
+        return {"": partial(_with_labels, data, label_map)}
+    parts: Parts = _guarded(form.name, form.parts, data)
+    if not parts:
+        raise MessageError("the file contains no objects")
+    return {name: partial(_converted, form, part, label_map) for name, part in parts.items()}
 
 
-def _converted(
-    form: Format, data: Any, label_map: LabelMap | None, scene: object, name: str
-) -> SceneFields:
-    """Convert data of a format of the table."""
-    try:
-        part = _chosen(form.parts(data), scene, name)
-        message = form.read(part)
-        fields = from_message(vars(message), label_map, viewpoint=message.viewpoint)
-    except MessageError:
-        raise
-    except (LookupError, AttributeError, TypeError, ValueError, OverflowError):
-        problem = f"looks like {form.name}, but a field is missing or has a wrong type"
-        raise MessageError(f"the file {problem}; docs/clients.md describes the format") from None
+def chosen(scenes: Mapping[str, Reader], scene: object, file: str = "") -> Reader:
+    """Return the reader of the scene with a name, or of the only scene.
+
+    ``file`` is the name of the file for the text of errors.
+
+    Raises:
+        MessageError: there is no such scene, or there are several scenes and ``scene`` is None.
+    """
+    if scene is None and len(scenes) == 1:
+        return next(iter(scenes.values()))
+    if scene is not None and str(scene) in scenes:
+        return scenes[str(scene)]
+    if [*scenes] == [""]:
+        raise MessageError(f"the file has one scene, and no scene {scene}")
+    names = ", ".join(islice(scenes, 5)) + (", …" if len(scenes) > 5 else "")
+    first = next(iter(scenes), "")
+    how = f"{file}:{first}" if file else f"scene={first!r}"
+    problem = "" if scene is None else f"no scene {scene}; it has "
+    raise MessageError(
+        f"the file has {problem}{len(scenes)} scenes ({names}): choose one, such as {how}"
+    )
+
+
+def _converted(form: Format, part: Any, label_map: LabelMap | None) -> SceneFields:
+    """Convert one scene of a format of the table."""
+    message = _guarded(form.name, form.read, part)
+    fields = from_message(vars(message), label_map, viewpoint=message.viewpoint)
     fields.notes = message.notes + fields.notes
     return fields
 
 
-def _chosen(parts: Parts, scene: object, name: str) -> Any:
-    """Return the data of the scene with a name, or of the only scene."""
-    if not parts:
-        raise MessageError("the file contains no objects")
-    if scene is None and len(parts) == 1:
-        return next(iter(parts.values()))
-    if scene is not None and str(scene) in parts:
-        return parts[str(scene)]
-    names = ", ".join(islice(parts, 5)) + (", …" if len(parts) > 5 else "")
-    first = next(iter(parts))
-    how = f"{name}:{first}" if name else f"scene={first!r}"
-    problem = "" if scene is None else f"no scene {scene}; it has "
-    raise MessageError(
-        f"the file has {problem}{len(parts)} scenes ({names}): choose one, such as {how}"
-    )
-
-
-def _check_single(scene: object) -> None:
-    if scene is not None:
-        raise MessageError(f"the file has one scene, and no scene {scene}")
+def _guarded(name: str, read: Callable[[Any], T], data: Any) -> T:
+    """Return the result of a reader. A wrong value in the data becomes a `MessageError`."""
+    try:
+        return read(data)
+    except MessageError:
+        raise
+    except (LookupError, AttributeError, TypeError, ValueError, OverflowError, RecursionError):
+        problem = f"looks like {name}, but a field is missing or has a wrong type"
+        raise MessageError(f"the file {problem}; docs/clients.md describes the format") from None
 
 
 # ------------------------------------------------------------------------------------ requests
@@ -162,6 +178,8 @@ def _request(data: Any) -> dict[str, Any]:
         return data
     try:
         return _of_training(data, things)
+    except MessageError:
+        raise
     except (LookupError, AttributeError, TypeError, ValueError):
         raise MessageError("this is not a scene of the training format") from None
 
@@ -229,24 +247,31 @@ def _named(value: Any, names: Mapping[Any, str]) -> Any:
 
 
 def _image_relations(annotated: list[Any], objects: list[Any]) -> list[list[str]]:
-    """Return the relations left between boxes in an image, if all objects have ids and boxes."""
+    """Return the relations left between boxes in an image, if all objects have ids and boxes.
+
+    Raises:
+        MessageError: there are more boxes than a request can have objects. The time grows with the
+            square of their number.
+    """
     boxes = [thing.get("box2d") if isinstance(thing, dict) else None for thing in annotated]
     if any("position" in thing or "id" not in thing for thing in objects) or None in boxes:
         return []
+    if len(boxes) > MAX_OBJECTS:
+        raise MessageError(f"the scene has more than {MAX_OBJECTS} boxes in an image")
     ids = [thing["id"] for thing in objects]
     pairs = sorted(left_pairs(boxes, range(len(boxes))))
     return [[ids[first], "left", ids[second]] for first, second in pairs]
 
 
-def _with_labels(scene: dict[str, Any], labels: Mapping[str, str | None]) -> dict[str, Any]:
-    """Replace the labels of objects that are class ids."""
-    objects = []
+def _with_labels(data: Any, label_map: LabelMap | None) -> SceneFields:
+    """Return a request, with labels in place of class ids."""
+    scene, labels, objects = _request(data), read_label_map(label_map), []
     for thing in scene["objects"]:
         label = thing.get("label") if isinstance(thing, dict) else thing
-        if str(label).isdecimal():
+        if isinstance(label, str | int) and str(label).isdecimal():
             label = labels.get(str(label))
             if label is None:
                 raise MessageError(f"an object has a class id instead of a label: {REMEDY}")
             thing = {**thing, "label": label} if isinstance(thing, dict) else label
         objects.append(thing)
-    return scene | {"objects": objects}
+    return SceneFields(scene | {"objects": objects})

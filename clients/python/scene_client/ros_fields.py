@@ -183,7 +183,8 @@ COCO_91: Final = dict(zip((n for n in range(1, 91) if n not in _UNUSED), COCO, s
 """Labels of the same classes by the `category_id` (1 to 90) of COCO's files."""
 
 REMEDY: Final = (
-    "set label_map (--label-map of the command scene) to coco80, coco91 or the labels of the ids"
+    "choose a label map (label_map, or --label-map of the command scene): coco80, coco91 or the "
+    "labels of the ids"
 )
 """What to do about numeric class ids."""
 

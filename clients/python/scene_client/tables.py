@@ -47,7 +47,7 @@ def relations(answer: schemas.RelationsAnswer) -> RenderableType:
         for entry in answer.disagreements
     ]
     return _tables(
-        _table("subject", "relation", "object", "probability", "", "expected", rows=rows),
+        _table("subject", "relation", "object", "probability", "", "if not observed", rows=rows),
         _table(
             *("subject", "observed", "object", "probability", "expected"),
             rows=disagreements,

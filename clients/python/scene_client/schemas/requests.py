@@ -47,7 +47,8 @@ RelationName = Literal[
 ]
 
 
-def _plain_text(value: str) -> str:
+def plain_text(value: str) -> str:
+    """Return a printable text that is not blank. Other texts raise a validation error."""
     if not value.strip() or not value.isprintable():
         raise PydanticCustomError("plain_text", "must be printable text, and must not be blank")
     return value
@@ -64,8 +65,8 @@ Metres = Annotated[float, Field(ge=-1e8, le=1e8, allow_inf_nan=False)]
 Extent = Annotated[float, Field(ge=0, le=1e4, allow_inf_nan=False)]
 Angle = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)]
 Probability = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
-Label = Annotated[str, Field(min_length=1, max_length=MAX_LABEL), AfterValidator(_plain_text)]
-Name = Annotated[str, Field(min_length=1, max_length=128), AfterValidator(_plain_text)]
+Label = Annotated[str, Field(min_length=1, max_length=MAX_LABEL), AfterValidator(plain_text)]
+Name = Annotated[str, Field(min_length=1, max_length=128), AfterValidator(plain_text)]
 Id = Annotated[
     Name,
     BeforeValidator(
@@ -74,7 +75,7 @@ Id = Annotated[
 ]
 """An id or a label. A whole number is the id with its digits, as in training scenes."""
 Unused = Annotated[str | None, Field(max_length=256)]
-ModelSpec = Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_plain_text)]
+ModelSpec = Annotated[str, Field(min_length=1, max_length=200), AfterValidator(plain_text)]
 
 
 Body: TypeAlias = Mapping[str, Any]
