@@ -33,7 +33,7 @@ from scene_client.files import from_file, is_file, label_map_of
 from scene_client.formats import from_data
 from scene_client.offline import OfflineClient
 from scene_client.ros_fields import MessageError
-from scene_client.schemas import Detail, FieldError, RelationName, Sensitivity, UnknownLabels
+from scene_client.schemas import Detail, RelationName, Sensitivity, UnknownLabels
 from scene_client.sync import Client
 
 REFUSED, MEANINGLESS, UNREACHABLE, LATE, BUSY, FAILED = range(1, 7)
@@ -107,7 +107,6 @@ def _show(
     context: typer.Context,
     question: Callable[[Client], AnswerT],
     table: Callable[[AnswerT], RenderableType],
-    request: Any = None,
 ) -> None:
     """Print the answer to a question as JSON or as a table. An error ends the program.
 
@@ -115,10 +114,9 @@ def _show(
         context: context of the command, with the general options.
         question: function that sends the question.
         table: function that returns the table.
-        request: body of the request, for the messages of errors.
     """
     options: Options = context.obj
-    with _exit_on_error(request), options.client() as client:
+    with _exit_on_error(), options.client() as client:
         answer = question(client)
     if options.as_json:
         print(answer.model_dump_json(exclude_unset=True))
@@ -238,7 +236,7 @@ def relations(
     request = scene | _named(
         top_k=top_k, min_probability=min_probability, include_opposites=include_opposites or None
     )
-    _show(context, lambda client: client.relations(request), tables.relations, request)
+    _show(context, lambda client: client.relations(request), tables.relations)
 
 
 @app.command()
@@ -269,7 +267,7 @@ def missing(
         top_k=top_k, coverage=coverage, at=place, candidates=candidates or None, detail=detail
     )
     shown = partial(tables.missing, asked_place=request.get("at") is not None)
-    _show(context, lambda client: client.missing(request), shown, request)
+    _show(context, lambda client: client.missing(request), shown)
 
 
 @app.command()
@@ -291,7 +289,7 @@ def outliers(
     """List objects that do not fit the scene, and relations that are probably false."""
     scene = _scene(things, label_map, relations, room_type=room_type, unknown_labels=unknown_labels)
     request = scene | _named(sensitivity=sensitivity, threshold=threshold, detail=detail)
-    _show(context, lambda client: client.outliers(request), tables.outliers, request)
+    _show(context, lambda client: client.outliers(request), tables.outliers)
 
 
 @app.command()
@@ -309,7 +307,7 @@ def rooms(
     """List the likely types of the room, or where one object usually is."""
     scene = _scene(things, label_map, unknown_labels=unknown_labels)
     request = scene | _named(top_k=top_k, candidates=candidates or None, detail=detail)
-    _show(context, lambda client: client.rooms(request), tables.rooms, request)
+    _show(context, lambda client: client.rooms(request), tables.rooms)
 
 
 @app.command()
@@ -334,7 +332,7 @@ def generate(
     things = things or []
     scene = _scene(things, label_map, relations, room_type=room_type, unknown_labels=unknown_labels)
     request = scene | _named(count=count, seed=seed, steps=steps, temperature=temperature)
-    _show(context, lambda client: client.generate(request), tables.generate, request)
+    _show(context, lambda client: client.generate(request), tables.generate)
 
 
 # ------------------------------------------------------------------------------------- models
@@ -362,7 +360,7 @@ def contexts(context: typer.Context) -> None:
 def ready(context: typer.Context) -> None:
     """Check that the service is ready. The only output is the exit status."""
     options: Options = context.obj
-    with _exit_on_error(None), options.client() as client:
+    with _exit_on_error(), options.client() as client:
         client.check_ready()
 
 
@@ -440,14 +438,12 @@ def _relations_for(words: Iterable[str]) -> str:
 
 
 @contextmanager
-def _exit_on_error(request: Any) -> Iterator[None]:
+def _exit_on_error() -> Iterator[None]:
     """End the program with a message and an exit status if the block raises an error."""
     try:
         yield
     except ProblemError as problem:
-        errors = [_quoted(error, request) for error in problem.errors]
-        parts = (problem.type, problem.status, problem.title, problem.detail)
-        _fail(str(ProblemError(*parts, errors=errors)), _status(problem))
+        _fail(str(problem), _status(problem))
     except UnreachableError as error:
         _fail(f"the service cannot be reached: {error}", UNREACHABLE)
     except DeadlineError as error:
@@ -456,19 +452,6 @@ def _exit_on_error(request: Any) -> Iterator[None]:
         _fail(str(error))
     except ClientError as error:
         _fail(str(error), FAILED)
-
-
-def _quoted(error: FieldError, request: Any) -> FieldError:
-    """Return the error with the text of the request that it is about, if its value is a text."""
-    value = request
-    for step in error.pointer.split("/")[1:]:
-        if isinstance(value, list) and step.isdigit():
-            value = value[int(step)] if int(step) < len(value) else None
-        else:
-            value = value.get(step) if isinstance(value, dict) else None
-    if not isinstance(value, str):
-        return error
-    return error.model_copy(update={"message": f'"{value}": {error.message}'})
 
 
 def _status(problem: ProblemError) -> int:

@@ -44,6 +44,7 @@ class InvalidRequestError(ClientError, ValueError):
 
 MOST_SHOWN: Final = 10
 """Maximum number of errors in the text of an exception."""
+_LONGEST_QUOTE: Final = 128  # characters, the maximum of an id
 
 
 class ProblemError(ClientError):
@@ -121,8 +122,8 @@ def problem_of(
         status: HTTP status.
         headers: headers of the response, with lower-case names.
         body: body of the response.
-        request: body of the request. The messages of unknown labels quote the labels from it,
-            because the service never repeats text of a request.
+        request: body of the request. The messages quote its texts, because the service never
+            repeats text of a request.
     """
     try:
         problem = Problem.model_validate_json(body, extra="ignore")
@@ -142,37 +143,33 @@ def problem_of(
         status,
         problem.title,
         problem.detail,
-        errors=_quoted(problem, request),
+        errors=_quoted(problem.errors or (), request) if request else problem.errors or (),
         failures=problem.failures or (),
         request_id=problem.request_id,
         retry_after=_seconds(headers.get("retry-after", "")),
     )
 
 
-def _quoted(problem: Problem, request: str | None) -> Sequence[FieldError]:
-    """Return the errors of a problem. The messages of unknown labels quote the labels."""
-    errors = problem.errors or ()
-    if problem.type != "/problems/unknown-labels" or request is None:
-        return errors
-    body = json.loads(request)
+def _quoted(errors: Sequence[FieldError], request: str) -> Sequence[FieldError]:
+    """Return the errors, with the text of the request that each of them is about."""
+    body = json.loads(request) if errors else None
     return [
         error.model_copy(
-            update={"message": f"{json.dumps(label, ensure_ascii=False)}: {error.message}"}
+            update={"message": f"{json.dumps(text, ensure_ascii=False)}: {error.message}"}
         )
-        if (label := _label_at(body, error.pointer))
+        if (text := _text_at(body, error.pointer))
         else error
         for error in errors
     ]
 
 
-def _label_at(body: Any, pointer: str) -> str | None:
-    """Return the label at a JSON pointer, or of the object there."""
+def _text_at(body: Any, pointer: str) -> str | None:
+    """Return the text at a JSON pointer, or the label of the object there, or None."""
     with suppress(LookupError, TypeError, ValueError):
         for part in pointer.split("/")[1:]:
-            name = part.replace("~1", "/").replace("~0", "~")
-            body = body[int(name)] if isinstance(body, list) else body[name]
-        label = body["label"] if isinstance(body, dict) else body
-        return label if isinstance(label, str) else None
+            body = body[int(part)] if isinstance(body, list) else body[part]
+        text = body["label"] if isinstance(body, dict) else body
+        return text if isinstance(text, str) and len(text) <= _LONGEST_QUOTE else None
     return None
 
 
