@@ -37,8 +37,8 @@ _BY_REST: Final = 0.9  # factor if the first letters differ, because people rare
 _SAME_HEAD: Final = 0.5  # minimum similarity of names with the same last word
 _FARTHER: Final = 0.1  # maximum difference of similarity between a suggestion and the best one
 
-# Costs of edits: 1 for a letter too many or too few, or another first letter, which people rarely
-# mistype; 2 for another letter, or two exchanged letters.
+# Costs of edits: 1 for a letter too many or too few, 2 for another letter or two exchanged letters,
+# and 1 more for another first or last letter, which people rarely mistype.
 _BY_PHRASE: Final = 1  # additional cost if the other words of the phrase agree
 _MARGIN: Final = 1  # two entries with costs as close as this make a name ambiguous
 _MOST_EDITS: Final = 2
@@ -178,7 +178,10 @@ class NameIndex:
         matches = process.extract(
             word, candidates, scorer=Indel.distance, limit=None, score_cutoff=most
         )
-        corrections = [(known, cost + (known[0] != word[0])) for known, cost, _ in matches]
+        corrections = [
+            (known, cost + (known[0] != word[0]) + (known[-1] != word[-1]))
+            for known, cost, _ in matches
+        ]
         cheapest = sorted(corrections, key=lambda correction: correction[1])[:_MOST_CORRECTIONS]
         return cheapest or [(word, 0)]
 
