@@ -16,7 +16,7 @@ from app.questions import QUESTIONS
 from app.settings import Settings
 from scene_client import schemas
 from tests.conftest import REPOSITORY
-from tests.services import ADMIN_KEY, LiveService, live_service
+from tests.services import ADMIN_KEY, PATIENCE, LiveService, live_service
 
 pytestmark = pytest.mark.system
 
@@ -105,7 +105,9 @@ def call(service: LiveService) -> Iterator[Any]:
             # schemathesis takes this key as valid; its checks remove the key or replace it.
             key = {"X-Admin-Key": ADMIN_KEY}
             checks = [form_is_as_documented, bad_scenes_have_problems]
-            case.call_and_validate(service.url, session, key, additional_checks=checks)
+            case.call_and_validate(
+                service.url, session, key, additional_checks=checks, timeout=PATIENCE
+            )
 
         yield call
 

@@ -23,7 +23,7 @@ from app.registry import Store, StoreError
 from app.scene.relations import CANONICAL, opposite
 from tests.http.stores import PROFILES, VOCABULARY, corrupt, publish
 from tests.http.test_problems import problem
-from tests.services import ADMIN_KEY, Hold, Replace, defect, serve
+from tests.services import ADMIN_KEY, PATIENCE, Hold, Replace, defect, serve
 
 
 async def default(client: httpx.AsyncClient) -> str:
@@ -160,13 +160,13 @@ async def test_requests_are_answered_while_the_store_is_read(
 
     def slow(*args: Any) -> Any:
         started.set()
-        assert go_on.wait(30)
+        assert go_on.wait(PATIENCE)
         return load(*args)
 
     monkeypatch.setattr(Store, "load", slow)
     publish(store, "home", "2.0.0", seed=2, alias="default")
     refresh = asyncio.create_task(own.post("/models/refresh"))
-    assert await asyncio.to_thread(started.wait, 30)
+    assert await asyncio.to_thread(started.wait, PATIENCE)
     assert await default(own) == "home@1.0.0"
     assert (await own.get("/health/ready")).status_code == 200
     assert not refresh.done()
@@ -181,7 +181,7 @@ async def test_a_request_keeps_the_models_it_started_with(
     held = hold("missing", lambda manifest: manifest.version == "1.0.0")
     batch = {"scenes": [{"objects": ["bed"] * 33}] * 3}  # so many are not for the event loop
     asking = asyncio.create_task(own.post("/missing/batch", json=batch))
-    assert await asyncio.to_thread(held.started.wait, 30)
+    assert await asyncio.to_thread(held.started.wait, PATIENCE)
     publish(store, "home", "2.0.0", seed=2, alias="default")
     assert (await own.post("/models/refresh")).status_code == 200
     assert await default(own) == "home@2.0.0"
@@ -309,7 +309,7 @@ async def ready(client: httpx.AsyncClient) -> int:
 
 
 async def until(client: httpx.AsyncClient, ask: Ask, expected: Any) -> None:
-    async with asyncio.timeout(60):
+    async with asyncio.timeout(PATIENCE):
         while await ask(client) != expected:  # noqa: ASYNC110 - a service has no event to wait for
             await asyncio.sleep(POLL)
 

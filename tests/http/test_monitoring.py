@@ -25,6 +25,7 @@ from tests.conftest import REPOSITORY
 from tests.http.stores import publish
 from tests.http.test_problems import problem
 from tests.services import (
+    PATIENCE,
     Hold,
     LiveService,
     Replace,
@@ -170,7 +171,7 @@ async def test_metrics_of_a_removed_model_disappear(
     # A request that still holds the old snapshot reports late.
     held = hold("missing", lambda manifest: manifest.name == "plain")
     late = asyncio.ensure_future(ask("plain", 33))  # on a thread
-    assert await asyncio.to_thread(held.started.wait, 30)
+    assert await asyncio.to_thread(held.started.wait, PATIENCE)
     shutil.rmtree(store / "plain")
     await own.post("/models/refresh")
     assert await names("plain") == set()
