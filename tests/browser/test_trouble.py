@@ -15,8 +15,9 @@ from tests.services import ADMIN_KEY, LiveService, launch
 pytestmark = pytest.mark.system
 
 EIGHT_STEPS = """
+const press = {key: 'ArrowUp', bubbles: true};
 for (let step = 0; step < 8; step += 1)
-  document.activeElement.dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowUp', bubbles: true}));
+  document.activeElement.dispatchEvent(new KeyboardEvent('keydown', press));
 """
 
 
@@ -47,23 +48,27 @@ def test_a_question_that_is_overtaken_is_dropped(open_board: OpenBoard) -> None:
 @pytest.mark.slow
 def test_a_full_service_is_asked_again_when_it_says(open_board: OpenBoard) -> None:
     board = open_board(allow=("429",))
-    board.page.clock.install()
-    refusals = []
+    asked = list[Route]()
 
-    def refuse_once(route: Route) -> None:
-        if refusals:
-            route.continue_()
+    def refuse_first_and_hold_second(route: Route) -> None:
+        asked.append(route)
+        if len(asked) > 1:
             return
-        refusals.append(route)
         problem = {"type": "/problems/queue-full", "title": "Queue full", "status": 429}
         problem |= {"detail": "The queue is full.", "request_id": "r"}
-        route.fulfill(status=429, json=problem, headers={"Retry-After": "3600"})
+        route.fulfill(status=429, json=problem, headers={"Retry-After": "1"})
 
-    board.page.route("**/missing", refuse_once)
-    board.add("laptop")
+    board.page.route("**/missing", refuse_first_and_hold_second)
+    box = board.page.get_by_role("combobox", name="Add an object")
+    box.fill("laptop")
+    box.press("Enter")
     alert = board.column("missing").get_by_role("alert")
     expect(alert).to_contain_text("The queue is full")
-    board.page.clock.fast_forward("01:00:00")
+    for _ in range(600):
+        if len(asked) == 2:
+            break
+        board.page.wait_for_timeout(100)
+    asked[1].continue_()
     expect(alert).to_be_hidden()
     board.settle()
     assert board.rows("missing")
