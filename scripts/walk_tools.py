@@ -22,9 +22,12 @@ import httpx
 from playwright.sync_api import Browser, Page
 
 ROOT = Path(__file__).resolve().parent.parent
-FOLLOWS = 30.0  # seconds in which a service follows a change of its store
+PATIENCE = 120.0  # seconds after which a wait is a hang
 START_TIMEOUT = 900.0
-SETTLED = 1200  # milliseconds until the page shows all answers
+DELAY = 400  # milliseconds; the page asks this long after a change at the latest
+
+
+BUSY = "article:not([hidden])[aria-busy=true], #drawn[aria-busy=true]"
 
 
 class WalkError(Exception):
@@ -61,7 +64,7 @@ class Record:
 
     def picture(self, page: Page, name: str, words: str) -> None:
         """Add a screenshot of the page."""
-        page.wait_for_timeout(SETTLED)
+        settle(page)
         page.screenshot(path=self._folder / f"{name}.png")
         self._add(f"\n{words}\n\n![{words}]({name}.png)\n")
 
@@ -138,14 +141,14 @@ class User:
             yield url
         finally:
             process.terminate()
-            process.wait(60)
+            process.wait(PATIENCE)
 
     def _ask(
         self, url: str, path: str, body: dict[str, Any], *, status: int = 200
     ) -> dict[str, Any]:
         """Send a request as curl does, and return the answer."""
         started = time.monotonic()
-        response = httpx.post(f"{url}/{path}", json=body, timeout=30)
+        response = httpx.post(f"{url}/{path}", json=body, timeout=PATIENCE)
         answer: dict[str, Any] = response.json()
         shown = json.dumps(answer, indent=1, ensure_ascii=False)
         seconds = time.monotonic() - started
@@ -158,12 +161,12 @@ class User:
         """Ask about an object until the running service answers with a version."""
         started = time.monotonic()
         while True:
-            response = httpx.post(f"{url}/missing", json={"objects": [label]}, timeout=30)
+            response = httpx.post(f"{url}/missing", json={"objects": [label]}, timeout=PATIENCE)
             seconds = time.monotonic() - started
             require(response.is_success, response.text)
             if "{name}@{version}".format(**response.json()["model"]) == reference:
                 break
-            require(seconds < FOLLOWS, f"{reference} is not served after {FOLLOWS:.0f} s")
+            require(seconds < PATIENCE, f"{reference} is not served after {PATIENCE:.0f} s")
             time.sleep(0.5)
         self._record.block("POST /missing, until the model changes", reference, seconds)
 
@@ -176,8 +179,9 @@ class User:
     def _page(self, url: str) -> Iterator[Page]:
         context = self._browser.new_context(viewport={"width": 1360, "height": 820})
         page = context.new_page()
+        page.set_default_timeout(1000 * PATIENCE)
         page.goto(url)
-        page.wait_for_timeout(SETTLED)
+        settle(page)
         try:
             yield page
         finally:
@@ -187,6 +191,13 @@ class User:
         page.get_by_role("button", name=re.compile("Import")).first.click()
         page.get_by_label("Scene, JSON").fill(json.dumps(scene))
         page.get_by_role("button", name="Put on the board").click()
+
+
+def settle(page: Page) -> None:
+    """Wait until the page has all answers to the last change."""
+    page.wait_for_selector("main:not([aria-busy=true])")
+    page.wait_for_timeout(DELAY)
+    page.wait_for_function(f"!document.querySelector({BUSY!r})")
 
 
 def _python_path() -> str:

@@ -24,6 +24,10 @@ from typing import Any
 import httpx
 import pytest
 
+PATIENCE = 120.0
+"""Seconds after which a wait is a hang. A busy machine needs many, and no test measures them."""
+DEADLINE_MS = 60_000
+"""The deadline of a request, unless deadlines are the subject of a test."""
 CONTROL = {"objects": ["bed", "lamp", {"id": "desk_1", "label": "desk"}], "seed": 11}
 NAMED = {"allowed_hosts": ["service"]}
 """Settings of a service in process; its clients use the URL http://service."""
@@ -59,6 +63,8 @@ async def serve(store: Path, **settings: Any) -> AsyncIterator[httpx.AsyncClient
     from app.main import create_app
     from app.settings import Settings
 
+    if "max_request_timeout_ms" not in settings:
+        settings = {"request_timeout_ms": DEADLINE_MS, **settings}
     app = create_app(Settings(store=store, **{**NAMED, **settings}))
     app.state.runtime.metrics.max_age = 0.0
     # `python -m app` also disables the collector; the runtime enables it after the start.
@@ -145,7 +151,7 @@ def hold(replace: Replace) -> Iterator[Hold]:
         def wait(question: Any, artifact: Any, *args: Any, **parameters: Any) -> Any:
             if of(artifact.manifest):
                 held.started.set()
-                assert held.release.wait(30)
+                assert held.release.wait(PATIENCE)
             return question(artifact, *args, **parameters)
 
         replace(name, wait)
@@ -204,7 +210,7 @@ class LiveService:
         self.client.close()
         self.process.terminate()
         try:
-            self.process.wait(timeout=30)
+            self.process.wait(timeout=PATIENCE)
         finally:
             self.process.kill()
         return self.log.read_text()
@@ -224,7 +230,9 @@ def begin(
         name: value for name, value in os.environ.items() if not name.startswith("SCENE_")
     }
     # Without a load balancer, nothing has to notice the end.
-    environment |= {"SCENE_STORE": str(store), "SCENE_DRAIN_SECONDS": "0"} | variables
+    own = {"SCENE_STORE": str(store), "SCENE_DRAIN_SECONDS": "0"}
+    own |= {"SCENE_REQUEST_TIMEOUT_MS": str(DEADLINE_MS), "SCENE_CLIENT_TIMEOUT": "120"}
+    environment |= own | variables
     with log.open("w") as stream:
         return subprocess.Popen(
             [sys.executable, *program], env=environment, stderr=stream, text=True
@@ -245,8 +253,8 @@ def launch(
     """
     port = port or free_port()
     process = begin(store, log, program=program, **{"SCENE_PORT": str(port), **variables})
-    client = httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30)
-    deadline = time.monotonic() + 60
+    client = httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=PATIENCE)
+    deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
         try:
             client.get("/health/live")
@@ -281,14 +289,15 @@ def free_port() -> int:
 def is_ready(port: int) -> bool:
     """Whether a service, or one behind a proxy, is ready."""
     with suppress(httpx.TransportError):
-        return httpx.get(f"http://127.0.0.1:{port}/health/ready").status_code == 200
+        url = f"http://127.0.0.1:{port}/health/ready"
+        return httpx.get(url, timeout=PATIENCE).status_code == 200
     return False
 
 
 def wait_until(
-    condition: Callable[[], object], log: Path | None = None, *, seconds: float = 30
+    condition: Callable[[], object], log: Path | None = None, *, seconds: float = PATIENCE
 ) -> None:
-    """Wait until the condition holds. Fail with the log after some seconds."""
+    """Wait until the condition holds. Fail with the log if this takes too long."""
     deadline = time.monotonic() + seconds
     while not condition():
         if time.monotonic() > deadline:

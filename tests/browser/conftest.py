@@ -9,10 +9,12 @@ from typing import Any
 
 import httpx
 import pytest
-from playwright.sync_api import Browser, Page, Route, sync_playwright
+from playwright.sync_api import Browser, Page, Route, expect, sync_playwright
 
 from tests.browser.driving import Board, link_to
-from tests.services import LiveService
+from tests.services import PATIENCE, LiveService
+
+expect.set_options(timeout=1000 * PATIENCE)
 
 DESK = {
     "objects": [
@@ -92,7 +94,7 @@ def open_board(chromium: Browser, shipped: LiveService) -> Iterator[Callable[...
         **options: Any,
     ) -> Board:
         context = chromium.new_context(viewport={"width": 1300, "height": 900}, **options)
-        context.set_default_timeout(15_000)
+        context.set_default_timeout(1000 * PATIENCE)
         context.add_init_script(_WITNESS)
         root = home or str(shipped.client.base_url)
         wrong: list[str] = []

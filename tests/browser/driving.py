@@ -21,12 +21,10 @@ class Board:
 
     def settle(self) -> None:
         """Wait until everything that changed has been asked and answered."""
-        expect(self.page.locator("main[aria-busy=true], #import:disabled")).to_have_count(
-            0, timeout=20_000
-        )
+        expect(self.page.locator("main[aria-busy=true], #import:disabled")).to_have_count(0)
         self.page.evaluate("window.quiet()")
         busy = self.page.locator("article:not([hidden])[aria-busy=true], #drawn[aria-busy=true]")
-        expect(busy).to_have_count(0, timeout=20_000)
+        expect(busy).to_have_count(0)
         self.page.evaluate("() => new Promise((done) => requestAnimationFrame(() => done()))")
 
     # ------------------------------------------------------------------------------ doing

@@ -16,26 +16,33 @@ from tests.services import LiveService, launch, wait_until
 
 pytestmark = pytest.mark.system
 
+EIGHT_STEPS = """
+const press = {key: 'ArrowUp', bubbles: true};
+for (let step = 0; step < 8; step += 1)
+  document.activeElement.dispatchEvent(new KeyboardEvent('keydown', press));
+"""
+
 
 @pytest.mark.slow
 def test_a_question_that_is_overtaken_is_dropped(open_board: OpenBoard) -> None:
     board = open_board()
-    every, failed, held = list[str](), list[str](), list[Route]()
-    board.page.on("request", lambda one: every.append(one.url.rpartition("/")[2]))
-    board.page.on("requestfailed", lambda one: failed.append(one.url.rpartition("/")[2]))
-    board.page.route("**/missing", lambda route: held.append(route))
+    asked, held = list[str](), list[Route]()
+
+    def hold_first(route: Route) -> None:
+        asked.append(route.request.url)
+        if held:
+            route.continue_()
+        else:
+            held.append(route)
+
+    board.page.route("**/missing", hold_first)
     board.thing("chair").focus()
-    for _ in range(8):
+    with board.page.expect_request("**/missing"):
+        board.page.evaluate(EIGHT_STEPS)
+    with board.page.expect_event("requestfailed", lambda one: one.url.endswith("/missing")):
         board.page.keyboard.press("ArrowUp")
-    board.page.wait_for_timeout(500)
-    asked = every.count("missing")
-    assert asked < 8
-    board.page.keyboard.press("ArrowUp")
-    board.page.wait_for_timeout(500)
-    assert every.count("missing") == asked + 1
-    assert failed.count("missing") == asked
-    held[-1].continue_()
     board.settle()
+    assert len(asked) == 2
     assert board.scene["objects"][1]["position"]["x"] == pytest.approx(1.9)
     assert board.rows("missing")
 
@@ -43,22 +50,28 @@ def test_a_question_that_is_overtaken_is_dropped(open_board: OpenBoard) -> None:
 @pytest.mark.slow
 def test_a_full_service_is_asked_again_when_it_says(open_board: OpenBoard) -> None:
     board = open_board(allow=("429",))
-    refusals = []
+    asked = list[Route]()
 
-    def refuse_once(route: Route) -> None:
-        if refusals:
-            route.continue_()
+    def refuse_first_and_hold_second(route: Route) -> None:
+        asked.append(route)
+        if len(asked) > 1:
             return
-        refusals.append(route)
         problem = {"type": "/problems/queue-full", "title": "Queue full", "status": 429}
         problem |= {"detail": "The queue is full.", "request_id": "r"}
         route.fulfill(status=429, json=problem, headers={"Retry-After": "1"})
 
-    board.page.route("**/missing", refuse_once)
-    board.add("laptop")
+    board.page.route("**/missing", refuse_first_and_hold_second)
+    box = board.page.get_by_role("combobox", name="Add an object")
+    box.fill("laptop")
+    box.press("Enter")
     alert = board.column("missing").get_by_role("alert")
     expect(alert).to_contain_text("The queue is full")
-    expect(alert).to_be_hidden(timeout=5000)
+    for _ in range(600):
+        if len(asked) == 2:
+            break
+        board.page.wait_for_timeout(100)
+    asked[1].continue_()
+    expect(alert).to_be_hidden()
     board.settle()
     assert board.rows("missing")
 
@@ -76,7 +89,7 @@ def test_the_page_outlives_the_service(
         expect(board.page.get_by_role("alert").first).to_contain_text("does not answer")
         assert board.things == ["desk", "chair", "laptop"]
     with launch(store, tmp_path / "log2", port=mortal.port):
-        expect(board.page.locator("#banner")).to_be_hidden(timeout=30_000)
+        expect(board.page.locator("#banner")).to_be_hidden()
         board.settle()
         assert len(board.body("missing")["objects"]) == 3
         assert board.rows("missing")
@@ -95,7 +108,7 @@ def test_a_service_with_a_key_is_asked_with_it(
         board.page.get_by_label("API key").first.press("Enter")
         # The page opens with an example as soon as the service answers.
         entries = board.column("missing").locator("ol > li")
-        expect(entries).not_to_have_count(0, timeout=20_000)
+        expect(entries).not_to_have_count(0)
         assert board.things
         assert '-H "X-API-Key: $SCENE_API_KEY"' in board.curl("missing")
         assert key not in board.page.content()

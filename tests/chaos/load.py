@@ -14,6 +14,7 @@ from typing import Any
 import httpx
 
 from benchmarks.load.connections import Connection, connect, prepared
+from tests.services import PATIENCE
 
 
 @dataclass
@@ -65,7 +66,7 @@ class ConstantLoad:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._ending.set()
-        self._thread.join(timeout=60)
+        self._thread.join(timeout=PATIENCE)
         assert kind is not None or not self._thread.is_alive(), "an answer is lost"
 
     async def _run(self, port: int, requests: Any, judge: Any, connections: int) -> None:

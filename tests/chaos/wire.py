@@ -10,6 +10,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from tests.services import PATIENCE
+
 BODY: Final = b'{"objects": ["bed", "lamp"]}'
 
 
@@ -38,7 +40,7 @@ class Answer:
     body: bytes
 
 
-def exchange(port: int, wire: Wire, patience: float = 30.0) -> tuple[list[Answer], bool]:
+def exchange(port: int, wire: Wire, patience: float = PATIENCE) -> tuple[list[Answer], bool]:
     """Send, and read until as many answers came as are expected, or the connection is closed.
 
     Returns:

@@ -25,6 +25,10 @@ from scene_client import (
 )
 from scene_client.schemas import FieldError
 from tests.conftest import REPOSITORY, run_program
+from tests.services import PATIENCE
+
+LONG = 60.0
+"""Seconds of a call, unless deadlines are the subject: the longest that a service accepts."""
 
 
 class Caller(Protocol):
@@ -42,7 +46,7 @@ def _plain(answer: Any) -> Any:
 @contextmanager
 def sync_caller(place: Any, kind: type[Client] = Client, **options: Any) -> Iterator[Caller]:
     """`Client` at a URL, or `OfflineClient` with a store."""
-    with kind(place, **options) as client:
+    with kind(place, **{"timeout": LONG, **options}) as client:
         yield lambda method, *request, timeout=None: _plain(
             getattr(client, method)(*request, timeout=timeout)
         )
@@ -52,7 +56,7 @@ def sync_caller(place: Any, kind: type[Client] = Client, **options: Any) -> Iter
 def async_caller(url: str, **options: Any) -> Iterator[Caller]:
     """`AsyncClient`, on an event loop that runs during each call."""
     with asyncio.Runner() as runner:
-        client = AsyncClient(url, **options)
+        client = AsyncClient(url, **{"timeout": LONG, **options})
         try:
             yield lambda method, *request, timeout=None: _plain(
                 runner.run(getattr(client, method)(*request, timeout=timeout))
@@ -91,7 +95,7 @@ _ERRORS = {
 
 @contextmanager
 def cpp_caller(
-    program: Path, url: str, *, timeout: float = 10.0, retries: int = 5, api_key: str = ""
+    program: Path, url: str, *, timeout: float = LONG, retries: int = 5, api_key: str = ""
 ) -> Iterator[Caller]:
     """`scene::Client`, in a separate process."""
     process = subprocess.Popen(
@@ -121,6 +125,6 @@ def cpp_caller(
         yield call
     finally:
         process.stdin.close()
-        status = process.wait(timeout=10)
+        status = process.wait(timeout=PATIENCE)
         process.stdout.close()
     assert status == 0

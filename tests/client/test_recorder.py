@@ -35,6 +35,7 @@ from scene_client.recorded_scene import scene_of
 from scene_client.schemas import MissingRequest
 from tests.conftest import run_program
 from tests.http.stores import VOCABULARY
+from tests.services import PATIENCE
 from training.datasets.encoding import encode
 from training.datasets.jsonl import read_jsonl
 
@@ -297,7 +298,7 @@ def test_a_slow_disk_limits_the_waiting_scenes(file: Path, monkeypatch: pytest.M
     disk, append = threading.Event(), Recorder._append
 
     def slow(self: Recorder, scenes: Any) -> None:
-        disk.wait(60.0)
+        disk.wait(PATIENCE)
         append(self, scenes)
 
     monkeypatch.setattr(Recorder, "_append", slow)
@@ -308,7 +309,7 @@ def test_a_slow_disk_limits_the_waiting_scenes(file: Path, monkeypatch: pytest.M
     more.join(0.2)
     assert more.is_alive()
     disk.set()
-    more.join(60.0)
+    more.join(PATIENCE)
     writer.flush()
     assert len(lines(file)) == recorder.MOST_WAITING
 

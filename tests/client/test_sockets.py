@@ -118,13 +118,13 @@ def test_a_refused_connection_is_unreachable_and_not_ready(open_caller: Any) -> 
 def test_the_key_and_the_time_left_are_sent(peer: Any, open_caller: Any) -> None:
     heads: list[bytes] = []
     url = peer(partial(serve, heads=heads)).url + "/robot/"
-    with open_caller(url, api_key="k" * 16, timeout=5.0) as call:
+    with open_caller(url, api_key="k" * 16, timeout=60.0) as call:
         call("is_ready")
     (head,) = heads
     assert head.startswith(b"GET /robot/health/ready HTTP/1.1\r\n")
     lines = dict(line.lower().split(b": ", 1) for line in head.split(b"\r\n")[1:] if line)
     assert lines[b"x-api-key"] == b"k" * 16
-    assert 2000 < int(lines[b"x-request-timeout-ms"]) <= 5000
+    assert 0 < int(lines[b"x-request-timeout-ms"]) <= 60_000
     # A compressed answer could decompress to any size.
     assert lines[b"accept-encoding"] == b"identity"
 

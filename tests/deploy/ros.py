@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from tests.client.ros_messages import Layout, blank, through_cdr
+from tests.services import PATIENCE
 
 STORE = Layout.current
 PACKAGE = Path(__file__).resolve().parents[2] / "clients" / "ros2" / "scene_reasoning"
@@ -149,7 +150,7 @@ class Slow:
     def missing(self, **fields: Any) -> Any:
         self.asked.append(fields)
         self.started.release()
-        assert self.answering.wait(30)
+        assert self.answering.wait(PATIENCE)
         if isinstance(self.outcome, Exception):
             raise self.outcome
         return self.outcome

@@ -15,7 +15,7 @@ from py_trees.common import Status
 from scene_client import Client
 from scene_client.vision_msgs import SceneFields
 from tests.deploy.ros import Slow, load_package
-from tests.services import LiveService, wait_until
+from tests.services import PATIENCE, LiveService, wait_until
 
 BED = {"objects": ["bed"]}
 NOTHING = SimpleNamespace(missing=[])
@@ -24,7 +24,7 @@ Make = Callable[..., Any]
 
 @pytest.fixture(scope="module")
 def client(live: LiveService) -> Iterator[Client]:
-    with Client(live.url, timeout=20.0) as client:
+    with Client(live.url, timeout=60.0) as client:
         yield client
 
 
@@ -37,7 +37,7 @@ def make(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Mak
     def make(kind: str, client: Any, scene: Any, *arguments: Any, **options: Any) -> Any:
         source = scene if callable(scene) else lambda: scene
         condition = getattr(behaviours, kind)(
-            "condition", client, source, *arguments, **{"timeout": 30.0, **options}
+            "condition", client, source, *arguments, **{"timeout": PATIENCE, **options}
         )
         root = py_trees.composites.Sequence("root", memory=True, children=[condition])
         condition.tree = py_trees.trees.BehaviourTree(root)
@@ -120,7 +120,7 @@ def test_an_interrupted_condition_uses_the_next_scene(make: Make) -> None:
     client, scenes = Slow(NOTHING), iter([["bed"], ["lamp"], ["sofa"]])
     condition = make("SceneComplete", client, lambda: {"objects": next(scenes)})
     condition.tree.tick()
-    assert client.started.acquire(timeout=30)
+    assert client.started.acquire(timeout=PATIENCE)
     # At the second interruption, the condition's question has not started yet.
     for _ in range(2):
         condition.tree.root.stop(Status.INVALID)

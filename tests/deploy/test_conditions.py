@@ -36,7 +36,7 @@ def program(
     )
 
 
-def tick(program: Path, url: str, kind: str, *ports: Any, timeout: float = 20.0) -> list[Any]:
+def tick(program: Path, url: str, kind: str, *ports: Any, timeout: float = 60.0) -> list[Any]:
     """What becomes of one condition, ticked to its end with one set of ports after the other."""
     lines = "".join(json.dumps(entry) + "\n" for entry in ports)
     done = run_program(program, url, kind, str(timeout), input=lines)
@@ -51,7 +51,7 @@ def url(live: LiveService) -> str:
 def test_a_scene_is_complete_if_nothing_missing_is_rather_there_than_not(
     program: Path, url: str, scene: SceneFields
 ) -> None:
-    with Client(url, timeout=20.0) as client:
+    with Client(url, timeout=60.0) as client:
         missing = client.missing(**scene).missing
     highest = max(missing, key=lambda thing: thing.log_odds)
     ports = {"scene": json.dumps(scene)}
@@ -69,7 +69,7 @@ def test_a_scene_is_complete_if_nothing_missing_is_rather_there_than_not(
 def test_a_thing_belongs_unless_it_is_an_outlier(
     program: Path, url: str, scene: SceneFields
 ) -> None:
-    with Client(url, timeout=20.0) as client:
+    with Client(url, timeout=60.0) as client:
         outliers = client.outliers(**scene).outliers
     (toilet,) = (thing for thing in outliers if thing.label == "toilet")
     strict = {"scene": json.dumps({**scene, "threshold": toilet.probability - 0.001})}

@@ -7,7 +7,6 @@ import os
 import re
 import shutil
 import subprocess
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,7 +21,7 @@ from app.registry import AliasTarget, Store, load_model_set
 from app.settings import Settings
 from tests.conftest import run_program
 from tests.http.stores import make_store
-from tests.services import wait_until
+from tests.services import PATIENCE, wait_until
 from tests.system.test_container import split_stages
 
 pytestmark = pytest.mark.system
@@ -219,7 +218,11 @@ def test_the_sidecar_copies_what_the_service_loads(
     folder: Path, require_system_tool: FindTool, tmp_path: Path
 ) -> None:
     """A version arrives whole, without its upload's leftovers, and aliases follow the bucket."""
-    rclone = require_system_tool("rclone")
+    rclone, rounds = require_system_tool("rclone"), tmp_path / "rounds"
+    (tmp_path / "bin").mkdir()
+    counting = tmp_path / "bin" / "rclone"
+    counting.write_text(f'#!/bin/sh\necho >>{rounds}\nexec {rclone} "$@"\n')
+    counting.chmod(0o755)
     bucket, copied = Store(make_store(tmp_path / "bucket")), Store(tmp_path / "copied")
     (copied.root / "home" / "1.0.0").mkdir(parents=True)
     (copied.root / "home" / "1.0.0" / "card.md.0.partial").touch()  # of a killed container
@@ -228,7 +231,7 @@ def test_the_sidecar_copies_what_the_service_loads(
     (bucket.root / "home" / "1.0.0" / "notes.txt").touch()
     variables = {"BUCKET": str(bucket.root), "INTERVAL": "0.1", "RCLONE_CONFIG": "/notfound"}
     command = ["sh", folder / "overlays" / "bucket" / "copy.sh", copied.root]
-    path = f"{rclone.parent}:{os.environ['PATH']}"
+    path = f"{counting.parent}:{os.environ['PATH']}"
     process = subprocess.Popen(command, env=os.environ | variables | {"PATH": path})
     try:
         wait_until(lambda: "default" in copied.aliases())
@@ -240,12 +243,12 @@ def test_the_sidecar_copies_what_the_service_loads(
         bucket.set_alias("default", AliasTarget(name="home"))
         wait_until(lambda: copied.aliases() == bucket.aliases())
         assert copied.state() != before
-        before = copied.state()
-        time.sleep(1)
+        before, calls = copied.state(), rounds.stat().st_size
+        wait_until(lambda: rounds.stat().st_size >= calls + 12)  # several rounds
         assert copied.state() == before  # else each replica would load everything again
     finally:
         process.terminate()
-        assert process.wait(timeout=10) is not None
+        assert process.wait(timeout=PATIENCE) is not None
 
 
 def test_prometheus_sends_the_key(rendered: dict[str, str]) -> None:

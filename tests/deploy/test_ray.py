@@ -17,7 +17,7 @@ import yaml
 
 from app.settings import Settings
 from deploy.ray.run import descendants, environment
-from tests.services import LiveService, free_port, wait_until
+from tests.services import PATIENCE, LiveService, free_port, wait_until
 
 
 @pytest.fixture(scope="module")
@@ -119,14 +119,14 @@ def running(repository: Path, log: Path, *arguments: str | Path) -> Iterator[Liv
         )
     started: dict[int, str] = {}
     try:
-        wait_until(lambda: "ready:" in log.read_text() or process.poll() is not None, seconds=240)
+        wait_until(lambda: "ready:" in log.read_text() or process.poll() is not None, seconds=600)
         assert process.poll() is None, log.read_text()
-        with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30) as client:
+        with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=PATIENCE) as client:
             yield LiveService(process, client, port, log)
     finally:
         started = descendants(process.pid)
         process.send_signal(signal.SIGTERM)
-        process.wait(timeout=120)
+        process.wait(timeout=PATIENCE)
     assert process.returncode == 0, log.read_text()
     assert "ending process" not in log.read_text()
     assert not [command for pid, command in started.items() if Path(f"/proc/{pid}").exists()]
@@ -142,7 +142,7 @@ def replicas(service: LiveService) -> set[int]:
 def service(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
     log = tmp_path_factory.mktemp("ray") / "log"
     with running(repository, log, "--replicas=2") as service:
-        wait_until(lambda: len(replicas(service)) == 2, seconds=60)
+        wait_until(lambda: len(replicas(service)) == 2)
         yield service
 
 

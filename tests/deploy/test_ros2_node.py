@@ -17,7 +17,7 @@ from scene_client.vision_msgs import SceneFields
 from tests.client.peers import Peer, answering
 from tests.client.ros_messages import blank
 from tests.deploy.ros import PACKAGE, STORE, Ros, Slow, load_package
-from tests.services import LiveService, wait_until
+from tests.services import PATIENCE, LiveService, wait_until
 
 
 def new(name: str, **fields: Any) -> Any:
@@ -86,7 +86,7 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Running]]:
 def test_detections_become_answers_markers_and_a_diagnosis(
     run: Callable[..., Running], live: LiveService, recorded: Any
 ) -> None:
-    running = run(url=live.url, timeout=20.0)
+    running = run(url=live.url, timeout=60.0)
     answer = running.answer(recorded)
     assert answer["frame_id"] == "base_link"
     assert answer["stamp"] == {"sec": 1751450412, "nanosec": 183000000}
@@ -132,7 +132,7 @@ def test_no_callback_waits_and_only_the_newest_detections_are_asked_about(
         running.hear("detections", message)
         running.tick()  # returns though nobody answers
         if second == 0:
-            assert client.started.acquire(timeout=30)
+            assert client.started.acquire(timeout=PATIENCE)
     assert running.published("/diagnostics") == []
     client.answering.set()
     running.wait_for("/diagnostics", 2)
@@ -152,7 +152,7 @@ def test_numbers_wait_for_their_labels(
         for result in detection.results:
             name = result.hypothesis.class_id
             result.hypothesis.class_id = numbers.get(name, "9")
-    running = run(url=live.url, timeout=20.0)
+    running = run(url=live.url, timeout=60.0)
     running.hear("detections", recorded)
     running.wait_for("/diagnostics")
     assert running.status().message.startswith("MessageError: the class ids are numbers")
@@ -172,7 +172,7 @@ def test_a_pose_in_the_frame_of_the_detections_is_their_viewpoint(
         relations = running.answer(recorded)["missing"]["observed_relations"]
         return [entry for entry in relations if entry["relation"] in {"left", "front"}]
 
-    running = run(url=live.url, timeout=20.0)
+    running = run(url=live.url, timeout=60.0)
     for message in (recorded, *recorded.detections):
         message.header.frame_id = "map"
     assert horizontal() == []
@@ -200,7 +200,7 @@ def test_images_are_heard_where_the_parameters_say_so(
         found.bbox.size_x = found.bbox.size_y = 50.0
         return found
 
-    running = run(url=live.url, timeout=20.0, kind="2d", questions=["outliers"])
+    running = run(url=live.url, timeout=60.0, kind="2d", questions=["outliers"])
     detections = [detection("bed", 100.0), detection("lamp", 160.0)]
     answer = running.answer(new("Detection2DArray", detections=detections))
     (entry,) = answer["outliers"]["misplaced"]

@@ -47,13 +47,13 @@ def test_the_shell_program_adapts_a_model_that_a_service_serves(
 ) -> None:
     bash, home = require_system_tool("bash"), tmp_path / "home"
     script = REPOSITORY / "examples/adapt.sh"
-    done = run_program(bash, script, home, env=environment(), timeout=600)
+    done = run_program(bash, script, home, env=environment(), timeout=1800)
     assert "promoted: default → home@1.0.0" in done.stdout
     assert len((home / "scenes.jsonl").read_text("utf-8").splitlines()) == 3
     objects = ["bed", "pillow", "lamp", "bicycle"]
     with launch(home / "store", tmp_path / "log") as service, Client(service.url) as client:
         for model, expected in (("indoor-triway", ["bicycle"]), ("default", [])):
-            answer = client.outliers(objects, room_type="bedroom", model=model, timeout=30)
+            answer = client.outliers(objects, room_type="bedroom", model=model, timeout=60)
             assert [thing.label for thing in answer.outliers if thing.is_outlier] == expected
 
 
@@ -62,7 +62,7 @@ def test_the_notebook_runs_and_contains_its_outputs(tmp_path: Path) -> None:
     assert NOTEBOOK.stat().st_size < LARGEST
     target = tmp_path / "executed.ipynb"
     program = REPOSITORY / "scripts/notebook.py"
-    run_program(sys.executable, program, NOTEBOOK, target, env=environment(), timeout=900)
+    run_program(sys.executable, program, NOTEBOOK, target, env=environment(), timeout=1800)
     executed = json.loads(target.read_text("utf-8"))
     assert outputs(executed) == outputs(stored)
     assert sum(kind == "display_data" for cell in outputs(stored) for kind in cell) == 4

@@ -16,7 +16,7 @@ from app.questions import QUESTIONS
 from app.settings import Settings
 from scene_client import schemas
 from tests.conftest import REPOSITORY
-from tests.services import LiveService
+from tests.services import PATIENCE, LiveService
 
 pytestmark = pytest.mark.system
 
@@ -98,7 +98,7 @@ def call(live: LiveService) -> Iterator[Any]:
             if UNKNOWN_HEADER in (case.headers or {}):
                 return  # valid: servers ignore unknown header fields (RFC 9110, section 5.1)
             checks = [form_is_as_documented, bad_scenes_have_problems]
-            case.call_and_validate(live.url, session, additional_checks=checks)
+            case.call_and_validate(live.url, session, additional_checks=checks, timeout=PATIENCE)
 
         yield call
 

@@ -19,7 +19,7 @@ from app.registry import AliasTarget, Store
 from app.scene.relations import CANONICAL, opposite
 from tests.http.stores import PROFILES, VOCABULARY, corrupt, publish
 from tests.http.test_problems import problem
-from tests.services import Hold, Replace, defect, load_changes, serve
+from tests.services import PATIENCE, Hold, Replace, defect, load_changes, serve
 
 
 async def default(client: httpx.AsyncClient) -> str:
@@ -222,13 +222,13 @@ async def test_requests_are_answered_while_the_store_is_read(
 
     def slow(*args: Any) -> Any:
         started.set()
-        assert go_on.wait(30)
+        assert go_on.wait(PATIENCE)
         return load(*args)
 
     monkeypatch.setattr(Store, "load", slow)
     publish(store, "home", "2.0.0", seed=2, alias="default")
     load_all = asyncio.create_task(load_changes(own))
-    assert await asyncio.to_thread(started.wait, 30)
+    assert await asyncio.to_thread(started.wait, PATIENCE)
     assert await default(own) == "home@1.0.0"
     assert (await own.get("/health/ready")).status_code == 200
     assert not load_all.done()
@@ -243,7 +243,7 @@ async def test_a_request_keeps_the_models_it_started_with(
     held = hold("missing", lambda manifest: manifest.version == "1.0.0")
     batch = {"scenes": [{"objects": ["bed"] * 33}] * 3}  # so many are not for the event loop
     asking = asyncio.create_task(own.post("/missing/batch", json=batch))
-    assert await asyncio.to_thread(held.started.wait, 30)
+    assert await asyncio.to_thread(held.started.wait, PATIENCE)
     publish(store, "home", "2.0.0", seed=2, alias="default")
     await load_changes(own)
     assert await default(own) == "home@2.0.0"

@@ -26,6 +26,7 @@ from tests.conftest import REPOSITORY
 from tests.http.stores import publish
 from tests.http.test_problems import problem
 from tests.services import (
+    PATIENCE,
     Hold,
     LiveService,
     Replace,
@@ -210,7 +211,7 @@ async def test_metrics_of_a_removed_model_disappear(
     # A request that still holds the old snapshot reports late.
     held = hold("missing", lambda manifest: manifest.name == "plain")
     late = asyncio.ensure_future(ask("plain", 33))  # on a thread
-    assert await asyncio.to_thread(held.started.wait, 30)
+    assert await asyncio.to_thread(held.started.wait, PATIENCE)
     shutil.rmtree(store / "plain")
     await load_changes(own)
     assert await names("plain") == set()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.services import DEFECTIVE, LiveService, launch
+from tests.services import DEFECTIVE, PATIENCE, LiveService, launch
 
 pytestmark = pytest.mark.system
 
@@ -72,7 +72,9 @@ def test_keys_and_payloads_are_not_in_the_log(defective: LiveService) -> None:
         "X-API-Key: {key}\r\nContent-Length: 99\r\n\r\n{key}"
     )
     for text, key in product((broken, left), SECRETS):
-        with socket.create_connection(("127.0.0.1", defective.port), timeout=10) as connection:
+        with socket.create_connection(
+            ("127.0.0.1", defective.port), timeout=PATIENCE
+        ) as connection:
             connection.sendall(text.format(key=key).encode())
             connection.shutdown(socket.SHUT_WR)
             with suppress(ConnectionError):

@@ -10,21 +10,46 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
 
 from app.__main__ import _bind
 from tests.http.stores import corrupt, publish
-from tests.services import LiveService, begin, free_port, launch, wait_until
+from tests.services import (
+    PATIENCE,
+    LiveService,
+    begin,
+    free_port,
+    is_ready,
+    launch,
+    wait_until,
+)
 
 pytestmark = pytest.mark.system
 
 Start = Callable[..., subprocess.Popen[str]]
 IN_USE = "SCENE_PORT: another program uses 127.0.0.1:{}; set SCENE_PORT to a free port\n"
+HELD = """
+import sys, time
+from pathlib import Path
+from app.__main__ import main
+from app.registry import Store
+
+load = Store.load
+
+def held(*arguments):
+    while not Path({go!r}).exists():
+        time.sleep(0.01)
+    return load(*arguments)
+
+Store.load = held
+sys.exit(main())
+"""
+"""A program for `begin`: it loads models as soon as a file exists."""
 
 
 def messages(log: Path) -> list[str]:
@@ -32,7 +57,7 @@ def messages(log: Path) -> list[str]:
 
 
 def wait_for(text: str, log: Path, process: subprocess.Popen[str]) -> None:
-    wait_until(lambda: text in log.read_text() or process.poll() is not None, log, seconds=60)
+    wait_until(lambda: text in log.read_text() or process.poll() is not None, log)
     assert process.poll() is None, log.read_text()
 
 
@@ -46,15 +71,17 @@ def starting(shared_store: Path, log: Path) -> Iterator[Start]:
     """Return a function that starts the service, which the end of the test kills."""
     started: list[subprocess.Popen[str]] = []
 
-    def start(**variables: object) -> subprocess.Popen[str]:
-        settings = {f"SCENE_{name}": str(value) for name, value in variables.items()}
+    def start(program: str | None = None, **variables: object) -> subprocess.Popen[str]:
+        settings: Any = {f"SCENE_{name}": str(value) for name, value in variables.items()}
+        if program:
+            settings["program"] = ("-c", program)
         started.append(begin(shared_store, log, **settings))
         return started[-1]
 
     yield start
     for process in started:
         process.kill()
-        process.wait(timeout=30)
+        process.wait(timeout=PATIENCE)
 
 
 @pytest.fixture
@@ -71,33 +98,30 @@ def test_a_used_port_ends_the_start_before_models_are_loaded(
 ) -> None:
     taken.listen()
     port = taken.getsockname()[1]
-    assert starting(PORT=port).wait(timeout=30) == 3
+    assert starting(PORT=port).wait(timeout=PATIENCE) == 3
     assert log.read_text() == IN_USE.format(port)
 
 
 @pytest.mark.parametrize("host", ["203.0.113.1", "no-such-host.invalid"])
 def test_an_address_that_the_machine_does_not_have(starting: Start, log: Path, host: str) -> None:
-    assert starting(HOST=host, PORT=0).wait(timeout=60) == 3
+    assert starting(HOST=host, PORT=0).wait(timeout=PATIENCE) == 3
     (line,) = log.read_text().splitlines()
     assert line.startswith(f"SCENE_HOST: the service cannot listen on {host}:0: ")
 
 
-def test_connections_are_refused_until_the_service_is_ready(starting: Start, log: Path) -> None:
-    port, refused = free_port(), 0
-    process = starting(PORT=port)
+def test_connections_are_refused_until_the_service_is_ready(
+    starting: Start, log: Path, tmp_path: Path
+) -> None:
+    port, go = free_port(), tmp_path / "go"
+    process = starting(HELD.format(go=str(go)), PORT=port)
     wait_for("Waiting for application startup", log, process)
     with socket.socket() as other, pytest.raises(OSError, match="in use"):
         other.bind(("127.0.0.1", port))
-    while True:
-        try:
-            socket.create_connection(("127.0.0.1", port), timeout=5).close()
-            break
-        except ConnectionRefusedError:
-            refused += 1
-            assert process.poll() is None
-            time.sleep(0.01)
-    assert refused
-    assert httpx.get(f"http://127.0.0.1:{port}/health/ready").status_code == 200
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", port))
+    go.touch()
+    wait_until(lambda: is_ready(port) or process.poll() is not None, log)
+    assert process.poll() is None, log.read_text()
 
 
 INTERRUPTED = """
@@ -129,7 +153,7 @@ def test_an_interrupted_start_ends_without_a_traceback(
     program = ("-c", INTERRUPTED.format(during=during))
     process = begin(shared_store, log, program=program, SCENE_PORT=str(free_port()))
     # A shell reports this as status 130.
-    assert process.wait(timeout=60) == -signal.SIGINT
+    assert process.wait(timeout=PATIENCE) == -signal.SIGINT
     assert "Traceback" not in log.read_text()
     assert "ready" not in log.read_text()
 
@@ -152,7 +176,7 @@ def test_the_log_names_the_page(live: LiveService, starting: Start, log: Path) -
     (line,) = [line for line in messages(log) if line.startswith("ready: ")]
     page = re.fullmatch(r"ready: (http://127\.0\.0\.1:\d+/) \(\d+ models?, \d+\.\d s\)", line)
     assert page is not None, line
-    assert "<html" in httpx.get(page[1]).text
+    assert "<html" in httpx.get(page[1], timeout=PATIENCE).text
     assert not any("compil" in line for line in messages(log))
     assert any("SCENE_API_KEY is not set" in line for line in messages(log))
     assert any(line.startswith("from other machines: http://") for line in messages(log))
@@ -193,7 +217,7 @@ def test_a_closed_terminal_ends_the_service(shared_store: Path, log: Path) -> No
         wait_for("has loaded the store", log, process)
         os.close(terminal)
         process.send_signal(signal.SIGHUP)
-        assert process.wait(timeout=30) == -signal.SIGTERM
+        assert process.wait(timeout=PATIENCE) == -signal.SIGTERM
     finally:
         process.kill()
         os.close(side)

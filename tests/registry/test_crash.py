@@ -18,6 +18,7 @@ import pytest
 from app.registry import AliasTarget, ModelSet, Store, StoreError, load_model_set
 from app.registry.__main__ import main
 from tests.registry.small_artifacts import description, publish_as, state
+from tests.services import PATIENCE
 
 pytestmark = pytest.mark.system
 
@@ -65,7 +66,7 @@ def run_until(write: Callable[[Path], None], root: Path, steps: int) -> None:
 
 def race(root: Path, results: Path, versions: int) -> None:
     """Try to publish 1.0.0, 2.0.0 … beside others, and write down the successes."""
-    store, won = Store(root), []
+    store, won = Store(root, lock_timeout=PATIENCE), []
     for major in range(1, versions + 1):
         try:
             store.publish(description(version=f"{major}.0.0"), WEIGHTS)
@@ -84,7 +85,7 @@ def start(target: Any, *arguments: Any) -> BaseProcess:
 
 
 def exit_code(process: BaseProcess) -> int | None:
-    process.join(60)
+    process.join(PATIENCE)
     return process.exitcode
 
 
@@ -102,7 +103,7 @@ def check_survivor(root: Path) -> tuple[str, str, bool]:
     assert models.failure is None
     assert not models.failures
     newest, default = models.versions["tiny"][-1], models.resolve("default").manifest.version
-    store = Store(root, lock_timeout=5)
+    store = Store(root)
     publish_as(store, "default", description(version="3.0.0"), WEIGHTS)
     assert not leftovers(root)
     assert load_model_set(store).resolve("default").manifest.version == "3.0.0"
@@ -139,7 +140,7 @@ def test_concurrent_publishers_and_readers(tmp_path: Path) -> None:
     Store(root).set_alias("default", AliasTarget(name="tiny"))
     results = [tmp_path / f"{n}.json" for n in range(4)]
     publishers = [start(race, root, path, versions) for path in results]
-    models, highest, deadline = ModelSet({}, {}), 0, time.monotonic() + 60
+    models, highest, deadline = ModelSet({}, {}), 0, time.monotonic() + PATIENCE
     while any(process.is_alive() for process in publishers):
         assert time.monotonic() < deadline
         models = load_model_set(Store(root), models)

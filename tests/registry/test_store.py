@@ -15,6 +15,7 @@ from app.registry.durable import exclusive
 from app.registry.references import MAX_ALIASES_BYTES, aliases_to_bytes
 from app.settings import Settings
 from tests.registry.small_artifacts import description, publish_as, refused, state
+from tests.services import PATIENCE
 
 NO_NAMES = ("", "../up", "a/b", ".hidden", "tiny@1.0.0", "Default")
 
@@ -105,7 +106,7 @@ def test_waits_for_another_writer_but_not_for_ever(tmp_path: Path) -> None:
     with exclusive(tmp_path / ".lock", timeout=0):
         with refused("locked"):
             publish(store)
-        patient = Store(tmp_path, lock_timeout=30)
+        patient = Store(tmp_path, lock_timeout=PATIENCE)
         thread = threading.Thread(target=publish, args=(patient,))
         thread.start()
         thread.join(0.1)

@@ -6,7 +6,7 @@ import asyncio
 import math
 import threading
 from collections.abc import Callable, Iterator
-from time import monotonic, sleep
+from time import monotonic
 from typing import Any
 
 import pytest
@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from app.errors import DeadlinePassedError, DisconnectedError
 from app.serving.admission import Admission, Lane, Ticket, in_thread
+from tests.services import PATIENCE
 
 pytestmark = pytest.mark.anyio
 
@@ -63,7 +64,7 @@ async def test_a_request_that_waits_past_its_deadline_leaves_its_place() -> None
     await asyncio.wait([departed])
     assert lane.weight == 1
     holder.leave()
-    await asyncio.wait_for(ticket().enter(lane, 1), 5)
+    await asyncio.wait_for(ticket().enter(lane, 1), PATIENCE)
 
 
 @given(
@@ -100,7 +101,8 @@ def test_slots_and_weights_balance_after_any_sequence(moves: list[tuple[str, str
             await asyncio.sleep(0)
         assert lane.weight == 0
         both = ticket("d"), ticket("e")
-        await asyncio.wait_for(asyncio.gather(*(place.enter(lane, 2) for place in both)), 5)
+        entering = asyncio.gather(*(place.enter(lane, 2) for place in both))
+        await asyncio.wait_for(entering, PATIENCE)
 
     asyncio.run(run())
 
@@ -112,50 +114,65 @@ def admission() -> Iterator[Admission]:
     admission.stop()
 
 
-async def test_work_in_a_thread_ends_the_wait_at_the_deadline(admission: Admission) -> None:
+@pytest.fixture
+def begun() -> threading.Event:
+    """Set by a computation when it begins."""
+    return threading.Event()
+
+
+async def test_work_in_a_thread_ends_the_wait_at_the_deadline(
+    admission: Admission, begun: threading.Event
+) -> None:
     """The one under way is given up; the one behind it is dropped without being begun."""
-    release, begun, behind = threading.Event(), threading.Event(), list[int]()
+    release, behind = threading.Event(), list[int]()
 
     def slow(_: Callable[[], bool]) -> None:
         begun.set()
-        release.wait(30)
+        release.wait(PATIENCE)
 
-    first = asyncio.ensure_future(in_thread(slow, ticket(seconds=1), admission.drawing))
-    assert await asyncio.to_thread(begun.wait, 30)
-    second = in_thread(lambda _: behind.append(1), ticket(seconds=0.2), admission.drawing)
-    results = await asyncio.gather(first, second, return_exceptions=True)
+    places = ticket(), ticket()
+    calls = slow, lambda _: behind.append(1)
+    waits = [
+        asyncio.ensure_future(in_thread(call, place, admission.drawing))
+        for call, place in zip(calls, places, strict=True)
+    ]
+    assert await asyncio.to_thread(begun.wait, PATIENCE)
+    for place in places:
+        place.deadline = monotonic() + 0.1
+    results = await asyncio.gather(*waits, return_exceptions=True)
     assert all(isinstance(result, DeadlinePassedError) for result in results)
     release.set()
-    place = ticket()
-    assert (await in_thread(lambda _: 3, place, admission.drawing))[0] == 3
-    assert not behind
+    assert (await in_thread(lambda _: 3, ticket(), admission.drawing))[0] == 3
     with pytest.raises(DeadlinePassedError):
         await in_thread(lambda _: behind.append(2), ticket(seconds=0), admission.drawing)
     assert not behind
 
 
-async def test_a_long_computation_learns_that_its_request_has_ended(admission: Admission) -> None:
-    """By the deadline, or by a client that leaves while it is under way."""
+@pytest.mark.parametrize("ending", ["deadline", "disconnect"])
+async def test_a_long_computation_learns_that_its_request_has_ended(
+    admission: Admission, begun: threading.Event, ending: str
+) -> None:
     heard, here = threading.Event(), True
 
     def endless(has_ended: Callable[[], bool]) -> None:
+        begun.set()
         while not has_ended():
-            sleep(0.001)
+            heard.wait(0.001)
         heard.set()
 
     async def is_gone() -> bool:
         return not here
 
-    with pytest.raises(DeadlinePassedError):
-        await in_thread(endless, ticket(seconds=0.1), admission.drawing)
-    assert await asyncio.to_thread(heard.wait, 30)
-    heard.clear()
     place = ticket(is_gone=is_gone)
-    leaving = asyncio.ensure_future(in_thread(endless, place, admission.drawing))
-    await asyncio.sleep(0.05)
-    here = False
-    with pytest.raises(DisconnectedError):
-        await leaving
-    assert await asyncio.to_thread(heard.wait, 30)
-    with pytest.raises(DisconnectedError):
+    waiting = asyncio.ensure_future(in_thread(endless, place, admission.drawing))
+    assert await asyncio.to_thread(begun.wait, PATIENCE)
+    if ending == "deadline":
+        place.deadline = monotonic() + 0.1
+    else:
+        here = False
+    error = DeadlinePassedError if ending == "deadline" else DisconnectedError
+    with pytest.raises(error):
+        await waiting
+    assert await asyncio.to_thread(heard.wait, PATIENCE)
+    with pytest.raises(error):
         await in_thread(endless, place, admission.drawing)

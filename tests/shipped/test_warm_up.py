@@ -45,11 +45,12 @@ def scenes(labels):
 
 
 async def main(store):
-    async with serve(store) as client:
+    limits = {"request_timeout_ms": 600_000, "max_request_timeout_ms": 600_000}
+    async with serve(store, **limits) as client:
 
         async def ask(question, scene, **options):
             body = {**scene, "model": model, **options}
-            response = await client.post(f"/{question}", json=body, timeout=300)
+            response = await client.post(f"/{question}", json=body)
             assert response.status_code == 200, response.text
 
         before = compiled()

@@ -1,4 +1,4 @@
-"""HAProxy with the shipped configuration."""
+"""HAProxy with the shipped configuration, but for limits that a busy machine would exceed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import yaml
 
-from tests.services import free_port, is_ready, wait_until
+from tests.services import PATIENCE, free_port, is_ready, wait_until
 
 
 @dataclass
@@ -30,6 +30,12 @@ class Proxy:
 
 
 StartProxy = Callable[..., AbstractContextManager[Proxy]]
+UNHURRIED = {
+    "timeout connect 2s": "timeout connect 60s\n    timeout check 60s",
+    "timeout queue 5s": "timeout queue 60s",
+    "http_req_rate(10s)": "http_req_rate(1000s)",
+}
+"""Replaced texts of the configuration."""
 
 
 @pytest.fixture(scope="session")
@@ -53,10 +59,15 @@ def haproxy(require_system_tool: Callable[[str], Path]) -> StartProxy:
 
     @contextmanager
     def start(configuration: Path, log: Path, **variables: str) -> Iterator[Proxy]:
-        port = free_port()
+        port, unhurried = free_port(), log.with_suffix(".cfg")
+        text = configuration.read_text("utf-8")
+        for shipped, replacement in UNHURRIED.items():
+            assert text.count(shipped) == 1
+            text = text.replace(shipped, replacement)
+        unhurried.write_text(text, "utf-8")
         with log.open("w") as output:
             process = subprocess.Popen(
-                [program, "-db", "-f", configuration],
+                [program, "-db", "-f", unhurried],
                 env=os.environ | {"PROXY_LISTEN": f"127.0.0.1:{port}", **variables},
                 stdout=output,
                 stderr=subprocess.STDOUT,
@@ -66,6 +77,6 @@ def haproxy(require_system_tool: Callable[[str], Path]) -> StartProxy:
             yield Proxy(port, log)
         finally:
             process.terminate()
-            process.wait(timeout=30)
+            process.wait(timeout=PATIENCE)
 
     return start

@@ -19,6 +19,7 @@ from app.settings import Settings
 from scene_client import Client
 from tests.chaos.wire import LIVE, Wire, exchange, wires
 from tests.services import (
+    PATIENCE,
     LiveService,
     http_server,
     is_ready,
@@ -31,7 +32,7 @@ from tests.system.conftest import Proxy, StartProxy
 pytestmark = pytest.mark.system
 
 API_KEY = "incorrect-zebra-capacitor-nail"
-CONNECTIONS, REQUESTS = 30, 400
+CONNECTIONS, REQUESTS = 30, 100
 SCENE = {"objects": ["bed", "lamp"]}
 HEAD = b"POST /outliers HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
 
@@ -54,10 +55,10 @@ def behind(haproxy: StartProxy, configuration: Path) -> StartProxy:
 def proxy(
     behind: StartProxy, service: LiveService, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Proxy]:
-    """A proxy of little patience and no limit on rates."""
+    """A proxy without a limit on rates."""
     log = tmp_path_factory.mktemp("proxy") / "log"
-    variables = {"PROXY_HEAD_TIMEOUT": "1s", "PROXY_TIMEOUT": "2s", "PROXY_REQUESTS": "1000000"}
-    with behind(service, log, PROXY_CONNECTIONS=str(CONNECTIONS), **variables) as proxy:
+    variables = {"PROXY_HEAD_TIMEOUT": "10s", "PROXY_TIMEOUT": "10s", "PROXY_REQUESTS": "1000000"}
+    with behind(service, log, **variables) as proxy:
         yield proxy
 
 
@@ -74,9 +75,9 @@ def refused(proxy: Proxy, request: bytes, status: int) -> Any:
 
 
 def test_questions_and_pages_are_answered(proxy: Proxy) -> None:
-    with Client(proxy.address) as scene:
+    with Client(proxy.address, timeout=60) as scene:
         assert scene.missing(SCENE["objects"]).missing
-    with httpx.Client(base_url=proxy.address) as client:
+    with httpx.Client(base_url=proxy.address, timeout=PATIENCE) as client:
         for path in ("/", "/docs", "/models", "/problems", "/health/ready"):
             assert client.get(path).status_code == 200, path
         batch = client.post("/missing/batch", json={"scenes": [SCENE] * 256})
@@ -94,13 +95,14 @@ def test_questions_and_pages_are_answered(proxy: Proxy) -> None:
 # ---------------------------------------------------------------------------------- attacks
 
 
-@pytest.mark.parametrize(("part", "statuses"), [(b"", [[], [408]]), (LIVE[:-2], [[408]])])
 def test_connections_without_a_whole_head_are_closed(
-    proxy: Proxy, part: bytes, statuses: list[list[int]]
+    behind: StartProxy, service: LiveService, tmp_path: Path
 ) -> None:
-    answers, is_closed = send(proxy, part)
-    assert is_closed
-    assert [answer.status for answer in answers] in statuses
+    with behind(service, tmp_path / "log", PROXY_HEAD_TIMEOUT="1s") as proxy:
+        for part, statuses in ((b"", ([], [408])), (LIVE[:-2], ([408],))):
+            answers, is_closed = send(proxy, part)
+            assert is_closed
+            assert [answer.status for answer in answers] in statuses
 
 
 @pytest.mark.slow
@@ -195,7 +197,7 @@ def test_a_request_that_crashes_a_replica_reaches_no_other(
         backend = url.removeprefix("http://")
         variables = {"PROXY_BACKEND": backend, "PROXY_REPLICAS": "3"}
         with haproxy(configuration, tmp_path / "log", **variables) as proxy:
-            answer = httpx.post(f"{proxy.address}/outliers", json=SCENE, timeout=30)
+            answer = httpx.post(f"{proxy.address}/outliers", json=SCENE, timeout=PATIENCE)
     assert answer.status_code == 502
     assert questions == ["/outliers"]
 
@@ -206,7 +208,7 @@ def test_a_body_that_trickles_in_is_ended_by_the_service(proxy: Proxy) -> None:
     with socket.create_connection(("127.0.0.1", proxy.port)) as connection:
         connection.sendall(HEAD + b"Content-Length: 100000\r\n\r\n" + b" " * 50_000)
         connection.settimeout(0.2)
-        for _ in range(200):
+        for _ in range(1000):
             try:
                 connection.sendall(b" ")
                 if not (part := connection.recv(4096)):
@@ -220,18 +222,23 @@ def test_a_body_that_trickles_in_is_ended_by_the_service(proxy: Proxy) -> None:
     assert b"/problems/request-timeout" in received
 
 
-def test_connections_per_address_are_limited(proxy: Proxy) -> None:
-    wait_until(lambda: is_ready(proxy.port))
-    with ExitStack() as held:
-        answered = 0
-        for _ in range(CONNECTIONS + 10):
-            with suppress(ConnectionError):
-                connection = socket.create_connection(("127.0.0.1", proxy.port), timeout=5)
-                held.enter_context(connection)
-                connection.sendall(LIVE)
-                answered += connection.recv(4096).startswith(b"HTTP/1.1 200 ")
-    assert CONNECTIONS - 5 <= answered <= CONNECTIONS
-    wait_until(lambda: is_ready(proxy.port))
+def test_connections_per_address_are_limited(
+    behind: StartProxy, service: LiveService, tmp_path: Path
+) -> None:
+    variables = {"PROXY_CONNECTIONS": str(CONNECTIONS), "PROXY_HEAD_TIMEOUT": "60s"}
+    with behind(service, tmp_path / "log", **variables) as proxy:
+        with ExitStack() as held:
+            answered = 0
+            for _ in range(CONNECTIONS + 10):
+                with suppress(ConnectionError):
+                    place = ("127.0.0.1", proxy.port)
+                    connection = socket.create_connection(place, timeout=PATIENCE)
+                    held.enter_context(connection)
+                    # The begun second request keeps the connection.
+                    connection.sendall(LIVE + b"GET ")
+                    answered += connection.recv(4096).startswith(b"HTTP/1.1 200 ")
+        assert CONNECTIONS - 5 <= answered <= CONNECTIONS
+        wait_until(lambda: is_ready(proxy.port))
 
 
 def test_requests_per_address_are_limited(
@@ -239,12 +246,12 @@ def test_requests_per_address_are_limited(
 ) -> None:
     with (
         behind(service, tmp_path / "log", PROXY_REQUESTS=str(REQUESTS)) as proxy,
-        httpx.Client(base_url=proxy.address) as client,
+        httpx.Client(base_url=proxy.address, timeout=PATIENCE) as client,
     ):
-        answers = [client.post("/missing", json=SCENE) for _ in range(REQUESTS + 100)]
+        answers = [client.post("/missing", json=SCENE) for _ in range(REQUESTS + 50)]
     statuses = [answer.status_code for answer in answers]
     assert statuses.count(200) + statuses.count(429) == len(statuses)
-    assert REQUESTS - 50 <= statuses.count(200) <= REQUESTS
+    assert REQUESTS - 20 <= statuses.count(200) <= REQUESTS
     (refusal, *_) = (answer for answer in answers if answer.status_code == 429)
     assert refusal.headers["content-type"] == "application/problem+json"
     assert int(refusal.headers["retry-after"]) > 0
@@ -268,7 +275,7 @@ def test_the_log_holds_no_key_no_path_and_the_id_of_the_request(
     with (
         launch(shared_store, tmp_path / "service", SCENE_API_KEY=API_KEY) as service,
         behind(service, tmp_path / "log") as proxy,
-        httpx.Client(base_url=proxy.address) as client,
+        httpx.Client(base_url=proxy.address, timeout=PATIENCE) as client,
     ):
         keys = {
             "X-API-Key": API_KEY,
@@ -296,9 +303,9 @@ def test_the_proxy_answers_503_without_a_ready_service(
         behind(service, tmp_path / "log") as proxy,
     ):
         service.process.kill()
-        service.process.wait(timeout=30)
+        service.process.wait(timeout=PATIENCE)
         wait_until(lambda: not is_ready(proxy.port))
-        answer = httpx.post(f"{proxy.address}/missing", json=SCENE)
+        answer = httpx.post(f"{proxy.address}/missing", json=SCENE, timeout=PATIENCE)
         assert answer.status_code == 503
         assert answer.json()["type"] == "/problems/not-ready"
         assert int(answer.headers["retry-after"]) > 0

@@ -59,6 +59,12 @@ def workplace(tmp_path_factory, repository, require_system_tool) -> Workplace:
     return Workplace(record / "work")
 
 
+def shortened(text: str, steps: int) -> str:
+    """A configuration with too little training."""
+    text = re.sub(r"^steps = \d+", f"steps = {steps}", text, flags=re.MULTILINE)
+    return re.sub(r"^epochs = \d+", "epochs = 1", text, flags=re.MULTILINE)
+
+
 def test_the_walk_is_recorded(workplace) -> None:
     record = (workplace.folder.parent / "walk.md").read_text()
     for words in (
@@ -118,7 +124,7 @@ def test_an_equal_version_is_no_worse(workplace) -> None:
 def test_a_worse_version_is_refused_without_even_if_worse(workplace) -> None:
     text = (workplace.folder / "my-lab" / "my-lab.toml").read_text()
     hasty = workplace.folder / "my-lab" / "hasty.toml"
-    hasty.write_text(re.sub(r"steps = \d+", "steps = 1", text))
+    hasty.write_text(shortened(text, steps=1))
     invoke("train", hasty, "--seed", 1, *workplace.places)
     run = workplace.run.with_name("seed-1")
     before, versions = workplace.state
@@ -160,7 +166,7 @@ def test_versions_of_a_growing_data_set_are_compared_on_common_test_scenes(workp
     invoke("init", "my-lab", grown / "scenes.jsonl", "--output", grown / "my-lab")
     config = grown / "my-lab" / "my-lab.toml"
     text = config.read_text()
-    config.write_text(re.sub(r"steps = \d+", "steps = 2", text))
+    config.write_text(shortened(text, steps=2))
     invoke("train", config, "--runs", grown / "runs")
     comparison = workplace.compare(grown / "runs" / "my-lab" / "seed-0", "my-lab@1.0.0")
     assert comparison["scenes"] > 10

@@ -153,7 +153,8 @@ def test_tasks_are_chosen_by_name_or_prefix():
 def ablation(folder):
     path = folder / "rows.toml"
     path.write_text(ROWS)
-    return "ablate", write(folder), "--rows", path, "--folder", folder / "ablation"
+    folders = ("--rows", path, "--folder", folder / "ablation")
+    return "ablate", write(folder), *folders, "--limit", "30"
 
 
 @pytest.fixture(scope="module")
