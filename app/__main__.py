@@ -44,11 +44,7 @@ def _refuse_arguments(arguments: list[str] | None) -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Serve until the process is stopped. Return 2 for invalid settings, else as `serve`.
 
-    Args:
-        arguments: those of the command line, by default. Every argument but --help is an error.
-
-    Raises:
-        SystemExit: there are arguments.
+    Arguments end the process (SystemExit).
     """
     began = monotonic()
     from pydantic import ValidationError

@@ -6,16 +6,15 @@ service refuses a directory that other users can change.
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import os
 import stat
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 _logger = logging.getLogger("app.compiling")
 
@@ -26,10 +25,9 @@ def _folders() -> Iterator[Path]:
         yield Path(configured).absolute()
         return
     yield Path(__file__).parent.parent / ".numba_cache"
-    if cache := os.environ.get("XDG_CACHE_HOME"):
-        yield Path(cache) / "scene-boltzmann"
     with suppress(RuntimeError):  # the user does not have a home directory
-        yield Path.home() / ".cache" / "scene-boltzmann"
+        cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        yield Path(cache) / "scene-boltzmann"
 
 
 def _make_private(folder: Path) -> None:
@@ -55,10 +53,9 @@ def _choose() -> tuple[Path | None, str]:
     for folder in _folders():
         try:
             _make_private(folder)
+            return folder, "; ".join(problems)
         except OSError as error:
             problems.append(str(error))
-        else:
-            return folder, "; ".join(problems)
     return None, "; ".join(problems)
 
 
@@ -88,25 +85,19 @@ def check_cache() -> None:
         _logger.info("compiled loops are stored in %s: %s", FOLDER, _PROBLEM)
 
 
-@contextmanager
-def progress(kernels: Sequence[Any]) -> Iterator[None]:
-    """Log the loops that the ``with`` block compiles. Only one process compiles at a time."""
-    listener = _Progress(kernels)
-    try:
-        with event.install_listener("numba:compile", listener):
-            yield
-    finally:
-        listener.unlock()
+def progress(kernels: Sequence[Any]) -> AbstractContextManager[Any]:
+    """Return a context manager that logs the loops compiled in its ``with`` block."""
+    listener = event.install_listener("numba:compile", _Progress(kernels))
+    return cast("AbstractContextManager[Any]", listener)
 
 
 class _Progress(event.Listener):
-    """Event listener that locks the cache directory and logs at most one line per second."""
+    """Event listener that logs at most one line per second."""
 
     def __init__(self, kernels: Sequence[Any]) -> None:
         self._kernels = {id(kernel) for kernel in kernels}
         self._begun: set[int] = set()
         self._logged = float("-inf")
-        self._lock: int | None = None
 
     def on_start(self, event: Any) -> None:
         """Log the start of a loop's compilation. Ignore functions of numba itself."""
@@ -115,7 +106,6 @@ class _Progress(event.Listener):
             return
         if not self._begun:
             _logger.info("compiling loops, once for this version")
-            self._lock = _lock()
         self._begun.add(kernel)
         if time.monotonic() - self._logged >= 1:
             _logger.info("compiling loop %d of %d", len(self._begun), len(self._kernels))
@@ -123,23 +113,3 @@ class _Progress(event.Listener):
 
     def on_end(self, event: Any) -> None:
         """Ignore the end of a compilation."""
-
-    def unlock(self) -> None:
-        """Let other processes compile."""
-        if self._lock is not None:
-            os.close(self._lock)
-
-
-def _lock() -> int | None:
-    """Wait until no other process compiles. The lock ends when its file is closed."""
-    if FOLDER is None:
-        return None
-    file = os.open(FOLDER / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        _logger.info("waiting until another process has compiled the same loops")
-        fcntl.flock(file, fcntl.LOCK_EX)
-    except OSError:  # the file system does not support file locks
-        _logger.debug("the file system of %s does not support locks", FOLDER)
-    return file

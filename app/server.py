@@ -53,12 +53,6 @@ class Server(uvicorn.Server):
        A second signal, or Ctrl-C, ends this step at once.
     2. The server closes the listening socket.
     3. The server finishes the requests in progress.
-
-    Args:
-        config: configuration of uvicorn.
-        runtime: the runtime of the service. It is not ready during the shutdown.
-        settings: the settings of the service.
-        began: `time.monotonic()` at the start of the process.
     """
 
     def __init__(

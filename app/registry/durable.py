@@ -77,11 +77,7 @@ def rename(source: Path, target: Path) -> None:
 
 
 def replace_file(path: Path, data: bytes, *, prefix: str) -> None:
-    """Create a file, or replace its contents atomically.
-
-    The function writes a temporary file, whose name is the prefix and the name of the file. Then it
-    renames the temporary file.
-    """
+    """Create a file, or replace its contents atomically. The prefix names the temporary file."""
     temporary = path.with_name(f"{prefix}{path.name}")
     try:
         write_file(temporary, data)

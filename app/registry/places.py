@@ -102,8 +102,7 @@ class Places(TensorGroup):
     def shows(self, relation: int, subject: Indices, other: Indices) -> NDArray[np.bool_]:
         """Return whether training shows the relation from each subject to each other class, (N, M).
 
-        A single scene may be an error, so two scenes are needed. The class indices are (N,) and
-        (M,).
+        The class indices are (N,) and (M,). A single scene may be an error.
         """
         V = len(self.frequency)
         return triple_counts(self.triple, self.held, V, relation, subject, other) >= _SHOWN
@@ -112,7 +111,6 @@ class Places(TensorGroup):
         """Return the share of each other class among the supporters of each subject, (N, M).
 
         A supporter is an object on or in which the subject is. The class indices are (N,) and (M,).
-        The counts of a subject are smoothed by `_SUPPORTER` supporters of all classes.
         """
         total, share = self._supporters
         V, of_pairs = len(self.frequency), _SUPPORTER * share[other]
@@ -164,8 +162,7 @@ class Places(TensorGroup):
     def means_under(self, upper: int, lower: int) -> bool:
         """Return whether "upper on top of lower" means that the lower object is under the other.
 
-        A desk is on top of a bin in this sense: it does not stand on the bin. The roles of the two
-        classes decide. At least `_SHOWN` scenes must show the lower class under the upper.
+        A desk is on top of a bin in this sense. The roles of the two classes decide.
         """
         under = role_counts(self.roles, lower, upper)[UNDER]
         return bool(under >= _SHOWN and under > role_counts(self.roles, upper, lower)[ON])

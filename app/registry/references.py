@@ -61,10 +61,7 @@ Version = Annotated[str, AfterValidator(VERSION.require)]
 
 
 class AliasTarget(BaseModel):
-    """The target of an alias: a version of a model.
-
-    If `version` is None (null in JSON), the target is the newest usable version.
-    """
+    """The target of an alias: a version of a model, or None for its newest usable version."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

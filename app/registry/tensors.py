@@ -82,13 +82,9 @@ def unpack(data: bytes, entries: Mapping[str, TensorEntry]) -> dict[str, NDArray
 def require_equal(
     actual: Mapping[str, object], expected: Mapping[str, object], has: str, needs: str
 ) -> None:
-    """Require that ``actual`` and ``expected`` are equal maps of tensor names to dtype and shape.
+    """Raise ArtifactError `wrong_shape` unless both maps of tensors to dtype and shape are equal.
 
-    ``has`` and ``needs`` are the words of the error message before the actual tensor and before the
-    expected tensor.
-
-    Raises:
-        ArtifactError: `wrong_shape` for the first tensor that differs.
+    ``has`` and ``needs`` are the words of the message before the actual and the expected tensor.
     """
     for name in sorted(actual.keys() | expected.keys()):
         entry, needed = actual.get(name, "none"), expected.get(name, "none")

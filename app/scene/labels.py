@@ -210,8 +210,7 @@ _IDS: Final = re.compile(
 def readings(label: str) -> Iterator[tuple[Rule, str]]:
     """Yield pairs (rule, name) of the names in a detector's label, most certain name first.
 
-    A name can need two rules: "a photo of a sofa/couch". Its pair contains the first rule. The
-    function yields at most `_MOST_READINGS` pairs.
+    A name can need two rules: "a photo of a sofa/couch". Its pair contains the first rule.
     """
     return islice(_readings(label), _MOST_READINGS)
 

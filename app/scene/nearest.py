@@ -142,9 +142,6 @@ class NameIndex:
         """Return the entry whose name is the phrase, perhaps with misspelt words.
 
         The result is None if the edits cost too much, or if another entry costs about the same.
-
-        Args:
-            corrections: for each word, pairs (known word, cost of the edits); see `_corrections`.
         """
         costs: dict[int, tuple[int, int]] = {}  # by entry: cost and maximum cost
         for spelling in itertools.product(*(corrections[word] for word in words)):
@@ -207,10 +204,7 @@ class NameIndex:
             yield Match(self._entries[row], similarity * factor)
 
     def _by_last_word(self, words: Sequence[str]) -> Iterator[Match]:
-        """Yield the entries whose names have the same last word.
-
-        The similarity grows with the shared words as a share of all words of both names.
-        """
+        """Yield the entries whose names have the same last word."""
         for row in self._by_head.get(words[-1], ()) if words else ():
             known_words = self._words[row]
             shared = len({*words} & {*known_words}) / len({*words, *known_words})
