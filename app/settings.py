@@ -74,15 +74,13 @@ def _names_of_this_machine() -> set[str]:
     return {name for name in names if _HOST.fullmatch(name)}
 
 
-_ORIGIN: Final = re.compile(r"(https?)://([\w.-]+|\[[0-9a-f:.]+\])(:[1-9][0-9]{0,4})?")
+_ORIGIN: Final = re.compile(r"https?://([a-z0-9_.-]+|\[[0-9a-f:.]+\])(:[1-9][0-9]{0,4})?")
 
 
 def _is_origin(text: str) -> bool:
     """Return whether a browser could send exactly this text as the Origin header."""
-    match = _ORIGIN.fullmatch(text)
-    if match is None or text != text.lower():
-        return False
-    return match[3] != {"http": ":80", "https": ":443"}[match[1]]
+    default_port = ":443" if text.startswith("https:") else ":80"
+    return _ORIGIN.fullmatch(text) is not None and not text.endswith(default_port)
 
 
 class _Environment(EnvSettingsSource):

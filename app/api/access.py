@@ -18,11 +18,7 @@ API_KEY: Final = "X-API-Key"
 TIMEOUT_HEADER: Final = "X-Request-Timeout-Ms"
 
 HEALTH: Final = frozenset(("/health/live", "/health/ready"))
-"""Routes of health checks. They accept every Host header and take no turn.
-
-Orchestrators and load balancers send the address of a replica as Host header. The answer of a
-health check contains only a status, so it reveals no data.
-"""
+"""Routes of health checks. They accept every Host header and take no turn."""
 
 # Paths that need no API key. Orchestrators send health checks without credentials. The HTML pages
 # contain no private data. docs/security.md gives the reasons.

@@ -299,10 +299,7 @@ class JSONRoute(APIRoute):
 
 async def _send(answer: bytes, bodies: Bodies, client: str, send: Send) -> None:
     """Send an answer to a client. A large answer is sent in parts."""
-    headers = [
-        (b"content-length", b"%d" % len(answer)),
-        (b"content-type", b"application/json"),
-    ]
+    headers = [(b"content-length", b"%d" % len(answer)), (b"content-type", b"application/json")]
     start = {"type": "http.response.start", "status": 200, "headers": headers}
     if len(answer) <= _PART:
         await send(start)

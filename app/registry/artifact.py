@@ -110,10 +110,9 @@ class Artifact:
 
     @cached_property
     def intruder_prior(self) -> NDArray[np.float64]:
-        """(V,) log prior that an intruder has each class, up to a constant.
+        """(V,) log prior that an intruder has each class, up to a constant: alpha · popularity.
 
-        It is alpha times the popularity. A class that no training scene shows counts as the rarest
-        other class: its log-odds in an empty scene do not matter.
+        A class that no training scene shows counts as the rarest other class.
         """
         calibration, none = self.calibration, np.zeros(0, np.int64)
         if not calibration.popularity:
@@ -126,10 +125,7 @@ class Artifact:
 
     @cached_property
     def rarely_shown(self) -> NDArray[np.bool_]:
-        """(V,) True for classes that fewer than `RARELY` of the training scenes show.
-
-        Without popularity in the calibration, no class is rare.
-        """
+        """(V,) True for classes that fewer than `RARELY` of the training scenes show."""
         if not self.calibration.popularity:
             return np.zeros(self.spec.V, np.bool_)
         popularity = np.array(self.calibration.popularity, dtype=np.float64)
@@ -199,8 +195,7 @@ def load_artifact(
 
     Args:
         directory: directory with exactly the three files of an artifact.
-        previous: an artifact that was loaded earlier. The function returns it instead of a second
-            copy if the verified files have the same digest.
+        previous: an earlier artifact, which the function returns if its digest is unchanged.
         max_weights_bytes: maximum size of the weights file, checked before the file is read.
 
     Raises:

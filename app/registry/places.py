@@ -133,9 +133,8 @@ class Places(TensorGroup):
     def unseen(self) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Change of the log-odds of stacked relations that training never shows.
 
-        The change is the log share of the subject's stand: on a wall for above, on or in an object
-        for on-top and inside. So a blackboard does not stand on a chair. Shares of at least `USUAL`
-        do not change the log-odds.
+        The change is the log share of the subject's stand, at most `USUAL`: on a wall for above, on
+        or in an object for on-top and inside. So a blackboard does not stand on a chair.
 
         Returns:
             Relations of `STACKED` that training shows, (V, V): bit a is relation a. Then the change

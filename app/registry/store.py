@@ -116,8 +116,7 @@ class Store:
         """Return the (name, version) that an alias, `name` or `name@version` points at.
 
         Raises:
-            StoreError: the reference does not resolve (see `resolve_reference`), or the code is
-                `invalid_aliases` or `unreadable`.
+            StoreError: see `resolve_reference`; also `invalid_aliases` or `unreadable`.
         """
         self.names()  # without a readable root, no name is unknown
         return resolve_reference(reference, self.aliases(), self.versions)

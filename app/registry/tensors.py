@@ -31,9 +31,8 @@ def pack(
     Args:
         state: maps names to numpy arrays or CPU tensors. Arrays of integers and booleans keep their
             dtype.
-        storage_dtype: dtype of floating-point arrays with two or more axes. float16 halves the size
-            of the file, with a relative error of at most 2^-11 per weight. Floating-point arrays
-            with at most one axis (biases) are stored as float32.
+        storage_dtype: dtype of floating-point arrays with two or more axes. float16 has a relative
+            error of at most 2^-11 per weight. Biases are stored as float32.
 
     Raises:
         ArtifactError: `not_finite` for NaN, infinity or a weight above the float16 maximum of

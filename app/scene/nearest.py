@@ -28,8 +28,7 @@ from app.scene.labels import LookUp, head_of, split_words
 LONGEST: Final = 64
 """Maximum length of a name whose spelling the search compares, in characters.
 
-The length counts after Unicode normalisation, which can turn one character into 18. The time of a
-comparison grows with the length. All class names have fewer than 32 characters.
+The length counts after Unicode normalisation. All class names have fewer than 32 characters.
 """
 
 _LEAST: Final = 0.7  # minimum similarity of a suggestion
@@ -162,10 +161,9 @@ class NameIndex:
         return LookUp(entry, round(1 - cost / 2 / len("".join(words)), 3), "spelling")
 
     def _corrections(self, word: str) -> list[tuple[str, int]]:
-        """Return the known words with a similar spelling, as pairs (known word, cost of the edits).
+        """Return at most `_MOST_CORRECTIONS` pairs (known word, cost of the edits), cheapest first.
 
-        The list has at most `_MOST_CORRECTIONS` pairs, cheapest first. A short word, or a word
-        without similar words, stands for itself: the list is [(word, 0)].
+        A short word, or a word without similar words, stands for itself: [(word, 0)].
         """
         if len(word) < _SHORTEST:
             return [(word, 0)]

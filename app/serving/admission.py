@@ -49,7 +49,7 @@ SLOW_SLOTS: Final = 2
 SMALL: Final = 16 * 1024
 """Maximum size in bytes of a body that the event loop parses, in less than a millisecond.
 
-The service accepts such a body if it arrives in one piece, also when other bodies fill the budget.
+In one piece, such a body is always accepted.
 """
 
 # Time in seconds between two checks of the client's connection during a computation in a thread.

@@ -100,8 +100,7 @@ class ServedModels:
 
     @cached_property
     def _resolved(self) -> dict[str, Artifact]:
-        # The cache contains only valid references, because clients can send any number of invalid
-        # references. The contents of the store limit the number of valid references.
+        # Only valid references, because clients can send any number of invalid ones.
         return {}
 
     @cached_property

@@ -179,11 +179,7 @@ def is_quick(scene: SceneRequest, vocabulary: Vocabulary) -> bool:
 
 
 def is_small(scene: Mapping[str, Any]) -> bool:
-    """Return whether the event loop may validate a scene.
-
-    Args:
-        scene: the fields of the request, validated or not.
-    """
+    """Return whether the event loop may validate a scene, given by its fields."""
     for name, value in scene.items():
         if isinstance(value, list):
             if len(value) > (QUICK_OBJECTS if name == "objects" else QUICK_ENTRIES):
