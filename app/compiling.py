@@ -49,7 +49,7 @@ def _make_private(folder: Path) -> None:
 
 def _choose() -> tuple[Path | None, str]:
     """Return the first usable directory or None, and why the directories before it are not."""
-    problems = []
+    problems: list[str] = []
     for folder in _folders():
         try:
             _make_private(folder)

@@ -77,5 +77,5 @@ async def _handle(request: Request, error: Exception) -> Response:
 
 
 def install(app: FastAPI) -> None:
-    """Answer Starlette's exceptions with problems. `Failures` in `app.api.gateway` answers others."""
+    """Answer exceptions of Starlette with problems. The gateway answers all other exceptions."""
     app.add_exception_handler(HTTPException, _handle)
