@@ -38,8 +38,7 @@ def _make_private(folder: Path) -> None:
         raise NotADirectoryError(f"{folder} is not a directory")
     if status.st_uid != os.geteuid() or parent.st_uid not in {os.geteuid(), 0}:
         raise PermissionError(f"{folder} or its parent belongs to another user")
-    # A parent with the sticky bit, such as /tmp, is safe. Other users can add files to this parent,
-    # but they cannot replace files of this user.
+    # In a parent with the sticky bit, such as /tmp, others cannot replace files of this user.
     by_others = stat.S_IWGRP | stat.S_IWOTH
     unsafe_parent = parent.st_mode & by_others and not parent.st_mode & stat.S_ISVTX
     if status.st_mode & by_others or unsafe_parent:

@@ -153,8 +153,8 @@ class _Pieces:
 
     def _each(self, brackets: str) -> Iterator[None]:
         """Read the brackets and commas of an object or array. Yield before each of its parts."""
-        opening, closing = brackets
-        self._mark(opening)
+        closing = brackets[1]
+        self._mark(brackets[0])
         mark = self._mark(closing) if self._peek() == closing else ","
         while mark != closing:
             yield
@@ -252,19 +252,14 @@ def _check_media(scope: Scope) -> None:
 
 
 class JSONRoute(APIRoute):
-    """A route that parses and validates the JSON body without FastAPI.
+    """A route that parses and validates the JSON body, because FastAPI's parser is too lenient.
 
-    FastAPI only documents the route, because FastAPI's JSON parser is too lenient. The endpoint
-    receives the validated body as ``data``, the HTTP request as ``http`` and the path parameters.
-    It returns the answer as bytes.
+    The endpoint receives the validated body as ``data``, the HTTP request as ``http`` and the path
+    parameters. It returns the answer as bytes.
     """
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one request.
-
-        Raises:
-            ServiceError: the service cannot answer the request.
-        """
+        """Answer one request, or raise ServiceError."""
         if scope["method"] not in (self.methods or ()):
             await super().handle(scope, receive, send)
             return

@@ -20,7 +20,7 @@ _MODEL: Final = {
     "variant": "triway",
     "digest": "4e706b9f30e062589ec5cace2744da497a49f08f095626ee533c50f22dad94d4",
 }
-_LISTS: Final = {"ignored": [], "mapped": [], "warnings": []}
+_LISTS: Final[dict[str, Any]] = {"ignored": [], "mapped": [], "warnings": []}
 _ENVELOPE: Final = {"model": _MODEL, "request_id": REQUEST_ID, **_LISTS}
 
 _VERSION: Final = {"version": "1.0.0", "status": "ready", "aliases": ["default"]} | {

@@ -75,11 +75,7 @@ class Size:
         self._limit_of_scene = min(settings.max_scene_bytes, self._limit)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on.
-
-        Raises:
-            ServiceError: the body is too large, too slow or incomplete, or the budget is full.
-        """
+        """Pass a request on. The errors are those of `Bodies.read`."""
         state = scope["state"]
         if scope["method"] not in _WITH_BODY:
             state["body"] = b""

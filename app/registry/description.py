@@ -285,12 +285,6 @@ class Metric(Frozen):
     high: float
     n: Annotated[int, Field(ge=1)]
 
-    @model_validator(mode="after")
-    def _is_interval(self) -> Self:
-        if self.low > self.high:
-            raise ValueError(f"low ({self.low}) must not exceed high ({self.high})")
-        return self
-
 
 MAX_EXAMPLES: Final = 8
 MAX_EXAMPLES_BYTES: Final = 32_768

@@ -14,7 +14,7 @@ import re
 from collections.abc import Mapping
 from typing import Annotated, Final, Literal, Self
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, field_validator
 
 from app.registry.counts import Counts
 from app.registry.description import Description
@@ -57,7 +57,14 @@ class Manifest(Description):
 
     format: Literal[8] = FORMAT
     tensors: Annotated[dict[str, TensorEntry], Field(max_length=MAX_TENSORS)]
-    files: Annotated[dict[Literal["model.safetensors", "card.md"], FileEntry], Field(min_length=2)]
+    files: dict[str, FileEntry]
+
+    @field_validator("files")
+    @classmethod
+    def _names_every_file(cls, files: dict[str, FileEntry]) -> dict[str, FileEntry]:
+        if set(files) != {WEIGHTS, CARD}:
+            raise ValueError(f"the files must be exactly {WEIGHTS} and {CARD}")
+        return files
 
     def to_bytes(self) -> bytes:
         """Return the contents of the manifest file, with the checksum at the end."""

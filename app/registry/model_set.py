@@ -5,18 +5,16 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import groupby
 from operator import itemgetter
 from types import MappingProxyType
-from typing import Final, TypeVar
+from typing import Final
 
 from app.registry.artifact import Artifact
 from app.registry.errors import ArtifactError, StoreError
 from app.registry.references import AliasTarget, resolve_reference, version_key
 from app.registry.store import Store
-
-T = TypeVar("T")
 
 _logger = logging.getLogger("app.registry")
 
@@ -87,7 +85,9 @@ EMPTY: Final = ModelSet({}, {})
 
 
 def load_model_set(
-    store: Store, previous: ModelSet = EMPTY, check: Callable[[Artifact], None] = lambda _: None
+    store: Store,
+    previous: ModelSet = EMPTY,
+    check: Callable[[Artifact], None] = lambda _: None,
 ) -> ModelSet:
     """Load and verify every version of a store. The result contains all errors.
 
@@ -96,23 +96,25 @@ def load_model_set(
     Args:
         check: further check of each new artifact. It raises `ArtifactError`.
     """
-    failures: list[StoreError] = []
-
-    def attempt(read: Callable[[], T], otherwise: T) -> T:
+    failure: StoreError | None = None
+    aliases: Mapping[str, AliasTarget]
+    try:
+        # Aliases are read before versions. Writers publish a version before its alias, so the list
+        # of versions contains the target of each alias.
+        aliases = store.aliases()
+    except StoreError as error:
+        aliases, failure = {}, StoreError(error.code, error.reason)
+    keys: list[tuple[str, str]] = []
+    try:
+        names = store.names()
+    except StoreError as error:
+        names, failure = [], StoreError(error.code, error.reason)
+    for name in names:
         try:
-            return read()
-        except StoreError as error:
-            failures.append(StoreError(error.code, error.reason))
-            return otherwise
-
-    # Aliases are read before versions. Writers publish a version before its alias, so the list of
-    # versions contains the target of each alias.
-    aliases = attempt(store.aliases, {})
-    names = attempt(store.names, [])
-    versions = {name: attempt(partial(store.versions, name), ()) for name in names}
-    keys = [(name, version) for name in names for version in versions[name]]
+            keys += [(name, version) for version in store.versions(name)]
+        except StoreError as error:  # only this model's folder is unreadable
+            failure = StoreError(error.code, error.reason)
     entries = {key: _load(store, *key, previous.artifacts.get(key), check) for key in keys}
-    failure = failures[-1] if failures else None
     return ModelSet(MappingProxyType(entries), MappingProxyType(dict(aliases)), failure)
 
 

@@ -39,8 +39,7 @@ _MODEL: Final = ("model", "version")
 _FINDINGS: Final = (("outlier", "misplaced"), ("ignored", "guessed"), get_args(WarningCode))
 _GUESSES: Final = ("spelling", "head")  # the other rules of `scene_client.schemas.Rule` are certain
 
-# By default, the library adds a second series to each counter, the creation time. Prometheus does
-# not need this series, because it detects restarts itself.
+# Prometheus needs no second series of each counter, because it detects restarts itself.
 disable_created_metrics()  # type: ignore[no-untyped-call]
 
 
