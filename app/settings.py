@@ -119,8 +119,6 @@ def warnings() -> list[str]:
 class Settings(BaseSettings):
     """The settings of the service.
 
-    By default, the service listens only on the loopback address.
-
     Raises:
         pydantic.ValidationError: a value is invalid. Each message names the environment variable.
     """

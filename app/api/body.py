@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterator, Sized
 from contextlib import suppress
 from email.message import Message
+from functools import cache
 from itertools import islice
 from typing import Any, Final, TypeVar
 
@@ -38,18 +39,34 @@ _PART: Final = 64 * 1024
 
 
 def validated(value: Any, form: type[FormT], *, at: errors.Location = ()) -> FormT:
-    """Validate a JSON value.
+    """Validate a JSON value. Refuse lists with too many entries before their validation.
 
     ``at`` is the location of the value in a batch request. It is empty for other requests.
 
     Raises:
         InvalidRequestError: the value does not match the schema.
     """
+    too_long = [
+        FieldError(pointer=pointer((*at, name)), message=f"must have at most {most} entries")
+        for name, most in _most_entries(form).items()
+        if isinstance(value, dict) and isinstance(value.get(name), list) and len(value[name]) > most
+    ]
+    if too_long:
+        raise errors.InvalidRequestError(errors=too_long)
     try:
         return form.model_validate(value)
     except ValidationError as error:
         invalid = field_errors(error, value, form, at=at)
         raise errors.InvalidRequestError(errors=invalid) from None
+
+
+@cache
+def _most_entries(form: type[Form]) -> dict[str, int]:
+    """Return the maximum length of each list (and text) among the fields of a schema."""
+    limits = (
+        (name, limit) for name, field in form.model_fields.items() for limit in field.metadata
+    )
+    return {name: limit.max_length for name, limit in limits if hasattr(limit, "max_length")}
 
 
 def parse(body: bytes, most: int) -> Any:

@@ -67,8 +67,7 @@ class Runtime:
         """Load, verify and warm up all versions in the store, and follow its changes."""
         sys.setswitchinterval(_SWITCH_INTERVAL)
         check_cache()
-        # The models load on this thread, because the service has no requests yet. Another thread
-        # would cost time and memory.
+        # The models load on this thread, because the service has no requests yet.
         self._serve(self._load())
         self._following = asyncio.create_task(self._follow_store())
 
@@ -132,8 +131,7 @@ class Runtime:
             _freeze_memory()
 
     def _load(self) -> ServedModels:
-        # Read the state before the files. So the next check of the store finds changes that other
-        # processes make during the load.
+        # Read the state first. So the next check finds changes that are made during the load.
         self._loaded_state = self._store.state()
         with progress(KERNELS):
             return ServedModels(load_model_set(self._store, self.models.store, warm_up))
