@@ -44,11 +44,7 @@ def _refuse_arguments(arguments: list[str] | None) -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Serve until the process is stopped. Return 2 for invalid settings, else as `serve`.
 
-    Args:
-        arguments: those of the command line, by default. Every argument but --help is an error.
-
-    Raises:
-        SystemExit: there are arguments.
+    Arguments end the process (SystemExit).
     """
     began = monotonic()
     from pydantic import ValidationError
@@ -67,8 +63,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 # Number of new objects after which Python starts a garbage collection. Python's default of 700
-# costs 4 to 8 % of a request's time. Reference counting already frees the containers of an answer
-# (about 200).
+# costs 4 to 8 % of a request's time.
 _YOUNG = 10_000
 
 # The C function mallopt(3) takes these two numbers: option M_MMAP_THRESHOLD, limit in bytes.
@@ -85,8 +80,7 @@ def tune() -> None:
     gc.disable()
     gc.set_threshold(_YOUNG, *gc.get_threshold()[1:])
     # Return freed blocks of 128 KiB or more to the operating system at once. By default, the C
-    # library raises this limit whenever a large block is freed. After request bodies of several
-    # megabytes, the process would then hold 20 MB of unused memory.
+    # library raises this limit, and the process would hold 20 MB of unused memory.
     if (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
         mallopt(_M_MMAP_THRESHOLD, _LARGE)
     # A question needs only small matrix products. More threads would take cores from other

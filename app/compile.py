@@ -1,8 +1,4 @@
-"""``python -m app.compile``: compile kernels and sources for this machine before the first start.
-
-Without this command, the first start of the service compiles the kernels. If the service cannot
-store the compiled kernels, every start compiles the kernels again.
-"""
+"""``python -m app.compile``: compile kernels and sources for this machine before a start."""
 
 from __future__ import annotations
 
@@ -20,10 +16,7 @@ from app.settings import Settings
 def main() -> int:
     """Warm up every model of the store, then compile all Python sources to bytecode.
 
-    A warm-up asks a model each question once. The first question compiles the kernels.
-
-    Returns:
-        Exit status of the process: 1 if a model, an alias or the store is not usable, else 0.
+    Return the exit status: 1 if a model, an alias or the store is not usable, else 0.
     """
     settings = Settings()
     dictConfig(log_config(settings.log_level, settings.log_format, settings.secrets))

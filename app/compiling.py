@@ -6,16 +6,15 @@ service refuses a directory that other users can change.
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import os
 import stat
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 _logger = logging.getLogger("app.compiling")
 
@@ -26,10 +25,9 @@ def _folders() -> Iterator[Path]:
         yield Path(configured).absolute()
         return
     yield Path(__file__).parent.parent / ".numba_cache"
-    if cache := os.environ.get("XDG_CACHE_HOME"):
-        yield Path(cache) / "scene-boltzmann"
     with suppress(RuntimeError):  # the user does not have a home directory
-        yield Path.home() / ".cache" / "scene-boltzmann"
+        cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        yield Path(cache) / "scene-boltzmann"
 
 
 def _make_private(folder: Path) -> None:
@@ -40,8 +38,7 @@ def _make_private(folder: Path) -> None:
         raise NotADirectoryError(f"{folder} is not a directory")
     if status.st_uid != os.geteuid() or parent.st_uid not in {os.geteuid(), 0}:
         raise PermissionError(f"{folder} or its parent belongs to another user")
-    # A parent with the sticky bit, such as /tmp, is safe. Other users can add files to this parent,
-    # but they cannot replace files of this user.
+    # In a parent with the sticky bit, such as /tmp, others cannot replace files of this user.
     by_others = stat.S_IWGRP | stat.S_IWOTH
     unsafe_parent = parent.st_mode & by_others and not parent.st_mode & stat.S_ISVTX
     if status.st_mode & by_others or unsafe_parent:
@@ -51,14 +48,13 @@ def _make_private(folder: Path) -> None:
 
 def _choose() -> tuple[Path | None, str]:
     """Return the first usable directory or None, and why the directories before it are not."""
-    problems = []
+    problems: list[str] = []
     for folder in _folders():
         try:
             _make_private(folder)
+            return folder, "; ".join(problems)
         except OSError as error:
             problems.append(str(error))
-        else:
-            return folder, "; ".join(problems)
     return None, "; ".join(problems)
 
 
@@ -88,25 +84,19 @@ def check_cache() -> None:
         _logger.info("compiled loops are stored in %s: %s", FOLDER, _PROBLEM)
 
 
-@contextmanager
-def progress(kernels: Sequence[Any]) -> Iterator[None]:
-    """Log the loops that the ``with`` block compiles. Only one process compiles at a time."""
-    listener = _Progress(kernels)
-    try:
-        with event.install_listener("numba:compile", listener):
-            yield
-    finally:
-        listener.unlock()
+def progress(kernels: Sequence[Any]) -> AbstractContextManager[Any]:
+    """Return a context manager that logs the loops compiled in its ``with`` block."""
+    listener = event.install_listener("numba:compile", _Progress(kernels))
+    return cast("AbstractContextManager[Any]", listener)
 
 
 class _Progress(event.Listener):
-    """Event listener that locks the cache directory and logs at most one line per second."""
+    """Event listener that logs at most one line per second."""
 
     def __init__(self, kernels: Sequence[Any]) -> None:
         self._kernels = {id(kernel) for kernel in kernels}
         self._begun: set[int] = set()
         self._logged = float("-inf")
-        self._lock: int | None = None
 
     def on_start(self, event: Any) -> None:
         """Log the start of a loop's compilation. Ignore functions of numba itself."""
@@ -115,7 +105,6 @@ class _Progress(event.Listener):
             return
         if not self._begun:
             _logger.info("compiling loops, once for this version")
-            self._lock = _lock()
         self._begun.add(kernel)
         if time.monotonic() - self._logged >= 1:
             _logger.info("compiling loop %d of %d", len(self._begun), len(self._kernels))
@@ -123,23 +112,3 @@ class _Progress(event.Listener):
 
     def on_end(self, event: Any) -> None:
         """Ignore the end of a compilation."""
-
-    def unlock(self) -> None:
-        """Let other processes compile."""
-        if self._lock is not None:
-            os.close(self._lock)
-
-
-def _lock() -> int | None:
-    """Wait until no other process compiles. The lock ends when its file is closed."""
-    if FOLDER is None:
-        return None
-    file = os.open(FOLDER / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        _logger.info("waiting until another process has compiled the same loops")
-        fcntl.flock(file, fcntl.LOCK_EX)
-    except OSError:  # the file system does not support file locks
-        _logger.debug("the file system of %s does not support locks", FOLDER)
-    return file

@@ -67,8 +67,7 @@ class LocatedError:
 class ServiceError(HTTPException):
     """Base class of all errors that the service answers with.
 
-    This class extends `HTTPException`, because Starlette wraps all other exceptions that occur
-    while Starlette reads a body. A subclass without a slug has the problem type of its base class.
+    A subclass without a slug has the problem type of its base class.
 
     Args:
         detail: cause of this error. Clients receive it. The default is the title.
@@ -123,10 +122,7 @@ class ServiceError(HTTPException):
 class RequestError(ServiceError):
     """The request does not match the schema or the model, or is contradictory.
 
-    Args:
-        located: errors in the request. `locate` converts them to `errors`.
-        errors: further errors in the request, with pointers.
-        detail: cause of this error. The default is the number of errors.
+    `locate` converts the ``located`` errors to `errors`. The default detail is their number.
     """
 
     _hint: ClassVar[str] = ""
@@ -170,9 +166,8 @@ class NotJSONError(ServiceError, slug="not-json", status=400, steps=("body",)):
     """The body is not acceptable JSON.
 
     The body must be one JSON value in UTF-8 without a byte order mark. The service refuses NaN,
-    Infinity, lone surrogates, duplicate member names in an object and nesting deeper than 200. JSON
-    parsers read such texts in different ways. In a body of at most 16 KiB, `errors` points at each
-    NaN and Infinity.
+    Infinity, lone surrogates, duplicate member names in an object and nesting deeper than 200. In a
+    body of at most 16 KiB, `errors` points at each NaN and Infinity.
     """
 
 
@@ -196,14 +191,6 @@ class UnauthorizedError(ServiceError, slug="unauthorized", status=401, steps=("k
     """
 
 
-class OriginRefusedError(ServiceError, slug="origin-refused", status=403):
-    """Pages of this origin may not send this request.
-
-    A browser asked whether a page of another origin may send a request. SCENE_CORS_ORIGINS lists
-    the allowed origins. Pages of these origins may ask questions and read the models.
-    """
-
-
 class NotFoundError(ServiceError, slug="not-found", status=404, steps=("http",)):
     """The service has no route at this path.
 
@@ -214,8 +201,7 @@ class NotFoundError(ServiceError, slug="not-found", status=404, steps=("http",))
 class UnknownModelError(ServiceError, slug="model-not-found", status=404, steps=("name",)):
     """The model or version does not exist.
 
-    Name a model by an alias, by its name or as name@version. A name selects the newest usable
-    version. GET /models lists all models, versions and aliases.
+    Name a model by an alias, by its name or as name@version. GET /models lists all three.
     """
 
 
@@ -229,8 +215,8 @@ class MethodNotAllowedError(ServiceError, slug="method-not-allowed", status=405,
 class RequestTimeoutError(ServiceError, slug="request-timeout", status=408, steps=("body",)):
     """The request did not arrive in time.
 
-    The body of a request must arrive within SCENE_CLIENT_TIMEOUT seconds after its headers. The
-    service closes the connection. Send the request again on a new connection.
+    The body of a request must arrive within SCENE_CLIENT_TIMEOUT seconds after its headers. Send
+    the request again on a new connection.
     """
 
 
@@ -255,9 +241,9 @@ class UnsupportedMediaTypeError(
 class InvalidRequestError(RequestError, slug="invalid-request", status=422, steps=("body", "word")):
     """The request is not valid for this route.
 
-    The body is JSON, but does not match the schema of this route. `errors` lists the errors. The
-    `pointer` of an error is a JSON pointer into the body. `suggestions` lists the nearest valid
-    names. A label in a path has at most 100 characters.
+    The body does not match the schema of this route. The `pointer` of an error is a JSON pointer
+    into the body. `suggestions` lists the nearest valid names. A label in a path has at most 100
+    characters.
     """
 
     example = _example("#/objects/1/confidence", "must be greater than 0")
@@ -266,20 +252,19 @@ class InvalidRequestError(RequestError, slug="invalid-request", status=422, step
 class UnreadableFileError(RequestError, slug="unreadable-file", status=422, steps=("file",)):
     """The file contains no scene that can be read.
 
-    `detail` gives the reason. docs/clients.md lists the formats. POST /scenes reads files with at
-    most 32,768 lines, lists, objects, elements or attributes. The command `scene` reads larger
-    files. Numeric class ids need the field `label_map`.
+    docs/clients.md lists the formats. POST /scenes reads files with at most 32,768 lines, lists,
+    objects, elements or attributes; the command `scene` reads larger files. Numeric class ids need
+    the field `label_map`.
     """
 
 
 class UnknownLabelsError(RequestError, slug="unknown-labels", status=422, steps=("scene",)):
     """The model does not know some labels or room types.
 
-    `errors` points at each unknown name and suggests the nearest known ones. With `unknown_labels`
-    set to `ignore`, the service ignores unknown labels and lists them in `ignored`. With `nearest`,
-    it maps misspelt labels and phrases to a class and lists them in `mapped`. It refuses a label
-    that could be several classes. With `nearest-or-ignore`, it ignores such a label. GET
-    /models/{name}/vocabulary lists every known label.
+    GET /models/{name}/vocabulary lists every known label. With `unknown_labels` set to `ignore`,
+    the service ignores unknown labels and lists them in `ignored`. With `nearest`, it maps misspelt
+    labels and phrases to a class and lists them in `mapped`. It refuses a label that could be
+    several classes. With `nearest-or-ignore`, it ignores such a label.
     """
 
     example = _example("#/objects/1", "the model does not know this label", "nightstand")
@@ -294,9 +279,8 @@ class UnknownLabelsError(RequestError, slug="unknown-labels", status=422, steps=
 class ContradictionError(RequestError, slug="contradictory-evidence", status=422, steps=("scene",)):
     """The scene contradicts itself.
 
-    There are three cases. An object has a relation to itself. A pair has both a relation and its
-    opposite (left and right, on-top and under). Objects hold each other in a circle: a box on a
-    book, the book on a laptop, and the laptop in the box.
+    An object has a relation to itself, a pair has both a relation and its opposite (left and
+    right), or objects hold each other in a circle: a box on a book, and the book in the box.
     """
 
     example = _example(
@@ -307,8 +291,8 @@ class ContradictionError(RequestError, slug="contradictory-evidence", status=422
 class RareRoomTypeError(RequestError, slug="rare-room-type", status=422, steps=("scene",)):
     """The model has too few training scenes of this room type to sample such a room.
 
-    The field `rare_room_types` of GET /models/{name}/vocabulary lists these room types. The other
-    questions accept them. Leave the room type out, or choose another one.
+    The field `rare_room_types` of GET /models/{name}/vocabulary lists these room types. Leave the
+    room type out, or choose another one.
     """
 
     example = _example(
@@ -320,8 +304,7 @@ class RareRoomTypeError(RequestError, slug="rare-room-type", status=422, steps=(
 class AnswerTooLargeError(RequestError, slug="answer-too-large", status=422, steps=("scene",)):
     """The answer would be too large.
 
-    The answer would exceed SCENE_MAX_ANSWER_BYTES. `errors` points at the parameter to lower:
-    `top_k`, `count` or the number of `objects`. Shorter ids also make the answer smaller. All
+    The answer would exceed SCENE_MAX_ANSWER_BYTES. `errors` points at the parameter to lower. All
     scenes of a batch share one limit, and a batch stops at the first answer beyond it. Send the
     refused scenes in another request.
     """
@@ -331,9 +314,8 @@ class HostRefusedError(ServiceError, slug="host-refused", status=421, steps=("ho
     """The service does not answer to this host name.
 
     The Host header must contain an IP address or one of the names in SCENE_ALLOWED_HOSTS. The
-    service ignores the port in this header. The default names are localhost, the host name of the
-    machine, and this name with .local. If clients use another name, add this name to
-    SCENE_ALLOWED_HOSTS. Health checks accept every host name.
+    default names are localhost, the host name of the machine, and this name with .local. Health
+    checks accept every host name.
     """
 
 
@@ -341,16 +323,14 @@ class BodiesFullError(ServiceError, slug="bodies-full", status=503, steps=("body
     """The service holds too many bytes of request bodies and answers.
 
     All requests in progress share SCENE_HELD_BODY_BYTES for their bodies and for large answers. One
-    client holds at most a quarter. The service always accepts a body of at most 16 KiB that has
-    arrived whole. Send the request again after the time in Retry-After.
+    client holds at most a quarter. Send the request again after the time in Retry-After.
     """
 
 
 class InternalError(ServiceError, slug="internal-error", status=500, steps=("route",)):
     """The service failed.
 
-    This is a defect of the service. Search the log of the service for the request id to find the
-    details.
+    This is a defect. The log of the service contains the request id and the details.
     """
 
 
@@ -366,15 +346,13 @@ class ModelUnavailableError(ServiceError, slug="model-unavailable", status=503, 
     """This model is not usable.
 
     The version is in the store, but the service refused to load it. GET /models gives the reason.
-    Other models may still be usable.
     """
 
 
 class DrainingError(ServiceError, slug="draining", status=503, steps=("readiness",)):
     """The service is shutting down.
 
-    The service soon closes its socket. Use another instance, or send the request again after the
-    time in Retry-After.
+    Use another instance, or send the request again after the time in Retry-After.
     """
 
 
@@ -382,8 +360,8 @@ class QueueFullError(ServiceError, slug="queue-full", status=429, steps=("admiss
     """Too many requests are waiting.
 
     The queue of requests (SCENE_QUEUE_REQUESTS), of batches and large scenes (SCENE_QUEUE_ROWS) or
-    of drawn scenes is full. One client holds at most a quarter of a queue. The service did not
-    start the computation. Send the request again after the time in Retry-After.
+    of drawn scenes is full. One client holds at most a quarter of a queue. Send the request again
+    after the time in Retry-After.
     """
 
 
@@ -391,5 +369,5 @@ class DeadlinePassedError(ServiceError, slug="deadline-passed", status=504, step
     """The deadline passed.
 
     The answer was not complete within the time limit of the request. X-Request-Timeout-Ms sets this
-    limit. The default is SCENE_REQUEST_TIMEOUT_MS. The service has stopped the computation.
+    limit. The default is SCENE_REQUEST_TIMEOUT_MS.
     """

@@ -34,11 +34,7 @@ class InProcess(httpx.BaseTransport):
     def __init__(self, store: Path) -> None:
         try:
             settings = _FixedSettings(
-                store=store,
-                metrics=False,
-                access_log=False,
-                docs=False,
-                allowed_hosts=("*",),
+                store=store, metrics=False, access_log=False, docs=False, allowed_hosts=("*",)
             )
         except ValidationError:  # of the store, because all other values are fixed
             raise InvalidRequestError.about("the store must be an existing directory") from None

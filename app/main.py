@@ -66,11 +66,7 @@ def _add_routes(app: FastAPI, settings: Settings) -> None:
     app.router.routes.extend(
         (*questions.router.routes, *questions.batches.routes, *scenes.router.routes)
     )
-    routers = [
-        models.router,
-        health.router,
-        *([health.monitoring] if settings.metrics else []),
-    ]
+    routers = [models.router, health.router, *([health.monitoring] if settings.metrics else [])]
     for router in routers:
         app.include_router(router)
     pages.install(app, docs=settings.docs)

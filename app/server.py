@@ -32,9 +32,8 @@ from app.serving.logs import log_config
 from app.serving.runtime import Runtime
 from app.settings import Settings, warnings
 
-# The server closes a connection after this idle time in seconds. A proxy must close its idle
-# connections earlier. Otherwise the proxy may send a request while the server closes the
-# connection.
+# The server closes a connection after this idle time in seconds. A proxy must do so earlier, or it
+# may send a request while the server closes the connection.
 KEEP_ALIVE: Final = 20
 
 # A socket with one of these addresses listens on every address of the machine.
@@ -53,12 +52,6 @@ class Server(uvicorn.Server):
        A second signal, or Ctrl-C, ends this step at once.
     2. The server closes the listening socket.
     3. The server finishes the requests in progress.
-
-    Args:
-        config: configuration of uvicorn.
-        runtime: the runtime of the service. It is not ready during the shutdown.
-        settings: the settings of the service.
-        began: `time.monotonic()` at the start of the process.
     """
 
     def __init__(

@@ -6,7 +6,7 @@ import os
 import re
 import sys
 from difflib import get_close_matches
-from importlib.util import find_spec
+from importlib import import_module
 from ipaddress import IPv6Address, ip_address
 from pathlib import Path
 from socket import gethostname
@@ -29,7 +29,7 @@ from scene_client.schemas import MAX_RELATIONS
 MAX_OBJECTS = 256
 """Upper limit of the setting ``SCENE_MAX_OBJECTS``."""
 
-_EXPORTER = ("opentelemetry.sdk.trace", "opentelemetry.exporter.otlp.proto.http")
+_EXPORTER = "opentelemetry.exporter.otlp.proto.http"
 _ENDPOINTS = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
 
 _PREFIX: Final = "SCENE_"
@@ -38,23 +38,11 @@ _OF_CLIENTS: Final = ("URL",)
 _WITHOUT_USE: Final = {
     "ADMIN_KEY": "the service is administered with `python -m app.registry`, which needs no key"
 }
-_NO_STREAMS: Final = "the service has no streams; send each scene in a request of its own"
-_REMOVED: Final = {
-    "WORKERS": "a replica is one process; start several replicas",
-    **dict.fromkeys(("MAX_STREAMS", "STREAM_IDLE", "STREAM_RESUME"), _NO_STREAMS),
-}
 # Kubernetes sets such variables in each pod, for every Service whose name starts with `scene`.
 _SERVICE_LINK: Final = re.compile(
     r"(\w+_)?SERVICE_(HOST|PORT(_\w+)?)=.*|(\w+_)?PORT_\d+_(TCP|UDP|SCTP)(_\w+)?=.*"
     r"|\w+_PORT=(tcp|udp|sctp)://.*"
 )
-
-
-def _is_installed(module: str) -> bool:
-    try:
-        return find_spec(module) is not None
-    except ModuleNotFoundError:  # the parent package is not installed
-        return False
 
 
 def _lower(value: object) -> object:
@@ -72,11 +60,7 @@ _HOST: Final = re.compile(r"[a-z0-9_]([a-z0-9._-]*[a-z0-9_])?")
 
 
 def _host(text: str) -> str:
-    """Return a host name in lower case, or an IP address without brackets.
-
-    Raises:
-        ValueError: the text is neither a host name nor an IP address.
-    """
+    """Return a host name in lower case, or an IP address without brackets. Else: ValueError."""
     name = text.lower()
     if _HOST.fullmatch(name):
         return name
@@ -90,26 +74,20 @@ def _names_of_this_machine() -> set[str]:
     return {name for name in names if _HOST.fullmatch(name)}
 
 
-_ORIGIN: Final = re.compile(r"(https?)://([\w.-]+|\[[0-9a-f:.]+\])(:[1-9][0-9]{0,4})?")
+_ORIGIN: Final = re.compile(r"https?://([a-z0-9_.-]+|\[[0-9a-f:.]+\])(:[1-9][0-9]{0,4})?")
 
 
 def _is_origin(text: str) -> bool:
     """Return whether a browser could send exactly this text as the Origin header."""
-    match = _ORIGIN.fullmatch(text)
-    if match is None or text != text.lower():
-        return False
-    return match[3] != {"http": ":80", "https": ":443"}[match[1]]
+    default_port = ":443" if text.startswith("https:") else ":80"
+    return _ORIGIN.fullmatch(text) is not None and not text.endswith(default_port)
 
 
 class _Environment(EnvSettingsSource):
     """The environment variables of the service. Unknown names are errors."""
 
     def __call__(self) -> dict[str, Any]:
-        """Return the settings in the environment.
-
-        Raises:
-            pydantic.ValidationError: the environment contains an unknown setting.
-        """
+        """Return the settings in the environment. Unknown ones raise pydantic.ValidationError."""
         names = [name.upper() for name in self.settings_cls.model_fields]
         known = {*names, *_OF_CLIENTS, *_WITHOUT_USE}
         errors: list[InitErrorDetails] = []
@@ -120,9 +98,7 @@ class _Environment(EnvSettingsSource):
             if _SERVICE_LINK.fullmatch(f"{name}={value}"[:256]):
                 continue
             message = "unknown setting; docs/operations.md lists the settings"
-            if name in _REMOVED:
-                message = f"this setting is removed: {_REMOVED[name]}"
-            elif similar := get_close_matches(name, names, 1):
+            if similar := get_close_matches(name, names, 1):
                 message = f"unknown setting; did you mean {_PREFIX}{similar[0]}?"
             kind = PydanticCustomError("unknown_setting", "{message}", {"message": message})
             errors.append({"type": kind, "loc": (name.lower(),), "input": None})
@@ -142,8 +118,6 @@ def warnings() -> list[str]:
 
 class Settings(BaseSettings):
     """The settings of the service.
-
-    By default, the service listens only on the loopback address.
 
     Raises:
         pydantic.ValidationError: a value is invalid. Each message names the environment variable.
@@ -248,10 +222,7 @@ class Settings(BaseSettings):
 
     @property
     def accepted_hosts(self) -> frozenset[str] | None:
-        """Accepted names in a Host header, without ports, or None if every name is accepted.
-
-        Every IP address is accepted, too.
-        """
+        """Accepted names in a Host header, without ports, or None if every name is accepted."""
         if _ANY_HOST in self.allowed_hosts:
             return None
         return frozenset(self.allowed_hosts or (*_names_of_this_machine(), self.host))
@@ -294,8 +265,7 @@ class Settings(BaseSettings):
     @classmethod
     def _covers_the_default(cls, value: int, info: ValidationInfo) -> int:
         if value < info.data.get("request_timeout_ms", 0):
-            limits = "SCENE_MAX_REQUEST_TIMEOUT_MS must be at least SCENE_REQUEST_TIMEOUT_MS"
-            raise ValueError(limits)
+            raise ValueError("it must be at least SCENE_REQUEST_TIMEOUT_MS")
         return value
 
     @field_validator("opentelemetry")
@@ -303,13 +273,13 @@ class Settings(BaseSettings):
     def _can_export(cls, value: bool) -> bool:
         if not value:
             return value
-        if not all(map(_is_installed, _EXPORTER)):
-            packages = "the packages of the dependency group telemetry (pip install '.[telemetry]')"
-            raise ValueError(f"SCENE_OPENTELEMETRY needs {packages}")
+        try:
+            import_module(_EXPORTER)
+        except ImportError:
+            raise ValueError("SCENE_OPENTELEMETRY needs pip install '.[telemetry]'") from None
         # Without the URL of a collector, the service would start but never send a trace.
         if not any(map(os.environ.get, _ENDPOINTS)):
-            url = f"the URL of a collector: set {_ENDPOINTS[0]}"
-            raise ValueError(f"SCENE_OPENTELEMETRY needs {url}")
+            raise ValueError(f"SCENE_OPENTELEMETRY needs {_ENDPOINTS[0]}, the URL of a collector")
         return value
 
     @field_validator("api_key")
@@ -330,8 +300,7 @@ class Settings(BaseSettings):
     def _are_origins(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         if not all(map(_is_origin, value)):
             raise ValueError(
-                "SCENE_CORS_ORIGINS must list origins as browsers send them, such as "
-                "https://panel.example:8443: http or https, a host in lower case, and a port only "
-                "if it is not the default port; a path or wildcard is not allowed"
+                "SCENE_CORS_ORIGINS must list origins as browsers send them: http or https, a host "
+                "in lower case, a port other than the default port, and no path or wildcard"
             )
         return value

@@ -9,7 +9,6 @@ from typing import Final
 from pydantic import SecretStr
 from starlette.datastructures import Headers
 from starlette.middleware.cors import CORSMiddleware
-from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from app import errors
@@ -19,11 +18,7 @@ API_KEY: Final = "X-API-Key"
 TIMEOUT_HEADER: Final = "X-Request-Timeout-Ms"
 
 HEALTH: Final = frozenset(("/health/live", "/health/ready"))
-"""Routes of health checks. They accept every Host header and take no turn.
-
-Orchestrators and load balancers send the address of a replica as Host header. The answer of a
-health check contains only a status, so it reveals no data.
-"""
+"""Routes of health checks. They accept every Host header and take no turn."""
 
 # Paths that need no API key. Orchestrators send health checks without credentials. The HTML pages
 # contain no private data. docs/security.md gives the reasons.
@@ -47,7 +42,6 @@ class HostCheck:
     machine. That attack needs a name, so every IP address is accepted.
 
     Args:
-        app: the ASGI application that answers accepted requests.
         names: accepted host names, in lower case, without ports.
     """
 
@@ -71,58 +65,19 @@ class HostCheck:
         await answer(errors.HostRefusedError(detail), scope, receive, send)
 
 
-class CrossOrigin(CORSMiddleware):
-    """Allow pages of the listed origins to send GET and POST requests, without cookies.
-
-    Args:
-        app: the ASGI application that answers allowed requests.
-        origins: allowed values of the Origin header.
-    """
-
-    def __init__(self, app: ASGIApp, origins: tuple[str, ...]) -> None:
-        super().__init__(
-            app,
-            allow_origins=origins,
-            allow_methods=("GET", "POST"),
-            allow_headers=(
-                "Authorization",
-                "Content-Type",
-                API_KEY,
-                "X-Request-Id",
-                TIMEOUT_HEADER,
-            ),
-            expose_headers=("Retry-After", "X-Request-Id"),
-        )
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a preflight request (CORS), or pass another request on."""
-        try:
-            await super().__call__(scope, receive, send)
-        except errors.OriginRefusedError as refused:
-            await answer(refused, scope, receive, send)
-
-    def preflight_response(self, request_headers: Headers) -> Response:
-        """Answer a preflight request.
-
-        Raises:
-            OriginRefusedError: the service does not allow the request.
-        """
-        response = super().preflight_response(request_headers)
-        if response.status_code != 200:
-            raise errors.OriginRefusedError(
-                "The service does not allow the origin, the method or a header of this request.",
-                headers={"Vary": response.headers["vary"]},
-            )
-        return response
+def cross_origin(app: ASGIApp, origins: tuple[str, ...]) -> ASGIApp:
+    """Allow pages of the listed origins to send GET and POST requests, without cookies."""
+    return CORSMiddleware(
+        app,
+        allow_origins=origins,
+        allow_methods=("GET", "POST"),
+        allow_headers=("Authorization", "Content-Type", API_KEY, "X-Request-Id", TIMEOUT_HEADER),
+        expose_headers=("Retry-After", "X-Request-Id"),
+    )
 
 
 class KeyCheck:
-    """Refuse requests without the API key, except for open routes.
-
-    Args:
-        app: the ASGI application that answers requests with the key.
-        key: the API key.
-    """
+    """Refuse requests without the API key, except for open routes."""
 
     def __init__(self, app: ASGIApp, key: SecretStr) -> None:
         self._app, self._key = app, key.get_secret_value()

@@ -6,7 +6,7 @@ import asyncio
 import json
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sized
 from contextlib import suppress
 from email.message import Message
 from functools import cache
@@ -29,10 +29,9 @@ from scene_client.validation import MAX_ERRORS, PLAIN, field_errors, pointer
 FormT = TypeVar("FormT", bound=Form)
 
 MAX_MEMBERS: Final = 32
-"""Maximum number of members of a JSON object. Objects of valid requests have fewer members.
+"""Maximum number of members of a JSON object, more than in valid requests.
 
 Validation reports each unknown member, and a report takes a hundred times the memory of the member.
-So the limit on the number of members bounds the memory of the reports.
 """
 
 # A large answer is sent in parts of this size in bytes, so that a slow client delays the next part.
@@ -64,12 +63,10 @@ def validated(value: Any, form: type[FormT], *, at: errors.Location = ()) -> For
 @cache
 def _most_entries(form: type[Form]) -> dict[str, int]:
     """Return the maximum length of each list (and text) among the fields of a schema."""
-    return {
-        name: limit.max_length
-        for name, field in form.model_fields.items()
-        for limit in field.metadata
-        if hasattr(limit, "max_length")
-    }
+    limits = (
+        (name, limit) for name, field in form.model_fields.items() for limit in field.metadata
+    )
+    return {name: limit.max_length for name, limit in limits if hasattr(limit, "max_length")}
 
 
 def parse(body: bytes, most: int) -> Any:
@@ -93,11 +90,6 @@ def parse(body: bytes, most: int) -> Any:
         # from_json() is strict, but only the decoder of the standard library finds duplicate names.
         from_json(body, allow_inf_nan=False)
         return _DECODER.decode(body.decode())
-    except _TooManyMembersError:
-        raise _invalid(f"A JSON object has more than {MAX_MEMBERS} members.") from None
-    except _RepeatedNameError as error:
-        detail = f"A JSON object has two members with the same name{error}."
-        raise errors.NotJSONError(detail) from None
     except ValueError as error:
         not_finite = _not_finite(body)
         detail = "NaN and Infinity are not JSON. `errors` lists their places."
@@ -111,20 +103,16 @@ def parse(body: bytes, most: int) -> Any:
 
 
 def _check_density(body: bytes, most: int) -> None:
-    """Check that no part of a body has too many arrays and objects, before their creation.
+    """Check that a large body has at most one array or object for every five bytes.
 
-    Each part of at most ``most`` bytes may have one of them for every five bytes. The shortest
-    sensible one is the array of a pair, such as `[1,2],`.
-
-    Raises:
-        InvalidRequestError: a part has more arrays and objects.
+    The shortest sensible one is the array of a pair, such as `[1,2],`. The check applies to each
+    part of ``most`` bytes.
     """
     for start in range(0, len(body), most) if len(body) > SMALL else ():
-        part = start, min(start + most, len(body))
-        size = part[1] - start
-        if body.count(b"[", *part) + body.count(b"{", *part) > size // 5:
-            detail = f"{size} bytes of the body have more than {size // 5} arrays and objects."
-            raise _invalid(detail)
+        part = body[start : start + most]
+        if part.count(b"[") + part.count(b"{") > len(part) // 5:
+            fewer = f"more than {len(part) // 5} arrays and objects."
+            raise _invalid(f"{len(part)} bytes of the body have {fewer}")
 
 
 def _invalid(detail: str) -> errors.InvalidRequestError:
@@ -134,10 +122,7 @@ def _invalid(detail: str) -> errors.InvalidRequestError:
 
 
 def _not_finite(body: bytes) -> list[FieldError]:
-    """Return an error for each NaN and Infinity in a small body that is otherwise JSON.
-
-    The search in a large body could take 0.4 s.
-    """
+    """Return an error for each NaN and Infinity in a small body that is otherwise JSON."""
     if len(body) > SMALL or (b"NaN" not in body and b"Infinity" not in body):
         return []
     try:
@@ -151,48 +136,46 @@ def _not_finite(body: bytes) -> list[FieldError]:
 
 
 class _Pieces:
-    """A large JSON object, parsed in short steps.
+    """A large JSON object, parsed in short steps, because the parsers hold the interpreter.
 
-    A step parses one member, or one entry of a member that is a list. The parsers hold the
-    interpreter during a step, so all other requests wait. A step reads one text, or at most
-    ``most`` characters.
+    A step parses one member, or one entry of a list: a text, or at most ``most`` characters.
     """
 
     def __init__(self, text: str, most: int) -> None:
         self._text, self._most, self._at = text, most, 0
 
     def read(self) -> dict[str, Any]:
-        """Return the object.
-
-        Raises:
-            ValueError: the text is not a JSON object, or a value has too many characters.
-            InvalidRequestError: a list has too many entries.
-        """
+        """Return the object. Raise ValueError or InvalidRequestError like `parse`."""
         members: list[tuple[str, Any]] = []
-        mark = self._mark("{")
-        while mark != "}" and len(members) <= MAX_MEMBERS:
+        for _ in self._each("{}"):
             name = self._value()
             if not isinstance(name, str):
                 raise ValueError(f"expected a name before character {self._at}")
             self._mark(":")
             members.append((name, self._entries(name) if self._peek() == "[" else self._value()))
-            mark = self._mark(",}")
-        if mark == "}" and self._peek():
+            _check_number(members)
+        if self._peek():
             raise ValueError(f"trailing characters at character {self._at}")
         return _members(members)
 
     def _entries(self, name: str) -> list[Any]:
         entries: list[Any] = []
-        self._mark("[")
-        mark = self._mark("]") if self._peek() == "]" else ","
-        while mark != "]":
+        for _ in self._each("[]"):
             if len(entries) == MAX_BATCH:
                 message = f"must have at most {MAX_BATCH} entries"
                 too_long = FieldError(pointer=pointer((name,)), message=message)
                 raise errors.InvalidRequestError(errors=[too_long])
             entries.append(self._value())
-            mark = self._mark(",]")
         return entries
+
+    def _each(self, brackets: str) -> Iterator[None]:
+        """Read the brackets and commas of an object or array. Yield before each of its parts."""
+        closing = brackets[1]
+        self._mark(brackets[0])
+        mark = self._mark(closing) if self._peek() == closing else ","
+        while mark != closing:
+            yield
+            mark = self._mark("," + closing)
 
     def _value(self) -> Any:
         # The parsers would read the rest of the body, so the slice bounds the step.
@@ -204,8 +187,6 @@ class _Pieces:
             value, end = _DECODER.raw_decode(text, start)
             from_json(text[start:end], allow_inf_nan=False)
         except (ValueError, RecursionError) as error:
-            if isinstance(error, _TooManyMembersError | _RepeatedNameError):
-                raise
             message = f"the value at character {self._at} is invalid or too long: {error}"
             raise ValueError(message) from None
         self._at += end - start
@@ -244,21 +225,18 @@ def _constants(value: Any, at: errors.Location = ()) -> Iterator[tuple[str, erro
             yield from _constants(part, (*at, index))
 
 
-class _RepeatedNameError(ValueError):
-    """The message is the repeated name if the name is plain, and otherwise empty."""
-
-
-class _TooManyMembersError(ValueError):
-    pass
+def _check_number(members: Sized) -> None:
+    if len(members) > MAX_MEMBERS:
+        raise _invalid(f"A JSON object has more than {MAX_MEMBERS} members.")
 
 
 def _members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    if len(pairs) > MAX_MEMBERS:
-        raise _TooManyMembersError
+    _check_number(pairs)
     members = dict(pairs)
     if len(members) != len(pairs):
         name, _ = Counter(name for name, _ in pairs).most_common(1)[0]
-        raise _RepeatedNameError(f", `{name}`" if PLAIN.fullmatch(name) else "")
+        shown = f", `{name}`" if PLAIN.fullmatch(name) else ""
+        raise errors.NotJSONError(f"A JSON object has two members with the same name{shown}.")
     return members
 
 
@@ -272,17 +250,10 @@ _LENIENT: Final = json.JSONDecoder(object_pairs_hook=_members, parse_constant=_C
 
 
 def _check_media(scope: Scope) -> None:
-    """Check that the headers declare plain JSON in UTF-8.
-
-    Raises:
-        UnsupportedMediaTypeError: the headers declare something else.
-    """
-    content_type, detail, is_coded = b"", "", False
-    for name, value in scope["headers"]:
-        if name == b"content-type":
-            content_type = content_type or value
-        elif name == b"content-encoding":
-            is_coded = is_coded or value.lower() != b"identity"
+    """Raise UnsupportedMediaTypeError if the headers do not declare plain JSON in UTF-8."""
+    headers, detail = scope["headers"], ""
+    content_type = next((value for name, value in headers if name == b"content-type"), b"")
+    codings = {value.lower() for name, value in headers if name == b"content-encoding"}
     if content_type != b"application/json":
         message = Message()
         message["content-type"] = content_type.decode("latin-1")
@@ -291,26 +262,21 @@ def _check_media(scope: Scope) -> None:
             detail = "The header Content-Type must be application/json."
         elif message.get_content_charset("utf-8") not in {"utf-8", "utf8"}:
             detail = "The charset in the header Content-Type must be utf-8."
-    if is_coded:
+    if codings - {b"identity"}:
         detail = "The body must not be compressed: leave the header Content-Encoding out."
     if detail:
         raise errors.UnsupportedMediaTypeError(detail)
 
 
 class JSONRoute(APIRoute):
-    """A route that parses and validates the JSON body without FastAPI.
+    """A route that parses and validates the JSON body, because FastAPI's parser is too lenient.
 
-    FastAPI only documents the route, because FastAPI's JSON parser is too lenient. The endpoint
-    receives the validated body as ``data``, the HTTP request as ``http`` and the path parameters.
-    It returns the answer as bytes.
+    The endpoint receives the validated body as ``data``, the HTTP request as ``http`` and the path
+    parameters. It returns the answer as bytes.
     """
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one request.
-
-        Raises:
-            ServiceError: the service cannot answer the request.
-        """
+        """Answer one request, or raise ServiceError."""
         if scope["method"] not in (self.methods or ()):
             await super().handle(scope, receive, send)
             return
@@ -345,10 +311,7 @@ class JSONRoute(APIRoute):
 
 async def _send(answer: bytes, bodies: Bodies, client: str, send: Send) -> None:
     """Send an answer to a client. A large answer is sent in parts."""
-    headers = [
-        (b"content-length", b"%d" % len(answer)),
-        (b"content-type", b"application/json"),
-    ]
+    headers = [(b"content-length", b"%d" % len(answer)), (b"content-type", b"application/json")]
     start = {"type": "http.response.start", "status": 200, "headers": headers}
     if len(answer) <= _PART:
         await send(start)

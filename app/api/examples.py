@@ -20,24 +20,23 @@ _MODEL: Final = {
     "variant": "triway",
     "digest": "4e706b9f30e062589ec5cace2744da497a49f08f095626ee533c50f22dad94d4",
 }
-_ENVELOPE: Final = {
-    "model": _MODEL,
-    "request_id": REQUEST_ID,
-    "ignored": [],
-    "mapped": [],
-    "warnings": [],
-}
+_LISTS: Final[dict[str, Any]] = {"ignored": [], "mapped": [], "warnings": []}
+_ENVELOPE: Final = {"model": _MODEL, "request_id": REQUEST_ID, **_LISTS}
 
-_VERSION: Final = {
-    "version": "1.0.0",
-    "status": "ready",
-    "aliases": ["default"],
-    "variant": _MODEL["variant"],
-    "digest": _MODEL["digest"],
+_VERSION: Final = {"version": "1.0.0", "status": "ready", "aliases": ["default"]} | {
+    name: _MODEL[name] for name in ("variant", "digest")
 }
 _CAUSE: Final = {
     "reason": "checksum_mismatch",
     "detail": "model.safetensors does not match the manifest",
+}
+_BIN: Final = {
+    "label": "garbage bin",
+    "aliases": ["trash can"],
+    "structure": False,
+    "anywhere": False,
+    "size": {"x": 0.3, "y": 0.3, "z": 0.5},
+    "parent": "container",
 }
 _REFUSED: Final = {"version": "1.1.0", "status": "refused", "aliases": [], **_CAUSE}
 _FAILURE: Final = {"subject": "home@1.1.0", **_CAUSE}
@@ -103,13 +102,8 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
             | {"value": 0.5, "low": 0.49, "high": 0.51, "n": 1000}
         ],
         "data": [
-            {
-                "source": "procthor",
-                "scenes": 4936,
-                "digest": "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08",
-                "terms": "Apache-2.0",
-                "research_only": False,
-            }
+            {"source": "procthor", "scenes": 4936, "digest": _MODEL["digest"]}
+            | {"terms": "Apache-2.0", "research_only": False}
         ],
         "terms": "Apache-2.0",
         "card": "# home 1.0.0\n",
@@ -117,14 +111,7 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
     "show_vocabulary": {
         "model": _MODEL,
         "objects": [
-            {
-                "label": "garbage bin",
-                "aliases": ["trash can"],
-                "structure": False,
-                "anywhere": False,
-                "size": {"x": 0.3, "y": 0.3, "z": 0.5},
-                "parent": "container",
-            },
+            _BIN,
             {"label": "container", "aliases": [], "structure": False, "anywhere": False},
             {"label": "floor", "aliases": [], "structure": True, "anywhere": False},
         ],
@@ -147,15 +134,8 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
     },
     "show_word": {
         "model": _MODEL,
-        "word": "standing lamp",
-        "class": {
-            "label": "floor lamp",
-            "aliases": ["standing lamp"],
-            "structure": False,
-            "anywhere": False,
-            "parent": "lamp",
-            "size": {"x": 0.4, "y": 0.4, "z": 1.6},
-        },
+        "word": "trash can",
+        "class": _BIN,
         "rule": "alias",
         "certain": True,
         "suggestions": [],

@@ -11,7 +11,7 @@ from uuid import uuid4
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.api.access import CrossOrigin, HostCheck, KeyCheck
+from app.api.access import HostCheck, KeyCheck, cross_origin
 from app.api.problems import answer, from_exception
 from app.api.turns import Deadline, Size, Turn
 from app.serving.request import SUCCESS, Record
@@ -27,10 +27,6 @@ An example is an invalid Range header in a request for a static file.
 """
 
 _REQUEST_ID: Final = re.compile(rb"[A-Za-z0-9._~:-]{1,128}")
-# HTTP methods of RFC 9110 and RFC 5789. The log shows all other methods as "-".
-_METHODS: Final = frozenset(
-    ("GET", "HEAD", "POST", "PUT", "DELETE", "CONNECT", "OPTIONS", "TRACE", "PATCH")
-)
 
 # These headers stop browsers from guessing the media type and from sending a Referer.
 _ALWAYS: Final = ((b"x-content-type-options", b"nosniff"), (b"referrer-policy", b"no-referrer"))
@@ -49,7 +45,7 @@ def gateway(app: ASGIApp, settings: Settings, runtime: Runtime) -> ASGIApp:
         steps = KeyCheck(steps, settings.api_key)
     steps = Failures(steps)
     if settings.cors_origins:
-        steps = CrossOrigin(steps, settings.cors_origins)
+        steps = cross_origin(steps, settings.cors_origins)
     if (names := settings.accepted_hosts) is not None:
         steps = HostCheck(steps, names)
     return Recorded(steps, app, settings, runtime)
@@ -59,13 +55,8 @@ class Recorded:
     """Complete the headers of each response, and record the request in metrics and access log.
 
     The header `X-Request-Id` of the response and the access log contain the id of the request. The
-    client may choose an id of 1 to 128 unreserved URI characters or colons.
-
-    Args:
-        app: the ASGI application that answers requests.
-        other: the ASGI application for everything else, such as the start of the service.
-        settings: settings of the access log.
-        runtime: owner of the metrics.
+    client may choose an id of 1 to 128 unreserved URI characters or colons. The application
+    ``other`` gets everything but requests, such as the start of the service.
     """
 
     def __init__(self, app: ASGIApp, other: ASGIApp, settings: Settings, runtime: Runtime) -> None:
@@ -111,7 +102,7 @@ class Recorded:
         status = record.status or 500
         if status >= 400 and record.outcome == SUCCESS:
             record.outcome = OTHER
-        method = scope["method"] if scope["method"] in _METHODS else "-"
+        method = scope["method"]  # the server refuses others than the registered ones
         # The log contains the template of the route, because a raw path may contain private data.
         route = getattr(scope.get("route"), "path", "-")
         metrics = self._runtime.metrics
@@ -142,11 +133,7 @@ def _with_defaults(headers: Sequence[tuple[bytes, bytes]], request_id: bytes) ->
 
 
 class Failures:
-    """Answer every failure with a problem document.
-
-    Args:
-        app: the ASGI application whose errors are answered.
-    """
+    """Answer every failure with a problem document."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app

@@ -1,7 +1,7 @@
 """Liveness and readiness.
 
-The process is live if it answers a request. The process is ready if its default model has answered
-a question during the warm-up. The module also has the route of the metrics.
+The process is ready if its default model has answered a question during the warm-up. The module
+also has the route of the metrics.
 """
 
 from __future__ import annotations

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from typing import Annotated, Final, cast
 from weakref import WeakKeyDictionary
 
 from fastapi import APIRouter, Depends, Path
-from pydantic import BaseModel
 from starlette.requests import Request
 from starlette.responses import Response
 
 from app.api.openapi import error_responses
 from app.errors import InvalidRequestError
 from app.registry import Artifact
+from app.registry.manifest import of_machine
 from app.scene.relations import relation_names
 from app.scene.vocabulary import ObjectClass
 from app.serving.models import ServedModels
@@ -53,6 +52,9 @@ async def _runtime(http: Request) -> Runtime:
 RuntimeDep = Annotated[Runtime, Depends(_runtime)]
 
 router = APIRouter(prefix="/models", tags=["models"])
+
+# A vocabulary never changes, and its JSON takes milliseconds.
+_VOCABULARIES: Final[WeakKeyDictionary[Artifact, str]] = WeakKeyDictionary()
 
 
 @router.get(
@@ -96,10 +98,11 @@ async def show_version(
     served = models.served.get((name, version))
     if served is None:
         return schemas.VersionDetails(name=name, **dict(summary))
+    weights = of_machine(served.manifest.tensors)
     return schemas.VersionDetails(
         name=name,
         **dict(summary),
-        parameters=sum(math.prod(entry.shape) for entry in served.manifest.weights.values()),
+        parameters=sum(math.prod(entry.shape) for entry in weights.values()),
         card=served.card,
         **served.manifest.model_dump(include={"created", "metrics", "data", "terms"}),
     )
@@ -113,7 +116,10 @@ async def show_version(
 )
 async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> Response:
     """List the object classes with their aliases, the relations and the room types of a model."""
-    return _vocabulary(runtime.models.resolve(name))
+    model = runtime.models.resolve(name)
+    if model not in _VOCABULARIES:
+        _VOCABULARIES[model] = _vocabulary(model).model_dump_json()
+    return Response(_VOCABULARIES[model], media_type="application/json")
 
 
 @router.get(
@@ -144,19 +150,6 @@ async def show_word(
     return await runtime.admission.in_worker(http.state.ticket, look_up)
 
 
-def _once(build: Callable[[Artifact], BaseModel]) -> Callable[[Artifact], Response]:
-    """Return a function that builds an answer about a model once, because it never changes."""
-    documents: WeakKeyDictionary[Artifact, bytes] = WeakKeyDictionary()
-
-    def answer(model: Artifact) -> Response:
-        if model not in documents:
-            documents[model] = build(model).model_dump_json().encode()
-        return Response(documents[model], media_type="application/json")
-
-    return answer
-
-
-@_once
 def _vocabulary(served: Artifact) -> schemas.VocabularyAnswer:
     vocabulary, manifest = served.vocabulary, served.manifest
     relations, rooms = relation_names(served.spec.A), vocabulary.room_types

@@ -145,12 +145,11 @@ def _complete_operation(operation: dict[str, Any], path: str, settings: Settings
 
 
 def _timeout_parameter(most: int) -> dict[str, Any]:
-    text = "time limit of the request in milliseconds; after this time, the service answers 504"
     return {
         "name": TIMEOUT_HEADER,
         "in": "header",
         "required": False,
-        "description": text,
+        "description": "time limit in milliseconds; after this time, the service answers 504",
         "schema": {"type": "integer", "minimum": 1, "maximum": most},
         "examples": {"second": {"summary": "one second", "value": min(1000, most)}},
     }

@@ -84,8 +84,7 @@ async def show_problem_type(slug: str) -> HTMLResponse:
 class Assets(StaticFiles):
     """Static files with entity tags (the header ETag).
 
-    Browsers may cache the files of vendored libraries for a year. These files never change, because
-    the folder name of a library contains the version of the library.
+    Browsers may cache vendored libraries for a year, because their folders name the version.
     """
 
     async def get_response(self, path: str, scope: Scope) -> Response:

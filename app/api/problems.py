@@ -77,9 +77,5 @@ async def _handle(request: Request, error: Exception) -> Response:
 
 
 def install(app: FastAPI) -> None:
-    """Replace the exception handlers of FastAPI by handlers that answer with problems.
-
-    `app.api.gateway.Failures` answers unexpected exceptions. FastAPI would answer an unexpected
-    exception and then raise the exception again. The server would then close the connection.
-    """
+    """Answer exceptions of Starlette with problems. The gateway answers all other exceptions."""
     app.add_exception_handler(HTTPException, _handle)

@@ -63,10 +63,6 @@ def _read(data: ScenesRequest, request_id: str, limit: int, stop: Callable[[], b
     """Return the answer as JSON. Its scenes have at most ``limit`` bytes in total.
 
     ``stop`` returns whether the request has ended.
-
-    Raises:
-        InvalidRequestError: `base64` is not Base64.
-        UnreadableFileError: the file contains no scene that can be read.
     """
     content = _content(data)
     if any(content.count(mark) > most * MOST_PARTS for mark, most in _MARKS.items()):

@@ -24,14 +24,7 @@ _LARGE: Final = frozenset(("/scenes", *(f"/{question.name}/batch" for question i
 
 
 class Deadline:
-    """Give each request a ticket with its deadline. Health checks need no ticket.
-
-    Args:
-        app: the ASGI application that answers requests with a ticket, in ``scope["state"]``.
-        health: the ASGI application that answers health checks.
-        settings: settings with the default and the longest time limit.
-        runtime: owner of the models.
-    """
+    """Give each request a ticket with its deadline, in ``scope["state"]``, except health checks."""
 
     def __init__(self, app: ASGIApp, health: ASGIApp, settings: Settings, runtime: Runtime) -> None:
         self._app, self._health, self._runtime = app, health, runtime
@@ -74,13 +67,7 @@ class Deadline:
 
 
 class Size:
-    """Read the body of each request, up to the limit of its route, into ``scope["state"]``.
-
-    Args:
-        app: the ASGI application that answers requests with a body.
-        settings: settings with the limits of bodies.
-        bodies: budget of all bodies.
-    """
+    """Read the body of each request, up to the limit of its route, into ``scope["state"]``."""
 
     def __init__(self, app: ASGIApp, settings: Settings, bodies: Bodies) -> None:
         self._app, self._bodies = app, bodies
@@ -88,11 +75,7 @@ class Size:
         self._limit_of_scene = min(settings.max_scene_bytes, self._limit)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on.
-
-        Raises:
-            ServiceError: the body is too large, too slow or incomplete, or the budget is full.
-        """
+        """Pass a request on. The errors are those of `Bodies.read`."""
         state = scope["state"]
         if scope["method"] not in _WITH_BODY:
             state["body"] = b""
@@ -110,12 +93,7 @@ class Size:
 
 
 class Turn:
-    """Let each request wait for its turn, which ends when its response starts.
-
-    Args:
-        app: the ASGI application that answers requests in their turn.
-        admission: the lanes of the requests.
-    """
+    """Let each request wait for its turn, which ends when its response starts."""
 
     def __init__(self, app: ASGIApp, admission: Admission) -> None:
         self._app, self._quick, self._slow = app, admission.quick, admission.slow

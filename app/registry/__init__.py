@@ -9,6 +9,7 @@ from app.registry.description import (
     CountSlope,
     DataSource,
     Description,
+    Example,
     Judgement,
     Metric,
     Misplaced,
@@ -18,7 +19,6 @@ from app.registry.description import (
     VocabularyEntry,
 )
 from app.registry.errors import ArtifactError, RegistryError, StoreError
-from app.registry.examples import Example
 from app.registry.manifest import Manifest
 from app.registry.model_set import ModelSet, load_model_set
 from app.registry.offsets import Offsets

@@ -38,8 +38,7 @@ MAX_MANIFEST_BYTES: Final = 4 * 2**20
 """Maximum size of a manifest in bytes. A manifest of 785 classes has 162 kB."""
 MAX_CARD_BYTES: Final = 2**20
 MAX_WEIGHTS_BYTES: Final = 2**30
-"""Default maximum size of the weights file in bytes. The environment variable
-SCENE_MAX_WEIGHTS_BYTES sets another maximum."""
+"""Default maximum size of the weights file in bytes."""
 
 RARELY: Final = 1 / 500
 """A class is rarely shown if a smaller share of the training scenes shows it."""
@@ -56,15 +55,13 @@ class Artifact:
         weights: weights of the machine.
         vocabulary: names of the model's V object classes and C room types.
         calibration: conversion of log-odds into probabilities.
-        digest: SHA-256 of the manifest's bytes as a hexadecimal string. The digest changes if any
-            file of the artifact changes.
+        digest: SHA-256 of the manifest in hexadecimal. It depends on all files of the artifact.
         card: model card in Markdown.
         path: directory of the artifact.
-        offsets: vectors in metres between the centres of related objects. None means that the
-            training scenes had no poses.
-        counts: statistics of the numbers of instances. None means that the training scenes do not
-            count instances.
-        places: counts of where objects stand. None means that the training scenes had no relations.
+        offsets: vectors in metres between the centres of related objects; None without poses in the
+            training scenes.
+        counts: statistics of the numbers of instances; None without such numbers.
+        places: counts of where objects stand; None without relations in the training scenes.
     """
 
     manifest: Manifest
@@ -113,10 +110,9 @@ class Artifact:
 
     @cached_property
     def intruder_prior(self) -> NDArray[np.float64]:
-        """(V,) log prior that an intruder has each class, up to a constant.
+        """(V,) log prior that an intruder has each class, up to a constant: alpha · popularity.
 
-        It is alpha times the popularity. A class that no training scene shows counts as the rarest
-        other class: its log-odds in an empty scene do not matter.
+        A class that no training scene shows counts as the rarest other class.
         """
         calibration, none = self.calibration, np.zeros(0, np.int64)
         if not calibration.popularity:
@@ -129,10 +125,7 @@ class Artifact:
 
     @cached_property
     def rarely_shown(self) -> NDArray[np.bool_]:
-        """(V,) True for classes that fewer than `RARELY` of the training scenes show.
-
-        Without popularity in the calibration, no class is rare.
-        """
+        """(V,) True for classes that fewer than `RARELY` of the training scenes show."""
         if not self.calibration.popularity:
             return np.zeros(self.spec.V, np.bool_)
         popularity = np.array(self.calibration.popularity, dtype=np.float64)
@@ -202,8 +195,7 @@ def load_artifact(
 
     Args:
         directory: directory with exactly the three files of an artifact.
-        previous: an artifact that was loaded earlier. The function returns it instead of a second
-            copy if the verified files have the same digest.
+        previous: an earlier artifact, which the function returns if its digest is unchanged.
         max_weights_bytes: maximum size of the weights file, checked before the file is read.
 
     Raises:
@@ -266,15 +258,7 @@ def _weights(manifest: Manifest, tensors: Mapping[str, NDArray[Any]]) -> Weights
 
 
 def _read_verified(directory: Path, max_weights_bytes: int) -> tuple[Manifest, bytes, bytes, str]:
-    """Read and verify the files of an artifact; see `load_artifact`.
-
-    Returns:
-        The parsed manifest, its bytes, the bytes of the weights file and the model card.
-
-    Raises:
-        ArtifactError: a file is missing, unexpected, unreadable, too large, truncated or altered,
-            or this release cannot read the manifest.
-    """
+    """Return the verified manifest, its bytes, the bytes of the weights and the model card."""
     try:
         if directory.is_symlink():
             raise OSError(errno.ELOOP, "")
@@ -292,11 +276,7 @@ def _read_verified(directory: Path, max_weights_bytes: int) -> tuple[Manifest, b
     manifest = Manifest.from_bytes(text)
     weights = _read_checked(directory / WEIGHTS, manifest, max_weights_bytes)
     card = _read_checked(directory / CARD, manifest, MAX_CARD_BYTES)
-    try:
-        page = card.decode()
-    except UnicodeDecodeError:
-        raise ArtifactError("invalid_manifest", f"{CARD} is not UTF-8") from None
-    return manifest, text, weights, page
+    return manifest, text, weights, card.decode(errors="replace")
 
 
 def _require_size(name: str, size: int, limit: int) -> None:

@@ -162,10 +162,8 @@ def _metrics(description: Description) -> str:
         cell = f"{m.value:.3f} [{m.low:.3f}, {m.high:.3f}]"
         rows.setdefault((m.task, m.metric), dict.fromkeys(sources, ""))[m.source] = cell
     table = [(*name, *cells.values()) for name, cells in rows.items()]
-    judged = {
-        "objects": description.calibration.outlier is not None,
-        "relations": description.calibration.misplaced.judges_relations,
-    }
+    calibration = description.calibration
+    judged = {"objects": calibration.outlier, "relations": calibration.misplaced.judges_relations}
     unjudged = [
         f"`/outliers` judges no {part}, because the calibration had too few scenes."
         for part, is_judged in judged.items()

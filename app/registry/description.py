@@ -8,13 +8,22 @@ from typing import Annotated, Any, Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, JsonValue, PrivateAttr, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    JsonValue,
+    PrivateAttr,
+    field_serializer,
+    field_validator,
+    model_validator,
+)
 
-from app.registry.examples import Examples
 from app.registry.fields import Count, Frozen, Many, Sha256, Text, Timestamp, to_json
 from app.registry.references import ModelName, Version
 from app.scene.relations import CANONICAL
 from app.scene.vocabulary import ObjectClass, Vocabulary
+from scene_client.schemas import Label, SceneRequest
 from scene_client.schemas import Sensitivity as Sensitivity
 
 Floats = NDArray[np.floating[Any]]
@@ -137,39 +146,32 @@ class Calibration(Frozen):
     """The conversion of a machine's log-odds into probabilities.
 
     With the default values, the calibration changes nothing, and the model judges neither objects
-    nor relations. An intruder is an object that does not belong to the scene. Structural classes
-    are parts of the building (floor, wall) and vague names (object).
+    nor relations. An intruder is an object that does not belong to the scene. Tuples of the V
+    classes or C room types may be empty: all classes are equally popular, or there is no minimum.
 
     Attributes:
-        coverage: share of the classes of a scene that a request lists. A request may contain
-            another value.
+        coverage: default share of the classes of a scene that a request lists.
         missing: calibration of the log-odds that an unlisted class is present. n is the number of
             listed classes without structure.
-        popularity: (V,) log-odds that a training scene has each class. None means that no
-            source shows the class in training. If the tuple is empty, all classes have the same
-            popularity.
+        popularity: (V,) log-odds that a training scene has each class; None for a class that no
+            source shows in training.
         popularity_weight: exponent alpha. The prior probability of an intruder's class is
             proportional to popularity^alpha, where popularity is the odds of the class.
         outlier_lines: minimum log-odds of an outlier, by the number of listed classes without
             structure. None exactly if `outlier` is None.
         rooms: calibration of the probabilities of the room types.
-        rare_rooms: indices of the room types that `/generate` refuses, because too few training
-            scenes have them.
-        smallest: (C + 1,) minimum number of classes in a generated scene of each room type. 90 % of
-            the real rooms reach this number. The last entry is for scenes without a room type. If
-            the tuple is empty, there is no minimum.
+        rare_rooms: indices of the room types with too few training scenes for `/generate`.
+        smallest: (C + 1,) minimum number of classes in a generated scene of each room type, which
+            90 % of the real rooms reach. The last entry is for scenes without a room type.
         room_fit: (C,) minimum of `app.questions.generate.room_fit` for a generated scene of each
-            room type. 85 % of the real rooms reach this value. If the tuple is empty, there is no
-            minimum.
+            room type, which 85 % of the real rooms reach.
         outlier: calibration that converts a class's log-odds of presence to the log-odds that its
-            object is an intruder. n is the number of classes in the scene without structure. None
-            means that training had too few scenes for the fit: the model then judges no object.
-        relation: calibration of each canonical relation in scenes without observed relations.
-        relation_given: calibration of each canonical relation in scenes with observed relations.
-        placement: calibration of each canonical relation for a missing object at its most probable
-            places.
-        at: calibration of each canonical relation for a missing object at the place that a request
-            names.
+            object is an intruder. n is the number of classes in the scene without structure. None:
+            training had too few scenes for the fit, so the model judges no object.
+        relation, relation_given: calibrations of each canonical relation in scenes without and with
+            observed relations.
+        placement, at: calibrations of each canonical relation for a missing object at its most
+            probable places, and at the place that a request names.
         misplaced: calibration of the observed relations, and of objects on the floor or on a wall.
     """
 
@@ -256,11 +258,7 @@ class VocabularyEntry(Frozen):
 
 
 class DataSource(Frozen):
-    """One source of training scenes: its name, number of scenes and terms of use.
-
-    ``digest`` is the SHA-256 of the data. ``research_only`` means that the terms allow only
-    research use.
-    """
+    """One source of training scenes. ``digest`` is the SHA-256 of the data."""
 
     source: Text
     scenes: Count
@@ -287,11 +285,53 @@ class Metric(Frozen):
     high: float
     n: Annotated[int, Field(ge=1)]
 
-    @model_validator(mode="after")
-    def _is_interval(self) -> Self:
-        if self.low > self.high:
-            raise ValueError(f"low ({self.low}) must not exceed high ({self.high})")
-        return self
+
+MAX_EXAMPLES: Final = 8
+MAX_EXAMPLES_BYTES: Final = 32_768
+"""Maximum size of all examples of a model as JSON, in bytes."""
+_FIELDS: Final = frozenset({"objects", "relations", "room_type", "frame_id", "viewpoint"})
+
+
+def _compact(value: Any) -> Any:
+    """Remove absent and empty fields, and make each label an object."""
+    if isinstance(value, dict):
+        return {name: _compact(part) for name, part in value.items() if part not in (None, [])}
+    if isinstance(value, list):
+        return [{"label": part} if isinstance(part, str) else _compact(part) for part in value]
+    return value
+
+
+class Example(Frozen):
+    """An example scene, as the fields of a request to the service, and its name."""
+
+    name: Label
+    scene: Annotated[SceneRequest, BeforeValidator(_compact)]
+
+    @field_validator("scene")
+    @classmethod
+    def _has_no_other_field(cls, scene: SceneRequest) -> SceneRequest:
+        if extra := sorted(scene.model_fields_set - _FIELDS):
+            raise ValueError(f"an example must not have the field {extra[0]!r}")
+        return scene
+
+    @field_serializer("scene")
+    def _without_defaults(self, scene: SceneRequest) -> dict[str, Any]:
+        return scene.model_dump(mode="json", exclude_defaults=True)
+
+    def request(self) -> dict[str, Any]:
+        """Return the scene as the fields of a request, without absent fields."""
+        return self._without_defaults(self.scene)
+
+
+def _are_small(examples: tuple[Example, ...]) -> tuple[Example, ...]:
+    size = len(to_json([example.model_dump(mode="json") for example in examples]).encode())
+    if size > MAX_EXAMPLES_BYTES:
+        raise ValueError(f"the examples have {size} bytes, more than {MAX_EXAMPLES_BYTES}")
+    return examples
+
+
+Examples = Annotated[Many[Example], Field(max_length=MAX_EXAMPLES), AfterValidator(_are_small)]
+"""The examples of a model: at most `MAX_EXAMPLES`, of at most `MAX_EXAMPLES_BYTES` together."""
 
 
 class Description(Frozen):

@@ -38,11 +38,7 @@ def read_file(path: Path, limit: int) -> bytes:
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Create a new file and sync its bytes to disk.
-
-    Raises:
-        FileExistsError: the path already exists.
-    """
+    """Create a new file and sync its bytes to disk. An existing path raises FileExistsError."""
     with path.open("xb") as file:
         file.write(data)
         file.flush()
@@ -59,10 +55,7 @@ def sync_directory(path: Path) -> None:
 
 
 def make_directory(path: Path) -> None:
-    """Create a directory and its missing parents, and sync the new directory entries to disk.
-
-    An existing directory stays unchanged.
-    """
+    """Create a missing directory and its parents, and sync the new directory entries to disk."""
     if path.is_dir():
         return
     make_directory(path.parent)
@@ -77,11 +70,7 @@ def rename(source: Path, target: Path) -> None:
 
 
 def replace_file(path: Path, data: bytes, *, prefix: str) -> None:
-    """Create a file, or replace its contents atomically.
-
-    The function writes a temporary file, whose name is the prefix and the name of the file. Then it
-    renames the temporary file.
-    """
+    """Create a file, or replace its contents atomically. The prefix names the temporary file."""
     temporary = path.with_name(f"{prefix}{path.name}")
     try:
         write_file(temporary, data)
@@ -93,8 +82,6 @@ def replace_file(path: Path, data: bytes, *, prefix: str) -> None:
 @contextmanager
 def exclusive(path: Path, timeout: float) -> Iterator[None]:
     """Hold an exclusive lock on a file. The kernel releases the lock when the process ends.
-
-    The function creates the file if it is missing, and never removes it.
 
     Raises:
         StoreError: `locked`, if another process still holds the lock after ``timeout`` seconds.

@@ -57,9 +57,9 @@ class Frozen(BaseModel):
 class TensorGroup:
     """Base class of groups of arrays that an artifact stores beside the tensors of the machine.
 
-    A subclass is a dataclass whose fields are the arrays. The annotation of a field contains the
-    name or the number of each size: `Annotated[Table, "V", 3]`. The names of the stored tensors
-    begin with `prefix`. The fields in `integers` have integers, all others floating-point numbers.
+    A subclass is a dataclass of arrays. The annotation of a field contains the name or the number
+    of each size: `Annotated[Table, "V", 3]`. The names of the stored tensors begin with `prefix`.
+    The fields in `integers` have integers, all others floating-point numbers.
     """
 
     prefix: ClassVar[str]
@@ -92,19 +92,13 @@ class TensorGroup:
             required = shapes.get(name.removeprefix(cls.prefix))
             shape = tensors[name].shape if name in tensors else None
             if shape != required:
-                raise ArtifactError(
-                    "wrong_shape",
-                    f"tensor '{name}' has the shape {shape}, but the shape must be {required} "
-                    "(None means that the tensor does not exist)",
-                )
+                reason = f"tensor '{name}' has the shape {shape}, not {required} (None: no tensor)"
+                raise ArtifactError("wrong_shape", reason)
         group = cls(**{name: tensors[f"{cls.prefix}{name}"] for name in shapes})
         for name in shapes:
-            is_integer = name in cls.integers
-            words = "integers" if is_integer else "floating-point numbers"
-            kind = np.integer if is_integer else np.floating
-            group.require(
-                np.issubdtype(getattr(group, name).dtype, kind), f"{name} must be {words}"
-            )
+            kind = np.integer if name in cls.integers else np.floating
+            is_right = np.issubdtype(getattr(group, name).dtype, kind)
+            group.require(is_right, f"{name} must have a dtype of {kind.__name__}")
         return group
 
     def require(self, condition: object, complaint: str) -> None:

@@ -59,11 +59,6 @@ class Manifest(Description):
     tensors: Annotated[dict[str, TensorEntry], Field(max_length=MAX_TENSORS)]
     files: dict[str, FileEntry]
 
-    @property
-    def weights(self) -> dict[str, TensorEntry]:
-        """The tensors of the machine, without offsets, counts and places."""
-        return of_machine(self.tensors)
-
     @field_validator("files")
     @classmethod
     def _names_every_file(cls, files: dict[str, FileEntry]) -> dict[str, FileEntry]:

@@ -89,9 +89,8 @@ def load_model_set(
     previous: ModelSet = EMPTY,
     check: Callable[[Artifact], None] = lambda _: None,
 ) -> ModelSet:
-    """Load and verify every version of a store.
+    """Load and verify every version of a store. The result contains all errors.
 
-    The result contains all errors, such as invalid versions, unreadable aliases or a missing store.
     An artifact of the previous snapshot is verified again, and reused if its digest is unchanged.
 
     Args:

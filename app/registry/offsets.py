@@ -73,10 +73,9 @@ class Offsets(TensorGroup):
         """Return the offsets of n pairs (relation, subject class, object class) of indices (n,).
 
         Returns:
-            Offsets (n, 6): mean (3) and standard deviation (3). Then, for each pair, the number of
-            training scenes that contain it, (n,). For a pair without training scenes, the number is
-            0. Its offset is then the sum of a term of the relation and one term of each class. If
-            the relation never occurred in training, the number is `UNOBSERVED`.
+            Offsets (n, 6): mean (3) and standard deviation (3). Then the number of training scenes
+            that contain each pair, (n,). If it is 0, the offset is the sum of a term of the
+            relation and one term of each class. `UNOBSERVED`: training lacks the relation.
         """
         offsets, scenes = look_up_offsets(self.tables, relation, subject, other)
         return offsets, scenes

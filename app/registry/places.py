@@ -102,8 +102,7 @@ class Places(TensorGroup):
     def shows(self, relation: int, subject: Indices, other: Indices) -> NDArray[np.bool_]:
         """Return whether training shows the relation from each subject to each other class, (N, M).
 
-        A single scene may be an error, so two scenes are needed. The class indices are (N,) and
-        (M,).
+        The class indices are (N,) and (M,). A single scene may be an error.
         """
         V = len(self.frequency)
         return triple_counts(self.triple, self.held, V, relation, subject, other) >= _SHOWN
@@ -112,7 +111,6 @@ class Places(TensorGroup):
         """Return the share of each other class among the supporters of each subject, (N, M).
 
         A supporter is an object on or in which the subject is. The class indices are (N,) and (M,).
-        The counts of a subject are smoothed by `_SUPPORTER` supporters of all classes.
         """
         total, share = self._supporters
         V, of_pairs = len(self.frequency), _SUPPORTER * share[other]
@@ -135,9 +133,8 @@ class Places(TensorGroup):
     def unseen(self) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Change of the log-odds of stacked relations that training never shows.
 
-        The change is the log share of the subject's stand: on a wall for above, on or in an object
-        for on-top and inside. So a blackboard does not stand on a chair. Shares of at least `USUAL`
-        do not change the log-odds.
+        The change is the log share of the subject's stand, at most `USUAL`: on a wall for above, on
+        or in an object for on-top and inside. So a blackboard does not stand on a chair.
 
         Returns:
             Relations of `STACKED` that training shows, (V, V): bit a is relation a. Then the change
@@ -164,8 +161,7 @@ class Places(TensorGroup):
     def means_under(self, upper: int, lower: int) -> bool:
         """Return whether "upper on top of lower" means that the lower object is under the other.
 
-        A desk is on top of a bin in this sense: it does not stand on the bin. The roles of the two
-        classes decide. At least `_SHOWN` scenes must show the lower class under the upper.
+        A desk is on top of a bin in this sense. The roles of the two classes decide.
         """
         under = role_counts(self.roles, lower, upper)[UNDER]
         return bool(under >= _SHOWN and under > role_counts(self.roles, upper, lower)[ON])

@@ -61,10 +61,7 @@ Version = Annotated[str, AfterValidator(VERSION.require)]
 
 
 class AliasTarget(BaseModel):
-    """The target of an alias: a version of a model.
-
-    If `version` is None (null in JSON), the target is the newest usable version.
-    """
+    """The target of an alias: a version of a model, or None for its newest usable version."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -96,8 +93,7 @@ def resolve_reference(
 
     Args:
         aliases: the target of each alias. An alias takes precedence over a model of its name.
-        versions: returns the versions of a model, and an empty sequence for an unknown model. A
-            reference without a version points at the last of them.
+        versions: returns the versions of a known model. Without a version, the last one is meant.
 
     Raises:
         StoreError: `invalid_reference`, `unknown_model`, `unknown_version`, or `dangling_alias` if

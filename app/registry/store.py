@@ -88,9 +88,8 @@ class Store:
     def versions(self, name: str) -> tuple[str, ...]:
         """Return the published versions of a model in ascending order. The result may be empty.
 
-        A folder without a manifest is left out, because a writer may still be writing the version.
-        Writers write the manifest last. Every other entry with the name of a version is in the
-        result, so that `load` reports invalid versions.
+        A folder without a manifest is left out, because writers write the manifest last. Every
+        other entry with the name of a version is in the result, so that `load` reports its error.
 
         Raises:
             StoreError: `invalid_reference`, or `unreadable`.
@@ -117,8 +116,7 @@ class Store:
         """Return the (name, version) that an alias, `name` or `name@version` points at.
 
         Raises:
-            StoreError: the reference does not resolve (see `resolve_reference`), or the code is
-                `invalid_aliases` or `unreadable`.
+            StoreError: see `resolve_reference`; also `invalid_aliases` or `unreadable`.
         """
         self.names()  # without a readable root, no name is unknown
         return resolve_reference(reference, self.aliases(), self.versions)
@@ -127,8 +125,7 @@ class Store:
         """Load and verify one version; see `load_artifact`.
 
         Raises:
-            ArtifactError: the artifact is not valid. The code is `wrong_place` if the manifest has
-                another name or version than the folder.
+            ArtifactError: the artifact is not valid, or has another name or version.
             StoreError: `invalid_reference`, or `unknown_version`.
         """
         folder = self.root / NAME.check(name, "model name") / VERSION.check(version, "version")
@@ -143,10 +140,7 @@ class Store:
         return artifact
 
     def state(self) -> StoreState:
-        """Return a value that changes whenever a version or an alias of the store changes.
-
-        The method reads only the metadata of the files.
-        """
+        """Return metadata of files that changes whenever a version or an alias changes."""
         files = [self.root / ALIASES]
         with suppress(StoreError):
             for name in self.names():
@@ -180,8 +174,7 @@ class Store:
     ) -> Artifact:
         """Publish a version permanently, and return the artifact.
 
-        The method writes the artifact to a temporary folder and loads it from there. So it never
-        publishes a version that the service would refuse. Then it renames the folder. See
+        The method writes and loads the artifact in a temporary folder, and renames the folder. See
         `write_artifact` for the arguments.
 
         Raises:
@@ -199,8 +192,7 @@ class Store:
     def copy(self, source: Store, name: str, version: str) -> bool:
         """Copy a version of another store, and return whether it is new to this store.
 
-        The method verifies the version like `load`, and writes it like `publish`. A version that
-        this store already has with the same digest stays unchanged.
+        A version that this store already has with the same digest stays unchanged.
 
         Raises:
             ArtifactError: the version is not valid in ``source``, or in this store.
@@ -209,25 +201,20 @@ class Store:
         """
         artifact = source.load(name, version)
         with self._writing():
-            if version in self.versions(name):
-                self._require_same(artifact)
-                return False
-            self._add(name, version, lambda folder: copy_artifact(artifact, folder))
-        return True
-
-    def _require_same(self, artifact: Artifact) -> None:
-        """Check that this store has a version with the digest of an artifact."""
-        name, version = artifact.key
-        try:
-            own = self.load(name, version)
-        except ArtifactError as error:
-            advice = f"Remove its folder {name}/{version}, then copy again"
-            reason = f"the copy of {name}@{version} is damaged: {error.reason}. {advice}"
-            raise ArtifactError(error.code, reason) from None
+            if version not in self.versions(name):
+                self._add(name, version, lambda folder: copy_artifact(artifact, folder))
+                return True
+            try:
+                own = self.load(name, version)
+            except ArtifactError as error:
+                advice = f"Remove its folder {name}/{version}, then copy again"
+                reason = f"the copy of {name}@{version} is damaged: {error.reason}. {advice}"
+                raise ArtifactError(error.code, reason) from None
         if own.digest != artifact.digest:
             digests = f"{own.digest[:12]}, not {artifact.digest[:12]}"
             reason = f"{name}@{version} is already published with the digest {digests}"
             raise StoreError("version_exists", f"{reason}, and a version never changes")
+        return False
 
     def _add(self, name: str, version: str, write: Callable[[Path], object]) -> Artifact:
         """Add a version whose folder ``write`` creates. The caller holds the lock."""
@@ -260,8 +247,6 @@ class Store:
         """Point an alias at a version, or at the newest usable version of a model.
 
         Args:
-            alias: name of the alias. The method creates a missing alias.
-            target: an existing version or model.
             expected: target that the alias must have before the change. None means that the alias
                 must not exist. "any" accepts every target.
 
@@ -280,21 +265,19 @@ class Store:
                 targets = f"{current or 'nothing'}, not at {expected or 'nothing'}"
                 raise StoreError("alias_conflict", f"alias '{alias}' points at {targets}")
             resolve_reference(str(target), {}, self.versions)
-            self._change_table(alias, target)
+            self._write_table({**self.aliases(), alias: target})
 
     def remove_alias(self, alias: str) -> None:
         """Remove an alias. The errors are those of `set_alias`."""
         NAME.check(alias, "alias")
         with self._writing():
-            if alias not in self.aliases():
+            table = dict(self.aliases())
+            if table.pop(alias, None) is None:
                 raise StoreError("unknown_model", f"no alias has the name '{alias}'")
-            self._change_table(alias, None)
+            self._write_table(table)
 
-    def _change_table(self, alias: str, target: AliasTarget | None) -> None:
-        """Give one alias another target in the file of aliases. None removes the alias."""
-        table = {**self.aliases(), alias: target}
-        kept = {name: entry for name, entry in table.items() if entry is not None}
-        replace_file(self.root / ALIASES, aliases_to_bytes(kept), prefix=TEMPORARY)
+    def _write_table(self, aliases: Mapping[str, AliasTarget]) -> None:
+        replace_file(self.root / ALIASES, aliases_to_bytes(aliases), prefix=TEMPORARY)
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
@@ -329,13 +312,8 @@ def _file_state(path: Path) -> tuple[int, ...]:
 
 def _is_unfinished(version: Path) -> bool:
     """Return whether a version is a readable folder without a manifest."""
-    try:
-        (version / MANIFEST).lstat()
-    except FileNotFoundError:
-        return _is_directory(version)
-    except OSError:
-        pass
-    return False
+    is_readable = _is_directory(version) and os.access(version, os.X_OK)
+    return is_readable and not os.path.lexists(version / MANIFEST)
 
 
 def _is_directory(path: Path) -> bool:

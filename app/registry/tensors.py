@@ -31,9 +31,8 @@ def pack(
     Args:
         state: maps names to numpy arrays or CPU tensors. Arrays of integers and booleans keep their
             dtype.
-        storage_dtype: dtype of floating-point arrays with two or more axes. float16 halves the size
-            of the file, with a relative error of at most 2^-11 per weight. Floating-point arrays
-            with at most one axis (biases) are stored as float32.
+        storage_dtype: dtype of floating-point arrays with two or more axes. float16 has a relative
+            error of at most 2^-11 per weight. Biases are stored as float32.
 
     Raises:
         ArtifactError: `not_finite` for NaN, infinity or a weight above the float16 maximum of
@@ -82,13 +81,9 @@ def unpack(data: bytes, entries: Mapping[str, TensorEntry]) -> dict[str, NDArray
 def require_equal(
     actual: Mapping[str, object], expected: Mapping[str, object], has: str, needs: str
 ) -> None:
-    """Require that ``actual`` and ``expected`` are equal maps of tensor names to dtype and shape.
+    """Raise ArtifactError `wrong_shape` unless both maps of tensors to dtype and shape are equal.
 
-    ``has`` and ``needs`` are the words of the error message before the actual tensor and before the
-    expected tensor.
-
-    Raises:
-        ArtifactError: `wrong_shape` for the first tensor that differs.
+    ``has`` and ``needs`` are the words of the message before the actual and the expected tensor.
     """
     for name in sorted(actual.keys() | expected.keys()):
         entry, needed = actual.get(name, "none"), expected.get(name, "none")

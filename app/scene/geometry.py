@@ -102,9 +102,7 @@ def to_viewer_frame(
 
     Args:
         positions: (n, 3) centres in the frame, in metres. The heights do not change.
-        viewpoint: position and heading of the viewer in the frame.
-        yaws: (n,) rotations about z in radians. None means that the boxes are aligned with the axes
-            of the frame.
+        yaws: (n,) rotations about z in radians; all 0 by default.
 
     Raises:
         ValueError: a shape is wrong.
@@ -129,15 +127,11 @@ def derive_relations(
     """Derive the relations between n boxes by the rules of this module.
 
     Args:
-        positions: (n, 3) centres in viewer axes, in metres. A row with NaN means an unknown
-            position. The relations of such a box stay unobserved.
-        sizes: (n, 3) extents before the rotation, in metres; 0 for flat boxes. A row with NaN means
-            an unknown size.
-        yaws: (n,) rotation of each box about z in radians. None means that all rotations are 0.
-        horizontal: whether to derive left and front. False means that the viewer is unknown, so
-            that left and front stay unobserved.
-        classes: (n,) index of the class of each box, -1 for an unknown class. None means that all
-            classes are unknown.
+        positions: (n, 3) centres in viewer axes, in metres; a row with NaN where unknown.
+        sizes: (n, 3) extents before the rotation, in metres; 0 for flat boxes, NaN where unknown.
+        yaws: (n,) rotation of each box about z in radians; all 0 by default.
+        horizontal: whether the viewer is known. Otherwise, left and front stay unobserved.
+        classes: (n,) index of the class of each box, -1 where unknown.
         roles: counts that decide between the roles of rule 3. None leaves all roles undecided.
 
     Raises:
@@ -190,13 +184,8 @@ def overlap_and_gap(
 def excluded_by_centres(points: Array, sizes: Array, *, horizontal: bool) -> NDArray[np.bool_]:
     """Return the relations that the centres of n boxes exclude, (A, n, n).
 
-    Unknown centres exclude no relation.
-
-    Args:
-        points: (n, 3) centres in viewer axes, in metres; NaN where unknown.
-        sizes: (n, 3) extents, in metres. A footprint of unknown size, NaN, has a radius of
-            `UNKNOWN_REACH`.
-        horizontal: whether the viewer is known, so that left and front are defined.
+    Points and sizes (n, 3) are those of `derive_relations`. Unknown centres exclude no relation. A
+    footprint of unknown size has a radius of `UNKNOWN_REACH`.
     """
     x, y = points[:, 0], points[:, 1]
     dx, dy = x[:, None] - x, y[:, None] - y

@@ -122,8 +122,7 @@ def head_of(label: str) -> str | None:
 def singular(word: str) -> str:
     """Return the singular of an English noun in lower case. Return other words unchanged.
 
-    The function knows the regular endings (-ies, -ches, -shes, -xes, -sses, -oes, -s) and a short
-    list of irregular plurals. docs/decisions/data.md compares it with a general inflection library.
+    docs/decisions/data.md compares the function with a general inflection library.
     """
     if word.endswith(_IRREGULAR_ENDINGS):
         for plural, single in _IRREGULAR.items():
@@ -151,14 +150,12 @@ def label_key(label: str) -> str:
     """Return the key that all spellings of ``label`` share.
 
     The key ignores case, Unicode compatibility variants, separators (whitespace, ``_ - . / '``) and
-    a final plural: "Night-Stands", "night_stand" and "nightstand" have the key "nightstand". A
-    label that contains only separators has the empty key. The key of a key is the same key. A label
-    with more than `LONGEST` characters after Unicode normalisation is its own key.
+    a final plural: "Night-Stands", "night_stand" and "nightstand" have the key "nightstand". The
+    key of a key is the same key. A label with more than `LONGEST` characters is its own key.
     """
     if label.isascii():
         return singular(_SEPARATORS.sub("", label.casefold()))
-    # The loop repeats the normalisation until the label does not change. One pass is not enough: if
-    # it removes a separator, an accent can combine with the letter before the separator.
+    # Without a separator, an accent can combine with the letter before it, so repeat this.
     while (folded := _fold_unicode(label)) != label:
         label = folded
     return label
@@ -210,8 +207,7 @@ _IDS: Final = re.compile(
 def readings(label: str) -> Iterator[tuple[Rule, str]]:
     """Yield pairs (rule, name) of the names in a detector's label, most certain name first.
 
-    A name can need two rules: "a photo of a sofa/couch". Its pair contains the first rule. The
-    function yields at most `_MOST_READINGS` pairs.
+    A name can need two rules: "a photo of a sofa/couch". Its pair contains the first rule.
     """
     return islice(_readings(label), _MOST_READINGS)
 

@@ -28,8 +28,7 @@ from app.scene.labels import LookUp, head_of, split_words
 LONGEST: Final = 64
 """Maximum length of a name whose spelling the search compares, in characters.
 
-The length counts after Unicode normalisation, which can turn one character into 18. The time of a
-comparison grows with the length. All class names have fewer than 32 characters.
+The length counts after Unicode normalisation. All class names have fewer than 32 characters.
 """
 
 _LEAST: Final = 0.7  # minimum similarity of a suggestion
@@ -142,9 +141,6 @@ class NameIndex:
         """Return the entry whose name is the phrase, perhaps with misspelt words.
 
         The result is None if the edits cost too much, or if another entry costs about the same.
-
-        Args:
-            corrections: for each word, pairs (known word, cost of the edits); see `_corrections`.
         """
         costs: dict[int, tuple[int, int]] = {}  # by entry: cost and maximum cost
         for spelling in itertools.product(*(corrections[word] for word in words)):
@@ -165,10 +161,9 @@ class NameIndex:
         return LookUp(entry, round(1 - cost / 2 / len("".join(words)), 3), "spelling")
 
     def _corrections(self, word: str) -> list[tuple[str, int]]:
-        """Return the known words with a similar spelling, as pairs (known word, cost of the edits).
+        """Return at most `_MOST_CORRECTIONS` pairs (known word, cost of the edits), cheapest first.
 
-        The list has at most `_MOST_CORRECTIONS` pairs, cheapest first. A short word, or a word
-        without similar words, stands for itself: the list is [(word, 0)].
+        A short word, or a word without similar words, stands for itself: [(word, 0)].
         """
         if len(word) < _SHORTEST:
             return [(word, 0)]
@@ -210,10 +205,7 @@ class NameIndex:
             yield Match(self._entries[row], similarity * factor)
 
     def _by_last_word(self, words: Sequence[str]) -> Iterator[Match]:
-        """Yield the entries whose names have the same last word.
-
-        The similarity grows with the shared words as a share of all words of both names.
-        """
+        """Yield the entries whose names have the same last word."""
         for row in self._by_head.get(words[-1], ()) if words else ():
             known_words = self._words[row]
             shared = len({*words} & {*known_words}) / len({*words, *known_words})

@@ -69,8 +69,7 @@ def opposite(relation: str) -> str:
 def canonicalise(subject: End, relation: str, anchor: End) -> tuple[int, End, End]:
     """Return a statement in canonical form: (relation index, subject, anchor).
 
-    For ``right``, ``behind``, ``under``, ``below`` and ``contains``, the function exchanges subject
-    and anchor. Subject and anchor may have any type.
+    For the opposites of `CANONICAL`, the function exchanges subject and anchor.
 
     Raises:
         ValueError: the relation is not one of the ten `RELATIONS`.

@@ -15,9 +15,7 @@ from numpy.typing import NDArray
 from app.inference.kernels import IN as IN
 from app.inference.kernels import ON as ON
 from app.inference.kernels import UNDER as UNDER
-from app.inference.kernels import is_smaller as is_smaller
 from app.inference.kernels import likely_role as likely_role
-from app.inference.kernels import possible_roles as possible_roles
 
 
 class RoleCounts(NamedTuple):

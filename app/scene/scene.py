@@ -45,12 +45,11 @@ class SceneObject:
     Attributes:
         id: name of the object in this scene.
         label: label of the object in the request.
-        class_index: index of the object's class in the model's vocabulary. None means that the
-            vocabulary does not contain the label.
+        class_index: index of the object's class in the model's vocabulary; None if the vocabulary
+            does not contain the label.
         confidence: probability in (0, 1] that the object exists.
-        position: centre (x, y, z) in metres in viewer axes (x away, y left, z up). None means that
-            the position is unknown.
-        size: extents (x, y, z) in metres before the rotation. None means that the size is unknown.
+        position: centre (x, y, z) in metres in viewer axes (x away, y left, z up), if known.
+        size: extents (x, y, z) in metres before the rotation, if known.
         yaw: rotation of the object about z in radians.
     """
 
@@ -71,15 +70,11 @@ class Scene:
         objects: objects of the scene. ``relations`` refers to their indices in this tuple.
         relations: triples (canonical relation, subject, object) that hold. None means that all
             relations are unobserved.
-        relations_complete: True if all relations that are missing from ``relations`` are known not
-            to hold.
-        room_type: index of the room type in the model's vocabulary. None means that the room type
-            is unknown.
+        relations_complete: whether all relations missing from ``relations`` do not hold.
+        room_type: index of the room type in the model's vocabulary, if known.
         profile: index of the data source whose base rates apply. None: inferred from the objects.
-        poses: relations derived from poses by `observe`. They include relations observed
-            not to hold, and replace ``relations`` as evidence. ``relations`` must list the derived
-            relations that hold, but the class does not check this condition. None means that no
-            relations were derived from poses.
+        poses: relations derived from poses by `observe`, also those observed not to hold. They
+            replace ``relations`` as evidence, and ``relations`` must list those that hold.
         excluded: (A, n, n) bool, True for relations that the poses of the objects exclude, without
             the stated relations. Left and front also count if the objects are far apart. None means
             that no object has a position.
@@ -109,20 +104,14 @@ def observe(
 ) -> Scene:
     """Derive the relations of a scene from the poses of its objects.
 
-    Positions and yaws must be in body axes (x forward, y left, z up). If ``viewpoint`` is
-    given, the returned scene has positions and yaws in viewer axes. The field ``relations`` of the
-    result lists the relations that hold. The field ``poses`` also contains relations observed not
-    to hold.
-
-    Stated relations take the place of derived relations. If the scene states relations, the
-    function only sets the field ``excluded``. It returns a scene without positions unchanged.
-    Without a viewer, left and front are undefined. The function then derives only on-top, above and
-    inside.
+    Positions and yaws must be in body axes (x forward, y left, z up). The result has viewer axes.
+    If the scene states relations, the function only sets the field ``excluded``. It returns a scene
+    without positions unchanged.
 
     Args:
         viewpoint: position and heading of the viewer in this frame. By default, the viewer is at
             the origin and looks along x.
-        has_viewer: whether the viewer's pose is known.
+        has_viewer: whether the viewer's pose is known. Otherwise, left and front are undefined.
         typical_sizes: (V, 3) typical extents of each class in metres (`Vocabulary.sizes`). They
             replace missing sizes of objects, and sizes below `SMALLEST`. NaN means an unknown size.
         roles: counts that decide between on-top, under and inside; see `derive_relations`.

@@ -27,13 +27,10 @@ USUAL: Final = 0.5  # share of a stand that is usual for a class
 
 
 def floor_level(bottoms: Floats, weights: Floats) -> float:
-    """Return the height of the floor: the lower weighted tertile of bottoms, in metres.
+    """Return the height of the floor: the lower weighted tertile of bottoms (n,), in metres.
 
-    Only objects that usually stand on the floor count. Without them, the height is NaN.
-
-    Args:
-        bottoms: (n,) heights in metres; NaN where unknown.
-        weights: (n,) shares of the objects of each class that stand on the floor.
+    Only objects that usually stand on the floor count: the weights (n,) are the shares of the
+    objects of each class that do. Without them, the height is NaN.
     """
     usable = np.isfinite(bottoms) & (weights >= USUAL)
     bottoms, weights = bottoms[usable], weights[usable]

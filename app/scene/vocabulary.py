@@ -52,9 +52,8 @@ class ObjectClass:
         aliases: synonyms of the label. Other spellings and plurals do not need an alias.
         structure: True for a structural class: a part of the building (floor, wall) or a vague name
             (object). Scenes may contain structural classes, but a model never proposes them.
-        size: typical extents (x, y, z) in metres, with z vertical. None means that they are
-            unknown.
-        parent: label of the broader class, such as "lamp" for "floor lamp". None means no parent.
+        size: typical extents (x, y, z) in metres, with z vertical, if known.
+        parent: label of the broader class, such as "lamp" for "floor lamp".
         anywhere: True if objects of the class belong in every room (pets, people, bags, toys).
 
     Raises:
@@ -91,10 +90,9 @@ class Vocabulary:
         parents: (V,) index of the parent of each class, -1 without a parent.
 
     Raises:
-        ValueError: the list of classes is empty, a room type has an empty name, a key of
-            `room_aliases` is not a room type, a parent is not a class or its own ancestor, or a
-            name is ambiguous. A name is ambiguous if two classes, or two room types, have names
-            with the same `label_key`.
+        ValueError: the list of classes is empty, a name is empty, a key of `room_aliases` is not a
+            room type, a parent is not a class or its own ancestor, or two classes, or two room
+            types, have names with the same `label_key`.
     """
 
     objects: Sequence[ObjectClass]
@@ -171,10 +169,7 @@ class Vocabulary:
         return _read_only(do_not_fit(self.sizes, self.sizes))
 
     def bare_objects(self, labels: Sequence[str]) -> tuple[SceneObject, ...] | None:
-        """Return objects without id and pose that have these labels, or None for a new spelling.
-
-        `Vocabulary` stores these objects, because most scenes of robots are lists of labels.
-        """
+        """Return stored objects without id and pose, or None if a label has a new spelling."""
         objects = tuple(map(self._bare.get, labels))
         return None if None in objects else objects  # type: ignore[return-value]
 
@@ -217,10 +212,7 @@ class Vocabulary:
         return "alias" if key in (self._room_by_key if is_room else self._by_key) else "phrase"
 
     def room_index(self, room: str) -> int | None:
-        """Return the index of a room type, or None for an unknown room type.
-
-        The method accepts all spellings with the same `label_key`.
-        """
+        """Return the index of a room type in any spelling, or None for an unknown room type."""
         return self._room_by_key.get(label_key(room))
 
     @cached_property
@@ -241,11 +233,7 @@ class Vocabulary:
 
     @_remembered
     def guess(self, label: str, *, is_room: bool = False) -> LookUp | None:
-        """Return the class or room type that an unknown label probably stands for, or None.
-
-        The method guesses the first alternatives of a label, or the name in the syntax of
-        detectors.
-        """
+        """Return the class or room type that an unknown label probably stands for, or None."""
         names = self._room_names if is_room else self._names
         pairs = list(readings(label))
         alternatives = [name for rule, name in pairs if rule == "alternative"]
@@ -255,12 +243,7 @@ class Vocabulary:
         return None
 
     def remembers(self, label: str, searches: Sequence[str], *, is_room: bool = False) -> bool:
-        """Return whether the class of a label is known without a new search.
-
-        Args:
-            searches: names of the methods that search for the label, until one of them finds
-                something.
-        """
+        """Return whether methods, tried one after the other, know a label without a new search."""
         if label in (self._room_by_spelling if is_room else self._by_spelling):
             return True
         keys = [(search, label, is_room) for search in searches]

@@ -15,8 +15,7 @@ the event loop looks at the network again, so health checks wait a few milliseco
 batches are computed one by one between quick requests, and large scenes and draws in threads of low
 priority. Compiled loops release the interpreter lock, so the event loop can continue.
 
-Each question is computed separately, so an answer never depends on other requests. A request is
-dropped if its deadline passes, or its client disconnects, before its computation starts.
+Each question is computed separately, so an answer never depends on other requests.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ SLOW_SLOTS: Final = 2
 SMALL: Final = 16 * 1024
 """Maximum size in bytes of a body that the event loop parses, in less than a millisecond.
 
-The service accepts such a body if it arrives in one piece, also when other bodies fill the budget.
+In one piece, such a body is always accepted.
 """
 
 # Time in seconds between two checks of the client's connection during a computation in a thread.
@@ -83,11 +82,9 @@ class Lane:
         return self.weight + weight > self.limit or of_client > self.limit // SHARE
 
     async def let_pass(self) -> None:
-        """Let requests of this lane run before the next scene of a batch.
-
-        A turn takes three iterations of the event loop: one to end the turn before it, one to
-        start, and one to answer.
-        """
+        """Let requests of this lane run before the next scene of a batch."""
+        # A turn takes three iterations of the event loop: to end the turn before it, to start, and
+        # to answer.
         for _ in range(3 if self._queues else 1):
             await asyncio.sleep(0)
 
@@ -98,8 +95,7 @@ class Lane:
             client: name of the client.
             weight: weight of the request. A weight of 0 is never refused.
             deadline: deadline of the request, as a value of `time.monotonic`.
-            line: key of the queue. Requests with the same key start in their order of arrival, and
-                the keys take turns. The default is the client.
+            line: key of the queue; the keys take turns. The default is the client.
 
         Raises:
             QueueFullError: the lane or the client's share of it is full.
@@ -130,11 +126,7 @@ class Lane:
             raise
 
     def leave(self, client: str, weight: int) -> None:
-        """End the turn of a request, and free its slot in the event loop's next iteration.
-
-        Between two looks at the network, the event loop therefore starts at most as many requests
-        as the lane has slots.
-        """
+        """End the turn of a request, and free its slot in the event loop's next iteration."""
         self.weight -= weight
         left = self._weights.pop(client, 0) - weight
         if left:
@@ -190,20 +182,12 @@ class Ticket:
             lane.leave(self.client, self.weight)
 
     def check(self) -> None:
-        """Check that the deadline has not passed.
-
-        Raises:
-            DeadlinePassedError: the deadline has passed.
-        """
+        """Raise DeadlinePassedError if the deadline has passed."""
         if monotonic() >= self.deadline:
             raise errors.DeadlinePassedError("The deadline passed before the computation started.")
 
     async def check_connected(self) -> None:
-        """Check that the client is still connected.
-
-        Raises:
-            DisconnectedError: the client has disconnected.
-        """
+        """Raise DisconnectedError if the client has disconnected."""
         if self.is_gone is not None and await self.is_gone():
             raise errors.DisconnectedError("The client has disconnected.")
 
@@ -225,11 +209,7 @@ class Admission:
     async def in_worker(self, ticket: Ticket, call: Callable[[], T]) -> T:
         """Run a computation in a turn of the lane `slow`, in its thread, and return the result.
 
-        In the lane `quick`, a request that waits for a thread would keep others out.
-
-        Raises:
-            QueueFullError, DeadlinePassedError, DisconnectedError, Exception: see `Lane.enter` and
-                `in_thread`.
+        The errors are those of `Lane.enter` and `in_thread`.
         """
         await ticket.enter(self.slow, 1)
         result, _ = await in_thread(lambda _: call(), ticket, self.worker)
@@ -284,9 +264,7 @@ async def in_thread(
             if future.done():
                 return future.result()
             if left <= _LOOK:
-                raise errors.DeadlinePassedError(
-                    "The deadline passed before the computation finished."
-                )
+                raise errors.DeadlinePassedError("The deadline passed before the result.")
             await ticket.check_connected()
     finally:
         has_ended = True
@@ -314,11 +292,7 @@ class Bodies:
 
     @contextmanager
     def hold(self, client: str, size: int) -> Iterator[None]:
-        """Count a large answer of a client until the ``with`` block ends.
-
-        Raises:
-            BodiesFullError: the budget is full.
-        """
+        """Count a large answer of a client in the ``with`` block, or raise BodiesFullError."""
         self._add(client, size)
         try:
             self._check(client, size)
@@ -342,7 +316,7 @@ class Bodies:
         # int() must not parse very long numbers, so the length is checked first.
         if length.isdigit() and (len(length) > 18 or int(length) > limit):
             raise _too_large(limit)
-        body: bytes | bytearray = b""
+        body = bytearray()
         try:
             async with asyncio.timeout(self.patience):
                 more = True
@@ -354,11 +328,7 @@ class Bodies:
                     part, more = message.get("body", b""), message.get("more_body", False)
                     is_whole = not (more or body)
                     self._add(client, len(part))
-                    if is_whole:
-                        body = part
-                    else:
-                        body = bytearray(body) if isinstance(body, bytes) else body
-                        body += part
+                    body += part
                     if len(body) > limit:
                         raise _too_large(limit)
                     if not (is_whole and len(body) <= SMALL):

@@ -71,8 +71,8 @@ def log_config(
     """Return the log configuration of the service and uvicorn for `logging.config.dictConfig`.
 
     The access log of uvicorn is off, because it would contain raw paths. The service writes its own
-    access log. The log level of libraries is at least `info`, because at `debug` numba would log
-    each step of a compilation. Every line masks the secrets.
+    access log. The log level of libraries is at least `info`, because numba logs each step of a
+    compilation at `debug`.
     """
     level = level.upper()
     libraries = max(logging.getLevelNamesMapping()[level], logging.INFO)

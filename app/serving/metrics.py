@@ -1,8 +1,7 @@
 """Metrics for Prometheus. `GET /metrics` returns them as text.
 
-Clients cannot create new label values of metrics, because the number of series must stay small. The
-label of a route is its template instead of the path, and only served models have labels. Each
-replica of the service is one process and reports its own metrics (docs/decisions/artifacts.md).
+Clients cannot create label values of metrics, so the number of series stays small. The label of a
+route is its template, and only served models have labels. Each replica reports its own metrics.
 """
 
 from __future__ import annotations
@@ -40,8 +39,7 @@ _MODEL: Final = ("model", "version")
 _FINDINGS: Final = (("outlier", "misplaced"), ("ignored", "guessed"), get_args(WarningCode))
 _GUESSES: Final = ("spelling", "head")  # the other rules of `scene_client.schemas.Rule` are certain
 
-# By default, the library adds a second series to each counter, the creation time. Prometheus does
-# not need this series, because it detects restarts itself.
+# Prometheus needs no second series of each counter, because it detects restarts itself.
 disable_created_metrics()  # type: ignore[no-untyped-call]
 
 
@@ -156,13 +154,7 @@ class Metrics:
         self._reloads.labels(outcome).inc()
 
     def answered(self, route: str, outcome: str, seconds: float) -> None:
-        """Count one answered request.
-
-        Args:
-            route: template of the route, or "-" if no route has the requested path.
-            outcome: "success" or the slug (short name) of the problem type.
-            seconds: duration of the request in seconds.
-        """
+        """Count one answered request, by the template of its route, or "-" without a route."""
         series = self._of_requests.get((route, outcome))
         if series is None:
             series = self._requests.labels(route, outcome), self._latency.labels(route)
@@ -178,20 +170,12 @@ class Metrics:
     def computed(
         self, key: Key, question: str, waited: float, seconds: float, objects: int, answer: Fields
     ) -> None:
-        """Record one question that a model has answered.
+        """Record one question about a number of objects that a model has answered.
 
-        The method does nothing for a model that is no longer served. Otherwise the removed series
-        of this model would appear again.
-
-        Args:
-            key: name and version of the model.
-            question: name of the question.
-            waited, seconds: time in seconds before the computation, and of the computation.
-            objects: number of objects in the request.
-            answer: the fields of the answer.
+        ``waited`` and ``seconds`` are times before and of the computation.
         """
         questions = self._of_model.get(key)
-        if questions is None:
+        if questions is None:  # the model is no longer served, and its series are removed
             return
         series = questions.get(question)
         if series is None:

@@ -1,8 +1,7 @@
 """The served models: the registry has verified them, and the service has warmed them up.
 
-A snapshot of the models never changes, so a request uses the same models from beginning to end. The
-snapshot lists each refused version with the reason. A name without a version means the newest
-usable version. During its warm-up, a model answers every question.
+A snapshot of the models never changes, so a request uses the same models from beginning to end. A
+name without a version means the newest usable version.
 """
 
 from __future__ import annotations
@@ -41,12 +40,7 @@ _UNKNOWN = {"unknown_model", "unknown_version", "invalid_reference"}
 
 @dataclass(frozen=True, eq=False)
 class ServedModels:
-    """A snapshot of served models, refused versions and aliases.
-
-    Attributes:
-        store: snapshot of the registry, with all versions and aliases. The models that failed
-            their warm-up are among its failures.
-    """
+    """A snapshot of served models, refused versions and aliases, including failed warm-ups."""
 
     store: ModelSet
 
@@ -106,8 +100,7 @@ class ServedModels:
 
     @cached_property
     def _resolved(self) -> dict[str, Artifact]:
-        # The cache contains only valid references, because clients can send any number of invalid
-        # references. The contents of the store limit the number of valid references.
+        # Only valid references, because clients can send any number of invalid ones.
         return {}
 
     @cached_property

@@ -32,12 +32,9 @@ class Record:
     Attributes:
         outcome: `SUCCESS`, or the slug (short name) of the problem type in the response.
         status: HTTP status of the response, or 0 before the response starts.
-        models: pairs (name, version) of the models that the request used. A batch may use several
-            models.
-        queue_seconds: total time in seconds that the scenes of the request waited, or None if the
-            request used no model.
-        compute_seconds: total computation time of the models in seconds, or None if the request
-            used no model.
+        models: pairs (name, version) of the models that the request used.
+        queue_seconds, compute_seconds: total times that the scenes of the request waited, and that
+            models computed. None if the request used no model.
     """
 
     outcome: str = SUCCESS
@@ -47,10 +44,7 @@ class Record:
     compute_seconds: float | None = None
 
     def log_fields(self) -> dict[str, str | float]:
-        """Return the fields for the access log line, with times in milliseconds.
-
-        The dictionary contains the model only if the request used exactly one model.
-        """
+        """Return the fields for the access log line, and the model if the request used only one."""
         entry: dict[str, str | float] = {"outcome": self.outcome}
         if len(self.models) == 1:
             ((entry["model"], entry["version"]),) = self.models
@@ -185,11 +179,7 @@ def is_quick(scene: SceneRequest, vocabulary: Vocabulary) -> bool:
 
 
 def is_small(scene: Mapping[str, Any]) -> bool:
-    """Return whether the event loop may validate a scene.
-
-    Args:
-        scene: the fields of the request, validated or not.
-    """
+    """Return whether the event loop may validate a scene, given by its fields."""
     for name, value in scene.items():
         if isinstance(value, list):
             if len(value) > (QUICK_OBJECTS if name == "objects" else QUICK_ENTRIES):

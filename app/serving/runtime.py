@@ -58,25 +58,16 @@ class Runtime:
         self._loaded_state: StoreState | None = None
 
     def check_ready(self) -> None:
-        """Check that the service accepts requests and that its default model is usable.
-
-        Raises:
-            NotReadyError: the default model is not usable.
-            DrainingError: the service is shutting down.
-        """
+        """Raise NotReadyError without a usable default model, or DrainingError at shutdown."""
         if self.draining:
             raise errors.DrainingError
         self.models.resolve(DEFAULT)
 
     async def start(self) -> None:
-        """Load, verify and warm up all versions in the store.
-
-        Afterwards, `models.failures` contains the refused versions and aliases.
-        """
+        """Load, verify and warm up all versions in the store, and follow its changes."""
         sys.setswitchinterval(_SWITCH_INTERVAL)
         check_cache()
-        # The models load on this thread, because the service has no requests yet. Another thread
-        # would cost time and memory.
+        # The models load on this thread, because the service has no requests yet.
         self._serve(self._load())
         self._following = asyncio.create_task(self._follow_store())
 
@@ -95,10 +86,7 @@ class Runtime:
 
         If a new version fails, the service lists this version as refused and serves the other
         changes. If a usable version or alias would become unusable, the service serves no change.
-        The log and the metrics contain the outcome.
-
-        Args:
-            always: whether to load an unchanged state, too.
+        With ``always``, it loads an unchanged state, too.
         """
         outcome: Outcome = "failed"
         try:
@@ -143,8 +131,7 @@ class Runtime:
             _freeze_memory()
 
     def _load(self) -> ServedModels:
-        # Read the state before the files. So the next check of the store finds changes that other
-        # processes make during the load.
+        # Read the state first. So the next check finds changes that are made during the load.
         self._loaded_state = self._store.state()
         with progress(KERNELS):
             return ServedModels(load_model_set(self._store, self.models.store, warm_up))
@@ -158,11 +145,9 @@ def _log_failures(prefix: str, failures: Iterable[Failure]) -> None:
 def _freeze_memory() -> None:
     """Exclude long-lived objects from garbage collection, and release unused memory.
 
-    A full collection of all objects would stop every thread for 0.1 s. So the function freezes the
-    objects of the current snapshot. Objects of a replaced snapshot stay frozen: they form no
-    reference cycles, so Python frees them without the collector. At the end, the function returns
-    unused memory (about 30 MB after the load) to the operating system, if the C library supports
-    this.
+    A full collection of all objects would stop every thread for 0.1 s. Objects of a replaced
+    snapshot stay frozen: they form no reference cycles, so Python frees them without the collector.
+    malloc_trim returns about 30 MB to the operating system after the load.
     """
     if gc.isenabled():
         gc.collect()  # objects that are not frozen yet

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import subprocess
@@ -36,30 +35,22 @@ def package(tmp_path: Path, repository: Path) -> Path:
     return tmp_path / "service" / "app"
 
 
-def begin(package: Path, **variables: str) -> subprocess.Popen[str]:
+def start(package: Path, **variables: Any) -> tuple[int, str | None, str]:
+    """Return the number of compilations, the directory of the loops, and the log."""
     environment = {name: text for name, text in os.environ.items() if "NUMBA" not in name}
     home = package.parent.parent / "home"
     environment |= {"PYTHONPATH": "", "HOME": str(home), "XDG_CACHE_HOME": str(home / "cache")}
-    return subprocess.Popen(
+    process = subprocess.run(
         [sys.executable, "-c", PROGRAM],
         cwd=package.parent,
-        env=environment | variables,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
+        env=environment | {name: str(value) for name, value in variables.items()},
+        capture_output=True,
         text=True,
+        timeout=120,
     )
-
-
-def end(process: subprocess.Popen[str]) -> tuple[int, str | None, str]:
-    """Return the number of compilations, the directory of the loops, and the log."""
-    output, log = process.communicate(timeout=120)
-    assert process.returncode == 0, log
-    compilations, folder = json.loads(output)
-    return compilations, folder, log
-
-
-def start(package: Path, **variables: Any) -> tuple[int, str | None, str]:
-    return end(begin(package, **{name: str(value) for name, value in variables.items()}))
+    assert process.returncode == 0, process.stderr
+    compilations, folder = json.loads(process.stdout)
+    return compilations, folder, process.stderr
 
 
 def test_a_second_start_compiles_nothing(package: Path) -> None:
@@ -99,19 +90,6 @@ def test_a_folder_of_another_user_is_refused(package: Path, tmp_path: Path) -> N
     compilations, stored, log = start(package, NUMBA_CACHE_DIR=folder)
     assert (compilations, stored) == (1, None)
     assert f"{folder} or its parent belongs to another user" in log
-
-
-def test_one_process_compiles_at_a_time(package: Path) -> None:
-    folder = package.parent / ".numba_cache"
-    folder.mkdir(mode=0o700)
-    with (folder / ".lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        process = begin(package)
-        assert process.stderr is not None
-        assert any("waiting until another process" in line for line in process.stderr)
-        assert process.poll() is None
-    assert end(process)[0] == 1
-    assert start(package)[0] == 0
 
 
 def test_every_loop_is_in_one_file_that_depends_on_no_other(repository: Path) -> None:

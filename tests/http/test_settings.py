@@ -98,8 +98,6 @@ def test_invalid_settings_are_refused(tmp_path: Path, name: str, value: object) 
         ("scene_max_object", "7", "unknown setting; did you mean SCENE_MAX_OBJECTS?"),
         ("SCENE_HTTP_PORT", "80", "unknown setting"),
         ("SCENE_ZZ", "1", "unknown setting; docs/operations.md lists the settings"),
-        ("SCENE_WORKERS", "2", "this setting is removed: a replica is one process"),
-        ("SCENE_STREAM_RESUME", "1", "this setting is removed: the service has no streams"),
         ("SCENE_PORT", "tcp://10.0.0.1:8000", "Input should be a valid integer"),
     ],
 )

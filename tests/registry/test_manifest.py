@@ -93,7 +93,6 @@ def test_refuses_malformed_manifests(data: bytes, code: str) -> None:
         ("calibration.outlier_lines", None),  # the fit needs its lines
         ("calibration.outlier", None),  # without a fit, there are no lines
         ("training.rate", math.nan),
-        ("metrics.0.low", 0.7),  # above high
         ("examples", [{"name": "a", "scene": {"objects": ["bed"], "model": "other"}}]),
         ("examples", [{"name": "a", "scene": {"objects": ["bed"]}}] * 9),
         ("files", {}),

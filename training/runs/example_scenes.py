@@ -19,8 +19,9 @@ from pydantic import TypeAdapter, ValidationError
 
 from app.errors import RequestError
 from app.questions.reading import Limits, read_scene
-from app.registry.examples import MAX_WORD, Example, Examples
+from app.registry.description import Example, Examples
 from app.scene import Vocabulary, canonicalise
+from scene_client.schemas.requests import MAX_LABEL
 from training.datasets import AnnotatedScene, DatasetError
 from training.datasets.encoding import room_viewpoint
 from training.datasets.records import AnnotatedObject
@@ -135,7 +136,7 @@ def _usable(scene: AnnotatedScene, vocabulary: Vocabulary) -> list[tuple[int, An
         (index, thing)
         for index, thing in zip(indices, scene.objects, strict=True)
         if index is not None and not vocabulary.structure[index]
-        if len(label := vocabulary.labels[index]) <= MAX_WORD and label.isprintable()
+        if len(label := vocabulary.labels[index]) <= MAX_LABEL and label.isprintable()
     ]
 
 
@@ -161,7 +162,7 @@ def _make_example(
     values["objects"] = [{"label": names[thing.id]} | _pose(thing) for _, thing in kept]
     scene_id = "".join(filter(str.isprintable, scene.scene_id))
     title = f"{values.get('room_type', 'scene').capitalize()}, {scene_id}"
-    return Example.model_validate({"name": title[:MAX_WORD], "scene": values})
+    return Example.model_validate({"name": title[:MAX_LABEL], "scene": values})
 
 
 def _viewpoint(scene: AnnotatedScene) -> dict[str, float]:
