@@ -44,11 +44,9 @@ ATTEMPTS: Final = 8
 """Maximum number of draws for one scene."""
 
 
-DRAWN_SEED_BITS: Final = 53
-"""Size in bits of a seed that the service chooses.
-
-A JSON reader may store numbers as doubles. A double represents an integer of 53 bits exactly.
-"""
+# Size in bits of a seed that the service chooses. A double, in which a JSON reader may store it,
+# represents such an integer exactly.
+_SEED_BITS: Final = 53
 
 
 def generate(
@@ -87,19 +85,8 @@ def generate(
         The fields `seed` and `scenes` of `scene_client.schemas.GenerateAnswer`. For `log_score`,
         see `ConditionedChains.log_score`. Only scores of the same model, for the same listed
         classes and profile, can be compared.
-
-    Raises:
-        ValueError: a number is out of range.
     """
     steps = STEPS if steps is None else steps
-    if count < 1:
-        raise ValueError(f"count must be at least 1, not {count}")
-    if seed < 0:
-        raise ValueError(f"seed must not be negative, not {seed}")
-    if steps < 1:
-        raise ValueError(f"steps must be at least 1, not {steps}")
-    if not temperature > 0:
-        raise ValueError(f"temperature must be positive, not {temperature}")
     conditions = _conditions(artifact, scene)
     chains = artifact.scene_chains.under(conditions, temperature)
     shown = ~artifact.vocabulary.structure
@@ -124,7 +111,7 @@ def _conditions(artifact: Artifact, scene: Scene) -> Conditions:
     """Return the fixed part of each chain: classes, relations, room type and profile."""
     listing = present(scene, artifact.spec)
     observed = given_relations(scene, listing, artifact.spec.A)
-    return Conditions(listing.classes, listing.log_counts, observed, scene.room_type, scene.profile)
+    return Conditions(listing.classes, observed, scene.room_type, scene.profile)
 
 
 def _scene(
@@ -240,7 +227,7 @@ def _read(request: GenerateRequest, artifact: Artifact, reading: Reading) -> Opt
     errors.raise_any()
     return {
         "count": request.count,
-        "seed": secrets.randbits(DRAWN_SEED_BITS) if request.seed is None else request.seed,
+        "seed": secrets.randbits(_SEED_BITS) if request.seed is None else request.seed,
         "steps": request.steps,
         "temperature": request.temperature,
     }

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference.elementary import sigmoid
-from app.inference.kernels import companions
+from app.inference.kernels import best
 from app.questions.answer import EXPLAINED, Fields, reasons, rounded_number, significant
 from app.questions.misplaced import misplaced_fields
 from app.questions.posterior import Posterior, calibrated
@@ -208,7 +208,9 @@ def _companions(artifact: Artifact, present: NDArray[np.int64], flagged: int) ->
     """
     usable = ~artifact.vocabulary.structure
     usable[present] = False
-    chosen = companions(*artifact.objects.increases(flagged), usable, _LEAST_SHARE, COMPANIONS)
+    increase, rank = artifact.objects.increases(flagged)
+    least = max(_LEAST_SHARE * float(increase[usable].max(initial=0)), 1e-6)
+    chosen = best(rank, usable & (increase >= least) & (rank > 0), COMPANIONS)
     return [artifact.vocabulary.labels[index] for index in chosen.tolist()]
 
 
