@@ -1302,26 +1302,6 @@ def pool_classes(
     return distinct[:n], first[:n], row, counts[:n], 1.0 - absent[:n]
 
 
-@compiled
-def pool_relations(
-    row: NDArray[np.int64], n: int, holds: NDArray[np.bool_], observed: NDArray[np.bool_]
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Pool the relations of instances (A, N, N) into relations of classes (A, n, n).
-
-    ``row`` (N,) is the index of each instance's class, from 0 to n - 1. The results are ``holds``
-    and ``observed`` of `ClassEvidence`.
-    """
-    A, size, _ = holds.shape
-    class_holds, class_observed = np.zeros((A, n, n), np.bool_), np.zeros((A, n, n), np.bool_)
-    for a in range(A):
-        for i in range(size):
-            for j in range(size):
-                if i != j and (holds[a, i, j] or observed[a, i, j]):
-                    class_observed[a, row[i], row[j]] = True
-                    class_holds[a, row[i], row[j]] |= holds[a, i, j]
-    return class_holds, class_observed
-
-
 # ------------------------------------------------------------- calibration and ranking: questions
 
 EXCLUDED = np.float32(-1.0)
@@ -1645,53 +1625,6 @@ def triple_counts(
             if row >= 0:
                 counts[i, j] = held[row]
     return counts
-
-
-# ------------------------------------------------------------ drawn scenes: questions/generate.py
-
-# Direction of each relation: 1 for left, 2 for front, and 0 (up) for on-top, above and inside.
-# Their subjects are higher than their objects, or in their objects.
-_DIRECTION: Final = np.array([1, 2, 0, 0, 0])
-
-
-@compiled
-def select_consistent(
-    relation: NDArray[np.int64],
-    ends: NDArray[np.int64],
-    order: NDArray[np.int64],
-    fixed: int,
-    count: int,
-) -> NDArray[np.bool_]:
-    """Select relations that contradict neither the evidence nor each other, as a bool mask (m,).
-
-    Args:
-        relation: (fixed + m,) canonical relations. The relations of the evidence come first.
-        ends: (fixed + m, 2) indices of the subject and object classes, from 0 to count - 1.
-        order: indices from 0 to m - 1 of the drawn relations to try, likeliest first.
-        fixed: number of relations in the evidence.
-        count: number of classes.
-    """
-    # reaches[d, x, y] is True if relations of direction d lead from x to y, directly or through
-    # other classes.
-    reaches = np.zeros((3, count, count), np.bool_)
-    related, supported = np.zeros((count, count), np.bool_), np.zeros(count, np.bool_)
-    stay = np.zeros(len(relation) - fixed, np.bool_)
-    for turn in range(fixed + len(order)):
-        e = turn if turn < fixed else fixed + order[turn - fixed]
-        x, y, reached = ends[e, 0], ends[e, 1], reaches[_DIRECTION[relation[e]]]
-        on_top = relation[e] == ON_TOP
-        if turn >= fixed:
-            if reached[y, x] or related[x, y] or (on_top and supported[x]):
-                continue
-            stay[e - fixed] = True
-        related[x, y] = related[y, x] = True
-        supported[x] |= on_top
-        # Each class that leads to x now also leads to y and to all classes after y.
-        for k in range(count):
-            if k == x or reached[k, x]:
-                reached[k] |= reached[y]
-                reached[k, y] = True
-    return stay
 
 
 # -------------------------------------------------------------------- digits: questions/answer.py
