@@ -67,14 +67,12 @@ class Conditions:
 
     Attributes:
         classes: (n,) int64, distinct indices of the classes that stay present, ascending.
-        log_counts: (n,) log of the number of instances of each class.
         observed: observed relations between these classes, or None without observed relations.
         room: index of the room type, or None if unknown.
         profile: index of the data source whose base rates apply, or None.
     """
 
     classes: Indices
-    log_counts: Floats
     observed: ObservedRelations | None
     room: int | None = None
     profile: int | None = None
@@ -143,8 +141,7 @@ class SceneChains:
             present: presence of each class in the scene, (V,).
             room: index of the room type that the chain keeps, or None.
         """
-        none = np.zeros(0, np.int64)
-        conditions = Conditions(none, np.zeros(0, np.float32), None, room)
+        conditions = Conditions(np.zeros(0, np.int64), None, room)
         on = (present > 0).astype(np.uint8)
         self.under(conditions).sweep(on, steps, stream)
         return on

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from app.inference import kernels
 from app.inference.elementary import log_softmax, sigmoid
+from app.inference.relations import Context
 from app.inference.weights import SHARES, Weights
 
 Floats = NDArray[np.float32]
@@ -48,8 +49,6 @@ _LARGEST_GROUP: Final = 25
 _TILE: Final = 800
 # The width of a tile is a multiple of this number, so that it fills whole vector registers.
 _LANES: Final = 16
-_LN2 = np.float32(0.6931471805599453)
-_ONE = np.float32(1.0)
 _SMALLEST: Final = 1e-300  # least probability of a room type
 # Maximum number of biases that a scorer keeps, of 4 bytes for each class.
 _KEPT_BIASES: Final = 64
@@ -154,10 +153,7 @@ class ObjectScorer:
 
     def given_rest(
         self,
-        x: Floats,
-        shares: Floats,
-        classes: Indices,
-        presence: Floats,
+        scene: Context,
         profile: int | None,
         room: int | None = None,
         *,
@@ -170,36 +166,27 @@ class ObjectScorer:
         0. Otherwise this result is (n, 0).
 
         Args:
-            x: (H1,) logits of h1 given all listed classes.
-            shares: (n, H1) contribution of each class to x.
-            classes, presence, profile, room: see `absent`.
+            profile, room: see `absent`. The room type is that of the scene.
         """
-        weights, rows = self._weights, np.arange(len(classes))
+        weights, rows = self._weights, np.arange(len(scene.classes))
         bias = weights["b"] + weights.room_couplings(room) + weights["kappa"][-1]
-        effects = bias, x, shares, classes, presence, profile, rows, classes
-        return self._explained(*effects, explained=explained)
+        return self._explained(bias, scene, profile, rows, scene.classes, explained=explained)
 
     def reasons_for_absent(
-        self,
-        x: Floats,
-        shares: Floats,
-        classes: Indices,
-        presence: Floats,
-        profile: int | None,
-        candidates: Indices,
+        self, scene: Context, profile: int | None, candidates: Indices
     ) -> Floats:
-        """Return how much each listed class changes the log-odds of N unlisted classes, (N, n)."""
-        bias, rows = self._weights["b"], classes[:0]
-        effects = bias, x, shares, classes, presence, profile, rows, candidates
-        return self._explained(*effects, explained=True)[1]
+        """Return how much each listed class changes the log-odds of unlisted classes, (N, n).
+
+        An entry is the log-odds of one of the N candidates with the listed class, minus its
+        log-odds without this class.
+        """
+        bias, rows = self._weights["b"], candidates[:0]
+        return self._explained(bias, scene, profile, rows, candidates, explained=True)[1]
 
     def _explained(
         self,
         bias: Floats,
-        x: Floats,
-        shares: Floats,
-        classes: Indices,
-        presence: Floats,
+        scene: Context,
         profile: int | None,
         rows: Indices,
         targets: Indices,
@@ -210,9 +197,9 @@ class ObjectScorer:
         weights = self._weights
         possible = slice(None) if profile is None else slice(profile, profile + 1)
         log_odds, change = kernels.explained_log_odds(
-            *(x, shares, weights["W"], bias, self._couplings),
+            *(scene.x, scene.shares, weights["W"], bias, self._couplings),
             *(weights["f"][possible], weights["a"][possible], self._states),
-            *(classes, presence, rows, targets, explained),
+            *(scene.classes, scene.presence, rows, targets, explained),
         )
         return log_odds, change
 

@@ -101,24 +101,14 @@ class ScenePosterior:
         return of_absent
 
     def given_rest(self, *, explained: bool = False) -> tuple[Floats, Floats]:
-        """Return the log-odds of each class given the scene without this class, (n,).
-
-        If `explained`, the second result is how much each class j changes the log-odds of each
-        class i, (n, n), otherwise (n, 0). `ObjectScorer.given_rest` describes the changes.
-        """
-        scene = self.context.x, self.context.shares, *self._scene, self._profile, self._room
-        return self._objects.given_rest(*scene, explained=explained)
+        """See `ObjectScorer.given_rest`."""
+        return self._objects.given_rest(
+            self.context, self._profile, self._room, explained=explained
+        )
 
     def reasons_for_absent(self, candidates: Indices) -> Floats:
-        """Return how much each class of the scene changes the log-odds of absent classes, (N, n).
-
-        Each row is one of the N absent candidates. Each column is one of the n classes of the
-        scene. An entry is the candidate's log-odds with the class of the scene, minus the
-        candidate's log-odds without this class.
-        """
-        x, shares = self.context.x, self.context.shares
-        profile = self._profile
-        return self._objects.reasons_for_absent(x, shares, *self._scene, profile, candidates)
+        """See `ObjectScorer.reasons_for_absent`."""
+        return self._objects.reasons_for_absent(self.context, self._profile, candidates)
 
     def room_log_p(self) -> Doubles:
         """Return log p(t | objects) of each room type t, (C,), in a scene of unknown room type."""
@@ -150,16 +140,12 @@ class ScenePosterior:
 
     def alone_log_odds(self) -> Floats:
         """Return the log-odds of every relation given the objects alone, (A, n, n)."""
-        return self._alone
+        return to_log_odds(self._between.mean, self._between.spread)
 
     def relation_change(self) -> Floats:
         """Return the change of every logit by observed relations of other pairs, (A, n, n)."""
         change = self._between.apart
         return change if len(change) else np.zeros_like(self._between.mean)
-
-    @cached_property
-    def _alone(self) -> Floats:
-        return to_log_odds(self._between.mean, self._between.spread)
 
     def log_odds_apart(self, i: Indices, j: Indices) -> tuple[Floats, Floats]:
         """Return the log-odds (A, P) of all relations from classes i to j, and (A, P) from j to i.
@@ -177,10 +163,7 @@ class ScenePosterior:
     def placement_log_odds(
         self, candidates: Indices, anchors: Indices, only: int | None = None
     ) -> tuple[Floats, Floats]:
-        """Return the log-odds of relations between absent candidate classes and anchor classes.
-
-        `RelationUnits.placement_log_odds` describes arguments and results.
-        """
+        """See `RelationUnits.placement_log_odds`."""
         return self._units.placement_log_odds(self.context, candidates, anchors, only)
 
     def placed_log_p(

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference import kernels
-from app.inference.elementary import sigmoid
+from app.inference.elementary import sigmoid, softmax
 from app.inference.variants import MachineSpec
 
 SWEEPS: Final = 10
@@ -48,7 +48,7 @@ def layout(spec: MachineSpec) -> dict[str, tuple[type, tuple[int, ...]]]:
     `MachineSpec` defines the sizes.
 
         b (V,), c1 (H1,), c2 (H2,), e (C,): biases of objects, hidden units and room types
-        f (profiles,): biases of the data sources; see `Weights.class_bias`
+        f (profiles,): biases of the data sources; see `Weights.source_weights`
         W (V, H1), J (H1, H2), Q (C, H1): weights between h1 and objects, h2 and room types
         L (V, V): couplings between classes, symmetric with a diagonal of 0, if `coupled`
         Y (C, V): couplings between room types and classes, if `coupled`
@@ -162,24 +162,11 @@ class Weights:
             one = np.zeros((len(presence), self.spec.profiles))
             one[:, profile] = 1.0
             return one
-        return kernels.source_weights(self["f"], self["a"], classes, presence)
-
-    def class_bias(
-        self, classes: NDArray[Any], presence: NDArray[Any], profile: int | None
-    ) -> NDArray[Any]:
-        """Return the bias of each class given the listed classes, (V,).
-
-        The bias is b + sum_q p(q) a[q]; see `source_weights`. b alone is the bias for the mix of
-        data sources that the model serves.
-
-        Args:
-            classes, presence: (n,) indices of the listed classes, and the probabilities that they
-                are present.
-            profile: index of the data source whose base rates apply, or None.
-        """
-        weights = self.source_weights(classes, presence[None], profile)[0]
-        bias: NDArray[Any] = self["b"] + weights.astype(self["b"].dtype) @ self["a"]
-        return bias
+        # The sum has float64 digits, so that listed structure, whose terms are 0, changes none.
+        p: NDArray[np.float64] = softmax(
+            self["f"] + presence @ self["a"][:, classes].T.astype(np.float64)
+        )
+        return p
 
     def scene_bias(
         self, classes: NDArray[Any], profile: int | None, room: int | None

@@ -25,7 +25,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.kernels import best, count_distributions, count_summaries
+from app.inference.elementary import softmax
+from app.inference.kernels import INTERCEPT, ROOM, SEVERAL, SINGLE, best
 from app.questions.answer import Fields, significant
 from app.questions.posterior import Present
 from app.registry.artifact import Artifact
@@ -36,6 +37,8 @@ Ints = NDArray[np.int64]
 
 LIKELY: Final = 0.5
 """Minimum probability of further instances at which an answer contains a class."""
+
+_OUTSIDE: Final = 0.1  # probability of a count below `low`, and of a count above `high`
 
 _FIELDS: Final = ("label", "listed_count", "expected_count", "low", "high", "probability")
 
@@ -76,7 +79,8 @@ def more(
         unlisted = (1 - coverage) / (1 - usual)
     rows, p = distribution(artifact.counts, artifact.spec.V, classes, listed, room, unlisted)
     classes, listed = classes[rows], listed[rows]
-    p_more, expected, low, high = count_summaries(p, listed)
+    numbers, cumulative = np.arange(1, p.shape[1] + 1), p.cumsum(axis=1)
+    p_more = 1 - cumulative[np.arange(len(p)), listed - 1]
     usable = p_more >= LIKELY if candidates is None else np.isin(classes, list(candidates))
     order = best(p_more, usable, top_k)
     if not len(order):
@@ -85,9 +89,11 @@ def more(
     columns = (
         [labels[index] for index in classes[order].tolist()],
         listed[order].tolist(),
-        significant(expected[order]),
-        low[order].tolist(),
-        high[order].tolist(),
+        significant(p[order] @ numbers),
+        *(
+            ((cumulative[order] < share).sum(axis=1) + 1).tolist()
+            for share in (_OUTSIDE, 1 - _OUTSIDE)
+        ),
         significant(p_more[order]),
     )
     return [dict(zip(_FIELDS, values, strict=True)) for values in zip(*columns, strict=True)]
@@ -115,12 +121,21 @@ def distribution(
         Indices into `classes` of the k classes with statistics that cover the listed number, (k,).
         Then the probability of 1, 2, ... M instances, (k, M).
     """
-    scene = classes, listed, -1 if room is None else room
-    log_unlisted = math.log(max(unlisted, sys.float_info.min))
-    tables = counts.classes, counts.most, counts.log_share, counts.weights
-    first = counts.weights.shape[-1] - V
-    rows, p = count_distributions(*tables, *scene, first, log_unlisted)
-    return rows, p
+    known, weights, M = counts.classes, counts.weights, counts.log_share.shape[1]
+    entry = np.searchsorted(known[:-1], classes)
+    rows = np.flatnonzero((known[entry] == classes) & (listed <= counts.most[entry]))
+    entry, number = entry[rows, None], listed[rows, None]
+    # The effect of a class on itself is 0, so the sum over all listed classes is correct.
+    of_class = weights.shape[-1] - V + classes
+    exponents = weights[entry, :, of_class].sum(1, np.float64) / math.sqrt(max(len(classes) - 1, 1))
+    several = np.count_nonzero(listed > 1)
+    effects = (INTERCEPT, True), (SINGLE, number == 1), (SEVERAL, several > (number > 1))
+    for column, applies in effects if room is None else (*effects, (ROOM + room, True)):
+        exponents += weights[entry[:, 0], :, column] * applies
+    n = np.arange(1, M + 1)
+    logits = counts.log_share[entry[:, 0]] + exponents @ functions(M)
+    logits += (n - number) * math.log(max(unlisted, sys.float_info.min))
+    return rows, softmax(np.where(n >= number, logits, -np.inf))
 
 
 @lru_cache(maxsize=8)

@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from app.errors import RareRoomTypeError
 from app.inference.chains import ChainState, ConditionedChains, Conditions, random_stream
-from app.inference.kernels import select_consistent
 from app.inference.posterior import context_of
 from app.questions.answer import Fields, rounded_number
 from app.questions.names import ErrorList
@@ -33,7 +32,7 @@ from app.questions.posterior import given_relations, present
 from app.questions.question import BEDROOM, POSES, REFUSED, Example, Options, Question
 from app.questions.reading import Reading, Triple
 from app.registry.artifact import Artifact
-from app.scene.relations import CANONICAL
+from app.scene.relations import CANONICAL, ON_TOP
 from app.scene.scene import Scene, SceneObject
 from scene_client.schemas import GenerateAnswer, GenerateRequest
 
@@ -44,11 +43,13 @@ ATTEMPTS: Final = 8
 """Maximum number of draws for one scene."""
 
 
-DRAWN_SEED_BITS: Final = 53
-"""Size in bits of a seed that the service chooses.
+# Direction of each relation: 1 for left, 2 for front, and 0 (up) for on-top, above and inside. The
+# subjects of these are higher than their objects, or in their objects.
+_DIRECTION: Final = (1, 2, 0, 0, 0)
 
-A JSON reader may store numbers as doubles. A double represents an integer of 53 bits exactly.
-"""
+# Size in bits of a seed that the service chooses. A double, in which a JSON reader may store it,
+# represents such an integer exactly.
+_SEED_BITS: Final = 53
 
 
 def generate(
@@ -87,20 +88,11 @@ def generate(
         The fields `seed` and `scenes` of `scene_client.schemas.GenerateAnswer`. For `log_score`,
         see `ConditionedChains.log_score`. Only scores of the same model, for the same listed
         classes and profile, can be compared.
-
-    Raises:
-        ValueError: a number is out of range.
     """
     steps = STEPS if steps is None else steps
-    if count < 1:
-        raise ValueError(f"count must be at least 1, not {count}")
-    if seed < 0:
-        raise ValueError(f"seed must not be negative, not {seed}")
-    if steps < 1:
-        raise ValueError(f"steps must be at least 1, not {steps}")
-    if not temperature > 0:
-        raise ValueError(f"temperature must be positive, not {temperature}")
-    conditions = _conditions(artifact, scene)
+    listing = present(scene, artifact.spec)
+    observed = given_relations(scene, listing, artifact.spec.A)
+    conditions = Conditions(listing.classes, observed, scene.room_type, scene.profile)
     chains = artifact.scene_chains.under(conditions, temperature)
     shown = ~artifact.vocabulary.structure
     shown[conditions.classes] = True
@@ -118,13 +110,6 @@ def generate(
                 scenes.append(_scene(artifact, chains, state, is_shown, evidence))
                 break
     return {"seed": seed, "scenes": scenes}
-
-
-def _conditions(artifact: Artifact, scene: Scene) -> Conditions:
-    """Return the fixed part of each chain: classes, relations, room type and profile."""
-    listing = present(scene, artifact.spec)
-    observed = given_relations(scene, listing, artifact.spec.A)
-    return Conditions(listing.classes, listing.log_counts, observed, scene.room_type, scene.profile)
 
 
 def _scene(
@@ -187,11 +172,27 @@ def staying(
     order = np.lexsort((*units.T[::-1], -logits))
     possible = (units[:, 1] != units[:, 2]) & ~structure[units[:, 1:]].any(axis=1)
     triples = np.concatenate([fixed, units])
-    relation = np.ascontiguousarray(triples[:, 0])
     classes, ends = np.unique(triples[:, 1:], return_inverse=True)
-    stay: NDArray[np.bool_] = select_consistent(
-        relation, ends.reshape(-1, 2), order[possible[order]], len(fixed), len(classes)
-    )
+    relation_and_ends = np.c_[triples[:, 0], ends.reshape(-1, 2)].tolist()
+    # reaches[d, x, y] is True if relations of direction d lead from x to y, through any number of
+    # other classes.
+    reaches = np.broadcast_to(np.eye(len(classes), dtype=np.bool_), (3, *[len(classes)] * 2)).copy()
+    stay = np.zeros(len(triples), np.bool_)
+    related, supported = set[tuple[int, int]](), set[int]()
+    for number in (*range(len(fixed)), *(len(fixed) + order[possible[order]]).tolist()):
+        a, x, y = relation_and_ends[number]
+        reached = reaches[_DIRECTION[a]]
+        if number >= len(fixed) and (
+            (x, y) in related or reached[y, x] or (a == ON_TOP and x in supported)
+        ):
+            continue
+        stay[number] = True
+        related |= {(x, y), (y, x)}
+        if a == ON_TOP:
+            supported.add(x)
+        # Each class that leads to x now also leads to all classes to which y leads.
+        reached |= reached[:, x, None] & reached[y]
+    stay = stay[len(fixed) :]
     # A drawn relation that is part of the evidence always stays.
     if evidence:
         shape = len(CANONICAL), len(structure), len(structure)
@@ -240,7 +241,7 @@ def _read(request: GenerateRequest, artifact: Artifact, reading: Reading) -> Opt
     errors.raise_any()
     return {
         "count": request.count,
-        "seed": secrets.randbits(DRAWN_SEED_BITS) if request.seed is None else request.seed,
+        "seed": secrets.randbits(_SEED_BITS) if request.seed is None else request.seed,
         "steps": request.steps,
         "temperature": request.temperature,
     }

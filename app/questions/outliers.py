@@ -14,13 +14,13 @@ is below half of the largest increase are ignored.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.inference.elementary import sigmoid
-from app.inference.kernels import companions
+from app.inference.kernels import best
 from app.questions.answer import EXPLAINED, Fields, reasons, rounded_number, significant
 from app.questions.misplaced import misplaced_fields
 from app.questions.posterior import Posterior, calibrated
@@ -35,16 +35,6 @@ COMPANIONS: Final = 3
 """Maximum number of companions in the answer for one outlier."""
 
 _LEAST_SHARE: Final = 0.5  # smallest increase of a companion, as a share of the largest
-
-
-class _Alarms(NamedTuple):
-    """When an object is an outlier: its probability reaches `threshold`, and its class can alarm.
-
-    `possible` is True for the classes that can alarm, (V,) bool.
-    """
-
-    threshold: float
-    possible: NDArray[np.bool_]
 
 
 def outliers(
@@ -102,8 +92,9 @@ def outliers(
     if posterior is not None:
         wrong = misplaced_fields(artifact, posterior, scene, sensitivity, flipped)
         if entry is not None and threshold is not None:
-            alarms = _Alarms(threshold, can_alarm)
-            judged, unsure = _judged(artifact, entry, posterior, scene, alarms, details=details)
+            judged, unsure = _judged(
+                artifact, entry, posterior, scene, threshold, can_alarm, details=details
+            )
             warnings += _too_rare(unsure)
     fields: Fields = {"warnings": warnings}
     if threshold is not None:
@@ -116,13 +107,15 @@ def _judged(
     entry: CountSlope,
     posterior: Posterior,
     scene: Scene,
-    alarms: _Alarms,
+    threshold: float,
+    can_alarm: NDArray[np.bool_],
     *,
     details: bool,
 ) -> tuple[list[Fields], list[SceneObject]]:
     """Return the fields of `scene_client.schemas.Outlier` for every object of a scene.
 
     The second result lists the objects that reach the threshold, but whose class raises no alarm.
+    `can_alarm` is True for the classes that raise an alarm, (V,).
 
     `because` lists up to three other objects, in order of their effect on `log_odds`. For an
     outlier, these objects lower its log-odds. For other objects, they raise the log-odds.
@@ -130,8 +123,8 @@ def _judged(
     present, labels = posterior.present, artifact.vocabulary.labels
     log_odds, change = posterior.given_rest(explained=details)
     logits, p = _intruder_odds(artifact, entry, posterior, log_odds)
-    reaches = p >= alarms.threshold
-    is_outlier = reaches & alarms.possible[present.classes]
+    reaches = p >= threshold
+    is_outlier = reaches & can_alarm[present.classes]
     # The order follows the logits, because probabilities near 0 or 1 may round to the same number.
     order = (-logits[present.row]).argsort(kind="stable")
     rows, flags, n = present.row[order].tolist(), is_outlier.tolist(), len(log_odds)
@@ -208,7 +201,9 @@ def _companions(artifact: Artifact, present: NDArray[np.int64], flagged: int) ->
     """
     usable = ~artifact.vocabulary.structure
     usable[present] = False
-    chosen = companions(*artifact.objects.increases(flagged), usable, _LEAST_SHARE, COMPANIONS)
+    increase, rank = artifact.objects.increases(flagged)
+    least = max(_LEAST_SHARE * float(increase[usable].max(initial=0)), 1e-6)
+    chosen = best(rank, usable & (increase >= least) & (rank > 0), COMPANIONS)
     return [artifact.vocabulary.labels[index] for index in chosen.tolist()]
 
 

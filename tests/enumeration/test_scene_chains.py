@@ -48,7 +48,6 @@ def conditions(classes=(), relations=(), **options):
     a, i, j, r = np.array(relations, dtype=np.int64).reshape(-1, 4).T.copy()
     return Conditions(
         classes=np.array(classes, dtype=np.int64),
-        log_counts=np.zeros(len(classes), dtype=np.float32),
         observed=ObservedRelations(a, i, j, r.astype(np.float32)) if relations else None,
         **options,
     )

@@ -104,8 +104,9 @@ class Case:
         self.profile = None if self.source < 0 else self.source
         self.scorer = ObjectScorer(weights)
         room = None if self.room < 0 else self.room
-        context = context_of(weights, self.classes, self.presence, self.presence, room)
-        self.x, self.shares = context.x, context.shares
+        scene = self.classes, self.presence, self.presence
+        self.context = context_of(weights, *scene, room)
+        self.x = self.context.x
 
     def listed(self, *without):
         """v of the classes but those at some rows, (1, V)."""
@@ -134,7 +135,7 @@ def test_log_odds_equal_the_tensors(name, seed):
     found = case.scorer.absent(case.x, *scene, case.profile, 0.15, room)
     kappa = case.machine.kappa.numpy()
     close(found[absent], (case.log_odds() + kappa[0])[absent])
-    found, _ = case.scorer.given_rest(case.x, case.shares, *scene, case.profile, room)
+    found, _ = case.scorer.given_rest(case.context, case.profile, room)
     rest = [case.log_odds(k)[i] + kappa[-1, i] for k, i in enumerate(case.classes)]
     close(found, rest)
     if case.room < 0:
@@ -148,15 +149,14 @@ def test_log_odds_equal_the_tensors(name, seed):
 def test_reasons_are_differences_of_log_odds(name, seed):
     """With class j minus without class j, recomputed; of class i itself, 0."""
     case = Case(name, seed)
-    scene = case.x, case.shares, case.classes, case.presence, case.profile
-    _, found = case.scorer.given_rest(*scene, explained=True)
+    _, found = case.scorer.given_rest(case.context, case.profile, explained=True)
     expected = np.zeros_like(found)
     for k, i in enumerate(case.classes):
         for j in set(range(len(case.classes))) - {k}:
             expected[k, j] = case.log_odds(k)[i] - case.log_odds(k, j)[i]
     close(found, expected)
     candidates = np.setdiff1d(np.arange(V), case.classes)[::3]
-    found = case.scorer.reasons_for_absent(*scene, candidates)
+    found = case.scorer.reasons_for_absent(case.context, case.profile, candidates)
     each = [case.log_odds() - case.log_odds(j) for j in range(len(case.classes))]
     close(found, np.array(each).T[candidates])
 

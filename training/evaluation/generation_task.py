@@ -96,7 +96,6 @@ def machine_sampler(artifact: Artifact) -> Sampler:
             index = classes.nonzero().squeeze(1).numpy()
             conditions = Conditions(
                 index,
-                np.zeros(len(index), np.float32),
                 observed=None,
                 room=room_type if room_type >= 0 and artifact.spec.C else None,
             )

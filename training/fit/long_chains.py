@@ -126,8 +126,7 @@ class LongChains:
 
 def conditions_of(room: int | None, profile: int | None = None) -> Conditions:
     """Return the conditions of chains without listed objects."""
-    none = np.zeros(0, np.int64)
-    return Conditions(none, np.zeros(0, np.float32), None, room, profile)
+    return Conditions(np.zeros(0, np.int64), None, room, profile)
 
 
 def scene_chains(weights: Weights) -> SceneChains:

@@ -362,9 +362,9 @@ def test_b_is_the_bias_without_a_list_before_training():
     ObjectFit(machine, scenes, config, seed=0).finish()
     nothing = torch.zeros(1, V)
     torch.testing.assert_close(machine.source_weights(nothing, None)[0], torch.tensor([0.8, 0.2]))
-    none = np.zeros(0, np.int64), np.zeros(0, np.float32)
-    found = weights_of(machine).class_bias(*none, None)
-    np.testing.assert_allclose(found, machine.b.numpy(), rtol=0, atol=1e-6)
+    weights = weights_of(machine)
+    p = weights.source_weights(np.zeros(0, np.int64), np.zeros((1, 0), np.float32), None)
+    np.testing.assert_allclose(p @ weights["a"], np.zeros((1, V)), rtol=0, atol=1e-6)
 
 
 def test_training_finds_the_sources_of_lists():
