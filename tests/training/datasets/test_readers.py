@@ -26,12 +26,7 @@ from training.datasets import (
     jsonl,
     read_scenes,
 )
-from training.datasets.priors import (
-    COLUMNS,
-    MAX_LINE,
-    SOURCE,
-    read_prior_scenes,
-)
+from training.datasets.priors import COLUMNS, MAX_LINE, SOURCE, read_prior_scenes
 from training.datasets.readers import READERS, guess_format
 from training.fit.configuration import ConfigError, DataConfig
 from training.runs.pipeline import read_sources
@@ -479,12 +474,7 @@ def test_relations_of_unknown_objects_are_refused(triple: tuple[int, str, int]) 
         AnnotatedScene("s", "t", "g", None, (AnnotatedObject("0", "bed"),), (triple,))
 
 
-LAYOUTS = {
-    "jsonl": write_jsonl,
-    "3dssg": write_3dssg,
-    "sunrgbd-mat": write_mat,
-    "coco": write_coco,
-}
+LAYOUTS = {"jsonl": write_jsonl, "3dssg": write_3dssg, "sunrgbd-mat": write_mat, "coco": write_coco}
 
 
 @pytest.mark.parametrize("name", READERS)

@@ -19,12 +19,7 @@ from training.evaluation.intruders import (
 )
 from training.evaluation.missing_tasks import SEEDS
 from training.evaluation.model import Model, suspicion_of
-from training.evaluation.outlier_tasks import (
-    alarms_task,
-    hit_at_1,
-    outliers_task,
-    with_intruders,
-)
+from training.evaluation.outlier_tasks import alarms_task, hit_at_1, outliers_task, with_intruders
 from training.evaluation.parts import draw_parts, exactly
 from training.evaluation.setting import Setting
 

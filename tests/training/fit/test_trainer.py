@@ -94,7 +94,7 @@ def test_the_plot_marks_the_score_of_the_kept_weights(tmp_path, monkeypatch):
     alone, both = drawn
     loss, score = alone.axes
     assert "lab" in alone.get_suptitle()
-    assert (loss.get_ylabel(), score.get_ylabel()) == ("training loss", "MRR of hidden classes")
+    assert (loss.get_ylabel(), score.get_ylabel()) == ("training loss", "MRR")
     _, kept = score.lines
     assert (list(kept.get_xdata()), list(kept.get_ydata())) == ([1.0], [0.5])
     assert kept.get_label() == "kept weights (average): 0.500"
