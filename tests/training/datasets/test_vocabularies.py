@@ -111,9 +111,6 @@ def test_household_classes_need_no_mention() -> None:
     assert build_vocabulary(scenes("chair"), names, minimum=1).labels == ("chair", "hammer")
 
 
-# ------------------------------------------------------------------------- the committed files
-
-
 @pytest.mark.parametrize("table", ["aliases", "kinds", "rooms"])
 def test_each_curated_name_has_one_meaning(table: str) -> None:
     names = curated_names()

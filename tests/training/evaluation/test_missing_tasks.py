@@ -12,9 +12,11 @@ from tests.questions.answers import missing as ask_missing
 from tests.questions.artifacts import LARGER, larger_artifact
 from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
 from tests.training.evaluation.scenes import (
+    FLOOR,
     NO_STRUCTURE,
     WIDE,
     WIDE_STRUCTURE,
+    in_order,
     random_scenes,
     scene,
     tensors,
@@ -33,12 +35,6 @@ from training.evaluation.parts import all_but_one, draw_parts, one_quarter
 from training.evaluation.setting import Setting
 
 DATA = tensors(random_scenes(20), WIDE)
-FLOOR = torch.tensor([False, True, False, False, False])
-
-
-def in_order(v):
-    """Class 0 before 1 before 2, ..."""
-    return torch.tensor([5.0, 4, 3, 2, 1]).expand_as(v)
 
 
 def test_metrics_by_hand():
@@ -113,9 +109,6 @@ def test_the_score_is_the_ranking_of_the_service():
         assert torch.equal(usable, (row == 0) & ~STRUCTURE & ~is_kind)
         assert torch.allclose(own[usable].exp(), p[usable])
     assert kinds
-
-
-# ------------------------------------------------------------------------------------------ T2-at
 
 
 def test_every_class_in_a_relation_is_asked_for_once_by_one_of_its_relations():

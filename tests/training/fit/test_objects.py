@@ -367,28 +367,6 @@ def test_b_is_the_bias_without_a_list_before_training():
     np.testing.assert_allclose(found, machine.b.numpy(), rtol=0, atol=1e-6)
 
 
-def test_training_finds_the_sources_of_lists():
-    """Scenes of two classes, of which one is listed, so that p(q | listed) has a closed form.
-
-    The sources have opposite base rates. In the served mix, they are equally likely.
-    """
-    v = EVERY[EVERY.sum(1) == 2].float().repeat(2, 1)
-    source, sizes = torch.arange(2).repeat_interleave(6), torch.tensor([900.0, 100.0])
-    liking = torch.tensor([[1.5, 0.5, -0.5, -1.5], [-1.5, -0.5, 0.5, 1.5]])
-    share = torch.stack([(v[source == q] @ liking[q]).softmax(0) for q in range(2)])
-    weight = (share * sizes.unsqueeze(1)).flatten()
-    names = ("sunrgbd", "procthor")
-    scenes = ObjectScenes(v, torch.full((12,), -1), source, weight, ALL, names)
-    changes = {"leave_one_out": 1.0, "rate_prior": 0.0, "source_loss": 30.0}
-    changes |= {"generative_weight": 0.0, "learning_rate": 0.02}
-    machine = machine_of("coupled")
-    start_objects(machine, scenes)
-    fit_objects(ObjectFit(machine, scenes, CONFIG.model_copy(update=changes), seed=0))
-    listed = share @ v[:6] / 2
-    found = machine.source_weights(torch.eye(V), None)
-    torch.testing.assert_close(found, (listed / listed.sum(0)).T, rtol=0, atol=0.04)
-
-
 def test_weights_are_averaged_over_the_last_steps():
     """The last 30 % of 10 steps are 3."""
     machine = machine_of("binary")

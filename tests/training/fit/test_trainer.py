@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,7 @@ import torch
 
 from training.fit import samples, trainer
 from training.fit.configuration import Config
-from training.fit.curve import CurvePoint, write_plot
+from training.fit.curve import CurvePoint
 from training.fit.trainer import Trainer
 from training.machines.machine import OBJECT_WEIGHTS
 from training.runs.config_files import with_settings
@@ -80,27 +79,6 @@ def test_two_runs_with_the_same_seed_give_the_same_bits(data, settings):
         *(("objects", done) for done in (0.4, 0.8, 1.0)),
         *(("relations", done) for done in (0.5, 1.0)),
     ]
-
-
-def test_the_plot_marks_the_score_of_the_kept_weights(tmp_path, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(
-        "matplotlib.figure.Figure.savefig", lambda figure, *_, **__: drawn.append(figure)
-    )
-    objects = [CurvePoint("objects", done, 2.0, done / 2, 1.0) for done in (0.5, 1.0)]
-    relations = [CurvePoint("relations", 1.0, 9.0, math.nan, 1.0)]
-    for curve in (objects, objects + relations):
-        write_plot(tmp_path / "curve.png", curve, "lab")
-    alone, both = drawn
-    loss, score = alone.axes
-    assert "lab" in alone.get_suptitle()
-    assert (loss.get_ylabel(), score.get_ylabel()) == ("training loss", "MRR")
-    _, kept = score.lines
-    assert (list(kept.get_xdata()), list(kept.get_ydata())) == ([1.0], [0.5])
-    assert kept.get_label() == "kept weights (average): 0.500"
-    # Without annotated validation scenes, the second phase has no score.
-    assert [len(axis.lines) for axis in both.axes] == [1, 1, 2, 0]
-    assert both.axes[3].texts[0].get_text() == "no validation scenes"
 
 
 def test_relation_biases_start_at_log_odds(data):
