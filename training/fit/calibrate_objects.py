@@ -124,9 +124,6 @@ def served_scenes(scenes: SceneTensors, served: Mapping[str, float]) -> SceneTen
     return subset(scenes, torch.tensor(sorted(kept), dtype=torch.int64))
 
 
-# ------------------------------------------------------------------------------------ missing
-
-
 def fit_missing(
     artifact: Artifact, scenes: SceneTensors, structure: Tensor, chosen: Calibration | None = None
 ) -> dict[str, Any]:
@@ -174,9 +171,6 @@ def _first_classes(
     usable = candidates[rows, first]  # a small vocabulary has fewer candidates
     features = np.stack([z[rows, first], size], -1).astype(np.float64)
     return features[usable], hidden[rows, first][usable]
-
-
-# ----------------------------------------------------------------------------------- outliers
 
 
 @dataclass(frozen=True, eq=False)

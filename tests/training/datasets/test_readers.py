@@ -44,8 +44,6 @@ def write_json(path: Path, content: Any) -> Path:
     return path
 
 
-# ------------------------------------------------------------------------------- JSON lines
-
 DESK_SCENE: dict[str, Any] = {
     "scene_id": "a",
     "source": "robot",
@@ -230,8 +228,6 @@ def test_malformed_jsonl(tmp_path: Path, line: Any, message: str) -> None:
     check_malformed(path, message, "line 2")
 
 
-# ------------------------------------------------------------------------------- 3DSSG
-
 RESCANS = [
     {"reference": "room-1", "type": "train", "scans": [{"reference": "room-1b", "removed": []}]},
     {"reference": "room-2", "type": "validation", "scans": []},
@@ -304,8 +300,6 @@ MALFORMED_3DSSG = [
     ({"scans": [SCAN, SCAN]}, r"scans\.1: scene 3dssg-room-1b-2 is listed twice"),
 ]
 
-
-# ------------------------------------------------------------------------------- SUN RGB-D
 
 TURN = math.radians(30)
 COS, SIN = math.cos(TURN), math.sin(TURN)
@@ -415,8 +409,6 @@ def test_mat_files_of_other_content(tmp_path: Path) -> None:
     check_malformed(path, "Field required", "0.sequenceName")
 
 
-# ------------------------------------------------------------------------------- COCO
-
 COCO: dict[str, Any] = {
     "images": [{"id": 9, "file_name": "9.jpg"}, {"id": 4, "file_name": "4.jpg"}],
     "categories": [{"id": 62, "name": "chair"}, {"id": 67, "name": "dining table"}],
@@ -462,9 +454,6 @@ MALFORMED_COCO = [
 )
 def test_malformed_json(tmp_path: Path, write: Any, content: Any, message: str) -> None:
     check_malformed(write_json(write(tmp_path), content), message)
-
-
-# ------------------------------------------------------------------------------- all of them
 
 
 @pytest.mark.parametrize("triple", [(0, "left", 1), (-1, "left", 0)])

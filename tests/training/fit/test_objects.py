@@ -88,8 +88,6 @@ def target_scenes():
 ALL = torch.ones(2, V, dtype=torch.bool)
 PARTIAL = torch.tensor([[True, True, True, False], [True, True, True, True]])
 
-# -- scenes and parts --------------------------------------------------------------------------
-
 
 def test_scenes_keep_classes_that_their_source_shows():
     """procthor shows class 0 twice only; sunrgbd has an open vocabulary and shows all; of the
@@ -157,9 +155,6 @@ def test_shares_of_random_parts():
     of_class = parts.listed[one].mean(0)[5:45]
     error = 5 * (1 / 40 * 39 / 40 / float(one.sum())) ** 0.5
     assert float((of_class - 39 / 40).abs().max()) <= error
-
-
-# -- the losses and their gradients ------------------------------------------------------------
 
 
 def source_logit(machine, shows, x, q):
@@ -288,9 +283,6 @@ def test_the_prior_is_divided_by_the_scenes():
     assert fit._prior().item() == pytest.approx(expected / float(scenes.weight.sum()), rel=1e-5)
 
 
-# -- training ----------------------------------------------------------------------------------
-
-
 def context(likely):
     """Independent classes with these probabilities, (2^V,)."""
     p = torch.tensor(likely).double()
@@ -325,9 +317,6 @@ def test_only_object_weights_are_trained():
     for name, weight in machine.named_parameters():
         is_changed = not torch.equal(weight, before[name])
         assert is_changed == (name in objects.OBJECT_WEIGHTS and weight.numel() > 0), name
-
-
-# -- the served mix ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("served", [{}, {"sunrgbd": 1.0, "procthor": 0.25}])
@@ -396,9 +385,6 @@ def test_popularity_of_the_served_mix():
     assert torch.equal(popularity.isnan(), ~is_shown)
 
 
-# -- stored samples ----------------------------------------------------------------------------
-
-
 @torch.no_grad()
 @pytest.mark.parametrize("name", SPECS)
 def test_stored_samples_follow_the_machine_under_their_room_types(name):
@@ -420,8 +406,6 @@ def test_stored_samples_follow_the_machine_under_their_room_types(name):
         p = log_p(machine, room).exp()
         assert bool(((share - p).abs() <= 5 * (p * (1 - p) / len(own)).sqrt()).all())
 
-
-# -- base rates of whole scenes, and long chains ----------------------------------------------
 
 SHOWS = torch.tensor([[True] * V, [True, True, True, False]])
 SERVED = ObjectsConfig(served_sources={"sunrgbd": 2.0, "procthor": 1.0})
