@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.training import commands
 from training.fit import samples, trainer
 from training.fit.configuration import Config
 from training.fit.curve import CurvePoint
@@ -19,16 +20,8 @@ from training.runs.pipeline import prepare
 
 def small_config(**settings) -> Config:
     """Objects in 10 steps with a point of the curve after 4 each, then relations in 2 epochs."""
-    config = {
-        "name": "small-triway",
-        "data": {"sources": ["rooms"], "vocabulary": "rooms", "rooms": 90},
-        "machine": {
-            "variant": "triway", "units": 3, "states": 4, "coupled": True, "K": 4, "G": 2, "N": 16
-        },
-        "objects": {"steps": 10, "batch_size": 16, "warm_up": 3, "chains": 8},
-        "relations": {"epochs": 2, "batch_size": 32},
-    }  # fmt: skip
-    return with_settings(Config.model_validate(config), settings)
+    small = {"machine.coupled": True, "machine.G": 2, "objects.steps": 10, "objects.warm_up": 3}
+    return with_settings(commands.small_config(rooms=90), small | settings)
 
 
 DEEP = {"machine.coupled": False, "machine.H2": 3, "machine.G": 0}
