@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.enumeration.annealing import ais, base_log_partition
 from tests.enumeration.small_machines import (
     SMALL,
     check_frequencies,
@@ -19,7 +20,6 @@ from tests.enumeration.small_machines import (
     small_machine,
 )
 from training.machines.gibbs import Chains, draw_states, sweep
-from training.machines.partition import ais, base_log_partition
 
 CHAINS = 60_000
 

@@ -161,10 +161,7 @@ def test_a_stored_model_is_evaluated_on_files(tmp_path):
     assert "tiny: 2 of 6 objects are left out, because their labels are unknown" in output
     rows = json.loads(figures.read_text())["tiny"]
     origins = {(Path(row["file"]).name, row["source"], row["in_training"]) for row in rows}
-    assert origins == {
-        ("seen.jsonl", "seen", True),
-        ("homes.jsonl", "homes", False),
-    }
+    assert origins == {("seen.jsonl", "seen", True), ("homes.jsonl", "homes", False)}
     refused = invoke("evaluate", "tiny", *files, "--store", store, "--source", "rooms", code=1)
     assert "--file replaces the scenes of --data and --source" in refused
 

@@ -137,7 +137,7 @@ class TrainingData:
     test: SceneTensors
     structure: Tensor  # True for structural classes, (classes,)
     vocabulary: Vocabulary
-    digest: str = ""  # of the scenes, their vocabulary and split, for the resumption of a run
+    digest: str = ""  # of the scenes, their vocabulary and split
     words: Tensor | None = None  # (V, D) unit word vectors of the classes, 0 where unknown
     roles: RoleCounts | None = None  # of the classes in the training scenes
 

@@ -211,11 +211,8 @@ def altered_scene(
 ) -> tuple[Scene, Triple] | None:
     """Replace one random triple by a false triple with another relation or another object.
 
-    A triple is false if the scene lists neither it nor its mirror image.
-
-    Args:
-        structure: True for structural classes, (classes,).
-        triples: observed triples (relation, subject, object) of instances.
+    A triple is false if the scene lists neither it nor its mirror image. `structure` is True for
+    structural classes, (classes,).
 
     Returns:
         The scene with the altered triples, and the false triple. The result is None if

@@ -163,10 +163,7 @@ def annotated_classes(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) ->
 
 
 def _classes_named(labels: Iterable[str], vocabulary: Vocabulary) -> list[int]:
-    """Return the classes with these labels.
-
-    A name that is only an alias is skipped, because the class then contains other objects too.
-    """
+    """Return the classes with these labels, without names that are only an alias."""
     return [vocabulary.labels.index(label) for label in labels if label in vocabulary.labels]
 
 
@@ -293,10 +290,7 @@ def _from_lists(
 def _apply_rules(
     relations: PoseRelations, objects: Sequence[AnnotatedObject], meaning: Meaning
 ) -> None:
-    """Apply the data source's rule for unlisted relations to relations derived from positions.
-
-    Boxes with sizes show all their stacked relations, except roles that remain open.
-    """
+    """Apply the source's rule for unlisted relations; sizes show all stacks but open roles."""
     located = np.array([thing.position is not None for thing in objects])
     pairs = located[:, None] & located & ~np.eye(len(objects), dtype=np.bool_)
     for relation, unlisted in enumerate(meaning.unlisted):

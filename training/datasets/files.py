@@ -1,4 +1,4 @@
-"""Read data files with size limits. Each error names the file, and its position or the limit."""
+"""Read data files with size limits, and write files whole. Errors name the file and the place."""
 
 from __future__ import annotations
 
@@ -50,6 +50,14 @@ def check_size(path: Path, size: int, limit: int) -> None:
     """Raise DatasetError if a file has more bytes than the limit, after decompression."""
     if size > limit:
         raise DatasetError(path, "", f"is larger than {limit // 2**20} MiB after decompression")
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Replace a file atomically. If the process is interrupted, the earlier file is kept."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(path.name + ".part")
+    draft.write_text(text, encoding="utf-8")
+    draft.replace(path)
 
 
 def read_json(path: Path, content: type[T]) -> T:

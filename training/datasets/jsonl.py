@@ -15,14 +15,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    StrictBool,
-    StrictInt,
-    ValidationError,
-)
+from pydantic import BaseModel, BeforeValidator, ConfigDict, StrictBool, StrictInt, ValidationError
 
 from app.scene.geometry import SMALLEST
 from scene_client.schemas import Stamp
@@ -156,10 +149,7 @@ def _parse_scene(line: bytes, default_id: str) -> AnnotatedScene:
 def _objects(
     entries: Sequence[dict[str, Any]], counts: Mapping[str, int]
 ) -> tuple[AnnotatedObject, ...]:
-    """Return the objects with ids and counts.
-
-    An object without id gets its label as id, with a number if several objects have the label.
-    """
+    """Return the objects. One without id is called by its label, with a number if needed."""
     labels = Counter(str(entry.get("label")) for entry in entries)
     nameless = Counter(str(entry.get("label")) for entry in entries if entry.get("id") is None)
     ids = {str(entry["id"]) for entry in entries if entry.get("id") is not None}

@@ -253,10 +253,7 @@ def _to_floor(boxes: _Boxes, i: int, j: int, rng: Rng) -> Floats | None:
 def _free_spot(
     boxes: _Boxes, i: int, j: int, obstacles: Flags, reach: float, margin: float, z: float, rng: Rng
 ) -> Floats | None:
-    """Return a centre of instance i with its bottom at height z, near instance j, or None.
-
-    Its footprint touches no usable obstacle (n,), except the objects that move with instance i.
-    """
+    """Return a centre of instance i at height z near j, clear of the obstacles (n,), or None."""
     obstacles = obstacles & boxes.usable & ~boxes.group(i)
     for _ in range(_ATTEMPTS):
         point = boxes.beside(j, rng.uniform(-reach, reach, 2), margin)

@@ -31,7 +31,6 @@ class Names:
     structure: tuple[str, ...] = ()  # classes such as walls, which the service never proposes
     not_objects: tuple[str, ...] = ()  # labels that never become a class
     surroundings: tuple[str, ...] = ()  # outdoor structures such as buildings
-    outdoor: tuple[str, ...] = ()  # outdoor objects
     anywhere: tuple[str, ...] = ()  # classes that belong in every room, such as pets and bags
     aliases: dict[str, tuple[str, ...]] = field(default_factory=dict)  # other names of each class
     # More specific names of each class. If a vocabulary has a class for the specific name, the
@@ -111,13 +110,11 @@ def build_vocabulary(
     *,
     minimum: int = MINIMUM_MENTIONS,
     minimum_rooms: int | None = None,
-    outdoor: bool = False,
 ) -> Vocabulary:
     """Collect the frequent classes of scenes with their aliases, most frequent class first.
 
     A label counts for its curated name. The base and household classes of ``names`` are always
-    included. Labels in ``names.not_objects`` are always excluded, and those in ``names.outdoor``
-    and ``names.surroundings`` unless ``outdoor`` is True. ``minimum_rooms`` is the minimum number
+    included, and labels in ``names.not_objects`` excluded. ``minimum_rooms`` is the minimum number
     of scenes of a room type, by default ``minimum``.
 
     Raises:
@@ -133,8 +130,7 @@ def build_vocabulary(
             rooms[room] += 1
     # Spellings with the same key count as one label, under the most common spelling.
     mentions = Counter({most_frequent(x): x.total() for x in spellings.values()})
-    outdoors = () if outdoor else (*names.outdoor, *names.surroundings)
-    excluded = set(map(label_key, (*names.not_objects, *outdoors)))
+    excluded = set(map(label_key, names.not_objects))
     structure = set(map(label_key, (*names.structure, *names.surroundings)))
     frequent = {label for label, count in mentions.items() if count >= minimum}
     classes = [
@@ -161,7 +157,7 @@ def build_indoor_vocabulary(scenes: Iterable[AnnotatedScene]) -> Vocabulary:
     """
     names = replace(curated_names(), surroundings=())
     minima = {"minimum": INDOOR_MINIMUM_MENTIONS, "minimum_rooms": MINIMUM_MENTIONS}
-    return with_aliases(build_vocabulary(scenes, names, outdoor=True, **minima))
+    return with_aliases(build_vocabulary(scenes, names, **minima))
 
 
 def vocabulary_json(vocabulary: Vocabulary) -> str:
@@ -242,8 +238,8 @@ def source_vocabulary(
     # An empty entry preserves the curated spelling of a class without aliases.
     spellings = dict.fromkeys((*names.base, *names.household, *names.structure), ())
     aliases = spellings | names.aliases
-    mentioned_only = replace(names, base=(), household=(), outdoor=(), kinds={}, aliases=aliases)
-    return _with_kinds(build_vocabulary(scenes, mentioned_only, minimum=minimum, outdoor=True))
+    mentioned_only = replace(names, base=(), household=(), kinds={}, aliases=aliases)
+    return _with_kinds(build_vocabulary(scenes, mentioned_only, minimum=minimum))
 
 
 def _with_kinds(vocabulary: Vocabulary) -> Vocabulary:

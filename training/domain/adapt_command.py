@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import shlex
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -125,11 +124,7 @@ def _next_version(store: Store, name: str) -> str:
 
 
 def _corrected(files: Iterable[Sequence[AnnotatedScene]]) -> list[AnnotatedScene]:
-    """Join the scenes of files. A later scene replaces an earlier one with its id.
-
-    Raises:
-        ConfigError: the scenes come from several homes.
-    """
+    """Join the scenes of one home. A later scene replaces an earlier one with its id."""
     scenes = {scene.scene_id: scene for file in files for scene in file}
     homes = sorted({scene.source for scene in scenes.values()})
     if len(homes) > 1:
@@ -154,22 +149,15 @@ def _print_home(home: Home, parent: Artifact) -> None:
             "they belong there:"
         )
         most = sorted(home.left_out.items(), key=lambda entry: -len(entry[1]))[:ROWS]
-        lines += [f"  {label} ({len(scenes)}): {_some(scenes)}" for label, scenes in most]
+        for label, scenes in most:
+            more = ", ..." if len(scenes) > _NAMED else ""
+            lines.append(f"  {label} ({len(scenes)}): {', '.join(scenes[:_NAMED])}{more}")
     _print(lines)
 
 
 def _print(lines: Iterable[str]) -> None:
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
-
-
-def _some(scenes: Sequence[str]) -> str:
-    more = ["..."] if len(scenes) > _NAMED else []
-    return ", ".join([*scenes[:_NAMED], *more])
-
-
-def _counted(counts: Counter[str]) -> str:
-    return ", ".join(f"{label} ({n})" for label, n in counts.most_common(ROWS))
 
 
 def _print_result(result: Adapted) -> None:
@@ -189,10 +177,8 @@ def _print_result(result: Adapted) -> None:
     if result.objections:
         lines.append(f"the weights stay: {'; '.join(result.objections)}")
     if result.exceptions:
-        lines.append(
-            f"exceptions, never reported from now on: {_counted(result.exceptions)} (confirmed "
-            "scenes)"
-        )
+        counts = ", ".join(f"{label} ({n})" for label, n in result.exceptions.most_common(ROWS))
+        lines.append(f"exceptions, never reported from now on: {counts} (confirmed scenes)")
     if result.relations:
         lines.append(f"usual from now on: {', '.join(result.relations[:ROWS])} (confirmed scenes)")
     _print(lines)

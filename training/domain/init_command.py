@@ -15,6 +15,7 @@ from rich.markup import escape
 from app.registry import RegistryError
 from app.scene import label_key
 from training.datasets import AnnotatedScene, DatasetError, generate_rooms
+from training.datasets.files import write_whole
 from training.datasets.jsonl import scan_jsonl, write_jsonl
 from training.datasets.readers import guess_format, read_scenes
 from training.datasets.rooms import DOMAINS
@@ -22,7 +23,6 @@ from training.datasets.vocabulary import vocabulary_json
 from training.domain.look import Label
 from training.domain.proposal import Proposal, propose
 from training.domain.update import PROPOSED, proposed_json, update
-from training.evaluation.report import write_whole
 from training.fit.configuration import ConfigError
 from training.runs.config_files import shipped_configs
 from training.runs.example_scenes import examples_json

@@ -129,10 +129,7 @@ def propose(
 
 
 def _choose_vocabulary(scenes: Sequence[AnnotatedScene]) -> tuple[int, Vocabulary]:
-    """Return the largest of `_MINIMA` whose classes cover enough objects, and the classes.
-
-    Without such a minimum, the result is the smallest one.
-    """
+    """Return the largest minimum that covers enough objects, else the smallest; its classes."""
     for minimum in _MINIMA:
         try:
             vocabulary = source_vocabulary(scenes, minimum=minimum)
@@ -164,10 +161,7 @@ def use_frequent_names(vocabulary: Vocabulary, scenes: Sequence[AnnotatedScene])
 
 
 def _split(scenes: Sequence[AnnotatedScene]) -> tuple[int, dict[str, int], int]:
-    """Return a seed of the split, the number of scenes in each part, and of test groups.
-
-    The seed is the first whose parts are near their target shares, or the best of the tested seeds.
-    """
+    """Return the first seed with parts near their shares, or the best; sizes, test groups."""
     best: tuple[int, dict[str, int], int] | None = None
     smallest, shares = math.inf, FRACTIONS["stable"]
     for seed in range(_SPLIT_SEEDS):

@@ -113,10 +113,7 @@ class Translation:
         return score_scene_classes
 
     def _score_row(self, score: RelationScore, batch: Batch, row: int, scores: Tensor) -> None:
-        """Write the scores of one scene into `scores`, with shape (relations, classes, classes).
-
-        The scores of classes that the model lacks stay unchanged.
-        """
+        """Write the scores of one scene, (relations, classes, classes), for known classes."""
         classes = batch.classes[row]
         mapped = torch.where(classes >= 0, self.model_class[classes.clamp(min=0)], -1)
         columns = (mapped >= 0).nonzero().squeeze(1)

@@ -55,10 +55,7 @@ class Update:
 
 
 def update(
-    name: str,
-    folder: Path,
-    files: Sequence[Path],
-    read: Callable[[Path], Sequence[AnnotatedScene]],
+    name: str, folder: Path, files: Sequence[Path], read: Callable[[Path], Sequence[AnnotatedScene]]
 ) -> Update:
     """Extend the proposal in a folder with the scenes of files.
 

@@ -166,9 +166,6 @@ def discrepancy(held_out: Tensor, drawn: Tensor, bandwidth: float) -> Callable[[
 def marginal_error(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]:
     """Return the marginal error as a function of the weights of the held-out scenes.
 
-    The marginal error is sum_i |p_i - q_i| / sum_i q_i. p_i and q_i are the shares of generated and
-    of held-out scenes with class i.
-
     Args:
         held_out, drawn: presence of each class, (scenes, classes).
     """
@@ -187,9 +184,7 @@ def marginal_error(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]
 def pair_correlation(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]:
     """Return the pair correlation as a function of the weights of the held-out scenes.
 
-    The pair correlation is Pearson's r between the covariances of the pairs of common classes in
-    generated scenes and in held-out scenes. Common classes are the `_COMMON_CLASSES` most frequent
-    classes of the held-out scenes. The function returns NaN if r is undefined.
+    It counts the `_COMMON_CLASSES` most frequent held-out classes, and is NaN if r is undefined.
 
     Args:
         held_out, drawn: presence of each class, (scenes, classes).

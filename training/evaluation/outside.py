@@ -15,13 +15,7 @@ import torch
 
 from app.registry import Artifact
 from app.registry import Metric as CardMetric
-from training.datasets import (
-    AnnotatedScene,
-    DatasetError,
-    annotated_classes,
-    encode,
-    read_scenes,
-)
+from training.datasets import AnnotatedScene, DatasetError, annotated_classes, encode, read_scenes
 from training.datasets.batches import scene_tensors
 from training.datasets.records import digest_of
 from training.evaluation.artifact_model import artifact_model

@@ -168,13 +168,7 @@ def pairs_task(model: Model, setting: Setting) -> Outcome | None:
 
 @dataclass(frozen=True, eq=False)
 class _Answers:
-    """The answers about N pairs of some scenes.
-
-    Attributes:
-        scene: (N,) index of the scene of each pair.
-        classes: (N, 2) class indices of each pair.
-        p, listed: (N, 2 A) probability of each relation, and True for listed relations.
-    """
+    """The answers about N pairs: scene (N,), classes (N, 2), p and listed relations (N, 2 A)."""
 
     scenes: SceneTensors
     scene: Ints
@@ -215,8 +209,7 @@ def _hard_pairs(classes: Ints, setting: Setting) -> dict[str, Flags]:
     """Return masks (N,) of unseen pairs and of rare classes; empty without training scenes.
 
     "unseen pairs": training lists no relation of the two classes. "rare classes": training relates
-    one of the two classes to at most `RARE` classes. Training here means all data that the
-    model may have learnt from, not only the scenes of one source.
+    one of the two classes to at most `RARE` classes, in any source.
     """
     V = setting.scenes.v.shape[1]
     triples = setting.seen

@@ -21,6 +21,7 @@ from torch import Tensor
 from app.registry import Artifact
 from app.registry import Metric as CardMetric
 from training.datasets.batches import SceneTensors, subset
+from training.datasets.files import write_whole
 from training.evaluation.artifact_model import artifact_model
 from training.evaluation.everyday_task import SOURCE, facts_file
 from training.evaluation.metrics import Metric, Ratio, Resampled, Scored
@@ -74,14 +75,6 @@ class SourceReport:
                 metrics = {name: metric_from_dict(m) for name, m in outcome["metrics"].items()}
                 outcomes[task] = Outcome(**outcome | {"metrics": metrics})
         return cls(**values | {"outcomes": outcomes})
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Replace a file atomically. If the process is interrupted, the earlier file is kept."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(path.name + ".part")
-    draft.write_text(text, encoding="utf-8")
-    draft.replace(path)
 
 
 def by_source(scenes: SceneTensors) -> Iterator[tuple[str, SceneTensors]]:

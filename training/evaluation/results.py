@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from training.datasets.array_types import Floats
+from training.datasets.files import write_whole
 from training.evaluation.metrics import Figure, Metric, Resampled, paired_difference
-from training.evaluation.report import SourceReport, write_whole
+from training.evaluation.report import SourceReport
 from training.evaluation.tasks import TASKS
 
 Reports = Mapping[tuple[str, int], Mapping[str, SourceReport]]

@@ -81,15 +81,11 @@ class Outcome:
 
     @classmethod
     def over(
-        cls,
-        scenes: SceneTensors,
-        metrics: Mapping[str, Metric],
-        skipped: int,
-        notes: Mapping[str, float] | None = None,
+        cls, scenes: SceneTensors, metrics: Mapping[str, Metric], skipped: int
     ) -> Outcome | None:
         """Return the metrics per scene, summed by group of near-duplicates; None without any."""
         if not metrics:
             return None
         groups = scenes.group_ids
         by_group = {name: metric.by(groups) for name, metric in metrics.items()}
-        return cls(by_group, len(scenes), skipped, dict(notes or {}))
+        return cls(by_group, len(scenes), skipped)

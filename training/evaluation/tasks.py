@@ -100,9 +100,7 @@ TASKS: dict[str, Task] = {
         of_objects=False,
     ),
     "T1b completion": _task(
-        *("remaining relations", "completion", completion_task),
-        ("R-precision",),
-        of_objects=False,
+        *("remaining relations", "completion", completion_task), ("R-precision",), of_objects=False
     ),
     "T2 missing": _task(
         *("missing objects", "missing", missing_task),

@@ -173,10 +173,9 @@ class _Fit:
 
     def _batch_loss(self) -> Tensor:
         """Return the loss of parts of recorded scenes, followed by parts of stored samples."""
-        scenes = _joined(
-            self._draw(self.scenes, _BATCH),
-            self._draw(self._samples, _DISTILLED),
-        )
+        drawn = self._draw(self.scenes, _BATCH), self._draw(self._samples, _DISTILLED)
+        columns = zip(*(vars(part).values() for part in drawn), strict=True)
+        scenes = HomeScenes(*map(torch.cat, columns))
         of_home = (torch.arange(len(scenes)) < _BATCH).unsqueeze(1)
         scale = torch.where(of_home.squeeze(1), 1 / _BATCH, _DISTILLATION / _DISTILLED)
         parts = random_parts(scenes.v, _LEAVE_ONE_OUT, self._generator)
@@ -207,7 +206,3 @@ class _Fit:
         for weight, precision in self._changes.items():
             total = total + (precision * (weight - self._start[weight]) ** 2).sum()
         return total
-
-
-def _joined(*parts: HomeScenes) -> HomeScenes:
-    return HomeScenes(*map(torch.cat, zip(*(vars(part).values() for part in parts), strict=True)))

@@ -255,11 +255,7 @@ def _examples(blocks: list[Floats]) -> Floats:
 
 
 def _fit_possible(examples: Floats) -> tuple[CountSlope, ...]:
-    """Fit the slopes to the examples with log-odds of at least `_POSSIBLE`.
-
-    Most pairs of objects have no relation, and their log-odds are far lower. They would determine
-    the slopes.
-    """
+    """Fit the slopes to possible pairs: most pairs have far lower log-odds, and would decide."""
     examples = examples[examples[:, _TRUTH] != _UNKNOWN]
     is_possible = examples[:, _LOGIT] >= _POSSIBLE
     weight = np.where(is_possible, 1.0, _OF_THE_REST)
@@ -284,10 +280,7 @@ def _fit_listed(examples: Floats, listed: int) -> tuple[CountSlope, ...]:
 
 
 def _source_weights(examples: Floats, is_listed: Flags) -> Floats:
-    """Return weights that give each source the same total weight of listed examples, (examples,).
-
-    So the rooms of one generator do not outweigh the real rooms and people's sentences.
-    """
+    """Return weights (examples,) that give each source the same total of listed examples."""
     relation, source = examples[:, [_RELATION, _SOURCE]].astype(int).T
     key = relation * (source.max(initial=0) + 1) + source
     counts = np.bincount(key[is_listed], minlength=int(key.max(initial=-1)) + 1)

@@ -73,11 +73,8 @@ class _Cases(NamedTuple):
     Attributes:
         scene: number of the scene, in which one entry or no entry is wrong.
         encoded: number of the validation scene from which the scene was made.
-        source: data source of the scene.
         untouched: True for entries of a scene without a wrong entry.
         complete: True for entries of a source that annotates all supports.
-        wrong: True for wrong entries.
-        weight: weight of the entry in the fit.
     """
 
     scene: Ints
@@ -122,7 +119,9 @@ def _cases(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int) -> _Ca
     of_scene: list[tuple[int, str, bool, bool, float]] = []
     of_entries: list[tuple[Ints, Floats, Flags]] = []
     for number, encoded in enumerate(scenes):
-        shown = _shown_kinds(encoded)
+        # Without annotated supports, stands show nothing.
+        shows_all = annotated_relations(encoded)[ON_TOP].any()
+        shown = range(len(KINDS)) if shows_all else (BESIDE, SUPPORT, OVER, BELOW)
         for scene, flipped, wrong in _questions(artifact, encoded, seed):
             bare = replace(scene, room_type=None)
             entries = entries_of(artifact, Posterior(artifact, bare), bare, flipped)
@@ -145,27 +144,21 @@ def _cases(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int) -> _Ca
     return _Cases(*about, kind, terms, wrong_entries, weights)
 
 
-def _shown_kinds(encoded: EncodedScene) -> list[int]:
-    """Return the kinds of entries whose truth the scene shows."""
-    if annotated_relations(encoded)[ON_TOP].any():
-        return list(range(len(KINDS)))
-    return [BESIDE, SUPPORT, OVER, BELOW]
-
-
 def _questions(
     artifact: Artifact, encoded: EncodedScene, seed: int
 ) -> Iterator[tuple[Scene, Collection[Triple], Triple | int | None]]:
-    """Yield scenes, the triples that they state as "under", and the wrong triple or moved object.
-
-    The last entry is None for an untouched scene.
-    """
-    structure = artifact.vocabulary.structure
-    rng: Rng = scene_rng(encoded, seed)
+    """Yield scenes, triples stated as "under", and the wrong triple, moved object or None."""
+    structure, places = artifact.vocabulary.structure, artifact.places
+    classes, rng = encoded.instance_classes.tolist(), scene_rng(encoded, seed)
     triples = draw_true_relations(encoded, structure, rng)
     altered = altered_scene(encoded, structure, triples, rng) if triples else None
     if triples and altered:
         scene, false = altered
-        unders = [triple for triple in triples if _means_under(artifact, encoded, triple)]
+        unders = [
+            (a, i, j)
+            for a, i, j in triples
+            if a == ON_TOP and places is not None and places.means_under(classes[i], classes[j])
+        ]
         yield replace(scene, relations=tuple(triples)), unders, None
         yield scene, unders, false
         if false[0] == ON_TOP:
@@ -176,24 +169,14 @@ def _questions(
         moved = moved_scene(encoded, structure, state[1])
     if untouched is not None and moved is not None:
         sizes = artifact.vocabulary.sizes
-        roles = None if artifact.places is None else artifact.places.roles
+        roles = None if places is None else places.roles
         part = _part_of(untouched, scene_rng(encoded, seed + 2))
         for shown, wrong in ((untouched, None), (part, None), moved):
             yield observe(shown, typical_sizes=sizes, roles=roles), (), wrong
 
 
-def _means_under(artifact: Artifact, encoded: EncodedScene, triple: Triple) -> bool:
-    """Return whether a true on-top relation means that its object is under its subject."""
-    a, i, j = triple
-    classes, places = encoded.instance_classes.tolist(), artifact.places
-    return a == ON_TOP and places is not None and places.means_under(classes[i], classes[j])
-
-
 def _part_of(scene: Scene, rng: Rng) -> Scene:
-    """Return a scene with a random part of the objects. Its supports may be missing, as in a view.
-
-    A scene with stated relations is returned whole.
-    """
+    """Return a random part of the objects, as a view; with stated relations, the whole scene."""
     if scene.relations is not None:
         return scene
     count = int(rng.integers(1, len(scene.objects) + 1))
@@ -262,10 +245,7 @@ def _alarm_lines(judgement: Judgement, untouched: _Cases, budget: float) -> Alar
 
 
 def _line(points: Sequence[tuple[float, float]], least: float) -> AlarmLine:
-    """Return a line that rises with the number of entries, but by at most log n.
-
-    It is at least at this probability.
-    """
+    """Return a line, at least at `least`, that rises with the number n by at most log n."""
     x, y = np.array(points).T
     slope = min(max(float(np.polyfit(x, y, 1)[0]), 0.0), 1.0) if len(x) > 1 else 0.0
     intercept = float(np.mean(y - slope * x))

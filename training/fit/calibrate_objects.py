@@ -124,9 +124,6 @@ def served_scenes(scenes: SceneTensors, served: Mapping[str, float]) -> SceneTen
     return subset(scenes, torch.tensor(sorted(kept), dtype=torch.int64))
 
 
-# ------------------------------------------------------------------------------------ missing
-
-
 def fit_missing(
     artifact: Artifact, scenes: SceneTensors, structure: Tensor, chosen: Calibration | None = None
 ) -> dict[str, Any]:
@@ -167,20 +164,13 @@ def _mean_rank(z: Floats, candidates: Flags, hidden: Flags) -> float:
 def _first_classes(
     z: Floats, candidates: Flags, hidden: Flags, listed: Floats
 ) -> tuple[Floats, Flags]:
-    """Return the features and the truth of the first classes of each part.
-
-    The features, (examples, 2), are the log-odds and the log of the number of listed classes. The
-    truth, (examples,) bool, is True for a hidden class.
-    """
+    """Return features (log-odds, log of listed classes) and truth of each part's first classes."""
     first = np.argsort(np.where(candidates, -z, np.inf), axis=1, kind="stable")[:, :_LISTED]
     rows = np.arange(len(z))[:, None]
     size = np.broadcast_to(np.log(np.maximum(listed, 1))[:, None], first.shape)
     usable = candidates[rows, first]  # a small vocabulary has fewer candidates
     features = np.stack([z[rows, first], size], -1).astype(np.float64)
     return features[usable], hidden[rows, first][usable]
-
-
-# ----------------------------------------------------------------------------------- outliers
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,9 +213,7 @@ def fit_outliers(
 ) -> dict[str, Any]:
     """Fit the calibration of outliers on random parts of scenes, with and without an intruder.
 
-    Args:
-        train: training scenes. They give the distributions of the intruders.
-        chosen: a calibration whose `popularity_weight` is kept. Without it, the fit chooses one.
+    The training scenes give the distributions of intruders. A `chosen` calibration gives alpha.
 
     Returns:
         The fields `popularity_weight`, `outlier` and `outlier_lines` of a `Calibration`; none if

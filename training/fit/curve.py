@@ -48,7 +48,7 @@ def write_csv(path: Path, curve: Sequence[CurvePoint]) -> None:
         writer.writerows(map(astuple, curve))
 
 
-SCORES: Final = {"objects": "MRR of hidden classes", "relations": "R-precision of relations"}
+SCORES: Final = {"objects": "MRR", "relations": "R-precision"}
 """Name of the validation score of each phase."""
 
 

@@ -83,10 +83,7 @@ def fit_places(
 
 
 def _stands(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> Floats:
-    """Return the shares of floor, wall and supporting objects for each class, (V, 3).
-
-    The counts of a class are smoothed towards those of its parent, and of all classes.
-    """
+    """Return shares of floor, wall and supports, (V, 3), smoothed to the parent and to all."""
     counts = np.zeros((len(vocabulary), 3))
     for scene in scenes:
         known = scene.instance_stands >= 0

@@ -261,10 +261,7 @@ class ObjectFit:
         return torch.where(is_listed, room, -1)
 
     def _generative_loss(self, chains: Chains, v: Tensor, room: Tensor, source: Tensor) -> Tensor:
-        """Return F(scenes) - F(chains), after a sweep of the chains.
-
-        The chains keep the room types of the scenes where they start.
-        """
+        """Return F(scenes) - F(chains) after a sweep of the chains, which keep their room types."""
         machine, generator = self.machine, self._generator
         sweep(machine, chains, generator, classes=self.config.classes_per_sweep)
         h2 = v.new_zeros(len(v), 0)

@@ -153,11 +153,7 @@ class RelationFit:
         return total / len(batches)
 
     def _batches(self) -> list[Tensor]:
-        """Return the scenes of an epoch in batches, in random order.
-
-        The scenes of a batch have similar numbers of classes, because the time of a batch grows
-        with the square of the largest number.
-        """
+        """Return an epoch in random batches of similar scenes: large ones make a batch slow."""
         noise = torch.rand(len(self.train), generator=self._generator)
         order = (self._log_sizes + _MIXING * noise).argsort()
         batches = order.split(self.config.batch_size)

@@ -157,10 +157,7 @@ class Trainer:
 
     @torch.no_grad()
     def _begin_relations(self) -> RelationFit:
-        """Fix the object weights, and start the second phase.
-
-        Weights of structure classes become 0, so that listing these classes changes nothing.
-        """
+        """Fix the object weights, those of structure at 0, and start the second phase."""
         machine, structure = self.machine, self.data.structure
         bake_shared_weights(machine, ["W"])
         machine.W[structure] = 0

@@ -1,4 +1,4 @@
-"""Gibbs sampling of objects and hidden units for training and for annealed importance sampling.
+"""Gibbs sampling of objects and hidden units for training and for tests of the machine.
 
 A sweep draws h1 given v and h2, then h2 given h1, and then the classes given h1. Without couplings,
 the classes are independent given h1. With couplings, the sweep draws them one after another:
@@ -70,7 +70,7 @@ def sweep(
 
     Args:
         classes: number of random classes that a sweep over coupled classes draws. None means all.
-        beta: factor of all weights; see `training.machines.partition`.
+        beta: factor of all weights.
         base: log-odds of the classes at beta = 0, (classes,). The default is 0.
     """
     x = machine.context_bias(chains.room) + sums(chains.v, machine.W) + chains.h2 @ machine.J.T
@@ -113,16 +113,7 @@ def _draw_coupled(
     classes: int | None,
     generator: torch.Generator,
 ) -> Tensor:
-    """Draw coupled classes one after another, each given all other classes.
-
-    Args:
-        field: log-odds of the classes without the effect of the couplings, (chains, classes).
-        couplings: weights between the classes, (classes, classes).
-        classes: number of random classes to draw. None means all.
-
-    Returns:
-        The new presence of the classes, (chains, classes). Other classes keep their presence.
-    """
+    """Draw some random classes, None means all, one after another given all other classes."""
     # numpy has a smaller overhead than torch for the many small steps.
     V = field.shape[1]
     order = torch.randperm(V, generator=generator)[:classes].tolist()

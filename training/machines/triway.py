@@ -146,7 +146,7 @@ def implication_features(observed: Tensor) -> Tensor:
     return torch.cat([directed, paths, degrees], 1)
 
 
-def implied(gamma: Tensor, B: Tensor, observed: Tensor, h1: Tensor, apart: bool = False) -> Tensor:
+def implied(gamma: Tensor, B: Tensor, observed: Tensor, h1: Tensor) -> Tensor:
     """Return the changes x of the relation logits due to observed relations.
 
     The result has the shape (scenes, relations, n, n) over pairs of n classes.
@@ -156,14 +156,10 @@ def implied(gamma: Tensor, B: Tensor, observed: Tensor, h1: Tensor, apart: bool 
         B: weights from hidden units to z, (G, hidden units).
         observed: observed relations, (scenes, relations, n, n). 1 means that the relation holds.
         h1: means of the hidden units given the objects, (scenes, hidden units).
-        apart: True leaves out the effects between relations of the same pair of classes.
     """
     A = observed.shape[1]
     itself = torch.zeros(gamma.shape[1:], dtype=torch.bool)
     itself[:, :A].fill_diagonal_(True)
-    if apart:
-        # The path and degree features remain, because they depend on relations to other classes.
-        itself[:, : 2 * A] = True
     gamma = gamma.masked_fill(itself, 0.0)
     weight = gamma[0] + torch.einsum("bq,qaf->baf", h1 @ B.T, gamma[1:])
     features = implication_features(observed)

@@ -29,10 +29,10 @@ import typer
 from app.registry import Artifact
 from training.datasets import EncodedScene
 from training.datasets.array_types import Ints, Rng
+from training.datasets.files import write_whole
 from training.domain.adaptation import adapted
 from training.domain.home import Home, HomeScene, alarms_of, of_classes
 from training.evaluation.parts import ALL_BUT_ONE
-from training.evaluation.report import write_whole
 from training.fit.adapt import adapt
 from training.fit.calibrate_objects import calibrate_objects
 from training.fit.draft import placed_draft
@@ -224,11 +224,7 @@ def _mrr(side: Artifact, visits: Sequence[tuple[Ints, int, Ints]]) -> float:
 
 
 def _intruder(home: Home, lists: Sequence[Ints], own: Ints, rng: Rng) -> tuple[float, float] | None:
-    """Return the mean share of alarms about classes that the home does not have.
-
-    Each class is recorded twice, without a confirmation. The parent reports the class in at least
-    one of the visits.
-    """
+    """Return the mean alarms about intruders that were recorded twice, without a confirmation."""
     parent = home.parent
     visits = [(scene.classes, -1 if scene.room is None else scene.room) for scene in home.scenes]
     shares: list[tuple[float, float]] = []

@@ -37,14 +37,7 @@ from rich.progress import Progress as Bar
 
 from training.datasets import DatasetError
 from training.datasets.batches import TrainingData
-from training.evaluation.report import (
-    Progress,
-    SourceReport,
-    digest,
-    measure,
-    pooled,
-    silent,
-)
+from training.evaluation.report import Progress, SourceReport, digest, measure, pooled, silent
 from training.evaluation.results import Reports
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import ONCE, WHOLE_SET

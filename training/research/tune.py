@@ -31,19 +31,14 @@ from pydantic import BaseModel, ValidationError
 from rich.console import Console
 
 from training.datasets.batches import TrainingData
+from training.datasets.files import write_whole
 from training.evaluation.artifact_model import score_relations
 from training.evaluation.asking import score_missing
 from training.evaluation.metrics import Metric, paired_difference
 from training.evaluation.model import Model
-from training.evaluation.report import (
-    SourceReport,
-    measure,
-    pooled,
-    settings_by_source,
-    write_whole,
-)
+from training.evaluation.report import SourceReport, measure, pooled, settings_by_source
 from training.fit.configuration import Config, ConfigError, first_error
-from training.fit.curve import CurvePoint
+from training.fit.curve import SCORES, CurvePoint
 from training.fit.draft import draft_artifact
 from training.fit.trainer import Trainer
 from training.machines import BoltzmannMachine
@@ -57,7 +52,6 @@ from training.runs.config_files import (
     shortened,
     with_settings,
 )
-from training.runs.live import SCORES
 from training.runs.pipeline import prepare
 
 if TYPE_CHECKING:

@@ -8,14 +8,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from training.fit.curve import CurvePoint, TrainingResult
+from training.fit.curve import SCORES, CurvePoint, TrainingResult
 from training.fit.trainer import Trainer
-
-SCORES = {"objects": "MRR", "relations": "R-precision"}
-"""Name of the validation score of each phase."""
-
-# Share of the objects in the progress bar. Their phase takes about as long as the relations.
-_OF_OBJECTS = 0.5
 
 
 class Display(Progress):
@@ -38,7 +32,7 @@ class Display(Progress):
         """Show the progress after an update of the weights."""
         points = [point for point in self._trainer.curve if point.phase == phase]
         state = score_of(points[-1]) if points else f"loss {loss:.3f}"
-        whole = _OF_OBJECTS * done if phase == "objects" else _OF_OBJECTS + done / 2
+        whole = (done + (phase == "relations")) / 2  # both phases take about as long
         self.update(self._task, completed=whole, note=f"{phase} {done:.0%}, {state}")
 
 

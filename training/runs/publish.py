@@ -33,12 +33,7 @@ from training.fit.draft import placed_draft
 from training.fit.long_chains import measure_drift
 from training.fit.objects import ObjectScenes
 from training.fit.offset_statistics import fit_offsets
-from training.runs.config_files import (
-    load_config,
-    shipped_configs,
-    stored_config,
-    with_settings,
-)
+from training.runs.config_files import load_config, shipped_configs, stored_config, with_settings
 from training.runs.example_scenes import known_examples, read_examples
 from training.runs.folder import FinishedRun, RunError
 from training.runs.pipeline import SplitScenes, read_sources, split_and_encode
@@ -133,12 +128,7 @@ def publish_run(
 
 
 def refit(
-    artifact: Artifact,
-    root: Path,
-    store: Store,
-    version: str,
-    *,
-    progress: Progress = silent,
+    artifact: Artifact, root: Path, store: Store, version: str, *, progress: Progress = silent
 ) -> Artifact:
     """Publish a new version of a published model with refitted statistics, without training.
 
@@ -230,10 +220,7 @@ def calibrated_draft(
 
 
 def _measure(
-    artifact: Artifact,
-    data: TrainingData,
-    progress: Progress,
-    tasks: Collection[str] | None = None,
+    artifact: Artifact, data: TrainingData, progress: Progress, tasks: Collection[str] | None = None
 ) -> list[Metric]:
     """Return the metrics on test scenes, or an empty list if there are no test scenes."""
     if not len(data.test):

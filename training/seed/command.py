@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-import os
 import signal
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -27,7 +26,7 @@ import typer
 from rich.console import Console
 
 from training.datasets import DatasetError
-from training.datasets.files import DATA
+from training.datasets.files import DATA, write_whole
 from training.seed.learning import EPOCHS, KINDS, LEARNING_RATE, train
 from training.seed.machines import VARIANTS
 from training.seed.protocol import (
@@ -94,8 +93,8 @@ def seed(
         for split, machines in runs.items()
     }
     page = markdown(source, materials, results)
-    _write(folder / "results.json", json.dumps({"paper": PAPER, "splits": results}, indent=1))
-    _write(folder / "results.md", page)
+    write_whole(folder / "results.json", json.dumps({"paper": PAPER, "splits": results}, indent=1))
+    write_whole(folder / "results.md", page)
     plot(folder / "errors.png", results)
     console.print(page, markup=False, highlight=False, soft_wrap=True)
     console.print(f"results: {folder}/results.md, results.json, errors.png", soft_wrap=True)
@@ -133,14 +132,7 @@ def _start_worker() -> None:
 
 
 def _run(job: Job, source: str, data: Path, folder: Path, settings: Mapping[str, Any]) -> Run:
-    """Return the run in a file, or train and measure a machine and write the file.
-
-    A job is a split, a variant and a training seed.
-
-    Raises:
-        FolderError: the file contains a run with other scenes or settings.
-        FloatingPointError: training has diverged.
-    """
+    """Return the run of a job in its file. Without a file, train, measure and write it."""
     split, name, number = job
     path = folder / split / f"{name}-seed-{number}.json"
     material = _materials(source, data)[split]
@@ -171,7 +163,7 @@ def _run(job: Job, source: str, data: Path, folder: Path, settings: Mapping[str,
         "history": [asdict(epoch) for epoch in history],
         "cpu": time.process_time() - start,
     }
-    _write(path, json.dumps(run, indent=1))
+    write_whole(path, json.dumps(run, indent=1))
     return run
 
 
@@ -184,14 +176,6 @@ def _references(material: Material, seeds: int) -> dict[str, list[Row]]:
         name: [measure(answer, material.triples, material.test, k) for k in range(seeds)]
         for name, answer in answers.items()
     }
-
-
-def _write(path: Path, text: str) -> None:
-    """Write a file whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(f".{os.getpid()}.tmp")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)
 
 
 _EPOCHS_SHOWN: Final = (1, 10, 50)
@@ -228,11 +212,10 @@ def _table(result: Mapping[str, Any]) -> str:
     columns |= {name: [_row(run) for run in runs] for name, runs in result["machines"].items()}
     metrics = dict.fromkeys(metric for rows in columns.values() for row in rows for metric in row)
     titles = [VARIANTS[name].title if name in VARIANTS else name for name in columns]
-    lines = [
-        ["", *titles, "paper: RBM / GBM / Triway"],
-        ["---"] * (len(columns) + 2),
-        *([metric, *_cells(metric, columns.values()), _paper(metric)] for metric in metrics),
-    ]
+    lines = [["", *titles, "paper: RBM / GBM / Triway"], ["---"] * (len(columns) + 2)]
+    for metric in metrics:
+        paper = " / ".join(f"{value:.4f}" for value in PAPER.get(metric, {}).values())
+        lines.append([metric, *_cells(metric, columns.values()), paper])
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
@@ -257,10 +240,6 @@ def _cells(metric: str, columns: Iterable[list[Row]]) -> Iterator[str]:
         digits = 0 if metric in ("epochs", "weights") else 1 if metric.startswith("E ") else 3
         spread = f" ± {stdev(values):.{digits}f}" if len(values) > 1 and any(values) else ""
         yield f"{fmean(values):,.{digits}f}{spread}" if values else ""
-
-
-def _paper(metric: str) -> str:
-    return " / ".join(f"{value:.4f}" for value in PAPER.get(metric, {}).values())
 
 
 def plot(path: Path, results: Mapping[str, Any]) -> None:

@@ -173,9 +173,6 @@ def test_boxes_are_in_the_axes_that_relations_were_derived_in() -> None:
     assert chosen.instance_yaws == pytest.approx(seen.instance_yaws - viewpoint.yaw)
 
 
-# -- boxes in an image -----------------------------------------------------------------------------
-
-
 def test_left_and_above_in_an_image() -> None:
     drawn = [(0, 50, 10, 60), (14, 51, 24, 61), (1, 10, 11, 40), (500, 0, 510, 9), None]
     labels = ("desk", "monitor", "pencil", "desk", "pencil")

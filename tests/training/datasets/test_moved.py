@@ -160,8 +160,6 @@ def test_objects_without_a_box_stay() -> None:
         assert moved.objects[3].position is None
 
 
-# ---------------------------------------------------------------------------- without poses
-
 BARE = things(*LABELS, "cup", "wall")
 LISTED = (
     (CUP, "on-top", TABLE),

@@ -26,12 +26,7 @@ from training.datasets import (
     jsonl,
     read_scenes,
 )
-from training.datasets.priors import (
-    COLUMNS,
-    MAX_LINE,
-    SOURCE,
-    read_prior_scenes,
-)
+from training.datasets.priors import COLUMNS, MAX_LINE, SOURCE, read_prior_scenes
 from training.datasets.readers import READERS, guess_format
 from training.fit.configuration import ConfigError, DataConfig
 from training.runs.pipeline import read_sources
@@ -48,8 +43,6 @@ def write_json(path: Path, content: Any) -> Path:
     path.write_text(json.dumps(content))
     return path
 
-
-# ------------------------------------------------------------------------------- JSON lines
 
 DESK_SCENE: dict[str, Any] = {
     "scene_id": "a",
@@ -235,8 +228,6 @@ def test_malformed_jsonl(tmp_path: Path, line: Any, message: str) -> None:
     check_malformed(path, message, "line 2")
 
 
-# ------------------------------------------------------------------------------- 3DSSG
-
 RESCANS = [
     {"reference": "room-1", "type": "train", "scans": [{"reference": "room-1b", "removed": []}]},
     {"reference": "room-2", "type": "validation", "scans": []},
@@ -309,8 +300,6 @@ MALFORMED_3DSSG = [
     ({"scans": [SCAN, SCAN]}, r"scans\.1: scene 3dssg-room-1b-2 is listed twice"),
 ]
 
-
-# ------------------------------------------------------------------------------- SUN RGB-D
 
 TURN = math.radians(30)
 COS, SIN = math.cos(TURN), math.sin(TURN)
@@ -420,8 +409,6 @@ def test_mat_files_of_other_content(tmp_path: Path) -> None:
     check_malformed(path, "Field required", "0.sequenceName")
 
 
-# ------------------------------------------------------------------------------- COCO
-
 COCO: dict[str, Any] = {
     "images": [{"id": 9, "file_name": "9.jpg"}, {"id": 4, "file_name": "4.jpg"}],
     "categories": [{"id": 62, "name": "chair"}, {"id": 67, "name": "dining table"}],
@@ -469,9 +456,6 @@ def test_malformed_json(tmp_path: Path, write: Any, content: Any, message: str) 
     check_malformed(write_json(write(tmp_path), content), message)
 
 
-# ------------------------------------------------------------------------------- all of them
-
-
 @pytest.mark.parametrize("triple", [(0, "left", 1), (-1, "left", 0)])
 def test_relations_of_unknown_objects_are_refused(triple: tuple[int, str, int]) -> None:
     problem = r"a relation has object index -?1, but the scene has 1 objects"
@@ -479,12 +463,7 @@ def test_relations_of_unknown_objects_are_refused(triple: tuple[int, str, int]) 
         AnnotatedScene("s", "t", "g", None, (AnnotatedObject("0", "bed"),), (triple,))
 
 
-LAYOUTS = {
-    "jsonl": write_jsonl,
-    "3dssg": write_3dssg,
-    "sunrgbd-mat": write_mat,
-    "coco": write_coco,
-}
+LAYOUTS = {"jsonl": write_jsonl, "3dssg": write_3dssg, "sunrgbd-mat": write_mat, "coco": write_coco}
 
 
 @pytest.mark.parametrize("name", READERS)

@@ -19,10 +19,7 @@ from training.datasets import (
 )
 from training.datasets.batches import scene_tensors
 from training.datasets.cases import annotated_relations
-from training.datasets.sources import (
-    relations_of,
-    supported_subjects,
-)
+from training.datasets.sources import relations_of, supported_subjects
 
 VOCABULARY = Vocabulary([ObjectClass("desk"), ObjectClass("monitor"), ObjectClass("pencil")])
 LATERAL, VERTICAL = [LEFT, FRONT], [ON_TOP, ABOVE]
@@ -165,10 +162,7 @@ STACK = {(0, 1), (1, 0)}
         ("nr3d", {LEFT: STACK, FRONT: STACK}),
         ("vrd", {LEFT: STACK, FRONT: STACK}),
         ("virtualhome", {LEFT: STACK, FRONT: STACK, ON_TOP: ALL, INSIDE: ALL}),
-        (
-            "3dssg",
-            {LEFT: STACK, FRONT: STACK, ON_TOP: STACK | {(1, 2)}, INSIDE: STACK | {(1, 2)}},
-        ),
+        ("3dssg", {LEFT: STACK, FRONT: STACK, ON_TOP: STACK | {(1, 2)}, INSIDE: STACK | {(1, 2)}}),
         ("robot", dict.fromkeys((LEFT, FRONT, ON_TOP, ABOVE, INSIDE), ALL)),
     ],
 )

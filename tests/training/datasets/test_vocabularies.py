@@ -8,12 +8,7 @@ import pytest
 
 from app.scene import ObjectClass, Vocabulary, label_key
 from tests.training.scenes import scene
-from training.datasets import (
-    AnnotatedObject,
-    AnnotatedScene,
-    read_scenes,
-    source_vocabulary,
-)
+from training.datasets import AnnotatedObject, AnnotatedScene, read_scenes, source_vocabulary
 from training.datasets.vocabulary import (
     INDOOR_FILE,
     MINIMUM_MENTIONS,
@@ -33,7 +28,6 @@ NAMES = Names(
     structure=("wall",),
     not_objects=("space",),
     surroundings=("sky",),
-    outdoor=("truck",),
     aliases={"sofa": ("couch",), "wall": ("partition wall",)},
     rooms={"bathroom": ("toilet",), "": ("room",)},
 )
@@ -55,11 +49,8 @@ def test_labels_are_pooled_under_their_curated_names() -> None:
 def test_some_labels_become_no_class() -> None:
     several = scenes("space", "sky", "truck", "wall", "walls", "partition wall")
     found = build_vocabulary(several, NAMES, minimum=1)
-    assert found.labels == ("wall", "chair", "throne")
-    assert found.structure.tolist() == [True, False, False]
-    outdoors = build_vocabulary(several, NAMES, minimum=1, outdoor=True)
-    assert outdoors.labels == ("wall", "sky", "truck", "chair", "throne")
-    assert outdoors.structure.tolist() == [True, True, False, False, False]
+    assert found.labels == ("wall", "sky", "truck", "chair", "throne")
+    assert found.structure.tolist() == [True, True, False, False, False]
 
 
 def test_rooms_have_one_spelling() -> None:
@@ -120,9 +111,6 @@ def test_household_classes_need_no_mention() -> None:
     assert build_vocabulary(scenes("chair"), names, minimum=1).labels == ("chair", "hammer")
 
 
-# ------------------------------------------------------------------------- the committed files
-
-
 @pytest.mark.parametrize("table", ["aliases", "kinds", "rooms"])
 def test_each_curated_name_has_one_meaning(table: str) -> None:
     names = curated_names()
@@ -160,7 +148,7 @@ def test_the_committed_vocabulary_follows_the_curated_names() -> None:
     for label in names.not_objects:
         assert vocabulary.index(label) is None
     # Ends of relations in photographs, so that they are no structure.
-    for label in (*names.outdoor, *names.surroundings):
+    for label in ("airplane", "van", *names.surroundings):
         assert not vocabulary.structure[vocabulary.index(label)]
     assert all(entry.size is None for entry in vocabulary.objects)
     assert all(names.canonical_room(room) == room for room in vocabulary.room_types)

@@ -11,11 +11,7 @@ from typing import Any
 from training.datasets import generate_rooms
 
 HALL = ["shoe", "coat", "umbrella", "mirror", "doormat", "coat rack", "bag", "lamp"]
-HABITS = {
-    "living room": ["sofa", "cat", "oven"],
-    "hall": ["bicycle"],
-    "bedroom": ["desk"],
-}
+HABITS = {"living room": ["sofa", "cat", "oven"], "hall": ["bicycle"], "bedroom": ["desk"]}
 """Objects of each room type that other homes do not have there."""
 
 

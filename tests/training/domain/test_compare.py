@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from app.scene import Vocabulary
+from tests.training.commands import small_config
 from tests.training.research.baselines.furnished import STRUCTURE, furnished, tensors
 from training.datasets import generate_rooms, split
 from training.datasets.records import digest_of
@@ -16,19 +17,13 @@ from training.domain.candidates import BASELINES, Candidate, held_out
 from training.domain.compare import COMPARED, compare, side_by_side
 from training.evaluation.baselines import EASE, FREQUENCY_TABLE, POPULARITY
 from training.evaluation.model import Model
-from training.fit.configuration import Config, ConfigError
+from training.fit.configuration import ConfigError
 from training.fit.draft import as_stored, draft_artifact
 from training.fit.objects import ObjectScenes
 from training.fit.trainer import new_machine
 from training.runs.pipeline import prepare
 
-CONFIG = Config.model_validate(
-    {
-        "name": "small",
-        "data": {"sources": ["rooms"], "rooms": 120, "vocabulary": "rooms", "split": "stable"},
-        "machine": {"variant": "rbm", "units": 2, "states": 3, "N": 0},
-    }
-)
+CONFIG = small_config("small", "rbm", rooms=120, split="stable")
 
 
 def test_scenes_with_incomplete_lists_are_compared_on_relations_alone() -> None:
@@ -74,19 +69,10 @@ REFERENCE = Candidate(BASELINES, None, {}, None)
 LEARNT = {"rooms": digest_of(SCENES["rooms"])}
 
 
-def config(**data) -> Config:
-    return Config.model_validate(
-        {
-            "name": "rooms",
-            "data": {"sources": ["rooms"], "vocabulary": "rooms", "rooms": 500, **data},
-            "machine": {"variant": "rbm"},
-        }
-    )
-
-
 def candidate(title: str, learnt=LEARNT, **data) -> Candidate:
     # Any artifact except None stands for a model, because only its split matters.
-    return Candidate(title, config(**data), learnt, artifact="a model")  # type: ignore[arg-type]
+    config = small_config("rooms", "rbm", rooms=500, **data)
+    return Candidate(title, config, learnt, artifact="a model")  # type: ignore[arg-type]
 
 
 def learnt_groups(seed: int, protocol) -> set[str]:

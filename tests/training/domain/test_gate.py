@@ -10,6 +10,7 @@ import torch
 
 from app.registry import Artifact, Store
 from tests.http.stores import corrupt, make_store
+from tests.training.commands import small_config
 from training.datasets import EncodedScene
 from training.datasets.batches import TrainingData, subset
 from training.domain.candidates import Candidate
@@ -20,6 +21,7 @@ from training.evaluation.results import Difference, Results
 from training.fit.configuration import Config
 from training.fit.draft import as_stored, draft_artifact
 from training.fit.trainer import Trainer
+from training.runs.config_files import with_settings
 from training.runs.pipeline import SplitScenes, prepare
 
 
@@ -89,15 +91,9 @@ def test_a_model_without_relation_metrics_replaces_no_model_with_them(
 
 
 def small(**objects: float) -> Config:
-    return Config.model_validate(
-        {
-            "name": "small",
-            "data": {"sources": ["rooms"], "rooms": 240, "vocabulary": "rooms", "split": "stable"},
-            "machine": {"variant": "rbm", "units": 4, "states": 4, "N": 0},
-            "objects": {"steps": 150, "batch_size": 32} | objects,
-            "relations": {"epochs": 0},
-        }
-    )
+    settings = {"machine.units": 4, "machine.states": 4, "machine.N": 0, "relations.epochs": 0}
+    settings |= {f"objects.{name}": value for name, value in ({"steps": 150} | objects).items()}
+    return with_settings(small_config("small", "rbm", rooms=240, split="stable"), settings)
 
 
 @pytest.fixture(scope="module")

@@ -234,15 +234,6 @@ def test_too_few_scenes_are_refused_and_few_warned_of(tmp_path, scenes, message,
     assert message in init(tmp_path / "scenes.jsonl", folder=tmp_path / "o", code=code)
 
 
-def test_each_file_is_a_source(tmp_path) -> None:
-    files = [tmp_path / f"day{number}.jsonl.gz" for number in (0, 1)]
-    for path, some in zip(files, (SCENES[:40], SCENES[40:]), strict=True):
-        write_jsonl(some, path)
-    init(*files, folder=tmp_path / "lab")
-    config = load_config(str(tmp_path / "lab"))
-    assert prepare(config, tmp_path / "lab").counts == {"day0": 40, "day1": 40}
-
-
 @pytest.mark.parametrize(("copies", "states"), [(1, 8), (19, 32)])
 def test_many_scenes_get_a_larger_machine(copies, states) -> None:
     rooms = [

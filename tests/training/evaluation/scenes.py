@@ -17,6 +17,7 @@ from training.datasets.encoding import pool_instances
 
 V = 5
 NO_STRUCTURE = torch.zeros(V, dtype=torch.bool)
+FLOOR = torch.arange(V) == 1
 # Enough classes for many scenes that differ in them.
 WIDE = 12
 WIDE_STRUCTURE = torch.zeros(WIDE, dtype=torch.bool)
@@ -118,6 +119,11 @@ def knowing(scenes: SceneTensors):
         return values
 
     return score
+
+
+def in_order(v):
+    """A score of objects: class 0 before 1 before 2, ..."""
+    return torch.tensor([5.0, 4, 3, 2, 1]).expand_as(v)
 
 
 def flat(batch):

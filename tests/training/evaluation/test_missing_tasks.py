@@ -10,17 +10,18 @@ from app.registry import PlaceFit
 from app.scene import CANONICAL, OPPOSITES, Scene, SceneObject
 from tests.questions.answers import missing as ask_missing
 from tests.questions.artifacts import LARGER, larger_artifact
-from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
 from tests.training.evaluation.scenes import (
+    FLOOR,
     NO_STRUCTURE,
     WIDE,
     WIDE_STRUCTURE,
+    in_order,
     random_scenes,
     scene,
     tensors,
 )
 from training.evaluation.artifact_model import score_placed
-from training.evaluation.asking import LeakError, missing_probabilities, of_classes, score_missing
+from training.evaluation.asking import LeakError
 from training.evaluation.missing_tasks import (
     SEEDS,
     leave_one_out_at,
@@ -29,16 +30,10 @@ from training.evaluation.missing_tasks import (
     removed_places,
 )
 from training.evaluation.model import Places
-from training.evaluation.parts import all_but_one, draw_parts, one_quarter
+from training.evaluation.parts import all_but_one, draw_parts
 from training.evaluation.setting import Setting
 
 DATA = tensors(random_scenes(20), WIDE)
-FLOOR = torch.tensor([False, True, False, False, False])
-
-
-def in_order(v):
-    """Class 0 before 1 before 2, ..."""
-    return torch.tensor([5.0, 4, 3, 2, 1]).expand_as(v)
 
 
 def test_metrics_by_hand():
@@ -97,25 +92,6 @@ def test_a_planted_cheater_is_caught(first):
     turns = iter([*hidden] * 3)
     with pytest.raises(LeakError, match="leaks information"):
         rank_missing(data, WIDE_STRUCTURE, lambda v: torch.stack([next(turns) for _ in v]))
-
-
-def test_the_score_is_the_ranking_of_the_service():
-    """Unlisted classes without structure and without kinds of a listed class, by probability."""
-    v = draw_parts(rooms(10, 1), STRUCTURE, one_quarter).v
-    parents = torch.tensor(room_model().vocabulary.parents.tolist())
-    kinds = 0
-    for row, own in zip(v, score_missing(room_model(), v), strict=True):
-        asked = of_classes(row.nonzero().squeeze(1).tolist())
-        p = torch.from_numpy(missing_probabilities(room_model(), asked))
-        usable = p > -torch.inf
-        is_kind = (parents >= 0) & (row[parents.clamp(min=0)] > 0)
-        kinds += int((is_kind & (row == 0)).sum())
-        assert torch.equal(usable, (row == 0) & ~STRUCTURE & ~is_kind)
-        assert torch.allclose(own[usable].exp(), p[usable])
-    assert kinds
-
-
-# ------------------------------------------------------------------------------------------ T2-at
 
 
 def test_every_class_in_a_relation_is_asked_for_once_by_one_of_its_relations():

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import count
 
 import numpy as np
 import pytest
 
-from app import questions
-from app.registry import Judgement, Misplaced
-from app.scene import observe
-from tests.questions.artifacts import lines
-from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, room_model, rooms
+from tests.training.evaluation.furnished_rooms import STRUCTURE, rooms
 from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
-from training.evaluation.artifact_model import artifact_model
-from training.evaluation.asking import LeakError, score_misplaced
+from training.evaluation.asking import LeakError
 from training.evaluation.moved_task import flagged, moved_cases, moved_task
 from training.evaluation.setting import Setting
 
@@ -108,20 +102,3 @@ def test_a_score_that_follows_the_order_is_caught():
     undefined = lambda _: [{"subject": "0", "probability": np.nan}]  # noqa: E731
     with pytest.raises(FloatingPointError, match="NaN"):
         moved_task(undefined, Setting(LISTED, NO_STRUCTURE))
-
-
-def test_the_service_sees_the_poses_of_a_request():
-    artifact = room_model()
-    assert artifact_model(artifact).misplaced is None
-    terms = {"intercept": 0.0, "relation": -1.0, "change": -1.0, "stand": 0.0, "supporter": 0.0}
-    unlikely = Judgement(**terms, lines=lines(0.9, 0.8, 0.7))
-    judging = artifact.calibration.model_copy(
-        update={"misplaced": Misplaced(lateral=unlikely, support=unlikely)}
-    )
-    artifact = replace(artifact, calibration=judging)
-    case = moved_cases(POSED, STRUCTURE)[0]
-    entries = score_misplaced(artifact, case.moved)
-    assert entries == questions.misplaced(
-        artifact, observe(case.moved, typical_sizes=VOCABULARY.sizes)
-    )
-    assert entries

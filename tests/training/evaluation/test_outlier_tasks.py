@@ -19,12 +19,7 @@ from training.evaluation.intruders import (
 )
 from training.evaluation.missing_tasks import SEEDS
 from training.evaluation.model import Model, suspicion_of
-from training.evaluation.outlier_tasks import (
-    alarms_task,
-    hit_at_1,
-    outliers_task,
-    with_intruders,
-)
+from training.evaluation.outlier_tasks import alarms_task, hit_at_1, outliers_task, with_intruders
 from training.evaluation.parts import draw_parts, exactly
 from training.evaluation.setting import Setting
 
@@ -69,9 +64,6 @@ def test_a_request_lists_the_scene_and_its_intruder_without_structure():
     assert index.tolist() == [0] * len(SEEDS)
     assert intruder.tolist() == [4] * len(SEEDS)
     assert v.tolist() == [[0, 1, 1, 1, 1]] * len(SEEDS)
-
-
-# ------------------------------------------------------------------------------------------- laws
 
 
 def test_intruders_are_absent_and_no_structure():
@@ -129,9 +121,6 @@ def test_intruders_are_typical_of_another_room_and_foreign_to_this_one():
     assert weights.tolist() == [[0, 0.5, 0.5, 0, 0], [0] * 5, [0, 0, 1, 0, 0]]
     often = tensors([*TOY.scenes, scene([0, 2], room=0)])
     assert by_signature(tensors(asked[:1]), often).tolist() == [[0, 1, 0, 0, 0]]
-
-
-# ------------------------------------------------------------------------- asked as the service is
 
 
 def test_a_published_model_is_judged_as_the_service_ranks():

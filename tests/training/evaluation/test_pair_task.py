@@ -158,17 +158,6 @@ def test_rare_classes_are_those_that_training_relates_to_few():
     assert "accuracy, rare classes" not in metrics
 
 
-def test_no_relation_is_shown():
-    shown = []
-
-    def spy(batch):
-        shown.append(bool(batch.observed.any() or batch.holds.any()))
-        return flat(batch)
-
-    pairs_task(Model(relations=spy), Setting(DATA, WIDE_STRUCTURE))
-    assert set(shown) == {False}
-
-
 def test_the_service_is_asked_about_its_first_instances():
     asked = next(one for one in listed_pairs(rooms(20, 2), STRUCTURE) if len(one.ends) > 2)
     p = service_score(room_model())(asked)

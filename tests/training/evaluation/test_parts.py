@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.training.evaluation.scenes import NO_STRUCTURE, V, scene, tensors
+from tests.training.evaluation.scenes import FLOOR, NO_STRUCTURE, V, in_order, scene, tensors
 from training.evaluation.parts import (
     Ranking,
     all_but_one,
@@ -20,13 +20,6 @@ from training.evaluation.parts import (
     up_to_longest,
     validation_score,
 )
-
-FLOOR = torch.tensor([False, True, False, False, False])
-
-
-def in_order(v):
-    """Class 0 before 1 before 2, ..."""
-    return torch.tensor([5.0, 4, 3, 2, 1]).expand_as(v)
 
 
 @pytest.mark.parametrize(

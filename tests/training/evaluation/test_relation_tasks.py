@@ -9,6 +9,7 @@ import torch
 from app.scene import CANONICAL, ObjectClass, Vocabulary
 from tests.questions.artifacts import larger_artifact
 from tests.training.evaluation.scenes import (
+    FLOOR,
     NO_STRUCTURE,
     WIDE,
     WIDE_STRUCTURE,
@@ -36,7 +37,6 @@ from training.evaluation.relation_tasks import (
 
 A = len(CANONICAL)
 DATA = tensors(random_scenes(30), WIDE)
-FLOOR = torch.tensor([False, True, False, False, False])
 
 
 def by_hand(batch):
@@ -132,9 +132,6 @@ def test_seen_triples_are_counted_by_scene():
     assert seen_triples(scenes, V, minimum=2).tolist() == [[0, 0, 1]]
 
 
-# -------------------------------------------------------------------------------------------- T1b
-
-
 def test_halves_are_disjoint_and_together_the_truth():
     """Given plus asked is all; nothing given, nor its mirror image, is asked."""
     spy = Spy()
@@ -186,9 +183,6 @@ def test_classes_related_both_ways_are_stated_of_different_instances():
     assert torch.isfinite(values).all()
     assert not torch.allclose(values[0], values[1])
     torch.testing.assert_close(blind[0], blind[1])
-
-
-# -------------------------------------------------------------------------------------------- T3b
 
 
 def test_one_triple_is_replaced_by_a_false_one():

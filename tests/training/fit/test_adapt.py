@@ -138,9 +138,6 @@ def test_a_home_without_pairs_or_a_model_without_samples_is_refused():
         adapt(Weights(spec, arrays), scenes_of([0, 1]))
 
 
-# ------------------------------------------------------------------------- new words
-
-
 @pytest.fixture(scope="module", params=["indoor-rbm", "indoor-gbm", "indoor-triway"])
 def model(request, repository) -> Artifact:
     store = Store(repository / "model_store")

@@ -114,9 +114,6 @@ def test_a_seed_gives_the_same_calibration(model, fitted):
     assert calibrate(model, data_of(rooms(200, 1)), CONFIG) == fitted
 
 
-# ------------------------------------------------------------------------------- scenes of the fits
-
-
 def test_scenes_count_by_weight_and_incomplete_ones_not_at_all():
     """Of 300 scenes of weight 1/3 about 100 are kept: outside 60 to 140 with p < 1e-6.
 
@@ -145,8 +142,6 @@ def test_real_rooms_come_before_generated_ones():
     assert len(served_scenes(tensors(made, WIDE), served)) == 400
     assert len(served_scenes(tensors(made, WIDE), {})) == 400
 
-
-# ----------------------------------------------------------------------------------------- missing
 
 BARE = torch.zeros(WIDE, dtype=torch.bool)
 
@@ -191,9 +186,6 @@ def test_hidden_classes_are_as_likely_as_the_answer_states(judging, size, error)
     assert answers.score.mean() == pytest.approx(answers.truth.mean(), abs=error)
     assert answers.metric("ECE").value < error + 0.03
     assert answers.metric("Brier skill").value > 0
-
-
-# --------------------------------------------------------------------------------------- intruders
 
 
 def scores_of(log_odds, intruder, popularity=None, can_alarm=True):
@@ -306,9 +298,6 @@ def test_few_scenes_give_no_judgement_of_objects(judging, count):
 def replace_scenes(scenes, count):
     """The first scenes of a set."""
     return tensors(scenes.scenes[:count], len(VOCABULARY))
-
-
-# --------------------------------------------------------------------------------------- relations
 
 
 @pytest.fixture(scope="module")

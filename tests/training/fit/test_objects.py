@@ -88,8 +88,6 @@ def target_scenes():
 ALL = torch.ones(2, V, dtype=torch.bool)
 PARTIAL = torch.tensor([[True, True, True, False], [True, True, True, True]])
 
-# -- scenes and parts --------------------------------------------------------------------------
-
 
 def test_scenes_keep_classes_that_their_source_shows():
     """procthor shows class 0 twice only; sunrgbd has an open vocabulary and shows all; of the
@@ -157,9 +155,6 @@ def test_shares_of_random_parts():
     of_class = parts.listed[one].mean(0)[5:45]
     error = 5 * (1 / 40 * 39 / 40 / float(one.sum())) ** 0.5
     assert float((of_class - 39 / 40).abs().max()) <= error
-
-
-# -- the losses and their gradients ------------------------------------------------------------
 
 
 def source_logit(machine, shows, x, q):
@@ -288,9 +283,6 @@ def test_the_prior_is_divided_by_the_scenes():
     assert fit._prior().item() == pytest.approx(expected / float(scenes.weight.sum()), rel=1e-5)
 
 
-# -- training ----------------------------------------------------------------------------------
-
-
 def context(likely):
     """Independent classes with these probabilities, (2^V,)."""
     p = torch.tensor(likely).double()
@@ -325,9 +317,6 @@ def test_only_object_weights_are_trained():
     for name, weight in machine.named_parameters():
         is_changed = not torch.equal(weight, before[name])
         assert is_changed == (name in objects.OBJECT_WEIGHTS and weight.numel() > 0), name
-
-
-# -- the served mix ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("served", [{}, {"sunrgbd": 1.0, "procthor": 0.25}])
@@ -367,28 +356,6 @@ def test_b_is_the_bias_without_a_list_before_training():
     np.testing.assert_allclose(p @ weights["a"], np.zeros((1, V)), rtol=0, atol=1e-6)
 
 
-def test_training_finds_the_sources_of_lists():
-    """Scenes of two classes, of which one is listed, so that p(q | listed) has a closed form.
-
-    The sources have opposite base rates. In the served mix, they are equally likely.
-    """
-    v = EVERY[EVERY.sum(1) == 2].float().repeat(2, 1)
-    source, sizes = torch.arange(2).repeat_interleave(6), torch.tensor([900.0, 100.0])
-    liking = torch.tensor([[1.5, 0.5, -0.5, -1.5], [-1.5, -0.5, 0.5, 1.5]])
-    share = torch.stack([(v[source == q] @ liking[q]).softmax(0) for q in range(2)])
-    weight = (share * sizes.unsqueeze(1)).flatten()
-    names = ("sunrgbd", "procthor")
-    scenes = ObjectScenes(v, torch.full((12,), -1), source, weight, ALL, names)
-    changes = {"leave_one_out": 1.0, "rate_prior": 0.0, "source_loss": 30.0}
-    changes |= {"generative_weight": 0.0, "learning_rate": 0.02}
-    machine = machine_of("coupled")
-    start_objects(machine, scenes)
-    fit_objects(ObjectFit(machine, scenes, CONFIG.model_copy(update=changes), seed=0))
-    listed = share @ v[:6] / 2
-    found = machine.source_weights(torch.eye(V), None)
-    torch.testing.assert_close(found, (listed / listed.sum(0)).T, rtol=0, atol=0.04)
-
-
 def test_weights_are_averaged_over_the_last_steps():
     """The last 30 % of 10 steps are 3."""
     machine = machine_of("binary")
@@ -418,9 +385,6 @@ def test_popularity_of_the_served_mix():
     assert torch.equal(popularity.isnan(), ~is_shown)
 
 
-# -- stored samples ----------------------------------------------------------------------------
-
-
 @torch.no_grad()
 @pytest.mark.parametrize("name", SPECS)
 def test_stored_samples_follow_the_machine_under_their_room_types(name):
@@ -442,8 +406,6 @@ def test_stored_samples_follow_the_machine_under_their_room_types(name):
         p = log_p(machine, room).exp()
         assert bool(((share - p).abs() <= 5 * (p * (1 - p) / len(own)).sqrt()).all())
 
-
-# -- base rates of whole scenes, and long chains ----------------------------------------------
 
 SHOWS = torch.tensor([[True] * V, [True, True, True, False]])
 SERVED = ObjectsConfig(served_sources={"sunrgbd": 2.0, "procthor": 1.0})

@@ -40,8 +40,6 @@ def moments(values):
     return len(values), values.mean(), np.square(values - values.mean()).sum()
 
 
-# -- Bayes' rule --------------------------------------------------------------------------------
-
 PRIOR = (0.3, 2.0, 2.5, 0.4)  # expected, kappa, alpha, beta
 VALUES = (0.1, 0.5, 1.1)
 
@@ -70,8 +68,6 @@ def test_the_posterior_and_the_likelihood_are_the_integrals():
     assert found == pytest.approx(mean, abs=1e-4)
     assert variance == pytest.approx(second - mean**2, rel=2e-3)
 
-
-# -- what is learnt -----------------------------------------------------------------------------
 
 MEAN, STD = np.array([0.1, 1.2, -0.3]), np.array([0.4, 0.2, 0.05])
 

@@ -96,9 +96,6 @@ def loss_of(machine, batch, scenes, config=CONFIG):
     return fit.loss(batch, torch.Generator().manual_seed(3)).item()
 
 
-# -- offsets and observed units ----------------------------------------------------------------
-
-
 def test_offsets_absorb_how_often_a_source_lists_a_relation(machine):
     """Listed of four in five pairs here, of one in five there: 2.8 nats apart. The machine stays
     between, and keeps no offset."""
@@ -221,9 +218,6 @@ def test_implications_learn_that_one_relation_excludes_another():
     assert float(shift[other]) < -1.5
 
 
-# -- shared weights ----------------------------------------------------------------------------
-
-
 @given(st.integers(0, 2**32), st.integers(0, 3))
 def test_shared_weights_are_the_sum_of_their_parts(seed, dimensions):
     """Own deviation, that of the parent and a map of the words; the sum stays after baking."""
@@ -276,8 +270,6 @@ def test_a_class_that_was_never_seen_behaves_like_its_neighbour(words, parents):
     assert abs(without) < 0.5
     assert informed > 1.5
 
-
-# -- residuals ---------------------------------------------------------------------------------
 
 LISTED = {(0, 1, 2): (18, 2), (0, 3, 4): (4, 8), (1, 0, 3): (0, 12)}
 """Per triple: scenes that list it, and scenes that observe that it does not hold."""

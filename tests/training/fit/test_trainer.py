@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from tests.training import commands
 from training.fit import samples, trainer
 from training.fit.configuration import Config
-from training.fit.curve import CurvePoint, write_plot
+from training.fit.curve import CurvePoint
 from training.fit.trainer import Trainer
 from training.machines.machine import OBJECT_WEIGHTS
 from training.runs.config_files import with_settings
@@ -20,16 +20,8 @@ from training.runs.pipeline import prepare
 
 def small_config(**settings) -> Config:
     """Objects in 10 steps with a point of the curve after 4 each, then relations in 2 epochs."""
-    config = {
-        "name": "small-triway",
-        "data": {"sources": ["rooms"], "vocabulary": "rooms", "rooms": 90},
-        "machine": {
-            "variant": "triway", "units": 3, "states": 4, "coupled": True, "K": 4, "G": 2, "N": 16
-        },
-        "objects": {"steps": 10, "batch_size": 16, "warm_up": 3, "chains": 8},
-        "relations": {"epochs": 2, "batch_size": 32},
-    }  # fmt: skip
-    return with_settings(Config.model_validate(config), settings)
+    small = {"machine.coupled": True, "machine.G": 2, "objects.steps": 10, "objects.warm_up": 3}
+    return with_settings(commands.small_config(rooms=90), small | settings)
 
 
 DEEP = {"machine.coupled": False, "machine.H2": 3, "machine.G": 0}
@@ -80,27 +72,6 @@ def test_two_runs_with_the_same_seed_give_the_same_bits(data, settings):
         *(("objects", done) for done in (0.4, 0.8, 1.0)),
         *(("relations", done) for done in (0.5, 1.0)),
     ]
-
-
-def test_the_plot_marks_the_score_of_the_kept_weights(tmp_path, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(
-        "matplotlib.figure.Figure.savefig", lambda figure, *_, **__: drawn.append(figure)
-    )
-    objects = [CurvePoint("objects", done, 2.0, done / 2, 1.0) for done in (0.5, 1.0)]
-    relations = [CurvePoint("relations", 1.0, 9.0, math.nan, 1.0)]
-    for curve in (objects, objects + relations):
-        write_plot(tmp_path / "curve.png", curve, "lab")
-    alone, both = drawn
-    loss, score = alone.axes
-    assert "lab" in alone.get_suptitle()
-    assert (loss.get_ylabel(), score.get_ylabel()) == ("training loss", "MRR of hidden classes")
-    _, kept = score.lines
-    assert (list(kept.get_xdata()), list(kept.get_ydata())) == ([1.0], [0.5])
-    assert kept.get_label() == "kept weights (average): 0.500"
-    # Without annotated validation scenes, the second phase has no score.
-    assert [len(axis.lines) for axis in both.axes] == [1, 1, 2, 0]
-    assert both.axes[3].texts[0].get_text() == "no validation scenes"
 
 
 def test_relation_biases_start_at_log_odds(data):

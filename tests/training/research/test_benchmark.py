@@ -137,6 +137,9 @@ def test_baselines_that_no_seed_changes_are_trained_once():
         "scikit-learn BernoulliRBM", "denoising autoencoder", "ComplEx",
     }  # fmt: skip
     assert again < every
+    unrelated = {entry.name for entry in baseline_entries(0, related=False)}
+    assert every - unrelated >= {"frequency table", "frequency table p(i | a, j)", "ComplEx"}
+    assert {"popularity", "EASE", "naive Bayes of rooms"} <= unrelated
 
 
 def test_tasks_are_chosen_by_name_or_prefix():
@@ -145,9 +148,6 @@ def test_tasks_are_chosen_by_name_or_prefix():
     assert chosen_tasks(["Rooms", "T1"]) == (
         "T1a relations", "T1 pairs", "T1 with evidence", "T1b completion", "Rooms",
     )  # fmt: skip
-
-
-# --------------------------------------------------------------------------------------- ablations
 
 
 def ablation(folder):

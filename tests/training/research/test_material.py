@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.training.commands import invoke, small_config, write_config
 from training.fit.configuration import ConfigError, DataConfig
 from training.runs.pipeline import read_sources, split_and_encode
 
@@ -74,20 +73,3 @@ def test_relations_are_needed_to_learn_from_and_to_tune_on(tmp_path):
     assert not bare.related
     for part in ("train", "validation"):
         assert not replace(found, **{part: bare.train}).related
-
-
-def test_rows_of_relations_are_left_out_where_there_are_none(tmp_path):
-    write_scenes(tmp_path, "flats")
-    data = {"sources": ["flats"], "vocabulary": "source"}
-    config = write_config(tmp_path / "config.toml", small_config("flats-rbm", "rbm", **data))
-    where = ("--data", tmp_path, "--folder", tmp_path / "reports", "--workers", "1")
-    names = ("popularity", "EASE", "frequency table", "frequency table p(i | a, j)")
-    chosen = (word for name in names for word in ("--baseline", name))
-    tasks = ("--task", "T1", "--task", "T2", "--task", "T3")
-    invoke("benchmark", config, *where, *chosen, *tasks, "--seeds", "1", "--limit", "30")
-    results = json.loads((tmp_path / "reports/flats/results.json").read_text())
-    assert {cell["row"] for cell in results["cells"]} == {"flats-rbm", "popularity", "EASE"}
-    tasks = {cell["task"] for cell in results["cells"]}
-    assert {"T2 missing", "T3 outliers"} <= tasks
-    assert not {task for task in tasks if task.startswith(("T1", "T2-at", "T3b"))}
-    assert not (tmp_path / "reports/flats/frequency-table").exists()

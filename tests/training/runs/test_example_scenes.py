@@ -100,8 +100,3 @@ def test_examples_that_the_model_would_refuse_are_left_out_with_the_reason() -> 
     places = ("#/objects/1", "#/room_type", "#/relations/1", "#/relations/0/object")
     for reason, place in zip(reasons, places, strict=True):
         assert reason.startswith(f"a: {place}"), reason
-
-
-def test_a_label_alone_is_an_object() -> None:
-    example = Example.model_validate({"name": "a", "scene": {"objects": ["bed", "lamp"]}})
-    assert example.request() == {"objects": [{"label": "bed"}, {"label": "lamp"}]}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from pathlib import Path
 
 import pytest
@@ -88,7 +89,9 @@ def test_ctrl_c_keeps_the_last_finished_run(tmp_path, monkeypatch):
     assert message in invoke(*command, code=130)
     assert not runs.exists()
     monkeypatch.setattr(RelationFit, "epoch", epoch)
-    invoke(*command)
+    shown = invoke(*command)
+    scores = r"objects: MRR 0\.\d{3}, relations: R-precision 0\.\d{3}"
+    assert re.search(rf"trained in \d+ s; {scores}", shown)
     folder = runs / "rooms-triway/seed-0"
     before = contents(folder)
     monkeypatch.setattr(RelationFit, "epoch", interrupted)

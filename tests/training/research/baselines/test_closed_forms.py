@@ -19,12 +19,7 @@ from tests.training.research.baselines.furnished import (
     scene,
     tensors,
 )
-from training.evaluation.baselines.classes import (
-    Lists,
-    fit_ease,
-    frequency,
-    training_lists,
-)
+from training.evaluation.baselines.classes import Lists, fit_ease, frequency, training_lists
 from training.evaluation.baselines.triples import (
     count_triples,
     place_score,

@@ -21,12 +21,7 @@ from tests.training.research.baselines.furnished import (
     tensors,
 )
 from training.evaluation.baselines import PLACED, RELATIONS, placed_product
-from training.evaluation.baselines.fitting import (
-    TRIALS,
-    Baseline,
-    drawn_settings,
-    halving,
-)
+from training.evaluation.baselines.fitting import TRIALS, Baseline, drawn_settings, halving
 from training.evaluation.missing_tasks import removed_places
 from training.evaluation.moved_task import moved_cases
 from training.evaluation.relation_tasks import telling
