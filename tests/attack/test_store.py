@@ -198,10 +198,7 @@ def test_a_large_alias_table_or_a_pipe_is_not_read(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "place",
-    ["metrics", "vocabulary.objects", "training.x"],
-)
+@pytest.mark.parametrize("place", ["metrics", "vocabulary.objects", "training.x"])
 def test_a_manifest_of_a_million_empty_objects_is_refused_in_little_memory(
     published: Path, place: str
 ) -> None:

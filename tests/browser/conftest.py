@@ -28,7 +28,7 @@ DESK = {
             "position": {"x": 1, "y": 0, "z": 0.45},
             "size": {"x": 0.5, "y": 0.5, "z": 0.9},
         },
-    ],
+    ]
 }
 
 EXAMPLES = json.loads(

@@ -27,8 +27,7 @@ def posted(board: Board) -> list[str]:
     """The list of what the page posts from now on: routes, in order."""
     routes = list[str]()
     board.page.on(
-        "request",
-        lambda one: one.method == "POST" and routes.append(urlsplit(one.url).path[1:]),
+        "request", lambda one: one.method == "POST" and routes.append(urlsplit(one.url).path[1:])
     )
     return routes
 

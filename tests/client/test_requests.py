@@ -15,14 +15,7 @@ from typer.testing import CliRunner
 
 from scene_client import AsyncClient, Client, InvalidRequestError, ProblemError
 from scene_client.command import app
-from scene_client.schemas import (
-    Anchor,
-    Detection,
-    MissingRequest,
-    Position,
-    Relation,
-    SceneRequest,
-)
+from scene_client.schemas import Anchor, Detection, MissingRequest, Position, Relation, SceneRequest
 from tests.conftest import run_program
 
 EVERYTHING: dict[str, Any] = {

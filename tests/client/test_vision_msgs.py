@@ -65,10 +65,7 @@ def seen(
 
 def array(*detections: dict[str, Any], frame: str = "base_link", **header: Any) -> dict[str, Any]:
     stamp = {"sec": 3, "nanosec": 4}
-    return {
-        "header": {"stamp": stamp, "frame_id": frame, **header},
-        "detections": list(detections),
-    }
+    return {"header": {"stamp": stamp, "frame_id": frame, **header}, "detections": list(detections)}
 
 
 def only(fields: SceneFields) -> dict[str, Any]:

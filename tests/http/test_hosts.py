@@ -66,9 +66,7 @@ async def test_requests_for_another_host_are_refused(shared_store: Path) -> None
         problem(await client.get("/models", headers=twice), 421, "host-refused")
 
 
-async def test_only_health_checks_take_no_turn_and_accept_every_host(
-    shared_store: Path,
-) -> None:
+async def test_only_health_checks_take_no_turn_and_accept_every_host(shared_store: Path) -> None:
     """A path is matched whole: no route below another one becomes a health check."""
     async with serve(shared_store) as client:
         paths = client.app.state.paths  # type: ignore[attr-defined]

@@ -175,9 +175,7 @@ async def test_a_file_may_be_as_large_as_a_batch(shared_store: Path) -> None:
 
 
 @pytest.mark.skipif(not FIELD.is_dir(), reason="the collected files are not here")
-async def test_collected_files_are_read_as_the_client_reads_them(
-    client: httpx.AsyncClient,
-) -> None:
+async def test_collected_files_are_read_as_the_client_reads_them(client: httpx.AsyncClient) -> None:
     for path in sorted((*FIELD.glob("files/*"), *FIELD.glob("messages/*"))):
         content = base64.b64encode(path.read_bytes()).decode()
         response = await client.post("/scenes", json={"base64": content, "name": path.name})
