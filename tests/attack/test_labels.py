@@ -125,15 +125,8 @@ def test_the_time_of_a_pattern_is_linear(place: str, pattern: re.Pattern[Any], m
 WORST: Final = (
     *("a/" * 50, "a/b" * 33, "lamp-a1/" * 12, "the a_1/" * 12, "a/b/c/d/e/f/g/h_1 (x/y/z_1)" * 3),
     *("_" * 100, "the" + "_" * 97, "the_" + "a_" * 48, "a_1" * 33, "a_b1" * 25, "an a_" * 20),
-    *(
-        "x_(" * 33,
-        "x_(y)" * 20,
-        "a of " * 20,
-        "a photo of " * 9,
-        "a 1 " * 25,
-        "1|" * 50,
-        "1_a1|" * 20,
-    ),
+    *("x_(" * 33, "x_(y)" * 20, "a of " * 20, "a photo of " * 9, "a 1 " * 25, "1|" * 50),
+    "1_a1|" * 20,
     *("the an_1 (the a_1)" * 5, "s" * 100, "ies" * 33, "ß" * 100, "é_\u0301" * 33),
 )
 PLAIN_LABELS: Final = ("zxqvwkpm" * 13, "zxqvw kpm " * 10, "Küchengroßgerät " * 7)

@@ -12,6 +12,7 @@ import pytest
 from playwright.sync_api import Browser, Page, Route, sync_playwright
 
 from tests.browser.driving import Board, link_to
+from tests.conftest import REPOSITORY
 from tests.services import LiveService
 
 DESK = {
@@ -31,11 +32,7 @@ DESK = {
     ]
 }
 
-EXAMPLES = json.loads(
-    (Path(__file__).parents[2] / "training" / "runs" / "examples" / "indoor.json").read_text(
-        "utf-8"
-    )
-)
+EXAMPLES = json.loads((REPOSITORY / "training/runs/examples/indoor.json").read_text("utf-8"))
 """Example scenes of the shipped vocabulary."""
 
 # Whatever a policy forbids is told to the page that tried it. `quiet` waits until no short timer is

@@ -12,11 +12,9 @@ from typing import Any
 
 import pytest
 from rosbags.typesys.store import Typestore
-from typer.testing import CliRunner
 
 from app.registry import Store
 from scene_client import from_data
-from scene_client.command import app
 from scene_client.ros_fields import COCO, MessageError
 from scene_client.schemas import SceneRequest
 from scene_client.vision_msgs import (
@@ -415,22 +413,3 @@ def test_any_message_is_a_request_or_an_error_of_this_module(text: bytes) -> Non
             for convert in (from_message, from_detection3d_array, from_detection2d_array):
                 with suppress(MessageError):
                     SceneRequest(**convert(changed, "coco"))
-
-
-def test_the_command_takes_a_recorded_message_for_a_scene(repository: Path, url: str) -> None:
-    path = str(repository / "clients/ros2/detections.json")
-    recorded = json.loads(Path(path).read_text())
-    fields = from_message(recorded)
-    assert len(fields["objects"]) == len(recorded["msg"]["detections"]) - 1
-    assert reasons(fields) == [(8, "no-hypothesis")]
-    book = fields["objects"][-1]
-    assert "size" not in book
-    assert "orientation" not in book
-
-    done = CliRunner().invoke(app, ["--url", url, "--json", "outliers", path])
-    assert done.exit_code == 0, done.output
-    answer = json.loads(done.stdout)
-    assert {thing["object"] for thing in answer["outliers"]} == {
-        *("track_3", "track_5", "track_7", "toilet_1", "book_1")
-    }
-    assert done.stderr == f"{path}: detection 8: the detection has no hypothesis with a score\n"

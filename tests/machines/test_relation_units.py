@@ -184,10 +184,3 @@ def test_without_observed_relations_nothing_changes():
         shift = in_service(machine, observed).shift
         assert shift.shape == shape
         assert not shift.any()
-
-
-def test_relations_in_another_layout_are_refused():
-    machine = coupled_machine()
-    table = build(MachineSpec("rbm", V=V, A=1, units=1, T=0)).edges(torch.arange(V)[None])
-    with pytest.raises(TypeError, match="PairEdges"):
-        machine.relation_logits(table, torch.ones(1, V), torch.zeros(1, 3))
