@@ -6,7 +6,6 @@ import json
 import os
 import shlex
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -216,31 +215,16 @@ def test_the_key_is_taken_from_the_environment(
 # -- completion -----------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> str:
-    """A path that begins with a folder of the program ``scene``."""
-    program = tmp_path / "scene"
-    program.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m scene_client "$@"\n')
-    program.chmod(0o755)
-    return f"{tmp_path}{os.pathsep}{os.environ['PATH']}"
-
-
-@pytest.mark.system
-def test_bash_completes_by_the_printed_script(
-    path: str, require_system_tool: Callable[[str], Path]
-) -> None:
-    bash = require_system_tool("bash")
-    environment = os.environ | {"PATH": path}
-
-    def completions(*words: str) -> list[str]:
-        script = (
-            'eval "$(scene --show-completion)"; read -ra COMP_WORDS <<<"$1"; '
-            "COMP_CWORD=$2; $(complete -p scene | grep -o '[a-z_]*_completion') scene; "
-            'printf "%s\\n" "${COMPREPLY[@]}"'
-        )
-        line = ("-c", script, "bash", " ".join(words), str(len(words) - 1))
-        return run_program(bash, "--norc", *line, env=environment).stdout.split()
-
-    assert completions("scene", "mi") == ["missing"]
-    assert completions("scene", "missing", "--room") == ["--room-type"]
-    assert completions("scene", "outliers", "--sensitivity", "m") == ["medium"]
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("scene mi", "missing"),
+        ("scene missing --room", "--room-type"),
+        ("scene outliers --sensitivity m", "medium"),
+    ],
+)
+def test_bash_completes_commands_options_and_values(words: str, expected: str) -> None:
+    asked = {"COMP_WORDS": words, "COMP_CWORD": str(len(words.split()) - 1)}
+    environment = os.environ | asked | {"_SCENE_COMPLETE": "complete_bash"}
+    done = run_program(sys.executable, "-m", "scene_client", env=environment)
+    assert done.stdout.split() == [expected]

@@ -99,28 +99,6 @@ def test_messages_of_other_packages_may_be_objects(name: str) -> None:
 # ---------------------------------------------------------------------------------- 3D, by hand
 
 
-def test_a_detection_becomes_an_object_with_a_pose() -> None:
-    quarter = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
-    box = {"at": (1, 2, 3), "size": (0.1, 0.2, 0.3), "turn": quarter}
-    fields = from_detection3d_array(array(seen(result("lamp", 0.75), name="t7", **box)))
-    assert fields == {
-        "objects": [
-            {
-                "id": "t7",
-                "label": "lamp",
-                "confidence": 0.75,
-                "position": {"x": 1.0, "y": 2.0, "z": 3.0},
-                "size": {"x": 0.1, "y": 0.2, "z": 0.3},
-                "orientation": dict(zip("xyzw", quarter, strict=True)),
-            }
-        ],
-        "frame_id": "base_link",
-        "stamp": {"sec": 3, "nanosec": 4},
-        "unknown_labels": "nearest-or-ignore",
-    }
-    assert fields.notes == ()
-
-
 BED = {"label": "bed", "confidence": 0.9, "position": {"x": 1.0, "y": 0.0, "z": 0.5}}
 SIZED = BED | {"size": {"x": 0.5, "y": 0.5, "z": 0.5}}
 UPRIGHT = {"orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
