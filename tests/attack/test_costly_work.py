@@ -85,7 +85,6 @@ async def test_a_request_without_enough_memory_gets_503(
         assert (await client.post("/missing", json=HOME)).is_success
 
 
-# ------------------------------------------------------------------------------------------- memory
 # Reference cycles would keep bodies of megabytes until the collector runs, which is rare.
 
 

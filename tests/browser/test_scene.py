@@ -157,9 +157,6 @@ def test_a_link_that_cannot_be_read_says_so(
     assert board.things
 
 
-# ----------------------------------------------------------------------------------------- evidence
-
-
 SWITCH = "Positions count as evidence"
 
 
@@ -199,9 +196,6 @@ def test_positions_that_the_page_chose_do_not_count(open_board: OpenBoard) -> No
     expect(board.page.locator("#list li").nth(2)).to_contain_text("position not given")
     board.press("monitor", "ArrowUp")
     assert placed(board) == ["desk", "chair", "monitor"]
-
-
-# ------------------------------------------------------------------------- imported scenes
 
 
 def test_labels_and_supports_are_read(open_board: OpenBoard) -> None:

@@ -212,9 +212,6 @@ def test_the_key_is_taken_from_the_environment(
     assert b"x-api-key: " + b"k" * 16 in heads[0].lower()
 
 
-# -- completion -----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("words", "expected"),
     [

@@ -18,13 +18,8 @@ EVERYTHING: dict[str, Any] = {
     "model": {"name": "a", "version": "1.0.0", "variant": "rbm", "digest": "0"},
     "request_id": "r",
     "seed": 1,
-    "relations": [],
-    "disagreements": [],
-    "missing": [],
-    "outliers": [],
-    "misplaced": [],
-    "scenes": [],
-    "results": [],
+    **{key: [] for key in ("relations", "disagreements", "missing", "outliers", "misplaced")},
+    **{key: [] for key in ("scenes", "results")},
 }
 """An answer to every question."""
 
@@ -163,9 +158,6 @@ def test_names_are_quoted_in_addresses() -> None:
         with pytest.raises(ProblemError):
             scene.vocabulary(name)
         assert recorder.requests[-1].url.raw_path == b"/models/%b/vocabulary" % text
-
-
-# ------------------------------------------------------------- keys that a header cannot carry
 
 
 KEYS = ["secret-key\n", "secret-\rkey", "sécret-key", "secret key", "secret\x7f", "secret\udcff"]

@@ -31,9 +31,6 @@ def written(message: Any) -> bytes:
     return bytes(STORE.serialize_cdr(message, message.__msgtype__))
 
 
-# ---------------------------------------------------------------------------------- the messages
-
-
 def test_the_definitions_are_those_of_ros() -> None:
     names = {ros.Detection3DArray: ARRAY, ros.String: "std_msgs/msg/String"}
     assert {kind: STORE.hash_rihs01(name) for kind, name in names.items()} == ros.TYPE_HASHES
@@ -47,9 +44,6 @@ def test_every_field_has_the_bytes_of_ros(length: int) -> None:
     assert read.serialize() == written(message)
     answer = STORE.types["std_msgs/msg/String"](data='{"é": 1}')
     assert ros.String(answer.data).serialize() == written(answer)
-
-
-# ------------------------------------------------------------------------------------ the bridge
 
 
 @pytest.mark.parametrize(

@@ -91,9 +91,6 @@ async def test_a_prefix_that_stays_in_the_path_names_its_setting(client: httpx.A
     assert "SCENE_ROOT_PATH" in document["detail"]
 
 
-# ------------------------------------------------------------------------------------------ origins
-
-
 LISTED, SECOND, OTHER = "https://panel.example", "http://10.0.0.7:8080", "https://other.example"
 API_KEY = "incorrect-zebra-capacitor-nail"
 

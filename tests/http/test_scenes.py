@@ -112,8 +112,9 @@ async def test_a_label_map_may_be_the_content_of_a_file(
 
 
 LARGE = {
-    "lists": "[" * (MOST_PARTS + 1),
-    "objects": "{" * (MOST_PARTS + 1),
+    # A body may have one of them for every five bytes.
+    "lists": "[     " * (MOST_PARTS + 1),
+    "objects": "{     " * (MOST_PARTS + 1),
     "elements": "<a>" * (MOST_PARTS + 1),
     "attributes": "<annotations " + "a='' " * (MOST_PARTS + 1),
     "rows": "label,x\n" + "a,1\n" * MOST_PARTS,

@@ -73,8 +73,6 @@ def test_weights_that_float32_products_do_not_cover_are_refused(value):
         Gains(weights, 2)
 
 
-# -- the answers about a scene -----------------------------------------------------------------
-
 V, C = 14, 3
 SPECS = {
     "binary": MachineSpec("rbm", V=V, A=1, units=30, C=C, profiles=3),

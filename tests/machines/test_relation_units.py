@@ -116,9 +116,6 @@ def test_mean_and_variance_are_those_over_all_states_of_h1(name, room):
         np.testing.assert_allclose(one[0, 0], out[0, 1], rtol=1e-6)
 
 
-# ------------------------------------------------------------------------------------- implications
-
-
 @st.composite
 def relations(draw):
     """(A, n, n) of one or two relations between up to 6 classes, from few to all of them."""
