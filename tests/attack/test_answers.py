@@ -110,9 +110,6 @@ async def test_single_answers_have_the_same_limit(
     assert f"more than {SMALL} bytes" in error["message"]
 
 
-# ----------------------------------------------------------------------------------- unknown labels
-
-
 # Labels of one request that are looked up: to suggest some like them, and to take them for others.
 MAX_SUGGESTED, MAX_MAPPED = 32, 256
 

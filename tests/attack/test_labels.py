@@ -32,8 +32,6 @@ from scene_client.validation import MAX_ERRORS
 from tests.http.stores import VOCABULARY
 from tests.http.test_problems import problem
 
-# ------------------------------------------------------------------------------------ patterns
-
 METHODS: Final = ("match", "fullmatch", "search", "split", "sub", "findall", "finditer")
 # The service cuts these texts before the pattern reads them.
 BOUNDED: Final = {"app.settings._SERVICE_LINK"}
@@ -119,21 +117,11 @@ def test_the_time_of_a_pattern_is_linear(place: str, pattern: re.Pattern[Any], m
             assert time(parts, 4 * LENGTH, 5) < 8 * time(parts, LENGTH, 5), parts
 
 
-# ------------------------------------------------------------------------------------ readings
-
-
 WORST: Final = (
     *("a/" * 50, "a/b" * 33, "lamp-a1/" * 12, "the a_1/" * 12, "a/b/c/d/e/f/g/h_1 (x/y/z_1)" * 3),
     *("_" * 100, "the" + "_" * 97, "the_" + "a_" * 48, "a_1" * 33, "a_b1" * 25, "an a_" * 20),
-    *(
-        "x_(" * 33,
-        "x_(y)" * 20,
-        "a of " * 20,
-        "a photo of " * 9,
-        "a 1 " * 25,
-        "1|" * 50,
-        "1_a1|" * 20,
-    ),
+    *("x_(" * 33, "x_(y)" * 20, "a of " * 20, "a photo of " * 9, "a 1 " * 25, "1|" * 50),
+    "1_a1|" * 20,
     *("the an_1 (the a_1)" * 5, "s" * 100, "ies" * 33, "ß" * 100, "é_\u0301" * 33),
 )
 PLAIN_LABELS: Final = ("zxqvwkpm" * 13, "zxqvw kpm " * 10, "Küchengroßgerät " * 7)
@@ -182,9 +170,6 @@ def test_a_hostile_label_has_few_guesses(monkeypatch: pytest.MonkeyPatch) -> Non
         fresh().guess(label[:MAX_LABEL])
         assert 1 <= len(calls) <= 3
         calls.clear()
-
-
-# ------------------------------------------------------------------------------------ requests
 
 
 @pytest.mark.parametrize("treatment", ["error", "ignore", "nearest", "nearest-or-ignore"])

@@ -54,33 +54,15 @@ def hostile(root: Path) -> Path:
     return root / "hostile" / "1.0.0"
 
 
-def grow(file: Path, size: int) -> None:
-    """Make a sparse file of this size."""
-    os.truncate(file, size)
-
-
 def as_pipe(file: Path) -> None:
     file.unlink()
     os.mkfifo(file)
 
 
-def claim(folder: Path, name: str, size: int) -> None:
-    """Let the manifest say that a file has this size."""
-    rewrite_manifest(folder, lambda members: members["files"][name].update(bytes=size))
-
-
-def large_card(root: Path) -> None:
-    grow(hostile(root) / "card.md", TERABYTE)
-    claim(hostile(root), "card.md", TERABYTE)
-
-
-def large_weights(root: Path) -> None:
-    grow(hostile(root) / "model.safetensors", TERABYTE)
-    claim(hostile(root), "model.safetensors", TERABYTE)
-
-
-def large_manifest(root: Path) -> None:
-    grow(hostile(root) / "manifest.json", TERABYTE)
+def enlarge(folder: Path, name: str) -> None:
+    """Make a sparse file of a terabyte, whose size the manifest confirms."""
+    os.truncate(folder / name, TERABYTE)
+    rewrite_manifest(folder, lambda members: members["files"][name].update(bytes=TERABYTE))
 
 
 def many_tensors(root: Path) -> None:
@@ -95,15 +77,11 @@ def large_examples(root: Path) -> None:
     rewrite_manifest(hostile(root), lambda members: members.update(examples=examples))
 
 
-def piped_manifest(root: Path) -> None:
-    as_pipe(hostile(root) / "manifest.json")
-
-
 SPOILED = [
-    (piped_manifest, "unreadable"),
-    (large_card, "too_large"),
-    (large_weights, "too_large"),
-    (large_manifest, "too_large"),
+    (lambda root: as_pipe(hostile(root) / "manifest.json"), "unreadable"),
+    (lambda root: enlarge(hostile(root), "card.md"), "too_large"),
+    (lambda root: enlarge(hostile(root), "model.safetensors"), "too_large"),
+    (lambda root: os.truncate(hostile(root) / "manifest.json", TERABYTE), "too_large"),
     (many_tensors, "too_large"),
     (large_examples, "invalid_manifest"),
 ]
@@ -124,7 +102,7 @@ def test_a_hostile_version_is_refused_in_little_memory(
 
 async def test_a_version_that_turns_hostile_goes_on_answering(published: Path) -> None:
     async with serve(published, store_poll=0) as client:
-        large_card(published)
+        enlarge(hostile(published), "card.md")
         await load_changes(client)
         body = {"objects": ["bed"], "model": "hostile"}
         assert (await client.post("/relations", json=body)).status_code == 200
@@ -187,7 +165,7 @@ def test_a_load_is_linear_in_the_number_of_junk_versions(
     assert 0 < totals[1] <= 2 * totals[0]
 
 
-@pytest.mark.parametrize("spoil", [lambda path: grow(path, TERABYTE), as_pipe])
+@pytest.mark.parametrize("spoil", [lambda path: os.truncate(path, TERABYTE), as_pipe])
 def test_a_large_alias_table_or_a_pipe_is_not_read(
     published: Path, spoil: Callable[[Path], None]
 ) -> None:
@@ -198,10 +176,7 @@ def test_a_large_alias_table_or_a_pipe_is_not_read(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "place",
-    ["metrics", "vocabulary.objects", "training.x"],
-)
+@pytest.mark.parametrize("place", ["metrics", "vocabulary.objects", "training.x"])
 def test_a_manifest_of_a_million_empty_objects_is_refused_in_little_memory(
     published: Path, place: str
 ) -> None:

@@ -10,11 +10,8 @@ import math
 
 import httpx
 import pytest
-import typer
 from rich.console import Console
-from typer.testing import CliRunner
 
-from benchmarks.__main__ import main
 from benchmarks.gibbs import gibbs
 from benchmarks.load import plain
 from benchmarks.load.questions import KINDS, bodies
@@ -54,14 +51,6 @@ def test_log_odds_agree_with_those_of_the_yardstick():
     result = log_odds(V=30, H=12, objects=5, rounds=2)
     check_complete(result, 2)
     assert result.facts["largest difference from scikit-learn"] < 1e-4
-
-
-def test_command_says_what_it_skips(tmp_path):
-    app = typer.Typer()
-    app.command()(main)
-    result = CliRunner().invoke(app, ["service", "--store", str(tmp_path / "none")])
-    assert result.exit_code == 0, result.output
-    assert "service: skipped" in result.output
 
 
 LABELS = [f"thing {number}" for number in range(40)]

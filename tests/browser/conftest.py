@@ -12,6 +12,7 @@ import pytest
 from playwright.sync_api import Browser, Page, Route, expect, sync_playwright
 
 from tests.browser.driving import Board, link_to
+from tests.conftest import REPOSITORY
 from tests.services import PATIENCE, LiveService
 
 expect.set_options(timeout=1000 * PATIENCE)
@@ -30,14 +31,10 @@ DESK = {
             "position": {"x": 1, "y": 0, "z": 0.45},
             "size": {"x": 0.5, "y": 0.5, "z": 0.9},
         },
-    ],
+    ]
 }
 
-EXAMPLES = json.loads(
-    (Path(__file__).parents[2] / "training" / "runs" / "examples" / "indoor.json").read_text(
-        "utf-8"
-    )
-)
+EXAMPLES = json.loads((REPOSITORY / "training/runs/examples/indoor.json").read_text("utf-8"))
 """Example scenes of the shipped vocabulary."""
 
 # Whatever a policy forbids is told to the page that tried it. `quiet` waits until no short timer is

@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import expect
 
 from tests.browser.driving import Board, OpenBoard
-from tests.client.scene_files import EXAMPLES, REFUSED
+from tests.client.scene_files import EXAMPLES
 
 pytestmark = pytest.mark.system
 
@@ -27,8 +27,7 @@ def posted(board: Board) -> list[str]:
     """The list of what the page posts from now on: routes, in order."""
     routes = list[str]()
     board.page.on(
-        "request",
-        lambda one: one.method == "POST" and routes.append(urlsplit(one.url).path[1:]),
+        "request", lambda one: one.method == "POST" and routes.append(urlsplit(one.url).path[1:])
     )
     return routes
 
@@ -83,20 +82,6 @@ def test_the_service_reads_another_format_once(
     expected = EXAMPLES[name].expected["objects"]
     names = [one if isinstance(one, str) else one["id"] for one in expected]
     assert [thing["id"] for thing in board.exported()["objects"]] == names
-
-
-def test_a_refused_file_says_why_in_one_line(open_board: OpenBoard) -> None:
-    board = open_board(allow=("422",))
-    page, error = board.page, board.page.locator("#json-error")
-    page.get_by_role("button", name="Import, export").click()
-    for name in ("yolo.txt", "captions.json", "bomb.xml", "words.csv", "unknown.json"):
-        text, words = REFUSED[name]
-        page.get_by_label("Scene, JSON").fill(text)
-        expect(error).to_be_empty()
-        page.get_by_role("button", name="Put on the board").click()
-        expect(error).to_contain_text(words)
-        assert "\n" not in (error.text_content() or "")
-    assert board.things == ["desk", "chair"]
 
 
 def test_a_scene_of_a_file_and_the_labels_of_its_class_ids_are_chosen(

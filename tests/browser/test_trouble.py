@@ -114,9 +114,6 @@ def test_a_service_with_a_key_is_asked_with_it(
         assert key not in board.page.content()
 
 
-# ------------------------------------------------------------------------ models and unknown names
-
-
 def notes(board: Board, place: int) -> str:
     return board.page.locator("#list li").nth(place).locator(".error").text_content() or ""
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import asyncio
 import json
 import threading
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from time import perf_counter
 from typing import Any
 
 import httpx
@@ -24,13 +23,11 @@ class Tally:
     Attributes:
         sent: number of requests.
         statuses: statuses of the answers; 0 stands for a connection that broke.
-        seconds: durations of the answers, by status.
         faults: the complaints of the judge.
     """
 
     sent: int = 0
     statuses: Counter[int] = field(default_factory=Counter)
-    seconds: dict[int, list[float]] = field(default_factory=lambda: defaultdict(list))
     faults: list[str] = field(default_factory=list)
 
     def check(self) -> None:
@@ -70,19 +67,17 @@ class ConstantLoad:
         assert kind is not None or not self._thread.is_alive(), "an answer is lost"
 
     async def _run(self, port: int, requests: Any, judge: Any, connections: int) -> None:
-        asked: dict[Connection, tuple[int, float]] = {}
+        asked: dict[Connection, int] = {}
         finished = asyncio.Event()
 
         def send(connection: Connection) -> None:
-            number = self.tally.sent % len(requests)
-            asked[connection] = number, perf_counter()
+            asked[connection] = number = self.tally.sent % len(requests)
             self.tally.sent += 1
             connection.send(requests[number])
 
         def answered(connection: Connection, status: int, body: bytes) -> None:
-            number, began = asked.pop(connection)
+            number = asked.pop(connection)
             self.tally.statuses[status] += 1
-            self.tally.seconds[status].append(perf_counter() - began)
             if fault := judge(number, status, json.loads(body) if body else None):
                 self.tally.faults.append(fault)
             if status and not self._ending.is_set():
@@ -112,12 +107,10 @@ class Judge:
 
     Attributes:
         expected: the answers of each version by its digest.
-        seen: digests of the versions that answered.
     """
 
     def __init__(self, client: httpx.Client, versions: Iterable[str]) -> None:
         self.expected: dict[str, list[Any]] = {}
-        self.seen: set[str] = set()
         for version in versions:
             for scene in SCENES:
                 body = scene | {"model": f"home@{version}"}
@@ -128,7 +121,5 @@ class Judge:
     def __call__(self, number: int, status: int, answer: Any) -> str | None:
         if status != 200:
             return f"status {status}: {answer}"
-        digest = answer["model"]["digest"]
-        self.seen.add(digest)
-        missing, expected = answer["missing"], self.expected[digest][number]
+        missing, expected = answer["missing"], self.expected[answer["model"]["digest"]][number]
         return None if missing == expected else f"{answer['model']}: {missing}, not {expected}"

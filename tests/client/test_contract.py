@@ -12,11 +12,7 @@ import pytest
 
 from app import questions
 from app.api.examples import REQUESTS
-from scene_client import (
-    Client,
-    OfflineClient,
-    ProblemError,
-)
+from scene_client import Client, OfflineClient, ProblemError
 from tests.client.callers import Caller
 from tests.client.conftest import EVERY
 from tests.conftest import run_program

@@ -146,6 +146,8 @@ NAMES = {
     "list.yaml": "nc: 2\nnames: ['lamp', \"bed\"]\n",
     "block.yaml": "names:\n- lamp\n- bed\n",
     "names.txt": "lamp\nbed\n",
+    "list.json": '["lamp", "bed"]',
+    "object.json": '{"1": "bed", "0": "lamp"}',
     "coco.json": '{"categories": [{"id": 0, "name": "lamp"}, {"id": 1, "name": "bed"}]}',
 }
 

@@ -151,10 +151,7 @@ def test_the_cpp_block_compiles_and_runs(
 @pytest.mark.slow
 @pytest.mark.system
 def test_the_cpp_example_is_made_and_asks_all_five_questions(
-    url: str,
-    tmp_path: Path,
-    bridge: Path,
-    require_system_tool: Callable[[str], Path],
+    url: str, tmp_path: Path, bridge: Path, require_system_tool: Callable[[str], Path]
 ) -> None:
     # Asking for `bridge` leaves this test out where the libraries are missing.
     folder = shutil.copytree(REPOSITORY / "clients" / "cpp", tmp_path / "cpp")

@@ -10,11 +10,9 @@ import json
 import os
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from app.questions import QUESTIONS
 from tests.conftest import REPOSITORY, run_program
 from tests.services import LiveService
 
@@ -22,35 +20,19 @@ pytestmark = [pytest.mark.slow, pytest.mark.system]
 
 PROGRAM = """
 import asyncio, importlib, json, pkgutil, sys
+from pathlib import Path
 import scene_client
-from scene_client import AsyncClient, Client, ClientError
+from scene_client import AsyncClient, Client
 
 assert sys.version_info[:2] == (3, 10)
 for module in pkgutil.walk_packages(scene_client.__path__, "scene_client."):
     if not module.name.endswith("__main__"):
         importlib.import_module(module.name)
 
+async def ask():
+    async with AsyncClient(sys.argv[1], timeout=30) as client:
+        return await client.missing(["bed"])
 
-async def ask(url, question, request):
-    async with AsyncClient(url, timeout=30) as client:
-        return await getattr(client, question)(**request)
-
-
-with Client(sys.argv[1], timeout=30) as client:
-    for question, request in json.load(sys.stdin):
-        try:
-            answer = getattr(client, question)(**request)
-            assert answer.model_dump(exclude={"request_id"}) == asyncio.run(
-                ask(sys.argv[1], question, request)
-            ).model_dump(exclude={"request_id"})
-            print(answer.model_dump_json(exclude_unset=True))
-        except ClientError as error:
-            print(json.dumps(str(error)))
-"""
-NODE = """
-import json, sys
-from pathlib import Path
-from scene_client import Client
 
 package = Path("clients/ros2/scene_reasoning/scene_reasoning")
 for module in package.glob("*.py"):
@@ -62,6 +44,7 @@ from scene_reasoning.latest import Latest
 
 message = json.loads(Path("clients/ros2/detections.json").read_text("utf-8"))
 with Client(sys.argv[1], timeout=30) as client:
+    assert client.missing(["bed"]).missing == asyncio.run(ask()).missing
     latest = Latest(Advisor(client).advise)
     latest.see(message)
     while (outcome := latest.tick()) is None:
@@ -91,31 +74,11 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return program
 
 
-def run(python: Path, *arguments: str, **options: Any) -> list[Any]:
-    """The lines of JSON that a program prints."""
-    plain = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
-    done = run_program(python, "-W", "error", *arguments, env=plain, **options)
-    return [json.loads(line) for line in done.stdout.splitlines()]
-
-
-def test_the_answers_are_those_of_the_service(python: Path, live: LiveService) -> None:
-    requests = [
-        (question.name, case.value | ({"seed": 7} if question.name == "generate" else {}))
-        for question in QUESTIONS
-        for case in question.examples.values()
-        if case.problem is None
-    ]
-    refused = ("missing", {"objects": ["bed", "nightstnad"]})
-    *answers, problem = run(python, "-c", PROGRAM, live.url, input=json.dumps([*requests, refused]))
-    assert {question for question, _ in requests} == {question.name for question in QUESTIONS}
-    for (question, request), answer in zip(requests, answers, strict=True):
-        expected = live.client.post(f"/{question}", json=request).json()
-        assert answer == expected | {"request_id": answer["request_id"]}
-    assert "nightstand" in problem
-
-
-def test_the_command_and_the_parts_of_the_node_work(python: Path, live: LiveService) -> None:
+def test_clients_command_and_parts_of_the_node_work(python: Path, live: LiveService) -> None:
+    """With all modules imported. test_contract.py compares the answers."""
     scene = ("-m", "scene_client", "missing", "bed", "lamp", "--json", "--url", live.url)
     done = run_program(python, *scene)
     assert json.loads(done.stdout)["missing"]
-    assert run(python, "-c", NODE, live.url) == [[["missing", "outliers"], 3]]
+    plain = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    done = run_program(python, "-W", "error", "-c", PROGRAM, live.url, env=plain)
+    assert json.loads(done.stdout) == [["missing", "outliers"], 3]

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -15,27 +12,14 @@ from typer.testing import CliRunner
 
 from scene_client import AsyncClient, Client, InvalidRequestError, ProblemError
 from scene_client.command import app
-from scene_client.schemas import (
-    Anchor,
-    Detection,
-    MissingRequest,
-    Position,
-    Relation,
-    SceneRequest,
-)
-from tests.conftest import run_program
+from scene_client.schemas import Anchor, Detection, MissingRequest, Position, Relation, SceneRequest
 
 EVERYTHING: dict[str, Any] = {
     "model": {"name": "a", "version": "1.0.0", "variant": "rbm", "digest": "0"},
     "request_id": "r",
     "seed": 1,
-    "relations": [],
-    "disagreements": [],
-    "missing": [],
-    "outliers": [],
-    "misplaced": [],
-    "scenes": [],
-    "results": [],
+    **{key: [] for key in ("relations", "disagreements", "missing", "outliers", "misplaced")},
+    **{key: [] for key in ("scenes", "results")},
 }
 """An answer to every question."""
 
@@ -176,9 +160,6 @@ def test_names_are_quoted_in_addresses() -> None:
         assert recorder.requests[-1].url.raw_path == b"/models/%b/vocabulary" % text
 
 
-# ------------------------------------------------------------- keys that a header cannot carry
-
-
 KEYS = ["secret-key\n", "secret-\rkey", "sécret-key", "secret key", "secret\x7f", "secret\udcff"]
 each_key = pytest.mark.parametrize("key", KEYS)
 MESSAGE = "a key must have only ASCII characters, without spaces or line breaks"
@@ -198,10 +179,3 @@ def test_the_command_refuses_its_environment(monkeypatch: pytest.MonkeyPatch, ke
     result = CliRunner().invoke(app, ["missing", "bed"])
     assert (result.exit_code, result.stdout) == (2, "")
     assert result.stderr == MESSAGE + "\n"
-
-
-def test_a_bridge_refuses_its_environment(repository: Path) -> None:
-    program = (sys.executable, repository / "clients/ros2/over_rosbridge.py", "ws://robot", "/x")
-    done = run_program(*program, env=os.environ | {"SCENE_API_KEY": KEYS[0]}, status=2)
-    assert done.stderr.endswith(f"error: {MESSAGE}\n")
-    assert "cret" not in done.stderr

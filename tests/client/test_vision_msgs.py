@@ -12,11 +12,9 @@ from typing import Any
 
 import pytest
 from rosbags.typesys.store import Typestore
-from typer.testing import CliRunner
 
 from app.registry import Store
 from scene_client import from_data
-from scene_client.command import app
 from scene_client.ros_fields import COCO, MessageError
 from scene_client.schemas import SceneRequest
 from scene_client.vision_msgs import (
@@ -65,10 +63,7 @@ def seen(
 
 def array(*detections: dict[str, Any], frame: str = "base_link", **header: Any) -> dict[str, Any]:
     stamp = {"sec": 3, "nanosec": 4}
-    return {
-        "header": {"stamp": stamp, "frame_id": frame, **header},
-        "detections": list(detections),
-    }
+    return {"header": {"stamp": stamp, "frame_id": frame, **header}, "detections": list(detections)}
 
 
 def only(fields: SceneFields) -> dict[str, Any]:
@@ -102,28 +97,6 @@ def test_messages_of_other_packages_may_be_objects(name: str) -> None:
 
 
 # ---------------------------------------------------------------------------------- 3D, by hand
-
-
-def test_a_detection_becomes_an_object_with_a_pose() -> None:
-    quarter = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
-    box = {"at": (1, 2, 3), "size": (0.1, 0.2, 0.3), "turn": quarter}
-    fields = from_detection3d_array(array(seen(result("lamp", 0.75), name="t7", **box)))
-    assert fields == {
-        "objects": [
-            {
-                "id": "t7",
-                "label": "lamp",
-                "confidence": 0.75,
-                "position": {"x": 1.0, "y": 2.0, "z": 3.0},
-                "size": {"x": 0.1, "y": 0.2, "z": 0.3},
-                "orientation": dict(zip("xyzw", quarter, strict=True)),
-            }
-        ],
-        "frame_id": "base_link",
-        "stamp": {"sec": 3, "nanosec": 4},
-        "unknown_labels": "nearest-or-ignore",
-    }
-    assert fields.notes == ()
 
 
 BED = {"label": "bed", "confidence": 0.9, "position": {"x": 1.0, "y": 0.0, "z": 0.5}}
@@ -418,22 +391,3 @@ def test_any_message_is_a_request_or_an_error_of_this_module(text: bytes) -> Non
             for convert in (from_message, from_detection3d_array, from_detection2d_array):
                 with suppress(MessageError):
                     SceneRequest(**convert(changed, "coco"))
-
-
-def test_the_command_takes_a_recorded_message_for_a_scene(repository: Path, url: str) -> None:
-    path = str(repository / "clients/ros2/detections.json")
-    recorded = json.loads(Path(path).read_text())
-    fields = from_message(recorded)
-    assert len(fields["objects"]) == len(recorded["msg"]["detections"]) - 1
-    assert reasons(fields) == [(8, "no-hypothesis")]
-    book = fields["objects"][-1]
-    assert "size" not in book
-    assert "orientation" not in book
-
-    done = CliRunner().invoke(app, ["--url", url, "--json", "outliers", path])
-    assert done.exit_code == 0, done.output
-    answer = json.loads(done.stdout)
-    assert {thing["object"] for thing in answer["outliers"]} == {
-        *("track_3", "track_5", "track_7", "toilet_1", "book_1")
-    }
-    assert done.stderr == f"{path}: detection 8: the detection has no hypothesis with a score\n"

@@ -80,9 +80,6 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Running]]:
         assert running.ros.destroyed
 
 
-# ----------------------------------------------------------------------------------- the node
-
-
 def test_detections_become_answers_markers_and_a_diagnosis(
     run: Callable[..., Running], live: LiveService, recorded: Any
 ) -> None:

@@ -126,9 +126,6 @@ def run_python(
     return printed.getvalue().replace(workplace.address, "127.0.0.1:8000")
 
 
-# --------------------------------------------------- what the pages only mention, and no test runs
-
-
 # docs/upgrading.md names removed settings and commands.
 CURRENT = [page for page in PAGES if page.stem != "upgrading"]
 TARGETS = set(re.findall(r"^([a-z]+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE))

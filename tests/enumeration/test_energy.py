@@ -152,7 +152,6 @@ def test_conditionals_of_relations_and_hidden_units(name):
             assert float(means[n, k].logit()) == pytest.approx(exact, abs=1e-9)
 
 
-# -- log-odds: closed forms of classes and room types against the joint ----------------------------
 # In the joint, the room type t is a unit with C + 1 states, of which one is "not listed". A list of
 # classes means v_j = 0 for every other class j: a log-odds is that of v_i given all other classes.
 # The joint of an unknown source has the mean base rates given the listed classes. The joint also

@@ -75,9 +75,6 @@ def test_states_are_drawn_with_their_probabilities(states):
     assert float(h1[:, states - 1 : -1].sum()) == 0
 
 
-# --------------------------------------------------------------------------- the partition function
-
-
 BETAS = torch.linspace(0, 1, 41).tolist()
 AIS_CHAINS = 2000
 BASE = torch.tensor([0.3, -0.7, 0.2]).double()

@@ -61,14 +61,6 @@ def test_curl_asks_the_five_questions(
     assert {"desk", "bed"} <= set(answers["generate"]["scenes"][0]["objects"])
 
 
-def test_curl_ends_with_the_error_of_the_service(
-    require_system_tool: Callable[[str], Path],
-) -> None:
-    require_system_tool("curl")
-    done = run(require_system_tool("bash"), "curl.sh", url="http://127.0.0.1:9", status=7)
-    assert "127.0.0.1" in done.stderr
-
-
 def test_the_python_program_asks_and_branches_on_errors(shipped: LiveService) -> None:
     printed = run_python("ask.py", shipped.url).stdout.splitlines()
     said = dict(line.split(": ", 1) for line in printed)

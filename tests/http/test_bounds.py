@@ -75,25 +75,6 @@ async def test_a_client_with_a_quarter_of_a_queue_gets_429(shared_store: Path, h
         assert "`steps` must be at most 32000" in document["errors"][0]["message"]
 
 
-async def test_requests_for_documents_that_wait_delay_no_question(
-    shared_store: Path, hold: Hold
-) -> None:
-    """More requests than run at a time wait for the worker thread, which a large scene holds."""
-    async with serve(shared_store) as client:
-        client.headers.update(LONG)
-        held = hold("outliers")
-        large = asyncio.ensure_future(client.post("/outliers", json={"objects": ["bed"] * 40}))
-        assert await asyncio.to_thread(held.started.wait, 60)
-        documents = [asyncio.ensure_future(client.get("/openapi.json")) for _ in range(24)]
-        while 'scene_pending{lane="slow"} 25.0' not in (await client.get("/metrics")).text:
-            pass
-        assert (await client.post("/missing", json=SCENE)).is_success
-        assert not any(document.done() for document in documents)
-        held.release.set()
-        assert (await large).is_success
-        assert all(answer.is_success for answer in await asyncio.gather(*documents))
-
-
 async def test_a_batch_stops_where_its_deadline_passes(
     shared_store: Path, replace: Replace, monkeypatch: pytest.MonkeyPatch
 ) -> None:

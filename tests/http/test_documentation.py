@@ -76,9 +76,6 @@ def test_libraries_lie_here_as_they_were_published(repository: Path) -> None:
     assert sha256(text.encode()).hexdigest() == LIBRARIES
 
 
-# ------------------------------------------------------------------------------------ OpenAPI
-
-
 @pytest.fixture
 async def document(client: httpx.AsyncClient) -> dict[str, Any]:
     document: dict[str, Any] = (await client.get("/openapi.json")).json()
@@ -154,9 +151,6 @@ async def test_example_answers_have_the_fields_of_real_ones(document: dict[str, 
         validated = model_of(ok).model_validate(ok["example"], extra="forbid")
         dumped = json.loads(validated.model_dump_json(exclude_none=True))
         assert dumped == ok["example"], path
-
-
-# ------------------------------------------------------------------------------------------ headers
 
 
 NOTHING = "default-src 'none'; frame-ancestors 'none'"

@@ -13,7 +13,7 @@ from app.main import create_app
 from app.settings import Settings
 from tests.http.stores import corrupt, publish
 from tests.http.test_problems import problem
-from tests.services import NAMED, LiveService, load_changes, serve
+from tests.services import NAMED, load_changes, serve
 
 
 async def test_health_of_a_ready_service(client: httpx.AsyncClient) -> None:
@@ -120,22 +120,3 @@ async def test_an_empty_store_is_not_ready(tmp_path: Path) -> None:
     async with serve(tmp_path) as client:
         problem(await client.get("/health/ready"), 503, "not-ready")
         assert (await client.get("/models")).json()["models"] == []
-
-
-@pytest.mark.system
-def test_every_variant_answers_without_torch(live: LiveService) -> None:
-    """In the process of `live`, the import of torch, training and OpenTelemetry fails."""
-    client = live.client
-    listed = client.get("/models").json()
-    assert not listed["failures"]
-    variants = {entry["versions"][0]["variant"] for entry in listed["models"]}
-    assert variants == {"triway", "gbm", "rbm"}
-    for entry in listed["models"]:
-        body = {
-            "objects": ["bed", "lamp", "desk"],
-            "relations": [{"subject": "lamp", "relation": "on-top", "object": "desk"}],
-            "model": entry["name"],
-        }
-        for question in ("relations", "missing", "outliers", "rooms", "generate"):
-            answer = client.post(f"/{question}", json=body)
-            assert answer.status_code == 200, answer.text

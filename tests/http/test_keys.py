@@ -93,17 +93,16 @@ async def test_other_keys_are_refused(guarded: httpx.AsyncClient, headers: Any) 
         problem(await guarded.post(path, json=SCENE, headers=headers), 401, "unauthorized")
 
 
-@pytest.mark.parametrize(
-    "headers",
-    [
-        {"X-API-Key": API_KEY},
-        {"Authorization": f"Bearer {API_KEY}"},
-        {"Authorization": f"bearer {API_KEY}"},
-    ],
-)
-async def test_the_key_opens_questions(guarded: httpx.AsyncClient, headers: Any) -> None:
-    assert (await guarded.post("/relations", json=SCENE, headers=headers)).status_code == 200
-    assert (await guarded.get("/models", headers=headers)).status_code == 200
+async def test_the_key_opens_questions(guarded: httpx.AsyncClient) -> None:
+    for name, value in (
+        ("X-API-Key", ""),
+        ("Authorization", "Bearer "),
+        ("Authorization", "bearer "),
+    ):
+        headers = {name: value + API_KEY}
+        response = await guarded.post("/relations", json=SCENE, headers=headers)
+        assert response.status_code == 200
+        assert (await guarded.get("/models", headers=headers)).status_code == 200
 
 
 async def test_a_body_without_a_key_is_not_read(guarded: httpx.AsyncClient) -> None:

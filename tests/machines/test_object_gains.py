@@ -73,8 +73,6 @@ def test_weights_that_float32_products_do_not_cover_are_refused(value):
         Gains(weights, 2)
 
 
-# -- the answers about a scene -----------------------------------------------------------------
-
 V, C = 14, 3
 SPECS = {
     "binary": MachineSpec("rbm", V=V, A=1, units=30, C=C, profiles=3),
@@ -159,12 +157,3 @@ def test_reasons_are_differences_of_log_odds(name, seed):
     found = case.scorer.reasons_for_absent(case.context, case.profile, candidates)
     each = [case.log_odds() - case.log_odds(j) for j in range(len(case.classes))]
     close(found, np.array(each).T[candidates])
-
-
-@given(coverage=st.floats(0, 1))
-def test_kappa_is_interpolated_between_the_middles_of_the_bins(coverage):
-    machine = build(SPECS["binary"])
-    machine.kappa.data.copy_(torch.tensor([[0.0], [1.0], [4.0], [-2.0]]).expand(-1, V))
-    found = ObjectScorer(weights_of(machine)).kappa(coverage)
-    expected = np.interp(coverage, [0.15, 0.45, 0.8, 1.0], [0.0, 1.0, 4.0, -2.0])
-    np.testing.assert_allclose(found, np.full(V, expected), atol=1e-5)

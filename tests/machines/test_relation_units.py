@@ -115,9 +115,6 @@ def test_mean_and_variance_are_those_over_all_states_of_h1(name, room):
         np.testing.assert_allclose(one[0, 0], out[0, 1], rtol=1e-6)
 
 
-# ------------------------------------------------------------------------------------- implications
-
-
 @st.composite
 def relations(draw):
     """(A, n, n) of one or two relations between up to 6 classes, from few to all of them."""
@@ -181,10 +178,3 @@ def test_without_observed_relations_nothing_changes():
         shift = in_service(machine, observed).shift
         assert shift.shape == shape
         assert not shift.any()
-
-
-def test_relations_in_another_layout_are_refused():
-    machine = coupled_machine()
-    table = build(MachineSpec("rbm", V=V, A=1, units=1, T=0)).edges(torch.arange(V)[None])
-    with pytest.raises(TypeError, match="PairEdges"):
-        machine.relation_logits(table, torch.ones(1, V), torch.zeros(1, 3))

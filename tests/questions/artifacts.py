@@ -64,11 +64,7 @@ def judging(lines: AlarmLines = NO_ALARM, stand: float = 0.0, **changes: object)
 
 def calibration(relations: int, **changes: object) -> Calibration:
     """A neutral calibration without outliers, so every generated scene is plausible."""
-    judged = {
-        "outlier": CountSlope(slope=-1.0),
-        "outlier_lines": NO_ALARM,
-        "misplaced": judging(),
-    }
+    judged = {"outlier": CountSlope(slope=-1.0), "outlier_lines": NO_ALARM, "misplaced": judging()}
     return Calibration(**{**dict(Calibration.neutral(relations)), **judged, **changes})
 
 

@@ -86,13 +86,6 @@ class Exact:
         middles = [0.15, 0.45, 0.8, 1.0]
         return float(np.interp(coverage, middles, self.joint.machine.kappa[:, i].tolist()))
 
-    def changes(self, i, classes):
-        """The change of the log-odds of class i by each other class: a dictionary."""
-        return {
-            j: self.object(i, classes) - self.object(i, [c for c in classes if c != j])
-            for j in set(classes) - {i}
-        }
-
     def relation(self, triple, present, observed=()):
         """p(r_e = 1), given the classes.
 

@@ -115,8 +115,7 @@ def test_the_largest_weights_of_a_store_give_finite_numbers(sign, coverage):
     shares = np.full_like(huge.log_share, -64)
     shares[:, 0] = 0
     artifact = replace(
-        larger_artifact("triway", coverage=1.0),
-        counts=Counts(huge.classes, MOST, shares, weights),
+        larger_artifact("triway", coverage=1.0), counts=Counts(huge.classes, MOST, shares, weights)
     )
     scene = scene_of([index for index in range(WALL) for _ in range(M - 1)])
     entries = more(artifact, scene, candidates=EVERY, coverage=coverage)

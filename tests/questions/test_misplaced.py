@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from app.questions.misplaced import (
     wrong_log_odds,
     wrong_relations,
 )
-from app.questions.posterior import Present, present
+from app.questions.posterior import present
 from app.registry.description import Judgement
 from app.scene import ObjectClass, Scene, SceneObject, Vocabulary, observe
 from app.scene.relations import ABOVE, INSIDE, LEFT, ON_TOP
@@ -70,30 +71,17 @@ ARTIFACT = replace(larger_artifact("triway"), vocabulary=VOCABULARY, places=PLAC
 FLAT = -9.0  # log-odds of the relations that a test does not name
 
 
-@dataclass
-class Relations:
-    """A posterior with these log-odds of relations, and with these changes."""
-
-    present: Present
-    alone: np.ndarray
-    change: np.ndarray
-
-    def alone_log_odds(self):
-        return self.alone
-
-    def relation_change(self):
-        return self.change
-
-
 def posterior_of(scene, alone=(), change=()):
-    """Relations are triples of objects. Each object has a class of its own."""
+    """A stub with these log-odds and changes of triples. Each object has a class of its own."""
     listing = present(scene, ARTIFACT.spec)
     n = len(listing.classes)
-    stub = Relations(listing, np.full((5, n, n), FLAT), np.zeros((5, n, n)))
-    for array, values in ((stub.alone, dict(alone)), (stub.change, dict(change))):
+    log_odds, changes = np.full((5, n, n), FLAT), np.zeros((5, n, n))
+    for array, values in ((log_odds, dict(alone)), (changes, dict(change))):
         for (a, i, j), value in values.items():
             array[a, listing.row[i], listing.row[j]] = value
-    return stub
+    return SimpleNamespace(
+        present=listing, alone_log_odds=lambda: log_odds, relation_change=lambda: changes
+    )
 
 
 def stated(classes, triples):

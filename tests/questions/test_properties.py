@@ -11,12 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app.questions.answer import significant
-from app.scene import (
-    CANONICAL,
-    OPPOSITES,
-    RELATIONS,
-    Scene,
-)
+from app.scene import CANONICAL, OPPOSITES, RELATIONS, Scene
 from tests.questions.answers import disagreements, misplaced, missing, outliers, relations
 from tests.questions.artifacts import LABELS, LARGER, STRUCTURE, larger_artifact, scene_of
 

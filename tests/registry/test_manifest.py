@@ -9,10 +9,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from app.registry import (
-    ArtifactError,
-    Manifest,
-)
+from app.registry import ArtifactError, Manifest
 from tests.registry.small_artifacts import description, refused, resign
 
 DIGEST = "ab" * 32

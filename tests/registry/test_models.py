@@ -137,9 +137,6 @@ def test_one_unreadable_folder_does_not_take_the_others_down(
         models.resolve("other")
 
 
-# --------------------------------------------------------------------------------------- references
-
-
 VERSIONS = {"rooms": ("1.0.0", "1.9.0", "1.10.0"), "halls": ("0.1.0",)}
 ALIASES = {
     "default": AliasTarget(name="rooms"),

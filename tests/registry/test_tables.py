@@ -117,13 +117,7 @@ def with_zero(array: Any) -> Any:
 EMPTY = np.zeros(0, "i4")
 NO_CLASS = {"classes": EMPTY, "most": EMPTY, "log_share": full(-1, 0, M)}
 INVALID: list[tuple[Any, str, list[dict[str, Any]]]] = [
-    (
-        counts,
-        "wrong_shape",
-        [
-            {"weights": full(0, 2, 2, 2 + C + V)},
-        ],
-    ),
+    (counts, "wrong_shape", [{"weights": full(0, 2, 2, 2 + C + V)}]),
     (
         counts,
         "invalid_tensor",

@@ -11,18 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from app.scene import (
-    PoseRelations,
-    Scene,
-    SceneObject,
-    instance_evidence,
-    observe,
-)
-from app.scene.geometry import (
-    Viewpoint,
-    derive_relations,
-    to_viewer_frame,
-)
+from app.scene import PoseRelations, Scene, SceneObject, instance_evidence, observe
+from app.scene.geometry import Viewpoint, derive_relations, to_viewer_frame
 from app.scene.relations import (
     ABOVE,
     CANONICAL,

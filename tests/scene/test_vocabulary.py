@@ -104,9 +104,6 @@ def test_malformed_vocabularies_are_refused() -> None:
         Vocabulary([ObjectClass("bed")], [""])
 
 
-# ------------------------------------------------------------------------------------------- labels
-
-
 PLURALS = """
 chairs/chair curtains/curtain sofas/sofa photos/photo tvs/tv boxes/box dishes/dish benches/bench
 dresses/dress buses/bus batteries/battery shelves/shelf bookshelves/bookshelf knives/knife
@@ -142,9 +139,6 @@ def test_compatibility_characters_fold() -> None:
 def test_keys_ignore_case_and_separators(label: str, separator: str) -> None:
     assert label_key(separator + label + separator) == label_key(label)
     assert label_key(label.casefold()) == label_key(label)
-
-
-# ------------------------------------------------------------------------------------ similar names
 
 
 SIMILAR = Vocabulary(

@@ -13,12 +13,7 @@ from training.evaluation.everyday_task import EVERYDAY, LINES, ask_everyday, fac
 from training.runs.config_files import load_config
 
 STORE = Store(REPOSITORY / "model_store")
-SHIPPED = [
-    "indoor-gbm",
-    "indoor-rbm",
-    "indoor-triway",
-    "open-triway",
-]
+SHIPPED = ["indoor-gbm", "indoor-rbm", "indoor-triway", "open-triway"]
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +71,6 @@ def test_the_examples_of_its_configuration_fit_its_vocabulary(artifact):
     assert known_examples(examples, artifact.vocabulary) == (examples, [])
 
 
-# ---------------------------------------------------------------------------------- everyday facts
 # Scenes are drawn with fixed seeds, so the counts of a version of numpy and numba are always the
 # same. Another order of the draws gives other counts: over 16,000 scenes of other seeds .976 are
 # typical, .005 have what never belongs and .011 have fewer than three classes. The bounds of the

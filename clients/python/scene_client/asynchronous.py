@@ -75,8 +75,7 @@ class AsyncClient:
         **fields: Unpack[schemas.RelationsFields],
     ) -> schemas.RelationsAnswer:
         """Return the likely spatial relations between the objects."""
-        call = calls.RELATIONS.call(objects, fields, self.options.model)
-        return await self._call(call, timeout)
+        return await self._call(calls.RELATIONS.call(objects, fields, self.options.model), timeout)
 
     async def missing(
         self,
@@ -86,8 +85,7 @@ class AsyncClient:
         **fields: Unpack[schemas.MissingFields],
     ) -> schemas.MissingAnswer:
         """Return classes that are probably missing from the scene, and their likely places."""
-        call = calls.MISSING.call(objects, fields, self.options.model)
-        return await self._call(call, timeout)
+        return await self._call(calls.MISSING.call(objects, fields, self.options.model), timeout)
 
     async def outliers(
         self,
@@ -97,8 +95,7 @@ class AsyncClient:
         **fields: Unpack[schemas.OutliersFields],
     ) -> schemas.OutliersAnswer:
         """Return how well each object fits the scene, and the relations that are probably false."""
-        call = calls.OUTLIERS.call(objects, fields, self.options.model)
-        return await self._call(call, timeout)
+        return await self._call(calls.OUTLIERS.call(objects, fields, self.options.model), timeout)
 
     async def rooms(
         self,
@@ -108,8 +105,7 @@ class AsyncClient:
         **fields: Unpack[schemas.RoomsFields],
     ) -> schemas.RoomsAnswer:
         """Return the likely types of the room, or where one object usually is."""
-        call = calls.ROOMS.call(objects, fields, self.options.model)
-        return await self._call(call, timeout)
+        return await self._call(calls.ROOMS.call(objects, fields, self.options.model), timeout)
 
     async def generate(
         self,
@@ -119,8 +115,7 @@ class AsyncClient:
         **fields: Unpack[schemas.GenerateFields],
     ) -> schemas.GenerateAnswer:
         """Sample scenes from the model. Each sampled scene contains the given objects."""
-        call = calls.GENERATE.call(objects, fields, self.options.model)
-        return await self._call(call, timeout)
+        return await self._call(calls.GENERATE.call(objects, fields, self.options.model), timeout)
 
     # -------------------------------------------------------------------------------- batches
 
@@ -167,8 +162,8 @@ class AsyncClient:
     ) -> schemas.ModelSummary | schemas.VersionDetails:
         """Return the versions of a model, or the details of one version."""
         if version is None:
-            call = Call("GET", calls.model_path(name), schemas.ModelSummary)
-            return await self._call(call, timeout)
+            path = calls.model_path(name)
+            return await self._call(Call("GET", path, schemas.ModelSummary), timeout)
         path = calls.model_path(name, "versions", version)
         return await self._call(Call("GET", path, schemas.VersionDetails), timeout)
 

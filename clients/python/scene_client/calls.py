@@ -190,7 +190,6 @@ def _request(
 
 
 def _json_value(value: Any) -> Any:
-    """Return a schema object without its unset fields, a mapping or an iterable as JSON has it."""
     if isinstance(value, BaseModel):
         return value.model_dump(exclude_unset=True)
     if isinstance(value, Mapping):

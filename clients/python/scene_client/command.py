@@ -108,13 +108,7 @@ def _show(
     question: Callable[[Client], AnswerT],
     table: Callable[[AnswerT], RenderableType],
 ) -> None:
-    """Print the answer to a question as JSON or as a table. An error ends the program.
-
-    Args:
-        context: context of the command, with the general options.
-        question: function that sends the question.
-        table: function that returns the table.
-    """
+    """Print the answer to a question as JSON or as a table. An error ends the program."""
     options: Options = context.obj
     with _exit_on_error(), options.client() as client:
         answer = question(client)
@@ -131,7 +125,6 @@ def _show(
 
 
 def _version(is_set: bool) -> None:
-    """Print the version and end the program, if the option ``--version`` is set."""
     if is_set:
         print(f"scene {__version__}")
         raise typer.Exit
@@ -391,7 +384,6 @@ def _scene(
 
 
 def _named(**options: Any) -> dict[str, Any]:
-    """Return the options that the user has set."""
     return {name: value for name, value in options.items() if value is not None}
 
 
@@ -433,7 +425,6 @@ def _relations_for(words: Iterable[str]) -> str:
 
 @contextmanager
 def _exit_on_error() -> Iterator[None]:
-    """End the program with a message and an exit status if the block raises an error."""
     try:
         yield
     except ProblemError as problem:

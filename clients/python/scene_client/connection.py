@@ -146,21 +146,14 @@ def deadline(seconds: float) -> Iterator[None]:
 
 
 def _seconds_left(timeout: float | None) -> float:
-    """Return the maximum time of the next wait in seconds.
-
-    Raises:
-        httpcore.TimeoutException: the deadline has passed. Without this exception, a read of data
-            that have already arrived would succeed after the deadline.
-    """
+    """Return the maximum time of the next wait in seconds."""
     seconds = _ENDS.get() - monotonic()
-    if seconds <= 0:
+    if seconds <= 0:  # else a read of data that have already arrived would succeed
         raise httpcore.TimeoutException("the timeout of the call has expired")
     return seconds if timeout is None else min(timeout, seconds)
 
 
 class _Stream(httpcore.NetworkStream):
-    """A stream whose waits end at the `deadline`."""
-
     def __init__(self, stream: httpcore.NetworkStream) -> None:
         self._stream = stream
 
@@ -186,8 +179,6 @@ class _Stream(httpcore.NetworkStream):
 
 
 class _Backend(httpcore.SyncBackend):
-    """A network backend whose streams are `_Stream` objects."""
-
     def connect_tcp(
         self,
         host: str,
@@ -202,7 +193,6 @@ class _Backend(httpcore.SyncBackend):
 
 @contextmanager
 def _as_httpx() -> Iterator[None]:
-    """Convert the exceptions of httpcore to those of httpx."""
     try:
         yield
     except httpcore.TimeoutException as error:

@@ -147,7 +147,6 @@ def problem_of(
 
 
 def _quoted(errors: Sequence[FieldError], request: str) -> Sequence[FieldError]:
-    """Return the errors, with the text of the request that each of them is about."""
     body = json.loads(request) if errors else None
     return [
         error.model_copy(

@@ -147,7 +147,6 @@ def _names(text: str) -> Any:
 
 
 def _bytes(name: str) -> bytes:
-    """Return the contents of a file, or of standard input for the name ``-``."""
     try:
         if name == "-":
             text = sys.stdin.buffer.read(MAX_FILE + 1)
@@ -184,11 +183,6 @@ def _json_lines(name: str, text: str) -> list[str] | None:
 
 
 def _parsed(text: str) -> Any:
-    """Return the data in a text.
-
-    Raises:
-        MessageError: the text has an unknown format.
-    """
     start = text.lstrip()[:1]
     if start == "<":
         return _xml(text)

@@ -132,7 +132,6 @@ def chosen(scenes: Mapping[str, Reader], scene: object, file: str = "") -> Reade
 
 
 def _converted(form: Format, part: Any, label_map: LabelMap | None) -> SceneFields:
-    """Convert one scene of a format of the table."""
     message = _guarded(form.name, form.read, part)
     fields = from_message(vars(message), label_map, viewpoint=message.viewpoint)
     fields.notes = message.notes + fields.notes
@@ -160,7 +159,6 @@ _TRAINING_OBJECT: Final = frozenset(("box2d", "count"))
 
 
 def _request(data: Any) -> dict[str, Any]:
-    """Return a request, a list of objects, or a training scene as the fields of a request."""
     if isinstance(data, list) and all(
         isinstance(thing, str) or (isinstance(thing, dict) and "label" in thing) for thing in data
     ):
@@ -185,7 +183,6 @@ def _request(data: Any) -> dict[str, Any]:
 
 
 def _kind(data: Any) -> str:
-    """Return a short description of JSON data."""
     if isinstance(data, dict):
         names = ", ".join(str(name)[:40] for name in islice(data, 5))
         return f"a JSON object with the fields {names}" if names else "an empty JSON object"
@@ -193,12 +190,8 @@ def _kind(data: Any) -> str:
 
 
 def _of_training(scene: Mapping[str, Any], things: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the request fields for a scene of the training format.
-
-    The service accepts most scenes of this format too, but its answers would name an object by its
-    number. Here, the id of such an object is its label, followed by its number if several objects
-    have the label.
-    """
+    # The service accepts most of these scenes too, but its answers would name an object by its
+    # number. Here, its id is its label, followed by its number if several objects have the label.
     counts = Counter(thing["label"] for thing in things)
     names = {
         thing["id"]: thing["label"] + (f"_{thing['id']}" if counts[thing["label"]] > 1 else "")
@@ -234,7 +227,6 @@ def _of_training(scene: Mapping[str, Any], things: list[dict[str, Any]]) -> dict
 
 
 def _relation(relation: Any, names: Mapping[Any, str]) -> list[Any]:
-    """Return a relation whose objects have names in place of numbers."""
     if isinstance(relation, dict):
         relation = [relation[end] for end in ("subject", "relation", "object")]
     subject, kind, other = relation
@@ -242,21 +234,15 @@ def _relation(relation: Any, names: Mapping[Any, str]) -> list[Any]:
 
 
 def _named(value: Any, names: Mapping[Any, str]) -> Any:
-    """Return the name of an object's number; other values unchanged."""
     return names.get(value, value) if type(value) is int else value
 
 
 def _image_relations(annotated: list[Any], objects: list[Any]) -> list[list[str]]:
-    """Return the relations left between boxes in an image, if all objects have ids and boxes.
-
-    Raises:
-        MessageError: there are more boxes than a request can have objects. The time grows with the
-            square of their number.
-    """
+    """Return the relations left between boxes in an image, if all objects have ids and boxes."""
     boxes = [thing.get("box2d") if isinstance(thing, dict) else None for thing in annotated]
     if any("position" in thing or "id" not in thing for thing in objects) or None in boxes:
         return []
-    if len(boxes) > MAX_OBJECTS:
+    if len(boxes) > MAX_OBJECTS:  # the time grows with the square of their number
         raise MessageError(f"the scene has more than {MAX_OBJECTS} boxes in an image")
     ids = [thing["id"] for thing in objects]
     pairs = sorted(left_pairs(boxes, range(len(boxes))))
@@ -264,7 +250,6 @@ def _image_relations(annotated: list[Any], objects: list[Any]) -> list[list[str]
 
 
 def _with_labels(data: Any, label_map: LabelMap | None) -> SceneFields:
-    """Return a request, with labels in place of class ids."""
     scene, labels, objects = _request(data), read_label_map(label_map), []
     for thing in scene["objects"]:
         label = thing.get("label") if isinstance(thing, dict) else thing

@@ -109,7 +109,6 @@ def _to_optical(vector: Vector) -> Vector:
 
 
 def _rotation(quaternion: Quaternion) -> tuple[Vector, ...]:
-    """Return the axes of a box as vectors of the frame."""
     x, y, z, w = quaternion
     norm = math.sqrt(x * x + y * y + z * z + w * w)
     if not abs(norm - 1.0) <= _NORM_TOLERANCE:

@@ -78,7 +78,6 @@ def read_coco(part: Any) -> Message:
 
 
 def _corner_box(x: Any, y: Any, width: Any, height: Any) -> dict[str, Any]:
-    """Return the box with a corner, a width and a height."""
     left, top, across, down = (
         math.nan if (value := number(part)) is None else value for part in (x, y, width, height)
     )
@@ -120,12 +119,10 @@ def read_ultralytics(part: Any) -> Message:
 
 
 def _tracked(label: Any, track: Any) -> str:
-    """Return an id with the number of a tracker, or "" without a tracker."""
     return f"{text(label)}_{text(track)}" if text(track) else ""
 
 
 def _corners(box: Mapping[str, Any]) -> tuple[list[Any], list[Any]]:
-    """Return the values x1, x2 … and y1, y2 … of a box."""
     xs, ys = ([box[name] for name in sorted(box) if name[0] == axis] for axis in "xy")
     return xs, ys
 
@@ -297,7 +294,6 @@ def read_cvat(part: Any) -> Message:
 
 
 def _shape_box(shape: Element) -> dict[str, Any]:
-    """Return the box of a shape."""
     if shape.tag in ("box", "cuboid"):
         values = {name: float(value) for name, value in shape.items() if name[:3] in _EDGES}
         xs = [value for name, value in values.items() if name.startswith("x")]

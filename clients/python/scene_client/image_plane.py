@@ -72,5 +72,4 @@ def upright_box(centre: tuple[float, float], size: tuple[float, float], theta: f
 
 
 def _unit(box: Box, other: Box) -> float:
-    """Return the mean diagonal of two boxes."""
     return sum(math.hypot(right - left, low - high) for left, high, right, low in (box, other)) / 2

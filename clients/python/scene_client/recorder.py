@@ -218,11 +218,7 @@ class Recorder:
 
 @contextmanager
 def _locked(path: Path) -> Iterator[int]:
-    """Open the file for appending, create it if necessary, and lock it for other writers.
-
-    Raises:
-        OSError: the file cannot be opened, is not regular, or is locked for too long.
-    """
+    """Open the file for appending, create it if necessary, and lock it for other writers."""
     ends = monotonic() + _LONGEST_WAIT
     while True:
         file = os.open(path, _FLAGS, 0o600)
@@ -240,7 +236,6 @@ def _locked(path: Path) -> Iterator[int]:
 
 
 def _lock(file: int, path: Path) -> bool:
-    """Lock an open file, unless another writer has locked or renamed it."""
     try:
         if fcntl is not None:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -253,11 +248,7 @@ def _lock(file: int, path: Path) -> bool:
 
 
 def _mend(file: int) -> int:
-    """End the last line of a file, or cut it off if a crash left a part of a scene.
-
-    Returns:
-        size of the file in bytes.
-    """
+    """End the last line, or cut it off if a crash left a part of a scene. Return the size."""
     size = os.lseek(file, 0, os.SEEK_END)
     start, tail = size, b""
     while start and b"\n" not in tail and len(tail) < _LONGEST_LINE:
@@ -278,7 +269,6 @@ def _mend(file: int) -> int:
 
 
 def _write(file: int, size: int, line: bytes) -> None:
-    """Append a line to a file of this size, as a whole or not at all."""
     if os.write(file, line) < len(line):
         os.ftruncate(file, size)
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -290,7 +280,6 @@ def _write(file: int, size: int, line: bytes) -> None:
 def _hashes(
     hour: str, things: Sequence[Thing], room: str | None, relations: Iterable[Triple]
 ) -> list[int]:
-    """Return hashes of the labels, the room type and the recorded relations between labels."""
     hashes = [hash((hour, *sorted([one["label"] for one in things])))]
     if room is not None:
         hashes.append(hash((hashes[0], room)))
@@ -309,7 +298,6 @@ def _hashes(
 
 
 def _places(things: Sequence[Thing]) -> int:
-    """Return a hash of the labels and their cells."""
     cells = [
         (one["label"], at.x // STEP, at.y // STEP, at.z // STEP)
         for one in things

@@ -151,7 +151,6 @@ def as_vision_msgs(message: Any) -> Any:
 
 
 def _image_box(box: Any) -> dict[str, Any]:
-    """Return a yolo_msgs/BoundingBox2D as a vision_msgs/BoundingBox2D."""
     return {
         "center": take(box, "center"),
         "size_x": take(box, "size", "x"),

@@ -11,13 +11,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from scene_client.frames import Quaternion
 from scene_client.ros_fields import number
 from scene_client.vision_msgs import Note, Reason
-
-Quaternion = tuple[float, float, float, float]
-"""A rotation (x, y, z, w)."""
-
-Vector = tuple[float, float, float]
 
 NO_TURN: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
 

@@ -76,8 +76,7 @@ class Client:
         **fields: Unpack[schemas.RelationsFields],
     ) -> schemas.RelationsAnswer:
         """Return the likely spatial relations between the objects."""
-        call = calls.RELATIONS.call(objects, fields, self.options.model)
-        return self._call(call, timeout)
+        return self._call(calls.RELATIONS.call(objects, fields, self.options.model), timeout)
 
     def missing(
         self,
@@ -87,8 +86,7 @@ class Client:
         **fields: Unpack[schemas.MissingFields],
     ) -> schemas.MissingAnswer:
         """Return classes that are probably missing from the scene, and their likely places."""
-        call = calls.MISSING.call(objects, fields, self.options.model)
-        return self._call(call, timeout)
+        return self._call(calls.MISSING.call(objects, fields, self.options.model), timeout)
 
     def outliers(
         self,
@@ -98,8 +96,7 @@ class Client:
         **fields: Unpack[schemas.OutliersFields],
     ) -> schemas.OutliersAnswer:
         """Return how well each object fits the scene, and the relations that are probably false."""
-        call = calls.OUTLIERS.call(objects, fields, self.options.model)
-        return self._call(call, timeout)
+        return self._call(calls.OUTLIERS.call(objects, fields, self.options.model), timeout)
 
     def rooms(
         self,
@@ -109,8 +106,7 @@ class Client:
         **fields: Unpack[schemas.RoomsFields],
     ) -> schemas.RoomsAnswer:
         """Return the likely types of the room, or where one object usually is."""
-        call = calls.ROOMS.call(objects, fields, self.options.model)
-        return self._call(call, timeout)
+        return self._call(calls.ROOMS.call(objects, fields, self.options.model), timeout)
 
     def generate(
         self,
@@ -120,8 +116,7 @@ class Client:
         **fields: Unpack[schemas.GenerateFields],
     ) -> schemas.GenerateAnswer:
         """Sample scenes from the model. Each sampled scene contains the given objects."""
-        call = calls.GENERATE.call(objects, fields, self.options.model)
-        return self._call(call, timeout)
+        return self._call(calls.GENERATE.call(objects, fields, self.options.model), timeout)
 
     # -------------------------------------------------------------------------------- batches
 
@@ -168,8 +163,8 @@ class Client:
     ) -> schemas.ModelSummary | schemas.VersionDetails:
         """Return the versions of a model, or the details of one version."""
         if version is None:
-            call = Call("GET", calls.model_path(name), schemas.ModelSummary)
-            return self._call(call, timeout)
+            path = calls.model_path(name)
+            return self._call(Call("GET", path, schemas.ModelSummary), timeout)
         path = calls.model_path(name, "versions", version)
         return self._call(Call("GET", path, schemas.VersionDetails), timeout)
 

@@ -174,7 +174,6 @@ def notes(answer: BaseModel) -> list[str]:
 
 
 def _table(*columns: str, rows: Sequence[Sequence[str]], title: str | None = None) -> Table:
-    """Return a table without the columns that are empty in every row."""
     table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
     # Answers with `detail: scores` have no places and no reasons.
     shown = [n for n in range(len(columns)) if not rows or any(row[n] for row in rows)]
@@ -191,7 +190,6 @@ def _table(*columns: str, rows: Sequence[Sequence[str]], title: str | None = Non
 
 
 def _tables(first: Table, second: Table) -> RenderableType:
-    """Return both tables, or only the first one if the second one has no rows."""
     return Group(first, second) if second.row_count else first
 
 
@@ -200,7 +198,6 @@ def _relation(entry: schemas.ScoredRelation) -> tuple[str, str, str, str]:
 
 
 def _relations(relations: Sequence[schemas.Relation]) -> str:
-    """Return the first `MOST_RELATIONS` relations as lines of text, vertical relations first."""
     ranked = sorted(relations, key=lambda entry: entry.relation in {"left", "front"})
     lines = [f"{r.subject} {r.relation} {r.object}" for r in ranked[:MOST_RELATIONS]]
     if len(ranked) > MOST_RELATIONS:

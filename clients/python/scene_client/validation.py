@@ -81,11 +81,8 @@ def field_errors(
 
 
 def _all_errors(error: ValidationError, body: Any, form: type[Request]) -> list[ErrorDetails]:
-    """Return pydantic's errors of a request, the errors of objects first, as in the schema.
-
-    Pydantic reports the errors of the first invalid object only. So the function replaces this
-    object by a valid one and validates the objects again, until it has `MAX_ERRORS` errors.
-    """
+    # Pydantic reports the errors of the first invalid object only. So the function replaces this
+    # object by a valid one and validates the objects again, until it has `MAX_ERRORS` errors.
     errors = newest_errors = error.errors(include_url=False)
     while len(errors) < MAX_ERRORS:
         index = _invalid_object(newest_errors)
@@ -105,7 +102,6 @@ def _all_errors(error: ValidationError, body: Any, form: type[Request]) -> list[
 
 
 def _invalid_object(errors: list[ErrorDetails]) -> Any:
-    """Return the index of the first invalid object, or None without one."""
     for details in filter(_is_of_objects, errors):
         # An error of the whole list has the location ("objects",), without an index.
         if len(details["loc"]) > 1:
@@ -114,7 +110,6 @@ def _invalid_object(errors: list[ErrorDetails]) -> Any:
 
 
 def _is_of_objects(details: ErrorDetails) -> bool:
-    """Return whether an error is in the field `objects`."""
     return details["loc"][:1] == ("objects",)
 
 
@@ -177,7 +172,6 @@ def _message(details: ErrorDetails, form: type[Request]) -> tuple[str, list[str]
 
 
 def _unknown_field(location: Sequence[str | int], form: type[Request]) -> tuple[str, list[str]]:
-    """Return the message for a field that the schema lacks, and the similar fields."""
     schema, _ = _schema_at(location[:-1], form)
     names = list(schema.model_fields) if schema is not None else []
     similar = _similar_names(location[-1], names)
@@ -187,7 +181,6 @@ def _unknown_field(location: Sequence[str | int], form: type[Request]) -> tuple[
 
 
 def _similar_names(value: Any, choices: Sequence[str]) -> list[str]:
-    """Return the choices that share a word with a text, or that have a similar spelling."""
     if not isinstance(value, str):
         return []
     text = value[:64].lower()
@@ -210,10 +203,7 @@ def _required_fields(location: Sequence[str | int], form: type[Request]) -> str:
 def _schema_at(
     location: Sequence[str | int], form: type[Request]
 ) -> tuple[type[Request] | None, bool]:
-    """Return the schema of the object at a location, and whether an array may replace the object.
-
-    The schema is None if the value at the location is not an object with a schema.
-    """
+    """Return the schema of the object at a location, and whether an array may replace it."""
     schema: type[Request] | None = form
     or_array = False
     for step in location:
@@ -227,7 +217,6 @@ def _schema_at(
 
 
 def _annotations(annotation: Any) -> Iterator[Any]:
-    """Yield an annotation and all annotations that it contains."""
     yield annotation
     for inner in get_args(annotation):
         yield from _annotations(inner)

@@ -181,8 +181,6 @@ def is_message(value: Any) -> bool:
 
 @dataclass(slots=True)
 class _Sighting:
-    """A detection that becomes an object of the request."""
-
     index: int
     detection: Any
     label: str
@@ -191,8 +189,6 @@ class _Sighting:
 
 
 class _Reader:
-    """Reader of one message. It collects the usable detections and the notes."""
-
     def __init__(self, message: Any, label_map: LabelMap | None, min_score: float) -> None:
         if not is_message(message):
             raise MessageError("the message must have a list of detections")
@@ -267,10 +263,7 @@ class _Reader:
         return sorted(ranked[:MAX_OBJECTS], key=lambda sighting: sighting.index)
 
     def _ids(self) -> dict[int, str]:
-        """Return a dictionary from the index of each detection to an id.
-
-        A unique id of the detector stays. Otherwise the id is the label with a number.
-        """
+        """Return the id of each detection: that of the detector, or its label and a number."""
         index_of_id: dict[str, int] = {}
         for sighting in self.sightings:
             detection = sighting.detection
@@ -293,7 +286,6 @@ class _Reader:
         return ids
 
     def _frame(self) -> str | None:
-        """Return the frame in the message's header, or else in the first detection's header."""
         headers = [take(sighting.detection, "header") for sighting in self.sightings]
         for header in (self.header, *headers):
             if frame := frame_of(header):
@@ -389,7 +381,6 @@ class _Reader:
 
 
 def _is_flat(message: Any) -> bool:
-    """Return whether the message is a Detection2DArray, with boxes in an image."""
     detections = take(unwrapped(message), "detections")
     return any(has(take(entry, "bbox"), "size_x") for entry in items(detections, "detections"))
 
@@ -403,7 +394,6 @@ def _is_number(label: str) -> bool:
 
 
 def _is_unset(pose: Any) -> bool:
-    """Return whether a pose is missing or unset."""
     position = take(pose, "position")
     return position is None or numbers(position, "xyz") == {"x": 0.0, "y": 0.0, "z": 0.0}
 

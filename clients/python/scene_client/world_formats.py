@@ -11,13 +11,12 @@ from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from typing import Any, Final
 
+from scene_client.frames import Quaternion, Vector
 from scene_client.image_formats import Parts, are_dicts, has_list
 from scene_client.ros_fields import MessageError, items, numbers, take, text
 from scene_client.sightings import (
     NO_TURN,
     Message,
-    Quaternion,
-    Vector,
     box_between,
     detection,
     excluded,
@@ -116,7 +115,6 @@ def _from_unity(values: Mapping[str, float]) -> Vector:
 
 
 def _thor_box(thing: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the box of an object along the axes of the world."""
     box = thing.get("axisAlignedBoundingBox") or {}
     if not box.get("size"):
         turn = turn_of(-math.radians((thing.get("rotation") or {}).get("y", 0)))
@@ -297,7 +295,6 @@ def _collision_box(thing: Any) -> dict[str, Any]:
 
 
 def _extent(solid: Any) -> tuple[Vector, list[float]]:
-    """Return the centre and the extents of a primitive or of a mesh in its own frame."""
     if (vertices := take(solid, "vertices")) is None:
         return _ORIGIN, _SIDES[take(solid, "type")](take(solid, "dimensions"))
     spans = [[take(vertex, axis) for vertex in vertices] for axis in "xyz"]
@@ -306,7 +303,6 @@ def _extent(solid: Any) -> tuple[Vector, list[float]]:
 
 
 def _pose(pose: Any) -> tuple[Vector, Quaternion]:
-    """Return the position and the rotation of a pose. An unset pose is the identity."""
     at = numbers(take(pose, "position"), "xyz")
     turn = numbers(take(pose, "orientation"), "xyzw")
     length = math.hypot(*turn.values()) if turn else 0.0
@@ -337,7 +333,6 @@ def _product(p: Quaternion, q: Quaternion) -> Quaternion:
 
 
 def _turned(turn: Quaternion, point: Sequence[float]) -> Vector:
-    """Return a point after a rotation."""
     x, y, z, w = turn
     a, b, c, _ = _product(_product(turn, (point[0], point[1], point[2], 0.0)), (-x, -y, -z, w))
     return a, b, c

@@ -80,16 +80,9 @@ class ObservedRelation:
 
 
 Rule = Literal[
-    "alias",
-    "phrase",
-    "qualifier",
-    "alternative",
-    "article",
-    "instance",
-    "prompt",
-    "spelling",
-    "head",
-]
+    "alias", "phrase", "qualifier", "alternative", "article", "instance", "prompt",
+    "spelling", "head",
+]  # fmt: skip
 """how the service reads a label that is not a label of the vocabulary"""
 
 
@@ -112,15 +105,9 @@ class Mapped(Reply):
 
 
 WarningCode = Literal[
-    "implausible-position",
-    "implausible-size",
-    "implausible-scale",
-    "y-axis-up",
-    "rolled-objects",
-    "flat-scene",
-    "unknown-sizes",
-    "not-judged",
-]
+    "implausible-position", "implausible-size", "implausible-scale", "y-axis-up",
+    "rolled-objects", "flat-scene", "unknown-sizes", "not-judged",
+]  # fmt: skip
 
 
 class SceneWarning(Reply):
