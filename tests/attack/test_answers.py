@@ -1,7 +1,5 @@
 """Small requests for huge answers: refused by name before the answer is built."""
 
-from __future__ import annotations
-
 import string
 from collections import Counter
 from itertools import cycle, islice

@@ -1,7 +1,5 @@
 """Bodies and headers that cost much or pretend to be others: refused before the work begins."""
 
-from __future__ import annotations
-
 import json
 import threading
 from pathlib import Path

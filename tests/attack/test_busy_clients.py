@@ -1,7 +1,5 @@
 """One client that asks as fast as it can: others are served."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import socket

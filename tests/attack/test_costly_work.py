@@ -1,7 +1,5 @@
 """Costly questions: health and other models answer meanwhile, and unwanted work ends."""
 
-from __future__ import annotations
-
 import asyncio
 import gc
 import json

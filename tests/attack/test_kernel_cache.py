@@ -1,7 +1,5 @@
 """Compiled loops on disk: stored once, in a directory that only this user can change."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

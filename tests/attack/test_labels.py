@@ -1,7 +1,5 @@
 """Hostile labels: patterns take linear time, readings are few, and searches leave the loop."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import pkgutil

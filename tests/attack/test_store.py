@@ -1,7 +1,5 @@
 """A store with one hostile version: it is refused, the others serve, and memory stays bounded."""
 
-from __future__ import annotations
-
 import json
 import os
 import tracemalloc

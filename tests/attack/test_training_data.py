@@ -1,7 +1,5 @@
 """Hostile training data: an error that names file and line, in little memory."""
 
-from __future__ import annotations
-
 import gzip
 import struct
 import tracemalloc

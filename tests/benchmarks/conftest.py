@@ -1,7 +1,5 @@
 """`rbms` compiles with torch.jit as it is imported, which torch calls deprecated."""
 
-from __future__ import annotations
-
 import warnings
 
 with warnings.catch_warnings():

@@ -3,8 +3,6 @@
 No test here looks at speed: that is what the benchmarks are for.
 """
 
-from __future__ import annotations
-
 import io
 import math
 

@@ -1,7 +1,5 @@
 """The visual page in a browser, before a running service with the shipped models."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a person does on the page, and what the page shows."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re

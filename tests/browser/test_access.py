@@ -1,7 +1,5 @@
 """The page for keyboards, screen readers, small screens, light and dark."""
 
-from __future__ import annotations
-
 import httpx
 import pytest
 from axe_playwright_python.sync_playwright import Axe

@@ -1,7 +1,5 @@
 """The page shows the answers of the service, for every question and model."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys

@@ -1,7 +1,5 @@
 """Files on the page: requests and recordings stay in the browser, the service reads the others."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from urllib.parse import urlsplit

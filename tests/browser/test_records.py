@@ -1,7 +1,5 @@
 """A person confirms recorded scenes, and the corrected file goes back to the robot."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Objects come onto the board, move there and leave it, and the service is asked about them."""
 
-from __future__ import annotations
-
 import base64
 import json
 import zlib

@@ -1,7 +1,5 @@
 """Large scenes, superseded questions, refusals, keys, and a service that goes away."""
 
-from __future__ import annotations
-
 import re
 import signal
 from collections.abc import Iterator

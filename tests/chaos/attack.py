@@ -1,7 +1,5 @@
 """Sending hostile requests and judging the answers."""
 
-from __future__ import annotations
-
 import http.client
 import json
 from collections import Counter

@@ -6,8 +6,6 @@ Strings and numbers that are made up hold `MARKER` or `NUMBER`, so that a refusa
 of the input shows. Everything is generated in the same order every time.
 """
 
-from __future__ import annotations
-
 import copy
 import json
 from collections.abc import Iterator

@@ -3,8 +3,6 @@
 The expected statuses are those of the proxy in front of the service.
 """
 
-from __future__ import annotations
-
 import socket
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Every client behind one interface: a method and a request as JSON in, the answer as JSON out."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import os

@@ -1,7 +1,5 @@
 """Every client of a live service with small machines."""
 
-from __future__ import annotations
-
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack

@@ -1,7 +1,5 @@
 """Servers that misbehave, over real sockets."""
 
-from __future__ import annotations
-
 import socket
 import threading
 from collections.abc import Callable

@@ -5,8 +5,6 @@ Foxy. Messages are plain dataclasses; `blank` makes one with ROS's defaults, as 
 do, and `to_json` writes one as rosbridge does.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass

@@ -4,8 +4,6 @@ The command and the Python functions (tests/client/test_files.py) and the servic
 (tests/http/test_scenes.py) read the same files.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path

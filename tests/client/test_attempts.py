@@ -1,7 +1,5 @@
 """Attempts, pauses and deadlines of a call, on a clock that only the test moves."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta

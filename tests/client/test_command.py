@@ -1,7 +1,5 @@
 """The command ``scene``: its output, its errors and its exit statuses."""
 
-from __future__ import annotations
-
 import json
 import os
 import shlex

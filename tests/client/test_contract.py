@@ -1,7 +1,5 @@
 """What every client promises, asked of each of them: the service's answers, and its problems."""
 
-from __future__ import annotations
-
 import os
 import re
 import sys

@@ -1,7 +1,5 @@
 """Scenes from files of detectors, tools and simulators, and the reasons for refusals."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterable

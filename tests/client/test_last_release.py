@@ -4,8 +4,6 @@ Within one major version, it reads every answer. The folder `last_release` conta
 that client. docs/contributing.md says how a release renews it.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -1,7 +1,5 @@
 """What a robot installs: one package, whose blocking client is written from the other."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

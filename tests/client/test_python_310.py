@@ -4,8 +4,6 @@
 install the client as a robot does.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """The file of recorded scenes: which scenes it has, and that it survives crashes and full disks."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os

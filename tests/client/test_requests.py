@@ -1,7 +1,5 @@
 """What the clients send: the body, the headers, and what is not sent at all."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """The clients over real sockets: one connection for many calls, and deadlines that hold."""
 
-from __future__ import annotations
-
 import socket
 import ssl
 import subprocess

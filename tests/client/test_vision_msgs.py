@@ -1,7 +1,5 @@
 """Detections to requests: what is taken over, what is left out, and that both routes agree."""
 
-from __future__ import annotations
-
 import json
 import math
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """The recorded detections: as JSON, as a ROS message, and as the fields of a scene."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@ Messages are those of the parser that reads bags. A publisher writes each messag
 it back, so a message that does not fit its type fails here as in ROS.
 """
 
-from __future__ import annotations
-
 import sys
 import threading
 from collections.abc import Callable

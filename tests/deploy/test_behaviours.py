@@ -1,7 +1,5 @@
 """Conditions of behaviour trees, in py_trees itself, against a running service."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Callable, Iterator

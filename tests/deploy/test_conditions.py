@@ -1,7 +1,5 @@
 """Conditions for BehaviorTree.CPP, compiled against a stand-in of it, against a running service."""
 
-from __future__ import annotations
-
 import json
 import socket
 from collections.abc import Callable

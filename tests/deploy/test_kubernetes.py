@@ -1,7 +1,5 @@
 """The manifests for Kubernetes: valid, and in agreement with the image and the service."""
 
-from __future__ import annotations
-
 import math
 import os
 import re

@@ -1,7 +1,5 @@
 """The linters of other projects accept the configuration files for their programs."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

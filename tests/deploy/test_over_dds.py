@@ -1,7 +1,5 @@
 """The bridge without rclpy: its messages are those of ROS 2, and it answers over a real DDS."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

@@ -1,7 +1,5 @@
 """The example without ROS: a bridge of websockets on one side, the service on the other."""
 
-from __future__ import annotations
-
 import json
 import sys
 import threading

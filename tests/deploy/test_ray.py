@@ -1,7 +1,5 @@
 """Ray Serve: its configuration, and two replicas on this machine (with .venv-ray)."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

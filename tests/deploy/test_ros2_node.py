@@ -1,7 +1,5 @@
 """The example node against a running service, and its parts alone."""
 
-from __future__ import annotations
-
 import copy
 import importlib
 import json

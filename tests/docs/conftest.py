@@ -1,7 +1,5 @@
 """A copy of the repository and a running service, as a new engineer would have them."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import sys

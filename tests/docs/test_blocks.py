@@ -6,8 +6,6 @@ held to the house's lint; `json`, `yaml` and `toml` are read. See `tests.docs.bl
 says what is output and what is only shown.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import io

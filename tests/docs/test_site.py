@@ -1,7 +1,5 @@
 """The documentation's site: builds without a warning, and needs nothing from elsewhere."""
 
-from __future__ import annotations
-
 import os
 import re
 import sys

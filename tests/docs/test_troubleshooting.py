@@ -1,7 +1,5 @@
 """The messages and problem types of the page on troubleshooting are those of the service."""
 
-from __future__ import annotations
-
 import ast
 import re
 

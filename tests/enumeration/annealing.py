@@ -9,8 +9,6 @@ Sources: Neal, "Annealed importance sampling" (2001); Salakhutdinov and Murray, 
 analysis of deep belief networks" (2008).
 """
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 from typing import NamedTuple

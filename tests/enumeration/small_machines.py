@@ -1,7 +1,5 @@
 """Small machines of every variant, and all their states."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Iterable, Sequence

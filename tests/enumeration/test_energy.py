@@ -1,7 +1,5 @@
 """The energy against its formula, term by term, and F against its definition."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -5,8 +5,6 @@ yardstick is the total variation of as many exact draws (the Monte-Carlo floor),
 wrong kernel from slow mixing: a stationary kernel stays at the floor however slowly it mixes.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

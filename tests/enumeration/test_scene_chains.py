@@ -4,8 +4,6 @@ Stationarity is tested as in `test_gibbs`: states drawn from the enumerated join
 the histogram of v, h1 and h2 against p.
 """
 
-from __future__ import annotations
-
 import copy
 from itertools import product
 

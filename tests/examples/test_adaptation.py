@@ -1,7 +1,5 @@
 """The examples that adapt a model to a home: the shell program and the notebook."""
 
-from __future__ import annotations
-
 import base64
 import inspect
 import json

@@ -1,7 +1,5 @@
 """The programs of `examples/`, each with the shipped models."""
 
-from __future__ import annotations
-
 import json
 import os
 import runpy

@@ -1,7 +1,5 @@
 """Model stores for tests: real artifacts of small machines with random weights."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

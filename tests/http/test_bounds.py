@@ -1,7 +1,5 @@
 """Requests that wait: in order, bounded, until their deadline; and what ending does to them."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 import signal

@@ -1,7 +1,5 @@
 """Clients that are slow, leave, or do not read: bounded without a proxy too."""
 
-from __future__ import annotations
-
 import json
 import select
 import socket

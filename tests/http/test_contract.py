@@ -1,7 +1,5 @@
 """The OpenAPI document against a live service: generated requests get the answers it promises."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from typing import Any

@@ -1,7 +1,5 @@
 """The same request gives the same bytes, alone and under load of every kind."""
 
-from __future__ import annotations
-
 import pytest
 
 from benchmarks.load.connections import prepared

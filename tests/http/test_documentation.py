@@ -1,7 +1,5 @@
 """The pages work without internet, and the OpenAPI document tells the truth."""
 
-from __future__ import annotations
-
 import json
 import re
 from hashlib import sha256

@@ -1,7 +1,5 @@
 """Liveness, readiness, and the answers of a service with broken models."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

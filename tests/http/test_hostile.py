@@ -1,7 +1,5 @@
 """Hostile requests to a live service: wrong values at every place, and requests below HTTP."""
 
-from __future__ import annotations
-
 import pytest
 
 from app.questions import QUESTIONS

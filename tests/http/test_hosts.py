@@ -1,7 +1,5 @@
 """Host names that the service accepts, and whether it is open to other machines."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from socket import gethostname

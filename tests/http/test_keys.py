@@ -1,7 +1,5 @@
 """The API key: all routes except listed ones need it, before the body is read."""
 
-from __future__ import annotations
-
 from collections.abc import AsyncIterator
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Listing models, and changes in the store."""
 
-from __future__ import annotations
-
 import asyncio
 import gc
 import math

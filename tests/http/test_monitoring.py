@@ -1,7 +1,5 @@
 """``GET /metrics`` and the access log."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import re

@@ -1,7 +1,5 @@
 """Every failure is a problem document with its cause, and without secrets or input."""
 
-from __future__ import annotations
-
 import json
 import math
 import uuid

@@ -1,7 +1,5 @@
 """The five questions, answered by real artifacts of every variant."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import AsyncIterator

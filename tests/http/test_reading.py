@@ -1,7 +1,5 @@
 """Reading of scenes: ids, labels, relations, poses, and warnings."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

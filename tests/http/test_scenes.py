@@ -1,7 +1,5 @@
 """``POST /scenes``: files of detectors, annotation tools and simulators as scenes."""
 
-from __future__ import annotations
-
 import base64
 import json
 from pathlib import Path

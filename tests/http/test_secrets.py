@@ -1,7 +1,5 @@
 """Keys and payloads reach no log, whatever the level and however a request fails."""
 
-from __future__ import annotations
-
 import socket
 from collections.abc import Iterator
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Settings: safe defaults, and messages about invalid values."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os

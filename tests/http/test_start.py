@@ -1,7 +1,5 @@
 """The start of ``python -m app``: first the port, then the models, then the page's address."""
 
-from __future__ import annotations
-
 import json
 import os
 import pty

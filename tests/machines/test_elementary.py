@@ -1,7 +1,5 @@
 """The compiled elementary functions against numpy's in double precision."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Log-odds of classes and room types in the service, against the tensors in float64."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Relations in the service: moments of logits, the quadrature, and implications by hand."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Answers of the questions as named tuples, with the indices of objects instead of their ids."""
 
-from __future__ import annotations
-
 from collections import namedtuple
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Small artifacts for tests of the questions. Every test uses each machine of this module."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

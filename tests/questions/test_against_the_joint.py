@@ -1,7 +1,5 @@
 """Answers to the scoring questions, compared with the enumerated joint of a small machine."""
 
-from __future__ import annotations
-
 import copy
 import math
 from dataclasses import dataclass

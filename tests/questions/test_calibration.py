@@ -1,7 +1,5 @@
 """The formulas of the calibration, and that the answers use them."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """`more`: the distribution of the number of instances, and the classes in the answer."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What is observed in the answer to relations: probabilities of evidence, and exclusions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

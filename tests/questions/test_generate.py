@@ -1,7 +1,5 @@
 """Generated scenes: the evidence, the distribution of the model, and implausible scenes."""
 
-from __future__ import annotations
-
 import copy
 import math
 from concurrent.futures import ThreadPoolExecutor

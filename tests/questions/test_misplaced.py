@@ -1,7 +1,5 @@
 """The entries of `misplaced`: their kinds, their terms, and the object that has moved."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

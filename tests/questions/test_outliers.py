@@ -1,7 +1,5 @@
 """The probability of an outlier, the thresholds, and the companions of an outlier."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Placements of missing objects, and their offsets in metres."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections import namedtuple

@@ -1,7 +1,5 @@
 """Properties of every answer of every machine, for any weights."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

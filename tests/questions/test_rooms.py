@@ -1,7 +1,5 @@
 """The question `rooms`: its probabilities by hand, its candidates and its reasons."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Warnings that compare the sizes of a scene with typical sizes, one mistake at a time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

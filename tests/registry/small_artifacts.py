@@ -1,7 +1,5 @@
 """Small machines, described well enough to be published, and ways to spoil what was written."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable

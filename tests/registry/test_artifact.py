@@ -1,7 +1,5 @@
 """One artifact: it is read as it was written, and every damage is an error."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import random

@@ -1,7 +1,5 @@
 """Publishers that die at any moment, and publishers that meet."""
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import os

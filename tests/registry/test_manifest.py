@@ -1,7 +1,5 @@
 """The manifest: it is read as it was written, and invalid fields are errors."""
 
-from __future__ import annotations
-
 import json
 import math
 from typing import Any

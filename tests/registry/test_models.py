@@ -1,7 +1,5 @@
 """The loaded snapshot: reused artifacts, refused versions, and unreadable stores."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping
 from pathlib import Path

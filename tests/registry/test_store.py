@@ -1,7 +1,5 @@
 """The store: publishing, aliases, references, and other files in its folder."""
 
-from __future__ import annotations
-
 import os
 import threading
 from pathlib import Path

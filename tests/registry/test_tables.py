@@ -1,7 +1,5 @@
 """Counts, offsets and places in an artifact: they are stored, checked, and looked up."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Counts of roles for tests, written as a table."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

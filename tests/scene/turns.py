@@ -1,7 +1,5 @@
 """Turns as quaternions (x, y, z, w)."""
 
-from __future__ import annotations
-
 import math
 
 Turn = tuple[float, float, float, float]

@@ -1,7 +1,5 @@
 """Lanes: bounded, fair between clients, and a few requests per iteration of the event loop."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 import threading

@@ -4,8 +4,6 @@ The lists of `homes.toml` are asked with and without the room type, with the gue
 `nearest-or-ignore`. The bounds are the counts of the shipped version.
 """
 
-from __future__ import annotations
-
 import json
 import tomllib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What the shipped store promises: which models, how large, how quickly loaded, which words."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

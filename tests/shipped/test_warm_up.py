@@ -1,7 +1,5 @@
 """After its start the service compiles nothing more for any question."""
 
-from __future__ import annotations
-
 import sys
 
 from tests.conftest import REPOSITORY, run_program

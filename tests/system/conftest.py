@@ -1,7 +1,5 @@
 """HAProxy with the shipped configuration, but for limits that a busy machine would exceed."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """The audit never takes silence for a clean bill of health."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The image and its compose file: linted, valid, and in agreement with the service's settings."""
 
-from __future__ import annotations
-
 import os
 import re
 import sys

@@ -1,7 +1,5 @@
 """Two replicas of one store behind the shipped proxy: promotions, a crash, a rolling update."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Iterator
 from pathlib import Path

@@ -3,8 +3,6 @@
 promtool checks the form of the rules and of the queries: tests/deploy/test_linters.py.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`docs/network.md`: the service in one network namespace, the client in another."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

@@ -1,7 +1,5 @@
 """HAProxy with the shipped configuration in front of the service: attacked, and asked as usual."""
 
-from __future__ import annotations
-
 import json
 import resource
 import socket

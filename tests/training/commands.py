@@ -1,7 +1,5 @@
 """`python -m training` in this process, and the configuration of a small machine."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

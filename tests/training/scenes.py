@@ -1,7 +1,5 @@
 """Annotated scenes of a few objects."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from app.scene import RoleCounts, Vocabulary

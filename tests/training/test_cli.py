@@ -1,7 +1,5 @@
 """The command line end to end on generated rooms: train, publish and evaluate."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

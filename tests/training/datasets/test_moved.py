@@ -1,7 +1,5 @@
 """Cases of moved objects by hand: what moves, where to, and what stays."""
 
-from __future__ import annotations
-
 from collections import Counter
 from typing import Any
 

@@ -3,8 +3,6 @@
 A reader is tested by being listed: `LAYOUTS` must name every format of `READERS`.
 """
 
-from __future__ import annotations
-
 import gzip
 import itertools
 import json

@@ -1,7 +1,5 @@
 """Counts of roles in small scenes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Recorded scenes of a generated home whose habits contradict the shipped models."""
 
-from __future__ import annotations
-
 import json
 import random
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """`python -m training adapt`: a version of the shipped default for one home."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Two models are compared on scenes that neither has learnt from."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

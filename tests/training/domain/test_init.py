@@ -1,7 +1,5 @@
 """`init` on files of scenes."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """What `init` finds in scenes and labels."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from tests.training.evaluation.scenes import scene as encoded_scene

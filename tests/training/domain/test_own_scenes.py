@@ -3,8 +3,6 @@
 The scenes are generated: 300 of laboratories, workshops and storerooms, and those of a home.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

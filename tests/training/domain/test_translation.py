@@ -1,7 +1,5 @@
 """A model answers about scenes with other classes."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

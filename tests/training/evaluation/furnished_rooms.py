@@ -1,7 +1,5 @@
 """Furnished rooms of the generator, and a model of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

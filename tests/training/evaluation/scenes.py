@@ -1,7 +1,5 @@
 """Tiny scenes for the evaluation's tests."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import count

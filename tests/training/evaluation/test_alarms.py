@@ -1,7 +1,5 @@
 """The gate of false alarms: exact bounds, and a model that judges upside down."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from tests.training.evaluation.furnished_rooms import room_model, rooms

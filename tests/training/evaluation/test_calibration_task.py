@@ -1,7 +1,5 @@
 """Calibration: the right answers are collected, with the right truth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Everyday facts: asked as a client of the service asks them, by one module, for acceptance."""
 
-from __future__ import annotations
-
 import json
 import re
 import runpy

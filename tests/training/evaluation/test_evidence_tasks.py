@@ -1,7 +1,5 @@
 """With and without evidence: what is told, what is asked, and that these never meet."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

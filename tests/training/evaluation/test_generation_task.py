@@ -1,7 +1,5 @@
 """T4: each figure by hand, and the samplers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

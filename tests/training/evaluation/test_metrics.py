@@ -1,7 +1,5 @@
 """Metrics by hand, pooled, through JSON; their statistics; the bootstrap and its pairing."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

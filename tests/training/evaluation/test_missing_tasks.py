@@ -1,7 +1,5 @@
 """T2 and T2-at by hand, and that nothing of a hidden object can leak."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

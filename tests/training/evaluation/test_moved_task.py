@@ -1,7 +1,5 @@
 """T3c by hand: what is asked, and what counts."""
 
-from __future__ import annotations
-
 from itertools import count
 
 import numpy as np

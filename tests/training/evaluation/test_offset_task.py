@@ -1,7 +1,5 @@
 """The figures of offsets: shares and distances of known draws, source by source."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

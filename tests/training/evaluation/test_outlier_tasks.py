@@ -1,7 +1,5 @@
 """T3: who is added, by which law, who is first, and the alarms in untouched parts."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Files of a user as tests: read, asked and marked as learnt."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """T1 pairs by hand: what is asked, what is right, and what is new."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

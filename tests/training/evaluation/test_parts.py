@@ -1,7 +1,5 @@
 """Random parts of scenes by hand, and the validation score of a score that knows the answer."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """T1a, T1b and T3b by hand: what is given, what is asked, who finds it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

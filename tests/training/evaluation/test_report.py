@@ -1,7 +1,5 @@
 """Every task for one model, stored, resumed, pooled and published."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

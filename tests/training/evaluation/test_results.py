@@ -1,7 +1,5 @@
 """Tables, verdicts and differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The task about room types: its lists, figures and rows."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

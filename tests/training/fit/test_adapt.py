@@ -1,7 +1,5 @@
 """New classes and room types of a home, and the fit to it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

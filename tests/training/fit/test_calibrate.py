@@ -1,7 +1,5 @@
 """Calibration: the choices on validation scenes, and the judgements of the fitted entries."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

@@ -1,7 +1,5 @@
 """The answers at a place, on pairs of classes whose distribution is known."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The judgement of observed relations, in a world whose supports are known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Calibration of room types: their sharpness, rare types, and limits of generated scenes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Statistics of counts on scenes with known laws, and classes without statistics."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

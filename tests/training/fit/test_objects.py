@@ -1,7 +1,5 @@
 """The fit of object weights, by sums over all states of small machines."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

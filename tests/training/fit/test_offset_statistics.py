@@ -1,7 +1,5 @@
 """Offsets: their shrinkage is Bayes' rule, and draws are covered as promised."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

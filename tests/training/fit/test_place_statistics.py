@@ -1,7 +1,5 @@
 """Counts of where objects stand, by hand."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The fit of relations: offsets of sources, unknown units, shared weights and residuals."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The trainer on generated rooms: determinism, the curve, the start of the weights."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

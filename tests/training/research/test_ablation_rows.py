@@ -1,7 +1,5 @@
 """The rows of an ablation: what is read from TOML, and what is refused."""
 
-from __future__ import annotations
-
 import pytest
 
 from training.fit.configuration import ConfigError

@@ -1,7 +1,5 @@
 """The commands benchmark and ablate end to end on generated rooms, and their resumption."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """`python -m training homes` on houses of generated rooms."""
 
-from __future__ import annotations
-
 import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace

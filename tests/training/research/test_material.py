@@ -1,7 +1,5 @@
 """What rows learn from decides whether they are gone on with, and which rows there are."""
 
-from __future__ import annotations
-
 import gzip
 import json
 from dataclasses import replace

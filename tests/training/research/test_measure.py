@@ -1,7 +1,5 @@
 """Several processes: a diverging row, and any other error; folders of other experiments."""
 
-from __future__ import annotations
-
 import io
 from types import SimpleNamespace
 

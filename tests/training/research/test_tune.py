@@ -1,7 +1,5 @@
 """The tune command end to end on generated rooms, and its search spaces."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

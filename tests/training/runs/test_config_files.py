@@ -1,7 +1,5 @@
 """The configurations that come with the package."""
 
-from __future__ import annotations
-
 import pytest
 
 from training.datasets.files import DATA

@@ -1,7 +1,5 @@
 """Example scenes: their choice from a user's scenes, and their file."""
 
-from __future__ import annotations
-
 import json
 from collections import defaultdict
 from dataclasses import replace

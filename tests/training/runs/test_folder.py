@@ -1,7 +1,5 @@
 """The folder of a run: it holds the last finished run, whatever stops the next one."""
 
-from __future__ import annotations
-
 import csv
 import re
 from pathlib import Path

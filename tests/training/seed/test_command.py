@@ -1,7 +1,5 @@
 """`python -m training seed` on small files of scenes, and the scenes that it reads."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

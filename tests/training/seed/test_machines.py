@@ -1,7 +1,5 @@
 """RBM, GBM and Triway of the paper against sums over all states of tiny machines."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

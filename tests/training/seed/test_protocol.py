@@ -1,7 +1,5 @@
 """The four tasks of the paper on answers made by hand."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

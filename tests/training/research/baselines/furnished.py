@@ -1,7 +1,5 @@
 """Small scenes with a known structure, for fitting baselines in a moment."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Closed forms and counts against slow, independent ways of computing them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What every baseline of the registry promises, on scenes whose structure is known."""
 
-from __future__ import annotations
-
 import re
 from collections import defaultdict
 from functools import cache

@@ -1,7 +1,5 @@
 """The table of supporters by hand: what is counted, and who is suspicious."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 
