@@ -302,6 +302,29 @@ def gain_factors(p, raised, removed):
 
 
 @compiled
+def source_weights(f, a, classes, presence):
+    """Return softmax(f + a v) of the data sources in N scenes, (N, profiles).
+
+    The sums have float64 digits, so that listed structure, whose terms are 0, changes none. See
+    `weights.Weights.source_weights` for the arguments.
+    """
+    p = np.empty((len(presence), len(f)), np.float64)
+    for s in range(len(presence)):
+        top, total = -np.inf, 0.0
+        for q in range(len(f)):
+            p[s, q] = f[q]
+            for j in range(len(classes)):
+                p[s, q] += np.float64(a[q, classes[j]]) * presence[s, j]
+            top = max(top, p[s, q])
+        for q in range(len(f)):
+            p[s, q] = math.exp(p[s, q] - top)
+            total += p[s, q]
+        for q in range(len(f)):
+            p[s, q] /= total
+    return p
+
+
+@compiled
 def class_log_odds(gain, bias, p, a, L, classes, presence):
     """Return gain + bias + sum_q p_q a_q + sum_j presence_j L_j, (V,).
 
@@ -513,6 +536,28 @@ def pair_rows(start, keys, pairs):
             if keys[row] == pair:
                 rows[e] = row
     return rows
+
+
+@compiled
+def placement_ends(candidates, classes, log_counts, presence):
+    """Return the `Ends` of N candidate classes and m anchor classes, (N, 2 m) each.
+
+    In the first m columns, the candidate is the subject. In the others, the anchor is. Candidates
+    are present, with one instance.
+    """
+    N, m = len(candidates), len(classes)
+    i, j = np.empty((N, 2 * m), np.int64), np.empty((N, 2 * m), np.int64)
+    log_i, log_j = np.empty((N, 2 * m), np.float32), np.empty((N, 2 * m), np.float32)
+    p_i, p_j = np.empty((N, 2 * m), np.float32), np.empty((N, 2 * m), np.float32)
+    for c in range(N):
+        for k in range(m):
+            i[c, k] = j[c, m + k] = candidates[c]
+            j[c, k] = i[c, m + k] = classes[k]
+            log_i[c, k] = log_j[c, m + k] = np.float32(0.0)
+            log_j[c, k] = log_i[c, m + k] = log_counts[k]
+            p_i[c, k] = p_j[c, m + k] = np.float32(1.0)
+            p_j[c, k] = p_i[c, m + k] = presence[k]
+    return Ends(i, j, log_i, log_j, p_i, p_j)
 
 
 @compiled_in_any_order
@@ -1302,6 +1347,26 @@ def pool_classes(
     return distinct[:n], first[:n], row, counts[:n], 1.0 - absent[:n]
 
 
+@compiled
+def pool_relations(
+    row: NDArray[np.int64], n: int, holds: NDArray[np.bool_], observed: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Pool the relations of instances (A, N, N) into relations of classes (A, n, n).
+
+    ``row`` (N,) is the index of each instance's class, from 0 to n - 1. The results are ``holds``
+    and ``observed`` of `ClassEvidence`.
+    """
+    A, size, _ = holds.shape
+    class_holds, class_observed = np.zeros((A, n, n), np.bool_), np.zeros((A, n, n), np.bool_)
+    for a in range(A):
+        for i in range(size):
+            for j in range(size):
+                if i != j and (holds[a, i, j] or observed[a, i, j]):
+                    class_observed[a, row[i], row[j]] = True
+                    class_holds[a, row[i], row[j]] |= holds[a, i, j]
+    return class_holds, class_observed
+
+
 # ------------------------------------------------------------- calibration and ranking: questions
 
 EXCLUDED = np.float32(-1.0)
@@ -1527,6 +1592,79 @@ def likeliest_places(slopes, forward, backward, log_counts, count, first, share,
 
 
 @compiled
+def strongest(change, rows, count):
+    """Return the indices and values of the k <= `count` largest absolute changes, each (N, k).
+
+    The result leaves out the change of a class by itself.
+
+    Args:
+        change: (N, n) change of each explained class's log-odds by each of the n classes of the
+            scene.
+        rows: (N,) index of each explained class among the n classes. It is empty if the explained
+            classes are absent.
+        count: maximum of k.
+    """
+    N, n = change.shape
+    kept = min(count, n - (len(rows) > 0))
+    places, values = np.empty((N, kept), np.int64), np.empty((N, kept), np.float64)
+    usable = np.ones(n, np.bool_)
+    for c in range(N):
+        if len(rows):
+            usable[rows[c]] = False
+        indices = best(np.abs(change[c]), usable, kept)
+        if len(rows):
+            usable[rows[c]] = True
+        for k in range(kept):
+            places[c, k], values[c, k] = indices[k], change[c, indices[k]]
+    return places, values
+
+
+@compiled
+def observed_pairs(triples, row, judged, classes, relations):
+    """Return the pairs of objects with at least one observed relation, and their relations.
+
+    A bit set contains the relations of a pair. Bit a stands for relation a from subject to object.
+    Bit A + a stands for relation a from object to subject.
+
+    Args:
+        triples: (T, 3) observed relations, each as (relation, subject, object).
+        row: (N,) index of each object's class among the n classes.
+        judged: (N, N) bool, True for the ordered pairs of objects to judge. The result contains a
+            pair if one of its two orders is True.
+        classes: number n of classes in the scene.
+        relations: number A of canonical relations.
+
+    Returns:
+        Four arrays (P,): subject, object, bit set of the relations between these two objects, and
+        bit set of the relations between any two objects of their classes.
+    """
+    size = len(row)
+    holds, of_classes = np.zeros((size, size), np.int64), np.zeros((classes, classes), np.int64)
+    for t in range(len(triples)):
+        a, x, y = triples[t, 0], triples[t, 1], triples[t, 2]
+        holds[x, y] |= 1 << a
+        holds[y, x] |= 1 << (relations + a)
+        of_classes[row[x], row[y]] |= 1 << a
+        of_classes[row[y], row[x]] |= 1 << (relations + a)
+    columns = np.empty((4, min(len(triples), size * size)), np.int64)
+    pairs, forward = 0, (1 << relations) - 1
+    for x in range(size):
+        for y in range(x + 1, size):
+            if holds[x, y] and (judged[x, y] or judged[y, x]):
+                # The subject of the pair is the subject of its observed relation with the lowest
+                # number. n & -n is the lowest bit of n.
+                from_x, from_y = holds[x, y] & forward, holds[y, x] & forward
+                y_is_lower = from_y != 0 and (from_y & -from_y) < (from_x & -from_x)
+                swapped = from_x == 0 or y_is_lower
+                subject, object_ = (y, x) if swapped else (x, y)
+                columns[0, pairs], columns[1, pairs] = subject, object_
+                columns[2, pairs] = holds[subject, object_]
+                columns[3, pairs] = of_classes[row[subject], row[object_]]
+                pairs += 1
+    return columns[0, :pairs], columns[1, :pairs], columns[2, :pairs], columns[3, :pairs]
+
+
+@compiled
 def disagreeing(slopes, forward, backward, log_counts, holds, of_classes, least, count):
     """Return the `count` pairs whose observed relations differ most from the expected relation.
 
@@ -1540,9 +1678,8 @@ def disagreeing(slopes, forward, backward, log_counts, holds, of_classes, least,
         forward: (A, P) log-odds of the relations from subject to object.
         backward: (A, P) log-odds of the relations from object to subject.
         log_counts: (P,) log of the number of object pairs with these two classes.
-        holds, of_classes: (P,) bit sets of the relations between the two objects, and between any
-            two objects of their classes. Bit a stands for relation a from subject to object, and
-            bit A + a for relation a from object to subject.
+        holds, of_classes: (P,) bit sets of the relations of the pair and of its classes; see
+            `observed_pairs`.
         least: minimum probability of an expected relation.
         count: maximum number k of pairs.
 
@@ -1579,10 +1716,70 @@ def disagreeing(slopes, forward, backward, log_counts, holds, of_classes, least,
 INTERCEPT, SINGLE, SEVERAL, ROOM = 0, 1, 2, 3
 """Columns of `Counts.weights`: intercept, 1 if one object is listed, 1 if another class is listed
 several times, and the first of C room types. The last V columns are those of the other classes."""
+
+
+@compiled
+def count_distributions(
+    known: NDArray[np.integer[Any]],
+    most: NDArray[np.integer[Any]],
+    log_share: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    classes: Ints,
+    listed: Ints,
+    room: int,
+    first: int,
+    log_unlisted: float,
+) -> tuple[Ints, Floats]:
+    """Return the classes and the distributions of `distribution`, (k,) and (k, M).
+
+    Args:
+        known, most, log_share, weights: see `Counts`. Column `first` of the weights is class 0.
+        classes, listed: (n,) listed classes, and numbers of listed objects.
+        room: index of the room type, or -1.
+    """
+    n, M = len(classes), log_share.shape[1]
+    p, rows, k = np.empty((n, M), np.float64), np.empty(n, np.int64), 0
+    exponents, several, entry = np.empty(2), 0, np.empty(n, np.int64)
+    for i in range(n):
+        several += listed[i] > 1
+        entry[i] = _find(known, classes[i])
+        if entry[i] >= 0 and listed[i] <= most[entry[i]]:
+            rows[k] = i
+            k += 1
+    for row in range(k):
+        e, number = entry[rows[row]], listed[rows[row]]
+        for x in range(2):
+            exponents[x] = 0.0
+            # The effect of a class on itself is 0, so the sum over all listed classes is correct.
+            for j in range(n):
+                exponents[x] += weights[e, x, first + classes[j]]
+            exponents[x] /= math.sqrt(max(n - 1, 1))
+            exponents[x] += weights[e, x, INTERCEPT]
+            if number == 1:
+                exponents[x] += weights[e, x, SINGLE]
+            if several > (number > 1):
+                exponents[x] += weights[e, x, SEVERAL]
+            if room >= 0:
+                exponents[x] += weights[e, x, ROOM + room]
+        largest, total = -np.inf, 0.0
+        for m in range(number, M + 1):
+            log = math.log(m)
+            value = log_share[e, m - 1] + exponents[0] * log + (m - number) * log_unlisted
+            p[row, m - 1] = value + exponents[1] * log * (math.log(M) - log)
+            largest = max(largest, p[row, m - 1])
+        for m in range(number, M + 1):
+            p[row, m - 1] = math.exp(p[row, m - 1] - largest)
+            total += p[row, m - 1]
+        for m in range(M):
+            p[row, m] = p[row, m] / total if m + 1 >= number else 0.0
+    return rows[:k], p[:k]
+
+
 # --------------------------------------------------------- offsets and counts of places: registry
 
 UNOBSERVED: Final = -1
 """Number of scenes for a relation that never occurs in training, so that an offset is unknown."""
+_PER_METRE: Final = 1000.0  # offsets are rounded to millimetres
 
 
 @compiled
@@ -1609,6 +1806,75 @@ def look_up_offsets(tables, relation, subject, other):
 
 
 @compiled
+def rotated_offsets(
+    tables: tuple[NDArray[Any], ...],
+    relation: NDArray[np.int64],
+    missing: NDArray[np.int64],
+    anchor: NDArray[np.int64],
+    outgoing: NDArray[np.bool_],
+    axes: NDArray[np.float64],
+    has_axes: bool,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Compute the mean (n, 3), standard deviation (n, 3) and number of scenes (n,) of n offsets.
+
+    ``has_axes`` is False if the viewing direction is unknown. For the other arguments, see
+    `offsets_of`.
+    """
+    n = len(relation)
+    subject, object_ = np.empty(n, np.int64), np.empty(n, np.int64)
+    for k in range(n):
+        subject[k], object_[k] = missing[k], anchor[k]
+        if not outgoing[k]:
+            subject[k], object_[k] = anchor[k], missing[k]
+    offset, scenes = look_up_offsets(tables, relation, subject, object_)
+    mean, variance, std = np.zeros((n, 3)), np.zeros((n, 3)), np.empty((n, 3))
+    for k in range(n):
+        if has_axes:
+            for axis in range(3):
+                axis_mean, axis_variance = offset[k, axis], offset[k, 3 + axis] ** 2
+                for to in range(3):
+                    mean[k, to] += axes[axis, to] * axis_mean
+                    variance[k, to] += axes[axis, to] ** 2 * axis_variance
+        else:
+            if relation[k] == LEFT or relation[k] == FRONT:
+                scenes[k] = UNOBSERVED
+            mean[k, 2], variance[k, 2] = offset[k, 2], offset[k, 5] ** 2
+            # Any horizontal direction is equally likely, so x and y share E[x²] + E[y²] equally.
+            for axis in range(2):
+                half = (offset[k, axis] ** 2 + offset[k, 3 + axis] ** 2) / 2
+                variance[k, 0] += half
+                variance[k, 1] += half
+        for axis in range(3):
+            value = mean[k, axis] if outgoing[k] else -mean[k, axis]
+            # Adding 0.0 turns -0.0 into 0.0.
+            mean[k, axis] = np.rint(value * _PER_METRE) / _PER_METRE + 0.0
+            millimetres = np.rint(math.sqrt(variance[k, axis]) * _PER_METRE)
+            std[k, axis] = max(millimetres, 1.0) / _PER_METRE
+    return mean, std, scenes
+
+
+@compiled
+def add_unseen(shown, change, candidates, classes, forward, backward):
+    """Add the changes of stacked relations that training never shows to log-odds, in place.
+
+    Args:
+        shown: (V, V) stacked relations of two classes that training shows. Bit a is relation a.
+        change: (3, V) change for each subject class.
+        candidates, classes: (N,) and (m,) classes.
+        forward, backward: (N, A, m) log-odds with the candidate and with the other class as
+            subject. The last A - 2 relations are the stacked ones.
+    """
+    for c in range(len(candidates)):
+        for a in range(forward.shape[1] - ON_TOP):
+            for k in range(len(classes)):
+                i, j = candidates[c], classes[k]
+                if not shown[i, j] >> a & 1:
+                    forward[c, ON_TOP + a, k] += change[a, i]
+                if not shown[j, i] >> a & 1:
+                    backward[c, ON_TOP + a, k] += change[a, j]
+
+
+@compiled
 def triple_counts(
     triple: NDArray[Any],
     held: NDArray[Any],
@@ -1625,6 +1891,53 @@ def triple_counts(
             if row >= 0:
                 counts[i, j] = held[row]
     return counts
+
+
+# ------------------------------------------------------------ drawn scenes: questions/generate.py
+
+# Direction of each relation: 1 for left, 2 for front, and 0 (up) for on-top, above and inside.
+# Their subjects are higher than their objects, or in their objects.
+_DIRECTION: Final = np.array([1, 2, 0, 0, 0])
+
+
+@compiled
+def select_consistent(
+    relation: NDArray[np.int64],
+    ends: NDArray[np.int64],
+    order: NDArray[np.int64],
+    fixed: int,
+    count: int,
+) -> NDArray[np.bool_]:
+    """Select relations that contradict neither the evidence nor each other, as a bool mask (m,).
+
+    Args:
+        relation: (fixed + m,) canonical relations. The relations of the evidence come first.
+        ends: (fixed + m, 2) indices of the subject and object classes, from 0 to count - 1.
+        order: indices from 0 to m - 1 of the drawn relations to try, likeliest first.
+        fixed: number of relations in the evidence.
+        count: number of classes.
+    """
+    # reaches[d, x, y] is True if relations of direction d lead from x to y, directly or through
+    # other classes.
+    reaches = np.zeros((3, count, count), np.bool_)
+    related, supported = np.zeros((count, count), np.bool_), np.zeros(count, np.bool_)
+    stay = np.zeros(len(relation) - fixed, np.bool_)
+    for turn in range(fixed + len(order)):
+        e = turn if turn < fixed else fixed + order[turn - fixed]
+        x, y, reached = ends[e, 0], ends[e, 1], reaches[_DIRECTION[relation[e]]]
+        on_top = relation[e] == ON_TOP
+        if turn >= fixed:
+            if reached[y, x] or related[x, y] or (on_top and supported[x]):
+                continue
+            stay[e - fixed] = True
+        related[x, y] = related[y, x] = True
+        supported[x] |= on_top
+        # Each class that leads to x now also leads to y and to all classes after y.
+        for k in range(count):
+            if k == x or reached[k, x]:
+                reached[k] |= reached[y]
+                reached[k, y] = True
+    return stay
 
 
 # -------------------------------------------------------------------- digits: questions/answer.py

@@ -210,16 +210,8 @@ class RelationUnits(ABC):
             Log-odds (N, R, m) with the candidate as subject, and log-odds (N, R, m) with the
             anchor as subject.
         """
-        N, m = len(candidates), len(anchors)
-        # Each candidate is present, with one instance.
-        classes = np.concatenate([candidates, context.classes[anchors]])
-        presence = np.concatenate([np.ones(N, np.float32), context.presence[anchors]])
-        log_counts = np.concatenate([np.zeros(N, np.float32), context.log_counts[anchors]])
-        # The candidate is the subject in the first m columns, and the object in the others.
-        of_candidate, of_anchor = np.indices((N, m))
-        subject = np.concatenate([of_candidate, N + of_anchor], axis=1)
-        object_ = np.concatenate([N + of_anchor, of_candidate], axis=1)
-        ends = ends_of(classes, presence, log_counts, subject, object_)
+        m, scene = len(anchors), (context.classes, context.log_counts, context.presence)
+        ends = kernels.placement_ends(candidates, *(part[anchors] for part in scene))
         means = state_means(context.x + self._W[candidates], self._states)
         log_odds = to_log_odds(*self.normal(means, ends, only))
         return log_odds[:, :, :m], log_odds[:, :, m:]

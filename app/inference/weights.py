@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference import kernels
-from app.inference.elementary import sigmoid, softmax
+from app.inference.elementary import sigmoid
 from app.inference.variants import MachineSpec
 
 SWEEPS: Final = 10
@@ -37,8 +37,6 @@ WORD: Final = 32
 SHARES: Final = (0.3, 0.6, 1.0)
 """Upper limits of the listed share of a scene in the bins of kappa. The last row of kappa is for
 lists of all classes but one."""
-
-_HALF: Final = np.float32(0.5)
 
 
 def layout(spec: MachineSpec) -> dict[str, tuple[type, tuple[int, ...]]]:
@@ -162,11 +160,7 @@ class Weights:
             one = np.zeros((len(presence), self.spec.profiles))
             one[:, profile] = 1.0
             return one
-        # The sum has float64 digits, so that listed structure, whose terms are 0, changes none.
-        p: NDArray[np.float64] = softmax(
-            self["f"] + presence @ self["a"][:, classes].T.astype(np.float64)
-        )
-        return p
+        return kernels.source_weights(self["f"], self["a"], classes, presence)
 
     def scene_bias(
         self, classes: NDArray[Any], profile: int | None, room: int | None

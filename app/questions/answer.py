@@ -14,7 +14,7 @@ import orjson
 from numpy.typing import NDArray
 from pydantic_core import from_json, to_json, to_jsonable_python
 
-from app.inference.kernels import DIGITS, round_to_digits
+from app.inference.kernels import DIGITS, round_to_digits, strongest
 from app.questions.posterior import Present
 from app.questions.reading import Reading
 from app.scene.scene import Scene
@@ -74,12 +74,8 @@ def reasons(
         For each explained class, a list of reasons with the fields of
         `scene_client.schemas.Because`.
     """
-    size = np.abs(change)
-    if rows is not None:
-        size[np.arange(len(rows)), rows] = 0  # a class is no reason for itself
-    columns = (-size).argsort(axis=1, kind="stable")[:, :REASONS]
-    strong = np.take_along_axis(size, columns, 1) >= max(least, _ROUNDING)
-    values = np.take_along_axis(change, columns, 1)
+    columns, values = strongest(change, np.zeros(0, np.int64) if rows is None else rows, REASONS)
+    strong = np.abs(values) >= max(least, _ROUNDING)
     entries: list[list[Fields]] = [[] for _ in change]
     numbers, changes = present.first[columns[strong]].tolist(), significant(values[strong])
     for row, number, value in zip(strong.nonzero()[0].tolist(), numbers, changes, strict=True):

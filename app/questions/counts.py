@@ -25,8 +25,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.elementary import softmax
-from app.inference.kernels import INTERCEPT, ROOM, SEVERAL, SINGLE, best
+from app.inference.kernels import best, count_distributions
 from app.questions.answer import Fields, significant
 from app.questions.posterior import Present
 from app.registry.artifact import Artifact
@@ -121,21 +120,12 @@ def distribution(
         Indices into `classes` of the k classes with statistics that cover the listed number, (k,).
         Then the probability of 1, 2, ... M instances, (k, M).
     """
-    known, weights, M = counts.classes, counts.weights, counts.log_share.shape[1]
-    entry = np.searchsorted(known[:-1], classes)
-    rows = np.flatnonzero((known[entry] == classes) & (listed <= counts.most[entry]))
-    entry, number = entry[rows, None], listed[rows, None]
-    # The effect of a class on itself is 0, so the sum over all listed classes is correct.
-    of_class = weights.shape[-1] - V + classes
-    exponents = weights[entry, :, of_class].sum(1, np.float64) / math.sqrt(max(len(classes) - 1, 1))
-    several = np.count_nonzero(listed > 1)
-    effects = (INTERCEPT, True), (SINGLE, number == 1), (SEVERAL, several > (number > 1))
-    for column, applies in effects if room is None else (*effects, (ROOM + room, True)):
-        exponents += weights[entry[:, 0], :, column] * applies
-    n = np.arange(1, M + 1)
-    logits = counts.log_share[entry[:, 0]] + exponents @ functions(M)
-    logits += (n - number) * math.log(max(unlisted, sys.float_info.min))
-    return rows, softmax(np.where(n >= number, logits, -np.inf))
+    scene = classes, listed, -1 if room is None else room
+    log_unlisted = math.log(max(unlisted, sys.float_info.min))
+    tables = counts.classes, counts.most, counts.log_share, counts.weights
+    first = counts.weights.shape[-1] - V
+    rows, p = count_distributions(*tables, *scene, first, log_unlisted)
+    return rows, p
 
 
 @lru_cache(maxsize=8)

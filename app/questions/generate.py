@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from app.errors import RareRoomTypeError
 from app.inference.chains import ChainState, ConditionedChains, Conditions, random_stream
+from app.inference.kernels import select_consistent
 from app.inference.posterior import context_of
 from app.questions.answer import Fields, rounded_number
 from app.questions.names import ErrorList
@@ -32,7 +33,7 @@ from app.questions.posterior import given_relations, present
 from app.questions.question import BEDROOM, POSES, REFUSED, Example, Options, Question
 from app.questions.reading import Reading, Triple
 from app.registry.artifact import Artifact
-from app.scene.relations import CANONICAL, ON_TOP
+from app.scene.relations import CANONICAL
 from app.scene.scene import Scene, SceneObject
 from scene_client.schemas import GenerateAnswer, GenerateRequest
 
@@ -42,10 +43,6 @@ STEPS: Final = 50
 ATTEMPTS: Final = 8
 """Maximum number of draws for one scene."""
 
-
-# Direction of each relation: 1 for left, 2 for front, and 0 (up) for on-top, above and inside. The
-# subjects of these are higher than their objects, or in their objects.
-_DIRECTION: Final = (1, 2, 0, 0, 0)
 
 # Size in bits of a seed that the service chooses. A double, in which a JSON reader may store it,
 # represents such an integer exactly.
@@ -172,27 +169,11 @@ def staying(
     order = np.lexsort((*units.T[::-1], -logits))
     possible = (units[:, 1] != units[:, 2]) & ~structure[units[:, 1:]].any(axis=1)
     triples = np.concatenate([fixed, units])
+    relation = np.ascontiguousarray(triples[:, 0])
     classes, ends = np.unique(triples[:, 1:], return_inverse=True)
-    relation_and_ends = np.c_[triples[:, 0], ends.reshape(-1, 2)].tolist()
-    # reaches[d, x, y] is True if relations of direction d lead from x to y, through any number of
-    # other classes.
-    reaches = np.broadcast_to(np.eye(len(classes), dtype=np.bool_), (3, *[len(classes)] * 2)).copy()
-    stay = np.zeros(len(triples), np.bool_)
-    related, supported = set[tuple[int, int]](), set[int]()
-    for number in (*range(len(fixed)), *(len(fixed) + order[possible[order]]).tolist()):
-        a, x, y = relation_and_ends[number]
-        reached = reaches[_DIRECTION[a]]
-        if number >= len(fixed) and (
-            (x, y) in related or reached[y, x] or (a == ON_TOP and x in supported)
-        ):
-            continue
-        stay[number] = True
-        related |= {(x, y), (y, x)}
-        if a == ON_TOP:
-            supported.add(x)
-        # Each class that leads to x now also leads to all classes to which y leads.
-        reached |= reached[:, x, None] & reached[y]
-    stay = stay[len(fixed) :]
+    stay: NDArray[np.bool_] = select_consistent(
+        relation, ends.reshape(-1, 2), order[possible[order]], len(fixed), len(classes)
+    )
     # A drawn relation that is part of the evidence always stays.
     if evidence:
         shape = len(CANONICAL), len(structure), len(structure)

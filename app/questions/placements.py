@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.kernels import NO_UNIT, UNOBSERVED, likeliest_places
+from app.inference.kernels import NO_UNIT, UNOBSERVED, add_unseen, likeliest_places, rotated_offsets
 from app.questions.answer import Fields, significant
 from app.questions.posterior import Posterior
 from app.registry.artifact import Artifact
@@ -38,7 +38,7 @@ PLACES: Final = 3
 LEAST_SHARE: Final = 0.75  # least probability of a placement, as a share of the first placement
 LEAST_LIKELY: Final = 0.05  # least probability of a placement
 _SEEN_FROM_ANCHORS: Final = tuple(map(opposite, RELATIONS))
-_PER_METRE: Final = 1000.0  # offsets are rounded to millimetres
+_UNTURNED: Final = np.eye(3)
 
 
 class Place(NamedTuple):
@@ -114,13 +114,7 @@ def placements(
             objects[column] = at.anchor
     things = [scene.objects[number] for number in objects.tolist()]
     if A > ON_TOP and artifact.places is not None:
-        shown, change = artifact.places.unseen
-        bits = np.arange(A - ON_TOP)[:, None]
-        for log_odds, subject, other in (
-            (forward, candidates[:, None, None], classes),
-            (backward, classes, candidates[:, None, None]),
-        ):
-            log_odds[:, ON_TOP:] += change[bits, subject] * (shown[subject, other] >> bits & 1 == 0)
+        add_unseen(*artifact.places.unseen, candidates, classes, forward, backward)
     if A > INSIDE:
         candidates_too_large, things_too_large = _too_large(artifact, things, candidates, classes)
         forward[:, INSIDE][candidates_too_large] = NO_UNIT
@@ -221,18 +215,8 @@ def offsets_of(
         scenes that contain the two classes in this relation, (n,). It is `UNOBSERVED` for an
         unknown offset.
     """
-    subject, object_ = np.where(outgoing, (missing, anchor), (anchor, missing))
-    offset, scenes = offsets.find(relation, subject, object_)
-    mean, variance = offset[:, :3], offset[:, 3:] ** 2
-    if axes is not None:
-        mean, variance = mean @ np.array(axes), variance @ np.array(axes) ** 2
-    else:
-        scenes[relation < ON_TOP] = UNOBSERVED
-        # Any horizontal direction is equally likely, so x and y share E[x²] + E[y²] equally.
-        variance[:, :2] = (mean[:, :2] ** 2 + variance[:, :2]).sum(axis=1, keepdims=True) / 2
-        mean = mean * [0, 0, 1]
-    mean = np.where(outgoing[:, None], mean, -mean)
-    # Adding 0.0 turns -0.0 into 0.0.
-    mean = np.rint(mean * _PER_METRE) / _PER_METRE + 0.0
-    std = np.maximum(np.rint(np.sqrt(variance) * _PER_METRE), 1.0) / _PER_METRE
+    rotation = _UNTURNED if axes is None else np.array(axes)
+    mean, std, scenes = rotated_offsets(
+        offsets.tables, relation, missing, anchor, outgoing, rotation, axes is not None
+    )
     return mean, std, scenes

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import InvalidRequestError, Location
-from app.inference.kernels import EXCLUDED, disagreeing, likeliest_relations
+from app.inference.kernels import EXCLUDED, disagreeing, likeliest_relations, observed_pairs
 from app.questions.answer import Fields, significant
 from app.questions.names import ErrorList
 from app.questions.placements import held_objects
@@ -180,26 +180,16 @@ def _disagreements(
     stated = [triple for triple in scene.relations or () if triple[0] < A]
     if not stated:
         return []
-    row = posterior.present.row
-    # Bit sets, as `disagreeing` describes them, of each ordered pair of objects and of classes.
-    a, x, y = np.array(stated).T
-    of_objects, of_classes = np.zeros((2, len(row), len(row)), np.int64)
-    for bit, first, second in ((a, x, y), (A + a, y, x)):
-        np.bitwise_or.at(of_objects, (first, second), 1 << bit)
-        np.bitwise_or.at(of_classes, (row[first], row[second]), 1 << bit)
-    x, y = np.triu(of_objects * (judged | judged.T)).nonzero()
-    if not len(x):
+    present = posterior.present
+    pairs = observed_pairs(np.array(stated), present.row, judged, len(present.classes), A)
+    subjects, objects, holds, of_classes = pairs
+    if not len(subjects):
         return []
-    # The subject of a pair is that of its observed relation with the lowest number. The lowest bit
-    # of n is n & -n. A relation of the pair itself has a lower bit than one of the reversed pair.
-    lowest = of_objects & -of_objects
-    is_subject = lowest[x, y] < lowest[y, x]
-    subjects, objects = np.where(is_subject, (x, y), (y, x))
-    holds, i, j = of_objects[subjects, objects], row[subjects], row[objects]
+    i, j = present.row[subjects], present.row[objects]
     table, least = artifact.relation_slopes.relation_given, max(least, EXPECTED)
-    log_odds, log_counts = posterior.log_odds_apart(i, j), posterior.present.log_counts
+    log_odds, log_counts = posterior.log_odds_apart(i, j), present.log_counts
     chosen, expected, p, observed_p = disagreeing(
-        table, *log_odds, log_counts[i] + log_counts[j], holds, of_classes[i, j], least, top_k
+        table, *log_odds, log_counts[i] + log_counts[j], holds, of_classes, least, top_k
     )
     columns = *(part[chosen].tolist() for part in (subjects, objects, holds)), expected.tolist()
     return [
@@ -228,7 +218,7 @@ def _names(
     Args:
         A: number of canonical relations that the machine knows.
         flipped: relations that the request states by their opposite.
-        holds: bit set of the observed relations; see `disagreeing`.
+        holds: bit set of the observed relations; see `observed_pairs`.
         expected: number of the expected relation.
     """
     names = relation_names(A)

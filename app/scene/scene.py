@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference.kernels import pool_classes as pool_classes
+from app.inference.kernels import pool_relations as pool_relations
 from app.scene.geometry import (
     SMALLEST,
     PoseRelations,
@@ -184,19 +185,3 @@ def instance_evidence(scene: Scene) -> tuple[NDArray[np.bool_], NDArray[np.bool_
     if scene.relations:
         holds[tuple(np.array(scene.relations).T)] = True
     return holds, np.full((A, size, size), scene.relations_complete)
-
-
-def pool_relations(
-    row: Indices, n: int, holds: NDArray[np.bool_], observed: NDArray[np.bool_]
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Pool the relations of instances (A, N, N) into relations of classes (A, n, n).
-
-    ``row`` (N,) is the index of each instance's class, from 0 to n - 1. The results are which
-    relations of classes hold, and which are observed.
-    """
-    pooled = np.zeros((2, len(holds), n, n), np.bool_)
-    is_pair = ~np.eye(len(row), dtype=np.bool_)
-    for of_classes, of_instances in zip(pooled, (holds, holds | observed), strict=True):
-        a, i, j = (of_instances & is_pair).nonzero()
-        of_classes[a, row[i], row[j]] = True
-    return pooled[0], pooled[1]
