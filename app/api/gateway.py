@@ -147,10 +147,19 @@ class Failures:
         """
         try:
             await self._app(scope, receive, send)
-        except Exception as error:
-            problem = from_exception(error, scope["state"]["request_id"])
-            record: Record = scope["state"]["record"]
-            if record.status:
-                record.outcome, record.status = problem.slug, 500
-                raise
-            await answer(problem, scope, receive, send)
+        except Exception as error:  # noqa: BLE001 - _fail() answers and logs every error
+            await _fail(error, scope, receive, send)
+
+
+async def _fail(error: Exception, scope: Scope, receive: Receive, send: Send) -> None:
+    """Answer a failure, or raise it again if a part of the response has been sent already.
+
+    This is a separate function, because the error refers to the frame that catches it. A variable
+    of that frame must not refer to the error: the cycle would keep the body in memory.
+    """
+    problem = from_exception(error, scope["state"]["request_id"])
+    record: Record = scope["state"]["record"]
+    if record.status:
+        record.outcome, record.status = problem.slug, 500
+        raise error
+    await answer(problem, scope, receive, send)

@@ -292,7 +292,7 @@ TARGET = torch.where(EVERY.sum(1) >= 2, TARGET, 0) / TARGET[EVERY.sum(1) >= 2].s
 """Two contexts, in scenes of at least two classes."""
 
 
-@pytest.mark.parametrize("name", SPECS)
+@pytest.mark.parametrize("name", ONE_LAYER)
 def test_the_generative_share_brings_samples_near_the_scenes(name):
     """By the divergence of the enumerated p(v) from the scenes, in nats."""
 

@@ -193,7 +193,8 @@ def test_an_interrupted_ablation_goes_on(ablated, tmp_path, monkeypatch):
     monkeypatch.setattr(RelationFit, "epoch", interrupted)
     assert "to continue" in invoke(*command, code=130)
     invoke(*command)
-    assert widths == [3, 3, 12, 12, 12]
+    # The first row has ended. The second one, stopped in its second epoch, starts again.
+    assert widths == [3, 3, 12, 12, 12, 12]
     first, again = (read(x)[1] for x in (ablated, tmp_path / "ablation/rooms-triway"))
     assert again == {key: value for key, value in first.items() if key[0] != "no-counts"}
 
