@@ -40,15 +40,15 @@ COPY app ./app
 COPY training ./training
 COPY --chown=10001:10001 model_store ./model_store
 # Commands run in this folder. A volume mounted here belongs to the user.
-RUN install -d -o 10001 -g 10001 /work
+RUN install -d -o 10001 -g 10001 /srv/training
 # Under a read-only root, only /tmp and volumes are writable.
 ENV HOME=/tmp \
     MPLCONFIGDIR=/tmp/matplotlib \
-    NUMBA_CACHE_DIR=/work/.compiled \
+    NUMBA_CACHE_DIR=/srv/training/.compiled \
     PYTHONPATH=/srv/scene \
     SCENE_STORE=/srv/scene/model_store
 USER 10001:10001
-WORKDIR /work
+WORKDIR /srv/training
 ENTRYPOINT ["python", "-m", "training"]
 CMD ["--help"]
 

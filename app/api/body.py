@@ -193,7 +193,7 @@ class _Pieces:
         return value
 
     def _peek(self) -> str:
-        """Return the next character that is no white space, or an empty text at the end."""
+        """Skip white space. Return the next character, or an empty text at the end."""
         self._at = _SPACE.match(self._text, self._at).end()  # type: ignore[union-attr]
         return self._text[self._at : self._at + 1]
 

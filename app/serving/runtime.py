@@ -78,7 +78,7 @@ class Runtime:
         self.admission.stop()
 
     def request_check(self) -> None:
-        """Make the service load the state of the store now, even if nothing has changed."""
+        """Make the service load the state of the store now, also an unchanged one."""
         self._requested.set()
 
     async def check_store(self, *, always: bool = False) -> None:

@@ -55,7 +55,7 @@ class FileNote(Reply):
 
 
 class ScenesAnswer(Reply):
-    """The scenes of a file in the order of the file, and notes on what they leave out."""
+    """The scenes of a file in their order, and notes about the parts that they leave out."""
 
     request_id: str
     scenes: list[FileScene]
