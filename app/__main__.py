@@ -1,7 +1,5 @@
 """``python -m app``: start the service with the settings of the environment."""
 
-from __future__ import annotations
-
 import argparse
 import ctypes
 import errno
@@ -125,7 +123,7 @@ def _bind(host: str, port: int, send_timeout: float) -> list[socket.socket]:
     return bound
 
 
-def _refuse_address(settings: Settings, error: OSError) -> int:
+def _refuse_address(settings: "Settings", error: OSError) -> int:
     """Print why the service cannot listen on its address; return the exit status."""
     address = f"{settings.host}:{settings.port}"
     if error.errno == errno.EADDRINUSE:
@@ -137,7 +135,7 @@ def _refuse_address(settings: Settings, error: OSError) -> int:
     return 3
 
 
-def serve(settings: Settings, began: float) -> int:
+def serve(settings: "Settings", began: float) -> int:
     """Serve until the process is stopped. Return its exit status: 0, or 3 if it could not start.
 
     Args:

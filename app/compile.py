@@ -1,7 +1,5 @@
 """``python -m app.compile``: compile kernels and sources for this machine before a start."""
 
-from __future__ import annotations
-
 import asyncio
 import compileall
 import sys

@@ -4,8 +4,6 @@ A stored loop is code: a user who can write to this directory can run code in th
 service refuses a directory that other users can change.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import stat

@@ -4,8 +4,6 @@ The docstring of a class is the page of the problem type: its first line is the 
 else derives from `ERRORS`: the pages, the error responses in the OpenAPI document, and the tests.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final, Literal
@@ -38,7 +36,7 @@ Step = Literal[
 MOST_NAMED: Final = 50
 """Maximum number of known names in the message of an error."""
 
-ERRORS: Final[dict[str, type[ServiceError]]] = {}
+ERRORS: Final[dict[str, type["ServiceError"]]] = {}
 """All problem types by slug, in the order of this module."""
 
 

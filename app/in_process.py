@@ -1,7 +1,5 @@
 """An httpx transport that runs the service in the process of the client."""
 
-from __future__ import annotations
-
 import weakref
 from contextlib import ExitStack
 from pathlib import Path

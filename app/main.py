@@ -1,7 +1,5 @@
 """The application: wiring and lifespan."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager

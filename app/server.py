@@ -1,7 +1,5 @@
 """The server: uvicorn with a graceful shutdown."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import fcntl

@@ -1,7 +1,5 @@
 """The settings of the service, read from environment variables with the prefix ``SCENE_``."""
 
-from __future__ import annotations
-
 import os
 import re
 import sys

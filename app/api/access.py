@@ -1,7 +1,5 @@
 """Who may use the service: the checks of the Host header, of the origin and of the API key."""
 
-from __future__ import annotations
-
 import hmac
 import re
 from typing import Final

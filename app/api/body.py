@@ -1,7 +1,5 @@
 """Strict reading of JSON bodies. docs/decisions/http.md gives the reason for each rule."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import re

@@ -5,8 +5,6 @@ example requests unchanged. Figures in the example answers are only illustrative
 question in `app.questions` contains the examples of this question.
 """
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 from app.errors import UnknownLabelsError

@@ -1,7 +1,5 @@
 """The steps of a request before its route: ASGI middleware with one concern each."""
 
-from __future__ import annotations
-
 import logging
 import re
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ The process is ready if its default model has answered a question during the war
 also has the route of the metrics.
 """
 
-from __future__ import annotations
-
 from fastapi import APIRouter
 from fastapi.responses import PlainTextResponse
 

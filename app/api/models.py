@@ -1,7 +1,5 @@
 """Routes that list the models, their versions and their vocabularies."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict
 from functools import partial

@@ -1,7 +1,5 @@
 """The OpenAPI document: stable operation ids, and all problems of each route."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 from fastapi import FastAPI

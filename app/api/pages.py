@@ -4,8 +4,6 @@ With the Content-Security-Policy of these pages, a browser loads files only from
 page cannot contact another host by mistake.
 """
 
-from __future__ import annotations
-
 from html import escape
 from importlib.resources import files
 from pathlib import Path

@@ -3,8 +3,6 @@
 A problem document never contains a traceback, a file name or a copy of the input.
 """
 
-from __future__ import annotations
-
 import logging
 from difflib import get_close_matches
 from typing import Final

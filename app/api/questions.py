@@ -3,8 +3,6 @@
 The answer to a batch has one entry for each scene.
 """
 
-from __future__ import annotations
-
 from collections.abc import Awaitable, Callable
 from typing import Any, TypeVar
 

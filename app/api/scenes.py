@@ -3,8 +3,6 @@
 The readers are those of the client (`scene_client.files`). The service stores nothing.
 """
 
-from __future__ import annotations
-
 import binascii
 from collections.abc import Callable
 from typing import Final

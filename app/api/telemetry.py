@@ -5,8 +5,6 @@ The service sends only traces to OpenTelemetry. Prometheus reads the metrics
 messages.
 """
 
-from __future__ import annotations
-
 import os
 from typing import Final
 

@@ -1,7 +1,5 @@
 """The steps that give a request its deadline, its body and its turn."""
 
-from __future__ import annotations
-
 import re
 from time import monotonic
 from typing import Final

@@ -18,8 +18,6 @@ priority. Compiled loops release the interpreter lock, so the event loop can con
 Each question is computed separately, so an answer never depends on other requests.
 """
 
-from __future__ import annotations
-
 import asyncio
 import os
 import threading

@@ -1,7 +1,5 @@
 """Log formats: JSON lines or plain text, on standard error. Keys are masked in every line."""
 
-from __future__ import annotations
-
 import json
 import logging
 from collections.abc import Sequence

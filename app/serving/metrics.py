@@ -4,8 +4,6 @@ Clients cannot create label values of metrics, so the number of series stays sma
 route is its template, and only served models have labels. Each replica reports its own metrics.
 """
 
-from __future__ import annotations
-
 import asyncio
 import time
 from functools import partial

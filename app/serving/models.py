@@ -4,8 +4,6 @@ A snapshot of the models never changes, so a request uses the same models from b
 name without a version means the newest usable version.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging
@@ -13,7 +11,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final
+from typing import Final, Self
 
 from app.errors import (
     ModelUnavailableError,
@@ -130,7 +128,7 @@ class ServedModels:
         except NotReadyError:
             return False
 
-    def lost_in(self, new: ServedModels) -> list[Failure]:
+    def lost_in(self, new: Self) -> list[Failure]:
         """Return the failures of entries that are usable here and unusable in a newer snapshot."""
         lost = {*self.usable, DEFAULT} if self.is_ready and not new.is_ready else self.usable
         return [failure for subject, failure in new.failures.items() if subject in lost]

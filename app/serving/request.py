@@ -1,7 +1,5 @@
 """A request in the serving layer: its deadline, its models, and its record for log and metrics."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial

@@ -1,7 +1,5 @@
 """The runtime of the process. It contains the current snapshot of the models."""
 
-from __future__ import annotations
-
 import asyncio
 import ctypes
 import gc
