@@ -61,9 +61,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
 
 def _add_routes(app: FastAPI, settings: Settings) -> None:
-    app.router.routes.extend(
-        (*questions.router.routes, *questions.batches.routes, *scenes.router.routes)
-    )
+    app.router.routes.extend((*questions.router.routes, *scenes.router.routes))
     routers = [models.router, health.router, *([health.monitoring] if settings.metrics else [])]
     for router in routers:
         app.include_router(router)

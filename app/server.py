@@ -6,18 +6,9 @@ import fcntl
 import logging
 import os
 import signal
+import socket
 import struct
 from contextlib import suppress
-from socket import (
-    AF_INET,
-    SO_ACCEPTCONN,
-    SOCK_DGRAM,
-    SOL_SOCKET,
-    gethostname,
-    if_nameindex,
-    inet_ntoa,
-    socket,
-)
 from time import monotonic
 from types import FrameType
 from typing import Final
@@ -62,7 +53,7 @@ class Server(uvicorn.Server):
         self._began = began
         self._has_terminal = os.isatty(0)
 
-    async def startup(self, sockets: list[socket] | None = None) -> None:
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Load the models, accept connections and log the addresses of the service.
 
         Raises:
@@ -87,7 +78,7 @@ class Server(uvicorn.Server):
         else:
             self._runtime.request_check()
 
-    def _log_addresses(self, sockets: list[socket]) -> None:
+    def _log_addresses(self, sockets: list[socket.socket]) -> None:
         port = sockets[0].getsockname()[1]
         hosts = dict.fromkeys(listener.getsockname()[0] for listener in sockets)
         others = [host for host in hosts if host not in _ANY]
@@ -135,9 +126,9 @@ class Server(uvicorn.Server):
         return await super().on_tick(counter)
 
 
-def _listens(listener: socket) -> bool:
+def _listens(listener: socket.socket) -> bool:
     try:
-        return listener.getsockopt(SOL_SOCKET, SO_ACCEPTCONN) == 1
+        return listener.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN) == 1
     except OSError:  # the socket is closed
         return False
 
@@ -154,12 +145,12 @@ def _lan_addresses() -> list[str]:
     in multicast DNS.
     """
     found = []
-    with socket(AF_INET, SOCK_DGRAM) as probe:
-        for _, name in if_nameindex():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        for _, name in socket.if_nameindex():
             with suppress(OSError):  # the interface has no address
                 answer = fcntl.ioctl(probe, _SIOCGIFADDR, struct.pack("256s", name.encode()))
-                found.append(inet_ntoa(answer[20:24]))
-    name = f"{gethostname().partition('.')[0]}.local"
+                found.append(socket.inet_ntoa(answer[20:24]))
+    name = f"{socket.gethostname().partition('.')[0]}.local"
     return [address for address in found if not address.startswith("127.")] or [name]
 
 

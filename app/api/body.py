@@ -2,9 +2,10 @@
 
 import asyncio
 import json
+import math
 import re
 from collections import Counter
-from collections.abc import Iterator, Sized
+from collections.abc import Iterator
 from contextlib import suppress
 from email.message import Message
 from functools import cache
@@ -18,7 +19,7 @@ from starlette.requests import Request
 from starlette.types import Receive, Scope, Send
 
 from app import errors
-from app.serving.admission import SMALL, Bodies, in_thread
+from app.serving.admission import SMALL, Bodies
 from app.serving.runtime import Runtime
 from scene_client.schemas import MAX_BATCH, FieldError
 from scene_client.schemas import Request as Form
@@ -45,7 +46,7 @@ def validated(value: Any, form: type[FormT], *, at: errors.Location = ()) -> For
         InvalidRequestError: the value does not match the schema.
     """
     too_long = [
-        FieldError(pointer=pointer((*at, name)), message=f"must have at most {most} entries")
+        _too_many(pointer((*at, name)), most)
         for name, most in _most_entries(form).items()
         if isinstance(value, dict) and isinstance(value.get(name), list) and len(value[name]) > most
     ]
@@ -56,6 +57,10 @@ def validated(value: Any, form: type[FormT], *, at: errors.Location = ()) -> For
     except ValidationError as error:
         invalid = field_errors(error, value, form, at=at)
         raise errors.InvalidRequestError(errors=invalid) from None
+
+
+def _too_many(place: str, most: int) -> FieldError:
+    return FieldError(pointer=place, message=f"must have at most {most} entries")
 
 
 @cache
@@ -84,7 +89,7 @@ def parse(body: bytes, most: int) -> Any:
     _check_density(body, most)
     try:
         if len(body) > most:
-            return _Pieces(body.decode(), most).read()
+            return _in_pieces(body.decode(), most)
         # from_json() is strict, but only the decoder of the standard library finds duplicate names.
         from_json(body, allow_inf_nan=False)
         return _DECODER.decode(body.decode())
@@ -121,100 +126,81 @@ def _invalid(detail: str) -> errors.InvalidRequestError:
 
 def _not_finite(body: bytes) -> list[FieldError]:
     """Return an error for each NaN and Infinity in a small body that is otherwise JSON."""
-    if len(body) > SMALL or (b"NaN" not in body and b"Infinity" not in body):
-        return []
     try:
-        constants = islice(_constants(_LENIENT.decode(body.decode())), MAX_ERRORS)
-        return [
-            FieldError(pointer=pointer(at), message=f"must be a finite number, not {name}")
-            for name, at in constants
-        ]
-    except (ValueError, RecursionError):
+        value = from_json(body) if len(body) <= SMALL else None
+    except ValueError:
         return []
+    return [
+        FieldError(pointer=pointer(at), message=f"must be a finite number, not {name}")
+        for name, at in islice(_constants(value), MAX_ERRORS)
+    ]
 
 
-class _Pieces:
-    """A large JSON object, parsed in short steps, because the parsers hold the interpreter.
+def _in_pieces(text: str, most: int) -> dict[str, Any]:
+    """Parse a large JSON object in short steps, because the parsers hold the interpreter.
 
     A step parses one member, or one entry of a list: a text, or at most ``most`` characters.
     """
+    at = 0
 
-    def __init__(self, text: str, most: int) -> None:
-        self._text, self._most, self._at = text, most, 0
+    def mark(expected: str) -> str:
+        """Read one of the expected characters and the spaces around it. Return the character."""
+        nonlocal at
+        found = _MARK.match(text, at)
+        if found is None or found[1] not in expected:
+            raise ValueError(f"expected one of {expected} at character {at}")
+        at = found.end()
+        return found[1]
 
-    def read(self) -> dict[str, Any]:
-        """Return the object. Raise ValueError or InvalidRequestError like `parse`."""
-        members: list[tuple[str, Any]] = []
-        for _ in self._each("{}"):
-            name = self._value()
-            if not isinstance(name, str):
-                raise ValueError(f"expected a name before character {self._at}")
-            self._mark(":")
-            members.append((name, self._entries(name) if self._peek() == "[" else self._value()))
-            _check_number(members)
-        if self._peek():
-            raise ValueError(f"trailing characters at character {self._at}")
-        return _members(members)
-
-    def _entries(self, name: str) -> list[Any]:
-        entries: list[Any] = []
-        for _ in self._each("[]"):
-            if len(entries) == MAX_BATCH:
-                message = f"must have at most {MAX_BATCH} entries"
-                too_long = FieldError(pointer=pointer((name,)), message=message)
-                raise errors.InvalidRequestError(errors=[too_long])
-            entries.append(self._value())
-        return entries
-
-    def _each(self, brackets: str) -> Iterator[None]:
+    def parts(opening: str, closing: str) -> Iterator[None]:
         """Read the brackets and commas of an object or array. Yield before each of its parts."""
-        closing = brackets[1]
-        self._mark(brackets[0])
-        mark = self._mark(closing) if self._peek() == closing else ","
-        while mark != closing:
+        mark(opening)
+        last = mark(closing) if text.startswith(closing, at) else ","
+        while last != closing:
             yield
-            mark = self._mark("," + closing)
+            last = mark("," + closing)
 
-    def _value(self) -> Any:
+    def value() -> Any:
+        nonlocal at
         # The parsers would read the rest of the body, so the slice bounds the step.
-        is_text = self._peek() == '"'
-        text, start = self._text, self._at
-        if not is_text:
-            text, start = text[start : start + self._most], 0
+        part, start = (text, at) if text.startswith('"', at) else (text[at : at + most], 0)
         try:
-            value, end = _DECODER.raw_decode(text, start)
-            from_json(text[start:end], allow_inf_nan=False)
+            found, end = _DECODER.raw_decode(part, start)
+            from_json(part[start:end], allow_inf_nan=False)
         except (ValueError, RecursionError) as error:
-            message = f"the value at character {self._at} is invalid or too long: {error}"
+            message = f"the value at character {at} is invalid or too long: {error}"
             raise ValueError(message) from None
-        self._at += end - start
-        return value
+        at += end - start
+        return found
 
-    def _peek(self) -> str:
-        """Skip white space. Return the next character, or an empty text at the end."""
-        self._at = _SPACE.match(self._text, self._at).end()  # type: ignore[union-attr]
-        return self._text[self._at : self._at + 1]
+    def entries(name: str) -> list[Any]:
+        found: list[Any] = []
+        for _ in parts("[", "]"):
+            if len(found) == MAX_BATCH:
+                raise errors.InvalidRequestError(errors=[_too_many(pointer((name,)), MAX_BATCH)])
+            found.append(value())
+        return found
 
-    def _mark(self, expected: str) -> str:
-        """Read one of the expected characters, and return it."""
-        mark = self._peek()
-        if not mark or mark not in expected:
-            raise ValueError(f"expected one of {expected} at character {self._at}")
-        self._at += 1
-        return mark
+    members: list[tuple[str, Any]] = []
+    for _ in parts("{", "}"):
+        name = value()
+        if not isinstance(name, str):
+            raise ValueError(f"expected a name before character {at}")
+        mark(":")
+        members.append((name, entries(name) if text.startswith("[", at) else value()))
+        _members(members)
+    if at < len(text):
+        raise ValueError(f"trailing characters at character {at}")
+    return dict(members)
 
 
-_SPACE: Final = re.compile(r"[ \t\n\r]*")
-
-
-class _Constant(str):
-    """NaN, Infinity or -Infinity in a body."""
+_MARK: Final = re.compile(r"[ \t\n\r]*([{}\[\],:])[ \t\n\r]*")
 
 
 def _constants(value: Any, at: errors.Location = ()) -> Iterator[tuple[str, errors.Location]]:
-    """Yield the name and the location of each constant in a value at a location."""
-    if isinstance(value, _Constant):
-        yield value, at
+    """Yield the name and the location of each NaN and Infinity in a value at a location."""
+    if isinstance(value, float) and not math.isfinite(value):
+        yield json.dumps(value), at
     elif isinstance(value, dict):
         for name, part in value.items():
             yield from _constants(part, (*at, name))
@@ -223,13 +209,9 @@ def _constants(value: Any, at: errors.Location = ()) -> Iterator[tuple[str, erro
             yield from _constants(part, (*at, index))
 
 
-def _check_number(members: Sized) -> None:
-    if len(members) > MAX_MEMBERS:
-        raise _invalid(f"A JSON object has more than {MAX_MEMBERS} members.")
-
-
 def _members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    _check_number(pairs)
+    if len(pairs) > MAX_MEMBERS:
+        raise _invalid(f"A JSON object has more than {MAX_MEMBERS} members.")
     members = dict(pairs)
     if len(members) != len(pairs):
         name, _ = Counter(name for name, _ in pairs).most_common(1)[0]
@@ -244,7 +226,6 @@ _DECODER: Final = json.JSONDecoder(
     parse_int=lambda text: int(text),
     parse_float=lambda text: float(text),
 )
-_LENIENT: Final = json.JSONDecoder(object_pairs_hook=_members, parse_constant=_Constant)
 
 
 def _check_media(scope: Scope) -> None:
@@ -298,7 +279,7 @@ class JSONRoute(APIRoute):
         if len(body) <= SMALL:
             value, data = read(None)
         else:
-            (value, data), _ = await in_thread(read, ticket, runtime.admission.worker)
+            value, data = await runtime.admission.in_worker(ticket, read)
         try:
             answer: bytes = await self.endpoint(data=data, http=http, **scope["path_params"])
         except errors.RequestError as error:

@@ -2,14 +2,16 @@
 
 import logging
 import re
+from asyncio import CancelledError
 from collections.abc import Sequence
 from time import perf_counter
 from typing import Any, Final
 from uuid import uuid4
 
+from starlette.middleware.cors import CORSMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.api.access import HostCheck, KeyCheck, cross_origin
+from app.api.access import API_KEY, TIMEOUT_HEADER, HostCheck, KeyCheck
 from app.api.problems import answer, from_exception
 from app.api.turns import Deadline, Size, Turn
 from app.serving.request import SUCCESS, Record
@@ -43,7 +45,14 @@ def gateway(app: ASGIApp, settings: Settings, runtime: Runtime) -> ASGIApp:
         steps = KeyCheck(steps, settings.api_key)
     steps = Failures(steps)
     if settings.cors_origins:
-        steps = cross_origin(steps, settings.cors_origins)
+        headers = "Authorization", "Content-Type", API_KEY, "X-Request-Id", TIMEOUT_HEADER
+        steps = CORSMiddleware(
+            steps,
+            allow_origins=settings.cors_origins,
+            allow_methods=("GET", "POST"),
+            allow_headers=headers,
+            expose_headers=("Retry-After", "X-Request-Id"),
+        )
     if (names := settings.accepted_hosts) is not None:
         steps = HostCheck(steps, names)
     return Recorded(steps, app, settings, runtime)
@@ -87,9 +96,7 @@ class Recorded:
 
         try:
             await self._app(scope, receive, send_completed)
-        except Exception:
-            raise
-        except BaseException:
+        except CancelledError:
             record.outcome = CANCELLED
             raise
         finally:
@@ -103,8 +110,7 @@ class Recorded:
         method = scope["method"]  # the server refuses others than the registered ones
         # The log contains the template of the route, because a raw path may contain private data.
         route = getattr(scope.get("route"), "path", "-")
-        metrics = self._runtime.metrics
-        metrics.answered(route, record.outcome, seconds)
+        self._runtime.metrics.answered(route, record.outcome, seconds)
         if self._has_log and _access.isEnabledFor(logging.INFO):
             message = f"{method} {route} {status} {seconds * 1e3:.2f} ms"
             # `_access.info` would search the stack for its caller, which no format shows.

@@ -135,7 +135,7 @@ async def show_word(
     served = runtime.models.resolve(name)
     vocabulary = served.vocabulary
 
-    def look_up() -> schemas.WordAnswer:
+    def look_up(_: object) -> schemas.WordAnswer:
         answer = partial(schemas.WordAnswer, model=served.reference, word=word)
         reading = vocabulary.look_up(word)
         if reading is None:

@@ -98,7 +98,7 @@ class DocumentedAPI(FastAPI):
 async def show_document(http: Request) -> Response:
     """Return the OpenAPI document. Behind a proxy, it names the path of the service."""
 
-    def build() -> Response:
+    def build(_: object) -> Response:
         document, root = http.app.openapi(), http.scope.get("root_path")
         return JSONResponse(document | {"servers": [{"url": root}]} if root else document)
 

@@ -3,7 +3,6 @@
 The answer to a batch has one entry for each scene.
 """
 
-from collections.abc import Awaitable, Callable
 from typing import Any, TypeVar
 
 from fastapi import APIRouter
@@ -16,26 +15,13 @@ from app.api.problems import from_exception
 from app.errors import AnswerTooLargeError, LocatedError, RequestError
 from app.questions import QUESTIONS, Question
 from app.serving import request as serving
-from app.serving.admission import in_thread
 from scene_client.schemas import MAX_BATCH, BatchAnswer, BatchRequest, SceneRequest
 
 RequestT = TypeVar("RequestT", bound=SceneRequest)
-_Endpoint = Callable[..., Awaitable[bytes]]
 
 _FULL = "the batch has reached SCENE_MAX_ANSWER_BYTES. Send this scene in another request"
 
-router = APIRouter(
-    tags=["questions"],
-    route_class=JSONRoute,
-    responses=error_responses("admission", "body", "models", "name", "model", "scene"),
-    generate_unique_id_function=operation_id,
-)
-batches = APIRouter(
-    tags=["batches"],
-    route_class=JSONRoute,
-    responses=error_responses("admission", "body", "models"),
-    generate_unique_id_function=operation_id,
-)
+router = APIRouter(route_class=JSONRoute, generate_unique_id_function=operation_id)
 
 # The service does not validate its own answers: validation takes as long as writing the JSON.
 # The tests validate answers against the schemas of the routes.
@@ -86,8 +72,7 @@ async def _validated(
 
     if not isinstance(scene, dict) or serving.is_small(scene):
         return validate(None)
-    admission = request.runtime.admission
-    return (await in_thread(validate, request.ticket, admission.worker))[0]
+    return await request.runtime.admission.in_worker(request.ticket, validate)
 
 
 def _failed(error: Exception, number: int, scene: Any, request_id: str) -> tuple[str, bytes]:
@@ -103,40 +88,45 @@ def _failed(error: Exception, number: int, scene: Any, request_id: str) -> tuple
     return failure.slug, b'{"status":%d,"problem":%b}' % (failure.status, body)
 
 
-def _endpoints(question: Question[Any]) -> tuple[_Endpoint, _Endpoint]:
-    """Create the endpoint functions of a question: for one scene, and for a batch."""
-
+def _add_route(question: Question[Any]) -> None:
     async def answer(data: Any, http: Request) -> bytes:
         return await serving_request(http).answer(question, data)
 
-    async def answer_batch(data: Any, http: Request) -> bytes:
+    # FastAPI reads the schema of the body from the annotations.
+    answer.__annotations__["data"] = question.request
+    router.add_api_route(
+        f"/{question.name}",
+        answer,
+        methods=["POST"],
+        name=question.name,
+        tags=["questions"],
+        summary=question.summary,
+        description=question.description,
+        response_model=question.response,
+        responses=error_responses("admission", "body", "models", "name", "model", "scene"),
+    )
+
+
+def _add_batch_route(question: Question[Any]) -> None:
+    async def answer(data: Any, http: Request) -> bytes:
         return await _answer_each(http, data, question)
 
-    # FastAPI reads the schema of the body from the annotations.
-    answer.__annotations__ |= {"data": question.request, "http": Request}
-    schema = BatchRequest[question.request]  # type: ignore[name-defined]
-    answer_batch.__annotations__ |= {"data": schema, "http": Request}
-    return answer, answer_batch
+    answer.__annotations__["data"] = BatchRequest[question.request]  # type: ignore[name-defined]
+    router.add_api_route(
+        f"/{question.name}/batch",
+        answer,
+        methods=["POST"],
+        name=f"{question.name}_batch",
+        tags=["batches"],
+        summary=f"POST /{question.name} for many scenes",
+        description=f"Answer up to {MAX_BATCH} scenes, each like `POST /{question.name}`.",
+        response_model=BatchAnswer[question.response],  # type: ignore[name-defined]
+        responses=error_responses("admission", "body", "models"),
+    )
 
 
 for _question in QUESTIONS:
-    _answer, _answer_batch = _endpoints(_question)
-    router.add_api_route(
-        f"/{_question.name}",
-        _answer,
-        methods=["POST"],
-        name=_question.name,
-        summary=_question.summary,
-        description=_question.description,
-        response_model=_question.response,
-    )
+    _add_route(_question)
+for _question in QUESTIONS:
     if not _question.samples:
-        batches.add_api_route(
-            f"/{_question.name}/batch",
-            _answer_batch,
-            methods=["POST"],
-            name=f"{_question.name}_batch",
-            summary=f"POST /{_question.name} for many scenes",
-            description=f"Answer up to {MAX_BATCH} scenes, each like `POST /{_question.name}`.",
-            response_model=BatchAnswer[_question.response],  # type: ignore[name-defined]
-        )
+        _add_batch_route(_question)

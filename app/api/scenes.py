@@ -14,7 +14,6 @@ from starlette.requests import Request
 from app.api.body import JSONRoute
 from app.api.openapi import error_responses, operation_id
 from app.errors import InvalidRequestError, UnreadableFileError
-from app.serving.admission import in_thread
 from app.serving.runtime import Runtime
 from scene_client.files import labels_in, scenes_of
 from scene_client.ros_fields import MessageError
@@ -46,15 +45,11 @@ async def scenes(data: ScenesRequest, http: Request) -> bytes:
 
     The answer has the first 256 scenes of the file. The service stores nothing.
     """
-    runtime: Runtime = http.scope["app"].state.runtime
+    runtime: Runtime = http.app.state.runtime
     state, limit = http.scope["state"], runtime.limits.answer_bytes
-    ticket, admission = state["ticket"], runtime.admission
-    if ticket.lane is not admission.slow:
-        await ticket.enter(admission.slow, 1)
-    answer, _ = await in_thread(
-        lambda stop: _read(data, state["request_id"], limit, stop), ticket, admission.worker
+    return await runtime.admission.in_worker(
+        state["ticket"], lambda stop: _read(data, state["request_id"], limit, stop)
     )
-    return answer
 
 
 def _read(data: ScenesRequest, request_id: str, limit: int, stop: Callable[[], bool]) -> bytes:

@@ -41,11 +41,8 @@ class Deadline:
             return
         if self._runtime.models is NO_MODELS:
             raise errors.NotReadyError("The service is starting.")
-        seconds = self._seconds
-        for name, value in scope["headers"]:
-            if name == b"x-request-timeout-ms":
-                seconds = self._seconds_of(value)
-                break
+        stated = [value for name, value in scope["headers"] if name == b"x-request-timeout-ms"]
+        seconds = self._seconds_of(stated[0]) if stated else self._seconds
         client = (scope.get("client") or ("",))[0]
         is_gone = Request(scope, receive).is_disconnected
         scope["state"]["ticket"] = Ticket(client, monotonic() + seconds, is_gone)

@@ -204,14 +204,14 @@ class Admission:
         self.worker = ThreadPoolExecutor(1, "slow", _lower_priority)
         self.drawing = ThreadPoolExecutor(1, "drawing", _lower_priority)
 
-    async def in_worker(self, ticket: Ticket, call: Callable[[], T]) -> T:
-        """Run a computation in a turn of the lane `slow`, in its thread, and return the result.
+    async def in_worker(self, ticket: Ticket, call: Callable[[Callable[[], bool]], T]) -> T:
+        """Run a computation in a turn of the lane `slow`, in its thread; see `in_thread`.
 
         The errors are those of `Lane.enter` and `in_thread`.
         """
-        await ticket.enter(self.slow, 1)
-        result, _ = await in_thread(lambda _: call(), ticket, self.worker)
-        return result
+        if ticket.lane is not self.slow:
+            await ticket.enter(self.slow, 1)
+        return await in_thread(call, ticket, self.worker)
 
     def stop(self) -> None:
         """Stop the threads and drop the computations that have not started."""
@@ -228,14 +228,12 @@ def _lower_priority() -> None:
 
 async def in_thread(
     call: Callable[[Callable[[], bool]], T], ticket: Ticket, executor: Executor
-) -> tuple[T, float]:
-    """Run a computation on an executor until its end, the deadline or a disconnect of the client.
+) -> T:
+    """Run a computation on an executor and return its result.
 
+    The call ends at the end of the computation, at the deadline or at a disconnect of the client.
     The argument of ``call`` is a function that returns whether the request has ended. A long
     computation should call this function regularly.
-
-    Returns:
-        Result of the computation, and its time in seconds.
 
     Raises:
         DeadlinePassedError: the deadline passed before the end of the computation.
@@ -246,13 +244,12 @@ async def in_thread(
     await ticket.check_connected()
     has_ended, called_at = False, monotonic()
 
-    def compute() -> tuple[T, float]:
+    def compute() -> T:
         # The computation of an ended request is still in the executor's queue, so skip it here.
         if has_ended:
             raise errors.DeadlinePassedError("The request ended before the computation started.")
-        began = monotonic()
-        ticket.waited += began - called_at
-        return call(lambda: has_ended), monotonic() - began
+        ticket.waited += monotonic() - called_at
+        return call(lambda: has_ended)
 
     future = asyncio.get_running_loop().run_in_executor(executor, compute)
     try:
@@ -302,7 +299,7 @@ class Bodies:
         """Stop counting a body of a client."""
         self._add(client, -size)
 
-    async def read(self, receive: Receive, client: str, limit: int, length: bytes = b"") -> bytes:
+    async def read(self, receive: Receive, client: str, limit: int, length: bytes) -> bytes:
         """Read a whole body of at most ``limit`` bytes. The caller must `release` it.
 
         Args:

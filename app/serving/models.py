@@ -110,16 +110,6 @@ class ServedModels:
                 aliases[self.resolve(alias).key].append(alias)
         return aliases
 
-    @cached_property
-    def usable(self) -> frozenset[str]:
-        """Names of the versions (``name@version``) and aliases that are usable.
-
-        The set also contains "store" if the service could read the store.
-        """
-        versions = {f"{name}@{version}" for name, version in self.served}
-        subjects = versions | self.store.aliases.keys() | {DEFAULT, "store"}
-        return frozenset(subjects - self.failures.keys())
-
     @property
     def is_ready(self) -> bool:
         """Whether a model answers requests for the alias `default`."""
@@ -130,7 +120,10 @@ class ServedModels:
 
     def lost_in(self, new: Self) -> list[Failure]:
         """Return the failures of entries that are usable here and unusable in a newer snapshot."""
-        lost = {*self.usable, DEFAULT} if self.is_ready and not new.is_ready else self.usable
+        versions = {"@".join(key) for key in self.served}
+        lost = {*versions, *self.store.aliases, DEFAULT, "store"} - self.failures.keys()
+        if self.is_ready and not new.is_ready:
+            lost.add(DEFAULT)
         return [failure for subject, failure in new.failures.items() if subject in lost]
 
     @cached_property

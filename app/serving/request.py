@@ -1,6 +1,6 @@
 """A request in the serving layer: its deadline, its models, and its record for log and metrics."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from time import monotonic
@@ -88,11 +88,12 @@ class Request:
             RequestError: the scene is invalid, or the answer would be too large.
             QueueFullError, DeadlinePassedError, DisconnectedError: see `admission`.
         """
-        artifact = self.models.resolve(scene.model)
-        self.record.models.add(artifact.key)
+        artifact, record = self.models.resolve(scene.model), self.record
+        record.models.add(artifact.key)
         limits, admission, ticket = self.runtime.limits, self.runtime.admission, self.ticket
+        most = limits.answer_bytes if most_bytes is None else most_bytes
 
-        def read() -> tuple[Reading, partial[Fields]]:
+        def read(_: object) -> tuple[Reading, partial[Fields]]:
             reading = read_scene(
                 scene,
                 artifact.vocabulary,
@@ -105,50 +106,45 @@ class Request:
             options = question.read(scene, artifact, reading)
             return reading, partial(question.answer, artifact, reading.scene, **options)
 
-        def compute() -> tuple[Reading, Fields]:
-            reading, call = read()
-            return reading, call()
+        def finish(
+            reading: Reading, ask: Callable[[], Fields], began: float
+        ) -> tuple[bytes, Fields, float, float]:
+            fields = ask()
+            seconds, waited = monotonic() - began, ticket.waited - (record.queue_seconds or 0.0)
+            record.queue_seconds = ticket.waited
+            record.compute_seconds = (record.compute_seconds or 0.0) + seconds
+            answer = envelope(scene, self.id, artifact.reference, reading) | fields
+            answer["warnings"] = [*reading.warnings, *fields.get("warnings", ())]
+            if (body := written_within(answer, most)) is None:
+                raise _too_large(question, most)
+            return body, answer, waited, seconds
 
-        is_fast, executor = is_quick(scene, artifact.vocabulary), admission.worker
-        if not is_fast and ticket.lane is not admission.slow:
-            await ticket.enter(admission.slow, 1)
+        def compute(_: object) -> tuple[bytes, Fields, float, float]:
+            began = monotonic()
+            return finish(*read(None), began)
+
+        is_fast = is_quick(scene, artifact.vocabulary)
         if question.samples:
-            if is_fast:
-                reading, ask = read()
-            else:
-                (reading, ask), _ = await in_thread(lambda _: read(), ticket, admission.worker)
+            reading, ask = read(None) if is_fast else await admission.in_worker(ticket, read)
             weight = ask.keywords["count"] * (ask.keywords["steps"] or STEPS)
             # The models of a client take turns, too.
             await ticket.enter(admission.draws, weight, line=(ticket.client, artifact.key))
-            executor = admission.drawing
-            fields, seconds = await in_thread(lambda stop: ask(stop=stop), ticket, executor)
+            computed = await in_thread(
+                lambda stop: finish(reading, partial(ask, stop=stop), monotonic()),
+                ticket,
+                admission.drawing,
+            )
         elif is_fast:
             ticket.check()
-            began = monotonic()
-            reading, fields = compute()
-            seconds = monotonic() - began
+            computed = compute(None)
             ticket.check()
         else:
-            (reading, fields), seconds = await in_thread(lambda _: compute(), ticket, executor)
-        answer = envelope(scene, self.id, artifact.reference, reading) | fields
-        answer["warnings"] = [*reading.warnings, *fields.get("warnings", ())]
-        record, waited = self.record, ticket.waited
-        new = waited - (record.queue_seconds or 0.0)
-        record.queue_seconds = waited
-        record.compute_seconds = (record.compute_seconds or 0.0) + seconds
+            computed = await admission.in_worker(ticket, compute)
+        body, answer, waited, seconds = computed
         self.runtime.metrics.computed(
-            artifact.key, question.name, new, seconds, len(scene.objects), answer
+            artifact.key, question.name, waited, seconds, len(scene.objects), answer
         )
-
-        def write() -> bytes:
-            most = limits.answer_bytes if most_bytes is None else most_bytes
-            if (body := written_within(answer, most)) is None:
-                raise _too_large(question, most)
-            return body
-
-        if is_fast and not question.samples:
-            return write()
-        return (await in_thread(lambda _: write(), ticket, executor))[0]
+        return body
 
 
 def _too_large(question: Question[Any], most: int) -> AnswerTooLargeError:
