@@ -19,15 +19,13 @@ def _refuse_arguments(arguments: list[str] | None) -> None:
     """Exit with status 2 after unknown arguments. After --help, print the settings and exit."""
     from app.settings import Settings
 
-    lines = []
+    lines = ["Start the service. These settings are environment variables:\n"]
     for name, field in Settings.model_fields.items():
         default = field.get_default(call_default_factory=True)
         lines.append(f"  SCENE_{name.upper():<24}{'-' if default in (None, (), '') else default}")
     parser = argparse.ArgumentParser(
         prog="python -m app",
-        description="\n".join(
-            ("Start the service. These settings are environment variables:\n", *lines)
-        ),
+        description="\n".join(lines),
         epilog="The second column has the defaults. docs/operations.md describes the settings.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -60,14 +58,6 @@ def main(arguments: list[str] | None = None) -> int:
     return serve(settings, began)
 
 
-# Number of new objects after which Python starts a garbage collection. Python's default of 700
-# costs 4 to 8 % of a request's time.
-_YOUNG = 10_000
-
-# The C function mallopt(3) takes these two numbers: option M_MMAP_THRESHOLD, limit in bytes.
-_M_MMAP_THRESHOLD, _LARGE = -3, 128 * 1024
-
-
 def tune() -> None:
     """Set the garbage collector, the C library and OpenBLAS of this process for the service.
 
@@ -76,11 +66,12 @@ def tune() -> None:
     # Objects that the start creates stay in use. A search for garbage among them would take a fifth
     # of the startup time. The runtime enables the garbage collector again after the start.
     gc.disable()
-    gc.set_threshold(_YOUNG, *gc.get_threshold()[1:])
+    # A collection after 700 new objects, Python's default, costs 4 to 8 % of a request's time.
+    gc.set_threshold(10_000, *gc.get_threshold()[1:])
     # Return freed blocks of 128 KiB or more to the operating system at once. By default, the C
     # library raises this limit, and the process would hold 20 MB of unused memory.
     if (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
-        mallopt(_M_MMAP_THRESHOLD, _LARGE)
+        mallopt(-3, 128 * 1024)  # M_MMAP_THRESHOLD, limit in bytes; see mallopt(3)
     # A question needs only small matrix products. More threads would take cores from other
     # processes. numpy reads this variable at its import.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -146,9 +137,9 @@ def serve(settings: "Settings", began: float) -> int:
     except OSError as error:
         return _refuse_address(settings, error)
     tune()
-    from app.server import build
+    from app.server import Server
 
-    server = build(settings, began)
+    server = Server(settings, began)
     try:
         server.run(sockets)
     except OSError as error:

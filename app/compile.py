@@ -17,7 +17,7 @@ def main() -> int:
     Return the exit status: 1 if a model, an alias or the store is not usable, else 0.
     """
     settings = Settings()
-    dictConfig(log_config(settings.log_level, settings.log_format, settings.secrets))
+    dictConfig(log_config(settings))
     runtime = Runtime(settings)
     asyncio.run(runtime.start())
     runtime.stop()

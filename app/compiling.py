@@ -14,6 +14,9 @@ from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any, cast
 
+from numba import config
+from numba.core import event
+
 _logger = logging.getLogger("app.compiling")
 
 
@@ -59,14 +62,7 @@ def _choose() -> tuple[Path | None, str]:
 FOLDER, _PROBLEM = _choose()
 """The directory of compiled loops, or None if no directory is usable."""
 if FOLDER is not None:
-    # numba and child processes read this variable.
-    os.environ["NUMBA_CACHE_DIR"] = str(FOLDER)
-
-from numba import config  # noqa: E402
-from numba.core import event  # noqa: E402
-
-if FOLDER is not None:
-    # Another module may have imported numba earlier.
+    os.environ["NUMBA_CACHE_DIR"] = str(FOLDER)  # for child processes
     config.CACHE_DIR = str(FOLDER)  # type: ignore[attr-defined]
 
 

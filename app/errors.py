@@ -33,18 +33,17 @@ Step = Literal[
 ]
 """A step of a request. The steps of a route determine the errors in its documentation."""
 
-MOST_NAMED: Final = 50
-"""Maximum number of known names in the message of an error."""
+_MOST_NAMED: Final = 50  # known names in the message of an error
 
 ERRORS: Final[dict[str, type["ServiceError"]]] = {}
 """All problem types by slug, in the order of this module."""
 
 
 def some_of(names: Iterable[str]) -> str:
-    """Return the first `MOST_NAMED` names in alphabetical order, as text for a message."""
+    """Return the first 50 names in alphabetical order, as text for a message."""
     ordered = sorted(names)
-    text = ", ".join(ordered[:MOST_NAMED]) or "none"
-    return f"{text} and {len(ordered) - MOST_NAMED} more" if len(ordered) > MOST_NAMED else text
+    text = ", ".join(ordered[:_MOST_NAMED]) or "none"
+    return f"{text} and {len(ordered) - _MOST_NAMED} more" if len(ordered) > _MOST_NAMED else text
 
 
 @dataclass(frozen=True, slots=True)

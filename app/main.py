@@ -5,6 +5,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from fastapi import FastAPI
+from starlette.exceptions import HTTPException
 
 from app import __version__
 from app.api import health, models, openapi, pages, problems, questions, scenes, telemetry
@@ -23,13 +24,8 @@ The figures in the examples are illustrations. Real figures depend on the model.
 """
 
 
-def create_app(settings: Settings | None = None) -> FastAPI:
-    """Create the application of the service. By default, the environment contains the settings.
-
-    Raises:
-        pydantic.ValidationError: an environment variable contains an invalid setting.
-    """
-    settings = settings or Settings()
+def create_app(settings: Settings) -> FastAPI:
+    """Create the application of the service."""
     runtime = Runtime(settings)
 
     @asynccontextmanager
@@ -54,14 +50,14 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     app.state.settings = settings
     app.state.runtime = runtime
-    problems.install(app)
+    app.add_exception_handler(HTTPException, problems.handle)
     app.add_middleware(gateway, settings=settings, runtime=runtime)
     _add_routes(app, settings)
     return app
 
 
 def _add_routes(app: FastAPI, settings: Settings) -> None:
-    app.router.routes.extend((*questions.router.routes, *scenes.router.routes))
+    app.router.routes += questions.router.routes + scenes.router.routes
     routers = [models.router, health.router, *([health.monitoring] if settings.metrics else [])]
     for router in routers:
         app.include_router(router)

@@ -21,10 +21,6 @@ from app.serving.logs import log_config
 from app.serving.runtime import Runtime
 from app.settings import Settings, warnings
 
-# The server closes a connection after this idle time in seconds. A proxy must do so earlier, or it
-# may send a request while the server closes the connection.
-KEEP_ALIVE: Final = 20
-
 # A socket with one of these addresses listens on every address of the machine.
 _ANY: Final = frozenset(("0.0.0.0", "::"))  # noqa: S104 # nosec B104
 # Request to the kernel of Linux for the address of a network interface; see netdevice(7).
@@ -41,13 +37,33 @@ class Server(uvicorn.Server):
        A second signal, or Ctrl-C, ends this step at once.
     2. The server closes the listening socket.
     3. The server finishes the requests in progress.
+
+    ``began`` is `time.monotonic()` at the start of the process.
     """
 
-    def __init__(
-        self, config: uvicorn.Config, runtime: Runtime, settings: Settings, began: float
-    ) -> None:
+    def __init__(self, settings: Settings, began: float) -> None:
+        app = create_app(settings)
+        config = uvicorn.Config(
+            app,
+            root_path=settings.root_path,
+            http="httptools",
+            ws="none",
+            limit_concurrency=settings.max_connections,
+            # A proxy must close idle connections earlier. Otherwise it may send a request while the
+            # server closes the connection.
+            timeout_keep_alive=20,
+            log_config=log_config(settings),
+            access_log=False,
+            server_header=False,
+            # Behind a proxy, X-Forwarded-For tells the clients apart that share the queues.
+            proxy_headers=bool(settings.trusted_proxies),
+            forwarded_allow_ips=list(settings.trusted_proxies),
+            timeout_graceful_shutdown=settings.drain_timeout,
+        )
         super().__init__(config)
-        self._runtime = runtime
+        for warning in warnings():
+            _logger.warning(warning)
+        self._runtime: Runtime = app.state.runtime
         self._settings = settings
         self._closing_at: float | None = None
         self._began = began
@@ -152,31 +168,3 @@ def _lan_addresses() -> list[str]:
                 found.append(socket.inet_ntoa(answer[20:24]))
     name = f"{socket.gethostname().partition('.')[0]}.local"
     return [address for address in found if not address.startswith("127.")] or [name]
-
-
-def build(settings: Settings, began: float) -> Server:
-    """Return the server, not yet started.
-
-    ``began`` is `time.monotonic()` at the start of the process.
-    """
-    app = create_app(settings)
-    config = uvicorn.Config(
-        app,
-        host=settings.host,
-        port=settings.port,
-        root_path=settings.root_path,
-        http="httptools",
-        ws="none",
-        limit_concurrency=settings.max_connections,
-        timeout_keep_alive=KEEP_ALIVE,
-        log_config=log_config(settings.log_level, settings.log_format, settings.secrets),
-        access_log=False,
-        server_header=False,
-        # Behind a proxy, X-Forwarded-For tells the clients apart that share the queues.
-        proxy_headers=bool(settings.trusted_proxies),
-        forwarded_allow_ips=list(settings.trusted_proxies),
-        timeout_graceful_shutdown=settings.drain_timeout,
-    )
-    for warning in warnings():
-        _logger.warning(warning)
-    return Server(config, app.state.runtime, settings, began)

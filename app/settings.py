@@ -24,9 +24,6 @@ from pydantic_settings import PydanticBaseSettingsSource as Source
 
 from scene_client.schemas import MAX_RELATIONS
 
-MAX_OBJECTS = 256
-"""Upper limit of the setting ``SCENE_MAX_OBJECTS``."""
-
 _EXPORTER = "opentelemetry.exporter.otlp.proto.http"
 _ENDPOINTS = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
 
@@ -53,7 +50,6 @@ def _words(value: object) -> object:
 
 _Words = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_words)]
 
-_ANY_HOST: Final = "*"
 _HOST: Final = re.compile(r"[a-z0-9_]([a-z0-9._-]*[a-z0-9_])?")
 
 
@@ -72,13 +68,9 @@ def _names_of_this_machine() -> set[str]:
     return {name for name in names if _HOST.fullmatch(name)}
 
 
+# What a browser can send as the Origin header, but for default ports.
 _ORIGIN: Final = re.compile(r"https?://([a-z0-9_.-]+|\[[0-9a-f:.]+\])(:[1-9][0-9]{0,4})?")
-
-
-def _is_origin(text: str) -> bool:
-    """Return whether a browser could send exactly this text as the Origin header."""
-    default_port = ":443" if text.startswith("https:") else ":80"
-    return _ORIGIN.fullmatch(text) is not None and not text.endswith(default_port)
+_DEFAULT_PORT: Final = re.compile(r"http:.*:80|https:.*:443")
 
 
 class _Environment(EnvSettingsSource):
@@ -131,7 +123,7 @@ class Settings(BaseSettings):
     )
     reads_environment: ClassVar[bool] = True
 
-    host: Annotated[str, Field(min_length=1)] = "127.0.0.1"
+    host: str = "127.0.0.1"
     """Address to listen on."""
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
     """Port to listen on; 0 = any free port."""
@@ -160,7 +152,7 @@ class Settings(BaseSettings):
     held_body_bytes: Annotated[int, Field(ge=2**20, le=2**36)] = 64 * 2**20
     """Maximum total size in bytes of the bodies of all requests and large answers in progress; one
     client holds at most a quarter."""
-    max_objects: Annotated[int, Field(ge=1, le=MAX_OBJECTS)] = MAX_OBJECTS
+    max_objects: Annotated[int, Field(ge=1, le=256)] = 256
     """Maximum number of objects in a scene."""
     max_relations: Annotated[int, Field(ge=0, le=MAX_RELATIONS)] = 4096
     """Maximum number of stated relations in a scene."""
@@ -214,14 +206,9 @@ class Settings(BaseSettings):
         return init_settings, _Environment(settings_cls)
 
     @property
-    def secrets(self) -> list[str]:
-        """The configured keys, which every log line masks."""
-        return [self.api_key.get_secret_value()] if self.api_key else []
-
-    @property
     def accepted_hosts(self) -> frozenset[str] | None:
         """Accepted names in a Host header, without ports, or None if every name is accepted."""
-        if _ANY_HOST in self.allowed_hosts:
+        if "*" in self.allowed_hosts:
             return None
         return frozenset(self.allowed_hosts or (*_names_of_this_machine(), self.host))
 
@@ -245,7 +232,7 @@ class Settings(BaseSettings):
     @classmethod
     def _are_hosts(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         try:
-            return tuple(name if name == _ANY_HOST else _host(name) for name in value)
+            return tuple(name if name == "*" else _host(name) for name in value)
         except ValueError:
             raise ValueError(
                 "SCENE_ALLOWED_HOSTS must be * or a list of names; a name must not contain a "
@@ -296,7 +283,7 @@ class Settings(BaseSettings):
     @field_validator("cors_origins")
     @classmethod
     def _are_origins(cls, value: tuple[str, ...]) -> tuple[str, ...]:
-        if not all(map(_is_origin, value)):
+        if not all(map(_ORIGIN.fullmatch, value)) or any(map(_DEFAULT_PORT.fullmatch, value)):
             raise ValueError(
                 "SCENE_CORS_ORIGINS must list origins as browsers send them: http or https, a host "
                 "in lower case, a port other than the default port, and no path or wildcard"

@@ -50,9 +50,8 @@ class HostCheck:
         """Pass an accepted request on, or answer with status 421."""
         hosts = [value for name, value in scope["headers"] if name == b"host"]
         host = _HOST.fullmatch(hosts[0].lower()) if len(hosts) == 1 else None
-        if (
-            host is not None and (host[1] in self._names or _ADDRESS.fullmatch(host[1]))
-        ) or route_path(scope) in HEALTH:
+        is_named = host is not None and (host[1] in self._names or _ADDRESS.fullmatch(host[1]))
+        if is_named or route_path(scope) in HEALTH:
             await self._app(scope, receive, send)
             return
         detail = (

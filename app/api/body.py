@@ -33,6 +33,8 @@ MAX_MEMBERS: Final = 32
 Validation reports each unknown member, and a report takes a hundred times the memory of the member.
 """
 
+_MARK: Final = re.compile(r"[ \t\n\r]*([{}\[\],:])[ \t\n\r]*")
+
 # A large answer is sent in parts of this size in bytes, so that a slow client delays the next part.
 _PART: Final = 64 * 1024
 
@@ -192,9 +194,6 @@ def _in_pieces(text: str, most: int) -> dict[str, Any]:
     if at < len(text):
         raise ValueError(f"trailing characters at character {at}")
     return dict(members)
-
-
-_MARK: Final = re.compile(r"[ \t\n\r]*([{}\[\],:])[ \t\n\r]*")
 
 
 def _constants(value: Any, at: errors.Location = ()) -> Iterator[tuple[str, errors.Location]]:

@@ -18,14 +18,6 @@ from app.serving.request import SUCCESS, Record
 from app.serving.runtime import Runtime
 from app.settings import Settings
 
-CANCELLED: Final = "cancelled"
-"""Outcome of a request that the server cancelled during its shutdown."""
-OTHER: Final = "other"
-"""Outcome of a failure without a problem document.
-
-An example is an invalid Range header in a request for a static file.
-"""
-
 _REQUEST_ID: Final = re.compile(rb"[A-Za-z0-9._~:-]{1,128}")
 
 # These headers stop browsers from guessing the media type and from sending a Referer.
@@ -96,8 +88,8 @@ class Recorded:
 
         try:
             await self._app(scope, receive, send_completed)
-        except CancelledError:
-            record.outcome = CANCELLED
+        except CancelledError:  # the server shuts down
+            record.outcome = "cancelled"
             raise
         finally:
             self._record(scope, record, perf_counter() - began)
@@ -106,7 +98,8 @@ class Recorded:
         """Write the metrics and the access log of a request."""
         status = record.status or 500
         if status >= 400 and record.outcome == SUCCESS:
-            record.outcome = OTHER
+            # There is no problem document, such as for an invalid Range header of a static file.
+            record.outcome = "other"
         method = scope["method"]  # the server refuses others than the registered ones
         # The log contains the template of the route, because a raw path may contain private data.
         route = getattr(scope.get("route"), "path", "-")

@@ -4,41 +4,39 @@ The process is ready if its default model has answered a question during the war
 also has the route of the metrics.
 """
 
+from functools import partial
+
 from fastapi import APIRouter
 from fastapi.responses import PlainTextResponse
+from prometheus_client import CONTENT_TYPE_PLAIN_0_0_4 as CONTENT_TYPE
 
 from app import __version__
 from app.api.models import RuntimeDep
 from app.api.openapi import error_responses
-from app.serving.metrics import CONTENT_TYPE
 from scene_client import schemas
 
 router = APIRouter(tags=["health"])
 monitoring = APIRouter(tags=["monitoring"])
+_get = partial(router.get, response_model_exclude_none=True)
+# Load balancers may check health with HEAD. OpenAPI describes only GET.
+_head = partial(router.head, include_in_schema=False, response_model_exclude_none=True)
 
 # Maximum number of failures in an answer, because load balancers ask often and without a key.
 _FAILURES = 10
 
 
-# Load balancers may check health with HEAD. OpenAPI describes only GET.
-@router.head("/health/live", include_in_schema=False, response_model_exclude_none=True)
-@router.get(
-    "/health/live",
-    summary="Is the process alive?",
-    responses=error_responses(),
-    response_model_exclude_none=True,
-)
+@_head("/health/live")
+@_get("/health/live", summary="Is the process alive?", responses=error_responses())
 async def health_live() -> schemas.Health:
     """Return status 200 while the process runs, even if the models are not usable."""
     return schemas.Health(status="live", version=__version__)
 
 
-@router.head("/health/ready", include_in_schema=False, response_model_exclude_none=True)
-@router.get(
+@_head("/health/ready")
+@_get(
     "/health/ready",
     summary="Does a default model answer?",
     responses=error_responses("readiness"),
-    response_model_exclude_none=True,
 )
 async def health_ready(runtime: RuntimeDep) -> schemas.Health:
     """Return status 200 if a model answers for the alias `default`, else status 503.

@@ -50,17 +50,13 @@ async def _runtime(http: Request) -> Runtime:
 RuntimeDep = Annotated[Runtime, Depends(_runtime)]
 
 router = APIRouter(prefix="/models", tags=["models"])
+_get = partial(router.get, response_model_exclude_none=True)
 
 # A vocabulary never changes, and its JSON takes milliseconds.
 _VOCABULARIES: Final[WeakKeyDictionary[Artifact, str]] = WeakKeyDictionary()
 
 
-@router.get(
-    "",
-    summary="Models, versions and aliases",
-    responses=error_responses("admission", "models"),
-    response_model_exclude_none=True,
-)
+@_get("", summary="Models, versions and aliases", responses=error_responses("admission", "models"))
 async def list_models(runtime: RuntimeDep) -> schemas.ModelList:
     """List the models, versions and aliases of the store. Each refused version has a reason."""
     models = runtime.models
@@ -72,18 +68,13 @@ async def list_models(runtime: RuntimeDep) -> schemas.ModelList:
     )
 
 
-@router.get("/{name}", summary="One model", responses=_ERRORS, response_model_exclude_none=True)
+@_get("/{name}", summary="One model", responses=_ERRORS)
 async def show_model(name: Reference, runtime: RuntimeDep) -> schemas.ModelSummary:
     """List the versions of a model, newest version first."""
     return _summary(runtime.models, _name(runtime.models, name))
 
 
-@router.get(
-    "/{name}/versions/{version}",
-    summary="One version of a model",
-    responses=_ERRORS,
-    response_model_exclude_none=True,
-)
+@_get("/{name}/versions/{version}", summary="One version of a model", responses=_ERRORS)
 async def show_version(
     name: Reference, version: Version, runtime: RuntimeDep
 ) -> schemas.VersionDetails:
@@ -92,18 +83,13 @@ async def show_version(
     name = _name(models, name)
     if version not in models.store.versions[name]:
         raise models.unknown(f"{name}@{version}")
-    summary = _version_summary(models, name, version)
-    served = models.served.get((name, version))
-    if served is None:
-        return schemas.VersionDetails(name=name, **dict(summary))
-    weights = of_machine(served.manifest.tensors)
-    return schemas.VersionDetails(
-        name=name,
-        **dict(summary),
-        parameters=sum(math.prod(entry.shape) for entry in weights.values()),
-        card=served.card,
-        **served.manifest.model_dump(include={"created", "metrics", "data", "terms"}),
-    )
+    details = dict(_version_summary(models, name, version), name=name)
+    if (served := models.served.get((name, version))) is not None:
+        weights = of_machine(served.manifest.tensors)
+        details["parameters"] = sum(math.prod(entry.shape) for entry in weights.values())
+        details["card"] = served.card
+        details |= served.manifest.model_dump(include={"created", "metrics", "data", "terms"})
+    return schemas.VersionDetails(**details)
 
 
 @router.get(
@@ -120,11 +106,10 @@ async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> Response:
     return Response(_VOCABULARIES[model], media_type="application/json")
 
 
-@router.get(
+@_get(
     "/{name}/vocabulary/{word:path}",
     summary="The class of a label",
     responses=_LOADED_ERRORS | {422: error_responses("word")[422]},
-    response_model_exclude_none=True,
 )
 async def show_word(
     http: Request, name: Reference, word: Word, runtime: RuntimeDep

@@ -40,11 +40,8 @@ def error_responses(*steps: Step) -> Responses:
     for kind in ERRORS.values():
         if not {"route", *steps}.intersection(kind.steps):
             continue
-        schema = {"$ref": _REFERENCE.format(model="Problem")}
-        empty = {
-            "description": kind.title,
-            "content": {MEDIA_TYPE: {"schema": schema, "examples": {}}},
-        }
+        content = {"schema": {"$ref": _REFERENCE.format(model="Problem")}, "examples": {}}
+        empty = {"description": kind.title, "content": {MEDIA_TYPE: content}}
         response = responses.setdefault(kind.status, empty)
         problem = kind(detail=f"{kind.title}.", errors=kind.example).describe(examples.REQUEST_ID)
         response["content"][MEDIA_TYPE]["examples"][kind.slug] = {
@@ -131,7 +128,15 @@ def _complete_operation(operation: dict[str, Any], path: str, settings: Settings
         (body,) = operation["requestBody"]["content"].values()
         body["examples"] = {case: described(one) for case, one in examples.REQUESTS[name].items()}
     if "504" in responses:
-        timeout = _timeout_parameter(settings.max_request_timeout_ms)
+        most = settings.max_request_timeout_ms
+        timeout = {
+            "name": TIMEOUT_HEADER,
+            "in": "header",
+            "required": False,
+            "description": "time limit in milliseconds; after this time, the service answers 504",
+            "schema": {"type": "integer", "minimum": 1, "maximum": most},
+            "examples": {"second": {"summary": "one second", "value": min(1000, most)}},
+        }
         operation.setdefault("parameters", []).append(timeout)
     if "application/json" in responses.get("422", {}).get("content", {}):
         del responses["422"]
@@ -140,14 +145,3 @@ def _complete_operation(operation: dict[str, Any], path: str, settings: Settings
         responses["401"] = error_responses("key")[401]
     if settings.accepted_hosts is not None and path not in HEALTH:
         responses["421"] = error_responses("host")[421]
-
-
-def _timeout_parameter(most: int) -> dict[str, Any]:
-    return {
-        "name": TIMEOUT_HEADER,
-        "in": "header",
-        "required": False,
-        "description": "time limit in milliseconds; after this time, the service answers 504",
-        "schema": {"type": "integer", "minimum": 1, "maximum": most},
-        "examples": {"second": {"summary": "one second", "value": min(1000, most)}},
-    }

@@ -7,7 +7,6 @@ import logging
 from difflib import get_close_matches
 from typing import Final
 
-from fastapi import FastAPI
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response
@@ -39,16 +38,15 @@ def from_exception(error: Exception, request_id: str) -> ServiceError:
     return InternalError("The service failed. Its log contains the error.")
 
 
-def respond(request: Request, error: ServiceError) -> Response:
+def _respond(request: Request, error: ServiceError) -> Response:
     """Return a response with the problem. Store the slug of the error in the request's record."""
-    state = request.scope.get("state", {})
-    if (record := state.get("record")) is not None:
-        record.outcome = error.slug
+    state = request.scope["state"]
+    state["record"].outcome = error.slug
     headers = {**(error.headers or {}), **_HEADERS.get(error.status, {})}
     if error.status in (429, 503):
         headers["Retry-After"] = str(request.app.state.settings.retry_after)
     return Response(
-        error.describe(state.get("request_id", "")).model_dump_json(exclude_none=True),
+        error.describe(state["request_id"]).model_dump_json(exclude_none=True),
         error.status,
         headers=headers,
         media_type=MEDIA_TYPE,
@@ -57,10 +55,11 @@ def respond(request: Request, error: ServiceError) -> Response:
 
 async def answer(error: ServiceError, scope: Scope, receive: Receive, send: Send) -> None:
     """Answer a request with a problem."""
-    await respond(Request(scope), error)(scope, receive, send)
+    await _respond(Request(scope), error)(scope, receive, send)
 
 
-async def _handle(request: Request, error: Exception) -> Response:
+async def handle(request: Request, error: Exception) -> Response:
+    """Answer an exception of Starlette with a problem. The gateway answers all other exceptions."""
     problem = from_exception(error, request.scope["state"]["request_id"])
     if problem is not error and isinstance(problem, NotFoundError):
         path, paths = request.scope["path"][:64].lower(), request.app.state.paths
@@ -71,9 +70,4 @@ async def _handle(request: Request, error: Exception) -> Response:
                 " If a proxy adds a prefix to paths, the proxy must strip it, and SCENE_ROOT_PATH "
                 "must name it."
             )
-    return respond(request, problem)
-
-
-def install(app: FastAPI) -> None:
-    """Answer exceptions of Starlette with problems. The gateway answers all other exceptions."""
-    app.add_exception_handler(HTTPException, _handle)
+    return _respond(request, problem)

@@ -71,8 +71,8 @@ def _read(data: ScenesRequest, request_id: str, limit: int, stop: Callable[[], b
     size = 0
 
     def note(scene: int | None, detection: int | None, reason: str, detail: str) -> None:
-        detail = _in_one_line(detail)
-        notes.append(FileNote(scene=scene, detection=detection, reason=reason, detail=detail))
+        line = _in_one_line(detail)
+        notes.append(FileNote(scene=scene, detection=detection, reason=reason, detail=line))
 
     for number, (name, read) in enumerate(readers.items()):
         if number == MAX_BATCH or size > limit or stop():

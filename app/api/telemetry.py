@@ -27,7 +27,6 @@ def configuration(*, enabled: bool) -> TelemetryConfig:
     """
     if not enabled:
         return TelemetryConfig(tracing=False, metrics=False, logs=False, auto_configure=False)
-    # These packages are installed only with the dependency group `telemetry`.
     from opentelemetry.context import Context
     from opentelemetry.sdk.resources import SERVICE_VERSION, Resource
     from opentelemetry.sdk.trace import Span, SpanProcessor, TracerProvider

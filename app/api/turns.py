@@ -71,16 +71,12 @@ class Size:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on. The errors are those of `Bodies.read`."""
-        state = scope["state"]
-        if scope["method"] not in _WITH_BODY:
-            state["body"] = b""
-            await self._app(scope, receive, send)
-            return
-        client: str = state["ticket"].client
-        limit = self._limit if route_path(scope) in _LARGE else self._limit_of_scene
-        length = next((value for name, value in scope["headers"] if name == b"content-length"), b"")
-        body = await self._bodies.read(receive, client, limit, length)
-        state["body"] = body
+        client, body = scope["state"]["ticket"].client, b""
+        if scope["method"] in _WITH_BODY:
+            limit = self._limit if route_path(scope) in _LARGE else self._limit_of_scene
+            length = next((v for name, v in scope["headers"] if name == b"content-length"), b"")
+            body = await self._bodies.read(receive, client, limit, length)
+        scope["state"]["body"] = body
         try:
             await self._app(scope, receive, send)
         finally:

@@ -40,10 +40,6 @@ T = TypeVar("T")
 SHARE: Final = 4
 """One client holds at most this part of a lane, and of the bytes of all bodies: a quarter."""
 
-QUICK_SLOTS: Final = 8
-SLOW_SLOTS: Final = 2
-"""Number of requests of a lane that run at a time."""
-
 SMALL: Final = 16 * 1024
 """Maximum size in bytes of a body that the event loop parses, in less than a millisecond.
 
@@ -198,8 +194,8 @@ class Admission:
     """
 
     def __init__(self, requests: int, rows: int) -> None:
-        self.quick = Lane(QUICK_SLOTS, requests)
-        self.slow = Lane(SLOW_SLOTS, rows)
+        self.quick = Lane(8, requests)
+        self.slow = Lane(2, rows)
         self.draws = Lane(1, SHARE * MAX_SWEEPS)
         self.worker = ThreadPoolExecutor(1, "slow", _lower_priority)
         self.drawing = ThreadPoolExecutor(1, "drawing", _lower_priority)

@@ -8,6 +8,8 @@ from typing import Any, Final, Literal
 
 import orjson
 
+from app.settings import Settings
+
 _MASK: Final = "**********"
 _PLAIN: Final = logging.Formatter("%(asctime)s %(levelname)-8s %(process)d %(name)s: %(message)s")
 
@@ -56,28 +58,28 @@ class Masked(logging.Formatter):
 
 
 def _is_useful(record: logging.LogRecord) -> bool:
-    """Return False for uvicorn's advice to install a WebSocket library.
-
-    The service answers each upgrade request as plain HTTP.
-    """
+    # uvicorn advises to install a WebSocket library. The service answers upgrades as plain HTTP.
     return not str(record.msg).startswith("No supported WebSocket library")
 
 
-def log_config(
-    level: str, style: Literal["json", "plain"], secrets: Sequence[str] = ()
-) -> dict[str, Any]:
+def log_config(settings: Settings) -> dict[str, Any]:
     """Return the log configuration of the service and uvicorn for `logging.config.dictConfig`.
 
     The access log of uvicorn is off, because it would contain raw paths. The service writes its own
     access log. The log level of libraries is at least `info`, because numba logs each step of a
     compilation at `debug`.
     """
-    level = level.upper()
+    level, key = settings.log_level.upper(), settings.api_key
+    formatter = {
+        "()": Masked,
+        "style": settings.log_format,
+        "secrets": [key.get_secret_value()] if key else [],
+    }
     libraries = max(logging.getLevelNamesMapping()[level], logging.INFO)
     return {
         "version": 1,
         "disable_existing_loggers": False,
-        "formatters": {"masked": {"()": Masked, "style": style, "secrets": secrets}},
+        "formatters": {"masked": formatter},
         "handlers": {
             "stderr": {
                 "class": "logging.StreamHandler",

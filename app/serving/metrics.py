@@ -6,12 +6,11 @@ route is its template, and only served models have labels. Each replica reports 
 
 import asyncio
 import time
-from functools import partial
+from functools import cache, partial
 from time import monotonic
 from typing import Final, Literal, get_args
 
 from prometheus_client import (
-    CONTENT_TYPE_PLAIN_0_0_4,
     CollectorRegistry,
     Counter,
     Gauge,
@@ -24,8 +23,6 @@ from app.questions.answer import Fields
 from app.serving.admission import Admission
 from app.serving.models import DEFAULT, Key, ServedModels
 from scene_client.schemas.answers import WarningCode
-
-CONTENT_TYPE: Final = CONTENT_TYPE_PLAIN_0_0_4
 
 Outcome = Literal["success", "refused", "failed"]
 
@@ -44,19 +41,14 @@ disable_created_metrics()  # type: ignore[no-untyped-call]
 class Metrics:
     """The metrics of one application. Call the methods only on the thread of the event loop.
 
-    Args:
-        admission: lanes whose weights are metrics.
-
     Attributes:
-        registry: Prometheus registry of this application. A process can have several applications.
         max_age: maximum age in seconds of the text that `exposition` returns.
     """
 
     def __init__(self, admission: Admission) -> None:
-        self.registry = CollectorRegistry()
-        counter = partial(Counter, registry=self.registry)
-        gauge = partial(Gauge, registry=self.registry)
-        histogram = partial(Histogram, registry=self.registry, buckets=_SECONDS)
+        self._registry = registry = CollectorRegistry()  # a process may have several applications
+        counter, gauge = partial(Counter, registry=registry), partial(Gauge, registry=registry)
+        histogram = partial(Histogram, registry=registry, buckets=_SECONDS)
         self._requests = counter("scene_requests_total", "Requests answered", ("route", "outcome"))
         self._latency = histogram(
             "scene_request_duration_seconds",
@@ -114,7 +106,12 @@ class Metrics:
         self._is_ready = False
         # Look-ups of series by label values take a tenth of a request's time in the library. So the
         # series are kept here: of requests, and of the questions of each served model.
-        self._of_requests: dict[tuple[str, str], tuple[Counter, Histogram]] = {}
+        self._of_requests = cache(
+            lambda route, outcome: (
+                self._requests.labels(route, outcome),
+                self._latency.labels(route),
+            )
+        )
         self._of_model: dict[Key, dict[str, tuple[Histogram, Histogram, Counter]]] = {}
         for outcome in get_args(Outcome):
             self._reloads.labels(outcome)
@@ -153,11 +150,7 @@ class Metrics:
 
     def answered(self, route: str, outcome: str, seconds: float) -> None:
         """Count one answered request, by the template of its route, or "-" without a route."""
-        series = self._of_requests.get((route, outcome))
-        if series is None:
-            series = self._requests.labels(route, outcome), self._latency.labels(route)
-            self._of_requests[route, outcome] = series
-        requests, latency = series
+        requests, latency = self._of_requests(route, outcome)
         requests.inc()
         latency.observe(seconds)
 
@@ -207,5 +200,5 @@ class Metrics:
         """
         if self._text is None or monotonic() - self._written_at >= self.max_age:
             self._written_at = monotonic()
-            self._text = asyncio.ensure_future(asyncio.to_thread(generate_latest, self.registry))
+            self._text = asyncio.ensure_future(asyncio.to_thread(generate_latest, self._registry))
         return await asyncio.shield(self._text)

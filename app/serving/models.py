@@ -13,13 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final, Self
 
-from app.errors import (
-    ModelUnavailableError,
-    NotReadyError,
-    ServiceError,
-    UnknownModelError,
-    some_of,
-)
+from app import errors
 from app.questions import QUESTIONS
 from app.questions.answer import written
 from app.registry import Artifact, ArtifactError, ModelSet, StoreError
@@ -65,10 +59,10 @@ class ServedModels:
             model = self._resolved[reference] = self._find(reference)
         except (StoreError, ArtifactError) as error:
             if reference == DEFAULT:
-                raise NotReadyError("The default model is not usable.") from None
+                raise errors.NotReadyError("The default model is not usable.") from None
             if isinstance(error, StoreError) and error.code in _UNKNOWN:
                 raise self.unknown(reference) from None
-            raise ModelUnavailableError("The service refused to load this model.") from None
+            raise errors.ModelUnavailableError("The service refused to load this model.") from None
         return model
 
     def _find(self, reference: str) -> Artifact:
@@ -80,19 +74,19 @@ class ServedModels:
                 raise
             return self.store.resolve(target.name)
 
-    def unknown(self, reference: str) -> UnknownModelError:
+    def unknown(self, reference: str) -> errors.UnknownModelError:
         """Return the error for a reference to nothing. The error lists the known names."""
         name = reference.partition("@")[0]
         target = self.store.aliases.get(name)
         versions = self.store.versions.get(name if target is None else target.name)
         if versions:
-            return UnknownModelError(
-                f"This model has no such version. Its versions: {some_of(versions)}."
+            return errors.UnknownModelError(
+                f"This model has no such version. Its versions: {errors.some_of(versions)}."
             )
         similar = spelt_alike(name, sorted({*self.store.aliases, *self.store.versions}))
         hint = f" Similar names: {', '.join(similar)}." if similar else ""
-        aliases, models = some_of(self.store.aliases), some_of(self.store.versions)
-        return UnknownModelError(
+        aliases, models = errors.some_of(self.store.aliases), errors.some_of(self.store.versions)
+        return errors.UnknownModelError(
             f"No model or alias has this name.{hint} Aliases: {aliases}. Models: {models}."
         )
 
@@ -106,7 +100,7 @@ class ServedModels:
         """Maps each served model to the sorted aliases that point at it."""
         aliases: dict[Key, list[str]] = {key: [] for key in self.served}
         for alias in sorted(self.store.aliases):
-            with suppress(ServiceError):
+            with suppress(errors.ServiceError):
                 aliases[self.resolve(alias).key].append(alias)
         return aliases
 
@@ -115,7 +109,7 @@ class ServedModels:
         """Whether a model answers requests for the alias `default`."""
         try:
             return bool(self.resolve(DEFAULT))
-        except NotReadyError:
+        except errors.NotReadyError:
             return False
 
     def lost_in(self, new: Self) -> list[Failure]:

@@ -22,6 +22,9 @@ RequestT = TypeVar("RequestT", bound=SceneRequest)
 
 SUCCESS: Final = "success"
 
+# Text and fields of an answer, and the seconds that its scene waited and that the model computed.
+_Computed = tuple[bytes, Fields, float, float]
+
 
 @dataclass(slots=True)
 class Record:
@@ -106,9 +109,7 @@ class Request:
             options = question.read(scene, artifact, reading)
             return reading, partial(question.answer, artifact, reading.scene, **options)
 
-        def finish(
-            reading: Reading, ask: Callable[[], Fields], began: float
-        ) -> tuple[bytes, Fields, float, float]:
+        def finish(reading: Reading, ask: Callable[[], Fields], began: float) -> _Computed:
             fields = ask()
             seconds, waited = monotonic() - began, ticket.waited - (record.queue_seconds or 0.0)
             record.queue_seconds = ticket.waited
@@ -119,7 +120,7 @@ class Request:
                 raise _too_large(question, most)
             return body, answer, waited, seconds
 
-        def compute(_: object) -> tuple[bytes, Fields, float, float]:
+        def compute(_: object) -> _Computed:
             began = monotonic()
             return finish(*read(None), began)
 

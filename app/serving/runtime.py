@@ -44,8 +44,7 @@ class Runtime:
         self.bodies = Bodies(settings)
         self.draining = False
         self.metrics = Metrics(self.admission)
-        limit = settings.max_weights_bytes
-        self._store = Store(settings.store, max_weights_bytes=limit)
+        self._store = Store(settings.store, max_weights_bytes=settings.max_weights_bytes)
         self.limits = Limits(
             settings.max_objects, settings.max_relations, settings.max_answer_bytes
         )
@@ -119,8 +118,7 @@ class Runtime:
         new = [one for name, one in models.failures.items() if known.get(name) != one]
         _log_failures("", new)
         if not is_first:
-            count = len(models.served)
-            _logger.info("the service has loaded the store: %d usable versions", count)
+            _logger.info("the service has loaded the store: %d usable versions", len(models.served))
         for alias, target in models.store.aliases.items():
             if not is_first and previous.store.aliases.get(alias) != target:
                 _logger.info("the alias %s names %s now", alias, target)

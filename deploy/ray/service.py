@@ -22,7 +22,7 @@ class Replica:
         """Build the application. Ray Serve calls this method in the replica's process."""
         tune()
         settings = Settings()
-        dictConfig(log_config(settings.log_level, settings.log_format, settings.secrets))
+        dictConfig(log_config(settings))
         app = create_app(settings)
         self._runtime = app.state.runtime
 

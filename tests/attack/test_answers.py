@@ -15,6 +15,7 @@ from app.scene.vocabulary import Vocabulary
 from scene_client.schemas import MAX_BATCH
 from scene_client.validation import MAX_ERRORS
 from tests.http.stores import VOCABULARY
+from tests.http.test_monitoring import samples
 from tests.http.test_problems import problem
 from tests.services import Replace, client_of_service, serve
 
@@ -53,12 +54,16 @@ async def test_the_answer_to_a_batch_has_a_limit(shared_store: Path, replace: Re
         replace("relations", counted)
         headers = {"X-Request-Timeout-Ms": "60000"}
         answer = await client.post("/relations/batch", json=BATCH, headers=headers)
+        found = await samples(client)
     assert answer.status_code == 200
     assert len(answer.content) <= LIMIT
     results = answer.json()["results"]
     statuses = [entry["status"] for entry in results]
     assert statuses == [200] * (computed - 1) + [422] * (MAX_BATCH + 1 - computed)
     assert len(answer.content) > LIMIT / 2
+    # The metrics of the model count only the answers that were sent.
+    sent = sum(value for key, value in found.items() if key[0] == "scene_objects_total")
+    assert sent == 23 * (computed - 1)
     first, second = (
         entry["problem"]["errors"][0] for entry in results[computed - 1 : computed + 1]
     )
