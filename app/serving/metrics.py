@@ -107,10 +107,7 @@ class Metrics:
         # Look-ups of series by label values take a tenth of a request's time in the library. So the
         # series are kept here: of requests, and of the questions of each served model.
         self._of_requests = cache(
-            lambda route, outcome: (
-                self._requests.labels(route, outcome),
-                self._latency.labels(route),
-            )
+            lambda route, kind: (self._requests.labels(route, kind), self._latency.labels(route))
         )
         self._of_model: dict[Key, dict[str, tuple[Histogram, Histogram, Counter]]] = {}
         for outcome in get_args(Outcome):
