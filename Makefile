@@ -39,9 +39,10 @@ endef
 # Install torch, the packages of a lock file, and this repository.
 define install
 	@# torch first and alone, because a package of the lock file needs it. A CUDA build, from the default
-	@# index, then gets its companions.
-	@$(PIP) install --no-deps $(TORCH)
-	@$(PIP) install --require-hashes -r $(1)
+	@# index, then gets its companions. Python compiles the modules that it imports; pip would compile
+	@# all of them, for a minute.
+	@$(PIP) install --no-compile --no-deps $(TORCH)
+	@$(PIP) install --no-compile --require-hashes -r $(1)
 	@$(if $(TORCH_INDEX_URL),,$(PIP) install -qq $(TORCH))
 	@$(PIP) install -qq --no-deps --editable clients/python --editable .
 	@echo "Installed."
