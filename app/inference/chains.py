@@ -22,8 +22,6 @@ Source: Gordon, Salmond and Smith, "Novel approach to nonlinear/non-Gaussian Bay
 estimation" (1993), for resampling and moving.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -128,7 +126,7 @@ class SceneChains:
             x, _ = weights.with_second_layer(weights["c1"] + weights.scenes @ W)
             self.mean = weights.state_means(x).astype(np.float32)
 
-    def under(self, conditions: Conditions, temperature: float = 1.0) -> ConditionedChains:
+    def under(self, conditions: Conditions, temperature: float = 1.0) -> "ConditionedChains":
         """Return the chains under the conditions of one request."""
         return ConditionedChains(self, conditions, temperature)
 
@@ -212,7 +210,7 @@ class ConditionedChains:
         """Cumulative probabilities of the stored scenes as the start of a chain, (N,)."""
         return np.cumsum(self._chains.sample_weights(self._conditions))
 
-    def _in_room(self, room: int | None) -> ConditionedChains:
+    def _in_room(self, room: int | None) -> "ConditionedChains":
         """Return the chains under the same conditions in a room type."""
         if room == self._room:
             return self

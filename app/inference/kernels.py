@@ -7,8 +7,6 @@ of the loops, and it imports no other module with a part in them.
 The modules in the titles of the sections call the loops and explain the formulas.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple

@@ -20,8 +20,6 @@ multiplies the sums of several units and takes one log of the product. The group
 keep the product within float32.
 """
 
-from __future__ import annotations
-
 from bisect import bisect
 from typing import Final
 

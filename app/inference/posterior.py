@@ -12,8 +12,6 @@ objects and on other relations through h1 was not measurable (docs/decisions/evi
 change other relations by implications only.
 """
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np

@@ -12,8 +12,6 @@ docs/decisions/inference.md. The variant of the machine defines base and U. Each
 has its own row of U. `SharedUnits` computes U from factors. All variants share the other code.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import lru_cache

@@ -14,8 +14,6 @@ A mean-field iteration computes m2. The iteration starts at m2 = sigmoid(c2). Fo
 hidden layer, x is exact. At the temperature 1 / beta, beta multiplies all logits.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final

@@ -14,8 +14,6 @@ class. A request that states a coverage above the model's coverage lowers ρ fro
 (1 - coverage) / (1 - model's coverage).
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Collection

@@ -13,8 +13,6 @@ of room. A scene is drawn again if one of these conditions is met:
 After `ATTEMPTS` draws for the same scene, the last draw is accepted in any case.
 """
 
-from __future__ import annotations
-
 import secrets
 from collections.abc import Callable, Collection, Iterator
 from typing import Any, Final

@@ -34,8 +34,6 @@ A relation that a person has confirmed (`app.registry.Misplaced.usual`) has z = 
 d = s = q = 0, because its stand may be rare for the class.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Sequence
 from itertools import chain
 from typing import Final, NamedTuple

@@ -6,8 +6,6 @@ the centres of both. Structural classes (floor, wall) are neither candidates nor
 placements.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import Any, Final
 

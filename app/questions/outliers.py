@@ -11,8 +11,6 @@ multiplied by the probability of the companion in a scene with the outlier. Clas
 is below half of the largest increase are ignored.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator
 from typing import Any, Final
 

@@ -4,11 +4,9 @@ A placement is a relation between a candidate, a class that may be missing, and 
 called the anchor. An offset is the distance vector between the centres of both.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from itertools import repeat
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +53,7 @@ class Place(NamedTuple):
     outgoing: bool
 
     @classmethod
-    def of(cls, name: str, anchor: int) -> Place:
+    def of(cls, name: str, anchor: int) -> Self:
         """Return the place with the relation ``name`` from the missing object to the anchor."""
         relation, subject, _ = canonicalise("missing", name, "anchor")
         return cls(relation, anchor, subject == "missing")

@@ -1,7 +1,5 @@
 """The posterior: log-odds of objects and relations, given a scene, and their calibration."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, Final, NamedTuple
 

@@ -12,8 +12,6 @@ instance counts as observed for all instances. Example: one chair is to the left
 another chair is to the right. Then left and right both count as observed for each chair.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from typing import Final
 

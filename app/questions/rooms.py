@@ -6,8 +6,6 @@ of the request. The machine's probability of a room type t (`app.inference.objec
     p(t) ∝ p_machine(t | objects)^s,   s = slope + log_count · log(number of listed classes)
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final

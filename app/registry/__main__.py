@@ -3,8 +3,6 @@
 Without --store, the store is SCENE_STORE, or else the folder model_store, as for the service.
 """
 
-from __future__ import annotations
-
 import argparse
 import logging
 import os

@@ -1,7 +1,5 @@
 """Statistics of the number of instances of a class in a scene, such as the chairs of a kitchen."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Final, Self

@@ -5,8 +5,6 @@ viewer's axes (x away from the viewer, y left, z up). The tables contain only ca
 The opposite relation, with both classes exchanged, has the negative offset.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property

@@ -9,8 +9,6 @@ each other (`app.scene.roles`). The triples tell which classes stand at a place,
 held is the number of scenes with a relation a from class i to class j, or in the other direction.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

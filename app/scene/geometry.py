@@ -47,8 +47,6 @@ rotated by the yaw.
 4 does not allow, and stacked relations of boxes too far apart to overlap.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -10,8 +10,6 @@ shoes" is shoes. `readings` removes the syntax of detectors: a "mouse_(computer_
 mouse, and "chair_12" is a chair.
 """
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections.abc import Iterator

@@ -5,8 +5,6 @@ pillow on a bed with a headboard, and of milk in a fridge look alike. Their heig
 roles. The roles that such pairs of classes have in words and support links decide.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

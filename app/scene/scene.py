@@ -9,8 +9,6 @@ classes x and y is on if at least one instance of x has relation a to an instanc
 instances without an observed relation have no influence.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

@@ -1,11 +1,9 @@
 """What holds an object: the floor, a wall or the ceiling, or another object."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +48,7 @@ class Heights:
     areas: Floats
 
     @classmethod
-    def of(cls, centres: Floats, sizes: Floats) -> Heights:
+    def of(cls, centres: Floats, sizes: Floats) -> Self:
         """Return the heights of boxes with these centres and extents, (n, 3) each."""
         half = sizes[:, 2] / 2
         return cls(centres[:, 2] - half, centres[:, 2] + half, sizes[:, 0] * sizes[:, 1])

@@ -1,7 +1,5 @@
 """The object classes and room types of a model, and their accepted spellings."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -29,7 +27,7 @@ def _remembered(search: SearchT) -> SearchT:
     """Return a method of `Vocabulary` that remembers the results of another one."""
 
     @wraps(search)
-    def recall(self: Vocabulary, label: str, *, is_room: bool = False) -> Any:
+    def recall(self: "Vocabulary", label: str, *, is_room: bool = False) -> Any:
         memory, key = self._memory, (search.__name__, label, is_room)
         found = memory.get(key, memory)  # a result may be None
         if found is memory:
