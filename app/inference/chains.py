@@ -39,7 +39,7 @@ from app.inference.relations import (
     ends_of,
     relation_units,
 )
-from app.inference.weights import Weights, unpack_scenes
+from app.inference.weights import Weights, state_means, unpack_scenes
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.int64]
@@ -124,7 +124,7 @@ class SceneChains:
         self.mean: Floats = np.zeros((0, spec.H1), np.float32)
         if spec.N:
             x, _ = weights.with_second_layer(weights["c1"] + weights.scenes @ W)
-            self.mean = weights.state_means(x).astype(np.float32)
+            self.mean = state_means(x, spec.states).astype(np.float32)
 
     def under(self, conditions: Conditions, temperature: float = 1.0) -> "ConditionedChains":
         """Return the chains under the conditions of one request."""
@@ -153,8 +153,7 @@ class SceneChains:
         log_weights = self._room_log_weights(conditions.room)
         log_weights += self._classes_log_p(conditions.classes)
         weights = np.exp(log_weights - log_weights.max()).astype(np.float64)
-        probabilities: NDArray[np.float64] = weights / weights.sum()
-        return probabilities
+        return weights / weights.sum()
 
     def _room_log_weights(self, room: int | None) -> Floats:
         """Return the log weight of each stored scene for a requested room type, (N,).
@@ -181,8 +180,7 @@ class SceneChains:
         logits = machine["b"][classes] + self.mean @ machine["W"][classes].T
         if machine.spec.coupled:
             logits += machine.scenes @ machine["L"][:, classes]
-        log_p: Floats = -softplus(-logits).sum(1)
-        return log_p
+        return -softplus(-logits).sum(1)
 
 
 class ConditionedChains:

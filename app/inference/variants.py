@@ -5,7 +5,7 @@ its relation units from these arrays. To add a variant, write a class and add it
 docs/models.md defines the symbols in the formulas.
 """
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any, ClassVar, Final, Literal, Self, get_args
 
 Variant = Literal["rbm", "gbm", "triway"]
@@ -164,10 +164,7 @@ class MachineSpec:
         Raises:
             ValueError: a name is unknown or missing, or a value is invalid.
         """
-        names = {field.name for field in fields(cls)}
-        if unknown := sorted(set(values) - names):
-            raise ValueError(f"a machine spec has unknown fields: {unknown}")
         try:
             return cls(**values)
         except TypeError as error:
-            raise ValueError(f"a machine spec lacks required fields: {error}") from error
+            raise ValueError(f"a machine spec has wrong fields: {error}") from error

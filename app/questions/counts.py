@@ -122,8 +122,7 @@ def distribution(
     log_unlisted = math.log(max(unlisted, sys.float_info.min))
     tables = counts.classes, counts.most, counts.log_share, counts.weights
     first = counts.weights.shape[-1] - V
-    rows, p = count_distributions(*tables, *scene, first, log_unlisted)
-    return rows, p
+    return count_distributions(*tables, *scene, first, log_unlisted)
 
 
 @lru_cache(maxsize=8)

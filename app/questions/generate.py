@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from app.errors import RareRoomTypeError
 from app.inference.chains import ChainState, ConditionedChains, Conditions, random_stream
 from app.inference.kernels import select_consistent
-from app.inference.posterior import context_of
+from app.inference.relations import context_of
 from app.questions.answer import Fields, rounded_number
 from app.questions.names import ErrorList
 from app.questions.outliers import intruders
@@ -212,7 +212,6 @@ def room_fit(artifact: Artifact, classes: list[int], room: int) -> float:
 
 
 def _read(request: GenerateRequest, artifact: Artifact, reading: Reading) -> Options:
-    """Return the arguments of `generate` for a request."""
     errors = ErrorList()
     if reading.scene.room_type in artifact.calibration.rare_rooms:
         message = "the model has too few training scenes of this room type to sample such a room"

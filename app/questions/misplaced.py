@@ -229,8 +229,7 @@ def _heights(artifact: Artifact, scene: Scene, classes: Indices) -> Heights:
 def wrong_log_odds(judgement: Judgement, terms: Floats) -> Floats:
     """Return the log-odds that entries of one kind are wrong, (n,). `terms` is (n, 4)."""
     weights = np.array([judgement.relation, judgement.change, judgement.stand, judgement.supporter])
-    log_odds: Floats = judgement.intercept + terms @ weights
-    return log_odds
+    return judgement.intercept + terms @ weights
 
 
 def wrong_relations(artifact: Artifact, scene: Scene) -> dict[Triple, float]:

@@ -1,8 +1,7 @@
 """The question `missing`: which unlisted objects are probably present, and where?
 
-The answers are object classes that the scene does not list (candidates). A placement is a relation
-between a candidate and a listed object, called the anchor. An offset is the distance vector between
-the centres of both. Structural classes (floor, wall) are neither candidates nor anchors of
+The answers are object classes that the scene does not list (candidates), and their placements
+(`app.questions.placements`). Structural classes (floor, wall) are neither candidates nor anchors of
 placements.
 """
 
@@ -167,12 +166,10 @@ def _logits_at(
             break
         log_p = place_log_p(posterior, block, place)
         scores[block] = bound[block] + entry.relation * log_p
-    logits: NDArray[np.floating[Any]] = entry.intercept + entry.slope * scores
-    return logits
+    return entry.intercept + entry.slope * scores
 
 
 def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Options:
-    """Return the arguments of `missing` for a request."""
     errors, size = ErrorList(), len(artifact.vocabulary)
     # Only the default of `top_k` may exceed the size of the vocabulary.
     if request.top_k > size and "top_k" in request.model_fields_set:

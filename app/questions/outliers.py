@@ -228,7 +228,6 @@ def _unjudged(artifact: Artifact, scene: Scene) -> list[SceneWarning]:
 
 
 def _read(request: OutliersRequest, _: Artifact, reading: Reading) -> Options:
-    """Return the arguments of `outliers` for a request."""
     return {
         "sensitivity": request.sensitivity,
         "threshold": request.threshold,

@@ -1,8 +1,4 @@
-"""Conversion of a request to a scene with ids, class indices and relations from poses.
-
-The functions collect all errors of a request before they raise an exception. So a client can
-correct all errors at once.
-"""
+"""Conversion of a request to a scene with ids, class indices and relations from poses."""
 
 import math
 from collections import Counter

@@ -236,7 +236,6 @@ def _names(
 
 
 def _read(request: RelationsRequest, _: Artifact, reading: Reading) -> Options:
-    """Return the arguments of `relations` for a request."""
     return {
         "top_k": request.top_k,
         "min_probability": request.min_probability,

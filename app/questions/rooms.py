@@ -66,7 +66,6 @@ def rooms(
 
 
 def _read(request: RoomsRequest, _: Artifact, reading: Reading) -> Options:
-    """Return the arguments of `rooms` for a request."""
     candidates = None
     if request.candidates is not None:
         errors = ErrorList()

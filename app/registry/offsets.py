@@ -75,8 +75,7 @@ class Offsets(TensorGroup):
             that contain each pair, (n,). If it is 0, the offset is the sum of a term of the
             relation and one term of each class. `UNOBSERVED`: training lacks the relation.
         """
-        offsets, scenes = look_up_offsets(self.tables, relation, subject, other)
-        return offsets, scenes
+        return look_up_offsets(self.tables, relation, subject, other)
 
     @cached_property
     def tables(self) -> tuple[NDArray[Any], ...]:

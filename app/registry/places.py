@@ -94,8 +94,7 @@ class Places(TensorGroup):
         begin, end = start[relation * V + anchor], start[relation * V + anchor + 1]
         held = _PLACE * back_off[relation]
         held[classes[begin:end]] += counts[begin:end]
-        ratio: Floats = np.log(held / ((counts[begin:end].sum() + _PLACE) * self.frequency))
-        return ratio
+        return np.log(held / ((counts[begin:end].sum() + _PLACE) * self.frequency))
 
     def shows(self, relation: int, subject: Indices, other: Indices) -> NDArray[np.bool_]:
         """Return whether training shows the relation from each subject to each other class, (N, M).
@@ -114,8 +113,7 @@ class Places(TensorGroup):
         V, of_pairs = len(self.frequency), _SUPPORTER * share[other]
         for a in SUPPORTS:
             of_pairs = of_pairs + triple_counts(self.triple, self.held, V, a, subject, other)
-        shares: Floats = of_pairs / (total[subject, None] + _SUPPORTER)
-        return shares
+        return of_pairs / (total[subject, None] + _SUPPORTER)
 
     @cached_property
     def _supporters(self) -> tuple[Floats, Floats]:

@@ -35,6 +35,5 @@ def role_counts(roles: RoleCounts, i: int, j: int) -> NDArray[np.float32]:
     key = i * len(roles.anchor) + j
     row = int(roles.pair.searchsorted(key))
     if row < len(roles.pair) and roles.pair[row] == key:
-        counts: NDArray[np.float32] = roles.counts[row]
-        return counts
+        return roles.counts[row]
     return np.zeros(3, np.float32)

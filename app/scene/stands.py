@@ -60,8 +60,7 @@ class Heights:
         "i is on top of j" then means that j is under i, as a bin is under a desk.
         """
         is_deep = self.bottoms[:, None] < np.maximum(self.bottoms, self.tops - CONTACT)
-        around: Flags = is_deep & (self.areas[:, None] >= self.areas)
-        return around
+        return is_deep & (self.areas[:, None] >= self.areas)
 
 
 def stands_of(holds: Flags, observed: Flags, heights: Heights, floor: float) -> NDArray[np.int64]:
