@@ -150,8 +150,11 @@ class SceneChains:
         The log weight of a stored scene is a sum of two terms: of its room type and of the required
         classes. The module contains the formula.
         """
-        log_weights = self._room_log_weights(conditions.room)
-        log_weights += self._classes_log_p(conditions.classes)
+        machine, classes = self.machine, conditions.classes
+        logits = machine["b"][classes] + self.mean @ machine["W"][classes].T
+        if machine.spec.coupled:
+            logits += machine.scenes @ machine["L"][:, classes]
+        log_weights = self._room_log_weights(conditions.room) - softplus(-logits).sum(1)
         weights = np.exp(log_weights - log_weights.max()).astype(np.float64)
         return weights / weights.sum()
 
@@ -174,14 +177,6 @@ class SceneChains:
             is_other = np.zeros(len(self.mean), np.bool_)
         return np.where(is_other, -OTHER_ROOM, np.float32(0))
 
-    def _classes_log_p(self, classes: Indices) -> Floats:
-        """Return the log probability of the classes given each stored scene, (N,)."""
-        machine = self.machine
-        logits = machine["b"][classes] + self.mean @ machine["W"][classes].T
-        if machine.spec.coupled:
-            logits += machine.scenes @ machine["L"][:, classes]
-        return -softplus(-logits).sum(1)
-
 
 class ConditionedChains:
     """Chains under the same conditions. Each chain has its own random stream.
@@ -192,15 +187,13 @@ class ConditionedChains:
     def __init__(self, chains: SceneChains, conditions: Conditions, temperature: float) -> None:
         self._chains, self._machine = chains, chains.machine
         self._conditions, self._temperature = conditions, temperature
-        spec = chains.machine.spec
         of = conditions.classes, conditions.profile, conditions.room
         bias, self._room_bias = chains.machine.scene_bias(*of)
         self._w = chains.arrays._replace(b=bias)
         self._beta = np.float32(1.0 / temperature)
         self._room, self._bias = conditions.room, chains.machine.room_bias(conditions.room)
-        self._required_classes = np.zeros(spec.V, np.uint8)
+        self._required_classes = np.zeros(chains.machine.spec.V, np.uint8)
         self._required_classes[conditions.classes] = 1
-        self._classes, self._observed = conditions.classes, conditions.observed
         self._others: dict[int | None, ConditionedChains] = {}
 
     @cached_property
@@ -288,10 +281,10 @@ class ConditionedChains:
         """
         r = np.zeros(logits.shape, np.bool_)
         free = ~np.broadcast_to(np.eye(len(classes), dtype=np.bool_), r.shape)
-        observed = self._observed
+        observed = self._conditions.observed
         if observed is not None:
             # The observed classes are always present, so ``classes`` contains each of them.
-            rows = np.searchsorted(classes, self._classes)
+            rows = np.searchsorted(classes, self._conditions.classes)
             a, i, j = observed.a, rows[observed.i], rows[observed.j]
             has_unit = logits[a, i, j] > NEVER / 2
             units = a[has_unit], i[has_unit], j[has_unit]

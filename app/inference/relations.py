@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference import kernels
-from app.inference.kernels import NO_UNIT as NO_UNIT
-from app.inference.kernels import Ends, SharedArrays
+from app.inference.kernels import NO_UNIT, Ends, SharedArrays
 from app.inference.weights import Weights, state_means
 
 Floats = NDArray[np.float32]

@@ -26,12 +26,5 @@ QUESTIONS: Final[tuple[Question[Any], ...]] = (RELATIONS, MISSING, OUTLIERS, ROO
 """All questions, in the order of the documentation."""
 
 __all__ = [
-    "QUESTIONS",
-    "Question",
-    "generate",
-    "misplaced",
-    "missing",
-    "outliers",
-    "relations",
-    "rooms",
-]
+    "QUESTIONS", "Question", "generate", "misplaced", "missing", "outliers", "relations", "rooms",
+]  # fmt: skip

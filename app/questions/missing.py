@@ -175,7 +175,7 @@ def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Opti
     if request.top_k > size and "top_k" in request.model_fields_set:
         message = f"`top_k` must be at most {size}, the size of the vocabulary"
         errors.add(InvalidRequestError, ("top_k",), message)
-    candidates = at = None
+    candidates, at, view = None, None, request.viewpoint
     if request.candidates is not None:
         candidates = reading.unknown.resolve_all(request.candidates, "candidates", errors)
     if request.at is not None:
@@ -186,7 +186,7 @@ def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Opti
         "candidates": candidates,
         "at": at,
         "coverage": request.coverage,
-        "axes": _axes(request),
+        "axes": viewer_axes(request.frame_id, None if view is None else view.yaw),
         "details": request.detail == "full",
     }
 
@@ -205,14 +205,6 @@ def _at(
             message = "the model knows no relations to floor, wall and ceiling"
             errors.add(InvalidRequestError, ("at", "object"), message)
     return None if anchor is None else (at.relation, anchor)
-
-
-def _axes(request: MissingRequest) -> Axes | None:
-    """Return the viewer's axes in `frame_id`, or None if the viewing direction is unknown."""
-    if request.frame_id is None and request.viewpoint is None:
-        return VIEWER
-    view = request.viewpoint
-    return viewer_axes(request.frame_id, None if view is None else view.yaw)
 
 
 def _ask_all(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:

@@ -20,10 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference import MachineSpec
+from app.inference.kernels import pool_classes, pool_relations
 from app.inference.relations import Between, ObservedRelations, context_of, to_log_odds
 from app.registry.artifact import Artifact
 from app.registry.description import CountSlope
-from app.scene.scene import Scene, instance_evidence, pool_classes, pool_relations
+from app.scene.scene import Scene, instance_evidence
 
 Floats = NDArray[np.floating[Any]]
 Doubles = NDArray[np.float64]

@@ -7,10 +7,7 @@ from typing import Annotated, Any, ClassVar, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.kernels import INTERCEPT as INTERCEPT
-from app.inference.kernels import ROOM as ROOM
-from app.inference.kernels import SEVERAL as SEVERAL
-from app.inference.kernels import SINGLE as SINGLE
+from app.inference.kernels import ROOM
 from app.registry.fields import TensorGroup
 
 Table = NDArray[np.float32]

@@ -13,7 +13,6 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.kernels import UNOBSERVED as UNOBSERVED
 from app.inference.kernels import look_up_offsets
 from app.registry.fields import TensorGroup
 

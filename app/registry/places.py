@@ -18,10 +18,10 @@ from typing import Annotated, Any, ClassVar, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.kernels import triple_counts
+from app.inference.kernels import IN, ON, UNDER, triple_counts
 from app.registry.fields import TensorGroup
 from app.scene.relations import CANONICAL, STACKED, SUPPORTS
-from app.scene.roles import IN, ON, UNDER, RoleCounts, role_counts
+from app.scene.roles import RoleCounts, role_counts
 from app.scene.stands import HANGS, SUPPORTED, USUAL
 
 _PLACE: Final = 10.0  # smoothing s, in scenes

@@ -56,7 +56,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from app.inference import kernels
-from app.inference.kernels import CONTACT as CONTACT
 from app.inference.kernels import MIN_OFFSET
 from app.scene.relations import CANONICAL, FRONT, LEFT, ON_TOP
 from app.scene.roles import RoleCounts

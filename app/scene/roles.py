@@ -10,11 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.kernels import IN as IN
-from app.inference.kernels import ON as ON
-from app.inference.kernels import UNDER as UNDER
-from app.inference.kernels import likely_role as likely_role
-
 
 class RoleCounts(NamedTuple):
     """How often classes have each role, as sources state it in words or by support links.

@@ -16,8 +16,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.kernels import pool_classes as pool_classes
-from app.inference.kernels import pool_relations as pool_relations
 from app.scene.geometry import (
     SMALLEST,
     PoseRelations,

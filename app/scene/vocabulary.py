@@ -55,7 +55,7 @@ class ObjectClass:
         anywhere: True if objects of the class belong in every room (pets, people, bags, toys).
 
     Raises:
-        ValueError: a name is empty, or the size is not three positive finite numbers.
+        ValueError: the size is not three positive finite numbers.
     """
 
     __pydantic_config__: ClassVar = {"extra": "forbid"}  # for classes in JSON
@@ -68,10 +68,8 @@ class ObjectClass:
     anywhere: bool = False
 
     def __post_init__(self) -> None:
-        for name in (self.label, *self.aliases):
-            if not label_key(name):
-                raise ValueError(f"object class {self.label!r} has an empty name: {name!r}")
-        if self.size is not None and not _are_extents(self.size):
+        sides: Sequence[float] = (1.0, 1.0, 1.0) if self.size is None else self.size
+        if len(sides) != 3 or not all(math.isfinite(side) and side > 0 for side in sides):
             raise ValueError(
                 f"size of {self.label!r} must be three positive numbers (metres), not {self.size!r}"
             )
@@ -298,7 +296,3 @@ def _read_only(values: ArrayLike) -> NDArray[Any]:
     array = np.array(values)
     array.flags.writeable = False
     return array
-
-
-def _are_extents(size: Sequence[float]) -> bool:
-    return len(size) == 3 and all(math.isfinite(side) and side > 0 for side in size)
