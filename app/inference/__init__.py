@@ -4,8 +4,6 @@ A machine is a Boltzmann machine over the objects and relations of a scene. docs
 its units (v, r, h1, h2) and its parameters (b, c1, c2, W, J, Q, d, s, o, S, O, R, M, P, U).
 """
 
-from __future__ import annotations
-
 from app.inference.variants import MachineSpec
 from app.inference.weights import Weights
 

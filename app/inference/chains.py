@@ -22,8 +22,6 @@ Source: Gordon, Salmond and Smith, "Novel approach to nonlinear/non-Gaussian Bay
 estimation" (1993), for resampling and moving.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -41,7 +39,7 @@ from app.inference.relations import (
     ends_of,
     relation_units,
 )
-from app.inference.weights import Weights, unpack_scenes
+from app.inference.weights import Weights, state_means, unpack_scenes
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.int64]
@@ -126,9 +124,9 @@ class SceneChains:
         self.mean: Floats = np.zeros((0, spec.H1), np.float32)
         if spec.N:
             x, _ = weights.with_second_layer(weights["c1"] + weights.scenes @ W)
-            self.mean = weights.state_means(x).astype(np.float32)
+            self.mean = state_means(x, spec.states).astype(np.float32)
 
-    def under(self, conditions: Conditions, temperature: float = 1.0) -> ConditionedChains:
+    def under(self, conditions: Conditions, temperature: float = 1.0) -> "ConditionedChains":
         """Return the chains under the conditions of one request."""
         return ConditionedChains(self, conditions, temperature)
 
@@ -152,11 +150,13 @@ class SceneChains:
         The log weight of a stored scene is a sum of two terms: of its room type and of the required
         classes. The module contains the formula.
         """
-        log_weights = self._room_log_weights(conditions.room)
-        log_weights += self._classes_log_p(conditions.classes)
+        machine, classes = self.machine, conditions.classes
+        logits = machine["b"][classes] + self.mean @ machine["W"][classes].T
+        if machine.spec.coupled:
+            logits += machine.scenes @ machine["L"][:, classes]
+        log_weights = self._room_log_weights(conditions.room) - softplus(-logits).sum(1)
         weights = np.exp(log_weights - log_weights.max()).astype(np.float64)
-        probabilities: NDArray[np.float64] = weights / weights.sum()
-        return probabilities
+        return weights / weights.sum()
 
     def _room_log_weights(self, room: int | None) -> Floats:
         """Return the log weight of each stored scene for a requested room type, (N,).
@@ -177,15 +177,6 @@ class SceneChains:
             is_other = np.zeros(len(self.mean), np.bool_)
         return np.where(is_other, -OTHER_ROOM, np.float32(0))
 
-    def _classes_log_p(self, classes: Indices) -> Floats:
-        """Return the log probability of the classes given each stored scene, (N,)."""
-        machine = self.machine
-        logits = machine["b"][classes] + self.mean @ machine["W"][classes].T
-        if machine.spec.coupled:
-            logits += machine.scenes @ machine["L"][:, classes]
-        log_p: Floats = -softplus(-logits).sum(1)
-        return log_p
-
 
 class ConditionedChains:
     """Chains under the same conditions. Each chain has its own random stream.
@@ -196,15 +187,13 @@ class ConditionedChains:
     def __init__(self, chains: SceneChains, conditions: Conditions, temperature: float) -> None:
         self._chains, self._machine = chains, chains.machine
         self._conditions, self._temperature = conditions, temperature
-        spec = chains.machine.spec
         of = conditions.classes, conditions.profile, conditions.room
         bias, self._room_bias = chains.machine.scene_bias(*of)
         self._w = chains.arrays._replace(b=bias)
         self._beta = np.float32(1.0 / temperature)
         self._room, self._bias = conditions.room, chains.machine.room_bias(conditions.room)
-        self._required_classes = np.zeros(spec.V, np.uint8)
+        self._required_classes = np.zeros(chains.machine.spec.V, np.uint8)
         self._required_classes[conditions.classes] = 1
-        self._classes, self._observed = conditions.classes, conditions.observed
         self._others: dict[int | None, ConditionedChains] = {}
 
     @cached_property
@@ -212,7 +201,7 @@ class ConditionedChains:
         """Cumulative probabilities of the stored scenes as the start of a chain, (N,)."""
         return np.cumsum(self._chains.sample_weights(self._conditions))
 
-    def _in_room(self, room: int | None) -> ConditionedChains:
+    def _in_room(self, room: int | None) -> "ConditionedChains":
         """Return the chains under the same conditions in a room type."""
         if room == self._room:
             return self
@@ -292,10 +281,10 @@ class ConditionedChains:
         """
         r = np.zeros(logits.shape, np.bool_)
         free = ~np.broadcast_to(np.eye(len(classes), dtype=np.bool_), r.shape)
-        observed = self._observed
+        observed = self._conditions.observed
         if observed is not None:
             # The observed classes are always present, so ``classes`` contains each of them.
-            rows = np.searchsorted(classes, self._classes)
+            rows = np.searchsorted(classes, self._conditions.classes)
             a, i, j = observed.a, rows[observed.i], rows[observed.j]
             has_unit = logits[a, i, j] > NEVER / 2
             units = a[has_unit], i[has_unit], j[has_unit]

@@ -1,7 +1,5 @@
 """Elementary functions of numpy arrays."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -19,8 +17,7 @@ def sigmoid(x: Floats) -> Floats:
 
 def softplus(x: Floats) -> Floats:
     """Compute log(1 + e^x)."""
-    y: Floats = np.maximum(x, 0) + np.log1p(np.exp(-np.abs(x)))
-    return y
+    return np.maximum(x, 0) + np.log1p(np.exp(-np.abs(x)))
 
 
 def softmax(x: NDArray[Any]) -> NDArray[Any]:
@@ -32,5 +29,4 @@ def softmax(x: NDArray[Any]) -> NDArray[Any]:
 def log_softmax(x: NDArray[Any]) -> NDArray[Any]:
     """Compute log softmax(x) over the last axis, which may be empty."""
     shifted = x - x.max(-1, keepdims=True, initial=-np.inf)
-    y: NDArray[Any] = shifted - np.log(np.exp(shifted).sum(-1, keepdims=True))
-    return y
+    return shifted - np.log(np.exp(shifted).sum(-1, keepdims=True))

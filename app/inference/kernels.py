@@ -7,8 +7,6 @@ of the loops, and it imports no other module with a part in them.
 The modules in the titles of the sections call the loops and explain the formulas.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
@@ -22,7 +20,6 @@ from numpy.typing import NDArray
 from app.compiling import FOLDER
 
 Floats = NDArray[np.floating[Any]]
-Ints = NDArray[np.integer[Any]]
 Indices = NDArray[np.int64]
 
 KERNELS: Final[list[Any]] = []
@@ -77,8 +74,6 @@ _SQRT_HALF_BITS = _i(0x3F3504F3)
 _MANTISSA_BITS = _i(0x007FFFFF)
 _ONE_BITS = _i(0x3F800000)
 _LN2 = _f(0.6931471805599453)
-_ONE = _f(1.0)
-_HALF = _f(0.5)
 
 
 @intrinsic
@@ -168,21 +163,21 @@ def _find(keys, key):
 
 
 @compiled
-def all_states(x: NDArray[Any], states: int) -> NDArray[np.float32]:
+def all_states(x, states):
     """Return the probabilities of all states of the hidden units, (B, units, states).
 
     Args:
         x: (B, H1) logits of all states but the first of each unit.
         states: number of states of a unit.
     """
-    p: NDArray[np.float32] = _with_first(x, states)
+    p = _with_first(x, states)
     for b in range(len(p)):
         for m in range(p.shape[1]):
             row = p[b, m]
             top = _largest(row)
             # The square of e^(x/2) covers subnormal numbers.
             for z in range(states):
-                row[z] = exp((row[z] - top) * _HALF)
+                row[z] = exp((row[z] - top) * _f(0.5))
                 row[z] *= row[z]
             scale = np.float32(1.0) / _total(row)
             for z in range(states):
@@ -191,9 +186,9 @@ def all_states(x: NDArray[Any], states: int) -> NDArray[np.float32]:
 
 
 @compiled
-def odds(x: NDArray[Any], states: int) -> NDArray[np.float32]:
+def odds(x, states):
     """Return e^x of all states of the hidden units, (B, units, states). See `all_states`."""
-    p: NDArray[np.float32] = _with_first(x, states)
+    p = _with_first(x, states)
     flat = p.reshape(-1)
     for k in range(len(flat)):
         flat[k] = exp(flat[k])
@@ -201,7 +196,7 @@ def odds(x: NDArray[Any], states: int) -> NDArray[np.float32]:
 
 
 @compiled
-def _with_first(x: NDArray[Any], states: int) -> NDArray[np.float32]:
+def _with_first(x, states):
     """Return x (B, H1) with a 0 for the first state of each unit, (B, units, states)."""
     p = np.zeros((len(x), x.shape[1] // (states - 1), states), np.float32)
     for b in range(len(p)):
@@ -212,15 +207,15 @@ def _with_first(x: NDArray[Any], states: int) -> NDArray[np.float32]:
 
 
 @compiled_in_any_order
-def _largest(row: NDArray[np.float32]) -> np.float32:
-    largest: np.float32 = row[0]
+def _largest(row):
+    largest = row[0]
     for z in range(1, len(row)):
         largest = max(largest, row[z])
     return largest
 
 
 @compiled_in_any_order
-def _total(row: NDArray[np.float32]) -> np.float32:
+def _total(row):
     total = np.float32(0.0)
     for z in range(len(row)):
         total += row[z]
@@ -246,7 +241,7 @@ def gains(p, factors, group, rows):
     total = np.empty(width, np.float32)
     for t in range(tiles):
         for b in range(len(p)):
-            product[:], exponents[:] = _ONE, np.int32(0)
+            product[:], exponents[:] = _f(1.0), _i(0)
             for m in range(units):
                 total[:] = p[b, m, 0]
                 for z in range(0, states - 1, 2):
@@ -911,7 +906,7 @@ def sweeps(w, bias, always, beta, uniform, on, h1, h2):
     drawn one after another, each given all others.
 
     Args:
-        w: `chains.Arrays`.
+        w: `ChainArrays`.
         bias: (H1,) bias of h1.
         always: (V,) uint8, 1 for classes that stay present.
         beta: 1 / temperature.
@@ -1113,7 +1108,7 @@ _OF_ANCHOR: Final = 2.0
 
 
 @compiled
-def is_smaller(size_i: NDArray[Any], size_j: NDArray[Any]) -> bool:
+def is_smaller(size_i, size_j):
     """Return whether box i is smaller than box j.
 
     The function compares the areas of the footprints. If these are equal up to the share `SAME`, it
@@ -1129,7 +1124,7 @@ def is_smaller(size_i: NDArray[Any], size_j: NDArray[Any]) -> bool:
 
 
 @compiled
-def possible_roles(rise: float, height: float, larger_height: float) -> NDArray[np.bool_]:
+def possible_roles(rise, height, larger_height):
     """Return which roles the heights of two boxes allow, (3,) bool.
 
     Args:
@@ -1145,9 +1140,7 @@ def possible_roles(rise: float, height: float, larger_height: float) -> NDArray[
 
 
 @compiled
-def likely_role(
-    roles: tuple[NDArray[Any], NDArray[Any], NDArray[Any]], i: int, j: int, possible: NDArray[Any]
-) -> int:
+def likely_role(roles, i, j, possible):
     """Return the role of a smaller object of class i at a larger object of class j, or -1.
 
     The result is -1 if no role has `LEAST_SHARE` of the smoothed counts, and at least
@@ -1314,10 +1307,8 @@ def _horizontal(points, i, j):
 
 
 @compiled
-def pool_classes(
-    classes: NDArray[np.int64], confidence: NDArray[np.float64]
-) -> tuple[Indices, Indices, Indices, Indices, NDArray[np.float64]]:
-    """Return the n distinct classes of N instances.
+def pool_classes(classes, confidence):
+    """Return the n distinct classes of N instances; classes (N,) int64, confidence (N,) float64.
 
     Returns:
         Class indices in ascending order, (n,).
@@ -1348,13 +1339,11 @@ def pool_classes(
 
 
 @compiled
-def pool_relations(
-    row: NDArray[np.int64], n: int, holds: NDArray[np.bool_], observed: NDArray[np.bool_]
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Pool the relations of instances (A, N, N) into relations of classes (A, n, n).
+def pool_relations(row, n, holds, observed):
+    """Pool the relations of instances (A, N, N) into relations of classes (A, n, n), all bool.
 
-    ``row`` (N,) is the index of each instance's class, from 0 to n - 1. The results are ``holds``
-    and ``observed`` of `ClassEvidence`.
+    ``row`` (N,) is the index of each instance's class, from 0 to n - 1. The results are the pooled
+    ``holds`` and ``observed``.
     """
     A, size, _ = holds.shape
     class_holds, class_observed = np.zeros((A, n, n), np.bool_), np.zeros((A, n, n), np.bool_)
@@ -1376,7 +1365,7 @@ MOST_EXCLUDED = np.float32(0.01)
 
 
 @compiled
-def relation_probability(slopes: Floats, log_odds: Floats, log_count: Floats) -> Floats:
+def relation_probability(slopes, log_odds, log_count):
     """Return the probability that each relation holds between two objects, (B, A, N).
 
     The shape is (B candidate classes, A relations, N pairs of classes). B is 1 without candidates.
@@ -1401,7 +1390,7 @@ def relation_probability(slopes: Floats, log_odds: Floats, log_count: Floats) ->
 
 
 @inlined
-def exclusive(forward: Floats, backward: Floats) -> tuple[Floats, Floats]:
+def exclusive(forward, backward):
     """Scale p(a(x,y)) and p(a(y,x)) so that their sum is at most 1.
 
     The reason is that a relation a cannot hold in both directions between the same two objects.
@@ -1720,22 +1709,15 @@ several times, and the first of C room types. The last V columns are those of th
 
 @compiled
 def count_distributions(
-    known: NDArray[np.integer[Any]],
-    most: NDArray[np.integer[Any]],
-    log_share: NDArray[np.float32],
-    weights: NDArray[np.float32],
-    classes: Ints,
-    listed: Ints,
-    room: int,
-    first: int,
-    log_unlisted: float,
-) -> tuple[Ints, Floats]:
+    known, most, log_share, weights, classes, listed, room, first, log_unlisted
+):
     """Return the classes and the distributions of `distribution`, (k,) and (k, M).
 
     Args:
         known, most, log_share, weights: see `Counts`. Column `first` of the weights is class 0.
         classes, listed: (n,) listed classes, and numbers of listed objects.
         room: index of the room type, or -1.
+        log_unlisted: log ρ of the formula.
     """
     n, M = len(classes), log_share.shape[1]
     p, rows, k = np.empty((n, M), np.float64), np.empty(n, np.int64), 0
@@ -1806,19 +1788,22 @@ def look_up_offsets(tables, relation, subject, other):
 
 
 @compiled
-def rotated_offsets(
-    tables: tuple[NDArray[Any], ...],
-    relation: NDArray[np.int64],
-    missing: NDArray[np.int64],
-    anchor: NDArray[np.int64],
-    outgoing: NDArray[np.bool_],
-    axes: NDArray[np.float64],
-    has_axes: bool,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Compute the mean (n, 3), standard deviation (n, 3) and number of scenes (n,) of n offsets.
+def rotated_offsets(tables, relation, missing, anchor, outgoing, axes, has_axes):
+    """Return the offset from each of n anchors to its missing object, in metres.
 
-    ``has_axes`` is False if the viewing direction is unknown. For the other arguments, see
-    `offsets_of`.
+    Args:
+        tables: `Offsets.tables`.
+        relation, missing, anchor: (n,) indices of the canonical relations, of the classes of the
+            missing objects, and of the classes of the anchors.
+        outgoing: (n,) bool, True if the missing object is the relation's subject.
+        axes: (3, 3) float64, the viewer's axes in the frame of the offsets.
+        has_axes: False if the viewing direction is unknown. The relations left and front then have
+            no offset. The means of other offsets are then vertical.
+
+    Returns:
+        Mean (n, 3) and standard deviation (n, 3) along x, y and z. Then the number of training
+        scenes that contain the two classes in this relation, (n,). It is `UNOBSERVED` for an
+        unknown offset.
     """
     n = len(relation)
     subject, object_ = np.empty(n, np.int64), np.empty(n, np.int64)
@@ -1875,14 +1860,7 @@ def add_unseen(shown, change, candidates, classes, forward, backward):
 
 
 @compiled
-def triple_counts(
-    triple: NDArray[Any],
-    held: NDArray[Any],
-    V: int,
-    relation: int,
-    subject: NDArray[Any],
-    other: NDArray[Any],
-) -> Floats:
+def triple_counts(triple, held, V, relation, subject, other):
     """Return the counts of the triples (relation, subject, other), (N, M); 0 without an entry."""
     counts = np.zeros((len(subject), len(other)))
     for i in range(len(subject)):
@@ -1901,13 +1879,7 @@ _DIRECTION: Final = np.array([1, 2, 0, 0, 0])
 
 
 @compiled
-def select_consistent(
-    relation: NDArray[np.int64],
-    ends: NDArray[np.int64],
-    order: NDArray[np.int64],
-    fixed: int,
-    count: int,
-) -> NDArray[np.bool_]:
+def select_consistent(relation, ends, order, fixed, count):
     """Select relations that contradict neither the evidence nor each other, as a bool mask (m,).
 
     Args:
@@ -1950,8 +1922,8 @@ _POWERS: Final = np.array([10.0**power for power in range(23)])
 
 
 @compiled
-def round_to_digits(values: NDArray[np.float64]) -> bool:
-    """Round numbers to `DIGITS` significant digits in place.
+def round_to_digits(values):
+    """Round float64 numbers (n,) to `DIGITS` significant digits in place.
 
     Returns:
         False if a number is too small or too large for exact powers of ten. Such numbers stay

@@ -20,8 +20,6 @@ multiplies the sums of several units and takes one log of the product. The group
 keep the product within float32.
 """
 
-from __future__ import annotations
-
 from bisect import bisect
 from typing import Final
 
@@ -88,8 +86,7 @@ class Gains:
     def __call__(self, x: Floats) -> Floats:
         """Return the gain of each row of weights, (B, rows), at the logits x of h1, (B, H1)."""
         p = kernels.all_states(x, self._states)
-        gain: Floats = kernels.gains(p, self._factors, self._group, self._rows)
-        return gain
+        return kernels.gains(p, self._factors, self._group, self._rows)
 
 
 class ObjectScorer:
@@ -148,8 +145,7 @@ class ObjectScorer:
         low = bisect(_MIDDLES, coverage, 1, len(SHARES)) - 1
         share = (coverage - _MIDDLES[low]) / (_MIDDLES[low + 1] - _MIDDLES[low])
         weight = np.float32(min(max(share, 0.0), 1.0))
-        mixed: Floats = (1 - weight) * kappa[low] + weight * kappa[low + 1]
-        return mixed
+        return (1 - weight) * kappa[low] + weight * kappa[low + 1]
 
     def given_rest(
         self,
@@ -196,12 +192,11 @@ class ObjectScorer:
         """See `kernels.explained_log_odds`."""
         weights = self._weights
         possible = slice(None) if profile is None else slice(profile, profile + 1)
-        log_odds, change = kernels.explained_log_odds(
+        return kernels.explained_log_odds(
             *(scene.x, scene.shares, weights["W"], bias, self._couplings),
             *(weights["f"][possible], weights["a"][possible], self._states),
             *(scene.classes, scene.presence, rows, targets, explained),
         )
-        return log_odds, change
 
     def increases(self, i: int) -> tuple[Floats, Floats]:
         """Return how much the presence of class i increases the log-odds of each class, (V,).

@@ -12,8 +12,6 @@ docs/decisions/inference.md. The variant of the machine defines base and U. Each
 has its own row of U. `SharedUnits` computes U from factors. All variants share the other code.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import lru_cache
@@ -23,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference import kernels
-from app.inference.kernels import NO_UNIT as NO_UNIT
-from app.inference.kernels import Ends, SharedArrays
+from app.inference.kernels import NO_UNIT, Ends, SharedArrays
 from app.inference.weights import Weights, state_means
 
 Floats = NDArray[np.float32]
@@ -99,9 +96,34 @@ class Context:
     shares: Floats
     observed: ObservedRelations | None
 
-    def ends(self, i: Indices, j: Indices) -> Ends:
-        """See `ends_of`."""
-        return ends_of(self.classes, self.presence, self.log_counts, i, j)
+
+def context_of(
+    weights: Weights,
+    classes: Indices,
+    presence: Floats,
+    log_counts: Floats,
+    room: int | None = None,
+    observed: ObservedRelations | None = None,
+) -> Context:
+    """Compute the logits of h1 given the objects and the room type.
+
+    Args:
+        classes: (n,) indices of the distinct classes of the scene.
+        presence: (n,) probability that each class is present.
+        log_counts: (n,) log of the number of instances of each class.
+        room: index of the room type, or None if the room type is unknown.
+        observed: observed relations, or None if the scene has no observed relations.
+    """
+    shares = presence[:, None] * weights["W"][classes]
+    x = weights.room_bias(room) + shares.sum(0)
+    if weights.spec.H2:
+        # The effect of a class through the second layer is J m2 for the whole scene minus J m2 for
+        # the scene without this class.
+        bases = np.concatenate([x[None], x - shares]).astype(np.float32)
+        logits, _ = weights.with_second_layer(bases)
+        through = (logits - bases).astype(np.float32)
+        x, shares = logits[0].astype(np.float32), shares + through[0] - through[1:]
+    return Context(classes, presence, log_counts, x, shares, observed)
 
 
 def ends_of(classes: Indices, presence: Floats, log_counts: Floats, i: Indices, j: Indices) -> Ends:
@@ -154,25 +176,19 @@ class RelationUnits(ABC):
 
     def between(self, context: Context) -> Between:
         """Return the logits of all relations between the classes of a scene."""
-        n = len(context.classes)
+        n, observed = len(context.classes), context.observed
+        listed = context.classes, context.presence, context.log_counts
         means = state_means(context.x[None], self._states)
-        mean, spread = self.normal(means, context.ends(*all_pairs(n)))
+        mean, spread = self.normal(means, ends_of(*listed, *all_pairs(n)))
+        weight = NO_VALUES if observed is None else self.implication_weights(context.x)
+        shift = apart = NO_VALUES
+        if observed is not None and len(weight):
+            on = (observed.r > 0) & (observed.i != observed.j)
+            units = observed.a[on], observed.i[on], observed.j[on]
+            shifts = kernels.implication_shifts(weight, n, *units)
+            shift, apart = (np.ascontiguousarray(change.transpose(2, 0, 1)) for change in shifts)
         shape = self._A, n, n
-        shifts = self._implication_shifts(context.x, n, context.observed)
-        return Between(mean.reshape(shape), spread.reshape(shape), *shifts)
-
-    def _implication_shifts(
-        self, x: Floats, n: int, observed: ObservedRelations | None
-    ) -> tuple[Floats, Floats]:
-        """Return `shift` and `apart` of `Between` for n classes; x (H1,) are the logits of h1."""
-        weight = NO_VALUES if observed is None else self.implication_weights(x)
-        if observed is None or not len(weight):
-            return NO_VALUES, NO_VALUES
-        on = (observed.r > 0) & (observed.i != observed.j)
-        ends = observed.i[on], observed.j[on]
-        shifts = kernels.implication_shifts(weight, n, observed.a[on], *ends)
-        shift, apart = (np.ascontiguousarray(change.transpose(2, 0, 1)) for change in shifts)
-        return shift, apart
+        return Between(mean.reshape(shape), spread.reshape(shape), shift, apart)
 
     def implication_weights(self, x: Floats, beta: float = 1.0) -> Floats:
         """Return how much each of F features of the observed relations changes a logit, (F, A).
@@ -181,7 +197,6 @@ class RelationUnits(ABC):
         which relations do not change each other's logits directly. x (H1,) are the logits of h1
         given the objects, and beta is 1 / temperature.
         """
-        del x, beta
         return NO_VALUES.reshape(0, 0)
 
     def log_odds(self, between: Between, *, apart: bool = False) -> Floats:
@@ -222,36 +237,27 @@ class FreeUnits(RelationUnits):
 
     The logit of unit t is ℓ_t = d_t + g_t v_i + g'_t v_j + U_t·h1. Triples that do not occur in the
     training scenes have no unit. Such triples are not evidence, and their log-odds are `NO_UNIT`.
-
-    Args:
-        U: (T, H1) weights between units and h1.
-        g: (T, 2) weights of the presence of subject and object class. None means that all these
-            weights are 0.
+    The variant RBM has no g and g'.
     """
 
-    def __init__(self, weights: Weights, U: Floats, g: Floats | None = None) -> None:
+    def __init__(self, weights: Weights) -> None:
         super().__init__(weights)
-        self._U, self._d, self._g = U, weights["d"], g
+        self._U, self._d, self._g = weights["U"], weights["d"], weights.arrays.get("g")
         self._table, index = _pair_table(weights)
         # The unit of each pair and relation, or -1. The last row is for pairs outside the table.
         self._index = np.full((len(self._table[1]) + 1, self._A), -1, np.int32)
-        self._index[index] = np.arange(len(U))
-
-    def _units(self, a: Indices, i: Indices, j: Indices) -> Indices:
-        """Return the unit of each relation, or -1 for relations without a unit, (E,)."""
-        rows = kernels.pair_rows(*self._table, i * self._V + j)
-        return self._index[rows, a].astype(np.int64)
+        self._index[index] = np.arange(len(self._U))
 
     def normal(
         self, means: Floats, ends: Ends, only: int | None = None, *, certain: bool = False
     ) -> tuple[Floats, Floats]:
-        """See `RelationUnits`."""
-        del certain  # unused: the formula gives variance 0 for means of 0 and 1
+        """See `RelationUnits`. The formula gives variance 0 for means of 0 and 1."""
         chosen = _chosen_relations(self._A, only)
         shape = len(means), chosen.stop - chosen.start, ends.i.shape[1]
         # Row b of the means, relation a and pair p of each entry of the result.
         b, a, p = (indices.reshape(-1) for indices in np.indices(shape))
-        units = self._units(chosen.start + a, ends.i[b, p], ends.j[b, p])
+        rows = kernels.pair_rows(*self._table, ends.i[b, p] * self._V + ends.j[b, p])
+        units = self._index[rows, chosen.start + a].astype(np.int64)
         kept = np.flatnonzero(units >= 0)
         units, b, p = units[kept], b[kept], p[kept]
         base = self._d[units]
@@ -328,8 +334,7 @@ class SharedUnits(RelationUnits):
         by_unit = means.reshape(len(means), -1, self._states - 1).transpose(1, 0, 2)
         f = by_unit @ self._F[:, :, chosen.start * r : chosen.stop * r]
         f = f.reshape(len(f), len(means), R, r)
-        mean, spread = kernels.normal_logits(self._w, chosen.start, ends, U, Y, C, f)
-        return mean, spread
+        return kernels.normal_logits(self._w, chosen.start, ends, U, Y, C, f)
 
     def _products(self, chosen: slice, rows: Floats, columns: Floats) -> Floats:
         """Return the product of the rows (B, H1) with n columns of each chosen relation, (B, R, n).
@@ -354,9 +359,7 @@ class SharedUnits(RelationUnits):
 
 def relation_units(weights: Weights) -> RelationUnits:
     """Return the relation units of a machine."""
-    if weights.spec.kind.factorised:
-        return SharedUnits(weights)
-    return FreeUnits(weights, weights["U"], weights.arrays.get("g"))
+    return SharedUnits(weights) if weights.spec.kind.factorised else FreeUnits(weights)
 
 
 @lru_cache(maxsize=128)
@@ -417,7 +420,7 @@ def _directions(weights: Weights) -> tuple[Floats, Floats]:
     frequency, means = np.ones(spec.V), np.full((1, spec.H1), 1 / spec.states)
     if spec.N:
         frequency = weights.scenes.mean(0).astype(np.float64) + 1e-6
-        means = weights.state_means(weights["c1"] + weights.scenes @ weights["W"])
+        means = state_means(weights["c1"] + weights.scenes @ weights["W"], spec.states)
     p = (frequency / frequency.sum())[:, None]
     ones = np.ones((spec.V, 1))
     S, O = (  # noqa: E741

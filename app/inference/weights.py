@@ -14,8 +14,6 @@ A mean-field iteration computes m2. The iteration starts at m2 = sigmoid(c2). Fo
 hidden layer, x is exact. At the temperature 1 / beta, beta multiplies all logits.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
@@ -121,8 +119,7 @@ class Weights:
     def triple_keys(self) -> NDArray[np.int64]:
         """(T,) key (a V + i) V + j of each triple (a, i, j), in ascending order."""
         relation, subject, object_ = self["triples"].astype(np.int64).T
-        keys: NDArray[np.int64] = (relation * self.spec.V + subject) * self.spec.V + object_
-        return keys
+        return (relation * self.spec.V + subject) * self.spec.V + object_
 
     @property
     def scenes(self) -> NDArray[np.float32]:
@@ -134,15 +131,13 @@ class Weights:
 
         The bias is c1 if the room type is None or the machine has no room types.
         """
-        bias: NDArray[Any] = self["c1"]
-        return bias if room is None or not self.spec.C else bias + self["Q"][room]
+        return self["c1"] if room is None or not self.spec.C else self["c1"] + self["Q"][room]
 
     def room_couplings(self, room: int | None) -> NDArray[Any]:
         """Return the change of the log-odds of each class by a room type t, (V,): Y[t] or 0."""
         if room is None or not self.spec.C or not self.spec.coupled:
             return np.zeros(self.spec.V, self["b"].dtype)
-        couplings: NDArray[Any] = self["Y"][room]
-        return couplings
+        return self["Y"][room]
 
     def source_weights(
         self, classes: NDArray[Any], presence: NDArray[Any], profile: int | None
@@ -186,10 +181,6 @@ class Weights:
             bias = bias + self["u"][-1]
         return bias, 0.0 if room is None or not self.spec.C else float(of_room[room])
 
-    def state_means(self, x: NDArray[Any]) -> NDArray[Any]:
-        """Return the probabilities of the states of h1 with the logits x, both (..., H1)."""
-        return state_means(x, self.spec.states)
-
     def with_second_layer(
         self, base: NDArray[Any], beta: float = 1.0
     ) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -204,7 +195,7 @@ class Weights:
         J, c2 = self["J"], self["c2"]
         m2 = np.broadcast_to(sigmoid(beta * c2), (len(base), len(c2)))
         for _ in range(SWEEPS):
-            m1 = self.state_means(beta * (base + m2 @ J.T))
+            m1 = state_means(beta * (base + m2 @ J.T), self.spec.states)
             m2 = sigmoid(beta * (c2 + m1 @ J))
         return base + m2 @ J.T, m2
 

@@ -13,8 +13,6 @@ form or with fixed random numbers. So the same scene always gets the same answer
 random scenes. To add a question, add a module to this package and its record to `QUESTIONS`.
 """
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 from app.questions.generate import GENERATE, generate
@@ -28,12 +26,5 @@ QUESTIONS: Final[tuple[Question[Any], ...]] = (RELATIONS, MISSING, OUTLIERS, ROO
 """All questions, in the order of the documentation."""
 
 __all__ = [
-    "QUESTIONS",
-    "Question",
-    "generate",
-    "misplaced",
-    "missing",
-    "outliers",
-    "relations",
-    "rooms",
-]
+    "QUESTIONS", "Question", "generate", "misplaced", "missing", "outliers", "relations", "rooms",
+]  # fmt: skip

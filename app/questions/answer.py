@@ -5,8 +5,6 @@ order of the schema, without null fields. Answers are dictionaries, because pyda
 take twice the time (docs/decisions/http.md).
 """
 
-from __future__ import annotations
-
 from typing import Any, Final, TypeAlias
 
 import numpy as np

@@ -14,8 +14,6 @@ class. A request that states a coverage above the model's coverage lowers ρ fro
 (1 - coverage) / (1 - model's coverage).
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Collection
@@ -124,8 +122,7 @@ def distribution(
     log_unlisted = math.log(max(unlisted, sys.float_info.min))
     tables = counts.classes, counts.most, counts.log_share, counts.weights
     first = counts.weights.shape[-1] - V
-    rows, p = count_distributions(*tables, *scene, first, log_unlisted)
-    return rows, p
+    return count_distributions(*tables, *scene, first, log_unlisted)
 
 
 @lru_cache(maxsize=8)

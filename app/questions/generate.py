@@ -13,8 +13,6 @@ of room. A scene is drawn again if one of these conditions is met:
 After `ATTEMPTS` draws for the same scene, the last draw is accepted in any case.
 """
 
-from __future__ import annotations
-
 import secrets
 from collections.abc import Callable, Collection, Iterator
 from typing import Any, Final
@@ -22,12 +20,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from app.errors import RareRoomTypeError
+from app.errors import LocatedError, RareRoomTypeError
 from app.inference.chains import ChainState, ConditionedChains, Conditions, random_stream
 from app.inference.kernels import select_consistent
-from app.inference.posterior import context_of
+from app.inference.relations import context_of
 from app.questions.answer import Fields, rounded_number
-from app.questions.names import ErrorList
 from app.questions.outliers import intruders
 from app.questions.posterior import given_relations, present
 from app.questions.question import BEDROOM, POSES, REFUSED, Example, Options, Question
@@ -43,7 +40,6 @@ STEPS: Final = 50
 ATTEMPTS: Final = 8
 """Maximum number of draws for one scene."""
 
-
 # Size in bits of a seed that the service chooses. A double, in which a JSON reader may store it,
 # represents such an integer exactly.
 _SEED_BITS: Final = 53
@@ -55,7 +51,7 @@ def generate(
     *,
     count: int = 1,
     seed: int,
-    steps: int | None = None,
+    steps: int = STEPS,
     temperature: float = 1.0,
     stop: Callable[[], bool] = lambda: False,
 ) -> Fields:
@@ -76,7 +72,7 @@ def generate(
     Args:
         count: number of scenes.
         seed: seed of the random numbers. The same seed gives the same scenes.
-        steps: number of Gibbs sweeps for each draw. None means `STEPS`.
+        steps: number of Gibbs sweeps for each draw.
         temperature: temperature of the chains. Above 1, the scenes are more varied.
         stop: function called between draws. After it returns True, `generate` returns the scenes
             drawn so far.
@@ -86,7 +82,6 @@ def generate(
         see `ConditionedChains.log_score`. Only scores of the same model, for the same listed
         classes and profile, can be compared.
     """
-    steps = STEPS if steps is None else steps
     listing = present(scene, artifact.spec)
     observed = given_relations(scene, listing, artifact.spec.A)
     conditions = Conditions(listing.classes, observed, scene.room_type, scene.profile)
@@ -214,16 +209,13 @@ def room_fit(artifact: Artifact, classes: list[int], room: int) -> float:
 
 
 def _read(request: GenerateRequest, artifact: Artifact, reading: Reading) -> Options:
-    """Return the arguments of `generate` for a request."""
-    errors = ErrorList()
     if reading.scene.room_type in artifact.calibration.rare_rooms:
         message = "the model has too few training scenes of this room type to sample such a room"
-        errors.add(RareRoomTypeError, ("room_type",), message)
-    errors.raise_any()
+        raise RareRoomTypeError([LocatedError(("room_type",), message)])
     return {
         "count": request.count,
         "seed": secrets.randbits(_SEED_BITS) if request.seed is None else request.seed,
-        "steps": request.steps,
+        "steps": request.steps or STEPS,
         "temperature": request.temperature,
     }
 

@@ -34,8 +34,6 @@ A relation that a person has confirmed (`app.registry.Misplaced.usual`) has z = 
 d = s = q = 0, because its stand may be rare for the class.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Sequence
 from itertools import chain
 from typing import Final, NamedTuple
@@ -231,8 +229,7 @@ def _heights(artifact: Artifact, scene: Scene, classes: Indices) -> Heights:
 def wrong_log_odds(judgement: Judgement, terms: Floats) -> Floats:
     """Return the log-odds that entries of one kind are wrong, (n,). `terms` is (n, 4)."""
     weights = np.array([judgement.relation, judgement.change, judgement.stand, judgement.supporter])
-    log_odds: Floats = judgement.intercept + terms @ weights
-    return log_odds
+    return judgement.intercept + terms @ weights
 
 
 def wrong_relations(artifact: Artifact, scene: Scene) -> dict[Triple, float]:

@@ -1,12 +1,9 @@
 """The question `missing`: which unlisted objects are probably present, and where?
 
-The answers are object classes that the scene does not list (candidates). A placement is a relation
-between a candidate and a listed object, called the anchor. An offset is the distance vector between
-the centres of both. Structural classes (floor, wall) are neither candidates nor anchors of
+The answers are object classes that the scene does not list (candidates), and their placements
+(`app.questions.placements`). Structural classes (floor, wall) are neither candidates nor anchors of
 placements.
 """
-
-from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from typing import Any, Final
@@ -169,18 +166,16 @@ def _logits_at(
             break
         log_p = place_log_p(posterior, block, place)
         scores[block] = bound[block] + entry.relation * log_p
-    logits: NDArray[np.floating[Any]] = entry.intercept + entry.slope * scores
-    return logits
+    return entry.intercept + entry.slope * scores
 
 
 def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Options:
-    """Return the arguments of `missing` for a request."""
     errors, size = ErrorList(), len(artifact.vocabulary)
     # Only the default of `top_k` may exceed the size of the vocabulary.
     if request.top_k > size and "top_k" in request.model_fields_set:
         message = f"`top_k` must be at most {size}, the size of the vocabulary"
         errors.add(InvalidRequestError, ("top_k",), message)
-    candidates = at = None
+    candidates, at, view = None, None, request.viewpoint
     if request.candidates is not None:
         candidates = reading.unknown.resolve_all(request.candidates, "candidates", errors)
     if request.at is not None:
@@ -191,7 +186,7 @@ def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Opti
         "candidates": candidates,
         "at": at,
         "coverage": request.coverage,
-        "axes": _axes(request),
+        "axes": viewer_axes(request.frame_id, None if view is None else view.yaw),
         "details": request.detail == "full",
     }
 
@@ -210,14 +205,6 @@ def _at(
             message = "the model knows no relations to floor, wall and ceiling"
             errors.add(InvalidRequestError, ("at", "object"), message)
     return None if anchor is None else (at.relation, anchor)
-
-
-def _axes(request: MissingRequest) -> Axes | None:
-    """Return the viewer's axes in `frame_id`, or None if the viewing direction is unknown."""
-    if request.frame_id is None and request.viewpoint is None:
-        return VIEWER
-    view = request.viewpoint
-    return viewer_axes(request.frame_id, None if view is None else view.yaw)
 
 
 def _ask_all(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:

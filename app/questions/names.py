@@ -4,8 +4,6 @@ The functions collect all errors of a request before they raise an exception. So
 correct all errors at once.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property

@@ -11,8 +11,6 @@ multiplied by the probability of the companion in a scene with the outlier. Clas
 is below half of the largest increase are ignored.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator
 from typing import Any, Final
 
@@ -230,7 +228,6 @@ def _unjudged(artifact: Artifact, scene: Scene) -> list[SceneWarning]:
 
 
 def _read(request: OutliersRequest, _: Artifact, reading: Reading) -> Options:
-    """Return the arguments of `outliers` for a request."""
     return {
         "sensitivity": request.sensitivity,
         "threshold": request.threshold,

@@ -4,11 +4,9 @@ A placement is a relation between a candidate, a class that may be missing, and 
 called the anchor. An offset is the distance vector between the centres of both.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from itertools import repeat
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +15,6 @@ from app.inference.kernels import NO_UNIT, UNOBSERVED, add_unseen, likeliest_pla
 from app.questions.answer import Fields, significant
 from app.questions.posterior import Posterior
 from app.registry.artifact import Artifact
-from app.registry.offsets import Offsets
 from app.scene.relations import (
     INSIDE,
     ON_TOP,
@@ -55,7 +52,7 @@ class Place(NamedTuple):
     outgoing: bool
 
     @classmethod
-    def of(cls, name: str, anchor: int) -> Place:
+    def of(cls, name: str, anchor: int) -> Self:
         """Return the place with the relation ``name`` from the missing object to the anchor."""
         relation, subject, _ = canonicalise("missing", name, "anchor")
         return cls(relation, anchor, subject == "missing")
@@ -65,8 +62,10 @@ def place_log_p(
     posterior: Posterior, candidates: NDArray[np.int64], place: Place
 ) -> NDArray[np.floating[Any]]:
     """Return log p(relation to the anchor | candidate is present), not calibrated, (N,)."""
-    row = int(posterior.present.row[place.anchor])
-    return posterior.placed_log_p(candidates, place.relation, row, outgoing=place.outgoing)
+    anchor = posterior.present.row[[place.anchor]]
+    forward, backward = posterior.placement_log_odds(candidates, anchor, place.relation)
+    log_odds = (forward if place.outgoing else backward)[:, 0, 0]
+    return -np.logaddexp(np.float32(0.0), -log_odds)
 
 
 def placements(
@@ -87,9 +86,9 @@ def placements(
 
     Args:
         candidates: (N,) indices of absent classes.
-        axes: viewer's axes, or None; see `offsets_of`.
-        at: the place in the request, or None. It comes first in each result,
-            even if other places are likelier.
+        axes: viewer's axes, or None if the viewing direction is unknown; see `rotated_offsets`.
+        at: the place in the request, or None. It comes first in each result, even if other places
+            are likelier.
 
     Returns:
         For each candidate, the fields of `scene_client.schemas.Placement`.
@@ -126,10 +125,10 @@ def placements(
     )
     offsets: Iterator[Fields | None] = repeat(None)
     if artifact.offsets is not None and any(thing.position is not None for thing in things):
-        missing, anchor = candidates[rows], classes[columns]
-        offsets = _offset_fields(
-            *offsets_of(artifact.offsets, relations, missing, anchor, outgoing, axes)
-        )
+        ends = relations, candidates[rows], classes[columns], outgoing
+        rotation = _UNTURNED if axes is None else np.array(axes)
+        tables = artifact.offsets.tables
+        offsets = _offset_fields(*rotated_offsets(tables, *ends, rotation, axes is not None))
     entries: list[list[Fields]] = [[] for _ in candidates]
     arrays = rows.tolist(), relations.tolist(), outgoing.tolist(), columns.tolist()
     for row, relation, is_subject, column, probability, offset in zip(
@@ -189,34 +188,3 @@ def _offset_fields(
             "scenes": count,
         }
         yield None if count == UNOBSERVED else offset
-
-
-def offsets_of(
-    offsets: Offsets,
-    relation: NDArray[np.int64],
-    missing: NDArray[np.int64],
-    anchor: NDArray[np.int64],
-    outgoing: NDArray[np.bool_],
-    axes: Axes | None,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Return the offset from each of n anchors to its missing object, in metres.
-
-    Args:
-        relation: (n,) indices of canonical relations.
-        missing: (n,) class indices of the missing objects.
-        anchor: (n,) class indices of the anchors.
-        outgoing: (n,) bool, True if the missing object is the relation's subject.
-        axes: viewer's axes in the frame of the offsets. None means that the viewing direction is
-            unknown. The relations left and front then have no offset. The means of other offsets
-            are then vertical.
-
-    Returns:
-        Mean (n, 3) and standard deviation (n, 3) along x, y and z. Then the number of training
-        scenes that contain the two classes in this relation, (n,). It is `UNOBSERVED` for an
-        unknown offset.
-    """
-    rotation = _UNTURNED if axes is None else np.array(axes)
-    mean, std, scenes = rotated_offsets(
-        offsets.tables, relation, missing, anchor, outgoing, rotation, axes is not None
-    )
-    return mean, std, scenes

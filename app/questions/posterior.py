@@ -1,21 +1,33 @@
-"""The posterior: log-odds of objects and relations, given a scene, and their calibration."""
+"""The posterior given a scene: log-odds of objects, room types and relations; their calibration.
 
-from __future__ import annotations
+v are the object units, and h1 is the first hidden layer. Given v, the units of h1 are independent,
+with the logits x (`app.inference.weights`). The answers are in closed form:
+
+    object     log-odds_i = b_i + ..., see `app.inference.objects`
+    relation   p(r_e = 1) = E[sigmoid(ℓ_e(h1))], see `app.inference.relations`
+
+The log-odds of a listed class are computed at x without its contribution: its row of W, and its
+effect through the second layer. Observed relations do not change the logits of h1: their effect on
+objects and on other relations through h1 was not measurable (docs/decisions/evidence.md). They
+change other relations by implications only.
+"""
 
 import math
+from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.inference import MachineSpec
-from app.inference.posterior import ScenePosterior, context_of
-from app.inference.relations import ObservedRelations
+from app.inference.kernels import pool_classes, pool_relations
+from app.inference.relations import Between, ObservedRelations, context_of, to_log_odds
 from app.registry.artifact import Artifact
 from app.registry.description import CountSlope
-from app.scene.scene import Scene, instance_evidence, pool_classes, pool_relations
+from app.scene.scene import Scene, instance_evidence
 
 Floats = NDArray[np.floating[Any]]
+Doubles = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 LEAST_CHANGE: Final = math.log(3)
@@ -91,12 +103,18 @@ def relations_given(scene: Scene) -> bool:
     return bool(scene.relations or scene.relations_complete or scene.poses)
 
 
-class Posterior(ScenePosterior):
+class Posterior:
     """Log-odds of objects and relations given a scene and a published model.
+
+    Shapes contain V (classes of the vocabulary), A (canonical relations) and n (classes of the
+    scene). The log-odds of objects are exact for a machine with one hidden layer. The logits of
+    relations are approximated by normal variables. The smallest log-odds of a relation is
+    `NO_UNIT`.
 
     Attributes:
         present: the classes of the scene.
         listed: number of distinct classes of the scene, without structural classes.
+        context: hidden units of the scene, given its objects.
 
     Raises:
         ValueError: the machine does not know the class of an object, the room type or the profile.
@@ -107,12 +125,95 @@ class Posterior(ScenePosterior):
         is_structure = artifact.vocabulary.structure[listing.classes]
         self.listed = len(listing.classes) - int(np.count_nonzero(is_structure))
         observed = given_relations(scene, listing, artifact.spec.A)
-        context = context_of(
+        self.context = context_of(
             artifact.weights,
             *(listing.classes, listing.presence, listing.log_counts, scene.room_type, observed),
         )
-        units, room = artifact.relation_units, scene.room_type
-        super().__init__(artifact.objects, units, context, scene.profile, room)
+        self._objects, self._units = artifact.objects, artifact.relation_units
+        self._profile, self._room = scene.profile, scene.room_type
+
+    def absent_log_odds(self, absent: Indices, coverage: float) -> Floats:
+        """Return the log-odds that each of N unlisted classes is present, (N,).
+
+        Args:
+            absent: (N,) indices of the unlisted classes.
+            coverage: listed share of the classes of the scene.
+        """
+        listed = self.present.classes, self.present.presence
+        arguments = self.context.x, *listed, self._profile, coverage, self._room
+        return self._objects.absent(*arguments)[absent]
+
+    def given_rest(self, *, explained: bool = False) -> tuple[Floats, Floats]:
+        """See `ObjectScorer.given_rest`."""
+        return self._objects.given_rest(
+            self.context, self._profile, self._room, explained=explained
+        )
+
+    def reasons_for_absent(self, candidates: Indices) -> Floats:
+        """See `ObjectScorer.reasons_for_absent`."""
+        return self._objects.reasons_for_absent(self.context, self._profile, candidates)
+
+    def room_log_p(self) -> Doubles:
+        """Return log p(t | objects) of each room type t, (C,), in a scene of unknown room type."""
+        return self._room_log_p(self.context.x[None], self.present.presence[None])[0]
+
+    def _room_log_p(self, x: Floats, presence: Floats) -> Doubles:
+        return self._objects.room_log_p(x, self.present.classes, presence, self._profile)
+
+    def room_reasons(self) -> Doubles:
+        """Return how much each class changes the log-odds of each room type, (C, n).
+
+        An entry is the log-odds of the room type given all n classes, minus its log-odds given the
+        scene without the class.
+        """
+        # Row k has the logits of h1 and the presence of the classes in the scene without class k.
+        x, presence = self.context.x - self.context.shares, self.present.presence
+        without = self._room_log_p(x, presence * (1 - np.eye(len(presence), dtype=np.float32)))
+        return (_log_odds(self.room_log_p()) - _log_odds(without)).T
+
+    def relation_log_odds(self) -> Floats:
+        """Return the log-odds of every relation between the classes of the scene, (A, n, n).
+
+        The observation of a relation is not evidence for the same relation.
+        """
+        return self._units.log_odds(self._between)
+
+    def alone_log_odds(self) -> Floats:
+        """Return the log-odds of every relation given the objects alone, (A, n, n)."""
+        return to_log_odds(self._between.mean, self._between.spread)
+
+    def relation_change(self) -> Floats:
+        """Return the change of every logit by observed relations of other pairs, (A, n, n)."""
+        change = self._between.apart
+        return change if len(change) else np.zeros_like(self._between.mean)
+
+    def log_odds_apart(self, i: Indices, j: Indices) -> tuple[Floats, Floats]:
+        """Return the log-odds (A, P) of all relations from classes i to j, and (A, P) from j to i.
+
+        The observed relations of a pair are not evidence for the relations of the same pair.
+
+        Args:
+            i, j: (P,) indices of the two classes of each pair in the scene.
+        """
+        log_odds = self._units.log_odds(self._between, apart=True)
+        # The compiled functions of the questions need contiguous arrays.
+        forward, backward = np.ascontiguousarray(log_odds[:, [i, j], [j, i]].swapaxes(0, 1))
+        return forward, backward
+
+    def placement_log_odds(
+        self, candidates: Indices, anchors: Indices, only: int | None = None
+    ) -> tuple[Floats, Floats]:
+        """See `RelationUnits.placement_log_odds`."""
+        return self._units.placement_log_odds(self.context, candidates, anchors, only)
+
+    @cached_property
+    def _between(self) -> Between:
+        return self._units.between(self.context)
+
+
+def _log_odds(log_p: Doubles) -> Doubles:
+    """Return log p - log(1 - p). A p of nearly 1 counts as 1 - 1e-12."""
+    return log_p - np.log(-np.expm1(np.minimum(log_p, -1e-12)))
 
 
 # --------------------------------------------------------------------------------- calibration
@@ -128,5 +229,4 @@ def calibrated(entry: CountSlope, z: Floats, n: int | NDArray[np.integer[Any]]) 
         z: (N,) logits.
         n: number n of the formula, or an array (N,) with a number for each logit.
     """
-    log_odds: Floats = entry.intercept + entry.log_count * np.log(n) + entry.slope * z
-    return log_odds
+    return entry.intercept + entry.log_count * np.log(n) + entry.slope * z

@@ -1,7 +1,5 @@
 """The class `Question`: a function, its schemas and its examples."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from inspect import cleandoc, getdoc

@@ -1,10 +1,4 @@
-"""Conversion of a request to a scene with ids, class indices and relations from poses.
-
-The functions collect all errors of a request before they raise an exception. So a client can
-correct all errors at once.
-"""
-
-from __future__ import annotations
+"""Conversion of a request to a scene with ids, class indices and relations from poses."""
 
 import math
 from collections import Counter
@@ -160,20 +154,18 @@ def _objects(
     objects: list[SceneObject] = []
     detections: dict[int, Detection] = {}
     for number, (name, entry) in enumerate(zip(ids, request.objects, strict=True)):
-        location: Location = ("objects", number)
-        if isinstance(entry, str):
-            index = unknown.resolve(entry, name, location, errors)
-            if index is not None:
-                objects.append(SceneObject(name, entry, index))
-        else:
-            index = unknown.resolve(entry.label, name, (*location, "label"), errors)
-            if index is not None:
-                detections[len(objects)] = entry
-                objects.append(_scene_object(name, entry, index, optical=optical))
+        at: Location = ("objects", number)
+        label, at = (entry, at) if isinstance(entry, str) else (entry.label, (*at, "label"))
+        index = unknown.resolve(label, name, at, errors)
         if index is None:
-            left_out.append((name, entry if isinstance(entry, str) else entry.label))
+            left_out.append((name, label))
             if errors.by_class and errors.are_many:
                 break
+        elif isinstance(entry, str):
+            objects.append(SceneObject(name, label, index))
+        else:
+            detections[len(objects)] = entry
+            objects.append(_scene_object(name, entry, index, optical=optical))
     return tuple(objects), detections
 
 

@@ -12,8 +12,6 @@ instance counts as observed for all instances. Example: one chair is to the left
 another chair is to the right. Then left and right both count as observed for each chair.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from typing import Final
 
@@ -238,7 +236,6 @@ def _names(
 
 
 def _read(request: RelationsRequest, _: Artifact, reading: Reading) -> Options:
-    """Return the arguments of `relations` for a request."""
     return {
         "top_k": request.top_k,
         "min_probability": request.min_probability,

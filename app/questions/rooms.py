@@ -6,8 +6,6 @@ of the request. The machine's probability of a room type t (`app.inference.objec
     p(t) ∝ p_machine(t | objects)^s,   s = slope + log_count · log(number of listed classes)
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
@@ -68,7 +66,6 @@ def rooms(
 
 
 def _read(request: RoomsRequest, _: Artifact, reading: Reading) -> Options:
-    """Return the arguments of `rooms` for a request."""
     candidates = None
     if request.candidates is not None:
         errors = ErrorList()

@@ -4,8 +4,6 @@ Some checks compare the sizes of objects with the typical sizes of their classes
 units, a frame whose y axis points up, and quaternions in a wrong order.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from itertools import compress

@@ -3,8 +3,6 @@
 Without --store, the store is SCENE_STORE, or else the folder model_store, as for the service.
 """
 
-from __future__ import annotations
-
 import argparse
 import logging
 import os
@@ -12,15 +10,8 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from app.registry import (
-    DEFAULT_STORE,
-    AliasTarget,
-    RegistryError,
-    Store,
-    StoreError,
-    load_model_set,
-)
-from app.registry.references import version_key
+from app.registry import DEFAULT_STORE, RegistryError, Store, StoreError, load_model_set
+from app.registry.references import AliasTarget, version_key
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -30,14 +21,21 @@ def main(arguments: list[str] | None = None) -> int:
     logging.getLogger("app.registry").addHandler(logging.NullHandler())
     root = target = options.store or os.environ.get("SCENE_STORE") or DEFAULT_STORE
     try:
-        if options.command != "copy":
-            _run(options, _existing(root))
-            return 0
-        source = _existing(root := options.source)
-        # Aliases come first: a publisher adds a version before its alias.
-        aliases = {} if options.reference else source.aliases()
-        keys = _keys(source, options.reference)
-        return _copy(source, keys, aliases, _existing(root := target))
+        if options.command == "copy":
+            source = _existing(root := options.source)
+            # Aliases come first: a publisher adds a version before its alias.
+            aliases = {} if options.reference else source.aliases()
+            keys = _keys(source, options.reference)
+            return _copy(source, keys, aliases, _existing(root := target))
+        store = _existing(root)
+        if options.command == "alias":
+            _point(store, options.alias, _target(options.target), options.expected)
+        elif options.command == "remove-alias":
+            store.remove_alias(options.alias)
+            _print(f"alias '{options.alias}' is removed")
+        else:
+            _list(store)
+        return 0
     except RegistryError as error:
         sys.stderr.write(f"store {root}: {error.reason}\n")
         return 1
@@ -47,16 +45,6 @@ def _existing(root: str) -> Store:
     if not Path(root).is_dir():  # `Store` would create it
         raise StoreError("unreadable", f"there is no folder {root}")
     return Store(root)
-
-
-def _run(options: argparse.Namespace, store: Store) -> None:
-    if options.command == "alias":
-        _point(store, options.alias, _target(options.target), options.expected)
-    elif options.command == "remove-alias":
-        store.remove_alias(options.alias)
-        _print(f"alias '{options.alias}' is removed")
-    else:
-        _list(store)
 
 
 def _point(store: Store, alias: str, target: AliasTarget, expected: str | None) -> None:

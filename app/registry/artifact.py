@@ -3,8 +3,6 @@
 Every load reads each file once and checks it against its checksum. Symbolic links are not followed.
 """
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import math

@@ -3,8 +3,6 @@
 Sections follow Mitchell et al., "Model Cards for Model Reporting", FAT* 2019.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from math import prod
 

@@ -1,7 +1,5 @@
 """Statistics of the number of instances of a class in a scene, such as the chairs of a kitchen."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Final, Self
@@ -9,10 +7,7 @@ from typing import Annotated, Any, ClassVar, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.kernels import INTERCEPT as INTERCEPT
-from app.inference.kernels import ROOM as ROOM
-from app.inference.kernels import SEVERAL as SEVERAL
-from app.inference.kernels import SINGLE as SINGLE
+from app.inference.kernels import ROOM
 from app.registry.fields import TensorGroup
 
 Table = NDArray[np.float32]

@@ -1,7 +1,5 @@
 """The description of a model, as training writes it: metadata without weights and files."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Annotated, Any, Final, NamedTuple, Self

@@ -4,8 +4,6 @@ A rename is atomic for readers. To survive a power failure, fsync writes the byt
 before the rename, and the directory entry after it. A lock lets only one process at a time write.
 """
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os

@@ -1,7 +1,5 @@
 """Errors of the registry. Each error has a machine-readable code and a reason for people."""
 
-from __future__ import annotations
-
 import errno
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Base class and field types of stored JSON, and of groups of stored tensors."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields

@@ -6,8 +6,6 @@ the manifest is parsed. The manifest contains the checksums of the other files, 
 protects them.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

@@ -1,7 +1,5 @@
 """An immutable snapshot of all models of a store. A refresh replaces the whole snapshot."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ viewer's axes (x away from the viewer, y left, z up). The tables contain only ca
 The opposite relation, with both classes exchanged, has the negative offset.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,7 +13,6 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.kernels import UNOBSERVED as UNOBSERVED
 from app.inference.kernels import look_up_offsets
 from app.registry.fields import TensorGroup
 
@@ -77,8 +74,7 @@ class Offsets(TensorGroup):
             that contain each pair, (n,). If it is 0, the offset is the sum of a term of the
             relation and one term of each class. `UNOBSERVED`: training lacks the relation.
         """
-        offsets, scenes = look_up_offsets(self.tables, relation, subject, other)
-        return offsets, scenes
+        return look_up_offsets(self.tables, relation, subject, other)
 
     @cached_property
     def tables(self) -> tuple[NDArray[Any], ...]:

@@ -9,8 +9,6 @@ each other (`app.scene.roles`). The triples tell which classes stand at a place,
 held is the number of scenes with a relation a from class i to class j, or in the other direction.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,10 +18,10 @@ from typing import Annotated, Any, ClassVar, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.kernels import triple_counts
+from app.inference.kernels import IN, ON, UNDER, triple_counts
 from app.registry.fields import TensorGroup
 from app.scene.relations import CANONICAL, STACKED, SUPPORTS
-from app.scene.roles import IN, ON, UNDER, RoleCounts, role_counts
+from app.scene.roles import RoleCounts, role_counts
 from app.scene.stands import HANGS, SUPPORTED, USUAL
 
 _PLACE: Final = 10.0  # smoothing s, in scenes
@@ -96,8 +94,7 @@ class Places(TensorGroup):
         begin, end = start[relation * V + anchor], start[relation * V + anchor + 1]
         held = _PLACE * back_off[relation]
         held[classes[begin:end]] += counts[begin:end]
-        ratio: Floats = np.log(held / ((counts[begin:end].sum() + _PLACE) * self.frequency))
-        return ratio
+        return np.log(held / ((counts[begin:end].sum() + _PLACE) * self.frequency))
 
     def shows(self, relation: int, subject: Indices, other: Indices) -> NDArray[np.bool_]:
         """Return whether training shows the relation from each subject to each other class, (N, M).
@@ -116,8 +113,7 @@ class Places(TensorGroup):
         V, of_pairs = len(self.frequency), _SUPPORTER * share[other]
         for a in SUPPORTS:
             of_pairs = of_pairs + triple_counts(self.triple, self.held, V, a, subject, other)
-        shares: Floats = of_pairs / (total[subject, None] + _SUPPORTER)
-        return shares
+        return of_pairs / (total[subject, None] + _SUPPORTER)
 
     @cached_property
     def _supporters(self) -> tuple[Floats, Floats]:

@@ -9,8 +9,6 @@ alias replaces the whole file. Format of the file:
     {"default": {"name": "...", "version": "..." or null for the newest usable version}}
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

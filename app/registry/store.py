@@ -8,8 +8,6 @@ Only one writer at a time holds the lock. So a temporary file that a writer find
 crashed writer.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import shutil
@@ -189,7 +187,7 @@ class Store:
         with self._writing():
             return self._add(description.name, description.version, write)
 
-    def copy(self, source: Store, name: str, version: str) -> bool:
+    def copy(self, source: "Store", name: str, version: str) -> bool:
         """Copy a version of another store, and return whether it is new to this store.
 
         A version that this store already has with the same digest stays unchanged.

@@ -1,7 +1,5 @@
 """Reading and writing weights: a safetensors file with float32 or float16 weights."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, Final, Literal
 

@@ -47,8 +47,6 @@ rotated by the yaw.
 4 does not allow, and stacked relations of boxes too far apart to overlap.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -58,7 +56,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from app.inference import kernels
-from app.inference.kernels import CONTACT as CONTACT
 from app.inference.kernels import MIN_OFFSET
 from app.scene.relations import CANONICAL, FRONT, LEFT, ON_TOP
 from app.scene.roles import RoleCounts

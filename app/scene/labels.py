@@ -10,8 +10,6 @@ shoes" is shoes. `readings` removes the syntax of detectors: a "mouse_(computer_
 mouse, and "chair_12" is a chair.
 """
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections.abc import Iterator
@@ -20,17 +18,9 @@ from itertools import islice
 from typing import Final, Literal, NamedTuple
 
 Rule = Literal[
-    "label",
-    "alias",
-    "phrase",
-    "qualifier",
-    "alternative",
-    "article",
-    "instance",
-    "prompt",
-    "spelling",
-    "head",
-]
+    "label", "alias", "phrase", "qualifier", "alternative", "article", "instance", "prompt",
+    "spelling", "head",
+]  # fmt: skip
 """How a label was read. The rules "spelling" and "head" are guesses of `app.scene.nearest`."""
 
 
@@ -128,12 +118,9 @@ def singular(word: str) -> str:
         for plural, single in _IRREGULAR.items():
             if word.endswith(plural):
                 return word[: -len(plural)] + single
-    if (
-        len(word) < 3
-        or not word.endswith("s")
-        or word in _NOT_PLURAL
-        or word.endswith(_NOT_PLURAL_ENDINGS)
-    ):
+    if len(word) < 3 or not word.endswith("s"):
+        return word
+    if word in _NOT_PLURAL or word.endswith(_NOT_PLURAL_ENDINGS):
         return word
     if word.endswith("ies") and len(word) > 4:
         stem = word[:-3] + "y"

@@ -13,8 +13,6 @@ worse than none. It reads a name in two ways:
 vectors, because the nearest class by cosine similarity is right for only 40 % of held-out aliases.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence

@@ -5,8 +5,6 @@ A relation and its opposite are the same statement with exchanged objects: ``rig
 into `CANONICAL`. The first argument of a relation is its subject, and the second is its anchor.
 """
 
-from __future__ import annotations
-
 from collections.abc import Hashable, Iterable
 from graphlib import CycleError, TopologicalSorter
 from typing import Final, TypeVar

@@ -5,17 +5,10 @@ pillow on a bed with a headboard, and of milk in a fridge look alike. Their heig
 roles. The roles that such pairs of classes have in words and support links decide.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-
-from app.inference.kernels import IN as IN
-from app.inference.kernels import ON as ON
-from app.inference.kernels import UNDER as UNDER
-from app.inference.kernels import likely_role as likely_role
 
 
 class RoleCounts(NamedTuple):
@@ -37,6 +30,5 @@ def role_counts(roles: RoleCounts, i: int, j: int) -> NDArray[np.float32]:
     key = i * len(roles.anchor) + j
     row = int(roles.pair.searchsorted(key))
     if row < len(roles.pair) and roles.pair[row] == key:
-        counts: NDArray[np.float32] = roles.counts[row]
-        return counts
+        return roles.counts[row]
     return np.zeros(3, np.float32)

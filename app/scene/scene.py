@@ -9,8 +9,6 @@ classes x and y is on if at least one instance of x has relation a to an instanc
 instances without an observed relation have no influence.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -18,8 +16,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.kernels import pool_classes as pool_classes
-from app.inference.kernels import pool_relations as pool_relations
 from app.scene.geometry import (
     SMALLEST,
     PoseRelations,

@@ -1,16 +1,14 @@
 """What holds an object: the floor, a wall or the ceiling, or another object."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from app.scene.geometry import CONTACT
+from app.inference.kernels import CONTACT
 from app.scene.relations import ABOVE, INSIDE, ON_TOP
 
 UNKNOWN, FLOOR, HANGS, SUPPORTED = -1, 0, 1, 2
@@ -50,7 +48,7 @@ class Heights:
     areas: Floats
 
     @classmethod
-    def of(cls, centres: Floats, sizes: Floats) -> Heights:
+    def of(cls, centres: Floats, sizes: Floats) -> Self:
         """Return the heights of boxes with these centres and extents, (n, 3) each."""
         half = sizes[:, 2] / 2
         return cls(centres[:, 2] - half, centres[:, 2] + half, sizes[:, 0] * sizes[:, 1])
@@ -62,8 +60,7 @@ class Heights:
         "i is on top of j" then means that j is under i, as a bin is under a desk.
         """
         is_deep = self.bottoms[:, None] < np.maximum(self.bottoms, self.tops - CONTACT)
-        around: Flags = is_deep & (self.areas[:, None] >= self.areas)
-        return around
+        return is_deep & (self.areas[:, None] >= self.areas)
 
 
 def stands_of(holds: Flags, observed: Flags, heights: Heights, floor: float) -> NDArray[np.int64]:

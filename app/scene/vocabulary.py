@@ -1,7 +1,5 @@
 """The object classes and room types of a model, and their accepted spellings."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -29,7 +27,7 @@ def _remembered(search: SearchT) -> SearchT:
     """Return a method of `Vocabulary` that remembers the results of another one."""
 
     @wraps(search)
-    def recall(self: Vocabulary, label: str, *, is_room: bool = False) -> Any:
+    def recall(self: "Vocabulary", label: str, *, is_room: bool = False) -> Any:
         memory, key = self._memory, (search.__name__, label, is_room)
         found = memory.get(key, memory)  # a result may be None
         if found is memory:
@@ -57,7 +55,7 @@ class ObjectClass:
         anywhere: True if objects of the class belong in every room (pets, people, bags, toys).
 
     Raises:
-        ValueError: a name is empty, or the size is not three positive finite numbers.
+        ValueError: the size is not three positive finite numbers.
     """
 
     __pydantic_config__: ClassVar = {"extra": "forbid"}  # for classes in JSON
@@ -70,10 +68,8 @@ class ObjectClass:
     anywhere: bool = False
 
     def __post_init__(self) -> None:
-        for name in (self.label, *self.aliases):
-            if not label_key(name):
-                raise ValueError(f"object class {self.label!r} has an empty name: {name!r}")
-        if self.size is not None and not _are_extents(self.size):
+        sides: Sequence[float] = (1.0, 1.0, 1.0) if self.size is None else self.size
+        if len(sides) != 3 or not all(math.isfinite(side) and side > 0 for side in sides):
             raise ValueError(
                 f"size of {self.label!r} must be three positive numbers (metres), not {self.size!r}"
             )
@@ -300,7 +296,3 @@ def _read_only(values: ArrayLike) -> NDArray[Any]:
     array = np.array(values)
     array.flags.writeable = False
     return array
-
-
-def _are_extents(size: Sequence[float]) -> bool:
-    return len(size) == 3 and all(math.isfinite(side) and side > 0 for side in size)

@@ -8,8 +8,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.inference.posterior import context_of
-from app.inference.relations import NEVER, ObservedRelations, relation_units, to_log_odds
+from app.inference.relations import (
+    NEVER,
+    ObservedRelations,
+    context_of,
+    relation_units,
+    to_log_odds,
+)
 from tests.enumeration.small_machines import implied_by_hand, random_weights, unit_states
 from training.machines import MachineSpec, build
 from training.machines.arrays import weights_of

@@ -13,11 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import logit
 
-from app.questions.placements import Place, offsets_of, place_log_p
+from app.inference.kernels import UNOBSERVED, rotated_offsets
+from app.questions.placements import Place, place_log_p
 from app.questions.posterior import Posterior
 from app.registry import CountSlope, Offsets
 from app.registry.description import PlaceFit
-from app.registry.offsets import UNOBSERVED
 from app.scene import RELATIONS, ObjectClass, Scene, SceneObject, Vocabulary
 from app.scene.relations import (
     ABOVE,
@@ -121,7 +121,9 @@ VIEWER = viewer_axes()
 def offset_of(relation, missing, anchor, outgoing=True, axes=VIEWER, offsets=OFFSETS):
     """The offset of one placement, or None if it is unknown."""
     ends = (np.array([value]) for value in (relation, missing, anchor, outgoing))
-    mean, std, scenes = (values[0].tolist() for values in offsets_of(offsets, *ends, axes))
+    rotation = np.eye(3) if axes is None else np.array(axes)
+    values = rotated_offsets(offsets.tables, *ends, rotation, axes is not None)
+    mean, std, scenes = (value[0].tolist() for value in values)
     return None if scenes == UNOBSERVED else Offset(tuple(mean), tuple(std), scenes)
 
 

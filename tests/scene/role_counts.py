@@ -4,7 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from app.scene.roles import IN, ON, UNDER, RoleCounts
+from app.inference.kernels import IN, ON, UNDER
+from app.scene.roles import RoleCounts
 
 ROLES = {ON: "on", UNDER: "under", IN: "in"}
 LABELS = (

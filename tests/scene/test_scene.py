@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from app.inference.kernels import pool_classes
 from app.scene import PoseRelations, Scene, SceneObject, instance_evidence, observe
 from app.scene.geometry import Viewpoint, derive_relations, to_viewer_frame
 from app.scene.relations import (
@@ -24,7 +25,6 @@ from app.scene.relations import (
     opposite,
     support_cycle,
 )
-from app.scene.scene import pool_classes
 from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN, Heights, floor_level, stands_of
 from scene_client.frames import body_pose, is_optical, is_world_fixed, viewer_axes
 from scene_client.schemas import RelationName

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from app.inference.relations import NO_UNIT
+from app.inference.kernels import NO_UNIT
 from app.questions.placements import PLACES
 from app.questions.posterior import Posterior
 from app.registry import Artifact, Calibration, CountSlope

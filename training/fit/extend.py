@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference import Weights
+from app.inference.kernels import ROOM
 from app.inference.weights import layout, pack_scenes
 from app.registry import Artifact, Calibration, Counts, Offsets, Places
-from app.registry.counts import ROOM
 from app.scene import CANONICAL, ObjectClass, Vocabulary
 
 _RARE: Final = 0.1  # quantile of the known biases that a new class or room type gets
