@@ -96,9 +96,6 @@ def test_chains_are_stationary_under_conditions(name, profile):
     check_stationary(name, condition, lambda joint: joint.v[:, 1] > 0)
 
 
-# -- relations ---------------------------------------------------------------------------------
-
-
 def all_present(machine, temperature=1.0, relations=()):
     """Chains in which all classes are present, and the bias decides the states of h1."""
     spec = machine.spec
@@ -181,8 +178,6 @@ def test_relations_that_imply_each_other_are_drawn_in_groups(observed):
     machine.gamma.zero_()
     assert 0.5 * np.abs(implied_law(machine, observed) - law).sum() > 0.15
 
-
-# -- starts and scores -------------------------------------------------------------------------
 
 STORED = MachineSpec("triway", V=12, A=2, units=4, states=3, C=3, K=2, N=24, coupled=True)
 
