@@ -137,11 +137,6 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     return found
 
 
-def words(count: int, length: int) -> list[str]:
-    rng = Random(0)
-    return ["".join(rng.choices(string.ascii_lowercase, k=length)) for _ in range(count)]
-
-
 def suggestions(answer: httpx.Response) -> int:
     problems = [entry["problem"] for entry in answer.json()["results"] if "problem" in entry]
     errors = [error for problem in problems for error in problem["errors"]]
@@ -163,7 +158,8 @@ async def test_a_batch_has_few_suggestions(client: httpx.AsyncClient) -> None:
 async def test_a_batch_looks_few_labels_up(
     client: httpx.AsyncClient, calls: Counter[str], treatment: str, guesses: int
 ) -> None:
-    labels = iter(words(64 * 20, 12))
+    rng = Random(0)
+    labels = ("".join(rng.choices(string.ascii_lowercase, k=12)) for _ in range(64 * 20))
     scenes = [
         {"objects": ["bed", *(next(labels) for _ in range(20))], "unknown_labels": treatment}
         for _ in range(64)

@@ -2,12 +2,13 @@
 
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from tests.conftest import run_program
 
 PROGRAM = """
 import json, logging
@@ -38,15 +39,8 @@ def start(package: Path, **variables: Any) -> tuple[int, str | None, str]:
     environment = {name: text for name, text in os.environ.items() if "NUMBA" not in name}
     home = package.parent.parent / "home"
     environment |= {"PYTHONPATH": "", "HOME": str(home), "XDG_CACHE_HOME": str(home / "cache")}
-    process = subprocess.run(
-        [sys.executable, "-c", PROGRAM],
-        cwd=package.parent,
-        env=environment | {name: str(value) for name, value in variables.items()},
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert process.returncode == 0, process.stderr
+    environment |= {name: str(value) for name, value in variables.items()}
+    process = run_program(sys.executable, "-c", PROGRAM, cwd=package.parent, env=environment)
     compilations, folder = json.loads(process.stdout)
     return compilations, folder, process.stderr
 

@@ -6,6 +6,8 @@ import tracemalloc
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -179,8 +181,8 @@ def test_a_manifest_of_a_million_empty_objects_is_refused_in_little_memory(
     published: Path, place: str
 ) -> None:
     """Listing what is wrong with each of them took 8 GB."""
-    folder = hostile(published)
-    rewrite_manifest(folder, lambda members: insert(members, place, "@"))
+    folder, (*path, last) = hostile(published), place.split(".")
+    rewrite_manifest(folder, lambda members: reduce(getitem, path, members).update({last: "@"}))
     body = json.loads((folder / "manifest.json").read_bytes())
     del body["checksum"]
     many = "[" + ",".join(["{}"] * (MAX_MANIFEST_BYTES // 3 - 100_000)) + "]"
@@ -192,10 +194,3 @@ def test_a_manifest_of_a_million_empty_objects_is_refused_in_little_memory(
     models.resolve("default")
     # Free JSON of the trainer may hold anything.
     assert bool(models.failures) == (place != "training.x")
-
-
-def insert(members: dict[str, object], place: str, value: object) -> None:
-    *path, last = place.split(".")
-    for step in path:
-        members = members[step]  # type: ignore[assignment]
-    members[last] = value

@@ -10,10 +10,8 @@ import httpx
 import pytest
 from rich.console import Console
 
-from benchmarks.gibbs import gibbs
 from benchmarks.load import plain
 from benchmarks.load.questions import KINDS, bodies
-from benchmarks.log_odds import log_odds
 from benchmarks.queueing import erlang_c, mean_wait, replicas_for
 from benchmarks.report import Result
 
@@ -35,6 +33,9 @@ def check_complete(result: Result, rounds: int) -> None:
 
 def test_gibbs_yardsticks_sample_the_same_machine():
     """Means over 4,000 chains within more than 6 standard errors: chance fails below 1e-8."""
+    # Imported here, because every worker imports every module of tests, and this takes seconds.
+    from benchmarks.gibbs import gibbs
+
     result = gibbs(V=20, H=10, chains=4000, objects=4, rounds=4)
     check_complete(result, 4)
     ours, sklearn, other = result.facts.values()
@@ -46,6 +47,8 @@ def test_gibbs_yardsticks_sample_the_same_machine():
 
 
 def test_log_odds_agree_with_those_of_the_yardstick():
+    from benchmarks.log_odds import log_odds
+
     result = log_odds(V=30, H=12, objects=5, rounds=2)
     check_complete(result, 2)
     assert result.facts["largest difference from scikit-learn"] < 1e-4

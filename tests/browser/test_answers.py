@@ -308,9 +308,6 @@ def test_a_drawn_scene_is_the_service_s_and_can_be_kept(
     assert board.things == ["desk", "chair"]
 
 
-# -------------------------------------------------------------------------------------- suggestions
-
-
 def test_a_suggestion_at_another_place_or_none_says_so(open_board: OpenBoard) -> None:
     far = {"mean": {"x": 9.0, "y": 0.0, "z": 0.5}, "std": dict.fromkeys("xyz", 0.2), "scenes": 9}
     place = {"relation": "on-top", "object": "desk", "probability": 0.9, "offset": far}

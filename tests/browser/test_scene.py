@@ -155,9 +155,6 @@ def test_a_link_that_cannot_be_read_says_so(
     assert board.things
 
 
-SWITCH = "Positions count as evidence"
-
-
 def placed(board: Board) -> list[str]:
     """Objects whose position the request contains."""
     return [thing["id"] for thing in board.scene["objects"] if "position" in thing]
@@ -182,7 +179,7 @@ def test_positions_count_only_when_switched_on(open_board: OpenBoard, api: httpx
 
 def test_positions_that_the_page_chose_do_not_count(open_board: OpenBoard) -> None:
     board = open_board()
-    assert board.page.get_by_label(SWITCH).is_checked()
+    assert board.page.get_by_label("Positions count as evidence").is_checked()
     board.add("monitor")
     board.page.locator("#board .ghost").first.press("Enter")
     board.settle()

@@ -31,8 +31,6 @@ class Wire:
 
 @dataclass(frozen=True)
 class Answer:
-    """One answer."""
-
     status: int
     headers: dict[str, str]
     body: bytes

@@ -17,7 +17,6 @@ from tests.services import LiveService
 
 @pytest.fixture(scope="session")
 def url(live: LiveService) -> str:
-    """The URL of the service."""
     return live.url
 
 

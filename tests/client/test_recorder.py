@@ -71,9 +71,6 @@ def labels(file: Path) -> list[list[str]]:
     return [[thing["label"] for thing in scene["objects"]] for scene in lines(file)]
 
 
-# ----------------------------------------------------------------------- which scenes are written
-
-
 @pytest.mark.parametrize("kind", ["sync", "async", "offline"])
 def test_all_questions_about_a_scene_are_one_line(
     url: str, shared_store: Path, file: Path, kind: str
@@ -229,8 +226,6 @@ def test_in_a_map_without_a_viewpoint_the_viewer_is_unknown() -> None:
     assert scene["objects"][0]["position"] == [1.0, 2.0, 0.25]
     assert "viewer_frame" not in scene_of(request("bed", "lamp", frame_id="map"))
 
-
-# ------------------------------------------------------------------------------ crashes and disks
 
 # Each scene has a thousand bytes or more, so the operating system writes it in several pages.
 SCENES = """
@@ -435,9 +430,6 @@ def test_the_disk_and_the_memory_have_bounds(file: Path) -> None:
     assert len(writer._recent) == recorder.REMEMBERED
     written = [scene[1] for scene in (*labels(writer.older), *labels(file))]
     assert written == [f"thing {n}" for n in range(5000 - len(written), 5000)]
-
-
-# ------------------------------------------------------------------------------------ the command
 
 
 def test_the_command_records(url: str, file: Path) -> None:

@@ -140,12 +140,8 @@ def test_invalid_urls_are_refused(url: str) -> None:
             kind(url)
 
 
-def test_the_key_is_sent_and_not_shown(recorder: Recorder) -> None:
-    transport = httpx.MockTransport(recorder)
-    scene = Client("http://robot", api_key="a" * 16, transport=transport)
-    scene.missing(["bed"])
-    assert recorder.requests[-1].headers["x-api-key"] == "a" * 16
-    assert "aaaa" not in repr(scene.options)
+def test_the_key_is_not_shown() -> None:
+    assert "aaaa" not in repr(Client("http://robot", api_key="a" * 16).options)
 
 
 def test_names_are_quoted_in_addresses() -> None:

@@ -94,9 +94,6 @@ def test_messages_of_other_packages_may_be_objects(name: str) -> None:
     assert fields.notes == expected.notes
 
 
-# ---------------------------------------------------------------------------------- 3D, by hand
-
-
 BED = {"label": "bed", "confidence": 0.9, "position": {"x": 1.0, "y": 0.0, "z": 0.5}}
 SIZED = BED | {"size": {"x": 0.5, "y": 0.5, "z": 0.5}}
 UPRIGHT = {"orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
@@ -269,8 +266,6 @@ def test_other_values_than_messages_are_refused(message: Any) -> None:
         from_message(message)
 
 
-# --------------------------------------------------------------------------------- label maps
-
 CHAIR = {"class_id": 56, "class_name": "chair"}
 
 
@@ -309,9 +304,6 @@ def test_the_default_model_knows_most_of_cocos_indoor_classes(repository: Path) 
     known = {label for label in COCO if vocabulary.index(label) is not None}
     assert len(COCO) == len(set(COCO)) == 80
     assert {"chair", "couch", "dining table", "cell phone", "refrigerator", "potted plant"} <= known
-
-
-# ----------------------------------------------------------------------------------------- 2D
 
 
 def flat(
@@ -355,9 +347,6 @@ def test_invalid_boxes_are_reported() -> None:
     )
     assert lefts(fields) == set()
     assert reasons(fields) == [(1, "no-box"), (2, "no-box"), (3, "no-box")]
-
-
-# ----------------------------------------------------------------------------- the two routes
 
 
 @pytest.mark.parametrize("store", [Layout.current, Layout.former], ids=["current", "former"])

@@ -24,5 +24,4 @@ def recorded(envelope: Any) -> Any:
 
 @pytest.fixture
 def scene(envelope: Any) -> SceneFields:
-    """The scene of the message."""
     return from_message(envelope)

@@ -58,8 +58,6 @@ def rendered(
 
 @dataclass
 class Overlay:
-    """The manifests of one overlay."""
-
     name: str
     text: str
 
@@ -72,17 +70,14 @@ class Overlay:
         return manifests
 
     def spec(self, kind: str, name: str = "scene") -> dict[str, Any]:
-        """The specification of a manifest."""
         return self.manifests[kind, name]["spec"]
 
     @property
     def pod(self) -> dict[str, Any]:
-        """The specification of the pods."""
         return self.spec("Deployment")["template"]["spec"]
 
     @property
     def container(self) -> dict[str, Any]:
-        """The container of the service."""
         (container,) = self.pod["containers"]
         return container
 

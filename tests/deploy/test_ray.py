@@ -131,7 +131,6 @@ def running(repository: Path, log: Path, *arguments: str | Path) -> Iterator[Liv
 
 
 def replicas(service: LiveService) -> set[int]:
-    """Process ids of the replicas."""
     found = descendants(service.process.pid).items()
     return {pid for pid, command in found if command.startswith("ray::ServeReplica")}
 

@@ -17,6 +17,8 @@ from tests.client.ros_messages import blank
 from tests.deploy.ros import PACKAGE, STORE, Ros, Slow, load_package
 from tests.services import PATIENCE, LiveService, wait_until
 
+Run = Callable[..., "Running"]
+
 
 def new(name: str, **fields: Any) -> Any:
     """Return a message of vision_msgs."""
@@ -54,7 +56,6 @@ class Running:
         return self.published(topic)[-1]
 
     def answer(self, message: Any) -> Any:
-        """The answer to detections."""
         count = len(self.published("~/answers")) + 1
         self.hear("detections", message)
         return json.loads(self.wait_for("~/answers", count).data)
@@ -65,7 +66,7 @@ class Running:
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Running]]:
+def run(monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
     started: list[Running] = []
 
     def start(**parameters: Any) -> Running:
@@ -79,7 +80,7 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Running]]:
 
 
 def test_detections_become_answers_markers_and_a_diagnosis(
-    run: Callable[..., Running], live: LiveService, recorded: Any
+    run: Run, live: LiveService, recorded: Any
 ) -> None:
     running = run(url=live.url, timeout=60.0)
     answer = running.answer(recorded)
@@ -102,9 +103,7 @@ def test_detections_become_answers_markers_and_a_diagnosis(
     assert {marker.header.frame_id for marker in shown} == {"base_link"}
 
 
-def test_the_api_key_comes_from_a_file(
-    run: Callable[..., Running], recorded: Any, tmp_path: Path
-) -> None:
+def test_the_api_key_comes_from_a_file(run: Run, recorded: Any, tmp_path: Path) -> None:
     (tmp_path / "key").write_text("incorrect-zebra-capacitor-nail\n")
     for file in (str(tmp_path / "key"), ""):
         heads: list[bytes] = []
@@ -117,7 +116,7 @@ def test_the_api_key_comes_from_a_file(
 
 
 def test_no_callback_waits_and_only_the_newest_detections_are_asked_about(
-    run: Callable[..., Running], recorded: Any
+    run: Run, recorded: Any
 ) -> None:
     running = run()
     client = running.node.advisor.client = Slow(UnreachableError("gone"))
@@ -139,9 +138,7 @@ def test_no_callback_waits_and_only_the_newest_detections_are_asked_about(
     assert running.published("~/answers") == []
 
 
-def test_numbers_wait_for_their_labels(
-    run: Callable[..., Running], live: LiveService, recorded: Any
-) -> None:
+def test_numbers_wait_for_their_labels(run: Run, live: LiveService, recorded: Any) -> None:
     numbers = {"desk": "0", "chair": "1"}
     for detection in recorded.detections:
         for result in detection.results:
@@ -161,7 +158,7 @@ def test_numbers_wait_for_their_labels(
 
 
 def test_a_pose_in_the_frame_of_the_detections_is_their_viewpoint(
-    run: Callable[..., Running], live: LiveService, recorded: Any
+    run: Run, live: LiveService, recorded: Any
 ) -> None:
     def horizontal() -> list[dict[str, str]]:
         relations = running.answer(recorded)["missing"]["observed_relations"]
@@ -185,9 +182,7 @@ def test_a_pose_in_the_frame_of_the_detections_is_their_viewpoint(
     assert horizontal() == []
 
 
-def test_images_are_heard_where_the_parameters_say_so(
-    run: Callable[..., Running], live: LiveService
-) -> None:
+def test_images_are_heard_where_the_parameters_say_so(run: Run, live: LiveService) -> None:
     def detection(name: str, x: float) -> Any:
         hypothesis = new("ObjectHypothesis", class_id=name, score=0.9)
         found = new("Detection2D", results=[new("ObjectHypothesisWithPose", hypothesis=hypothesis)])
@@ -229,9 +224,7 @@ def test_a_ghost_stands_off_its_anchor_by_the_offset(monkeypatch: pytest.MonkeyP
     assert (pen.text, pen.position, pen.extent) == ("pen? inside desk", (1.0, 2.0, 0.4), None)
 
 
-def test_the_parameter_file_is_the_nodes_parameters_and_its_defaults(
-    run: Callable[..., Running],
-) -> None:
+def test_the_parameter_file_is_the_nodes_parameters_and_its_defaults(run: Run) -> None:
     given = yaml.safe_load((PACKAGE / "config" / "scene.yaml").read_text())
     parameters = given["scene"]["ros__parameters"]
     asked = run(**parameters).ros.declared

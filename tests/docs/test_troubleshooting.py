@@ -12,20 +12,16 @@ PAGE = (REPOSITORY / "docs" / "troubleshooting.md").read_text("utf-8")
 SYMPTOMS = re.findall(r"^\| `([^`]+)` \|", PAGE, re.MULTILINE)
 
 
-def texts() -> list[str]:
+@pytest.fixture(scope="module")
+def messages() -> str:
     """The string constants of the service and the client, f-strings in pieces."""
     sources = [*REPOSITORY.glob("app/**/*.py"), *REPOSITORY.glob("clients/python/**/*.py")]
-    return [
+    return "\n".join(
         node.value
         for path in sources
         for node in ast.walk(ast.parse(path.read_text("utf-8")))
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
-    ]
-
-
-@pytest.fixture(scope="module")
-def messages() -> str:
-    return "\n".join(texts())
+    )
 
 
 @pytest.mark.parametrize("symptom", SYMPTOMS)

@@ -16,6 +16,7 @@ from app.inference.relations import ObservedRelations
 from app.inference.weights import pack_scenes
 from tests.enumeration.small_machines import (
     SMALL,
+    at_temperature,
     binary,
     check_frequencies,
     code,
@@ -28,7 +29,6 @@ from tests.enumeration.small_machines import (
 )
 from training.machines import MachineSpec, build
 from training.machines.arrays import weights_of
-from training.machines.machine import OBJECT_WEIGHTS
 
 CHAINS, RELATION_DRAWS = 10_000, 4_000
 
@@ -54,14 +54,6 @@ def conditions(classes=(), relations=(), **options):
 def one_hot(states, Z):
     """h1 (..., H1) of the states (..., units)."""
     return (states[..., None] == np.arange(1, Z)).reshape(*states.shape[:-1], -1).astype(float)
-
-
-def at_temperature(machine, beta):
-    """The machine whose weights between objects and hidden units are multiplied by beta."""
-    scaled = copy.deepcopy(machine)
-    for name in {*OBJECT_WEIGHTS, "u"} & dict(machine.named_parameters()).keys():
-        scaled.get_parameter(name).mul_(beta)
-    return scaled
 
 
 def check_stationary(name, condition, given, beta=1.0):
@@ -102,9 +94,6 @@ def test_chains_are_stationary_under_conditions(name, profile):
 
     condition = conditions([1], room=room, profile=profile)
     check_stationary(name, condition, lambda joint: joint.v[:, 1] > 0)
-
-
-# -- relations ---------------------------------------------------------------------------------
 
 
 def all_present(machine, temperature=1.0, relations=()):
@@ -189,8 +178,6 @@ def test_relations_that_imply_each_other_are_drawn_in_groups(observed):
     machine.gamma.zero_()
     assert 0.5 * np.abs(implied_law(machine, observed) - law).sum() > 0.15
 
-
-# -- starts and scores -------------------------------------------------------------------------
 
 STORED = MachineSpec("triway", V=12, A=2, units=4, states=3, C=3, K=2, N=24, coupled=True)
 

@@ -23,10 +23,6 @@ HEAD = (
 service = live_service(SCENE_CLIENT_TIMEOUT="1", logs_errors=True)
 
 
-def connect(service: LiveService) -> socket.socket:
-    return socket.create_connection(("127.0.0.1", service.port), timeout=PATIENCE)
-
-
 @pytest.mark.parametrize(
     "part",
     [HEAD % len(BODY), HEAD % len(BODY) + BODY[:-1], HEAD % 250_000 + b" " * 200_000],
@@ -68,7 +64,8 @@ def test_unfinished_bodies_use_bounded_memory(shared_store: Path, tmp_path: Path
         before, answers = service.memory, service.control()
         waiting, head = list[socket.socket](), HEAD.replace(b"outliers", b"missing/batch") % size
         for _ in range(60):
-            waiting.append(held.enter_context(connect(service)))
+            connection = socket.create_connection(("127.0.0.1", service.port), timeout=PATIENCE)
+            waiting.append(held.enter_context(connection))
             with suppress(ConnectionError):  # refused before the end of the body
                 waiting[-1].sendall(head + b" " * (size - 1))
         while len(waiting) > 4:

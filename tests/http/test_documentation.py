@@ -75,9 +75,8 @@ def test_libraries_lie_here_as_they_were_published(repository: Path) -> None:
 
 
 @pytest.fixture
-async def document(client: httpx.AsyncClient) -> dict[str, Any]:
-    document: dict[str, Any] = (await client.get("/openapi.json")).json()
-    return document
+async def document(client: httpx.AsyncClient) -> Any:
+    return (await client.get("/openapi.json")).json()
 
 
 def operations(document: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
@@ -190,7 +189,7 @@ async def test_computed_answers_are_not_cached_and_load_nothing(
     assert response.headers["content-security-policy"] == NOTHING
 
 
-@pytest.mark.parametrize("path", ["/", "/docs", "/redoc", "/problems", "/problems/not-json"])
+@pytest.mark.parametrize("path", PAGES)
 async def test_pages_keep_their_own_policy(client: httpx.AsyncClient, path: str) -> None:
     response = await client.get(path)
     check(response)

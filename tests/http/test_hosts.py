@@ -17,12 +17,6 @@ SCENE = {"objects": ["bed"]}
 LOCAL = {"localhost", "pc-7.lab", "pc-7.local"}
 
 
-@pytest.fixture(autouse=True)
-def no_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("SCENE_HOST", "SCENE_ALLOWED_HOSTS", "SCENE_API_KEY"):
-        monkeypatch.delenv(name, raising=False)
-
-
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [

@@ -171,9 +171,6 @@ async def test_metrics_can_be_switched_off(shared_store: Path) -> None:
         assert "/metrics" not in (await client.get("/openapi.json")).json()["paths"]
 
 
-# ------------------------------------------------------------------------------- the models
-
-
 async def test_model_info_has_every_alias(own: httpx.AsyncClient, store: Path) -> None:
     Store(store).set_alias("night", AliasTarget(name="home"))
     await load_changes(own)
@@ -268,9 +265,6 @@ def test_a_request_is_one_line(live: LiveService) -> None:
     assert refused.pop("latency_ms") > 0
     expected = {"method": "GET", "route": "-", "status": 404, "outcome": "not-found"}
     assert refused == common | expected
-
-
-# ------------------------------------------------------------------------------------------- traces
 
 
 MARKER = "xyzzy"

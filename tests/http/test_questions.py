@@ -114,9 +114,6 @@ async def test_a_model_without_room_types_names_none(tmp_path: Path) -> None:
         assert [one["code"] for one in answer["warnings"]] == ["not-judged"]
 
 
-# ---------------------------------------------------------------------------------- generate
-
-
 async def test_rare_room_types_are_named_and_not_sampled(tmp_path: Path) -> None:
     """The other questions accept them. Without a room type, no scene has a rare one."""
     publish(tmp_path, "home", "1.0.0", rare_rooms=(1,), alias="default")
@@ -138,9 +135,6 @@ async def test_a_drawn_seed_is_reported_and_draws_the_same_again(client: httpx.A
     again = await ask(client, "generate", count=3, seed=first["seed"])
     assert first["scenes"] == again["scenes"]
     assert (await ask(client, "generate", count=3))["seed"] != first["seed"]
-
-
-# -------------------------------------------------------------------------- small vocabularies
 
 
 @pytest.mark.parametrize(
@@ -172,9 +166,6 @@ async def test_a_model_of_too_few_scenes_gives_no_judgement(tmp_path: Path) -> N
                 assert f"does not judge {part}" in warning["message"]
         assert (await ask(client, "missing", objects=["bed"]))["warnings"] == []
         assert (await ask(client, "generate", objects=["bed"]))["scenes"]
-
-
-# -------------------------------------------------------------------------- defaults, notes
 
 
 async def test_coverage_is_the_models_unless_given(client: httpx.AsyncClient) -> None:
@@ -212,9 +203,6 @@ def _numbers(value: Any) -> list[float]:
     if isinstance(value, list):
         return [number for entry in value for number in _numbers(entry)]
     return [value] if isinstance(value, float) else []
-
-
-# ------------------------------------------------------------------------------- counts and offsets
 
 
 LABELS = ("bed", "nightstand", "chair", "chair")
@@ -297,9 +285,6 @@ async def test_placements_have_offsets_in_the_axes_of_the_frame(
     places = [place for entry in answer["missing"] for place in entry["placements"]]
     kinds = {"offset" in place for place in places}
     assert kinds == ({True, False} if axes is None else {True})
-
-
-# ------------------------------------------------------------------------------------------ batches
 
 
 ENTRIES: list[Any] = [

@@ -32,9 +32,6 @@ def relation(subject: str, name: str, other: str) -> dict[str, str]:
     return {"subject": subject, "relation": name, "object": other}
 
 
-# ------------------------------------------------------------------------------------- names
-
-
 @pytest.mark.parametrize(
     ("objects", "expected"),
     [
@@ -72,9 +69,6 @@ async def test_a_repeated_relation_is_no_contradiction(client: httpx.AsyncClient
     _, found = await read(client, objects=["bed", "lamp"], relations=stated)
     assert {("bed", "front", "lamp")} < found
     assert len(found) == 2
-
-
-# ------------------------------------------------------------------------------------ labels
 
 
 async def test_ignored_labels_remove_their_relations(client: httpx.AsyncClient) -> None:
@@ -175,9 +169,6 @@ async def test_aliases_of_room_types_and_candidates_are_named(client: httpx.Asyn
         ("tv", "television", "alias"),
         ("pair of sofas", "sofa", "phrase"),
     ]
-
-
-# ------------------------------------------------------------------------------------- poses
 
 
 async def test_a_scene_of_the_training_is_a_request(client: httpx.AsyncClient) -> None:

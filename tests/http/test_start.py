@@ -181,9 +181,6 @@ def test_the_log_names_the_page(live: LiveService, starting: Start, log: Path) -
     assert not any("SCENE_API_KEY is not set" in line for line in messages(live.log))
 
 
-# ------------------------------------------------------------------------------------------ SIGHUP
-
-
 def test_sighup_loads_the_store_at_once(store: Path, log: Path) -> None:
     with launch(store, log, SCENE_STORE_POLL="0", SCENE_ADMIN_KEY="a former key") as service:
         (warning,) = (line for line in messages(log) if "SCENE_ADMIN_KEY" in line)

@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import expit
 
 from app.inference.relations import (
     NEVER,
@@ -16,14 +17,11 @@ from app.inference.relations import (
     to_log_odds,
 )
 from tests.enumeration.small_machines import implied_by_hand, random_weights, unit_states
+from tests.questions.artifacts import random_machine
 from training.machines import MachineSpec, build
 from training.machines.arrays import weights_of
 
 V, A = 6, 2
-
-
-def sigmoid(x):
-    return 1 / (1 + np.exp(-x))
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.3, 0.74, 0.8, 2.0, 10.0])
@@ -33,8 +31,8 @@ def test_log_odds_of_normal_logits(sigma):
     found = to_log_odds(mean, np.full(len(mean), 3**0.5 * sigma, dtype=np.float32))
     t = np.linspace(-9, 9, 20_001)
     weight = np.exp(-0.5 * t**2) / np.exp(-0.5 * t**2).sum()
-    on = sigmoid(mean[:, None] + sigma * t) @ weight
-    np.testing.assert_allclose(sigmoid(found.astype(float)), on, atol=4e-4)
+    on = expit(mean[:, None] + sigma * t) @ weight
+    np.testing.assert_allclose(expit(found.astype(float)), on, atol=4e-4)
     # Log-odds keep their sign and their tails: those of -l are minus those of l.
     np.testing.assert_allclose(found, -found[::-1], rtol=1e-5, atol=1e-5)
     if sigma == 0:
@@ -49,15 +47,6 @@ SPECS = {
     "triway-deep": MachineSpec("triway", V=V, A=A, units=3, states=5, H2=3, K=3, T=40, C=2),
 }
 CLASSES, LOG_COUNTS = np.array([4, 0, 3]), np.log([1, 3, 2]).astype(np.float32)
-
-
-def machine_of(name, scale=0.8):
-    """Float32 weights, and triples of random classes."""
-    generator = torch.Generator().manual_seed(3)
-    machine = build(SPECS[name])
-    keys = torch.randperm(A * V**2, generator=generator)[: machine.spec.T].sort().values
-    machine.set_triples(torch.stack([keys // V**2, keys // V % V, keys % V], 1))
-    return random_weights(machine, generator, scale)
 
 
 def exact_logits(machine, v, room):
@@ -96,7 +85,7 @@ def scene_of(machine, room):
 @pytest.mark.parametrize("name", SPECS)
 def test_mean_and_variance_are_those_over_all_states_of_h1(name, room):
     """Of relations between listed classes, and of placements, in which a candidate is present."""
-    machine = machine_of(name)
+    machine = random_machine(SPECS[name], 0.8)
     v, weights, context = scene_of(machine, room)
     units, machine = relation_units(weights), machine.double()
     between = units.between(context)

@@ -17,7 +17,7 @@ from app.registry.description import (
 )
 from app.registry.places import Places
 from app.scene import ObjectClass, Scene, SceneObject, Vocabulary
-from tests.enumeration.small_machines import SMALL
+from tests.enumeration.small_machines import SMALL, random_weights
 from training.machines import BoltzmannMachine, MachineSpec, build
 from training.machines.arrays import weights_of
 
@@ -139,13 +139,10 @@ def random_machine(spec: MachineSpec, scale: float) -> BoltzmannMachine:
         machine.set_triples(
             torch.stack([keys // spec.V**2, keys // spec.V % spec.V, keys % spec.V], 1)
         )
-    with torch.no_grad():
-        for parameter in machine.parameters():
-            noise = torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
-            parameter.copy_(noise * scale)
-        if spec.coupled:
-            machine.L.copy_(machine.couplings)
-    return machine.eval().requires_grad_(False)
+    random_weights(machine, generator, scale)
+    if spec.coupled:
+        machine.L.copy_(machine.couplings)
+    return machine.eval()
 
 
 def scene_of(

@@ -1,7 +1,6 @@
 """Answers to the scoring questions, compared with the enumerated joint of a small machine."""
 
 import copy
-import math
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
@@ -9,6 +8,7 @@ from itertools import product
 import numpy as np
 import pytest
 import torch
+from scipy.special import expit as sigmoid
 
 from app.scene import CANONICAL, OPPOSITES
 from tests.enumeration.small_machines import (
@@ -109,17 +109,13 @@ class Exact:
         return p
 
 
-def sigmoid(x):
-    return 1 / (1 + math.exp(-x))
-
-
 @cache
 def exact_case(name, scale=1.3, room=None, profile=None):
     """An artifact, and the joint of its machine under a room type and a profile."""
     machine = random_machine(EXACT[name], scale)
     source = -1 if profile is None else profile
     joint = enumerate_joint(copy.deepcopy(machine).double(), room, source=source)
-    return artifact_of(machine), Exact(joint, -1 if profile is None else profile)
+    return artifact_of(machine), Exact(joint, source)
 
 
 @pytest.fixture(params=EXACT)

@@ -3,14 +3,11 @@
 import math
 
 import pytest
+from scipy.special import expit as sigmoid
 
 from app.registry.description import CountSlope, PlaceFit
 from tests.questions.answers import missing, outliers, relations, without_minimums
 from tests.questions.artifacts import LARGER, STRUCTURE, larger_artifact, lines, scene_of
-
-
-def sigmoid(x: float) -> float:
-    return 1 / (1 + math.exp(-x))
 
 
 def test_scenes_with_relations_have_entries_of_their_own():

@@ -145,10 +145,6 @@ def check_share(count, drawn, p):
     assert abs(count / len(drawn) - p) <= 5 * error + 1e-12
 
 
-def label_sets(drawn):
-    return [frozenset(LABELS.index(label) for label in scene.objects) for scene in drawn]
-
-
 @pytest.mark.parametrize("name", DRAWN)
 @pytest.mark.parametrize("evidence", [[], [0]])
 @pytest.mark.parametrize("clamped", [False, True])
@@ -160,7 +156,8 @@ def test_objects_have_the_distribution_of_the_model(name, evidence, clamped):
     # The mean base rates depend on the evidence only if the machine has data sources.
     artifact, joint = with_joint(name, room, profile, tuple(evidence) if spec.profiles else ())
     scene = scene_of(evidence, room=room, profile=profile)
-    drawn = label_sets(generate(artifact, scene, count=512, seed=0, steps=40))
+    scenes = generate(artifact, scene, count=512, seed=0, steps=40)
+    drawn = [frozenset(map(LABELS.index, one.objects)) for one in scenes]
     condition = (joint.v[:, evidence] > 0).all(1)
     codes = (joint.v.long() << torch.arange(3)).sum(1)
     for code in range(8):

@@ -107,9 +107,6 @@ def entries(scene, alone=(), change=(), flipped=(), artifact=ARTIFACT):
     return {tuple(triple): (kind, terms, mover) for triple, kind, terms, mover in rows}
 
 
-# ------------------------------------------------------------------------------ stated relations
-
-
 def test_the_terms_of_a_hand_computed_example():
     """A monitor on a desk, a bin under the desk, and the bin to the left of the monitor."""
     on, under, left = (ON_TOP, 1, 0), (ON_TOP, 0, 2), (LEFT, 2, 1)
@@ -166,8 +163,6 @@ def test_a_supported_object_above_another_is_not_misplaced():
     assert held[over] == (OVER, [EXPLAINED, 0.0, 0.0, 0.0], 1)
 
 
-# ------------------------------------------------------------------------------------- poses
-
 STANDING = -1  # the floor as object of an entry
 
 
@@ -204,10 +199,7 @@ def test_without_places_stands_are_unknown(is_posed):
     assert (entry["subject"], entry["moved"]) == ("monitor", "monitor")
 
 
-# ------------------------------------------------------------------------------------ answers
-
 JUDGED = judging(lines(3.0, 2.0, 1.0), stand=-1.0)
-WITHOUT_STAND = JUDGED.model_copy(update={"stand": None})
 
 
 def fields_of(scene, alone=(), sensitivity="medium", flipped=(), judgements=JUDGED):
@@ -265,7 +257,7 @@ def test_a_kind_without_judgement_is_left_out():
     assert entry["relation"] == "on-top"
     on_floor = posed((POT, (0, 0, 0)), (SOFA, (4, 0, 0)))
     assert fields_of(on_floor)
-    assert not fields_of(on_floor, judgements=WITHOUT_STAND)
+    assert not fields_of(on_floor, judgements=JUDGED.model_copy(update={"stand": None}))
 
 
 def test_wrong_relations_have_the_log_odds_of_the_answer():

@@ -34,7 +34,6 @@ def test_the_popularity_of_a_class_counts_by_its_weight(alpha):
 
 
 def test_a_class_without_training_scene_counts_as_the_rarest():
-    """It counts as the rarest other class, whatever its log-odds in an empty scene."""
     unseen = LABELS.index("lamp")
     popularity = tuple(None if k == unseen else -1.0 - k for k in range(len(LABELS)))
     artifact = larger_artifact(

@@ -225,9 +225,6 @@ def test_no_place_is_inside_an_object_that_is_too_small():
     assert first(sofa, chair)["inside"] > 1e-3
 
 
-# ------------------------------------------------------------------- the place that a request names
-
-
 module = import_module("app.questions.missing")  # the package has a function of this name
 NAMES = ["rbm", "triway", "triway-states"]
 FITS = tuple(

@@ -45,9 +45,6 @@ def refusal(directory: Path) -> ArtifactError:
     return refused.value
 
 
-# -- round trip ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("variant", SPECS)
 def test_round_trip_is_exact_in_float32(variant: str, tmp_path: Path) -> None:
     weights = state(variant)
@@ -134,9 +131,6 @@ def test_refuses_to_write_numbers_that_the_file_cannot_hold(value: float, tmp_pa
         write_artifact(tmp_path / "a", description(), weights)
 
 
-# -- damaged files ------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("file", FILES)
 def test_refuses_a_file_that_is_cut_or_longer_or_missing(file: str, written: Path) -> None:
     whole = (written / file).read_bytes()
@@ -189,9 +183,6 @@ def test_refuses_links_folders_and_pipes(kind: str, written: Path, tmp_path: Pat
     before = sorted(Path("/proc/self/fd").iterdir())
     assert refusal(written).code == "unreadable"
     assert sorted(Path("/proc/self/fd").iterdir()) == before, "no descriptor stays open"
-
-
-# -- other contents with valid checksums --------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -295,9 +286,6 @@ def test_refuses_dtypes_that_artifacts_do_not_hold(dtype: Any, written: Path) ->
 def test_refuses_a_spec_that_no_machine_has(change: dict[str, Any], written: Path) -> None:
     rewrite_manifest(written, lambda members: members["spec"].update(change))
     assert refusal(written).code in {"invalid_manifest", "wrong_shape"}
-
-
-# -- the model card -----------------------------------------------------------------------------
 
 
 TENSORS = {

@@ -39,9 +39,6 @@ def tree(root: Path) -> dict[str, bytes]:
     }
 
 
-# -- publishing ---------------------------------------------------------------------------------
-
-
 def test_publishes_what_a_reader_loads(store: Store) -> None:
     new = publish_as(store, "default", description(), state(), storage_dtype="float16")
     loaded = store.load(*store.resolve("default"))
@@ -146,9 +143,6 @@ def test_everything_is_on_disk_before_it_is_pointed_at(
     assert [kind for kind, _ in events].count("renamed") == 2
 
 
-# -- aliases ------------------------------------------------------------------------------------
-
-
 def test_an_alias_follows_the_latest_or_stays(store: Store) -> None:
     publish(store)
     store.set_alias("default", AliasTarget(name="tiny"))
@@ -243,9 +237,6 @@ def test_an_invalid_alias_table_is_refused_and_kept(text: str, store: Store) -> 
             use()
     assert (store.root / "aliases.json").read_text() == text
     assert store.versions("tiny") == ("1.0.0",)
-
-
-# -- other files --------------------------------------------------------------------------------
 
 
 def test_readers_see_no_leftovers_and_the_next_writer_clears_them(store: Store) -> None:
@@ -352,9 +343,6 @@ def test_the_command_changes_the_store_of_the_service_and_creates_none(
     printed = capsys.readouterr()
     assert printed.out.splitlines()[-2:] == listed[:2]
     assert "store model_store: " in printed.err
-
-
-# -- copies ---------------------------------------------------------------------------------------
 
 
 def copy(source: Store, target: Store, *references: str) -> int:

@@ -228,9 +228,6 @@ def test_offsets_are_those_of_the_pair_or_of_the_relation(
     assert offset is None or values[0].tolist() == pytest.approx(offset)
 
 
-# -- places --------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("relation", range(A))
 @pytest.mark.parametrize("anchor", range(V))
 @pytest.mark.parametrize("outgoing", [True, False])

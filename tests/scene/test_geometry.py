@@ -172,9 +172,6 @@ def test_scenes_of_no_and_of_one_box() -> None:
     assert not derive_relations([[0, 0, 0]], [[1, 1, 1]]).observed.any()
 
 
-# -------------------------------------------------------------------------------------------- roles
-
-
 EVERY_ROLE = np.ones(3, np.bool_)
 
 
@@ -225,9 +222,6 @@ def test_the_footprint_and_then_the_volume_tell_the_smaller(
     i: tuple[float, ...], j: tuple[float, ...], expected: bool
 ) -> None:
     assert is_smaller(np.array(i), np.array(j)) is expected
-
-
-# --------------------------------------------------------------------------------------- footprints
 
 
 Point = tuple[float, float]

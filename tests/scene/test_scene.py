@@ -102,9 +102,6 @@ def test_boxes_of_unknown_size_are_not_stacked_from_far_apart(
     assert seen.excluded[[*STACKED], 0, 1].all() == is_far
 
 
-# --------------------------------------------------------------------------- evidence about classes
-
-
 A = len(CANONICAL)
 
 
@@ -153,9 +150,6 @@ def test_the_evidence_about_instances_is_stated_complete_or_from_poses() -> None
     assert of_poses == (poses.holds, poses.observed)
 
 
-# ---------------------------------------------------------------------------------------- relations
-
-
 relations = st.sampled_from(RELATIONS)
 
 
@@ -190,9 +184,6 @@ def test_supports_in_a_circle_are_found() -> None:
     assert {*pairwise(circle)} == {
         ("book", "bag"), ("bag", "desk"), ("desk", "book"),
     }  # fmt: skip
-
-
-# ------------------------------------------------------------------------------------------- stands
 
 
 NAN = math.nan
@@ -270,9 +261,6 @@ def test_an_open_relation_leaves_the_stand_unknown() -> None:
     assert stands_of(holds, observed, heights, 0.0).tolist() == [UNKNOWN, FLOOR]
     holds[INSIDE, 0, 1] = True
     assert stands_of(holds, observed, heights, 0.0).tolist() == [SUPPORTED, FLOOR]
-
-
-# ------------------------------------------------------------------------------------------- frames
 
 
 def same_turn(a: float, b: float, period: float = 2 * math.pi) -> bool:

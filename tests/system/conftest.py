@@ -16,8 +16,6 @@ from tests.services import PATIENCE, free_port, is_ready, wait_until
 
 @dataclass
 class Proxy:
-    """A running proxy."""
-
     port: int
     log: Path
 
@@ -44,7 +42,6 @@ def configuration(repository: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def compose(repository: Path) -> dict[str, Any]:
-    """The compose file."""
     return yaml.safe_load((repository / "docker-compose.yml").read_text("utf-8"))
 
 

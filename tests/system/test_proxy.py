@@ -90,9 +90,6 @@ def test_questions_and_pages_are_answered(proxy: Proxy) -> None:
         assert other_host.json()["type"] == "/problems/host-refused"
 
 
-# ---------------------------------------------------------------------------------- attacks
-
-
 def test_connections_without_a_whole_head_are_closed(
     behind: StartProxy, service: LiveService, tmp_path: Path
 ) -> None:

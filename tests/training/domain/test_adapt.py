@@ -170,7 +170,7 @@ def test_errors_name_the_reason(store, tmp_path):
 def test_five_habits_are_learnt_from_a_hundred_scenes(store, tmp_path):
     scenes = write(home_scenes(100, 7), tmp_path / "scenes.jsonl")
     said = adapt(store, scenes, "--promote")
-    before, after = default_parent(store), home(store)
+    before, after = store.load(*store.resolve("indoor-triway")), home(store)
     new = home_scenes(50, 8)
     counts = [
         sum(bool(alarms(side, scene["objects"], scene["room_type"])) for scene in new)
@@ -196,10 +196,6 @@ def tv_is_missing(artifact: Artifact, labels: list[str]) -> float:
     scene = Scene(tuple(SceneObject(x, x, words.index(x)) for x in labels))
     answer = questions.missing(artifact, scene, candidates=[words.index("tv")], coverage=0.8)
     return answer["missing"][0]["probability"]
-
-
-def default_parent(store: Store) -> Artifact:
-    return store.load(*store.resolve("indoor-triway"))
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from app.scene import ObjectClass, Vocabulary
+from tests.enumeration.small_machines import random_weights
 from training.datasets.batches import Batch
 from training.domain.translation import BEYOND, Translation, same_classes
 from training.evaluation.artifact_model import artifact_model
@@ -23,12 +24,8 @@ V, A = len(MODEL), 4
 @pytest.fixture(scope="module")
 def model():
     machine = build(MachineSpec("triway", V=V, A=A, units=2, states=3, K=3))
-    generator = torch.Generator().manual_seed(0)
-    with torch.no_grad():
-        for parameter in machine.parameters():
-            parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.5)
-    artifact = draft_artifact(machine.requires_grad_(False).eval(), MODEL)
-    return artifact_model(artifact)
+    random_weights(machine, torch.Generator().manual_seed(0), 0.5)
+    return artifact_model(draft_artifact(machine.eval(), MODEL))
 
 
 def batch(classes: list[int], size: int, told: tuple[int, int, int] | None = None) -> Batch:

@@ -133,8 +133,7 @@ def test_ranks_at_a_place_by_hand():
 
 
 def test_structure_and_equal_classes_are_not_asked():
-    structure = NO_STRUCTURE.clone()
-    structure[4] = True
+    structure = torch.arange(len(NO_STRUCTURE)) == 4
     found = scene([0, 0, 1, 4], [(0, 0, 4), (3, 0, 1)])
     found.evidence.holds[2, 0, 0] = True
     _, target, places = removed_places(tensors([found]), structure)

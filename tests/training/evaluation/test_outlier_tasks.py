@@ -21,8 +21,6 @@ from training.evaluation.outlier_tasks import alarms_task, hit_at_1, outliers_ta
 from training.evaluation.parts import draw_parts, exactly
 from training.evaluation.setting import Setting
 
-TRAIN, DATA = rooms(400, 1), rooms(40, 2)
-
 
 def only_intruders(v):
     """The suspicion of a model that knows classes 0 to 2 as usual."""
@@ -65,8 +63,7 @@ def test_a_request_lists_the_scene_and_its_intruder_without_structure():
 
 
 def test_intruders_are_absent_and_no_structure():
-    structure = NO_STRUCTURE.clone()
-    structure[4] = True
+    structure = torch.arange(len(NO_STRUCTURE)) == 4
     data = tensors([scene([0, 1, 2]) for _ in range(20)])
     assert set(draw_intruders(data, structure).tolist()) == {3}
     small = tensors([scene([0, 1]), scene([0, 1, 4])])
@@ -122,11 +119,12 @@ def test_intruders_are_typical_of_another_room_and_foreign_to_this_one():
 
 
 def test_a_published_model_is_judged_as_the_service_ranks():
-    outcome = outliers_task(artifact_model(room_model()), Setting(DATA, STRUCTURE, TRAIN))
+    data = rooms(40, 2)
+    outcome = outliers_task(artifact_model(room_model()), Setting(data, STRUCTURE, rooms(400, 1)))
     names = {f"{name}, {law}" for name in ("hit@1", "flagged") for law in LAWS}
     assert set(outcome.metrics) == names
-    index, v, intruder = with_intruders(DATA, STRUCTURE, None)
-    hits, flagged = np.zeros(len(DATA)), np.zeros(len(DATA))
+    index, v, intruder = with_intruders(data, STRUCTURE, None)
+    hits, flagged = np.zeros(len(data)), np.zeros(len(data))
     for k, row, target in zip(index.tolist(), v, intruder.tolist(), strict=True):
         classes = row.nonzero().squeeze(1)
         answers = judge(room_model(), of_classes(classes.tolist()))
@@ -134,7 +132,7 @@ def test_a_published_model_is_judged_as_the_service_ranks():
         first = answers[:, 0] == answers[:, 0].max()
         hits[k] += first[place] / first.sum()
         flagged[k] += answers[place, 2]
-    groups = np.unique(DATA.group_ids, return_inverse=True)[1]
+    groups = np.unique(data.group_ids, return_inverse=True)[1]
     for name, values in (("hit@1", hits), ("flagged", flagged)):
         assert outcome.metrics[f"{name}, uniform"].numerators == pytest.approx(
             np.bincount(groups, values)
@@ -166,4 +164,4 @@ def test_without_room_types_and_training_scenes_there_are_fewer_laws():
     assert set(unknown.metrics) == {"hit@1, uniform", "hit@1, by popularity"}
     alone = outliers_task(model, Setting(tensors([scene([0, 1, 2])]), NO_STRUCTURE))
     assert set(alone.metrics) == {"hit@1, uniform"}
-    assert outliers_task(Model(), Setting(DATA, STRUCTURE, TRAIN)) is None
+    assert outliers_task(Model(), Setting(TOY, NO_STRUCTURE, TOY)) is None

@@ -144,13 +144,6 @@ def test_real_rooms_come_before_generated_ones():
 BARE = torch.zeros(WIDE, dtype=torch.bool)
 
 
-def lists_with_hidden(count=200, classes=7):
-    """Scenes of `classes` random classes."""
-    rng = np.random.default_rng(3)
-    rows = [sorted(rng.permutation(WIDE)[:classes].tolist()) for _ in range(count)]
-    return tensors([scene(row, name=f"scene {k}") for k, row in enumerate(rows)], WIDE)
-
-
 def hidden_of(scenes, v):
     """The hidden classes of lists v, in scenes of which each has a list of each length."""
     lengths = [n for n in LENGTHS if n < scenes.v[0].sum()]
@@ -160,8 +153,9 @@ def hidden_of(scenes, v):
 
 def test_the_coverage_that_ranks_best_is_chosen(monkeypatch):
     """The log-odds name the hidden classes the more often, the closer the coverage is to .45."""
-    scenes = lists_with_hidden()
     rng = np.random.default_rng(0)
+    rows = [sorted(rng.permutation(WIDE)[:7].tolist()) for _ in range(200)]
+    scenes = tensors([scene(row, name=f"scene {k}") for k, row in enumerate(rows)], WIDE)
 
     def log_odds(artifact, v, coverages):
         hidden = hidden_of(scenes, v)
@@ -284,18 +278,10 @@ def test_structure_and_classes_that_belong_anywhere_are_never_judged(judging):
 
 @pytest.mark.parametrize("count", [19, 20])
 def test_few_scenes_give_no_judgement_of_objects(judging, count):
-    scenes = served_scenes(rooms(60, 1), {})
-    some = replace_scenes(scenes, count)
+    some = tensors(served_scenes(rooms(60, 1), {}).scenes[:count], len(VOCABULARY))
     entries = fit_outliers(judging, some, rooms(ROOM_COUNT, 2), STRUCTURE)
-    if count < 20:
-        assert entries == {}
-    else:
-        assert set(entries) == {"popularity_weight", "outlier", "outlier_lines"}
-
-
-def replace_scenes(scenes, count):
-    """The first scenes of a set."""
-    return tensors(scenes.scenes[:count], len(VOCABULARY))
+    judged = {"popularity_weight", "outlier", "outlier_lines"}
+    assert set(entries) == (judged if count == 20 else set())
 
 
 @pytest.fixture(scope="module")

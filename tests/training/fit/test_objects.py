@@ -422,12 +422,11 @@ def fitted(name):
 
 def exact_shares(machine, scenes, population):
     """p(v_i = 1) in chains that keep the room types of the scenes, (V,), by enumeration."""
-    every = (torch.arange(2**V).unsqueeze(1) >> torch.arange(V) & 1).double()
     source = -1 if population.profile is None else population.profile
     total = torch.zeros(V).double()
     for room in scenes.room.unique().tolist():
         weight = float(population.weight[(scenes.room == room).numpy()].sum())
-        total += weight * (log_p(machine, room, source).double().exp() @ every)
+        total += weight * (log_p(machine, room, source).double().exp() @ EVERY)
     return total.numpy()
 
 

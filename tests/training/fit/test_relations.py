@@ -273,21 +273,16 @@ LISTED = {(0, 1, 2): (18, 2), (0, 3, 4): (4, 8), (1, 0, 3): (0, 12)}
 """Per triple: scenes that list it, and scenes that observe that it does not hold."""
 
 
-def listed_scenes():
-    """Scenes of two sources; each observes one triple of `LISTED`."""
+@pytest.mark.parametrize("weights", [(1.0, 1.0), (0.5, 2.0)])
+def test_residuals_maximise_the_likelihood_of_triples_under_a_normal_prior(monkeypatch, weights):
+    """At the mode the slope of the log-likelihood is τ δ, with one precision τ for all triples."""
+    monkeypatch.setattr("training.fit.residuals.means_of_parts", of_whole_scenes)
     every = [
         annotated(triple, k < true, "captions" if k % 2 else "rooms")
         for triple, (true, false) in LISTED.items()
         for k in range(true + false)
     ]
-    return tensors(every)
-
-
-@pytest.mark.parametrize("weights", [(1.0, 1.0), (0.5, 2.0)])
-def test_residuals_maximise_the_likelihood_of_triples_under_a_normal_prior(monkeypatch, weights):
-    """At the mode the slope of the log-likelihood is τ δ, with one precision τ for all triples."""
-    monkeypatch.setattr("training.fit.residuals.means_of_parts", of_whole_scenes)
-    scenes, machine = listed_scenes(), machine_of("triway")
+    scenes, machine = tensors(every), machine_of("triway")
     with torch.no_grad():
         machine.residual.copy_(torch.linspace(-0.3, 0.3, 6))
     offsets, source_weights = torch.tensor([[0.4, 0.1], [-0.6, 0.2]]), torch.tensor(weights)

@@ -24,14 +24,6 @@ def arguments(folder, *, space=SPACE):
     return "tune", config, "--space", path, "--folder", folder / "tuning", "--length", "0.5"
 
 
-def search_in(folder):
-    """A search of one learning rate. Test scenes are never looked at."""
-    arguments(folder)
-    config = load_config(str(folder / "config.toml"))
-    data = replace(prepare(config, folder).training_data(), test=None)
-    return Search(folder / "study", config, data, rate(0.03))
-
-
 def rate(value):
     return {"objects.learning_rate": FloatDistribution(value, value)}
 
@@ -75,7 +67,10 @@ def test_bad_requests_are_refused_before_anything_runs(tmp_path):
 
 @pytest.mark.slow
 def test_diverging_trials_and_trials_below_the_median_are_given_up(tmp_path):
-    search = search_in(tmp_path)
+    """A search of one learning rate. Test scenes are never looked at."""
+    config = small_config()
+    data = replace(prepare(config, tmp_path).training_data(), test=None)
+    search = Search(tmp_path / "study", config, data, rate(0.03))
     study = search.run(5, 0)
     assert [trial.state.name for trial in study.trials] == ["COMPLETE"] * 5
     assert set(study.trials[-1].intermediate_values) == {50, 100, 150, 200}
