@@ -12,7 +12,6 @@ from torch import Tensor
 
 from training.machines import BoltzmannMachine, MachineSpec, build
 from training.machines.edges import Edges
-from training.machines.machine import OBJECT_WEIGHTS
 
 TRIPLES = [(0, 0, 1), (0, 1, 0), (1, 0, 0), (1, 1, 0)]
 
@@ -79,14 +78,6 @@ def with_mean_rates(machine: BoltzmannMachine, classes: Sequence[int] = ()) -> B
         copied.b += mean_rates(machine, required, whole_scenes=True)
         copied.u[-1] = 0
     return copied
-
-
-def at_temperature(machine: BoltzmannMachine, beta: float) -> BoltzmannMachine:
-    """The machine whose weights between objects and hidden units are multiplied by beta."""
-    scaled = copy.deepcopy(machine)
-    for name in {*OBJECT_WEIGHTS, "u"} & dict(machine.named_parameters()).keys():
-        scaled.get_parameter(name).mul_(beta)
-    return scaled
 
 
 def binary(units: int) -> Tensor:

@@ -16,7 +16,6 @@ from app.inference.relations import ObservedRelations
 from app.inference.weights import pack_scenes
 from tests.enumeration.small_machines import (
     SMALL,
-    at_temperature,
     binary,
     check_frequencies,
     code,
@@ -29,6 +28,7 @@ from tests.enumeration.small_machines import (
 )
 from training.machines import MachineSpec, build
 from training.machines.arrays import weights_of
+from training.machines.machine import OBJECT_WEIGHTS
 
 CHAINS, RELATION_DRAWS = 10_000, 4_000
 
@@ -54,6 +54,14 @@ def conditions(classes=(), relations=(), **options):
 def one_hot(states, Z):
     """h1 (..., H1) of the states (..., units)."""
     return (states[..., None] == np.arange(1, Z)).reshape(*states.shape[:-1], -1).astype(float)
+
+
+def at_temperature(machine, beta):
+    """The machine whose weights between objects and hidden units are multiplied by beta."""
+    scaled = copy.deepcopy(machine)
+    for name in {*OBJECT_WEIGHTS, "u"} & dict(machine.named_parameters()).keys():
+        scaled.get_parameter(name).mul_(beta)
+    return scaled
 
 
 def check_stationary(name, condition, given, beta=1.0):

@@ -63,31 +63,24 @@ def sweep(
     generator: torch.Generator,
     *,
     classes: int | None = None,
-    beta: float = 1.0,
-    base: Tensor | None = None,
 ) -> None:
     """Run one Gibbs sweep, in place.
 
     Args:
         classes: number of random classes that a sweep over coupled classes draws. None means all.
-        beta: factor of all weights.
-        base: log-odds of the classes at beta = 0, (classes,). The default is 0.
     """
     x = machine.context_bias(chains.room) + sums(chains.v, machine.W) + chains.h2 @ machine.J.T
-    h1 = draw_states(beta * x, machine.spec.states, generator)
+    h1 = draw_states(x, machine.spec.states, generator)
     if machine.spec.H2:
-        logits = beta * machine.second_layer_logits(h1)
-        chains.h2 = torch.bernoulli(logits.sigmoid(), generator=generator)
+        chains.h2 = torch.bernoulli(machine.second_layer_logits(h1).sigmoid(), generator=generator)
     bias = machine.scene_bias(chains.source) + machine.room_bias(chains.room)
-    field = beta * (bias + h1 @ machine.W.T)
-    if base is not None:
-        field = field + (1 - beta) * base
+    field = bias + h1 @ machine.W.T
     couplings = machine.couplings
     if couplings is None:
         drawn = torch.bernoulli(field.sigmoid(), generator=generator)
         chains.v = drawn * chains.possible
     else:
-        chains.v = _draw_coupled(chains, field, beta * couplings, classes, generator)
+        chains.v = _draw_coupled(chains, field, couplings, classes, generator)
 
 
 def draw_states(x: Tensor, states: int, generator: torch.Generator) -> Tensor:
