@@ -102,22 +102,22 @@ class LongChains:
         self._h2: list[Bits | None] = [None] * count
         self._streams = [random_stream(seed, k) for k in range(count)]
 
-    def run(self, sweeps: int) -> Floats:
-        """Run sweeps of each chain, and record the presence of the classes every `RECORDED` sweeps.
+    def run(self, sweeps: int, every: int = RECORDED) -> Floats:
+        """Run sweeps of each chain, and record the presence of the classes every ``every`` sweeps.
 
-        The number of sweeps is rounded up to a multiple of `RECORDED`.
+        The number of sweeps is rounded up to a multiple of ``every``.
 
         Returns:
             The share of the records in which each class is present, (chains, classes).
         """
         count = np.zeros(self.on.shape)  # number of records with each class
-        records = range(0, sweeps, RECORDED)
+        records = range(0, sweeps, every)
         for room in np.unique(self._rooms).tolist():
             conditions = conditions_of(None if room < 0 else room, self._profile)
             conditioned = self._chains.under(conditions)
             for k in np.flatnonzero(self._rooms == room).tolist():
                 for _ in records:
-                    state = self.on[k], RECORDED, self._streams[k], self._h2[k]
+                    state = self.on[k], every, self._streams[k], self._h2[k]
                     _, self._h2[k] = conditioned.sweep(*state)
                     count[k] += self.on[k]
         share: Floats = count / len(records)
@@ -198,7 +198,7 @@ def measure_drift(
         if q is None or served[q] < served.max() / 2:
             continue
         long = LongChains(chains, scenes, population, _CHAINS, seed=1)
-        long.run(_SETTLED)
+        long.run(_SETTLED, every=_SETTLED)
         drawn = long.run(_SWEEPS - _SETTLED)
         sizes = drawn[:, population.shows].sum(1) / population.p[population.shows].sum()
         top = np.argsort(-np.where(population.shows, population.p, 0))[:_COMMONEST]
