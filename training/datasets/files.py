@@ -18,6 +18,8 @@ MAX_BYTES: Final = 2**30
 """Maximum size of a text file in bytes, after decompression."""
 DATA: Final = Path("../shared/data")
 """Default folder of the shipped data sources."""
+KNOWLEDGE: Final = Path(__file__).resolve().parents[1] / "knowledge"
+"""Folder of the written tables, which the repository contains."""
 
 
 def read_lines(path: Path, limit: int) -> Iterator[bytes]:

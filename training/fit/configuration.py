@@ -36,17 +36,24 @@ class DataConfig(_Section):
     """The data sources of a run, their vocabulary and the split of their scenes.
 
     A data source is a name or a file in any known format. The name `rooms` means the built-in
-    generator of rooms. Any other name means the file `<name>.jsonl.gz` in the data folder
-    (`data_folder`).
+    generator of rooms, and `inventories` the written places of the repository. Any other name means
+    the file `<name>.jsonl.gz` in the data folder (`data_folder`).
     """
 
     sources: tuple[str, ...] = Field(min_length=1)
     vocabulary: str = Field(
-        default="indoor", description="indoor, source, rooms, or a file that ends in .json"
+        default="indoor",
+        description="everyday, indoor, source, rooms, or a file that ends in .json",
     )
     split: Literal["group", "stable", "final"] = "group"
     split_seed: int = 0
     rooms: int = Field(default=0, ge=0, description="scenes to generate where `rooms` is a source")
+    written: int = Field(
+        default=0,
+        ge=0,
+        exclude_if=not_,
+        description="scenes to draw of each place where `inventories` is a source",
+    )
     limit: int | None = Field(default=None, ge=10, description="maximum scenes of each source")
     words: str = Field(
         default="", description="file of word vectors in the data folder; empty: no vectors"
@@ -200,6 +207,9 @@ class Config(_Section):
             ),
             "data.rooms must be at least 1, because `rooms` is a source": (
                 "rooms" in self.data.sources and not self.data.rooms
+            ),
+            "data.written must be at least 1, because `inventories` is a source": (
+                "inventories" in self.data.sources and not self.data.written
             ),
         }
         if broken := next((message for message, breaks in rules.items() if breaks), None):

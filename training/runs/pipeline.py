@@ -20,6 +20,7 @@ from training.datasets import (
     annotated_classes,
     encode,
     generate_rooms,
+    inventories,
     priors,
     read_scenes,
     rooms_vocabulary,
@@ -27,6 +28,8 @@ from training.datasets import (
     split,
 )
 from training.datasets.batches import TrainingData, scene_tensors
+from training.datasets.everyday import everyday_vocabulary
+from training.datasets.files import KNOWLEDGE
 from training.datasets.records import digest_of
 from training.datasets.roles import count_roles
 from training.datasets.vocabulary import indoor_vocabulary, read_vocabulary, with_typical_sizes
@@ -101,7 +104,7 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
     """Read the scenes of every data source, by source name.
 
     A data source is a file, or a name. A name means `<name>.jsonl.gz` in `root` or in `root/extra`
-    (`<name>.tsv.gz` for the placing priors).
+    (`<name>.tsv.gz` for the placing priors). `rooms` and `inventories` come from the repository.
 
     Raises:
         ConfigError: a file is missing.
@@ -113,6 +116,9 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
         name, path = source_name(source), _path(source, root)
         if source == "rooms":
             own = generate_rooms(data.rooms, seed=data.split_seed)
+        elif source == inventories.SOURCE:
+            places = inventories.read_places(path)
+            own = inventories.written_scenes(places, data.written, seed=data.split_seed)
         elif source == priors.SOURCE:
             own = priors.read_prior_scenes(path)
         else:
@@ -122,6 +128,8 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
 
 
 def _path(source: str, root: Path) -> Path:
+    if source == inventories.SOURCE:
+        return KNOWLEDGE / "inventories.csv"
     if is_file(source):
         return root / source
     file = f"{source}.tsv.gz" if source == priors.SOURCE else f"{source}.jsonl.gz"
@@ -158,6 +166,7 @@ def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path)
     """
     name = data.vocabulary
     makers: dict[str, Callable[[], Vocabulary]] = {
+        "everyday": everyday_vocabulary,
         "indoor": indoor_vocabulary,
         "source": partial(source_vocabulary, scenes),
         "rooms": rooms_vocabulary,

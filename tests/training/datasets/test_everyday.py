@@ -1,0 +1,89 @@
+"""The vocabulary of written knowledge."""
+
+from collections import Counter
+
+import pytest
+
+from app.scene import label_key
+from training.datasets.everyday import LEAST_PLACES, everyday_vocabulary
+from training.datasets.files import KNOWLEDGE
+from training.datasets.inventories import read_places
+from training.datasets.things import read_things
+from training.datasets.vocabulary import indoor_vocabulary
+
+
+@pytest.fixture(scope="module")
+def vocabulary():
+    return everyday_vocabulary()
+
+
+def named(vocabulary, word):
+    index = vocabulary.index(word)
+    return None if index is None else vocabulary.labels[index]
+
+
+def test_common_things_and_indoor_classes_are_classes(vocabulary):
+    assert 1_400 < len(vocabulary) < 1_700
+    assert {label_key(x) for x in indoor_vocabulary().labels} <= set(
+        map(label_key, vocabulary.labels)
+    )
+    expected = Counter()
+    for place in read_places(KNOWLEDGE / "inventories.csv"):
+        for group, item in place.items:
+            expected[item.label] += group.share * item.share
+    indoor = set(indoor_vocabulary().labels)
+    things = [label for label in read_things(KNOWLEDGE / "things.csv") if label not in indoor][::40]
+    assert len(things) > 20
+    for label in things:
+        assert (label in vocabulary.labels) == (expected[label] >= LEAST_PLACES), label
+
+
+@pytest.mark.parametrize(
+    ("word", "label", "parent"),
+    [
+        ("hedge shears", "tool", None),  # rare, so a name of the broader class
+        ("zimmer frame", "walker", None),
+        ("couch", "sofa", "furniture"),
+        ("treadmill", "exercise equipment", "equipment"),
+        ("floor lamp", "floor lamp", "lamp"),
+        ("kayak", "boat", None),
+    ],
+)
+def test_words_are_read_as_the_nearest_class(vocabulary, word, label, parent):
+    assert named(vocabulary, word) == label
+    assert vocabulary.objects[vocabulary.index(label)].parent == parent
+
+
+def test_a_word_with_a_class_of_its_own_is_never_folded(vocabulary):
+    for label in vocabulary.labels:
+        assert named(vocabulary, label) == label
+    assert named(vocabulary, "key board") == "keyboard"  # things.csv: another name of a key holder
+
+
+def test_no_word_of_the_indoor_vocabulary_is_lost(vocabulary):
+    """A name moves to another class only where that class is written to have it."""
+    other = {
+        label_key(name): thing
+        for thing in read_things(KNOWLEDGE / "things.csv").values()
+        for name in (thing.label, *thing.other_names)
+    }
+    moved = 0
+    for entry in indoor_vocabulary().objects:
+        for name in entry.aliases:
+            if (found := named(vocabulary, name)) != entry.label:
+                moved += 1
+                assert found is not None
+                assert label_key(name) in other, name
+    assert moved <= 50
+
+
+def test_every_class_has_a_size_and_rooms_have_types(vocabulary):
+    assert all(entry.size for entry in vocabulary.objects)
+    x, y, z = vocabulary.objects[vocabulary.index("bed")].size
+    assert x == y
+    assert 1 < x < 2.5
+    assert 0.3 < z < 1.2
+    assert vocabulary.structure[vocabulary.index("wall")]
+    assert vocabulary.anywhere[vocabulary.index("person")]
+    assert {"workshop", "warehouse", "nursery", "operating room"} <= set(vocabulary.room_types)
+    assert vocabulary.room_index("hallway") == vocabulary.room_index("corridor")

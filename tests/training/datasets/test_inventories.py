@@ -1,0 +1,218 @@
+"""Written inventories and things: the reader, its errors, and the law of the sampler."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from training.datasets import DatasetError
+from training.datasets.files import KNOWLEDGE
+from training.datasets.inventories import (
+    COLUMNS,
+    Group,
+    Item,
+    Place,
+    draw_scene,
+    read_places,
+    written_scenes,
+)
+from training.datasets.things import COLUMNS as THING_COLUMNS
+from training.datasets.things import read_things
+from training.fit.configuration import Config, DataConfig, MachineConfig
+from training.runs.pipeline import prepare
+
+LAMP = "den,study,desk things,.5,lamp,.4,1-3,on-top,desk"
+DESK = "den,study,basics,1,desk,.8,1,floor,"
+CUP = "cup,.1,.09,.1,1.3,surface .7 inside .3,no,yes,hand,vessel,mug"
+VESSEL = "vessel,.2,.2,.2,2,surface 1,no,yes,hand,,"
+
+
+def write(folder: Path, *rows: str, columns=COLUMNS) -> Path:
+    path = folder / "table.csv"
+    path.write_text("\n".join([",".join(columns), *rows]) + "\n", "utf-8")
+    return path
+
+
+def test_places_are_read_in_order(tmp_path):
+    # A blank line, spaces and quotes of a spreadsheet change nothing.
+    (place,) = read_places(
+        write(tmp_path, DESK, "", '"den", study ' + LAMP.removeprefix("den,study"))
+    )
+    assert place == Place(
+        "den",
+        "study",
+        (
+            Group("basics", 1, (Item("desk", 0.8, 1, 1, "floor", ""),)),
+            Group("desk things", 0.5, (Item("lamp", 0.4, 1, 3, "on-top", "desk"),)),
+        ),
+    )
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        (LAMP.replace("den,", ","), "line 3, column place: is empty"),
+        (LAMP.replace("study", "shop"), "line 3, column room_type: is 'study' in other rows"),
+        (
+            LAMP.replace(",.4,", ",1.4,"),
+            "line 3, column share: must be a number above 0 and at most 1",
+        ),
+        (LAMP.replace(",.4,", ",,"), "line 3, column share: must be a number above 0"),
+        (LAMP.replace(",.4,", ",nan,"), "line 3, column share: must be a number above 0"),
+        (LAMP.replace(".5", "0"), "line 3, column group_share: must be a number above 0"),
+        (LAMP.replace("desk things", "basics"), "line 3, column group_share: is 1 in other rows"),
+        (LAMP.replace("1-3", "3-1"), "line 3, column count: must be a number such as 2"),
+        (LAMP.replace("1-3", "some"), "line 3, column count: must be a number such as 2"),
+        (LAMP.replace("on-top", "beside"), "line 3, column relation: must be one of on-top"),
+        (LAMP.removesuffix("desk"), "line 3, column anchor: is empty, but the relation is on-top"),
+        (LAMP.replace("on-top", "wall"), "line 3, column anchor: must be empty"),
+        (
+            LAMP.replace(",desk", ",table"),
+            "line 3, column anchor: 'table' is no label of the place",
+        ),
+        (LAMP + ",more", "line 3: the row has 10 values, not 9"),
+        ('"' + LAMP, "line 3: is no row"),
+        ("x" * 5000, "line 3: the line is longer than"),
+    ],
+)
+def test_errors_name_line_and_column(tmp_path, row, message):
+    path = write(tmp_path, DESK, row)
+    with pytest.raises(DatasetError) as caught:
+        read_places(path)
+    assert str(caught.value).startswith(f"{path}, {message}")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "line 1: must name the columns place, room_type"),
+        (b"place,share\n", "line 1: must name the columns room_type"),
+        (",".join(COLUMNS).encode() + b"\n", ": has no rows"),
+        (",".join(COLUMNS).encode() + b"\n\xff\n", "line 2: is not UTF-8"),
+        (None, "no such file"),
+    ],
+)
+def test_a_file_that_is_no_table_is_named(tmp_path, content, message):
+    path = tmp_path / "table.csv"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(DatasetError, match=message):
+        read_places(path)
+
+
+def test_scenes_follow_the_written_law():
+    """Shares of 4,000 scenes are within .04 of the law; five standard errors, p < 1e-5."""
+    place = Place(
+        "den",
+        "study",
+        (
+            Group("basics", 1, (Item("desk", 0.8, 1, 1, "floor", ""),)),
+            Group(
+                "desk things",
+                0.5,
+                (Item("lamp", 0.4, 1, 3, "on-top", "desk"), Item("clock", 0.4, 2, 2, "wall", "")),
+            ),
+        ),
+    )
+    scenes = written_scenes([place], 4000, seed=3)
+    assert len({scene.scene_id for scene in scenes}) == 4000
+    assert {scene.group for scene in scenes} == {"den"}
+    assert {scene.room_type for scene in scenes} == {"study"}
+    counts = [{thing.label: thing.count for thing in scene.objects} for scene in scenes]
+
+    def share(*labels: str) -> float:
+        return np.mean([set(labels) <= count.keys() for count in counts])
+
+    assert share("desk") == pytest.approx(0.8, abs=0.04)
+    assert share("lamp") == pytest.approx(0.5 * 0.4, abs=0.04)
+    # The group is drawn once for both of its things.
+    assert share("lamp", "clock") == pytest.approx(0.5 * 0.4 * 0.4, abs=0.04)
+    assert share("desk", "lamp") == pytest.approx(0.8 * 0.5 * 0.4, abs=0.04)
+    numbers = [count["lamp"] for count in counts if "lamp" in count]
+    for number in (1, 2, 3):
+        assert np.mean(np.equal(numbers, number)) == pytest.approx(1 / 3, abs=0.09)
+    assert {count["clock"] for count in counts if "clock" in count} == {2}
+
+
+def test_things_stand_where_the_table_says():
+    """A thing whose anchor is absent has no relation."""
+    table = Item("table", 1, 1, 1, "floor", "")
+    items = (
+        table,
+        Item("mug", 1, 1, 1, "on-top", "tables"),  # the anchor is found in the plural
+        Item("lamp", 1, 1, 1, "ceiling", ""),
+        Item("book", 1, 1, 1, "inside", "shelf"),
+        Item("shelf", 1e-9, 1, 1, "wall", ""),
+    )
+    place = Place("den", "study", (Group("basics", 1, items),))
+    scene = draw_scene(place, "one", np.random.default_rng(0))
+    names = [thing.label for thing in scene.objects]
+    assert names == ["table", "mug", "lamp", "book", "floor"]
+    told = {(names[i], relation, names[j]) for i, relation, j in scene.relations}
+    assert told == {("table", "on-top", "floor"), ("mug", "on-top", "table")}
+    assert [names[i] for i in scene.supported] == ["table", "mug", "lamp"]
+
+
+def test_a_seed_gives_the_same_scenes():
+    places = read_places(KNOWLEDGE / "inventories.csv")[:3]
+    assert written_scenes(places, 2, seed=1) == written_scenes(places, 2, seed=1)
+    assert written_scenes(places, 2, seed=1) != written_scenes(places, 2, seed=2)
+
+
+def test_places_are_a_data_source_without_a_data_folder(tmp_path):
+    """A place is in one part of the split. Labels without a class are left out and named."""
+    data = DataConfig(sources=("inventories",), vocabulary="rooms", written=2)
+    machine = MachineConfig(variant="triway")
+    scenes = prepare(Config(name="written", data=data, machine=machine), tmp_path)
+    assert scenes.counts == {"inventories": 2 * 265}
+    groups = [{scene.group for scene in part} for part in scenes.parts.values()]
+    assert sum(map(len, groups)) == len(set.union(*groups)) == 265
+    assert "surgical light" in {x for scene in scenes.parts["train"] for x in scene.unknown}
+    with pytest.raises(ValidationError, match=r"data\.written must be at least 1"):
+        Config(name="written", data=DataConfig(sources=("inventories",)), machine=machine)
+
+
+# -- things ------------------------------------------------------------------------------------
+
+
+def test_things_are_read(tmp_path):
+    path = write(tmp_path, CUP.replace("mug", '"mug, coffee cup"'), VESSEL, columns=THING_COLUMNS)
+    cup = read_things(path)["cup"]
+    assert cup.size == (0.1, 0.09, 0.1)
+    assert cup.stands == {"surface": 0.7, "inside": 0.3}
+    assert (cup.surface, cup.container, cup.carried) == ("no", "yes", "hand")
+    assert (cup.parent, cup.other_names) == ("vessel", ("mug", "coffee cup"))
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        (CUP.replace("cup,.1", "cup,0"), "line 3, column long: must be a number above 0"),
+        (CUP.replace(" .3", " .4"), "line 3, column stands: must list shares that add up to 1"),
+        (CUP.replace("inside .3", "sky .3"), "line 3, column stands: must list shares"),
+        (CUP.replace("inside .3", "inside"), "line 3, column stands: must list shares"),
+        (CUP.replace("hand", "robot"), "line 3, column carried: must be one of hand"),
+        (CUP.replace("vessel", "mug"), "line 3, column parent: 'mug' has no row"),
+        (CUP.replace("vessel", "cup"), "line 3, column parent: the parents of 'cup' lead back"),
+        (CUP.replace("cup,", "Vessels,", 1), "line 3, column label: 'Vessels' has two rows"),
+    ],
+)
+def test_errors_of_things_name_line_and_column(tmp_path, row, message):
+    path = write(tmp_path, VESSEL, row, columns=THING_COLUMNS)
+    with pytest.raises(DatasetError) as caught:
+        read_things(path)
+    assert str(caught.value).startswith(f"{path}, {message}")
+
+
+def test_a_long_loop_of_parents_is_found(tmp_path):
+    rows = [CUP.replace("cup,", f"{a},", 1).replace("vessel", b) for a, b in ("ab", "bc", "ca")]
+    with pytest.raises(DatasetError, match="the parents of 'a' lead back to 'a'"):
+        read_things(write(tmp_path, *rows, columns=THING_COLUMNS))
+
+
+def test_the_shipped_tables_are_valid():
+    places = read_places(KNOWLEDGE / "inventories.csv")
+    assert len(places) == 265
+    assert sum(1 for place in places for _ in place.items) == 32_680
+    assert len(read_things(KNOWLEDGE / "things.csv")) == 1_859

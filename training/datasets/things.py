@@ -1,0 +1,105 @@
+"""Written facts about things: sizes, where they stand, broader words and other names.
+
+`things.csv` has one row for each thing. Extents are those of a typical thing as it usually stands,
+in metres. ``stands`` has shares, such as "floor .92 inside .08".
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from app.scene import label_key
+from training.datasets.tables import Row, read_table
+
+COLUMNS: Final = (
+    *("label", "long", "wide", "high", "large", "stands", "surface", "container", "carried"),
+    *("parent", "other_names"),
+)
+_PLACES: Final = ("floor", "wall", "ceiling", "surface", "inside")
+_SOMETIMES: Final = ("no", "sometimes", "yes")
+_CARRIERS: Final = ("hand", "hands", "people", "no")
+
+
+@dataclass(frozen=True, slots=True)
+class Thing:
+    """A kind of thing.
+
+    Attributes:
+        size: extents of a typical one in metres: long, wide and high.
+        large: how much longer a large one is, as a factor.
+        stands: share of each place where it stands: floor, wall, ceiling, surface, inside.
+        surface, container: whether things are commonly put on it or into it: no, sometimes or yes.
+        carried: what carries it: one hand, two hands, two people or nobody ("no").
+        parent: label of the broader thing, or "".
+        other_names: names that detectors use for it.
+    """
+
+    label: str
+    size: tuple[float, float, float]
+    large: float
+    stands: Mapping[str, float]
+    surface: str
+    container: str
+    carried: str
+    parent: str
+    other_names: tuple[str, ...]
+
+
+def read_things(path: Path) -> dict[str, Thing]:
+    """Read the things by label, in the order of the file.
+
+    Raises:
+        DatasetError: the file cannot be read, a value is invalid, a label occurs twice, a parent
+            has no row, or the parents of a thing lead back to it. The error names the file, the
+            line and the column.
+    """
+    things: dict[str, Thing] = {}
+    rows: dict[str, Row] = {}
+    keys: set[str] = set()
+    for row in read_table(path, COLUMNS):
+        thing = _thing(row)
+        if (key := label_key(thing.label)) in keys:
+            raise row.error("label", f"{thing.label!r} has two rows")
+        keys.add(key)
+        things[thing.label], rows[thing.label] = thing, row
+    for label, thing in things.items():
+        seen, at = {label}, thing.parent
+        while at:
+            if at not in things:
+                raise rows[label].error("parent", f"{at!r} has no row")
+            if at in seen:
+                raise rows[label].error("parent", f"the parents of {label!r} lead back to {at!r}")
+            seen.add(at)
+            at = things[at].parent
+    return things
+
+
+def _thing(row: Row) -> Thing:
+    return Thing(
+        label=row.text("label"),
+        size=(row.number("long", 1000), row.number("wide", 1000), row.number("high", 1000)),
+        large=row.number("large", 100),
+        stands=_stands(row),
+        surface=row.one_of("surface", _SOMETIMES),
+        container=row.one_of("container", _SOMETIMES),
+        carried=row.one_of("carried", _CARRIERS),
+        parent=row.optional("parent"),
+        other_names=tuple(filter(None, map(str.strip, row.optional("other_names").split(",")))),
+    )
+
+
+def _stands(row: Row) -> dict[str, float]:
+    words = row.text("stands").split()
+    try:
+        shares = {place: float(share) for place, share in zip(words[::2], words[1::2], strict=True)}
+    except ValueError:
+        shares = {}
+    known = set(shares) <= set(_PLACES) and len(words) == 2 * len(shares)
+    if not known or not all(0 < share <= 1 for share in shares.values()):
+        shares = {}
+    if abs(sum(shares.values()) - 1) > 0.011:
+        places = ", ".join(_PLACES)
+        problem = f"must list shares that add up to 1, such as `floor .9 inside .1`; of {places}"
+        raise row.error("stands", problem)
+    return shares
