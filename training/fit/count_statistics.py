@@ -47,12 +47,13 @@ def fit_counts(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> Counts
     """Fit the statistics of counts. Return None if no class has enough data.
 
     All data sources that count instances have the same total weight. Camera frames are left out,
-    because they show a part of a room. A class gets statistics only if, in a cross-validation, the
-    expected number is closer to the truth than the class mean.
+    because they show a part of a room, and written numbers, which are judgements. A class gets
+    statistics only if, in a cross-validation, the expected number is closer to the truth than the
+    class mean.
     """
-    views = {name for name, source in SOURCES.items() if source.of_one_view}
+    unfit = {name for name, source in SOURCES.items() if source.of_one_view or source.written}
     counting = counted_classes(scenes, vocabulary)
-    counting = {source: counted for source, counted in counting.items() if source not in views}
+    counting = {source: counted for source, counted in counting.items() if source not in unfit}
     counted = [scene for scene in scenes if scene.source in counting]
     most = _most_listed(counted, counting, vocabulary)
     if (most > 1).any():
@@ -79,7 +80,7 @@ def _fit(
     """Fit the statistics to all cases of the scenes. Return those of the classes with a `most`."""
     cases = _Cases.of(scenes, counting, vocabulary)
     share = _shares(cases, len(vocabulary))
-    weights = _weights(cases, share, len(vocabulary))
+    weights = _weights(cases, share, most > 0)
     # The exponent -1 stands for the listed number, which is uniform from 1 to n.
     weights[:, 0, INTERCEPT] -= 1.0
     itself = ROOM + len(vocabulary.room_types) + np.arange(len(vocabulary))
@@ -184,14 +185,18 @@ def _shares(cases: _Cases, V: int) -> Floats:
     return np.log(table / table.sum(axis=1, keepdims=True))
 
 
-def _weights(cases: _Cases, share: Floats, V: int) -> Floats:
-    """Return the weights of each class, (V, 2, 3 + C + V), by maximum penalised likelihood."""
-    features, (N, width) = cases.features, cases.features.shape
+def _weights(cases: _Cases, share: Floats, fitted: Flags) -> Floats:
+    """Return the weights of each class, (V, 2, 3 + C + V), by maximum penalised likelihood.
+
+    A class has terms of its own only where `fitted`, (V,), is true.
+    """
+    features, (N, width), V = cases.features, cases.features.shape, len(fitted)
     # The terms of a class act only on cases of this class.
     entries = features.tocoo()
+    own = fitted[cases.index[entries.row]]
+    row, column = entries.row[own], entries.col[own]
     class_terms = sparse.csr_matrix(
-        (entries.data, (entries.row, cases.index[entries.row] * width + entries.col)),
-        shape=(N, V * width),
+        (entries.data[own], (row, cases.index[row] * width + column)), shape=(N, V * width)
     )
     used_columns = np.unique(class_terms.indices)
     all_terms = sparse.hstack([class_terms[:, used_columns], features]).tocsr()

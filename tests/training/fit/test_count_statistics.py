@@ -123,6 +123,12 @@ def test_no_statistics_where_the_data_cannot_tell():
     assert fit_counts(fair, words) is not None
 
 
+def test_frames_and_written_numbers_teach_no_counts():
+    for source in ("sunrgbd", "inventories"):
+        assert fit_counts(furnished(60, 0, source), WORDS) is None
+    assert fit_counts(furnished(60, 0), WORDS) is not None
+
+
 def test_every_source_weighs_as_much_as_the_others():
     """Each share has a standard deviation of 2 %, from the parts that list no chair."""
 
