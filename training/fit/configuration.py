@@ -43,7 +43,7 @@ class DataConfig(_Section):
     sources: tuple[str, ...] = Field(min_length=1)
     vocabulary: str = Field(
         default="indoor",
-        description="everyday, indoor, source, rooms, or a file that ends in .json",
+        description="written, indoor, source, rooms, or a file that ends in .json",
     )
     split: Literal["group", "stable", "final"] = "group"
     split_seed: int = 0

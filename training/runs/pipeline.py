@@ -28,12 +28,12 @@ from training.datasets import (
     split,
 )
 from training.datasets.batches import TrainingData, scene_tensors
-from training.datasets.everyday import everyday_vocabulary
 from training.datasets.files import KNOWLEDGE
 from training.datasets.records import digest_of
 from training.datasets.roles import count_roles
 from training.datasets.vocabulary import indoor_vocabulary, read_vocabulary, with_typical_sizes
 from training.datasets.words import class_vectors, read_word_vectors
+from training.datasets.written import written_vocabulary
 from training.fit.configuration import Config, ConfigError, DataConfig, is_file, source_name
 
 
@@ -166,7 +166,7 @@ def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path)
     """
     name = data.vocabulary
     makers: dict[str, Callable[[], Vocabulary]] = {
-        "everyday": everyday_vocabulary,
+        "written": written_vocabulary,
         "indoor": indoor_vocabulary,
         "source": partial(source_vocabulary, scenes),
         "rooms": rooms_vocabulary,

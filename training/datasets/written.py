@@ -16,7 +16,7 @@ LEAST_PLACES: Final = 0.5
 
 
 @cache
-def everyday_vocabulary() -> Vocabulary:
+def written_vocabulary() -> Vocabulary:
     """Build the vocabulary: the commonest things of the written places come first.
 
     The classes of the indoor vocabulary are always included. Another thing is a class from

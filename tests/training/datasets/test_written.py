@@ -5,16 +5,16 @@ from collections import Counter
 import pytest
 
 from app.scene import label_key
-from training.datasets.everyday import LEAST_PLACES, everyday_vocabulary
 from training.datasets.files import KNOWLEDGE
 from training.datasets.inventories import read_places
 from training.datasets.things import read_things
 from training.datasets.vocabulary import indoor_vocabulary
+from training.datasets.written import LEAST_PLACES, written_vocabulary
 
 
 @pytest.fixture(scope="module")
 def vocabulary():
-    return everyday_vocabulary()
+    return written_vocabulary()
 
 
 def named(vocabulary, word):
