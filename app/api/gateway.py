@@ -98,7 +98,7 @@ class Recorded:
         """Write the metrics and the access log of a request."""
         status = record.status or 500
         if status >= 400 and record.outcome == SUCCESS:
-            # There is no problem document, such as for an invalid Range header of a static file.
+            # A static file answers an invalid Range header without a problem document.
             record.outcome = "other"
         method = scope["method"]  # the server refuses others than the registered ones
         # The log contains the template of the route, because a raw path may contain private data.

@@ -1,4 +1,4 @@
-"""Written inventories: what is in a kind of place, how often, and where it stands.
+"""Written inventories: the things in a kind of place, their shares and their locations.
 
 Each row of the table is one thing at one usual location in a place:
 
@@ -94,7 +94,8 @@ def read_places(path: Path) -> tuple[Place, ...]:
     anchored: list[tuple[Row, str, str]] = []
     for row in read_table(path, COLUMNS):
         place, group = row.text("place"), row.text("group")
-        _require_same(row, "room_type", rooms.setdefault(place, row.text("room_type")))
+        if (room := rooms.setdefault(place, row.text("room_type"))) != row.text("room_type"):
+            raise row.error("room_type", f"is {room!r} in other rows of the place")
         share = row.number("group_share", 1)
         if shares.setdefault((place, group), share) != share:
             raise row.error("group_share", f"is {shares[place, group]:g} in other rows of {group}")
@@ -105,7 +106,7 @@ def read_places(path: Path) -> tuple[Place, ...]:
             anchored.append((row, place, item.anchor))
     for row, place, anchor in anchored:
         if label_key(anchor) not in labels[place]:
-            raise row.error("anchor", f"{anchor!r} is no label of the place {place!r}")
+            raise row.error("anchor", f"the place {place!r} has no row with the label {anchor!r}")
     if not rooms:
         raise DatasetError(path, "", "has no rows")
     return tuple(
@@ -116,11 +117,6 @@ def read_places(path: Path) -> tuple[Place, ...]:
         )
         for place, room in rooms.items()
     )
-
-
-def _require_same(row: Row, column: str, expected: str) -> None:
-    if row.text(column) != expected:
-        raise row.error(column, f"is {expected!r} in other rows of the place")
 
 
 def _item(row: Row) -> Item:

@@ -46,7 +46,7 @@ class Row:
         return value
 
     def number(self, column: str, most: float = math.inf) -> float:
-        """Return a number above 0. Raise DatasetError if it is no such number or above ``most``."""
+        """Return a number above 0 and up to ``most``. Raise DatasetError for another value."""
         try:
             value = float(self._values[column])
         except ValueError:

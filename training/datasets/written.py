@@ -1,7 +1,7 @@
 """The vocabulary of written knowledge, from `things.csv` and `inventories.csv` alone."""
 
 import math
-from collections import Counter
+from collections import defaultdict
 from functools import cache
 from typing import Final
 
@@ -25,14 +25,12 @@ def written_vocabulary() -> Vocabulary:
     with the same other name, `things.csv` comes before the curated names.
     """
     names, indoor = curated_names(), indoor_vocabulary()
-    things, places = (
-        read_things(KNOWLEDGE / "things.csv"),
-        read_places(KNOWLEDGE / "inventories.csv"),
-    )
-    expected: Counter[str] = Counter()
+    things = read_things(KNOWLEDGE / "things.csv")
+    places = read_places(KNOWLEDGE / "inventories.csv")
+    expected: defaultdict[str, float] = defaultdict(float)
     for place in places:
         for group, item in place.items:
-            expected[label_key(item.label)] += group.share * item.share  # type: ignore[assignment]
+            expected[label_key(item.label)] += group.share * item.share
     indoor_class = {label_key(entry.label): entry for entry in indoor.objects}
     classes = {
         label: thing
@@ -70,7 +68,7 @@ class _Aliases:
         self._taken = set(map(label_key, classes))
 
     def add(self, label: str | None, names: tuple[str, ...]) -> None:
-        """Add the names that no class has to a class. None is no class."""
+        """Give names without a class to a class. A label of None changes nothing."""
         for name in names:
             if label is not None and (key := label_key(name)) not in self._taken:
                 self._taken.add(key)

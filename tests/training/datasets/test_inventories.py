@@ -69,7 +69,7 @@ def test_places_are_read_in_order(tmp_path):
         (LAMP.replace("on-top", "wall"), "line 3, column anchor: must be empty"),
         (
             LAMP.replace(",desk", ",table"),
-            "line 3, column anchor: 'table' is no label of the place",
+            "line 3, column anchor: the place 'den' has no row with the label 'table'",
         ),
         (LAMP + ",more", "line 3: the row has 10 values, not 9"),
         ('"' + LAMP, "line 3: is no row"),
