@@ -48,8 +48,9 @@ def missing(
     The model assumes that the scene lists the share `coverage` of its classes. A lower coverage
     gives unlisted classes higher probabilities. Each class is judged separately, so the
     probabilities do not sum to 1. The list `missing` never contains listed or structural classes.
-    It contains a kind of a listed class only if `candidates` names this kind. For example, an
-    office chair may be the listed chair itself.
+    It contains a class of one family with a listed class only if `candidates` names it: an office
+    chair may be the listed chair itself, and a listed office chair is a chair. Of two classes of
+    one family, the list has the likelier.
 
     Args:
         scene: the listed objects, their relations and the room type.
@@ -111,12 +112,11 @@ def _ranked(
     Returns:
         The class indices, their probabilities, and their log-odds before calibration, each (k,).
     """
-    # The last entry stands for no parent, which has the index -1.
-    is_listed = np.zeros(len(artifact.vocabulary) + 1, np.bool_)
-    is_listed[posterior.present.classes] = True
-    usable = ~(artifact.vocabulary.structure | is_listed[:-1])
+    vocabulary, listed = artifact.vocabulary, posterior.present.classes
+    usable = ~vocabulary.structure
+    usable[listed] = False
     if candidates is None:
-        usable &= ~is_listed[artifact.vocabulary.parents]
+        usable &= ~vocabulary.related[listed].any(0)
     else:
         chosen = np.zeros_like(usable)
         chosen[list(candidates)] = True
@@ -124,15 +124,37 @@ def _ranked(
     if not usable.any():
         return np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
     log_odds = posterior.absent_log_odds(np.arange(len(usable)), coverage)
-    if place is None:
-        entry = artifact.calibration.missing
-        first = best(entry.slope * log_odds, usable, top_k)
-        logits = calibrated(entry, log_odds[first], max(1, posterior.listed))
-    else:
-        logits = _logits_at(artifact, posterior, place, usable, log_odds, top_k)
-        first = best(logits, usable, top_k)
-        logits = logits[first]
+    entry, count = artifact.calibration.missing, 2 * top_k
+    while True:
+        if place is None:
+            first = best(entry.slope * log_odds, usable, count)
+            logits = calibrated(entry, log_odds[first], max(1, posterior.listed))
+        else:
+            every = _logits_at(artifact, posterior, place, usable, log_odds, count)
+            first = best(every, usable, count)
+            logits = every[first]
+        chosen = np.arange(len(first))
+        if candidates is None:
+            chosen = _one_of_a_family(vocabulary.related[first[:, None], first])
+        if len(chosen) >= top_k or len(first) < count:
+            break
+        count *= 2
+    chosen = chosen[:top_k]
+    first, logits = first[chosen], logits[chosen]
     return first, 1.0 / (1.0 + np.exp(-logits.astype(np.float64))), log_odds[first]
+
+
+def _one_of_a_family(related: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the indices of N ranked classes without those related to a class that is kept before.
+
+    Args:
+        related: (N, N) True for classes of one family.
+    """
+    left_out = np.zeros(len(related), np.bool_)
+    for k in np.flatnonzero(related.any(1)):
+        if not left_out[k]:
+            left_out[k + 1 :] |= related[k, k + 1 :]
+    return np.flatnonzero(~left_out)
 
 
 def _logits_at(

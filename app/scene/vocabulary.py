@@ -164,6 +164,21 @@ class Vocabulary:
         """(V, V) True if a box of the size of class i does not fit into one of class j."""
         return _read_only(do_not_fit(self.sizes, self.sizes))
 
+    @cached_property
+    def broader(self) -> NDArray[np.bool_]:
+        """(V, V) True if class j is the parent of class i, or a parent of its parent."""
+        is_broader = np.zeros((len(self), len(self)), np.bool_)
+        rows, ancestors = np.arange(len(self)), self.parents
+        while (known := ancestors >= 0).any():
+            is_broader[rows[known], ancestors[known]] = True
+            ancestors = np.where(known, self.parents[ancestors], -1)
+        return _read_only(is_broader)
+
+    @cached_property
+    def related(self) -> NDArray[np.bool_]:
+        """(V, V) True if one of the classes i and j is broader than the other: one family."""
+        return _read_only(self.broader | self.broader.T)
+
     def bare_objects(self, labels: Sequence[str]) -> tuple[SceneObject, ...] | None:
         """Return stored objects without id and pose, or None if a label has a new spelling."""
         objects = tuple(map(self._bare.get, labels))

@@ -53,7 +53,15 @@ def random_weights(
     for parameter in machine.parameters():
         noise = torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
         parameter.copy_(noise * scale)
-    return machine.requires_grad_(False)
+    return with_symmetric_couplings(machine).requires_grad_(False)
+
+
+@torch.no_grad()
+def with_symmetric_couplings(machine: BoltzmannMachine) -> BoltzmannMachine:
+    """The machine with symmetric couplings and a diagonal of 0, as training keeps them."""
+    if machine.spec.coupled:
+        machine.L.copy_((machine.L + machine.L.T) / 2).fill_diagonal_(0)
+    return machine
 
 
 def mean_rates(

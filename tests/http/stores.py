@@ -8,6 +8,7 @@ import torch
 from app.registry import AliasTarget, Calibration, Counts, Offsets, Store, VocabularyEntry
 from app.scene.relations import CANONICAL
 from app.scene.vocabulary import ObjectClass, Vocabulary
+from tests.enumeration.small_machines import with_symmetric_couplings
 from tests.registry.small_artifacts import JUDGING, description
 from training.machines import BoltzmannMachine, MachineSpec, build
 
@@ -57,9 +58,7 @@ def random_machine(
     with torch.no_grad():
         for parameter in machine.parameters():
             parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.5)
-        if machine.spec.coupled:
-            machine.L.copy_(machine.couplings)
-    return machine.requires_grad_(False)
+    return with_symmetric_couplings(machine).requires_grad_(False)
 
 
 LAMP = {"label": "lamp", "position": {"x": 1, "y": 0.5, "z": 1}}

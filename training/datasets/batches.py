@@ -16,6 +16,8 @@ from training.datasets import EncodedScene
 from training.machines import BoltzmannMachine
 from training.machines.edges import Edges
 
+_BLOCK = 1024
+
 
 @dataclass(frozen=True)
 class Batch:
@@ -46,7 +48,12 @@ class SceneTensors:
     room: Tensor  # index of the room type, (scenes,) int64; -1 means unknown
     source: Tensor  # index in annotated_classes and source_names, (scenes,) int64
     annotated_classes: Tensor  # classes that a data source mentions, (sources, classes) bool
+    related: Tensor  # classes of one family, (classes, classes) float; see `Vocabulary.related`
     source_names: tuple[str, ...] = ()  # sorted
+
+    def relatives_of(self, v: Tensor) -> Tensor:
+        """Return the classes that are in one family with a class of v, both (N, classes)."""
+        return torch.cat([rows @ self.related > 0 for rows in v.split(_BLOCK)])
 
     @cached_property
     def weight(self) -> Tensor:
@@ -83,11 +90,11 @@ class SceneTensors:
 
 
 def scene_tensors(
-    scenes: Sequence[EncodedScene], annotated: dict[str, np.ndarray], size: int
+    scenes: Sequence[EncodedScene], annotated: dict[str, np.ndarray], vocabulary: Vocabulary
 ) -> SceneTensors:
     """Return encoded scenes as tensors. `annotated` has the classes, (classes,), of each source."""
     names = sorted(annotated)
-    v = torch.zeros(len(scenes), size)
+    v = torch.zeros(len(scenes), len(vocabulary))
     for row, scene in enumerate(scenes):
         v[row, torch.from_numpy(scene.evidence.classes)] = 1.0
     return SceneTensors(
@@ -96,6 +103,7 @@ def scene_tensors(
         room=torch.tensor([scene.room_type for scene in scenes], dtype=torch.int64),
         source=torch.tensor([names.index(scene.source) for scene in scenes], dtype=torch.int64),
         annotated_classes=torch.from_numpy(np.stack([annotated[name] for name in names])),
+        related=torch.from_numpy(vocabulary.related.astype(np.float32)),
         source_names=tuple(names),
     )
 

@@ -137,8 +137,8 @@ def encode(
     which labels are ignored. Relations of structure classes are unobserved.
     """
     encoder, scenes = _Encoder(vocabulary, roles), list(scenes)
-    groups = Counter((scene.source, scene.group) for scene in scenes)
-    return [encoder(scene, groups[scene.source, scene.group]) for scene in scenes]
+    groups = Counter(scene.group for scene in scenes)
+    return [encoder(scene, groups[scene.group]) for scene in scenes]
 
 
 def annotated_classes(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> dict[str, Flags]:

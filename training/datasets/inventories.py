@@ -9,13 +9,14 @@ Each row of the table is one thing at one usual location in a place:
 - ``relation`` is on-top, inside, under or above the ``anchor``, another thing of the place; or
   floor, wall or ceiling, without an anchor.
 
-`draw_scene` samples this model exactly.
+`draw_scene` samples this model exactly. A careful visitor's list is longer than any detector's, so
+training uses parts of the drawn scenes (`listed_part`).
 """
 
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -35,6 +36,8 @@ COLUMNS: Final = (
 )
 _AT_ANCHOR: Final = ("on-top", "inside", "under", "above")
 _BY_ITSELF: Final = ("floor", "wall", "ceiling")
+_LISTED: Final = 0.55
+"""Probability that a detector lists a thing of a written place."""
 _COUNT: Final = re.compile(r"(\d{1,7})(?:-(\d{1,7}))?")
 
 
@@ -172,11 +175,34 @@ def draw_scene(place: Place, scene_id: str, rng: Rng) -> AnnotatedScene:
     )
 
 
+def listed_part(scene: AnnotatedScene, rng: Rng) -> AnnotatedScene:
+    """Return a part of a scene, as a detector lists it.
+
+    All objects with one label are in the part, or none. The floor stays.
+    """
+    labels = list(dict.fromkeys(label_key(thing.label) for thing in scene.objects))
+    drawn = rng.random(len(labels)) < _LISTED
+    is_listed = dict(zip(labels, drawn.tolist(), strict=True)) | {"floor": True}
+    kept = [k for k, thing in enumerate(scene.objects) if is_listed[label_key(thing.label)]]
+    index_of = {old: new for new, old in enumerate(kept)}
+    relations = tuple(
+        (index_of[i], name, index_of[j])
+        for i, name, j in scene.relations or ()
+        if i in index_of and j in index_of
+    )
+    # A thing whose anchor is left out has no listed support: it does not hang on a wall.
+    stands = {i for i, _, _ in scene.relations or ()}
+    supported = {index_of[i] for i in scene.supported if i in index_of and i not in stands}
+    supported |= {i for i, name, _ in relations if name in ("on-top", "inside")}
+    objects = tuple(scene.objects[k] for k in kept)
+    return replace(scene, objects=objects, relations=relations, supported=tuple(sorted(supported)))
+
+
 def written_scenes(places: Sequence[Place], each: int, seed: int) -> list[AnnotatedScene]:
-    """Draw a number of scenes of each place. The scenes of a place are one group."""
+    """Draw parts of a number of scenes of each place. The scenes of a place are one group."""
     rngs = np.random.default_rng(seed).spawn(len(places))
     return [
-        draw_scene(place, f"{place.name} {number}", rng)
+        listed_part(draw_scene(place, f"{place.name} {number}", rng), rng)
         for place, rng in zip(places, rngs, strict=True)
         for number in range(each)
     ]

@@ -35,8 +35,8 @@ class Meaning:
     lateral: Unlisted = "off"  # left and front
     # Object lists are nearly complete: in the training of objects, unlisted objects are absent.
     complete_objects: bool = True
-    # Maximum total weight of a group of near-duplicates in the training of objects, in scenes. None
-    # means that each scene has weight 1.
+    # Maximum total weight of a group of near-duplicates in the training of objects, in scenes. The
+    # scenes of all data sources count. None means that each scene has weight 1.
     scenes_per_group: float | None = None
 
     @property
@@ -56,6 +56,13 @@ _CENTRES: Final = Meaning(on_top="unobserved", inside="unobserved", above="unobs
 _SELECTED: Final = replace(_CENTRES, lateral="unobserved")
 _SUPPORTS: Final = replace(_SELECTED, on_top="off", inside="off")
 _MENTIONS: Final = replace(_SELECTED, complete_objects=False)
+# Several data sources annotate the same photographs of COCO, so a photograph has the weight of one
+# scene.
+_PHOTOGRAPHS: Final = replace(_MENTIONS, scenes_per_group=1.0)
+
+# Photographers aim at people and pets. So photographs show them far more often than rooms contain
+# them.
+_AIMED_AT: Final = ("person", "cat", "dog", "bird", "animal")
 
 # Relation of each predicate of 3DSSG. All kinds of support become on-top or inside.
 _3DSSG: Final = {
@@ -167,10 +174,70 @@ SOURCES: Final[dict[str, Source]] = {
     "coco_captions": Source(
         "COCO captions (Lin et al., ECCV 2014; COCO Consortium): triples from captions of indoor "
         "pictures; CC BY 4.0, with attribution",
+        meaning=_PHOTOGRAPHS,
+        left_out=_AIMED_AT,
+        predicates={},
+    ),
+    "coco_captions_2014": Source(
+        "COCO captions (Lin et al., ECCV 2014; COCO Consortium) and VQA v2 (Goyal et al., CVPR "
+        "2017): objects and triples from sentences about pictures of 2014; CC BY 4.0, with "
+        "attribution",
+        meaning=_PHOTOGRAPHS,
+        left_out=_AIMED_AT,
+        predicates={},
+    ),
+    "coco_labels": Source(
+        "COCO (Lin et al., ECCV 2014; COCO Consortium): annotated classes of pictures; CC BY 4.0, "
+        "with attribution",
+        # Its scenes list no relations. Its annotators looked for 80 classes alone.
+        meaning=replace(LISTS, scenes_per_group=1.0),
+        left_out=_AIMED_AT,
+        predicates={},
+    ),
+    "vg_vlchecklist": Source(
+        "Visual Genome (Krishna et al., IJCV 2017), changed: objects and triples of photographs "
+        "from statements of VL-CheckList (Zhao et al., EMNLP 2022); CC BY 4.0, with attribution",
         meaning=_MENTIONS,
-        # Photographers aim at people and pets. So captions mention them far more often than rooms
-        # contain them.
-        left_out=("person", "cat", "dog", "bird", "animal"),
+        left_out=(*_AIMED_AT, "man", "woman"),
+        predicates={},
+    ),
+    "amber": Source(
+        "AMBER (Wang et al., 2023): objects of photographs; Apache-2.0",
+        meaning=_MENTIONS,
+        left_out=_AIMED_AT,
+        predicates={},
+    ),
+    "robocasa": Source(
+        "RoboCasa (Nasiriany et al., RSS 2024): designed kitchens and what stands in them; MIT",
+        meaning=replace(_SUPPORTS, scenes_per_group=3.0),
+        predicates={},
+    ),
+    "twc": Source(
+        "TextWorld Commonsense (Murugesan et al., AAAI 2021): where things belong; Apache-2.0",
+        meaning=_MENTIONS,
+        predicates={},
+    ),
+    "people_lists": Source(
+        "ProtoQA (Boratko et al., EMNLP 2020) and lists in the public domain: what people name at "
+        "a place; CC BY 4.0",
+        meaning=replace(_MENTIONS, scenes_per_group=1.0),
+        predicates={},
+    ),
+    "meetup_ade20k": Source(
+        "MeetUp (Ilinykh, Zarrieß, Schlangen, 2019): dialogues about photographs of rooms; MIT",
+        meaning=_MENTIONS,
+        left_out=_AIMED_AT,
+        predicates={},
+    ),
+    "virtualhome_programs": Source(
+        "VirtualHome (Puig et al., CVPR 2018): things that people use together; MIT",
+        meaning=replace(_MENTIONS, scenes_per_group=1.0),
+        predicates={},
+    ),
+    "robot_worlds": Source(
+        "Worlds of robot simulators (AWS RoboMaker, MIT-0; Open-RMF, Apache-2.0): hospitals, "
+        "offices and an airport",
+        meaning=replace(_MENTIONS, scenes_per_group=2.0),
         predicates={},
     ),
     "reverie_text": Source(
@@ -214,7 +281,7 @@ SOURCES: Final[dict[str, Source]] = {
     "vsr": Source(
         "Visual Spatial Reasoning (Liu, Emerson, Collier, TACL 2023): voted relations in "
         "photographs; Apache-2.0",
-        meaning=_MENTIONS,
+        meaning=_PHOTOGRAPHS,
         predicates={},
     ),
     "placing_priors": Source(

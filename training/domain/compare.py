@@ -183,7 +183,7 @@ def compare(a: Candidate, b: Candidate, root: Path, *, say: Progress) -> Compari
     data = split_and_encode(a.config.data, sources, root, a.vocabulary).training_data()
     encoded = encode(test, a.vocabulary)
     annotated = annotated_classes(encoded, a.vocabulary)
-    scenes = some_scenes(scene_tensors(encoded, annotated, len(a.vocabulary)), SCENES)
+    scenes = some_scenes(scene_tensors(encoded, annotated, a.vocabulary), SCENES)
     models = (a.model(a.vocabulary, data, say), b.model(a.vocabulary, data, say))
     try:
         titles = a.title, b.title if b.title != a.title else f"{b.title} (second)"

@@ -58,7 +58,7 @@ class RoomList:
         if len({scene.group for scene in encoded}) == 1:
             encoded = [replace(scene, group=scene.scene_id) for scene in encoded]
         annotated = annotated_classes(encoded, vocabulary)
-        scenes = scene_tensors(encoded, annotated, len(vocabulary))
+        scenes = scene_tensors(encoded, annotated, vocabulary)
         structure = torch.from_numpy(vocabulary.structure.copy())
         setting = Setting(scenes, structure, train=scenes, limit=None)
         model = artifact_model(artifact)

@@ -1,9 +1,10 @@
 """Random parts of scenes, as a robot lists them, and the rank of the hidden classes.
 
 A part lists some classes of a scene and hides the others. Structure classes are neither listed nor
-hidden, nor candidates. The rank of a hidden class ignores the other hidden classes, so these never
-count as errors. For ties, a metric is the expectation under random order. The random choices for a
-scene depend only on the seed and the id of the scene.
+hidden, nor candidates. Classes of one family with a listed class are neither targets nor
+candidates, because the service never proposes them. The rank of a hidden class ignores the other
+hidden classes, so these never count as errors. For ties, a metric is the expectation under random
+order. The random choices for a scene depend only on the seed and the id of the scene.
 """
 
 from __future__ import annotations
@@ -48,18 +49,26 @@ class Parts:
     Attributes:
         scene: (N,) int64, index of the scene.
         v, hidden: (N, V) 1 for listed classes; True for hidden classes.
+        related: (N, V) True for unlisted classes of one family with a listed class.
         scenes: number of scenes of the set, with the scenes without a part.
     """
 
     scene: Tensor
     v: Tensor
     hidden: Tensor
+    related: Tensor
     scenes: int
 
     @property
     def skipped(self) -> int:
         """Number of scenes without a part."""
         return self.scenes - len(self.scene.unique())
+
+    def of_listed_families(self) -> Ratio:
+        """Return the share of hidden classes of one family with a listed class."""
+        row, target = self.hidden.nonzero(as_tuple=True)
+        shares = self.related[row, target].double().numpy()
+        return Ratio.of_items(self.scene[row].numpy(), shares, self.scenes)
 
 
 def all_but_one(classes: int, _: Rng) -> int:
@@ -102,7 +111,8 @@ def draw_parts(
     for row, classes in enumerate(hidden):
         mask[row, torch.from_numpy(classes)] = True
     v = scenes.v[index].masked_fill(mask | structure, 0.0)
-    return Parts(index, v, mask, len(scenes))
+    related = scenes.relatives_of(v) & (v == 0)
+    return Parts(index, v, mask, related, len(scenes))
 
 
 def share_bin(listed: Tensor, classes: Tensor) -> Tensor:
@@ -166,12 +176,15 @@ class Ranking:
 
 
 def rank_hidden(parts: Parts, structure: Tensor, values: Tensor) -> Ranking:
-    """Rank each hidden class among the unlisted classes, by scores (N, V)."""
+    """Rank each hidden class among the unlisted classes, by scores (N, V).
+
+    Classes of one family with a listed class are neither ranked nor candidates.
+    """
     # -inf marks classes that are no candidates. So a candidate of score -inf gets the smallest
     # finite score.
     values = values.clamp(min=torch.finfo(values.dtype).min)
-    values = values.masked_fill((parts.v > 0) | structure, -torch.inf)
-    row, target = parts.hidden.nonzero(as_tuple=True)
+    values = values.masked_fill((parts.v > 0) | structure | parts.related, -torch.inf)
+    row, target = (parts.hidden & ~parts.related).nonzero(as_tuple=True)
     others = parts.hidden[row].scatter(1, target.unsqueeze(1), False)
     competing = values[row].masked_fill(others, -torch.inf)
     return Ranking.of(parts.scene[row], target, competing, parts.scenes, parts.skipped)

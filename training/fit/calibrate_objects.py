@@ -129,12 +129,14 @@ def fit_missing(
 ) -> dict[str, Any]:
     """Fit the entries `coverage` and `missing` of the calibration."""
     parts = [draw_parts(scenes, structure, exactly(n)) for n in LENGTHS]
-    v, hidden = (torch.cat([getattr(part, name) for part in parts]) for name in ("v", "hidden"))
+    v, hidden, related = (
+        torch.cat([getattr(part, name) for part in parts]) for name in ("v", "hidden", "related")
+    )
     if not len(v):
         return {}
     coverages = COVERAGES if chosen is None else (chosen.coverage,)
     log_odds = unlisted_log_odds(artifact, v, coverages)
-    masks = ((v == 0) & ~structure).numpy(), hidden.numpy()
+    masks = ((v == 0) & ~structure & ~related).numpy(), (hidden & ~related).numpy()
     best = int(np.argmax([_mean_rank(z, *masks) for z in log_odds]))
     features, truth = _first_classes(log_odds[best], *masks, v.sum(1).numpy())
     entry = CountSlope()

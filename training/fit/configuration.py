@@ -55,9 +55,7 @@ class DataConfig(_Section):
         description="scenes to draw of each place where `inventories` is a source",
     )
     limit: int | None = Field(default=None, ge=10, description="maximum scenes of each source")
-    words: str = Field(
-        default="", description="file of word vectors in the data folder; empty: no vectors"
-    )
+    words: bool = Field(default=False, description="whether word vectors tell similar classes")
     # A value that `exclude_if` leaves out of the dump preserves the digests of earlier runs.
     terms: str = Field(default="", exclude_if=not_, description="terms of use of own files")
     research_only: bool = Field(default=False, exclude_if=not_)

@@ -15,6 +15,8 @@ softplus.
   cross-entropy, with the weight k.
 - A class that a source shows in fewer than 3 scenes says nothing there: it has no term in the loss
   (partial labels). Structure is neither listed nor asked for.
+- A present class says nothing about unlisted classes of its family (`Vocabulary.related`): a desk
+  lamp is a lamp, and an annotator may call it so.
 - Each source q has its own base rates a_q and y_q, and each listed share its own bias kappa. The
   machine also learns p(q | listed), with the weight s, because a robot's list names no source.
 - With the weight g, persistent Gibbs chains (PCD) keep samples of the machine like scenes. The
@@ -63,6 +65,7 @@ class ObjectScenes:
         source: index of the source in `sources`, (scenes,) int64.
         weight: weight of each scene, (scenes,).
         shows: True for classes that a source shows, (sources, classes) bool.
+        known: True for classes whose presence the scene tells, (scenes, classes) bool.
         sources: names of the sources of these scenes.
     """
 
@@ -71,6 +74,7 @@ class ObjectScenes:
     source: Tensor
     weight: Tensor
     shows: Tensor
+    known: Tensor
     sources: tuple[str, ...]
 
     @classmethod
@@ -97,8 +101,9 @@ class ObjectScenes:
         if not len(kept):
             raise ValueError("no training scene has two classes; add scenes with more objects")
         used, source = train.source[kept].unique(return_inverse=True)
-        sources = tuple(names[q] for q in used.tolist())
-        return cls(v[kept].float(), train.room[kept], source, weight[kept], shows[used], sources)
+        sources, v = tuple(names[q] for q in used.tolist()), v[kept]
+        known = shows[used][source] & (v | ~train.relatives_of(v.float()))
+        return cls(v.float(), train.room[kept], source, weight[kept], shows[used], known, sources)
 
     @property
     def size(self) -> float:
@@ -183,7 +188,12 @@ class ObjectFit:
             if name.removeprefix("parametrizations.").split(".")[0] in OBJECT_WEIGHTS
         }
         self._average = {name: w.detach().clone() for name, w in self._weights.items()}
-        self._optimiser = torch.optim.Adam(self._weights.values(), lr=config.learning_rate)
+        # The normal priors, divided by the number of scenes, act as weight decay.
+        groups = [
+            {"params": [weight], "weight_decay": config.precision_of(name) / scenes.size}
+            for name, weight in self._weights.items()
+        ]
+        self._optimiser = torch.optim.Adam(groups, lr=config.learning_rate, fused=True)
         self._chains: Chains | None = None
         if config.generative_weight:
             index = scenes.draw(config.chains, self._generator)
@@ -218,6 +228,8 @@ class ObjectFit:
             group["lr"] = config.learning_rate * self._schedule()
         self._optimiser.zero_grad()
         loss.backward()
+        if (couplings := self.machine.couplings) is not None and couplings.grad is not None:
+            couplings.grad = (couplings.grad + couplings.grad.T).fill_diagonal_(0).div_(2)
         self._optimiser.step()
         self.steps += 1
         self._add_to_average()
@@ -226,27 +238,30 @@ class ObjectFit:
         """Return the loss of the next batch."""
         scenes = self.scenes
         index = scenes.draw(self.config.batch_size, self._generator)
-        v, room, source = scenes.v[index], scenes.room[index], scenes.source[index]
-        loss = self._conditional_loss(v, room, source) + self._prior()
+        loss = self._conditional_loss(index)
         if self._chains is not None:
-            difference = self._generative_loss(self._chains, v, self._some_rooms(room), source)
+            room = self._some_rooms(scenes.room[index])
+            difference = self._generative_loss(
+                self._chains, scenes.v[index], room, scenes.source[index]
+            )
             loss = loss + self.config.generative_weight * difference
         return loss
 
-    def _conditional_loss(self, v: Tensor, room: Tensor, source: Tensor) -> Tensor:
+    def _conditional_loss(self, index: Tensor) -> Tensor:
         """Return the mean over scenes of the negative log-likelihood of what is not listed."""
-        machine = self.machine
+        machine, scenes = self.machine, self.scenes
+        v, room, source = scenes.v[index], scenes.room[index], scenes.source[index]
         parts = random_parts(v, self.config.leave_one_out, self._generator)
         listed_room = self._some_rooms(room)
         log_odds = machine.object_log_odds(
             parts.listed, room=listed_room, source=source, share=parts.share
         )
         hidden = v - parts.listed
-        weight = self.scenes.shows[source] * (1 - parts.listed)
+        weight = scenes.known[index] * (1 - parts.listed)
         weight = weight * torch.where(hidden > 0, parts.weight.unsqueeze(1), 1.0)
         loss = ((softplus(log_odds) - hidden * log_odds) * weight).sum()
-        served = served_weights(self.scenes, self.config)
-        rates, _ = with_served_rates(machine.a, self.scenes.shows, served)
+        served = served_weights(scenes, self.config)
+        rates, _ = with_served_rates(machine.a, scenes.shows, served)
         logits = machine.f + parts.listed @ rates.T
         loss = loss + self.config.source_loss * cross_entropy(logits, source, reduction="sum")
         asked = (listed_room < 0) & (room >= 0)
@@ -268,22 +283,14 @@ class ObjectFit:
         if machine.spec.H2:
             with torch.no_grad():
                 h2 = torch.bernoulli(machine.context(v, room)[1], generator=generator)
-        data = self._free_energy(v, h2, room, source)
-        return data - self._free_energy(chains.v, chains.h2, chains.room, chains.source)
+        pairs = ((v, chains.v), (h2, chains.h2), (room, chains.room), (source, chains.source))
+        free = self._free_energy(*map(torch.cat, pairs))
+        return free[: len(v)].mean() - free[len(v) :].mean()
 
     def _free_energy(self, v: Tensor, h2: Tensor, room: Tensor, source: Tensor) -> Tensor:
-        """Return the mean free energy given the room types, which the chains do not draw."""
+        """Return the free energy given the room types, which the chains do not draw, (scenes,)."""
         free = self.machine.free_energy(v, h2, room=room, source=source)
-        return (free + self.machine.room_rate(room, source)).mean()
-
-    def _prior(self) -> Tensor:
-        """Return the negative log prior of the weights, divided by the number of scenes."""
-        total = torch.zeros(())
-        for name, weight in self._weights.items():
-            precision = self.config.precision_of(name)
-            if precision:
-                total = total + 0.5 * precision * (weight**2).sum()
-        return total / self.scenes.size
+        return free + self.machine.room_rate(room, source)
 
     def _schedule(self) -> float:
         """Return the factor of the learning rate: it rises, stays, and falls along a cosine."""
@@ -297,8 +304,8 @@ class ObjectFit:
     @torch.no_grad()
     def _add_to_average(self) -> None:
         count = self.steps - int((1 - _AVERAGED) * self.config.steps)
-        for name, weight in self._weights.items():
-            self._average[name].lerp_(weight, 1 / max(count, 1))
+        for name, weight in self._weights.items() if count > 0 else ():
+            self._average[name].lerp_(weight, 1 / count)
 
     @torch.no_grad()
     def finish(self) -> None:
@@ -320,9 +327,6 @@ class ObjectFit:
             bias.add_(mix)
         served = served.clamp(min=_UNSERVED)
         machine.f.add_((served / served.sum() * scenes.size / scenes.source_sizes).log())
-        couplings = machine.couplings
-        if couplings is not None:
-            machine.L.copy_(couplings)
 
 
 def with_served_rates(rates: Tensor, shows: Tensor, served: Tensor) -> tuple[Tensor, Tensor]:

@@ -130,11 +130,11 @@ class BoltzmannMachine(nn.Module, ABC):
 
     @property
     def couplings(self) -> Tensor | None:
-        """The couplings between classes, (V, V), symmetric with a diagonal of 0, or None."""
-        if not self.spec.coupled:
-            return None
-        symmetric = (self.L + self.L.T) / 2
-        return symmetric - torch.diag(symmetric.diagonal())
+        """The couplings between classes, (V, V), symmetric with a diagonal of 0, or None.
+
+        L starts at 0, and each step of the training changes it by a symmetric matrix.
+        """
+        return self.L if self.spec.coupled else None
 
     def by_unit(self, x: Tensor) -> Tensor:
         """Return values of h1, (..., H1), by unit and state, (..., units, states - 1)."""

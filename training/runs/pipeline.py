@@ -75,8 +75,8 @@ class SplitScenes:
                 f"the training part contains no scene of the source {source!r}; add scenes, or "
                 "remove the source from data.sources"
             )
-        V = len(self.vocabulary)
-        tensors = {name: scene_tensors(part, annotated, V) for name, part in self.parts.items()}
+        words = self.vocabulary
+        tensors = {name: scene_tensors(part, annotated, words) for name, part in self.parts.items()}
         return TrainingData(
             **tensors,
             structure=torch.from_numpy(self.vocabulary.structure.copy()),
@@ -138,10 +138,8 @@ def _path(source: str, root: Path) -> Path:
 
 
 def _require_files(data: DataConfig, root: Path) -> None:
-    """Raise ConfigError if a file of a source, or the file of word vectors, is missing."""
+    """Raise ConfigError if a file of a source is missing."""
     paths = {source: _path(source, root) for source in data.sources if source != "rooms"}
-    if data.words:
-        paths["word vectors"] = root / data.words
     missing = {source: path for source, path in paths.items() if not path.is_file()}
     if not missing:
         return
@@ -200,7 +198,7 @@ def split_and_encode(
     The split includes all data sources at once, because sources can contain the same room.
 
     Args:
-        root: folder of the word vectors and of the vocabulary.
+        root: folder of the vocabulary.
         vocabulary: vocabulary of a published model. The default is that of the configuration.
 
     Raises:
@@ -212,7 +210,7 @@ def split_and_encode(
         vocabulary = build_vocabulary(data, parts["train"], root)
     words = None
     if data.words:
-        vectors, _ = class_vectors(read_word_vectors(root / data.words), vocabulary)
+        vectors, _ = class_vectors(read_word_vectors(KNOWLEDGE / "words.npz"), vocabulary)
         words = torch.from_numpy(vectors)
     roles = count_roles(parts["train"], vocabulary)
     return SplitScenes(

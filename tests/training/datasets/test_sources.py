@@ -232,7 +232,7 @@ def test_a_floor_plan_counts_as_a_few_scenes() -> None:
     assert [scene.weight for scene in found] == [0.5] * 6 + [1.0] * 2 + [1.0] * 5
     assert found[0].evidence.counts.tolist() == [4, 1]
     assert found[0].instance_classes.tolist() == [0, 2]
-    tensors = scene_tensors(found, annotated_classes(found, VOCABULARY), len(VOCABULARY))
+    tensors = scene_tensors(found, annotated_classes(found, VOCABULARY), VOCABULARY)
     assert tensors.source_names == ("alfred", "vsr")
     batch = tensors.batch(torch.tensor([12, 0]))
     assert batch.source.tolist() == [1, 0]

@@ -21,7 +21,7 @@ STRUCTURE = torch.from_numpy(VOCABULARY.structure.copy())
 @cache
 def rooms(count: int, seed: int) -> SceneTensors:
     scenes = encode(generate_rooms(count, seed), VOCABULARY)
-    return scene_tensors(scenes, annotated_classes(scenes, VOCABULARY), len(VOCABULARY))
+    return scene_tensors(scenes, annotated_classes(scenes, VOCABULARY), VOCABULARY)
 
 
 @cache

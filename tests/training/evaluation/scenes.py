@@ -7,7 +7,7 @@ from itertools import count
 import numpy as np
 import torch
 
-from app.scene import CANONICAL
+from app.scene import CANONICAL, ObjectClass, Vocabulary
 from app.scene.stands import UNKNOWN
 from training.datasets import EncodedScene
 from training.datasets.batches import SceneTensors, scene_tensors
@@ -67,7 +67,8 @@ def toy(*args: object, **options: object) -> EncodedScene:
 def tensors(scenes: Sequence[EncodedScene], classes: int = V) -> SceneTensors:
     sources = {entry.source for entry in scenes}
     annotated = {source: np.ones(classes, dtype=np.bool_) for source in sources}
-    return scene_tensors(scenes, annotated, classes)
+    vocabulary = Vocabulary([ObjectClass(str(index)) for index in range(classes)])
+    return scene_tensors(scenes, annotated, vocabulary)
 
 
 def random_scenes(

@@ -37,7 +37,7 @@ def test_rooms_are_asked_every_task_that_needs_no_training_scenes(tmp_path):
     test = read_test(room_file(tmp_path, pairs))
     encoded = encode([replace(s, source="homes") for s in pairs], VOCABULARY)
     annotated = annotated_classes(encoded, VOCABULARY)
-    scenes = scene_tensors(encoded, annotated, len(VOCABULARY))
+    scenes = scene_tensors(encoded, annotated, VOCABULARY)
     setting = Setting(scenes, STRUCTURE, train=scenes, limit=None)
     model = artifact_model(room_model())
     outcomes = measure(model, setting, "homes", tasks=ROOM_TASKS).outcomes

@@ -44,7 +44,7 @@ def posed(number, labels=tuple(BOXES)):
 
 def tensors(*scenes):
     encoded = encode(scenes, VOCABULARY)
-    return scene_tensors(encoded, annotated_classes(encoded, VOCABULARY), len(VOCABULARY))
+    return scene_tensors(encoded, annotated_classes(encoded, VOCABULARY), VOCABULARY)
 
 
 SUSPICION = np.full((4, 5), 9.0)
