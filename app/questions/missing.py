@@ -48,9 +48,9 @@ def missing(
     The model assumes that the scene lists the share `coverage` of its classes. A lower coverage
     gives unlisted classes higher probabilities. Each class is judged separately, so the
     probabilities do not sum to 1. The list `missing` never contains listed or structural classes.
-    It contains a class of one family with a listed class only if `candidates` names it: an office
-    chair may be the listed chair itself, and a listed office chair is a chair. Of two classes of
-    one family, the list has the likelier.
+    A listed kind lists its broader classes: a listed office chair is a chair. The list contains a
+    kind of a listed class only if `candidates` names this kind, because an office chair may be the
+    listed chair itself. Of two classes of one family, the list has the likelier.
 
     Args:
         scene: the listed objects, their relations and the room type.
@@ -120,7 +120,7 @@ def _ranked(
     else:
         chosen = np.zeros_like(usable)
         chosen[list(candidates)] = True
-        usable &= chosen
+        usable &= chosen & ~vocabulary.broader[listed].any(0)
     if not usable.any():
         return np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
     log_odds = posterior.absent_log_odds(np.arange(len(usable)), coverage)
