@@ -39,7 +39,7 @@ SPECS = {
     "triway": MachineSpec(
         "triway", V=V, A=A, units=4, states=4, C=C, K=3, profiles=2, coupled=True
     ),
-    "gbm": MachineSpec("gbm", V=V, A=A, units=6, H2=4, C=C),
+    "gbm": MachineSpec("gbm", V=V, A=A, units=6, C=C),
     "rbm": MachineSpec("rbm", V=V, A=A, units=6, C=C),
 }
 PROFILES = ("homes", "shops")

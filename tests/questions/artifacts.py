@@ -21,20 +21,17 @@ from tests.enumeration.small_machines import SMALL, random_weights
 from training.machines import BoltzmannMachine, MachineSpec, build
 from training.machines.arrays import weights_of
 
-# Few enough states to enumerate, with one hidden layer and three classes.
-EXACT: dict[str, MachineSpec] = {
-    name: SMALL[name]
-    for name in ("rbm", "rbm-states", "gbm-one-layer", "triway-states", "triway-implications")
-}
+# Few enough states to enumerate, with three classes.
+EXACT: dict[str, MachineSpec] = {name: spec for name, spec in SMALL.items() if spec.V == 3}
 # Too large to enumerate, with structure and five relations.
 LARGER: dict[str, MachineSpec] = {
     "rbm": MachineSpec("rbm", V=9, A=5, units=6, T=40, C=2),
-    "gbm": MachineSpec("gbm", V=9, A=5, units=6, H2=3, T=40),
-    "triway": MachineSpec("triway", V=9, A=5, units=6, H2=3, K=3, T=5, C=2, profiles=2),
+    "gbm": MachineSpec("gbm", V=9, A=5, units=6, T=40),
+    "triway": MachineSpec("triway", V=9, A=5, units=6, K=3, T=5, C=2, profiles=2),
     "triway-states": MachineSpec(
         "triway", V=9, A=5, units=5, states=4, K=3, T=60, C=2, profiles=2, coupled=True
     ),
-    "triway-implications": MachineSpec("triway", V=9, A=5, units=6, H2=3, K=3, T=5, C=2, G=2),
+    "triway-implications": MachineSpec("triway", V=9, A=5, units=6, K=3, T=5, C=2, G=2),
 }
 LABELS = ("bed", "lamp", "desk", "chair", "sofa", "vase", "shelf", "rug", "wall")
 STRUCTURE = {"wall"}

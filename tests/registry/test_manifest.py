@@ -49,9 +49,9 @@ def test_refuses_another_format(value: object) -> None:
         (b"\xff\xfe", "truncated"),
         (b"[" * 200_000, "truncated"),
         (resign(b"{" + b'"a":[' * 100_000 + b"]" * 100_000 + b"}"), "invalid_manifest"),
-        (resign(b'{"format": 8, nonsense}'), "invalid_manifest"),
-        (b'{"format": 8}', "invalid_manifest"),
-        (resign(b'{"format": 8}'), "invalid_manifest"),
+        (resign(b'{"format": 9, nonsense}'), "invalid_manifest"),
+        (b'{"format": 9}', "invalid_manifest"),
+        (resign(b'{"format": 9}'), "invalid_manifest"),
     ],
 )
 def test_refuses_malformed_manifests(data: bytes, code: str) -> None:
