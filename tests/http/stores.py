@@ -110,7 +110,7 @@ def make_store(root: Path) -> Path:
     publish(root, "home", "1.0.0", alias="default")
     publish(root, "home", "1.1.0", seed=1, alias="candidate")
     publish(root, "plain", "1.0.0", variant="rbm")
-    publish(root, "deep", "0.1.0", variant="gbm")
+    publish(root, "general", "0.1.0", variant="gbm")
     return root
 
 

@@ -256,9 +256,8 @@ def test_the_generative_gradient_is_that_of_the_likelihood(name):
         exact = exact - log_q[(possible == v).all(1)][0] / len(KINDS)
     room, source = torch.tensor(KINDS).T
     many = source.repeat_interleave(count)
-    nothing = torch.zeros(len(many), 0).double()
     rooms = room.repeat_interleave(count)
-    chains = Chains(torch.cat(drawn), nothing, rooms, many, PARTIAL[many])
+    chains = Chains(torch.cat(drawn), rooms, many, PARTIAL[many])
     names = [n for n in ("b", "c1", "W", "Q", "L", "a", "e") if hasattr(machine, n)]
     weights = [machine.get_parameter(n) for n in names]
     found = torch.autograd.grad(fit._generative_loss(chains, data, room, source), weights)
