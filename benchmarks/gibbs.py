@@ -8,7 +8,7 @@ from benchmarks.report import Result
 from benchmarks.timing import interleave
 from benchmarks.yardsticks import object_machine, presence, random_scenes, rbms, scikit_learn
 from training.machines import MachineSpec
-from training.machines.gibbs import start_chains, sweep
+from training.machines.gibbs import Chains, sweep
 
 OURS, SKLEARN, RBMS = "ours", "scikit-learn", "rbms"
 PRODUCTS = "two bare products"
@@ -29,7 +29,8 @@ def gibbs(
     h = (torch.rand(chains, H, generator=generator) < 0.5).float()
     W = machine.W
     sklearn_rbm, rbms_rbm = scikit_learn(machine), rbms(machine)
-    ours = start_chains(machine, v, generator)
+    none = torch.full((chains,), -1)
+    ours = Chains(v, none, none, torch.ones(v.shape, dtype=torch.bool))
     sklearn, other = v.numpy(), rbms_rbm.init_chains(chains, start_v=v)
 
     def sklearn_sweep() -> None:

@@ -35,7 +35,7 @@ TOLERANCE: Final = 1e-5
 SEED: Final = 20261123
 QUESTIONS: Final = ("relations", "missing", "outliers", "rooms")
 MODELS: Final = (
-    "default", "indoor-triway", "indoor-gbm", "indoor-rbm", "open-triway", "indoor-triway@3.5.0",
+    "default", "indoor-triway", "indoor-rbm", "open-triway", "indoor-triway@3.5.0",
 )  # fmt: skip
 RELATIONS: Final = (
     *("left", "right", "front", "behind", "on-top"),

@@ -1,6 +1,6 @@
 """Sampling of scenes by Gibbs chains, each with its own random stream.
 
-A chain starts at a stored scene and makes sweeps over h1, h2 and v. It draws relations once, at the
+A chain starts at a stored scene and makes sweeps over h1 and v. It draws relations once, at the
 end, because relations do not act on the other units. Observed relations hold from the start.
 
 The start of a chain is a random stored scene. Its weight, given the evidence, is
@@ -39,7 +39,7 @@ from app.inference.relations import (
     ends_of,
     relation_units,
 )
-from app.inference.weights import Weights, state_means, unpack_scenes
+from app.inference.weights import Weights, unpack_scenes
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.int64]
@@ -110,21 +110,15 @@ class SceneChains:
     ) -> None:
         self.machine, self._excluded = weights, list(excluded)
         self.units = units or relation_units(weights)
-        W, J, spec = weights["W"], weights["J"], weights.spec
+        W, spec = weights["W"], weights.spec
         self.arrays = kernels.ChainArrays(
             W=W,
             WT=np.ascontiguousarray(W.T),
-            J=J,
-            JT=np.ascontiguousarray(J.T),
             L=weights["L"] if spec.coupled else np.zeros((0, spec.V), np.float32),
             b=weights["b"],
-            c2=weights["c2"],
         )
         # (N, H1) means of h1 given the stored scenes.
-        self.mean: Floats = np.zeros((0, spec.H1), np.float32)
-        if spec.N:
-            x, _ = weights.with_second_layer(weights["c1"] + weights.scenes @ W)
-            self.mean = state_means(x, spec.states).astype(np.float32)
+        self.mean: Floats = weights.scene_means if spec.N else np.zeros((0, spec.H1), np.float32)
 
     def under(self, conditions: Conditions, temperature: float = 1.0) -> "ConditionedChains":
         """Return the chains under the conditions of one request."""
@@ -227,43 +221,30 @@ class ConditionedChains:
 
     def _continued(self, on: Bits, steps: int, stream: np.random.Generator) -> ChainState:
         """Return the state of a chain after ``steps`` sweeps from the classes ``on``, (V,)."""
-        h1, _ = self.sweep(on, steps, stream)
+        h1 = self.sweep(on, steps, stream)
         classes = np.flatnonzero(on)
         logits = self._logits(classes, h1)
         r = self._relations(classes, logits, stream)
         return ChainState(classes, self._room, logits, r)
 
-    def sweep(
-        self, on: Bits, steps: int, stream: np.random.Generator, h2: Bits | None = None
-    ) -> tuple[Indices, Bits]:
+    def sweep(self, on: Bits, steps: int, stream: np.random.Generator) -> Indices:
         """Run ``steps`` sweeps from the classes ``on``, (V,), which change in place.
 
-        Args:
-            h2: (H2,) states of the second layer, which change in place. By default, they are drawn
-                from their mean field.
-
         Returns:
-            The state of each unit of h1, (units,), and the states of h2, (H2,).
+            The state of each hidden unit, (units,).
         """
         on |= self._required_classes
         h1 = np.zeros(self._machine.spec.units, np.int64)
-        if h2 is None:
-            _, means = self._context(np.flatnonzero(on), float(self._beta))
-            h2 = (stream.random(len(means), np.float32) < means).astype(np.uint8)
-        per_sweep = len(on) + len(h1) + len(h2)
         while steps > 0:
-            uniform = stream.random((min(steps, _AT_ONCE), per_sweep), np.float32)
-            kernels.sweeps(
-                self._w, self._bias, self._required_classes, self._beta, uniform, on, h1, h2
-            )
+            uniform = stream.random((min(steps, _AT_ONCE), len(h1) + len(on)), np.float32)
+            kernels.sweeps(self._w, self._bias, self._required_classes, self._beta, uniform, on, h1)
             steps -= _AT_ONCE
-        return h1, h2
+        return h1
 
-    def _context(self, classes: Indices, beta: float = 1.0) -> tuple[Floats, Floats]:
-        """Return the logits x of h1 given present classes, (H1,), and the means of h2, (H2,)."""
-        base = self._bias + self._machine["W"][classes].sum(0)
-        x, m2 = self._machine.with_second_layer(base[None], beta)
-        return x[0].astype(np.float32), m2[0].astype(np.float32)
+    def _context(self, classes: Indices) -> Floats:
+        """Return the logits x of h1 given present classes, (H1,)."""
+        x: Floats = self._bias + self._machine["W"][classes].sum(0)
+        return x
 
     def _logits(self, classes: Indices, h1: Indices) -> Floats:
         """Return the logits of the relations between classes with one instance each, (A, n, n)."""
@@ -291,7 +272,7 @@ class ConditionedChains:
             r[units], free[units] = observed.r[has_unit] > 0, False
         uniform, group_numbers = stream.random((2, *r.shape), np.float32)
         if self._machine.spec.G:
-            x, _ = self._context(classes, float(self._beta))
+            x = self._context(classes)
             weight = self._chains.units.implication_weights(x, float(self._beta))
             kernels.draw_in_groups(weight, self._beta * logits, free, uniform, group_numbers, r)
         else:
@@ -307,10 +288,7 @@ class ConditionedChains:
 
         b contains the base rates, which depend on the profile or on the listed classes. The first
         terms are log p(v, t) + log Z, where t is the room type. An unknown room type has e_t = 0
-        and Y_t = 0.
-        The last term is the log-probability of the relations given the sampled h1. With a second
-        layer, m is the mean field of h2. Then x contains J m, and the score also contains c2·m and
-        the entropy of m. This score is a lower bound on the log of the sum over h2.
+        and Y_t = 0. The last term is the log-probability of the relations given the sampled h1.
 
         Args:
             state: final state of a chain.
@@ -320,16 +298,12 @@ class ConditionedChains:
         if state.room != self._room:
             return self._in_room(state.room).log_score(state, shown, kept)
         listed, machine = state.classes[shown], self._machine
-        x, m = self._context(listed)
-        by_unit = x.astype(np.float64).reshape(-1, machine.spec.states - 1)
+        by_unit = self._context(listed).astype(np.float64).reshape(-1, machine.spec.states - 1)
         # The first state of each unit has the logit 0.
         log_sums = np.logaddexp.reduce(by_unit, axis=1, initial=0.0)
-        # A mean of exactly 0 or 1 has the entropy 0, but its logarithm would be infinite.
-        uncertain = m[(m > 0) & (m < 1)].astype(np.float64)
-        entropy = -(uncertain * np.log(uncertain) + (1 - uncertain) * np.log1p(-uncertain)).sum()
         logits = state.logits[:, shown][:, :, shown].astype(np.float64)
         on = kept[:, shown][:, :, shown]
-        score = self._w.b[listed].sum() + log_sums.sum() + machine["c2"] @ m
+        score = self._w.b[listed].sum() + log_sums.sum() + self._room_bias
         if machine.spec.coupled:
             score += 0.5 * machine["L"][np.ix_(listed, listed)].sum()
-        return float(score + self._room_bias + entropy + (on * logits - softplus(logits)).sum())
+        return float(score + (on * logits - softplus(logits)).sum())

@@ -854,18 +854,14 @@ class ChainArrays(NamedTuple):
 
     Attributes:
         WT: (H1, V), transpose of W.
-        JT: (H2, H1), transpose of J.
         L: (V, V) couplings, or (0, V) for a machine without couplings.
         b: (V,) biases of the classes.
     """
 
     W: Floats
     WT: Floats
-    J: Floats
-    JT: Floats
     L: Floats
     b: Floats
-    c2: Floats
 
 
 @compiled
@@ -899,52 +895,43 @@ def _draw_state(logits, beta, uniform):
 
 
 @compiled
-def sweeps(w, bias, always, beta, uniform, on, h1, h2):
-    """Run Gibbs sweeps that change the arrays on, h1 and h2 in place.
+def sweeps(w, bias, always, beta, uniform, on, h1):
+    """Run Gibbs sweeps that change the arrays on and h1 in place.
 
-    A sweep draws h1 given the rest, then h2 given h1, and then the classes. Coupled classes are
-    drawn one after another, each given all others.
+    A sweep draws h1 given the classes, and then the classes. Coupled classes are drawn one after
+    another, each given all others.
 
     Args:
         w: `ChainArrays`.
         bias: (H1,) bias of h1.
         always: (V,) uint8, 1 for classes that stay present.
         beta: 1 / temperature.
-        uniform: (sweeps, units + H2 + V) random numbers.
+        uniform: (sweeps, units + V) random numbers.
         on: (V,) uint8, presence of the classes.
         h1: (units,) state of each unit of h1.
-        h2: (H2,) uint8, states of the units of h2.
     """
     V, H1 = w.W.shape
-    units, H2 = len(h1), len(h2)
+    units = len(h1)
     states = H1 // units
     x, coupled = np.empty(H1, np.float32), len(w.L) > 0
-    field, logits2 = np.empty(V, np.float32), np.empty(H2, np.float32)
-    from_classes = np.zeros(V, np.float32)
+    field, from_classes = np.empty(V, np.float32), np.zeros(V, np.float32)
     if coupled:
         _add_rows(w.L, on, from_classes)
     for t in range(len(uniform)):
         row = uniform[t]
         x[:] = bias
         _add_rows(w.W, on, x)
-        _add_rows(w.JT, h2, x)
         for m in range(units):
             h1[m] = _draw_state(x[m * states : (m + 1) * states], beta, row[m])
         field[:] = w.b
-        logits2[:] = w.c2
         for m in range(units):
             if h1[m]:
-                entry = m * states + h1[m] - 1
-                from_h1, from_h1_to_h2 = w.WT[entry], w.J[entry]
+                from_h1 = w.WT[m * states + h1[m] - 1]
                 for i in range(V):
                     field[i] += from_h1[i]
-                for k in range(H2):
-                    logits2[k] += from_h1_to_h2[k]
-        for k in range(H2):
-            h2[k] = row[units + k] < logistic(beta * logits2[k])
         for i in range(V):
             logit = beta * (field[i] + from_classes[i])
-            drawn = max(always[i], np.uint8(row[units + H2 + i] < logistic(logit)))
+            drawn = max(always[i], np.uint8(row[units + i] < logistic(logit)))
             if coupled and drawn != on[i]:
                 sign, changed = np.float32(1.0 if drawn else -1.0), w.L[i]
                 for j in range(V):

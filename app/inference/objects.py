@@ -206,8 +206,8 @@ class ObjectScorer:
             increase_ij = gain_j(c1 + W_i) - gain_j(c1) + L_ij
 
         Here c1 are the biases of the hidden units, and W_i are the weights of class i. The increase
-        is symmetric in i and j. The formula is exact for a machine with one hidden layer. It leaves
-        out a second layer, the room type, and what the classes tell about the data source.
+        is symmetric in i and j. It leaves out the room type, and what the classes tell about the
+        data source.
 
         The second result is the increase multiplied by the probability of each class in this scene,
         (V,). The scorer keeps both results of each class, at most 8 V² bytes.

@@ -116,13 +116,6 @@ def context_of(
     """
     shares = presence[:, None] * weights["W"][classes]
     x = weights.room_bias(room) + shares.sum(0)
-    if weights.spec.H2:
-        # The effect of a class through the second layer is J m2 for the whole scene minus J m2 for
-        # the scene without this class.
-        bases = np.concatenate([x[None], x - shares]).astype(np.float32)
-        logits, _ = weights.with_second_layer(bases)
-        through = (logits - bases).astype(np.float32)
-        x, shares = logits[0].astype(np.float32), shares + through[0] - through[1:]
     return Context(classes, presence, log_counts, x, shares, observed)
 
 
@@ -420,7 +413,7 @@ def _directions(weights: Weights) -> tuple[Floats, Floats]:
     frequency, means = np.ones(spec.V), np.full((1, spec.H1), 1 / spec.states)
     if spec.N:
         frequency = weights.scenes.mean(0).astype(np.float64) + 1e-6
-        means = state_means(weights["c1"] + weights.scenes @ weights["W"], spec.states)
+        means = weights.scene_means
     p = (frequency / frequency.sum())[:, None]
     ones = np.ones((spec.V, 1))
     S, O = (  # noqa: E741

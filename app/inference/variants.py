@@ -24,8 +24,6 @@ class RBM:
     """
 
     factorised: ClassVar[bool] = False
-    two_layers: ClassVar[bool] = False
-    implications: ClassVar[bool] = False
 
     @staticmethod
     def shapes(spec: "MachineSpec") -> Shapes:
@@ -34,12 +32,10 @@ class RBM:
 
 
 class GBM(RBM):
-    """GBM: a machine with two hidden layers and one relation unit for each training triple.
+    """GBM: the RBM with two-way weights between each relation unit and its two classes.
 
     The logit of unit t is ℓ_t = d_t + g_t v_i + g'_t v_j + U_t·h1.
     """
-
-    two_layers = True
 
     @staticmethod
     def shapes(spec: "MachineSpec") -> Shapes:
@@ -58,8 +54,6 @@ class Triway:
     """
 
     factorised: ClassVar[bool] = True
-    two_layers: ClassVar[bool] = True
-    implications: ClassVar[bool] = True
 
     @staticmethod
     def shapes(spec: "MachineSpec") -> Shapes:
@@ -85,9 +79,8 @@ class MachineSpec:
         variant: ``rbm``, ``gbm`` or ``triway``.
         V: number of object classes (visible units v).
         A: number of canonical relations.
-        units: number of hidden units in the first layer.
-        states: number of states of a hidden unit in the first layer. 2 means a binary unit.
-        H2: number of binary hidden units in the second layer. 0 means no second layer.
+        units: number of hidden units.
+        states: number of states of a hidden unit. 2 means a binary unit.
         C: number of room types.
         K: rank of the weights that relation units share (Triway).
         G: rank of the effect of h1 on implications between relations (Triway). An implication is a
@@ -105,7 +98,6 @@ class MachineSpec:
     A: int
     units: int
     states: int = 2
-    H2: int = 0
     C: int = 0
     K: int = 0
     T: int = 0
@@ -127,18 +119,14 @@ class MachineSpec:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
         if self.states < 2:
             raise ValueError(f"states must be at least 2, not {self.states}")
-        for name in ("H2", "C", "K", "T", "G", "N", "profiles"):
+        for name in ("C", "K", "T", "G", "N", "profiles"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must be at least 0, not {getattr(self, name)}")
         kind = self.kind
         if kind.factorised and self.K < 1:
             raise ValueError(f"a {self.variant} machine needs a rank K of at least 1, not {self.K}")
-        if self.G and not kind.implications:
+        if self.G and not kind.factorised:
             raise ValueError(f"G is {self.G}, but only a triway may have a G above 0")
-        if self.H2 and not kind.two_layers:
-            raise ValueError(f"an RBM has one hidden layer, so H2 must be 0, not {self.H2}")
-        if self.H2 and self.coupled:
-            raise ValueError("a machine with two hidden layers has no couplings between classes")
 
     @property
     def kind(self) -> type[RBM | Triway]:
@@ -147,7 +135,7 @@ class MachineSpec:
 
     @property
     def H1(self) -> int:  # noqa: N802 - the symbol of docs/models.md
-        """Number of states of the first layer that have weights: units · (states - 1).
+        """Number of states of the hidden units that have weights: units · (states - 1).
 
         The first state of each unit has the energy 0, so it has no weights.
         """

@@ -1,17 +1,12 @@
-"""The weights of a trained machine: their layout for all variants, and the hidden layers.
+"""The weights of a trained machine: their layout for all variants, and the hidden units.
 
-A hidden unit of the first layer has Z states. h1 has an entry for each state but the first, whose
-energy is 0: h1 is 1 for the state of the unit, else 0. x are the logits of these entries:
+A hidden unit has Z states. h1 has an entry for each state but the first, whose energy is 0: h1 is 1
+for the state of the unit, else 0. x are the logits of these entries:
 
-    x = c1 + Q[t] + v'W + J m2,   m1 = exp(x_z) / (1 + sum_z' exp(x_z'))
+    x = c1 + Q[t] + v'W,   p(z) = exp(x_z) / (1 + sum_z' exp(x_z'))
 
 v is the presence of the classes, t is the room type, and z' runs over the states of the same unit.
-m1 are the probabilities of the states. For Z = 2, m1 is sigmoid(x). The second layer is binary:
-
-    m2 = sigmoid(c2 + m1'J)
-
-A mean-field iteration computes m2. The iteration starts at m2 = sigmoid(c2). For a machine with one
-hidden layer, x is exact. At the temperature 1 / beta, beta multiplies all logits.
+For Z = 2, p is sigmoid(x).
 """
 
 from collections.abc import Mapping
@@ -22,12 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference import kernels
-from app.inference.elementary import sigmoid
 from app.inference.variants import MachineSpec
-
-SWEEPS: Final = 10
-"""Number of iterations of a mean field. The shipped machines converge within these iterations. The
-number is constant, so that answers are reproducible."""
 
 WORD: Final = 32
 """Number of bits in a word of the packed stored scenes."""
@@ -43,9 +33,9 @@ def layout(spec: MachineSpec) -> dict[str, tuple[type, tuple[int, ...]]]:
     All variants have the arrays below. The classes in `variants` add the arrays of each variant.
     `MachineSpec` defines the sizes.
 
-        b (V,), c1 (H1,), c2 (H2,), e (C,): biases of objects, hidden units and room types
+        b (V,), c1 (H1,), e (C,): biases of objects, hidden units and room types
         f (profiles,): biases of the data sources; see `Weights.source_weights`
-        W (V, H1), J (H1, H2), Q (C, H1): weights between h1 and objects, h2 and room types
+        W (V, H1), Q (C, H1): weights between h1 and objects, and between h1 and room types
         L (V, V): couplings between classes, symmetric with a diagonal of 0, if `coupled`
         Y (C, V): couplings between room types and classes, if `coupled`
         a (profiles, V): change of b in scenes of a data source, 0 for classes that it cannot show
@@ -59,11 +49,11 @@ def layout(spec: MachineSpec) -> dict[str, tuple[type, tuple[int, ...]]]:
             one class.
         fantasy_rooms (N,): room type of each stored sample, or -1 if unknown
     """
-    V, H1, H2 = spec.V, spec.H1, spec.H2
+    V, H1 = spec.V, spec.H1
     floats: dict[str, tuple[int, ...]] = {
-        "b": (V,), "c1": (H1,), "c2": (H2,), "e": (spec.C,), "W": (V, H1), "J": (H1, H2),
-        "Q": (spec.C, H1), "f": (spec.profiles,), "a": (spec.profiles, V),
-        "y": (spec.profiles, spec.C), "u": (spec.profiles + 1, V), "kappa": (len(SHARES) + 1, V),
+        "b": (V,), "c1": (H1,), "e": (spec.C,), "W": (V, H1), "Q": (spec.C, H1),
+        "f": (spec.profiles,), "a": (spec.profiles, V), "y": (spec.profiles, spec.C),
+        "u": (spec.profiles + 1, V), "kappa": (len(SHARES) + 1, V),
     }  # fmt: skip
     if spec.coupled:
         floats |= {"L": (V, V), "Y": (spec.C, V)}
@@ -126,6 +116,11 @@ class Weights:
         """(N, V) presence of each class in each stored sample. Each access unpacks all samples."""
         return unpack_scenes(self["fantasies"], self.spec.V)
 
+    @property
+    def scene_means(self) -> NDArray[np.float32]:
+        """(N, H1) means of h1 given each stored scene, without its room type."""
+        return state_means(self["c1"] + self.scenes @ self["W"], self.spec.states)
+
     def room_bias(self, room: int | None) -> NDArray[Any]:
         """Return the bias of h1 for a room type t, (H1,): c1 + Q[t].
 
@@ -180,24 +175,6 @@ class Weights:
         else:
             bias = bias + self["u"][-1]
         return bias, 0.0 if room is None or not self.spec.C else float(of_room[room])
-
-    def with_second_layer(
-        self, base: NDArray[Any], beta: float = 1.0
-    ) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return x (B, H1) and m2 (B, H2) for B scenes; see the module.
-
-        Args:
-            base: (B, H1) logits of h1 without the second layer: c1 + Q[t] + v'W.
-            beta: 1 / temperature.
-        """
-        if not self.spec.H2:
-            return base, np.zeros((len(base), 0), base.dtype)
-        J, c2 = self["J"], self["c2"]
-        m2 = np.broadcast_to(sigmoid(beta * c2), (len(base), len(c2)))
-        for _ in range(SWEEPS):
-            m1 = state_means(beta * (base + m2 @ J.T), self.spec.states)
-            m2 = sigmoid(beta * (c2 + m1 @ J))
-        return base + m2 @ J.T, m2
 
 
 def state_means(x: NDArray[Any], states: int) -> NDArray[Any]:

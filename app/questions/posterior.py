@@ -1,15 +1,15 @@
 """The posterior given a scene: log-odds of objects, room types and relations; their calibration.
 
-v are the object units, and h1 is the first hidden layer. Given v, the units of h1 are independent,
-with the logits x (`app.inference.weights`). The answers are in closed form:
+v are the object units, and h1 are the hidden units. Given v, the units of h1 are independent, with
+the logits x (`app.inference.weights`). The answers are in closed form:
 
     object     log-odds_i = b_i + ..., see `app.inference.objects`
     relation   p(r_e = 1) = E[sigmoid(ℓ_e(h1))], see `app.inference.relations`
 
-The log-odds of a listed class are computed at x without its contribution: its row of W, and its
-effect through the second layer. Observed relations do not change the logits of h1: their effect on
-objects and on other relations through h1 was not measurable (docs/decisions/evidence.md). They
-change other relations by implications only.
+The log-odds of a listed class are computed at x without its contribution, which is its row of W.
+Observed relations do not change the logits of h1: their effect on objects and on other relations
+through h1 was not measurable (docs/decisions/evidence.md). They change other relations by
+implications only.
 """
 
 import math
@@ -107,9 +107,8 @@ class Posterior:
     """Log-odds of objects and relations given a scene and a published model.
 
     Shapes contain V (classes of the vocabulary), A (canonical relations) and n (classes of the
-    scene). The log-odds of objects are exact for a machine with one hidden layer. The logits of
-    relations are approximated by normal variables. The smallest log-odds of a relation is
-    `NO_UNIT`.
+    scene). The log-odds of objects are exact. The logits of relations are approximated by normal
+    variables. The smallest log-odds of a relation is `NO_UNIT`.
 
     Attributes:
         present: the classes of the scene.

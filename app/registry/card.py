@@ -131,24 +131,18 @@ def render_card(description: Description, tensors: Mapping[str, TensorEntry]) ->
 
 def _machine(spec: MachineSpec) -> list[tuple[str, str]]:
     """Return the rows of the table about units and weights."""
-    rows = [("Hidden units", _units(spec.units, spec.states))]
-    if spec.H2:
-        rows.append(("Second layer", _units(spec.H2, 2)))
     relations = f"own weights of {spec.T:,} triples"
     if spec.kind.factorised:
         relations = f"factors of rank {spec.K}, and {relations}"
     if spec.G:
         relations += f"; implications of rank {spec.G}"
+    kinds = "binary units" if spec.states == 2 else f"units of {spec.states} states"
     return [
-        *rows,
+        ("Hidden units", f"{spec.units} {kinds}"),
         ("Couplings", "between all pairs of classes" if spec.coupled else "none"),
         ("Relation weights", relations),
         ("Stored scenes", f"{spec.N:,}, where chains start" if spec.N else "none"),
     ]
-
-
-def _units(units: int, states: int) -> str:
-    return f"{units} binary units" if states == 2 else f"{units} units of {states} states"
 
 
 def _metrics(description: Description) -> str:

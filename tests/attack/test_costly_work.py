@@ -30,7 +30,7 @@ async def test_quick_questions_pass_large_scenes_batches_and_documents(
     async with serve(shared_store) as client:
         client.headers.update(LONG)
         held = hold("outliers")
-        large = {"objects": [LABELS[0]] * 33, "model": "deep"}
+        large = {"objects": [LABELS[0]] * 33, "model": "general"}
         costly = [
             *(asyncio.ensure_future(client.post("/outliers", json=large)) for _ in range(4)),
             asyncio.ensure_future(client.post("/outliers/batch", json={"scenes": [large] * 4})),

@@ -231,7 +231,7 @@ def test_the_sidecar_copies_what_the_service_loads(
         models = load_model_set(copied)
         assert not models.failures
         assert models.versions["home"] == ("1.0.0", "1.1.0")
-        assert models.versions.keys() == {"deep", "home", "plain"}
+        assert models.versions.keys() == {"general", "home", "plain"}
         before = copied.state()
         bucket.set_alias("default", AliasTarget(name="home"))
         wait_until(lambda: copied.aliases() == bucket.aliases())

@@ -20,20 +20,14 @@ SMALL: dict[str, MachineSpec] = {
     "rbm-states": MachineSpec(
         "rbm", V=3, A=2, units=2, states=3, C=2, T=4, profiles=2, coupled=True
     ),
-    "gbm": MachineSpec("gbm", V=2, A=2, units=2, H2=2, T=4),
-    "gbm-one-layer": MachineSpec("gbm", V=3, A=2, units=2, T=4, C=2, coupled=True),
-    "gbm-states": MachineSpec("gbm", V=2, A=2, units=2, states=3, H2=2, T=4, C=2, profiles=2),
+    "gbm": MachineSpec("gbm", V=3, A=2, units=2, T=4, C=2, coupled=True),
+    "gbm-states": MachineSpec("gbm", V=2, A=2, units=2, states=3, T=4, C=2, profiles=2),
     "triway": MachineSpec("triway", V=2, A=2, units=2, K=2, T=4),
     "triway-states": MachineSpec(
         "triway", V=3, A=1, units=2, states=3, C=2, K=2, T=2, profiles=2, coupled=True
     ),
     "triway-implications": MachineSpec("triway", V=3, A=1, units=2, C=3, K=2, T=2, G=2),
-    "triway-deep": MachineSpec(
-        "triway", V=2, A=2, units=2, states=3, H2=2, C=2, K=2, T=4, profiles=2
-    ),
 }
-ONE_LAYER = [name for name, spec in SMALL.items() if not spec.H2]
-TWO_LAYERS = [name for name, spec in SMALL.items() if spec.H2]
 
 
 def small_machine(name: str, seed: int = 0, scale: float = 0.8) -> BoltzmannMachine:
@@ -112,7 +106,7 @@ def unit_states(spec: MachineSpec) -> Tensor:
 class Joint:
     """Every state of a small machine, with its energy.
 
-    v, r, h1, h2: (N, units); room: (N,), -1 for "not listed"; energy: (N,); edges: the layout of r
+    v, r, h1: (N, units); room: (N,), -1 for "not listed"; energy: (N,); edges: the layout of r
     between all classes.
     """
 
@@ -121,7 +115,6 @@ class Joint:
     v: Tensor
     r: Tensor
     h1: Tensor
-    h2: Tensor
     room: Tensor
     energy: Tensor
 
@@ -156,13 +149,13 @@ def enumerate_joint(machine: BoltzmannMachine, *rooms: int | None, source: int =
     edges = machine.edges(torch.arange(spec.V).unsqueeze(0))
     visible, E = binary(spec.V), edges.valid.shape[1]
     t = torch.tensor([-1 if room is None else room for room in rooms or (-1,)])
-    blocks = [visible, binary(E), unit_states(spec), binary(spec.H2)]
-    index = torch.cartesian_prod(*(torch.arange(len(block)) for block in [*blocks, t]))
-    v, r, h1, h2 = (block[k] for block, k in zip(blocks, index.T, strict=False))
+    blocks = [visible, binary(E), unit_states(spec), t]
+    index = torch.cartesian_prod(*(torch.arange(len(block)) for block in blocks))
+    v, r, h1, room = (block[k] for block, k in zip(blocks, index.T, strict=True))
     allowed = (r <= machine.gate(edges, v)).all(1)
-    v, r, h1, h2, room = (block[allowed] for block in (v, r, h1, h2, t[index[:, 4]]))
-    energy = machine.energy(v, r, h1, h2, edges, room, torch.full((len(v),), source))
-    return Joint(machine, edges, v, r, h1, h2, room, energy)
+    v, r, h1, room = (block[allowed] for block in (v, r, h1, room))
+    energy = machine.energy(v, r, h1, edges, room, torch.full((len(v),), source))
+    return Joint(machine, edges, v, r, h1, room, energy)
 
 
 def same(block: Tensor, value: Tensor) -> Tensor:
@@ -219,14 +212,14 @@ def features_by_hand(given: Tensor) -> Tensor:
 def implied_by_hand(
     machine: BoltzmannMachine, v: Tensor, given: Tensor, room: int = -1, *, apart: bool = False
 ) -> Tensor:
-    """x (A, n, n) of a machine of one layer at v (V,), given relations.
+    """x (A, n, n) of a machine at v (V,), given relations.
 
     With `apart`, relations of the same pair have no effect.
     """
     spec = machine.spec
     gamma, B = machine.get_parameter("gamma"), machine.get_parameter("B")
     phi = features_by_hand(given)
-    mean = machine.state_means(machine.context(v[None], torch.tensor([room]))[0])[0]
+    mean = machine.state_means(machine.context(v[None], torch.tensor([room])))[0]
     z = [sum(float(B[q, k] * mean[k]) for k in range(spec.H1)) for q in range(spec.G)]
     x = torch.zeros(given.shape, dtype=torch.float64)
     for a in range(spec.A):

@@ -40,7 +40,7 @@ SPECS = {
     "triway": MachineSpec(
         "triway", V=V, A=A, units=4, states=4, C=C, K=3, profiles=2, coupled=True
     ),
-    "gbm": MachineSpec("gbm", V=V, A=A, units=6, H2=4, C=C),
+    "gbm": MachineSpec("gbm", V=V, A=A, units=6, C=C),
     "rbm": MachineSpec("rbm", V=V, A=A, units=6, C=C),
 }
 PROFILES = ("homes", "shops")
@@ -109,7 +109,7 @@ def make_store(root: Path) -> Path:
     publish(root, "home", "1.0.0", alias="default")
     publish(root, "home", "1.1.0", seed=1, alias="candidate")
     publish(root, "plain", "1.0.0", variant="rbm")
-    publish(root, "deep", "0.1.0", variant="gbm")
+    publish(root, "general", "0.1.0", variant="gbm")
     return root
 
 

@@ -32,7 +32,7 @@ async def test_models_versions_and_aliases_are_listed(client: httpx.AsyncClient)
     assert listing["aliases"] == {"candidate": "home@1.1.0", "default": "home@1.0.0"}
     assert listing["failures"] == []
     models = {model["name"]: model["versions"] for model in listing["models"]}
-    assert set(models) == {"home", "plain", "deep"}
+    assert set(models) == {"home", "plain", "general"}
     assert [version["version"] for version in models["home"]] == ["1.1.0", "1.0.0"]
     assert [version["aliases"] for version in models["home"]] == [["candidate"], ["default"]]
     assert {version["status"] for versions in models.values() for version in versions} == {"ready"}
@@ -104,11 +104,11 @@ async def test_new_and_removed_versions_are_taken_over(
     assert not caplog.messages
     before = (await own.get("/models")).json()["generation"]
     publish(store, "home", "2.0.0", seed=2, alias="default")
-    shutil.rmtree(store / "deep")
+    shutil.rmtree(store / "general")
     assert await default(own) == "home@1.0.0"
     await load_changes(own)
     assert await default(own) == "home@2.0.0"
-    problem(await own.get("/models/deep"), 404, "model-not-found")
+    problem(await own.get("/models/general"), 404, "model-not-found")
     assert caplog.messages == [
         "the service has loaded the store: 4 usable versions",
         "the alias default names home@2.0.0 now",
@@ -243,9 +243,9 @@ async def test_replaced_models_are_freed(
         return missing(artifact, *args, **parameters)
 
     replace("missing", note)
-    for model in ("deep", "home"):
+    for model in ("general", "home"):
         await own.post("/missing", json={"objects": ["bed"], "model": model})
-    shutil.rmtree(store / "deep")
+    shutil.rmtree(store / "general")
     await load_changes(own)
     await own.app.state.runtime.check_store(always=True)  # type: ignore[attr-defined]
     await own.post("/missing", json={"objects": ["bed"], "model": "home"})

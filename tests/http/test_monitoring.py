@@ -181,7 +181,7 @@ async def test_model_info_has_every_alias(own: httpx.AsyncClient, store: Path) -
         ("candidate", "home", "triway", "1.1.0"),
         ("night", "home", "triway", "1.1.0"),
         ("", "plain", "rbm", "1.0.0"),
-        ("", "deep", "gbm", "0.1.0"),
+        ("", "general", "gbm", "0.1.0"),
     ):
         listed = (await own.get(f"/models/{name}/versions/{version}")).json()
         expected.add((alias, listed["digest"], name, variant, version))

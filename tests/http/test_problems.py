@@ -310,7 +310,7 @@ async def test_pointers_leave_out_unusual_field_names(client: httpx.AsyncClient,
 async def test_unknown_models_are_not_found(client: httpx.AsyncClient, model: str) -> None:
     body = {"objects": ["bed"], "model": model}
     document = problem(await client.post("/missing", json=body), 404, "model-not-found")
-    named = "1.0.0, 1.1.0" if model.startswith("home@") else "Models: deep, home, plain."
+    named = "1.0.0, 1.1.0" if model.startswith("home@") else "Models: general, home, plain."
     assert named in document["detail"]
     assert ("Similar names: home." in document["detail"]) == (model == "hoome")
 

@@ -35,7 +35,7 @@ LAMP_ON_DESK: list[dict[str, Any]] = [
     {"id": "d", "label": "desk", "position": at(2, 0, 0.4), "size": at(0.7, 1.4, 0.8)},
     {"id": "l", "label": "lamp", "position": at(2, 0.5, 1), "size": at(0.2, 0.2, 0.4)},
 ]
-MODELS = ["home", "home@1.1.0", "candidate", "plain", "deep@0.1.0"]
+MODELS = ["home", "home@1.1.0", "candidate", "plain", "general@0.1.0"]
 
 
 def triples(listed: list[dict[str, Any]]) -> set[tuple[str, str, str]]:

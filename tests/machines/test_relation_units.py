@@ -41,21 +41,17 @@ def test_log_odds_of_normal_logits(sigma):
 
 SPECS = {
     "rbm": MachineSpec("rbm", V=V, A=A, units=4, states=3, T=40, C=2),
-    "gbm": MachineSpec("gbm", V=V, A=A, units=6, H2=3, T=40, C=2),
+    "gbm": MachineSpec("gbm", V=V, A=A, units=6, T=40, C=2),
     "triway": MachineSpec("triway", V=V, A=A, units=6, K=2, T=40, C=2),
     "triway-states": MachineSpec("triway", V=V, A=A, units=4, states=4, K=2, T=40, C=2),
-    "triway-deep": MachineSpec("triway", V=V, A=A, units=3, states=5, H2=3, K=3, T=40, C=2),
 }
 CLASSES, LOG_COUNTS = np.array([4, 0, 3]), np.log([1, 3, 2]).astype(np.float32)
 
 
 def exact_logits(machine, v, room):
-    """ℓ of every state of h1, (states, units), and p(state | v), (states,), by the tensors.
-
-    With a second layer, its means are those of the mean field given v.
-    """
+    """ℓ of every state of h1, (states, units), and p(state | v), (states,), by the tensors."""
     h1 = unit_states(machine.spec)
-    x, _ = machine.context(v, torch.tensor([room]))
+    x = machine.context(v, torch.tensor([room]))
     p = (h1 @ x[0]).softmax(0)
     counts = torch.ones(V, dtype=torch.int64)
     counts[CLASSES] = torch.from_numpy(np.exp(LOG_COUNTS)).round().long()
@@ -93,8 +89,6 @@ def test_mean_and_variance_are_those_over_all_states_of_h1(name, room):
     mean, variance = (m[grid] for m in moments(*exact_logits(machine, v, room)))
     np.testing.assert_allclose(between.mean, mean, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(between.spread**2 / 3, variance, rtol=1e-3, atol=1e-4)
-    if machine.spec.H2:
-        return  # a candidate leaves the means of h2 as they are
     for candidate in (1, 5):
         v[0, candidate] = 1
         mean, variance = moments(*exact_logits(machine, v, room))
@@ -146,7 +140,7 @@ def test_implications_equal_the_formula_by_hand(grid, room, states):
     observed = ObservedRelations(a, i, j, np.ones(len(a), np.float32))
     found = in_service(machine, observed, n, None if room < 0 else room)
     machine.double()
-    h1 = machine.state_means(machine.context(v, torch.tensor([room]))[0])
+    h1 = machine.state_means(machine.context(v, torch.tensor([room])))
     expected = implied_by_hand(machine, v[0], padded, room)
     edges = machine.edges(torch.arange(V).unsqueeze(0))
     ours = machine.implied(edges, padded.reshape(1, -1), h1)

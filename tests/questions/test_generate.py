@@ -31,7 +31,6 @@ from tests.questions.artifacts import (
     scene_of,
 )
 from tests.questions.test_properties import scenes
-from training.machines import MachineSpec
 
 NAMES = tuple(LARGER)
 ARTIFACTS = {name: larger_artifact(name) for name in NAMES}
@@ -113,21 +112,13 @@ def test_generation_stops_at_the_end_of_the_request(artifact):
     assert generate(artifact, scene, count=32, seed=5, stop=lambda: True) == ()
 
 
-# Few enough states to enumerate, also two machines with a second layer.
-DRAWN: dict[str, MachineSpec] = {
-    "gbm": MachineSpec("gbm", V=3, A=1, units=2, H2=2, T=2),
-    "triway-two-layers": MachineSpec("triway", V=3, A=1, units=2, states=3, H2=2, K=2, T=2),
-    **EXACT,
-}
-
-
 @cache
 def with_joint(name, room=None, profile=None, evidence=()):
     """An artifact, and the joint of its machine under a room type and a profile.
 
     Without a profile, the joint has the mean base rates given the listed classes.
     """
-    machine = random_machine(DRAWN[name], 1.3)
+    machine = random_machine(EXACT[name], 1.3)
     double, source = copy.deepcopy(machine).double(), profile
     if source is None:
         double, source = with_mean_rates(machine, evidence), -1
@@ -145,12 +136,12 @@ def check_share(count, drawn, p):
     assert abs(count / len(drawn) - p) <= 5 * error + 1e-12
 
 
-@pytest.mark.parametrize("name", DRAWN)
+@pytest.mark.parametrize("name", EXACT)
 @pytest.mark.parametrize("evidence", [[], [0]])
 @pytest.mark.parametrize("clamped", [False, True])
 def test_objects_have_the_distribution_of_the_model(name, evidence, clamped):
     """The frequency of every set of classes; also under a room type and a profile."""
-    spec = DRAWN[name]
+    spec = EXACT[name]
     room = 1 if clamped and spec.C else None
     profile = 1 if clamped and spec.profiles else None
     # The mean base rates depend on the evidence only if the machine has data sources.

@@ -125,10 +125,7 @@ def test_companions_raise_the_log_odds_of_an_outlier_most(name):
 
     def log_odds(j, *listed):
         v = none.index_fill(1, torch.tensor(listed, dtype=torch.int64), 1.0)
-        if not machine.spec.H2:
-            return float(machine.object_log_odds(v, source=torch.tensor([0]))[0, j])
-        # The formula leaves out the second layer.
-        return float(machine.gain(machine.c1 + v @ machine.W, machine.W)[0, j])
+        return float(machine.object_log_odds(v, source=torch.tensor([0]))[0, j])
 
     entries = outliers(artifact, scene_of([0, 1, 2]), threshold=0.0).outliers
     assert any(entry.usually_with for entry in entries)

@@ -40,7 +40,7 @@ VOCABULARY = Vocabulary(
 # One of each variant; a new one is put through the round trip by an entry here.
 SPECS: dict[str, dict[str, Any]] = {
     "rbm": {"variant": "rbm", "V": 3, "A": 5, "units": 5, "C": 2, "T": 2},
-    "gbm": {"variant": "gbm", "V": 3, "A": 5, "units": 5, "H2": 2, "T": 2},
+    "gbm": {"variant": "gbm", "V": 3, "A": 5, "units": 5, "T": 2},
     "triway": {"variant": "triway", "V": 3, "A": 5, "units": 2, "states": 4, "C": 2, "K": 2, "T": 2}
     | {"profiles": 2, "coupled": True},
 }

@@ -67,11 +67,10 @@ def test_round_trip_is_exact_in_float32(variant: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize(
     "more",
-    [{}, {"H2": 2, "C": 3, "N": 4, "G": 1}, {"states": 3, "C": 3, "profiles": 2, "coupled": True}],
+    [{}, {"C": 3, "N": 4, "G": 1}, {"states": 3, "C": 3, "profiles": 2, "coupled": True}],
 )
 def test_the_layout_is_that_of_the_machines(variant: str, more: dict[str, Any]) -> None:
-    leaves = {"rbm": {"H2", "G"}, "gbm": {"G"}}
-    sizes = {name: n for name, n in more.items() if name not in leaves.get(variant, ())}
+    sizes = {name: n for name, n in more.items() if name != "G" or variant == "triway"}
     spec = MachineSpec(variant, V=40, A=4, units=5, K=2, T=3, **sizes)
     state = build(spec).state_dict()
     kinds = {torch.float32: float, torch.int32: int}
@@ -277,7 +276,7 @@ def test_refuses_dtypes_that_artifacts_do_not_hold(dtype: Any, written: Path) ->
         {"surplus": 1},
         {"units": -5},
         {"states": 1},
-        {"H2": 1},  # an RBM has none
+        {"G": 1},  # an RBM has none
         {"profiles": 1},  # the vocabulary has none
         {"units": 10**15},  # beyond any memory: must be refused before it is allocated
         {"T": 10**18},

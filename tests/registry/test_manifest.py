@@ -8,6 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from app.registry import ArtifactError, Manifest
+from app.registry.manifest import FORMAT
 from tests.registry.small_artifacts import description, refused, resign
 
 DIGEST = "ab" * 32
@@ -31,7 +32,7 @@ def stored() -> dict[str, Any]:
     return members
 
 
-@pytest.mark.parametrize("value", [7, 9, 8.0, "8", None, True])
+@pytest.mark.parametrize("value", [FORMAT - 1, FORMAT + 1, float(FORMAT), str(FORMAT), None, True])
 def test_refuses_another_format(value: object) -> None:
     body = json.dumps(stored() | {"format": value}).encode()
     # A later format may end in another way, so the format is read before the checksum.
@@ -49,9 +50,9 @@ def test_refuses_another_format(value: object) -> None:
         (b"\xff\xfe", "truncated"),
         (b"[" * 200_000, "truncated"),
         (resign(b"{" + b'"a":[' * 100_000 + b"]" * 100_000 + b"}"), "invalid_manifest"),
-        (resign(b'{"format": 8, nonsense}'), "invalid_manifest"),
-        (b'{"format": 8}', "invalid_manifest"),
-        (resign(b'{"format": 8}'), "invalid_manifest"),
+        (resign(b'{"format": %d, nonsense}' % FORMAT), "invalid_manifest"),
+        (b'{"format": %d}' % FORMAT, "invalid_manifest"),
+        (resign(b'{"format": %d}' % FORMAT), "invalid_manifest"),
     ],
 )
 def test_refuses_malformed_manifests(data: bytes, code: str) -> None:

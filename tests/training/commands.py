@@ -18,7 +18,7 @@ def invoke(*arguments: object, code: int = 0) -> str:
 
 
 def small_config(name: str = "rooms-triway", variant: str = "triway", **data: Any) -> Config:
-    """A machine of one layer on 60 generated rooms."""
+    """A machine on 60 generated rooms."""
     return Config.model_validate(
         {
             "name": name,

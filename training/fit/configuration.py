@@ -80,9 +80,8 @@ class MachineConfig(_Section):
     """
 
     variant: Variant
-    units: int = Field(default=8, ge=1, description="hidden units of the first layer")
-    states: int = Field(default=32, ge=2, description="states of such a unit; 2: binary")
-    H2: int = Field(default=0, ge=0, description="binary hidden units of the second layer")
+    units: int = Field(default=8, ge=1, description="hidden units")
+    states: int = Field(default=32, ge=2, description="states of a hidden unit; 2: binary")
     coupled: bool = Field(default=False, description="couplings between classes")
     K: int = Field(default=32, ge=0)
     G: int = Field(default=0, ge=0, description="rank of the implication factors (Triway)")
@@ -104,7 +103,7 @@ class ObjectsConfig(_Section):
     leave_one_out: float = Field(default=0.3, ge=0, le=1, description="share of such parts")
     room_share: float = Field(default=0.15, ge=0, le=1, description="share of listed room types")
     weight_prior: float = Field(
-        default=1.5, ge=0, description="precision of W, J and Q, in numbers of scenes"
+        default=1.5, ge=0, description="precision of W and Q, in numbers of scenes"
     )
     coupling_prior: float = Field(default=5.0, ge=0, description="precision of L and Y")
     rate_prior: float = Field(default=7.5, ge=0, description="precision of a, y and kappa")
@@ -134,7 +133,7 @@ class ObjectsConfig(_Section):
 
     def precision_of(self, name: str) -> float:
         """Return the precision of the normal prior of an object weight, by the name of it."""
-        if name in ("W", "J", "Q") or name.startswith("parametrizations.W"):
+        if name in ("W", "Q") or name.startswith("parametrizations.W"):
             return self.weight_prior
         rates = dict.fromkeys(("a", "y", "kappa"), self.rate_prior)
         return (dict.fromkeys(("L", "Y"), self.coupling_prior) | rates).get(name, 0.0)
@@ -194,14 +193,8 @@ class Config(_Section):
                     f"{', '.join(unknown)}, only {', '.join(names)}"
                 )
         rules = {
-            "machine.H2 must be 0, because this machine.variant has one hidden layer": (
-                self.machine.H2 and not kind.two_layers
-            ),
-            "machine.coupled must be false, because the machine has two hidden layers": (
-                self.machine.H2 and self.machine.coupled
-            ),
             "machine.G is defined for the Triway only: it must be 0": (
-                self.machine.G and not kind.implications
+                self.machine.G and not kind.factorised
             ),
             "data.rooms must be at least 1, because `rooms` is a source": (
                 "rooms" in self.data.sources and not self.data.rooms

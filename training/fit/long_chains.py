@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import torch
 
-from app.inference.chains import Bits, Conditions, SceneChains, random_stream
+from app.inference.chains import Conditions, SceneChains, random_stream
 from app.inference.weights import Weights
 from app.registry import Metric
 from training.datasets.array_types import Flags, Floats, Ints
@@ -99,7 +99,6 @@ class LongChains:
         self.on = scenes.v[index].numpy().astype(np.uint8)
         self._chains, self._profile = chains, population.profile
         self._rooms = population.room[index]
-        self._h2: list[Bits | None] = [None] * count
         self._streams = [random_stream(seed, k) for k in range(count)]
 
     def run(self, sweeps: int, every: int = RECORDED) -> Floats:
@@ -117,8 +116,7 @@ class LongChains:
             conditioned = self._chains.under(conditions)
             for k in np.flatnonzero(self._rooms == room).tolist():
                 for _ in records:
-                    state = self.on[k], every, self._streams[k], self._h2[k]
-                    _, self._h2[k] = conditioned.sweep(*state)
+                    conditioned.sweep(self.on[k], every, self._streams[k])
                     count[k] += self.on[k]
         share: Floats = count / len(records)
         return share

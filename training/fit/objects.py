@@ -45,7 +45,7 @@ from training.datasets.sources import SOURCES
 from training.evaluation.parts import share_bin
 from training.fit.configuration import ObjectsConfig
 from training.machines import BoltzmannMachine
-from training.machines.gibbs import Chains, start_chains, sweep
+from training.machines.gibbs import Chains, sweep
 from training.machines.machine import OBJECT_WEIGHTS
 
 _SHOWN = 3  # scenes of a source in which a class must occur
@@ -198,12 +198,8 @@ class ObjectFit:
         if config.generative_weight:
             index = scenes.draw(config.chains, self._generator)
             source = scenes.source[index]
-            self._chains = start_chains(
-                *(machine, scenes.v[index], self._generator),
-                room=self._some_rooms(scenes.room[index]),
-                source=source,
-                possible=scenes.shows[source],
-            )
+            rooms = self._some_rooms(scenes.room[index])
+            self._chains = Chains(scenes.v[index], rooms, source, scenes.shows[source])
 
     @property
     def finished(self) -> bool:
@@ -277,20 +273,14 @@ class ObjectFit:
 
     def _generative_loss(self, chains: Chains, v: Tensor, room: Tensor, source: Tensor) -> Tensor:
         """Return F(scenes) - F(chains) after a sweep of the chains, which keep their room types."""
-        machine, generator = self.machine, self._generator
-        sweep(machine, chains, generator, classes=self.config.classes_per_sweep)
-        h2 = v.new_zeros(len(v), 0)
-        if machine.spec.H2:
-            with torch.no_grad():
-                h2 = torch.bernoulli(machine.context(v, room)[1], generator=generator)
-        pairs = ((v, chains.v), (h2, chains.h2), (room, chains.room), (source, chains.source))
+        sweep(self.machine, chains, self._generator, classes=self.config.classes_per_sweep)
+        pairs = ((v, chains.v), (room, chains.room), (source, chains.source))
         free = self._free_energy(*map(torch.cat, pairs))
         return free[: len(v)].mean() - free[len(v) :].mean()
 
-    def _free_energy(self, v: Tensor, h2: Tensor, room: Tensor, source: Tensor) -> Tensor:
+    def _free_energy(self, v: Tensor, room: Tensor, source: Tensor) -> Tensor:
         """Return the free energy given the room types, which the chains do not draw, (scenes,)."""
-        free = self.machine.free_energy(v, h2, room=room, source=source)
-        return free + self.machine.room_rate(room, source)
+        return self.machine.free_energy(v, room, source) + self.machine.room_rate(room, source)
 
     def _schedule(self) -> float:
         """Return the factor of the learning rate: it rises, stays, and falls along a cosine."""

@@ -38,7 +38,7 @@ def means_of_parts(machine: BoltzmannMachine, batch: Batch, generator: torch.Gen
     probability = torch.rand(len(batch), 1, generator=generator)
     listed = batch.v * (torch.rand(batch.v.shape, generator=generator) < probability)
     lists_room = torch.rand(len(batch), generator=generator) < 0.5
-    x, _ = machine.context(listed, torch.where(lists_room, batch.room, -1))
+    x = machine.context(listed, torch.where(lists_room, batch.room, -1))
     return machine.state_means(x)
 
 

@@ -47,7 +47,7 @@ def new_machine(config: Config, data: TrainingData, scenes: ObjectScenes) -> Bol
     V = data.train.v.shape[1]
     triples = seen_triples(data.train.scenes, V, shape.min_triple_count)
     spec = MachineSpec(
-        shape.variant, V=V, A=len(CANONICAL), units=shape.units, states=shape.states, H2=shape.H2,
+        shape.variant, V=V, A=len(CANONICAL), units=shape.units, states=shape.states,
         C=len(data.vocabulary.room_types), T=len(triples), G=shape.G, N=shape.N,
         K=shape.K if VARIANTS[shape.variant].factorised else 0,
         profiles=len(scenes.sources), coupled=shape.coupled,

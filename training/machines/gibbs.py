@@ -1,7 +1,7 @@
 """Gibbs sampling of objects and hidden units for training and for tests of the machine.
 
-A sweep draws h1 given v and h2, then h2 given h1, and then the classes given h1. Without couplings,
-the classes are independent given h1. With couplings, the sweep draws them one after another:
+A sweep draws h1 given v, and then the classes given h1. Without couplings, the classes are
+independent given h1. With couplings, the sweep draws them one after another:
 
     p(v_i = 1 | h1, other classes) = sigmoid(b_i + a_qi + u_qi + Y_ti + W_i·h1 + (vL)_i)
 
@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from training.machines.machine import BoltzmannMachine, sums
+from training.machines.machine import BoltzmannMachine
 
 
 @dataclass
@@ -26,34 +26,14 @@ class Chains:
 
     Attributes:
         v: presence of objects, (chains, classes).
-        h2: states of the second layer, (chains, H2).
         room, source: room type and data source of each chain, (chains,) int64. -1 means none.
         possible: True for classes that a chain may switch on, (chains, classes) bool.
     """
 
     v: Tensor
-    h2: Tensor
     room: Tensor
     source: Tensor
     possible: Tensor
-
-
-@torch.no_grad()
-def start_chains(
-    machine: BoltzmannMachine,
-    v: Tensor,
-    generator: torch.Generator,
-    *,
-    room: Tensor | None = None,
-    source: Tensor | None = None,
-    possible: Tensor | None = None,
-) -> Chains:
-    """Return chains that start at the scenes v, (chains, classes), with h2 drawn given v."""
-    unknown = torch.full((len(v),), -1)
-    room, source = (unknown if index is None else index for index in (room, source))
-    possible = torch.ones(v.shape, dtype=torch.bool) if possible is None else possible
-    _, m2 = machine.context(v, room)
-    return Chains(v * possible, torch.bernoulli(m2, generator=generator), room, source, possible)
 
 
 @torch.no_grad()
@@ -69,10 +49,7 @@ def sweep(
     Args:
         classes: number of random classes that a sweep over coupled classes draws. None means all.
     """
-    x = machine.context_bias(chains.room) + sums(chains.v, machine.W) + chains.h2 @ machine.J.T
-    h1 = draw_states(x, machine.spec.states, generator)
-    if machine.spec.H2:
-        chains.h2 = torch.bernoulli(machine.second_layer_logits(h1).sigmoid(), generator=generator)
+    h1 = draw_states(machine.context(chains.v, chains.room), machine.spec.states, generator)
     bias = machine.scene_bias(chains.source) + machine.room_bias(chains.room)
     field = bias + h1 @ machine.W.T
     couplings = machine.couplings

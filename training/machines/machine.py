@@ -1,19 +1,19 @@
 """The common interface of the machines, and the whole energy except its relation logits.
 
-    E(v,r,h1,h2,t | q) = - (b + a_q + u_q + Y_t)·v - v'Lv/2 - (c1 + Q_t)·h1 - v'W h1 - h1'J h2
-                         - c2·h2 - (e + y_q)_t - sum_e g_e [r_e ℓ_e(v, h1) - log(1 + exp ℓ_e)]
+    E(v, r, h1, t | q) = - (b + a_q + u_q + Y_t)·v - v'Lv/2 - (c1 + Q_t)·h1 - v'W h1
+                         - (e + y_q)_t - sum_e g_e [r_e ℓ_e(v, h1) - log(1 + exp ℓ_e)]
 
-q is the data source of the scene, and t its room type. A hidden unit of the first layer has Z
-states. h1 has one entry for each state but the first: 1 for the state of the unit, else 0. The
-first state has the energy 0. For Z = 2, the units are binary, as in the paper. An unknown room type
-has the weights 0. The last sum runs over the relation units e = (a, i, j). A variant defines its
-relation units, the gate g_e of a unit and the logit ℓ_e. A gate of 0 forces its unit to 0.
+q is the data source of the scene, and t its room type. A hidden unit has Z states. h1 has one entry
+for each state but the first: 1 for the state of the unit, else 0. The first state has the energy 0.
+For Z = 2, the units are binary, as in the paper. An unknown room type has the weights 0. The last
+sum runs over the relation units e = (a, i, j). A variant defines its relation units, the gate g_e
+of a unit and the logit ℓ_e. A gate of 0 forces its unit to 0.
 
 The term log(1 + exp ℓ_e) normalises each relation separately. So the sum over an unobserved
 relation is 1, and relations have no effect on objects and hidden units. The published machine lacks
 this term; `training.seed` has it as published.
 
-Given the objects, the log-odds of an unlisted class i have a closed form (one hidden layer):
+Given the objects, the log-odds of an unlisted class i have a closed form:
 
     log-odds_i = b_i + a_qi + Y_ti + (vL)_i + sum_m log sum_z p_m(z | v, t) exp(W_i[m, z])
 
@@ -22,8 +22,7 @@ with the probabilities p(q | v) = softmax(f + a v). A room type has the probabil
 
     p(t | v) = sum_q p(q | v) softmax_t(e + y_q + Y v + sum_m log sum_z p_m(z | v) exp(Q_t[m, z]))
 
-p_m are the probabilities of the states of unit m, with the logits x = c1 + Q_t + v'W + J m2. With a
-second layer, m2 are its mean-field means given v. They stay the same for v_i = 0 and v_i = 1.
+p_m are the probabilities of the states of unit m, with the logits x = c1 + Q_t + v'W.
 
 Tensor dimensions: "..." stands for samples. They come first, then scenes, then units.
 """
@@ -38,15 +37,15 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from app.inference.variants import MachineSpec
-from app.inference.weights import SHARES, SWEEPS
+from app.inference.weights import SHARES
 from training.machines.edges import Edges, triple_keys
 
-OBJECT_WEIGHTS = ("b", "c1", "c2", "e", "W", "J", "Q", "L", "Y", "f", "a", "y", "kappa")
+OBJECT_WEIGHTS = ("b", "c1", "e", "W", "Q", "L", "Y", "f", "a", "y", "kappa")
 """Names of the weights without relations."""
 
 
 class BoltzmannMachine(nn.Module, ABC):
-    """A Boltzmann machine over objects v, relations r, hidden units h1 and h2, and a room type t.
+    """A Boltzmann machine over objects v, relations r, hidden units h1, and a room type t.
 
     Source: Bozcan, Oymak, Alemdar, Kalkan, "What is (missing or wrong) in the scene?", ICRA 2018.
     """
@@ -60,10 +59,8 @@ class BoltzmannMachine(nn.Module, ABC):
         self.spec = spec
         self.b = nn.Parameter(torch.zeros(spec.V))
         self.c1 = nn.Parameter(torch.zeros(spec.H1))
-        self.c2 = nn.Parameter(torch.zeros(spec.H2))
         self.e = nn.Parameter(torch.zeros(spec.C))
         self.W = nn.Parameter(torch.zeros(spec.V, spec.H1))
-        self.J = nn.Parameter(torch.zeros(spec.H1, spec.H2))
         self.Q = nn.Parameter(torch.zeros(spec.C, spec.H1))
         self.f = nn.Parameter(torch.zeros(spec.profiles))
         self.a = nn.Parameter(torch.zeros(spec.profiles, spec.V))
@@ -113,7 +110,7 @@ class BoltzmannMachine(nn.Module, ABC):
 
     @torch.no_grad()
     def initialise(self, generator: torch.Generator, scale: float = 0.05) -> Self:
-        """Draw W, J and the factors of relations from N(0, scale²). Other weights keep 0."""
+        """Draw W and the factors of relations from N(0, scale²). Other weights keep 0."""
         for name, parameter in self.named_parameters():
             if parameter.dim() > 1 and name not in ("Q", "a", "y", "u", "kappa", "L", "Y"):
                 parameter.copy_(torch.randn(parameter.shape, generator=generator) * scale)
@@ -158,25 +155,9 @@ class BoltzmannMachine(nn.Module, ABC):
         """
         return self.c1 + _rows(self.Q, room)
 
-    def second_layer_logits(self, h1: Tensor) -> Tensor:
-        """Return the logits c2 + h1'J of p(h2 = 1 | h1), (..., scenes, units of h2)."""
-        return self.c2 + h1 @ self.J
-
-    def context(self, v: Tensor, room: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return the logits x of h1, (scenes, H1), and the means of h2, (scenes, H2), given v.
-
-        With two layers, the means of h2 are a mean-field fixed point, differentiable in the
-        weights.
-        """
-        base = self.context_bias(room) + sums(v, self.W)
-        m2 = base.new_zeros(len(base), self.spec.H2)
-        if not self.spec.H2:
-            return base, m2
-        m2 = self.c2.sigmoid().expand(len(base), -1)
-        for _ in range(SWEEPS):
-            m1 = self.state_means(base + m2 @ self.J.T)
-            m2 = self.second_layer_logits(m1).sigmoid()
-        return base + m2 @ self.J.T, m2
+    def context(self, v: Tensor, room: Tensor | None = None) -> Tensor:
+        """Return the logits x = c1 + Q[t] + v'W of h1 given the objects v, (scenes, H1)."""
+        return self.context_bias(room) + sums(v, self.W)
 
     def gain(self, x: Tensor, weights: Tensor) -> Tensor:
         """Return sum_m log sum_z p_m(z) exp(w[m, z]) for each row w of the weights, (scenes, rows).
@@ -225,9 +206,8 @@ class BoltzmannMachine(nn.Module, ABC):
             share: bin of the listed share, (scenes,) int64; see `app.inference.weights.SHARES`. It
                 adds kappa to the log-odds.
         """
-        x, _ = self.context(v, room)
         bias = self.b + self.source_weights(v, source) @ self.a + self.room_bias(room)
-        log_odds = bias + self.gain(x, self.W)
+        log_odds = bias + self.gain(self.context(v, room), self.W)
         couplings = self.couplings
         if couplings is not None:
             log_odds = log_odds + sums(v, couplings)
@@ -252,8 +232,7 @@ class BoltzmannMachine(nn.Module, ABC):
 
         The mean over the sources has the probabilities of `source_weights`.
         """
-        x, _ = self.context(v)
-        logits = self.e + self.gain(x, self.Q)
+        logits = self.e + self.gain(self.context(v), self.Q)
         if self.spec.coupled:
             logits = logits + sums(v, self.Y.T)
         if not self.spec.profiles:
@@ -263,30 +242,15 @@ class BoltzmannMachine(nn.Module, ABC):
         return (weights.log() + by_source).logsumexp(-2)
 
     def free_energy(
-        self,
-        v: Tensor,
-        h2: Tensor | None = None,
-        room: Tensor | None = None,
-        source: Tensor | None = None,
+        self, v: Tensor, room: Tensor | None = None, source: Tensor | None = None
     ) -> Tensor:
-        """Return F = -log sum over h1 and r of exp(-E), (scenes,), in closed form.
-
-        A machine with a second hidden layer needs the state h2, (scenes, H2).
-        """
-        if self.spec.H2 and h2 is None:
-            raise ValueError(
-                "the free energy of a machine with two hidden layers has a closed form only given "
-                "h2: pass h2"
-            )
+        """Return F = -log sum over h1 and r of exp(-E), (scenes,), in closed form."""
         free = -(v * self.scene_bias(source)).sum(-1)
-        x = self.context_bias(room) + sums(v, self.W)
-        if h2 is not None:
-            x, free = x + h2 @ self.J.T, free - h2 @ self.c2
         couplings = self.couplings
         if couplings is not None:
             free = free - 0.5 * (sums(v, couplings) * v).sum(-1)
             free = free - (v * self.room_bias(room)).sum(-1)
-        return free - self.room_rate(room, source) - self.log_states(x)
+        return free - self.room_rate(room, source) - self.log_states(self.context(v, room))
 
     def log_states(self, x: Tensor) -> Tensor:
         """Return the log of the sum over the states of h1 of exp(h1·x), (scenes,)."""
@@ -353,18 +317,16 @@ class BoltzmannMachine(nn.Module, ABC):
         v: Tensor,
         r: Tensor,
         h1: Tensor,
-        h2: Tensor,
         edges: Edges,
         room: Tensor | None = None,
         source: Tensor | None = None,
     ) -> Tensor:
-        """Return the energy E(v, r, h1, h2, t), (scenes,); +inf if a unit with gate 0 is 1.
+        """Return the energy E(v, r, h1, t), (scenes,); +inf if a unit with gate 0 is 1.
 
         The states of h1 are 0 or 1, (scenes, H1). At most one state of each unit is 1.
         """
         context = (h1 * (self.context_bias(room) + v @ self.W)).sum(-1)
-        log_weight = (v * self.scene_bias(source)).sum(-1) + context + h2 @ self.c2
-        log_weight = log_weight + ((h1 @ self.J) * h2).sum(-1)
+        log_weight = (v * self.scene_bias(source)).sum(-1) + context
         couplings = self.couplings
         if couplings is not None:
             log_weight = log_weight + 0.5 * ((v @ couplings) * v).sum(-1)

@@ -131,7 +131,7 @@ def test_independent_classes_have_the_frequencies_of_training():
 
 
 def test_given_classes_stay():
-    artifact = artifact_of(small_machine("triway-deep").float())
+    artifact = artifact_of(small_machine("triway").float())
     given = torch.tensor([[True, False]]).expand(50, -1)
     drawn = machine_sampler(artifact)(given, torch.full((50,), -1), 1)
     assert bool((drawn.v[:, 0] == 1).all())

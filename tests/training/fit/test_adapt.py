@@ -44,7 +44,7 @@ HOME = [[0, 1, 2], [0, 1, 3], [0, 1, 2, 3], [0, 1]] * 6
 
 @pytest.mark.parametrize("variant", ["rbm", "gbm", "triway"])
 def test_the_home_becomes_likelier_and_other_classes_keep_their_weights(variant):
-    parent, home = small(variant, H2=2 if variant == "gbm" else 0), scenes_of(*HOME)
+    parent, home = small(variant), scenes_of(*HOME)
     weights = adapt(parent, home)
     recorded = [0, 1, 2, 3]
     rest = np.setdiff1d(np.arange(V), recorded)
@@ -136,7 +136,7 @@ def test_a_home_without_pairs_or_a_model_without_samples_is_refused():
         adapt(Weights(spec, arrays), scenes_of([0, 1]))
 
 
-@pytest.fixture(scope="module", params=["indoor-rbm", "indoor-gbm", "indoor-triway"])
+@pytest.fixture(scope="module", params=["indoor-rbm", "indoor-triway"])
 def model(request, repository) -> Artifact:
     store = Store(repository / "model_store")
     return store.load(*store.resolve(request.param))

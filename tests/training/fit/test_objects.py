@@ -30,9 +30,7 @@ SPECS = {
     "coupled": MachineSpec(
         "triway", V=V, A=1, units=2, states=3, C=2, K=1, profiles=2, coupled=True
     ),
-    "two layers": MachineSpec("gbm", V=V, A=1, units=2, states=3, H2=2, C=2, profiles=2),
 }
-ONE_LAYER = ("binary", "coupled")
 
 
 def machine_of(name, scale=0.05, seed=0, **changes):
@@ -42,13 +40,13 @@ def machine_of(name, scale=0.05, seed=0, **changes):
 
 
 def log_sum(machine, v, room=-1, source=-1):
-    """log sum of exp(-E) over h1 and h2 of each row of v, without relations; differentiable."""
-    h1, h2 = unit_states(machine.spec).to(v.dtype), binary(machine.spec.H2).to(v.dtype)
-    index = torch.cartesian_prod(*map(torch.arange, (len(v), len(h1), len(h2)))).T
-    v, h1, h2 = (block[k] for block, k in zip((v, h1, h2), index, strict=True))
+    """log sum of exp(-E) over h1 of each row of v, without relations; differentiable."""
+    h1 = unit_states(machine.spec).to(v.dtype)
+    index = torch.cartesian_prod(*map(torch.arange, (len(v), len(h1)))).T
+    v, h1 = (block[k] for block, k in zip((v, h1), index, strict=True))
     edges, r = machine.edges(torch.zeros(1, 0, dtype=torch.int64)), v[:, :0]
     conditions = (torch.full((len(v),), k) for k in (room, source))
-    energy = machine.energy(v, r, h1, h2, edges, *conditions)
+    energy = machine.energy(v, r, h1, edges, *conditions)
     return (-energy).view(int(index[0].max()) + 1, -1).logsumexp(1)
 
 
@@ -190,7 +188,7 @@ def masked_loss(machine, scenes, parts, index, listed_room):
     return total / len(index)
 
 
-@pytest.mark.parametrize("name", ONE_LAYER)
+@pytest.mark.parametrize("name", SPECS)
 def test_the_masked_loss_and_its_gradient(name, monkeypatch):
     """Equal to a formula of its own, with the weights of hidden classes and partial labels.
 
@@ -242,7 +240,7 @@ KINDS = [(-1, 0), (-1, 1), (1, 0), (0, 1)]
 """Room types and sources of chains."""
 
 
-@pytest.mark.parametrize("name", ONE_LAYER)
+@pytest.mark.parametrize("name", SPECS)
 def test_the_generative_gradient_is_that_of_the_likelihood(name):
     """-log p(v | room type, source) of the classes that a source shows.
 
@@ -263,9 +261,8 @@ def test_the_generative_gradient_is_that_of_the_likelihood(name):
         exact = exact - log_q[(possible == v).all(1)][0] / len(KINDS)
     room, source = torch.tensor(KINDS).T
     many = source.repeat_interleave(count)
-    nothing = torch.zeros(len(many), 0).double()
     rooms = room.repeat_interleave(count)
-    chains = Chains(torch.cat(drawn), nothing, rooms, many, PARTIAL[many])
+    chains = Chains(torch.cat(drawn), rooms, many, PARTIAL[many])
     names = [n for n in ("b", "c1", "W", "Q", "L", "a", "e") if hasattr(machine, n)]
     weights = [machine.get_parameter(n) for n in names]
     found = torch.autograd.grad(fit._generative_loss(chains, data, room, source), weights)
@@ -310,7 +307,7 @@ TARGET = torch.where(EVERY.sum(1) >= 2, TARGET, 0) / TARGET[EVERY.sum(1) >= 2].s
 """Two contexts, in scenes of at least two classes."""
 
 
-@pytest.mark.parametrize("name", ONE_LAYER)
+@pytest.mark.parametrize("name", SPECS)
 def test_the_generative_share_brings_samples_near_the_scenes(name):
     """By the divergence of the enumerated p(v) from the scenes, in nats."""
 

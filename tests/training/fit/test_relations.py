@@ -77,7 +77,7 @@ def trained(machine, scenes, **changes):
 
 def of_whole_scenes(machine, batch, generator):
     with torch.no_grad():
-        return machine.state_means(machine.context(batch.v)[0])
+        return machine.state_means(machine.context(batch.v))
 
 
 def logit_of(machine, a, i, j):

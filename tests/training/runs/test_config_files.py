@@ -43,8 +43,6 @@ def small(variant="triway", rooms=10, **machine):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        (small("gbm", H2=4, coupled=True), "machine.coupled must be false"),
-        (small("rbm", H2=4), "machine.H2 must be 0"),
         (small("rbm", G=2), "machine.G is defined for the Triway only"),
         (small("rbm", without=["S"]), "a rbm has no weights S"),
         (small(rooms=0), "data.rooms must be at least 1"),
