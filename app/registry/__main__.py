@@ -49,7 +49,7 @@ def _existing(root: str) -> Store:
 
 def _point(store: Store, alias: str, target: AliasTarget, expected: str | None) -> None:
     """Point an alias at a usable version; see `Store.set_alias`."""
-    load_model_set(store).resolve(str(target))
+    load_model_set(store, release=Store(DEFAULT_STORE)).resolve(str(target))
     before = store.aliases().get(alias)
     condition = before if expected is None else _target(expected)
     store.set_alias(alias, target, expected=condition)
@@ -132,7 +132,7 @@ def _is_upgrade(old: AliasTarget, new: AliasTarget, added: set[tuple[str, str]])
 
 
 def _list(store: Store) -> None:
-    models = load_model_set(store)
+    models = load_model_set(store, release=Store(DEFAULT_STORE))
     for name, version in models.entries:
         failure = models.failures.get((name, version))
         state = "" if failure is None else f"  refused: {failure.code}: {failure.reason}"

@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
@@ -113,8 +112,8 @@ def load_model_set(
 
     Args:
         check: further check of each new artifact. It raises `ArtifactError`.
-        release: store with the models of this release. If the store itself does not have the
-            default model of the release and an alias needs it, the result also contains this model.
+        release: store with the models of this release. It states which models it replaces; without
+            it, the store itself does.
     """
     failure: StoreError | None = None
     aliases: Mapping[str, AliasTarget]
@@ -137,13 +136,30 @@ def load_model_set(
     statements = (_statement(source) for source in (release, store) if source is not None)
     shipped = next((statement for statement in statements if statement != NOTHING), NOTHING)
     entries = {key: _load(store, *key, previous.artifacts.get(key), check, shipped) for key in keys}
-    models = ModelSet(MappingProxyType(entries), MappingProxyType(dict(aliases)), failure, shipped)
-    if release is not None and any(map(models.is_outdated, aliases)):
-        with suppress(StoreError):
-            if (key := release.resolve(str(shipped.default or ""))) not in entries:
-                new = _load(release, *key, previous.artifacts.get(key), check, shipped)
-                return replace(models, entries=MappingProxyType({**entries, key: new}))
-    return models
+    return ModelSet(MappingProxyType(entries), MappingProxyType(dict(aliases)), failure, shipped)
+
+
+def with_default(
+    models: ModelSet,
+    release: Store,
+    previous: ModelSet = EMPTY,
+    check: Callable[[Artifact], None] = lambda _: None,
+) -> ModelSet:
+    """Add the default model of the release, if an alias needs it and the store does not have it.
+
+    An alias needs the model if it points at a model that only earlier releases could load. See
+    `load_model_set` for the arguments.
+    """
+    if models.shipped.default is None or not any(map(models.is_outdated, models.aliases)):
+        return models
+    try:
+        key = release.resolve(str(models.shipped.default))
+    except StoreError:  # the release has no models
+        return models
+    if key in models.entries:
+        return models
+    new = _load(release, *key, previous.artifacts.get(key), check, models.shipped)
+    return replace(models, entries=MappingProxyType({**models.entries, key: new}))
 
 
 def _statement(store: Store) -> Shipped:

@@ -13,6 +13,7 @@ from app.compiling import check_cache, progress
 from app.inference.kernels import KERNELS
 from app.questions.reading import Limits
 from app.registry import DEFAULT_STORE, Store, StoreState, load_model_set
+from app.registry.model_set import with_default
 from app.serving.admission import Admission, Bodies
 from app.serving.metrics import Metrics, Outcome
 from app.serving.models import DEFAULT, NO_MODELS, ServedModels, warm_up
@@ -132,7 +133,8 @@ class Runtime:
         self._loaded_state = self._store.state()
         with progress(KERNELS):
             previous = self.models.store
-            return ServedModels(load_model_set(self._store, previous, warm_up, self._release))
+            models = load_model_set(self._store, previous, warm_up, self._release)
+            return ServedModels(with_default(models, self._release, previous, warm_up))
 
 
 def _log_failures(prefix: str, failures: Iterable[Failure]) -> None:
