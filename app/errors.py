@@ -202,6 +202,16 @@ class UnknownModelError(ServiceError, slug="model-not-found", status=404, steps=
     """
 
 
+class ModelReplacedError(RequestError, slug="model-replaced", status=404, steps=("name",)):
+    """Another model replaces this model.
+
+    The model belongs to an earlier release. `errors` suggests the new model of this release. Read
+    its terms of use and its vocabulary before you change the name in your requests.
+    """
+
+    example = _example("#/model", "places-triway replaces this model", "places-triway")
+
+
 class MethodNotAllowedError(ServiceError, slug="method-not-allowed", status=405, steps=("http",)):
     """This route does not accept this method.
 
@@ -342,7 +352,8 @@ class NotReadyError(ServiceError, slug="not-ready", status=503, steps=("models",
 class ModelUnavailableError(ServiceError, slug="model-unavailable", status=503, steps=("model",)):
     """This model is not usable.
 
-    The version is in the store, but the service refused to load it. GET /models gives the reason.
+    The version is in the store, but the service refused to load it. `detail` and GET /models give
+    the reason.
     """
 
 

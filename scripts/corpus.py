@@ -432,7 +432,7 @@ def record(url: str, file: Path) -> int:
 def lost_model(old: Json, new: Json) -> bool:
     """Return True if the recorded service had the model of a request, and this one lacks it."""
     kind = str(new.get("json", {}).get("type", "")) if new["status"] == 404 else ""
-    return old["status"] != 404 and kind.endswith("/model-not-found")
+    return old["status"] != 404 and kind.endswith(("/model-not-found", "/model-replaced"))
 
 
 def compare(url: str, file: Path) -> int:

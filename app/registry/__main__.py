@@ -49,7 +49,7 @@ def _existing(root: str) -> Store:
 
 def _point(store: Store, alias: str, target: AliasTarget, expected: str | None) -> None:
     """Point an alias at a usable version; see `Store.set_alias`."""
-    load_model_set(store).resolve(str(target))
+    load_model_set(store, release=Store(DEFAULT_STORE)).resolve(str(target))
     before = store.aliases().get(alias)
     condition = before if expected is None else _target(expected)
     store.set_alias(alias, target, expected=condition)
@@ -80,12 +80,48 @@ def _copy(
     present = target.aliases()
     for alias, new in aliases.items():
         old = present.get(alias)
-        if old is None or _is_upgrade(old, new, added):
+        if replacement := old and _replacement(old, new, source, target, added):
+            new = replacement
+        if old is None or replacement or _is_upgrade(old, new, added):
             target.set_alias(alias, new, expected=old)
             _print(f"alias '{alias}' points at {new}" + (f", before at {old}" if old else ""))
         elif old != new:
             _print(f"alias '{alias}' still points at {old}, not at {new}")
+        if replacement:
+            terms = target.load(*target.resolve(str(new))).manifest.terms
+            _print(f"{new} replaces {old}. Its terms of use: {' '.join(terms.split())}")
     return status
+
+
+def _replacement(
+    old: AliasTarget,
+    new: AliasTarget,
+    source: Store,
+    target: Store,
+    added: set[tuple[str, str]],
+) -> AliasTarget | None:
+    """Return the target that replaces a shipped model of an earlier release, if an alias moves.
+
+    An alias of an own version stays. An alias that somebody moved back stays as long as this
+    release can load the old model.
+    """
+    versions = target.versions(old.name) if old.version is None else (old.version,)
+    shipped = source.shipped()
+    names = {shipped.replacement(old.name, v, target.digest(old.name, v)) for v in versions}
+    if len(names) != 1 or (name := names.pop()) is None:
+        return None
+    if new.name != name:
+        new = AliasTarget(name=name, version=source.resolve(name)[1])
+    is_new = (new.name, new.version) in added
+    return new if is_new or not _is_usable(target, old.name, versions[-1]) else None
+
+
+def _is_usable(store: Store, name: str, version: str) -> bool:
+    try:
+        store.load(name, version)
+    except RegistryError:
+        return False
+    return True
 
 
 def _is_upgrade(old: AliasTarget, new: AliasTarget, added: set[tuple[str, str]]) -> bool:
@@ -96,7 +132,7 @@ def _is_upgrade(old: AliasTarget, new: AliasTarget, added: set[tuple[str, str]])
 
 
 def _list(store: Store) -> None:
-    models = load_model_set(store)
+    models = load_model_set(store, release=Store(DEFAULT_STORE))
     for name, version in models.entries:
         failure = models.failures.get((name, version))
         state = "" if failure is None else f"  refused: {failure.code}: {failure.reason}"
@@ -133,7 +169,8 @@ def _parser() -> argparse.ArgumentParser:
         "copy",
         help="copy a version, or all versions and aliases, from another store",
         description="Without a model, copy all versions, add missing aliases, and move an alias "
-        "from an older version of a model to a copied version. Other aliases stay.",
+        "from an older version of a model to a copied version, or from a shipped model of an "
+        "earlier release to the model that replaces it. Other aliases stay.",
     )
     copy.add_argument("reference", nargs="?", metavar="NAME[@VERSION]", help="default: all")
     copy.add_argument("--from", dest="source", metavar="STORE", required=True, help="folder")

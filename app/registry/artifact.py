@@ -224,6 +224,14 @@ def load_artifact(
     )
 
 
+def manifest_digest(directory: Path) -> str | None:
+    """Return the digest of an artifact of any format, or None if its manifest cannot be read."""
+    try:
+        return _digest(read_file(directory / MANIFEST, MAX_MANIFEST_BYTES))
+    except OSError:
+        return None
+
+
 def _digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 

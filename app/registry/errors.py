@@ -1,17 +1,24 @@
 """Errors of the registry. Each error has a machine-readable code and a reason for people."""
 
 import errno
-from typing import Literal
+from typing import Final, Literal
 
 Code = Literal[
     # of an artifact
     "missing_file", "unexpected_file", "unreadable", "too_large", "truncated", "checksum_mismatch",
-    "unknown_format", "invalid_manifest", "not_safetensors", "wrong_shape", "not_finite",
-    "invalid_tensor", "unsupported", "wrong_place", "unexpected_error", "warm_up_failed",
+    "outdated_format", "unknown_format", "invalid_manifest", "not_safetensors", "wrong_shape",
+    "not_finite", "invalid_tensor", "unsupported", "wrong_place", "unexpected_error",
+    "warm_up_failed",
+    # of an artifact or of a reference
+    "replaced_model",
     # of a store; its folders may be "unreadable" too
     "invalid_reference", "unknown_model", "unknown_version", "dangling_alias", "invalid_aliases",
     "version_exists", "name_conflict", "alias_conflict", "unsafe_path", "not_writable", "locked",
 ]  # fmt: skip
+
+
+OUTDATED: Final[frozenset[Code]] = frozenset({"outdated_format", "replaced_model"})
+"""Codes of models that an earlier release could load."""
 
 
 class RegistryError(Exception):

@@ -10,7 +10,7 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import Field, ValidationError, field_validator
 
@@ -77,8 +77,8 @@ class Manifest(Description):
         """Parse the contents of a manifest file.
 
         Raises:
-            ArtifactError: with code `truncated`, `checksum_mismatch`, `unknown_format` or
-                `invalid_manifest`.
+            ArtifactError: with code `truncated`, `checksum_mismatch`, `outdated_format`,
+                `unknown_format` or `invalid_manifest`.
         """
         trailer = _TRAILER.search(data)
         if trailer and hashlib.sha256(data[: trailer.start()]).hexdigest().encode() != trailer[1]:
@@ -91,7 +91,11 @@ class Manifest(Description):
             raise _refused("truncated", "is truncated or not JSON") from None
         if not isinstance(members, dict):
             raise _refused("invalid_manifest", "is not a JSON object")
-        if type(version := members.get("format")) is not int or version != FORMAT:
+        if type(version := members.get("format")) is int and 0 < version < FORMAT:
+            again = _advice(members)
+            reason = f"has format {version}, but this release reads format {FORMAT}: {again}"
+            raise _refused("outdated_format", reason)
+        if type(version) is not int or version != FORMAT:
             advice = "the only format of this release; train or publish the model again"
             raise _refused("unknown_format", f"does not have format {FORMAT}, {advice}")
         if not trailer:
@@ -102,6 +106,14 @@ class Manifest(Description):
         except ValidationError as error:
             reason = f"has an invalid field: {first_error(error)}"
             raise _refused("invalid_manifest", reason) from None
+
+
+def _advice(members: Mapping[str, Any]) -> str:
+    """Return how to make a model of an older format again."""
+    training = members.get("training")
+    if isinstance(training, dict) and "parent" in training:
+        return "adapt the model to its home again (python -m training adapt)"
+    return "train the model again (python -m training train)"
 
 
 def _refused(code: Code, reason: str) -> ArtifactError:

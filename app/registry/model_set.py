@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
 from operator import itemgetter
@@ -10,8 +10,14 @@ from types import MappingProxyType
 from typing import Final
 
 from app.registry.artifact import Artifact
-from app.registry.errors import ArtifactError, StoreError
-from app.registry.references import AliasTarget, resolve_reference, version_key
+from app.registry.errors import OUTDATED, ArtifactError, StoreError
+from app.registry.references import (
+    NOTHING,
+    AliasTarget,
+    Shipped,
+    resolve_reference,
+    version_key,
+)
 from app.registry.store import Store
 
 _logger = logging.getLogger("app.registry")
@@ -27,6 +33,7 @@ class ModelSet:
         aliases: maps each alias to its target.
         failure: reason why the store or its aliases could not be read. None means that they could
             be read.
+        shipped: what the release states about its shipped models.
 
     The errors were never raised, so they keep no stack frames or weights in memory.
     """
@@ -34,6 +41,7 @@ class ModelSet:
     entries: Mapping[tuple[str, str], Artifact | ArtifactError]
     aliases: Mapping[str, AliasTarget]
     failure: StoreError | None = None
+    shipped: Shipped = NOTHING
 
     @cached_property
     def versions(self) -> Mapping[str, tuple[str, ...]]:
@@ -63,15 +71,25 @@ class ModelSet:
                 not be read.
         """
         try:
-            key = resolve_reference(reference, self.aliases, self._by_preference)
+            names = self.shipped.names
+            key = resolve_reference(reference, self.aliases, self._by_preference, names)
         except StoreError as error:
-            if self.failure is not None and error.code == "unknown_model":
+            is_absent = error.code in ("unknown_model", "replaced_model")
+            if self.failure is not None and is_absent:
                 raise StoreError(self.failure.code, self.failure.reason) from None
             raise
         entry = self.entries[key]
         if isinstance(entry, ArtifactError):
             raise ArtifactError(entry.code, f"{'@'.join(key)}: {entry.reason}")
         return entry
+
+    def is_outdated(self, alias: str) -> bool:
+        """Return whether an alias points at a model that only earlier releases could load."""
+        try:
+            self.resolve(alias)
+        except (ArtifactError, StoreError) as error:
+            return error.code in OUTDATED
+        return False
 
     def _by_preference(self, name: str) -> list[str]:
         """Return the versions of a model in ascending order, unusable versions first."""
@@ -86,6 +104,7 @@ def load_model_set(
     store: Store,
     previous: ModelSet = EMPTY,
     check: Callable[[Artifact], None] = lambda _: None,
+    release: Store | None = None,
 ) -> ModelSet:
     """Load and verify every version of a store. The result contains all errors.
 
@@ -93,6 +112,8 @@ def load_model_set(
 
     Args:
         check: further check of each new artifact. It raises `ArtifactError`.
+        release: store with the models of this release. It states which models it replaces; without
+            it, the store itself does.
     """
     failure: StoreError | None = None
     aliases: Mapping[str, AliasTarget]
@@ -112,8 +133,40 @@ def load_model_set(
             keys += [(name, version) for version in store.versions(name)]
         except StoreError as error:  # only this model's folder is unreadable
             failure = StoreError(error.code, error.reason)
-    entries = {key: _load(store, *key, previous.artifacts.get(key), check) for key in keys}
-    return ModelSet(MappingProxyType(entries), MappingProxyType(dict(aliases)), failure)
+    statements = (_statement(source) for source in (release, store) if source is not None)
+    shipped = next((statement for statement in statements if statement != NOTHING), NOTHING)
+    entries = {key: _load(store, *key, previous.artifacts.get(key), check, shipped) for key in keys}
+    return ModelSet(MappingProxyType(entries), MappingProxyType(dict(aliases)), failure, shipped)
+
+
+def with_default(
+    models: ModelSet,
+    release: Store,
+    previous: ModelSet = EMPTY,
+    check: Callable[[Artifact], None] = lambda _: None,
+) -> ModelSet:
+    """Add the default model of the release, if an alias needs it and the store does not have it.
+
+    An alias needs the model if it points at a model that only earlier releases could load. See
+    `load_model_set` for the arguments.
+    """
+    if models.shipped.default is None or not any(map(models.is_outdated, models.aliases)):
+        return models
+    try:
+        key = release.resolve(str(models.shipped.default))
+    except StoreError:  # the release has no models
+        return models
+    if key in models.entries:
+        return models
+    new = _load(release, *key, previous.artifacts.get(key), check, models.shipped)
+    return replace(models, entries=MappingProxyType({**models.entries, key: new}))
+
+
+def _statement(store: Store) -> Shipped:
+    try:
+        return store.shipped()
+    except StoreError:  # `load_model_set` reports the error of the store itself
+        return NOTHING
 
 
 def _load(
@@ -122,6 +175,7 @@ def _load(
     version: str,
     previous: Artifact | None,
     check: Callable[[Artifact], None],
+    shipped: Shipped,
 ) -> Artifact | ArtifactError:
     try:
         artifact = store.load(name, version, previous)
@@ -129,6 +183,11 @@ def _load(
             check(artifact)
         return artifact
     except ArtifactError as error:
+        if error.code == "outdated_format":
+            new = shipped.replacement(name, version, store.digest(name, version))
+            if new is not None:
+                reason = f"'{new}' replaces this version, whose format is too old for this release"
+                return ArtifactError("replaced_model", reason)
         return ArtifactError(error.code, error.reason)
     except StoreError as error:  # for example, the version was removed after it was listed
         return ArtifactError("missing_file", error.reason)

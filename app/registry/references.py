@@ -4,20 +4,25 @@ A reference is an alias, `name` (the newest usable version of the model) or `nam
 valid name is also a safe file name, because it is in lower case, without path separators or dots.
 
 The table of aliases is a small JSON file that maps each alias to a model version. Each change of an
-alias replaces the whole file. Format of the file:
+alias replaces the whole file. The table of the shipped store also states the default of the release
+and which models of earlier releases it replaces. Format of the file, with `_shipped` optional:
 
-    {"default": {"name": "...", "version": "..." or null for the newest usable version}}
+    {"default": {"name": "...", "version": "..." or null for the newest usable version},
+     "_shipped": {"default": {"name": "...", "version": "..."},
+                  "replaced": {"OLD": {"by": "NEW", "digests": {"VERSION": "..."}}}}}
 """
 
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Final, NamedTuple, Self
+from types import MappingProxyType
+from typing import Annotated, Any, Final, NamedTuple, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from app.registry.durable import read_file
-from app.registry.errors import StoreError, cause
+from app.registry.errors import OUTDATED, StoreError, cause
+from app.registry.fields import Sha256
 
 MAX_ALIASES_BYTES: Final = 256 * 2**10
 
@@ -76,7 +81,60 @@ class AliasTarget(BaseModel):
         return self.name if self.version is None else f"{self.name}@{self.version}"
 
 
-_TABLE: Final = TypeAdapter(dict[ModelName, AliasTarget])
+class Replacement(BaseModel):
+    """What replaces a shipped model of an earlier release.
+
+    Attributes:
+        by: name of the new model.
+        digests: digest of each replaced version. Other versions of the name are not shipped ones.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    by: ModelName
+    digests: dict[Version, Sha256] = {}
+
+
+class Shipped(BaseModel):
+    """What a release states about its shipped models.
+
+    Attributes:
+        default: the version that answers instead of an outdated own model; None in stores without
+            a statement.
+        replaced: maps the name of each replaced model to its replacement.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    default: AliasTarget | None = None
+    replaced: dict[ModelName, Replacement] = {}
+
+    @property
+    def names(self) -> dict[str, str]:
+        """Maps the name of each replaced model to the name of the new model."""
+        return {old: replacement.by for old, replacement in self.replaced.items()}
+
+    def replacement(self, name: str, version: str, digest: str | None) -> str | None:
+        """Return the name of the model that replaces a version, or None for any other version."""
+        if (entry := self.replaced.get(name)) is None or digest is None:
+            return None
+        return entry.by if entry.digests.get(version) == digest else None
+
+
+NOTHING: Final = Shipped()
+"""The statement of a store that is not a shipped one."""
+
+
+class AliasTable(NamedTuple):
+    """The contents of the file: the target of each alias, and the statement of the release."""
+
+    aliases: dict[str, AliasTarget]
+    shipped: Shipped = NOTHING
+
+
+_SHIPPED: Final = "_shipped"  # never an alias, because names start with a-z or 0-9
+_MEMBERS: Final = TypeAdapter(dict[str, Any])
+_ALIASES: Final = TypeAdapter(dict[ModelName, AliasTarget])
 
 
 def version_key(version: str) -> tuple[int, ...]:
@@ -85,33 +143,46 @@ def version_key(version: str) -> tuple[int, ...]:
 
 
 def resolve_reference(
-    reference: str, aliases: Mapping[str, AliasTarget], versions: Callable[[str], Sequence[str]]
+    reference: str,
+    aliases: Mapping[str, AliasTarget],
+    versions: Callable[[str], Sequence[str]],
+    replaced: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[str, str]:
     """Return the (name, version) that an alias, `name` or `name@version` points at.
 
     Args:
         aliases: the target of each alias. An alias takes precedence over a model of its name.
         versions: returns the versions of a known model. Without a version, the last one is meant.
+        replaced: maps the names of replaced models to those of the new models.
 
     Raises:
-        StoreError: `invalid_reference`, `unknown_model`, `unknown_version`, or `dangling_alias` if
-            the target of an alias does not exist.
+        StoreError: `invalid_reference`, `unknown_model`, `replaced_model`, `unknown_version`, or
+            `dangling_alias` if the target of an alias does not exist and is not replaced.
     """
+
+    def pick(target: AliasTarget) -> tuple[str, str]:
+        return _pick(target, versions, replaced)
+
     name, at, version = reference.partition("@")
     NAME.check(name, "model name")
     if at:
-        return _pick(AliasTarget(name=name, version=VERSION.check(version, "version")), versions)
+        return pick(AliasTarget(name=name, version=VERSION.check(version, "version")))
     if (target := aliases.get(name)) is None:
-        return _pick(AliasTarget(name=name), versions)
+        return pick(AliasTarget(name=name))
     try:
-        return _pick(target, versions)
+        return pick(target)
     except StoreError as error:
         reason = f"the target of alias '{name}' does not exist: {error.reason}"
-        raise StoreError("dangling_alias", reason) from None
+        code = error.code if error.code in OUTDATED else "dangling_alias"
+        raise StoreError(code, reason) from None
 
 
-def _pick(target: AliasTarget, versions: Callable[[str], Sequence[str]]) -> tuple[str, str]:
+def _pick(
+    target: AliasTarget, versions: Callable[[str], Sequence[str]], replaced: Mapping[str, str]
+) -> tuple[str, str]:
     if not (published := versions(target.name)):
+        if (new := replaced.get(target.name)) is not None:
+            raise StoreError("replaced_model", f"'{new}' replaces the model '{target.name}'")
         raise StoreError("unknown_model", f"no model or alias has the name '{target.name}'")
     if target.version is None:
         return target.name, published[-1]
@@ -121,8 +192,8 @@ def _pick(target: AliasTarget, versions: Callable[[str], Sequence[str]]) -> tupl
     return target.name, target.version
 
 
-def read_aliases(path: Path) -> dict[str, AliasTarget]:
-    """Return the target of each alias. The result is empty if the file does not exist.
+def read_table(path: Path) -> AliasTable:
+    """Return the contents of the file. The table is empty if the file does not exist.
 
     Raises:
         StoreError: `invalid_aliases` if the file is not a valid table of aliases.
@@ -132,9 +203,11 @@ def read_aliases(path: Path) -> dict[str, AliasTarget]:
         if len(text) > MAX_ALIASES_BYTES:
             reason = f"{path.name} has more than the maximum of {MAX_ALIASES_BYTES} bytes"
             raise StoreError("invalid_aliases", reason)
-        return _TABLE.validate_json(text)
+        members = _MEMBERS.validate_json(text)
+        shipped = Shipped.model_validate(members.pop(_SHIPPED, {}))
+        return AliasTable(_ALIASES.validate_python(members), shipped)
     except FileNotFoundError:
-        return {}
+        return AliasTable({})
     except OSError as error:
         raise StoreError("invalid_aliases", f"{path.name} cannot be read: {cause(error)}") from None
     except ValidationError as error:
@@ -143,13 +216,16 @@ def read_aliases(path: Path) -> dict[str, AliasTarget]:
         raise StoreError("invalid_aliases", reason) from None
 
 
-def aliases_to_bytes(aliases: Mapping[str, AliasTarget]) -> bytes:
+def aliases_to_bytes(aliases: Mapping[str, AliasTarget], shipped: Shipped = NOTHING) -> bytes:
     """Return the contents of the file for a table of aliases.
 
     Raises:
-        StoreError: `not_writable` if `read_aliases` would refuse the size of the file.
+        StoreError: `not_writable` if `read_table` would refuse the size of the file.
     """
-    text = _TABLE.dump_json(dict(sorted(aliases.items())), indent=2) + b"\n"
+    members: dict[str, BaseModel] = dict(sorted(aliases.items()))
+    if shipped != NOTHING:
+        members[_SHIPPED] = shipped
+    text = _MEMBERS.dump_json(members, indent=2) + b"\n"
     if len(text) > MAX_ALIASES_BYTES:
         limit = f"the maximum of {MAX_ALIASES_BYTES} bytes; remove an alias first"
         raise StoreError("not_writable", f"the table of aliases would have more than {limit}")

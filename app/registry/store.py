@@ -25,6 +25,7 @@ from app.registry.artifact import (
     Artifact,
     copy_artifact,
     load_artifact,
+    manifest_digest,
     write_artifact,
 )
 from app.registry.description import Description
@@ -35,8 +36,9 @@ from app.registry.references import (
     NAME,
     VERSION,
     AliasTarget,
+    Shipped,
     aliases_to_bytes,
-    read_aliases,
+    read_table,
     resolve_reference,
     version_key,
 )
@@ -108,7 +110,22 @@ class Store:
         Raises:
             StoreError: `invalid_aliases`.
         """
-        return MappingProxyType(read_aliases(self.root / ALIASES))
+        return MappingProxyType(read_table(self.root / ALIASES).aliases)
+
+    def shipped(self) -> Shipped:
+        """Return what the store states about shipped models; `NOTHING` without a statement.
+
+        Raises:
+            StoreError: `invalid_aliases`.
+        """
+        return read_table(self.root / ALIASES).shipped
+
+    def digest(self, name: str, version: str) -> str | None:
+        """Return the digest of a version of any format, or None if it cannot be read.
+
+        The files are not verified.
+        """
+        return manifest_digest(self.root / NAME.check(name, "model name") / version)
 
     def resolve(self, reference: str) -> tuple[str, str]:
         """Return the (name, version) that an alias, `name` or `name@version` points at.
@@ -117,7 +134,8 @@ class Store:
             StoreError: see `resolve_reference`; also `invalid_aliases` or `unreadable`.
         """
         self.names()  # without a readable root, no name is unknown
-        return resolve_reference(reference, self.aliases(), self.versions)
+        replaced = self.shipped().names
+        return resolve_reference(reference, self.aliases(), self.versions, replaced)
 
     def load(self, name: str, version: str, previous: Artifact | None = None) -> Artifact:
         """Load and verify one version; see `load_artifact`.
@@ -275,7 +293,8 @@ class Store:
             self._write_table(table)
 
     def _write_table(self, aliases: Mapping[str, AliasTarget]) -> None:
-        replace_file(self.root / ALIASES, aliases_to_bytes(aliases), prefix=TEMPORARY)
+        text = aliases_to_bytes(aliases, self.shipped())
+        replace_file(self.root / ALIASES, text, prefix=TEMPORARY)
 
     @contextmanager
     def _writing(self) -> Iterator[None]:

@@ -45,10 +45,12 @@ class ServedModels:
         """Return the model that an alias, `name` or `name@version` points at.
 
         If the target of the alias `default` is not usable, this alias points at the newest usable
-        version of the target's model.
+        version of the target's model. If only earlier releases could load the target of an alias,
+        the alias points at the default model of the release.
 
         Raises:
             UnknownModelError: the alias, model or version does not exist.
+            ModelReplacedError: the release has another model instead.
             ModelUnavailableError: the service refused the version, or the store lacks the target of
                 the alias.
             NotReadyError: the default model is not usable.
@@ -60,21 +62,30 @@ class ServedModels:
         except (StoreError, ArtifactError) as error:
             if reference == DEFAULT:
                 raise errors.NotReadyError("The default model is not usable.") from None
+            name = reference.partition("@")[0]
+            if error.code == "replaced_model" and name in self.store.shipped.replaced:
+                raise self._replaced(name) from None
             if isinstance(error, StoreError) and error.code in _UNKNOWN:
                 raise self.unknown(reference) from None
-            raise errors.ModelUnavailableError("The service refused to load this model.") from None
+            detail = f"The service refused to load this model: {error.reason}."
+            raise errors.ModelUnavailableError(detail) from None
         return model
 
     def _find(self, reference: str) -> Artifact:
         try:
             return self.store.resolve(reference)
         except (StoreError, ArtifactError):
-            target = self.store.aliases.get(DEFAULT)
-            if reference != DEFAULT or target is None:
+            target, default = self.store.aliases.get(reference), self.store.shipped.default
+            if target is None:
                 raise
-            return self.store.resolve(target.name)
+            if reference == DEFAULT:
+                with suppress(StoreError, ArtifactError):
+                    return self.store.resolve(target.name)
+            if default is None or not self.store.is_outdated(reference):
+                raise
+            return self.store.resolve(str(default))
 
-    def unknown(self, reference: str) -> errors.UnknownModelError:
+    def unknown(self, reference: str) -> errors.ServiceError:
         """Return the error for a reference to nothing. The error lists the known names."""
         name = reference.partition("@")[0]
         target = self.store.aliases.get(name)
@@ -83,12 +94,20 @@ class ServedModels:
             return errors.UnknownModelError(
                 f"This model has no such version. Its versions: {errors.some_of(versions)}."
             )
+        if name in self.store.shipped.replaced:
+            return self._replaced(name)
         similar = spelt_alike(name, sorted({*self.store.aliases, *self.store.versions}))
         hint = f" Similar names: {', '.join(similar)}." if similar else ""
         aliases, models = errors.some_of(self.store.aliases), errors.some_of(self.store.versions)
         return errors.UnknownModelError(
             f"No model or alias has this name.{hint} Aliases: {aliases}. Models: {models}."
         )
+
+    def _replaced(self, name: str) -> errors.ModelReplacedError:
+        new = self.store.shipped.replaced[name].by
+        located = errors.LocatedError(("model",), f"{new} replaces this model", (new,))
+        detail = f"The model {new} replaces the model {name}. GET /models lists all models."
+        return errors.ModelReplacedError([located], detail=detail)
 
     @cached_property
     def _resolved(self) -> dict[str, Artifact]:
@@ -130,21 +149,23 @@ class ServedModels:
 
     @cached_property
     def failures(self) -> Mapping[str, Failure]:
-        """Maps each unusable entry (``name@version``, an alias or "store") to its failure."""
-        causes: dict[str, ArtifactError | StoreError] = {
-            "@".join(key): failure for key, failure in self.store.failures.items()
-        }
+        """Maps each unusable entry (an alias, "store" or ``name@version``) to its failure.
+
+        Versions come last, because readiness checks list only the first failures.
+        """
+        causes: dict[str, ArtifactError | StoreError] = {}
         for alias in sorted({DEFAULT, *self.store.aliases}):
             try:
                 self.store.resolve(alias)
             except (StoreError, ArtifactError) as error:
                 causes[alias] = error
+                with suppress(errors.ServiceError):
+                    instead = "@".join(self.resolve(alias).key)
+                    reason = f"{error.reason}; {instead} answers instead"
+                    causes[alias] = type(error)(error.code, reason)
         if self.store.failure is not None:
             causes["store"] = self.store.failure
-        if DEFAULT in causes and self.is_ready:
-            instead = "@".join(self.resolve(DEFAULT).key)
-            cause = causes[DEFAULT]
-            causes[DEFAULT] = type(cause)(cause.code, f"{cause.reason}; {instead} answers instead")
+        causes |= {"@".join(key): failure for key, failure in self.store.failures.items()}
         return {
             subject: Failure(subject=subject, reason=cause.code, detail=cause.reason)
             for subject, cause in causes.items()

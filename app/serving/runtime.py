@@ -12,7 +12,8 @@ from app import errors
 from app.compiling import check_cache, progress
 from app.inference.kernels import KERNELS
 from app.questions.reading import Limits
-from app.registry import Store, StoreState, load_model_set
+from app.registry import DEFAULT_STORE, Store, StoreState, load_model_set
+from app.registry.model_set import with_default
 from app.serving.admission import Admission, Bodies
 from app.serving.metrics import Metrics, Outcome
 from app.serving.models import DEFAULT, NO_MODELS, ServedModels, warm_up
@@ -45,6 +46,7 @@ class Runtime:
         self.draining = False
         self.metrics = Metrics(self.admission)
         self._store = Store(settings.store, max_weights_bytes=settings.max_weights_bytes)
+        self._release = Store(DEFAULT_STORE)
         self.limits = Limits(
             settings.max_objects, settings.max_relations, settings.max_answer_bytes
         )
@@ -130,7 +132,9 @@ class Runtime:
         # Read the state first. So the next check finds changes that are made during the load.
         self._loaded_state = self._store.state()
         with progress(KERNELS):
-            return ServedModels(load_model_set(self._store, self.models.store, warm_up))
+            previous = self.models.store
+            models = load_model_set(self._store, previous, warm_up, self._release)
+            return ServedModels(with_default(models, self._release, previous, warm_up))
 
 
 def _log_failures(prefix: str, failures: Iterable[Failure]) -> None:

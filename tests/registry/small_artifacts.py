@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,8 @@ from app.registry import (
     VocabularyEntry,
 )
 from app.registry.description import KINDS
-from app.registry.manifest import MANIFEST
+from app.registry.manifest import FORMAT, MANIFEST
+from app.registry.references import Replacement, Shipped, aliases_to_bytes
 from app.scene.vocabulary import ObjectClass, Vocabulary
 
 VOCABULARY = Vocabulary(
@@ -116,6 +117,26 @@ def rewrite_manifest(directory: Path, change: Callable[[dict[str, Any]], object]
     del members["checksum"]
     change(members)
     (directory / MANIFEST).write_bytes(resign(json.dumps(members).encode()))
+
+
+def make_outdated(store: Store, name: str, version: str) -> None:
+    """Give a version the format of the last release."""
+    folder = store.root / name / version
+    rewrite_manifest(folder, lambda members: members.update(format=FORMAT - 1))
+
+
+def state_replaced(
+    release: Store, volume: Store, replaced: Mapping[str, str], versions: Sequence[str] = ()
+) -> None:
+    """Let a release state its default, and that it replaces the versions of a volume."""
+    digests = {
+        old: {v: str(volume.digest(old, v)) for v in versions or volume.versions(old)}
+        for old in replaced
+    }
+    entries = {old: Replacement(by=new, digests=digests[old]) for old, new in replaced.items()}
+    shipped = Shipped(default=release.aliases()["default"], replaced=entries)
+    text = aliases_to_bytes(release.aliases(), shipped)
+    (release.root / "aliases.json").write_bytes(text)
 
 
 def replace_file(directory: Path, name: str, data: bytes) -> None:

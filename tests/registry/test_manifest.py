@@ -32,12 +32,21 @@ def stored() -> dict[str, Any]:
     return members
 
 
-@pytest.mark.parametrize("value", [FORMAT - 1, FORMAT + 1, float(FORMAT), str(FORMAT), None, True])
-def test_refuses_another_format(value: object) -> None:
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (FORMAT - 1, r"outdated_format.*train the model again"),
+        *(
+            (value, r"unknown_format.*publish the model again")
+            for value in (FORMAT + 1, float(FORMAT), str(FORMAT), None, True, 0, -1)
+        ),
+    ],
+)
+def test_refuses_another_format(value: object, expected: str) -> None:
     body = json.dumps(stored() | {"format": value}).encode()
-    # A later format may end in another way, so the format is read before the checksum.
+    # Another format may end in another way, so the format is read before the checksum.
     for data in (resign(body), body):
-        with pytest.raises(ArtifactError, match=r"unknown_format.*publish the model again"):
+        with pytest.raises(ArtifactError, match=expected):
             Manifest.from_bytes(data)
 
 

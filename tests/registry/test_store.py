@@ -221,6 +221,10 @@ def test_the_writer_of_aliases_applies_the_limits_of_the_reader(store: Store) ->
         '{"../default": {"name": "tiny"}}',
         '{"default": {"name": "tiny", "version": "latest"}}',
         '{"default": {"version": "1.0.0"}}',
+        '{"_shipped": "tiny"}',
+        '{"_shipped": {"surplus": 1}}',
+        '{"_shipped": {"replaced": {"old": "tiny"}}}',
+        '{"_shipped": {"replaced": {"old": {"by": "tiny", "digests": {"1.0.0": "ab"}}}}}',
     ],
 )
 def test_an_invalid_alias_table_is_refused_and_kept(text: str, store: Store) -> None:

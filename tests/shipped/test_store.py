@@ -31,6 +31,16 @@ def test_every_shipped_model_verifies(models):
     assert sorted({name for name, _ in models.entries}) == SHIPPED
 
 
+def test_the_store_states_what_replaces_which_model_of_earlier_releases():
+    shipped = STORE.shipped()
+    assert shipped.default == STORE.aliases()["default"]
+    assert {*shipped.names.values()} <= {*SHIPPED}
+    assert not {*shipped.names} & {*SHIPPED}
+    upgrading = (REPOSITORY / "docs" / "upgrading.md").read_text()
+    for old, new in shipped.names.items():
+        assert re.search(rf"^\|[^|]*`{old}`[^|]*\| `{new}`", upgrading, re.MULTILINE), old
+
+
 def test_the_terms_of_each_model_are_those_of_its_data(artifact):
     text = (STORE.root / "TERMS.md").read_text()
     rows = dict(re.findall(r"^\| `([\w-]+)` \| ([^|]+) \|", text, re.MULTILINE))

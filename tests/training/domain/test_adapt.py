@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from app import questions
 from app.registry import Artifact, Store
 from app.scene import Scene, SceneObject
 from app.scene.relations import ON_TOP
+from tests.registry.small_artifacts import rewrite_manifest
 from tests.training.commands import invoke
 from tests.training.domain.homes import home_scenes, write
 from training.domain.home import alarms_of
@@ -63,6 +65,25 @@ def test_a_confirmed_object_is_never_reported_again(store, tmp_path):
     for command in (["evaluate", "home"], ["publish", "home@1.0.0", "1.0.1"]):
         said = invoke(*command, "--store", store.root, code=1)
         assert "home@1.0.0 was adapted to a home" in said
+
+
+def test_a_home_keeps_the_terms_of_its_parent(store, tmp_path):
+    terms = "Research use only: trained on scans."
+
+    def restrict(members: dict[str, Any]) -> None:
+        members["terms"] = terms
+        members["data"][0]["research_only"] = True
+
+    rewrite_manifest(default(store).path, restrict)
+    scene = {"objects": INTRUDER, "room_type": "bedroom", "confirmed": True}
+    adapt(store, write([scene], tmp_path / "scenes.jsonl"))
+    manifest = home(store).manifest
+    assert manifest.terms == terms
+    assert manifest.data[0].research_only
+    assert not manifest.data[-1].research_only, "the scenes of the home"
+    card = home(store).card
+    assert f"Terms of the weights: {terms}" in card
+    assert "**Research use.** These weights were trained on" in card
 
 
 @pytest.mark.parametrize(
