@@ -119,6 +119,7 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
         ],
         "room_types": ["bedroom", "garage"],
         "rare_room_types": ["garage"],
+        "written_room_types": [],
         "profiles": ["sunrgbd", "procthor"],
         "examples": [
             {

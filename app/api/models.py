@@ -142,6 +142,7 @@ def _vocabulary(served: Artifact) -> schemas.VocabularyAnswer:
         relations=[cast("schemas.RelationName", name) for name in relations],
         room_types=list(rooms),
         rare_room_types=[rooms[t] for t in served.calibration.rare_rooms],
+        written_room_types=[rooms[t] for t in served.calibration.written_rooms],
         profiles=list(manifest.vocabulary.profiles),
         examples=[
             schemas.ExampleScene(name=example.name, scene=example.request())

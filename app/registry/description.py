@@ -159,6 +159,7 @@ class Calibration(Frozen):
             structure. None exactly if `outlier` is None.
         rooms: calibration of the probabilities of the room types.
         rare_rooms: indices of the room types with too few training scenes for `/generate`.
+        written_rooms: indices of the room types that written scenes alone show.
         smallest: (C + 1,) minimum number of classes in a generated scene of each room type, which
             90 % of the real rooms reach. The last entry is for scenes without a room type.
         room_fit: (C,) minimum of `app.questions.generate.room_fit` for a generated scene of each
@@ -180,6 +181,7 @@ class Calibration(Frozen):
     outlier_lines: AlarmLines | None = None
     rooms: Sharpness = Sharpness()
     rare_rooms: Many[Count] = ()
+    written_rooms: Many[Count] = ()
     smallest: Many[Count] = ()
     room_fit: Many[float] = ()
     outlier: CountSlope | None = None
@@ -387,8 +389,9 @@ class Description(Frozen):
         rooms, types = self.spec.get("C", 0), len(words.room_types)
         if rooms not in (0, types):
             raise ValueError(f"the vocabulary has {types} room types, but the spec has C = {rooms}")
-        if any(t >= rooms for t in self.calibration.rare_rooms):
-            raise ValueError(f"calibration.rare_rooms must be below C = {rooms}")
+        for name in ("rare_rooms", "written_rooms"):
+            if any(t >= rooms for t in getattr(self.calibration, name)):
+                raise ValueError(f"calibration.{name} must be below C = {rooms}")
         return self
 
     @property

@@ -4,6 +4,8 @@ rooms        Sharpness of the probabilities of room types (`/rooms`), fitted by 
              likelihood to parts of validation scenes of each number of classes, and to whole
              scenes.
 rare_rooms   Room types of few training scenes (`rare_rooms`).
+written_rooms
+             Room types that only written sources show.
 smallest, room_fit
              Limits of a generated scene of each room type.
 """
@@ -24,6 +26,7 @@ from app.questions.posterior import Posterior
 from app.registry import Artifact, Sharpness
 from training.datasets.array_types import Flags, Floats
 from training.datasets.batches import SceneTensors, subset
+from training.datasets.sources import source_of
 from training.evaluation.asking import of_classes
 from training.evaluation.parts import Size, draw_parts, exactly
 from training.fit.long_chains import conditions_of
@@ -54,6 +57,7 @@ def calibrate_rooms(
     return {
         "rooms": fit_rooms(artifact, scenes, structure),
         "rare_rooms": rare_rooms(artifact, train, structure),
+        "written_rooms": written_rooms(train),
         "smallest": smallest_scenes(train, structure, artifact.spec.C),
         "room_fit": room_limits(artifact, train),
     }
@@ -83,6 +87,14 @@ def fit_rooms(artifact: Artifact, scenes: SceneTensors, structure: Tensor) -> Sh
 def posterior_of(artifact: Artifact, v: Tensor) -> Posterior:
     """Return the posterior given the listed classes v, (classes,)."""
     return Posterior(artifact, of_classes(v.nonzero().squeeze(1).tolist()))
+
+
+def written_rooms(train: SceneTensors) -> tuple[int, ...]:
+    """Return the room types whose training scenes are all written, in ascending order."""
+    is_written = torch.tensor([source_of(name).written for name in train.source_names])
+    written = is_written[train.source]
+    others = {-1, *train.room[~written].tolist()}
+    return tuple(sorted(set(train.room[written].tolist()) - others))
 
 
 def rare_rooms(

@@ -23,7 +23,7 @@ from training.fit.objects import ObjectScenes, served_weights
 RECORDED: Final = 5
 """Number of sweeps between two recorded states."""
 
-_CHAINS, _SWEEPS = 256, 3000
+_CHAINS, _SWEEPS = 128, 3000
 _SETTLED = 2000  # sweeps before the first recorded state of the test
 _COMMONEST = 50
 _SIZE_LIMIT, _SHARE_LIMIT = 0.10, 0.20

@@ -33,9 +33,9 @@ from training.machines import BoltzmannMachine
 from training.machines.arrays import weights_of
 
 _SWEEPS = 200  # sweeps of a stored sample
-_CHAINS = 128  # chains of each data source in the fit of u
-_ROUNDS = 60
-_ROUND_SWEEPS = 25
+_CHAINS = 64  # chains of each data source in the fit of u
+_ROUNDS = 50
+_ROUND_SWEEPS = 20
 _FIRST_STEP, _LAST_STEP = 0.7, 0.1  # of u, as a share of the difference of log-odds
 
 

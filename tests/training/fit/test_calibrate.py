@@ -83,8 +83,8 @@ def judging(model, fitted):
 
 def test_every_entry_is_fitted(fitted):
     neutral = Calibration.neutral(A)
-    # No room type is rare here; see test_calibrate_rooms.
-    entries = set(Calibration.model_fields) - {"popularity_weight", "rare_rooms"}
+    # No room type is rare or written here; see test_calibrate_rooms.
+    entries = set(Calibration.model_fields) - {"popularity_weight", "rare_rooms", "written_rooms"}
     assert {name for name in entries if getattr(fitted, name) == getattr(neutral, name)} == set()
     assert fitted.popularity_weight in ALPHAS
     assert fitted.coverage in COVERAGES

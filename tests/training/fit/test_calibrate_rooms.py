@@ -11,7 +11,7 @@ from tests.training.evaluation.scenes import WIDE, scene, tensors
 from training.evaluation.asking import of_classes
 from training.fit import calibrate_rooms
 from training.fit.calibrate_objects import recalibrated
-from training.fit.calibrate_rooms import fit_rooms, rare_rooms, smallest_scenes
+from training.fit.calibrate_rooms import fit_rooms, rare_rooms, smallest_scenes, written_rooms
 
 V = len(LABELS)
 STRUCTURE = torch.arange(V) == V - 1
@@ -46,6 +46,13 @@ def test_the_sharpness_that_draws_the_room_types_is_fitted(model, sharpness):
 def test_few_scenes_leave_the_room_types_as_they_are(model):
     few = [scene([0, 1], room=0)] * 19 + [scene([0, 1])] * 50
     assert fit_rooms(model, tensors(few, V), STRUCTURE) == Sharpness()
+
+
+def test_written_room_types_are_those_without_other_scenes():
+    rooms = (("inventories", 0), ("inventories", 1), ("virtualhome", 1), ("virtualhome", 2))
+    scenes = [scene([0, 1], room=room, source=source) for source, room in rooms]
+    scenes.append(scene([0, 1], source="inventories"))
+    assert written_rooms(tensors(scenes, V)) == (0,)
 
 
 def test_rare_room_types_are_those_that_samples_do_not_resemble(model):

@@ -116,6 +116,8 @@ class VocabularyAnswer(Reply):
     room_types: list[str]
     rare_room_types: list[str] = []
     """room types that `/generate` refuses, because too few training scenes have them"""
+    written_room_types: list[str] = []
+    """room types that the model knows from written descriptions alone, not from real rooms"""
     profiles: list[str] = []
     """names of the data sources whose base rates a request can choose"""
     examples: list[ExampleScene] = []
