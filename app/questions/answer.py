@@ -48,6 +48,19 @@ def envelope(
     return fields
 
 
+def named(name: str, word: str | None, field: str = "label") -> Fields:
+    """Return the field with the name of a class, and `listed_as` if the request has another word.
+
+    Args:
+        name: label of a class, or name of a room type.
+        word: word of the request for the class or room type. None means that it has none.
+        field: name of the field for `name`.
+    """
+    if word is None or word == name:
+        return {field: name}
+    return {field: name, "listed_as": word}
+
+
 def reasons(
     scene: Scene,
     present: Present,

@@ -172,14 +172,19 @@ class Unknown:
 
     def resolve_all(
         self, labels: Sequence[str], field: str, errors: ErrorList, *, is_room: bool = False
-    ) -> list[int]:
-        """Return the different classes or room types of the labels in a field of the request."""
-        indices: dict[int | None, None] = {}
+    ) -> dict[int, str]:
+        """Return the different classes or room types of the labels in a field of the request.
+
+        The value of each index is its first label.
+        """
+        first_label: dict[int, str] = {}
         for position, label in enumerate(labels):
-            indices[self.resolve(label, label, (field, position), errors, is_room=is_room)] = None
+            index = self.resolve(label, label, (field, position), errors, is_room=is_room)
+            if index is not None:
+                first_label.setdefault(index, label)
             if errors.by_class and errors.are_many:
                 break
-        return [index for index in indices if index is not None]
+        return first_label
 
     def _may_guess(self, label: str, *, is_room: bool) -> bool:
         """Return whether the service may search the class nearest to a label, and count it."""

@@ -6,14 +6,15 @@ of the request. The machine's probability of a room type t (`app.inference.objec
     p(t) ∝ p_machine(t | objects)^s,   s = slope + log_count · log(number of listed classes)
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
 
 from app.inference.elementary import softmax
-from app.questions.answer import Fields, reasons, significant
+from app.questions.answer import Fields, named, reasons, significant
 from app.questions.names import ErrorList
 from app.questions.posterior import LEAST_CHANGE, Posterior
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
@@ -29,6 +30,7 @@ def rooms(
     *,
     top_k: int = 5,
     candidates: Sequence[int] | None = None,
+    listed_as: Mapping[int, str] = MappingProxyType({}),
     details: bool = True,
 ) -> Fields:
     """Rank the room types by their probability, likeliest first.
@@ -38,6 +40,7 @@ def rooms(
         top_k: maximum number of room types in the answer.
         candidates: indices of the possible room types; their probabilities sum to 1. None means all
             room types.
+        listed_as: the name of each candidate in the request, by index of the room type.
         details: whether the answer contains `because`.
 
     Returns:
@@ -52,10 +55,10 @@ def rooms(
     sharpness = artifact.calibration.rooms.of(posterior.listed)
     p = softmax(sharpness * posterior.room_log_p()[among])
     first = np.argsort(-p, kind="stable")[:top_k]
-    names = [artifact.vocabulary.room_types[t] for t in among[first].tolist()]
+    names = artifact.vocabulary.room_types
     entries: list[Fields] = [
-        {"room_type": name, "probability": probability}
-        for name, probability in zip(names, significant(p[first]), strict=True)
+        {**named(names[t], listed_as.get(t), "room_type"), "probability": probability}
+        for t, probability in zip(among[first].tolist(), significant(p[first]), strict=True)
     ]
     if details:
         change = posterior.room_reasons()[among[first]]
@@ -66,15 +69,17 @@ def rooms(
 
 
 def _read(request: RoomsRequest, _: Artifact, reading: Reading) -> Options:
-    candidates = None
+    candidates, listed_as = None, dict[int, str]()
     if request.candidates is not None:
         errors = ErrorList()
         names = request.candidates
-        candidates = reading.unknown.resolve_all(names, "candidates", errors, is_room=True)
+        listed_as = reading.unknown.resolve_all(names, "candidates", errors, is_room=True)
         errors.raise_any()
+        candidates = list(listed_as)
     return {
         "top_k": request.top_k,
         "candidates": candidates,
+        "listed_as": listed_as,
         "details": request.detail == "full",
     }
 
