@@ -1,6 +1,7 @@
 """The probability of an outlier, the thresholds, and the companions of an outlier."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
