@@ -48,17 +48,16 @@ def envelope(
     return fields
 
 
-def named(name: str, word: str | None, field: str = "label") -> Fields:
-    """Return the field with the name of a class, and `listed_as` if the request has another word.
+def named(label: str, word: str | None) -> Fields:
+    """Return the field `label`, and `listed_as` if the request has another word for the class.
 
     Args:
-        name: label of a class, or name of a room type.
-        word: word of the request for the class or room type. None means that it has none.
-        field: name of the field for `name`.
+        label: label of the class.
+        word: word of the request for the class. None means that the request has no word for it.
     """
-    if word is None or word == name:
-        return {field: name}
-    return {field: name, "listed_as": word}
+    if word is None or word == label:
+        return {"label": label}
+    return {"label": label, "listed_as": word}
 
 
 def reasons(

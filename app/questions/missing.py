@@ -185,8 +185,9 @@ def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Opti
         errors.add(InvalidRequestError, ("top_k",), message)
     candidates, listed_as, at, view = None, dict[int, str](), None, request.viewpoint
     if request.candidates is not None:
-        listed_as = reading.unknown.resolve_all(request.candidates, "candidates", errors)
-        candidates = list(listed_as)
+        labels_of = reading.unknown.resolve_all(request.candidates, "candidates", errors)
+        candidates = list(labels_of)
+        listed_as = {index: labels[0] for index, labels in labels_of.items()}
     if request.at is not None:
         at = _at(request.at, artifact, reading, errors)
     errors.raise_any()
@@ -240,7 +241,7 @@ _EXAMPLES: Final = {
     ),
     "words": Example(
         "the robot's own words: the answer has the class as `label` and the word as `listed_as`",
-        {"objects": ["counter", "air fryer"], "candidates": ["hob", "treadmill"]},
+        {"objects": ["bed", "bedside table"], "candidates": ["couch", "trash can"]},
     ),
     "scores": Example(
         "probabilities only, for a fast and short answer", {**LABELS, "detail": "scores"}

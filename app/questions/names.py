@@ -172,19 +172,16 @@ class Unknown:
 
     def resolve_all(
         self, labels: Sequence[str], field: str, errors: ErrorList, *, is_room: bool = False
-    ) -> dict[int, str]:
-        """Return the different classes or room types of the labels in a field of the request.
-
-        The value of each index is its first label.
-        """
-        first_label: dict[int, str] = {}
+    ) -> dict[int, list[str]]:
+        """Return the different labels of each class or room type in a field of the request."""
+        labels_of: dict[int, list[str]] = {}
         for position, label in enumerate(labels):
             index = self.resolve(label, label, (field, position), errors, is_room=is_room)
-            if index is not None:
-                first_label.setdefault(index, label)
+            if index is not None and label not in (found := labels_of.setdefault(index, [])):
+                found.append(label)
             if errors.by_class and errors.are_many:
                 break
-        return first_label
+        return labels_of
 
     def _may_guess(self, label: str, *, is_room: bool) -> bool:
         """Return whether the service may search the class nearest to a label, and count it."""

@@ -6,15 +6,14 @@ of the request. The machine's probability of a room type t (`app.inference.objec
     p(t) ∝ p_machine(t | objects)^s,   s = slope + log_count · log(number of listed classes)
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
 
 from app.inference.elementary import softmax
-from app.questions.answer import Fields, named, reasons, significant
+from app.questions.answer import Fields, reasons, significant
 from app.questions.names import ErrorList
 from app.questions.posterior import LEAST_CHANGE, Posterior
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
@@ -30,7 +29,6 @@ def rooms(
     *,
     top_k: int = 5,
     candidates: Sequence[int] | None = None,
-    listed_as: Mapping[int, str] = MappingProxyType({}),
     details: bool = True,
 ) -> Fields:
     """Rank the room types by their probability, likeliest first.
@@ -40,7 +38,6 @@ def rooms(
         top_k: maximum number of room types in the answer.
         candidates: indices of the possible room types; their probabilities sum to 1. None means all
             room types.
-        listed_as: the name of each candidate in the request, by index of the room type.
         details: whether the answer contains `because`.
 
     Returns:
@@ -48,17 +45,17 @@ def rooms(
         has no room types. Then the field `warnings` says so.
     """
     C = artifact.spec.C
-    among = np.arange(C) if candidates is None else np.array(candidates, dtype=np.int64)
+    among = np.arange(C) if candidates is None else np.array([*candidates], dtype=np.int64)
     if not len(among):
         return {"warnings": [] if C else [_NO_ROOM_TYPES], "room_types": []}
     posterior = Posterior(artifact, replace(scene, room_type=None))
     sharpness = artifact.calibration.rooms.of(posterior.listed)
     p = softmax(sharpness * posterior.room_log_p()[among])
     first = np.argsort(-p, kind="stable")[:top_k]
-    names = artifact.vocabulary.room_types
+    names = [artifact.vocabulary.room_types[t] for t in among[first].tolist()]
     entries: list[Fields] = [
-        {**named(names[t], listed_as.get(t), "room_type"), "probability": probability}
-        for t, probability in zip(among[first].tolist(), significant(p[first]), strict=True)
+        {"room_type": name, "probability": probability}
+        for name, probability in zip(names, significant(p[first]), strict=True)
     ]
     if details:
         change = posterior.room_reasons()[among[first]]
@@ -69,17 +66,15 @@ def rooms(
 
 
 def _read(request: RoomsRequest, _: Artifact, reading: Reading) -> Options:
-    candidates, listed_as = None, dict[int, str]()
+    candidates = None
     if request.candidates is not None:
         errors = ErrorList()
         names = request.candidates
-        listed_as = reading.unknown.resolve_all(names, "candidates", errors, is_room=True)
+        candidates = reading.unknown.resolve_all(names, "candidates", errors, is_room=True)
         errors.raise_any()
-        candidates = list(listed_as)
     return {
         "top_k": request.top_k,
         "candidates": candidates,
-        "listed_as": listed_as,
         "details": request.detail == "full",
     }
 

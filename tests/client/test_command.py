@@ -99,7 +99,6 @@ def test_json_is_the_service_s_answer(
         ("outliers bed toilet sink", ("toilet", "because")),
         ("outliers bed Couches sink", ("Couches (sofa)",)),
         ("missing bed --candidates couch --candidates desk", ("couch (sofa)", "desk")),
-        ("rooms bed --candidates study", ("study (office)",)),
         (
             "generate Couches bed --relations 'Couches on-top bed' --seed 1",
             ("Couches (sofa)", "Couches on-top bed"),

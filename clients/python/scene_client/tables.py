@@ -112,11 +112,7 @@ def outliers(answer: schemas.OutliersAnswer) -> RenderableType:
 def rooms(answer: schemas.RoomsAnswer) -> RenderableType:
     """Return a table of room types, most probable first."""
     rows = [
-        (
-            _named(entry.room_type, entry.listed_as),
-            f"{entry.probability:.3f}",
-            _reasons(entry.because),
-        )
+        (entry.room_type, f"{entry.probability:.3f}", _reasons(entry.because))
         for entry in answer.room_types
     ]
     return _table("room type", "probability", "because", rows=rows)
@@ -209,9 +205,9 @@ def _class(entry: schemas.MissingObject | schemas.MoreInstances | schemas.Outlie
     return _named(entry.label, entry.listed_as)
 
 
-def _named(name: str, word: str | None) -> str:
-    """Return the word of the request, with the class or room type of another name after it."""
-    return name if word is None else f"{word} ({name})"
+def _named(label: str, word: str | None) -> str:
+    """Return the word of the request, with its class in parentheses if this has another name."""
+    return label if word is None else f"{word} ({label})"
 
 
 def _relations(relations: Sequence[schemas.Relation], words: Mapping[str, str]) -> str:

@@ -34,9 +34,6 @@ class RoomType(Reply):
     """A room type, and the probability that the scene is a room of this type."""
 
     room_type: str
-    """room type of the model"""
-    listed_as: str | None = None
-    """first entry of `candidates` that names the room type; absent if it equals `room_type`"""
     probability: Probability
     because: list[Because] = []
     """objects that change the odds of the room type by a factor of at least 3, largest change
