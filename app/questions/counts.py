@@ -72,26 +72,24 @@ def more(
     if artifact.counts is None:
         return []
     plain = ~artifact.vocabulary.structure[listing.classes]
-    classes, listed, first = (
-        column[plain] for column in (listing.classes, listing.counts, listing.first)
-    )
+    classes, listed = listing.classes[plain], listing.counts[plain]
     usual, unlisted = artifact.calibration.coverage, 1.0
     if coverage is not None and coverage > usual:
         unlisted = (1 - coverage) / (1 - usual)
     rows, p = distribution(
         artifact.counts, artifact.spec.V, classes, listed, scene.room_type, unlisted
     )
-    classes, listed, first = classes[rows], listed[rows], first[rows]
+    classes, listed = classes[rows], listed[rows]
     numbers, cumulative = np.arange(1, p.shape[1] + 1), p.cumsum(axis=1)
     p_more = 1 - cumulative[np.arange(len(p)), listed - 1]
     usable = p_more >= LIKELY if candidates is None else np.isin(classes, list(candidates))
     order = best(p_more, usable, top_k)
     if not len(order):
         return []
-    labels, objects = artifact.vocabulary.labels, scene.objects
+    labels, first = artifact.vocabulary.labels, listing.first[plain][rows][order]
     names = [
-        named(labels[index], objects[number].label)
-        for index, number in zip(classes[order].tolist(), first[order].tolist(), strict=True)
+        named(labels[index], scene.objects[number].label)
+        for index, number in zip(classes[order].tolist(), first.tolist(), strict=True)
     ]
     columns = (
         listed[order].tolist(),
