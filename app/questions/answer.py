@@ -48,6 +48,18 @@ def envelope(
     return fields
 
 
+def named(label: str, word: str | None) -> Fields:
+    """Return the field `label`, and `listed_as` if the request has another word for the class.
+
+    Args:
+        label: label of the class.
+        word: word of the request for the class. None means that the request has no word for it.
+    """
+    if word is None or word == label:
+        return {"label": label}
+    return {"label": label, "listed_as": word}
+
+
 def reasons(
     scene: Scene,
     present: Present,

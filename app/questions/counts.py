@@ -24,10 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference.kernels import best, count_distributions
-from app.questions.answer import Fields, significant
+from app.questions.answer import Fields, named, significant
 from app.questions.posterior import Present
 from app.registry.artifact import Artifact
 from app.registry.counts import Counts
+from app.scene.scene import Scene
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -37,13 +38,13 @@ LIKELY: Final = 0.5
 
 _OUTSIDE: Final = 0.1  # probability of a count below `low`, and of a count above `high`
 
-_FIELDS: Final = ("label", "listed_count", "expected_count", "low", "high", "probability")
+_FIELDS: Final = ("listed_count", "expected_count", "low", "high", "probability")
 
 
 def more(
     artifact: Artifact,
+    scene: Scene,
     listing: Present,
-    room: int | None = None,
     *,
     top_k: int = 10,
     candidates: Collection[int] | None = None,
@@ -55,8 +56,9 @@ def more(
     classes, classes without statistics, or classes with more listed objects than these cover.
 
     Args:
+        scene: the listed objects and the room type. The first object of a class is its name in
+            the request.
         listing: the classes of the listed objects.
-        room: index of the room type, or None.
         top_k: maximum number of classes in the answer.
         candidates: indices of classes. The answer then contains these classes at any probability,
             and no others. None means all classes with a probability of at least `LIKELY`.
@@ -74,7 +76,9 @@ def more(
     usual, unlisted = artifact.calibration.coverage, 1.0
     if coverage is not None and coverage > usual:
         unlisted = (1 - coverage) / (1 - usual)
-    rows, p = distribution(artifact.counts, artifact.spec.V, classes, listed, room, unlisted)
+    rows, p = distribution(
+        artifact.counts, artifact.spec.V, classes, listed, scene.room_type, unlisted
+    )
     classes, listed = classes[rows], listed[rows]
     numbers, cumulative = np.arange(1, p.shape[1] + 1), p.cumsum(axis=1)
     p_more = 1 - cumulative[np.arange(len(p)), listed - 1]
@@ -82,9 +86,12 @@ def more(
     order = best(p_more, usable, top_k)
     if not len(order):
         return []
-    labels = artifact.vocabulary.labels
+    labels, first = artifact.vocabulary.labels, listing.first[plain][rows][order]
+    names = [
+        named(labels[index], scene.objects[number].label)
+        for index, number in zip(classes[order].tolist(), first.tolist(), strict=True)
+    ]
     columns = (
-        [labels[index] for index in classes[order].tolist()],
         listed[order].tolist(),
         significant(p[order] @ numbers),
         *(
@@ -93,7 +100,10 @@ def more(
         ),
         significant(p_more[order]),
     )
-    return [dict(zip(_FIELDS, values, strict=True)) for values in zip(*columns, strict=True)]
+    return [
+        name | dict(zip(_FIELDS, values, strict=True))
+        for name, *values in zip(names, *columns, strict=True)
+    ]
 
 
 def distribution(

@@ -26,7 +26,7 @@ from app.inference.kernels import select_consistent
 from app.inference.relations import context_of
 from app.questions.answer import Fields, rounded_number
 from app.questions.outliers import intruders
-from app.questions.posterior import given_relations, present
+from app.questions.posterior import Present, given_relations, present
 from app.questions.question import BEDROOM, POSES, REFUSED, Example, Options, Question
 from app.questions.reading import Reading, Triple
 from app.registry.artifact import Artifact
@@ -78,9 +78,9 @@ def generate(
             drawn so far.
 
     Returns:
-        The fields `seed` and `scenes` of `scene_client.schemas.GenerateAnswer`. For `log_score`,
-        see `ConditionedChains.log_score`. Only scores of the same model, for the same listed
-        classes and profile, can be compared.
+        The fields of `scene_client.schemas.GenerateAnswer`. For `log_score`, see
+        `ConditionedChains.log_score`. Only scores of the same model, for the same listed classes
+        and profile, can be compared.
     """
     listing = present(scene, artifact.spec)
     observed = given_relations(scene, listing, artifact.spec.A)
@@ -101,7 +101,18 @@ def generate(
             if _is_plausible(artifact, scene, classes, state.room) or stop() or is_last:
                 scenes.append(_scene(artifact, chains, state, is_shown, evidence))
                 break
-    return {"seed": seed, "scenes": scenes}
+    fields: Fields = {"seed": seed, "scenes": scenes}
+    if listed_as := _words(artifact, scene, listing):
+        fields["listed_as"] = listed_as
+    return fields
+
+
+def _words(artifact: Artifact, scene: Scene, listing: Present) -> dict[str, str]:
+    """Return the words of the evidence that differ from the label of their class, by this label."""
+    labels, objects = artifact.vocabulary.labels, scene.objects
+    pairs = zip(listing.classes.tolist(), listing.first.tolist(), strict=True)
+    words = {labels[index]: objects[number].label for index, number in pairs}
+    return {label: word for label, word in words.items() if word != label}
 
 
 def _scene(

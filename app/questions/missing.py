@@ -5,7 +5,8 @@ The answers are object classes that the scene does not list (candidates), and th
 placements.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from app.errors import InvalidRequestError
 from app.inference.kernels import best
-from app.questions.answer import EXPLAINED, Fields, reasons, significant
+from app.questions.answer import EXPLAINED, Fields, named, reasons, significant
 from app.questions.counts import more
 from app.questions.names import ErrorList
 from app.questions.placements import Place, place_log_p, placements
@@ -38,6 +39,7 @@ def missing(
     *,
     top_k: int = 10,
     candidates: Sequence[int] | None = None,
+    listed_as: Mapping[int, str] = MappingProxyType({}),
     at: tuple[str, int] | None = None,
     coverage: float | None = None,
     axes: Axes | None = VIEWER,
@@ -57,6 +59,7 @@ def missing(
         top_k: maximum number of classes in each list of the answer.
         candidates: indices of the classes to rank; the list `more` contains listed candidates at
             any probability. None means all classes.
+        listed_as: the word of the request for each candidate, by class index.
         at: a place, as (relation, index of the anchor object). If set, `probability` is the
             probability that the class is present *and* has this relation to the anchor.
         coverage: listed share of the classes of the scene. None means the model's value. At 1, at
@@ -76,10 +79,11 @@ def missing(
     )
     labels = artifact.vocabulary.labels
     columns = classes.tolist(), significant(probabilities), significant(log_odds)
-    entries: list[Fields] = [
-        {"label": labels[index], "probability": probability, "log_odds": value}
-        for index, probability, value in zip(*columns, strict=True)
-    ]
+    entries: list[Fields] = []
+    for index, probability, value in zip(*columns, strict=True):
+        entry = named(labels[index], listed_as.get(index))
+        entry["probability"], entry["log_odds"] = probability, value
+        entries.append(entry)
     if details and entries:
         places = placements(artifact, posterior, scene, classes, axes, place)
         for entry, class_places in zip(entries, places, strict=True):
@@ -92,9 +96,13 @@ def missing(
                 entry["because"] = because
     further: list[Fields] = []
     if at is None:
-        listing, room = posterior.present, scene.room_type
         further = more(
-            artifact, listing, room, top_k=top_k, candidates=candidates, coverage=coverage
+            artifact,
+            scene,
+            posterior.present,
+            top_k=top_k,
+            candidates=candidates,
+            coverage=coverage,
         )
     return {"coverage": used_coverage, "missing": entries, "more": further}
 
@@ -197,15 +205,18 @@ def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Opti
     if request.top_k > size and "top_k" in request.model_fields_set:
         message = f"`top_k` must be at most {size}, the size of the vocabulary"
         errors.add(InvalidRequestError, ("top_k",), message)
-    candidates, at, view = None, None, request.viewpoint
+    candidates, listed_as, at, view = None, dict[int, str](), None, request.viewpoint
     if request.candidates is not None:
-        candidates = reading.unknown.resolve_all(request.candidates, "candidates", errors)
+        labels_of = reading.unknown.resolve_all(request.candidates, "candidates", errors)
+        candidates = list(labels_of)
+        listed_as = {index: labels[0] for index, labels in labels_of.items()}
     if request.at is not None:
         at = _at(request.at, artifact, reading, errors)
     errors.raise_any()
     return {
         "top_k": request.top_k,
         "candidates": candidates,
+        "listed_as": listed_as,
         "at": at,
         "coverage": request.coverage,
         "axes": viewer_axes(request.frame_id, None if view is None else view.yaw),
@@ -250,6 +261,10 @@ _EXAMPLES: Final = {
     "candidates": Example(
         "only these candidates", {**LABELS, "candidates": ["pillow", "sink", "toilet"], "top_k": 3}
     ),
+    "words": Example(
+        "the robot's own words: the answer has the class as `label` and the word as `listed_as`",
+        {"objects": ["bed", "bedside table"], "candidates": ["couch", "trash can"]},
+    ),
     "scores": Example(
         "probabilities only, for a fast and short answer", {**LABELS, "detail": "scores"}
     ),
@@ -288,6 +303,7 @@ _EXAMPLE_ANSWER: Final = {
     "more": [
         {
             "label": "nightstand",
+            "listed_as": "bedside table",
             "listed_count": 1,
             "expected_count": 1.7,
             "low": 1,

@@ -172,14 +172,16 @@ class Unknown:
 
     def resolve_all(
         self, labels: Sequence[str], field: str, errors: ErrorList, *, is_room: bool = False
-    ) -> list[int]:
-        """Return the different classes or room types of the labels in a field of the request."""
-        indices: dict[int | None, None] = {}
+    ) -> dict[int, list[str]]:
+        """Return the different labels of each class or room type in a field of the request."""
+        labels_of: dict[int, list[str]] = {}
         for position, label in enumerate(labels):
-            indices[self.resolve(label, label, (field, position), errors, is_room=is_room)] = None
+            index = self.resolve(label, label, (field, position), errors, is_room=is_room)
+            if index is not None and label not in (found := labels_of.setdefault(index, [])):
+                found.append(label)
             if errors.by_class and errors.are_many:
                 break
-        return [index for index in indices if index is not None]
+        return labels_of
 
     def _may_guess(self, label: str, *, is_room: bool) -> bool:
         """Return whether the service may search the class nearest to a label, and count it."""

@@ -93,7 +93,7 @@ def outliers(
             judged, unsure = _judged(
                 artifact, entry, posterior, scene, threshold, can_alarm, details=details
             )
-            warnings += _too_rare(unsure)
+            warnings += _too_rare(artifact, unsure)
     fields: Fields = {"warnings": warnings}
     if threshold is not None:
         fields["threshold"] = rounded_number(threshold)
@@ -139,13 +139,12 @@ def _judged(
         if flags[row]:
             usual[row] = _companions(artifact, present.classes, classes[row])
     for number, row in zip(order.tolist(), rows, strict=True):
-        fields: Fields = {
-            "object": scene.objects[number].id,
-            "label": labels[classes[row]],
-            "probability": probabilities[row],
-            "log_odds": values[row],
-            "is_outlier": flags[row],
-        }
+        thing = scene.objects[number]
+        fields: Fields = {"object": thing.id, "label": labels[classes[row]]}
+        if thing.label != fields["label"]:
+            fields["listed_as"] = thing.label
+        fields["probability"], fields["log_odds"] = probabilities[row], values[row]
+        fields["is_outlier"] = flags[row]
         if details:
             fields["because"] = causes[row] if row in explained else []
             fields["usually_with"] = usual[row]
@@ -205,12 +204,13 @@ def _companions(artifact: Artifact, present: NDArray[np.int64], flagged: int) ->
     return [artifact.vocabulary.labels[index] for index in chosen.tolist()]
 
 
-def _too_rare(objects: list[SceneObject]) -> list[SceneWarning]:
+def _too_rare(artifact: Artifact, objects: list[SceneObject]) -> list[SceneWarning]:
     """Return a warning for objects that reach the threshold, but whose class is rarely shown."""
     if not objects:
         return []
-    labels = ", ".join(sorted({thing.label for thing in objects}))
-    message = f"too few training scenes show {labels}, so the service raises no alarm"
+    classes = {thing.class_index for thing in objects}
+    labels = sorted(artifact.vocabulary.labels[index] for index in classes if index is not None)
+    message = f"too few training scenes show {', '.join(labels)}, so the service raises no alarm"
     ids = [thing.id for thing in objects]
     return [SceneWarning(code="not-judged", message=message, objects=ids)]
 
@@ -266,8 +266,9 @@ _EXAMPLE_ANSWER: Final = {
     "threshold": 0.7,
     "outliers": [
         {
-            "object": "toilet",
+            "object": "wc_1",
             "label": "toilet",
+            "listed_as": "WC",
             "probability": 0.94,
             "log_odds": -5.2,
             "is_outlier": True,

@@ -45,7 +45,7 @@ def rooms(
         has no room types. Then the field `warnings` says so.
     """
     C = artifact.spec.C
-    among = np.arange(C) if candidates is None else np.array(candidates, dtype=np.int64)
+    among = np.arange(C) if candidates is None else np.array([*candidates], dtype=np.int64)
     if not len(among):
         return {"warnings": [] if C else [_NO_ROOM_TYPES], "room_types": []}
     posterior = Posterior(artifact, replace(scene, room_type=None))

@@ -178,6 +178,27 @@ def test_outliers_are_marked_with_reasons_in_words(bedroom: Board, api: httpx.Cl
     expect(outliers).to_have_count(sum(one["is_outlier"] for one in answer["outliers"]))
 
 
+def test_the_robots_own_words_are_shown_with_their_classes(
+    open_board: OpenBoard, api: httpx.Client
+) -> None:
+    board = open_board({"objects": ["counter", "air fryer", "Plates"]})
+    answer = ask(api, "outliers", board.scene)
+    classes = {one["object"]: one["label"] for one in answer["outliers"]}
+    assert classes == {"counter": "counter", "air fryer": "deep fryer", "Plates": "plate"}
+    another = {"label": "plate", "listed_as": "Plates", "listed_count": 1, "expected_count": 4}
+    more = [another | {"low": 2, "high": 6, "probability": 0.9}]
+    board.alter("missing", lambda answer: answer | {"more": more})
+    board.add("fork")
+    (row,) = (row for row in board.rows("missing") if row.startswith("another"))
+    assert row.startswith("another Plates")
+    assert "class: plate" in row
+    board.tab("Wrong")
+    for row in board.rows("outliers")[:4]:
+        word = next(name for name in (*classes, "fork") if row.startswith(name))
+        listed = classes.get(word, word)
+        assert (f"class: {listed}" in row) == (listed != word)
+
+
 def test_relations_are_edges_and_those_that_hold_are_told_apart(
     bedroom: Board, api: httpx.Client
 ) -> None:
@@ -306,6 +327,17 @@ def test_a_drawn_scene_is_the_service_s_and_can_be_kept(
     assert not any("position" in thing for thing in board.scene["objects"])
     board.click("Undo")
     assert board.things == ["desk", "chair"]
+
+
+def test_a_drawn_scene_shows_the_words_of_the_board(open_board: OpenBoard) -> None:
+    board = open_board({"objects": ["counter", "air fryer"]})
+    board.tab("Generate")
+    board.page.get_by_label("with the objects on the board").check()
+    draw(board)
+    chips = board.page.locator("#drawn .chips li").all_text_contents()
+    assert {"counter", "air fryer (deep fryer)"} <= {*chips}
+    assert board.things[:2] == ["counter", "air fryer"]
+    assert len(board.things) == len(chips)
 
 
 def test_a_suggestion_at_another_place_or_none_says_so(open_board: OpenBoard) -> None:

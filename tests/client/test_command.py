@@ -97,6 +97,12 @@ def test_json_is_the_service_s_answer(
         ("models", ("home@1.0.0", "default", "triway", "ready")),
         ("vocabulary", ("garbage bin", "trash can, waste basket", "structure", "homes, shops")),
         ("outliers bed toilet sink", ("toilet", "because")),
+        ("outliers bed Couches sink", ("Couches (sofa)",)),
+        ("missing bed --candidates couch --candidates desk", ("couch (sofa)", "desk")),
+        (
+            "generate Couches bed --relations 'Couches on-top bed' --seed 1",
+            ("Couches (sofa)", "Couches on-top bed"),
+        ),
         ("rooms bed", ("room type", "probability", "bedroom")),
         ("relations bed lamp --relations 'lamp on-top bed'", ("if not observed", "on-top")),
         ("outliers bed lamp --relations 'lamp on-top bed'", ("on-top", "bed")),

@@ -80,7 +80,16 @@ def test_an_object_belongs_unless_it_is_an_outlier(
         assert condition.feedback_message.startswith("toilet_1: an outlier with probability 0.")
 
 
-LAMP = {"candidates": ["lamp"], "at": {"relation": "on-top", "object": "desk"}, "log_odds": -1e3}
+ANY = {"log_odds": -1e3}
+LAMP = {"candidates": ["lamp"], "at": {"relation": "on-top", "object": "desk"}, **ANY}
+
+
+@pytest.mark.parametrize("thing", ["Couches", "sofa"])
+def test_an_object_has_its_label_and_its_class(make: Make, client: Client, thing: str) -> None:
+    scene = {"objects": ["bed", {"id": "s", "label": "Couches"}]}
+    condition = make("ObjectBelongs", client, scene, thing, threshold=0.0)
+    assert settle(condition) is Status.FAILURE
+    assert condition.feedback_message.startswith("s: an outlier")
 
 
 def test_a_condition_fails_with_a_reason(make: Make, client: Client, scene: SceneFields) -> None:
@@ -89,6 +98,7 @@ def test_a_condition_fails_with_a_reason(make: Make, client: Client, scene: Scen
             "nothing was seen": make("SceneComplete", client, None),
             "nothing was seen.": make("SceneComplete", client, {"objects": []}),
             "missing: lamp": make("SceneComplete", client, scene, **LAMP),
+            "missing: couch": make("SceneComplete", client, scene, candidates=["couch"], **ANY),
             "no sofa was seen": make("ObjectBelongs", client, scene, "sofa"),
             "UnreachableError: ": make("SceneComplete", unreachable, BED),
         }

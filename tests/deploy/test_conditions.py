@@ -62,6 +62,10 @@ def test_a_scene_is_complete_if_nothing_missing_is_rather_there_than_not(
     absent = [thing.label for thing in missing if thing.log_odds >= 0]
     assert (default["status"] == "FAILURE") is bool(absent)
     assert all(label in default["because"] for label in absent)
+    # The robot's own word is named.
+    couch = {"scene": json.dumps({**scene, "candidates": ["couch"]}), "log_odds": "-1000"}
+    (own,) = tick(program, url, "SceneComplete", couch)
+    assert own["because"] == "missing: couch"
 
 
 def test_a_thing_belongs_unless_it_is_an_outlier(
@@ -82,6 +86,10 @@ def test_a_thing_belongs_unless_it_is_an_outlier(
         ("FAILURE", "no sofa was seen"),
         ("FAILURE", "no object was named"),
     ]
+    couch = {"scene": '{"objects": ["bed", {"id": "s", "label": "Couches"}], "threshold": 1}'}
+    words = [couch | {"object": word} for word in ("Couches", "sofa", "couch")]
+    found = tick(program, url, "ObjectBelongs", *words)
+    assert [entry["because"] for entry in found] == ["s belongs"] * 2 + ["no couch was seen"]
 
 
 def test_a_service_that_does_not_answer_fails_the_condition(program: Path) -> None:

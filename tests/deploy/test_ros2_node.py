@@ -216,11 +216,12 @@ def test_a_ghost_stands_off_its_anchor_by_the_offset(monkeypatch: pytest.MonkeyP
         "book": [there],
     }
     missing = [{"label": label, "placements": places} for label, places in placements.items()]
+    missing[3] |= {"listed_as": "mug"}
     lamp, cup, pen = ghosts(advisor.Advice(fields, {"missing": {"missing": missing}}), 3)
     assert lamp.text == "lamp? on-top desk"
     assert lamp.position == pytest.approx((1.1, 1.8, 0.9))
     assert lamp.extent == (0.4, 0.05, 1.5)
-    assert (cup.text, cup.position, cup.extent) == ("cup? on-top desk", (1.0, 2.0, 0.4), None)
+    assert (cup.text, cup.position, cup.extent) == ("mug? on-top desk", (1.0, 2.0, 0.4), None)
     assert (pen.text, pen.position, pen.extent) == ("pen? inside desk", (1.0, 2.0, 0.4), None)
 
 

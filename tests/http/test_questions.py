@@ -246,6 +246,12 @@ async def test_likely_further_instances_are_listed(
     (entry,) = answer
     assert [entry[name] for name in ("label", "listed_count", "low", "high")] == ["chair", 2, 2, 4]
     assert entry["probability"] == pytest.approx(0.8 / 0.9, abs=1e-3)
+    # The first object of a class is its word.
+    for labels, word in ((("Chairs", "chair"), "Chairs"), (("chair", "Chairs"), None)):
+        objects = [*LABELS[:2], *labels]
+        (again,) = (await ask(measured, "missing", objects=objects))["more"]
+        assert again.pop("listed_as", None) == word
+        assert again == entry
     # A question about a place lists none.
     place = {"relation": "on-top", "object": "bed"}
     assert (await ask(measured, "missing", objects=LABELS, at=place))["more"] == []

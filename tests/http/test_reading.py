@@ -112,6 +112,9 @@ async def test_unknown_labels_can_be_taken_for_the_nearest_class(client: httpx.A
     )
     stated = {(one["relation"], one["probability"]) for one in expected["misplaced"]}
     assert {(one["relation"], one["probability"]) for one in answer["misplaced"]} == stated
+    words = {one["object"]: one.pop("listed_as", None) for one in answer["outliers"]}
+    misspelt = {f"nigthstand_{k}": "nigthstand" for k in (1, 2)}
+    assert words == {"bed": None, "x": "big lamp", **misspelt}
     assert answer["outliers"] == expected["outliers"]
     # A label that is like none is refused all the same.
     scene["objects"].append("droid")
@@ -155,7 +158,7 @@ async def test_the_syntax_of_detectors_is_read(
 
 
 async def test_aliases_of_room_types_and_candidates_are_named(client: httpx.AsyncClient) -> None:
-    """Answers name them by their canonical names. Objects keep their ids."""
+    """Aliases of objects are not mapped, because answers name objects by id."""
     study = {"label": "study", "class": "office", "similarity": 1.0, "rule": "alias"}
     answer = await ask(client, "rooms", objects=["couch"], candidates=["study", "Bedrooms"])
     assert {one["room_type"] for one in answer["room_types"]} == {"office", "bedroom"}
@@ -169,6 +172,48 @@ async def test_aliases_of_room_types_and_candidates_are_named(client: httpx.Asyn
         ("tv", "television", "alias"),
         ("pair of sofas", "sofa", "phrase"),
     ]
+
+
+Words = set[tuple[str, str | None]]
+
+
+def words_of(entries: list[dict[str, Any]]) -> Words:
+    """The class of each entry, and the word of the request if it differs."""
+    return {(entry["label"], entry.get("listed_as")) for entry in entries}
+
+
+async def test_an_entry_has_the_class_and_the_word_of_the_request(
+    client: httpx.AsyncClient,
+) -> None:
+    """A word that is a class stays this class, also with a broader class, such as desk."""
+    objects = ["bed", "TV", "Chairs", {"id": "s", "label": "couch"}, "desk", "table"]
+    answer = await ask(client, "outliers", objects=objects)
+    assert {(one["object"], *entry) for one in answer["outliers"] for entry in words_of([one])} == {
+        ("bed", "bed", None),
+        ("TV", "television", "TV"),
+        ("Chairs", "chair", "Chairs"),
+        ("s", "sofa", "couch"),
+        ("desk", "desk", None),
+        ("table", "table", None),
+    }
+    # Candidates of one class have one entry, with the word of the first.
+    candidates = ["desk", "Sofas", "couch", "tv", "television", "table"]
+    answer = await ask(client, "missing", objects=["bed"], candidates=candidates)
+    expected: Words = {("desk", None), ("sofa", "Sofas"), ("television", "tv"), ("table", None)}
+    assert words_of(answer["missing"]) == expected
+
+
+async def test_a_sampled_scene_has_classes_and_the_answer_their_words(
+    client: httpx.AsyncClient,
+) -> None:
+    objects = ["bed", "couch", {"id": "s", "label": "Sofas"}]
+    relations = [["couch", "left", "bed"]]
+    answer = await ask(client, "generate", objects=objects, relations=relations, steps=1)
+    assert answer["listed_as"] == {"sofa": "couch"}
+    (scene,) = answer["scenes"]
+    assert {"bed", "sofa"} <= set(scene["objects"])
+    assert ("sofa", "left", "bed") in triples(scene["relations"])
+    assert "listed_as" not in await ask(client, "generate", objects=["bed", "sofa"], steps=1)
 
 
 async def test_a_scene_of_the_training_is_a_request(client: httpx.AsyncClient) -> None:

@@ -41,7 +41,7 @@ def _question(function: Callable[..., Any], *path: str) -> Callable[..., Any]:
 
 
 def _more(artifact: Artifact, scene: Scene, **options: Any) -> Any:
-    return counts.more(artifact, present(scene, artifact.spec), scene.room_type, **options)
+    return counts.more(artifact, scene, present(scene, artifact.spec), **options)
 
 
 # The answer to `outliers` has all its fields. The other functions return one list of an answer.

@@ -1,6 +1,7 @@
 """The probability of an outlier, the thresholds, and the companions of an outlier."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -58,6 +59,8 @@ def test_a_rarely_shown_class_raises_no_alarm_at_a_sensitivity(level):
         "triway", outlier=CountSlope(intercept=9.0), outlier_lines=LINES, popularity=popularity
     )
     scene = scene_of([common, rare, rare, unseen])
+    objects = [replace(thing, label="robot's own word") for thing in scene.objects]
+    scene = replace(scene, objects=tuple(objects))
     answer = outliers(artifact, scene, sensitivity=level)
     flagged = {one.object for one in answer.outliers if one.is_outlier}
     assert all(one.probability > answer.threshold for one in answer.outliers)

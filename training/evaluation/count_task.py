@@ -14,6 +14,7 @@ Classes without statistics, and classes whose instances the source does not coun
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -86,12 +87,13 @@ def _ask_counts(
     part, asked = listed_cases(scene, counted, artifact.vocabulary.structure, seed)
     room = part.room if part.room >= 0 else None
     scene_part = of_classes(np.repeat(part.classes, part.listed).tolist())
+    scene_part = replace(scene_part, room_type=room)
     listing = present(scene_part, artifact.spec)
     candidates = part.classes[asked].tolist()
     labels = artifact.vocabulary.labels
     pairs = zip(part.classes.tolist(), part.number.tolist(), strict=True)
     number_of = {labels[index]: (index, number) for index, number in pairs}
-    entries = more(artifact, listing, room, top_k=len(candidates), candidates=candidates)
+    entries = more(artifact, scene_part, listing, top_k=len(candidates), candidates=candidates)
     fields = ("listed_count", "expected_count", "low", "high", "probability")
     return [(*number_of[entry["label"]], *(entry[name] for name in fields)) for entry in entries]
 

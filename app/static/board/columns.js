@@ -6,7 +6,7 @@ import { judgedBy } from './edges.js';
 import { accept, ghostsOf, likely, SHIFTED } from './ghosts.js';
 import { common, inWords, QUESTIONS, reading, whyNot } from './questions.js';
 import { changed } from './store.js';
-import { namesOf, percent, SPOKEN } from './words.js';
+import { namesOf, percent, SPOKEN, wordOf } from './words.js';
 
 const SEEN = ['answers', 'shown', 'models', 'things', 'tab', 'draft', 'words', 'at', 'refused', 'posed', 'relations', 'room', 'right', 'line'];
 
@@ -52,6 +52,9 @@ const verdict = (words, about, onclick) => el('button', {
   onclick: ({ detail }) => detail < 2 && onclick(),
 }, words);
 
+/** The class of an entry, if the request has another word for it. */
+const classOf = ({ label, listed_as: word }) => (word ? el('p', { class: 'quiet' }, `class: ${label}`) : null);
+
 const ROWS = {
   missing(answer, name, state, store, column, verdicts) {
     const ghosts = new Map(column === state.shown ? ghostsOf(state).map((ghost) => [ghost.label, ghost]) : []);
@@ -76,7 +79,7 @@ const ROWS = {
     });
     // An answer about chosen classes also has improbable instances.
     const further = answer.more.filter((one) => one.probability >= 0.5).map((one) =>
-      [one.probability, row('missing', el('b', {}, `another ${one.label}`), one.probability, {},
+      [one.probability, row('missing', el('b', {}, `another ${wordOf(one)}`), one.probability, {}, classOf(one),
         el('p', { class: 'quiet' }, `${one.listed_count} listed, about ${Math.round(one.expected_count)} expected`))]);
     return [...rows, ...further].sort(([a], [b]) => b - a).map(([, node]) => node);
   },
@@ -90,7 +93,7 @@ const ROWS = {
       }, name(one.object)), one.probability, one.is_outlier
         ? { kind: 'alarm', words: 'does not belong', buttons: [verdict('Belongs here', name(one.object), () => verdicts.belongs(one.object))] }
         : { words: one.confirmed ? 'confirmed' : '' },
-      reasons(one.because, name, one.usually_with)));
+      classOf(one), reasons(one.because, name, one.usually_with)));
     const misplaced = answer.misplaced.filter((one) => one.is_misplaced || one.confirmed).map((one) =>
       row('outliers', el('b', {}, spoken(one, name)), one.probability, one.confirmed
         ? { words: 'confirmed' }

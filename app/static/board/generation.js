@@ -38,8 +38,8 @@ export function createGeneration(form, drawn, store, say) {
     const body = bodyOf(state);
     drawn.setAttribute('aria-busy', 'true');
     try {
-      const { scenes: [scene] } = await call('generate', body, signal);
-      if (!signal.aborted) show(state, scene, body);
+      const { scenes: [scene], listed_as: words = {} } = await call('generate', body, signal);
+      if (!signal.aborted) show(state, scene, new Map(Object.entries(words)), body);
     } catch (error) {
       if (!signal.aborted) fail(error, body);
     } finally {
@@ -54,23 +54,26 @@ export function createGeneration(form, drawn, store, say) {
     shown.problem.replaceChildren(...(error.problem ? problemWords(error.problem, body) : [error.message]));
   }
 
-  function show(state, scene, body) {
+  /** @param {Map<string, string>} words the words of the board for classes of other names, by class */
+  function show(state, scene, words, body) {
     shown.problem.hidden = true;
     const ids = new Set(body.objects.map(({ id }) => id));
-    const relations = scene.relations.map((one) => el('li', {}, `${one.subject} ${SPOKEN[one.relation]} ${one.object}`));
+    const word = (label) => words.get(label) ?? label;
+    const chip = (label) => el('li', {}, word(label), words.has(label) ? el('span', { class: 'quiet' }, ` (${label})`) : null);
+    const relations = scene.relations.map((one) => el('li', {}, `${word(one.subject)} ${SPOKEN[one.relation]} ${word(one.object)}`));
     shown.detail.replaceChildren(
-      el('ul', { class: 'chips' }, ...scene.objects.map((label) => el('li', {}, label))),
+      el('ul', { class: 'chips' }, ...scene.objects.map(chip)),
       relations.length ? el('details', {}, el('summary', {}, `${relations.length} relations`), el('ul', {}, ...relations)) : '');
     shown.calls.show('generate', body);
-    store.set({ draft: draftOf(state, scene, state.things.filter(({ id }) => ids.has(id))), selected: null });
-    say(`Generated: ${scene.objects.length} objects. ${scene.objects.join(', ')}.`);
+    store.set({ draft: draftOf(state, scene, words, state.things.filter(({ id }) => ids.has(id))), selected: null });
+    say(`Generated: ${scene.objects.length} objects. ${scene.objects.map(word).join(', ')}.`);
   }
 
   /** The generated scene for the board. Objects of the board stay in place; relations place the others. */
-  function draftOf(state, scene, board) {
+  function draftOf(state, scene, words, board) {
     const sized = sizer(sizesOf(state, state.models[0]));
-    const canonical = state.words[state.models[state.shown]]?.canonical ?? ((label) => label);
-    const ids = new Map(board.map((thing) => [canonical(thing.label), thing.id]).reverse());
+    const classes = new Map([...words].map(([label, word]) => [word, label]));
+    const ids = new Map(board.map((thing) => [classes.get(thing.label) ?? thing.label, thing.id]).reverse());
     const things = [...board];
     for (const label of scene.objects.filter((one) => !ids.has(one))) {
       const id = freshId(things, label);

@@ -3,7 +3,6 @@
 import { call, UnreachableError } from './api.js';
 import { el } from './dom.js';
 import { changed } from './store.js';
-import { plain } from './words.js';
 
 /** The selectable models: aliases first, then the usable versions without an alias, and the chosen versions. */
 function choices({ models, aliases }, chosen) {
@@ -23,18 +22,12 @@ const versionsOf = ({ models, aliases }) => new Set([
 ]);
 
 function words({ objects, room_types: rooms, examples = [] }) {
-  const names = new Map();
-  for (const { label, aliases } of objects) {
-    for (const alias of aliases) names.set(plain(alias), label);
-  }
-  for (const { label } of objects) names.set(plain(label), label);
   return {
     objects, rooms, examples,
     proposed: objects.filter(({ structure }) => !structure).map(({ label }) => label),
     // A Map, because a label such as “constructor” would clash with a property of plain objects.
     sizes: new Map(objects.filter(({ size }) => size).flatMap(
       ({ label, aliases, size }) => [label, ...aliases].map((name) => [name, size]))),
-    canonical: (label) => names.get(plain(label)) ?? label,
   };
 }
 

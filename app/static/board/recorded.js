@@ -9,6 +9,7 @@ import { asRequest } from './importing.js';
 import { sizesOf } from './questions.js';
 import { fromScene, toScene } from './scene.js';
 import { changed } from './store.js';
+import { wordOf } from './words.js';
 
 const AT_ONCE = 64; // scenes in a batch, so that other clients wait a few milliseconds only
 
@@ -110,13 +111,13 @@ export function createRecorded(store, records, go) {
 
 const MOST_NAMED = 3;
 
-/** The labels of outliers, and of the subjects of misplaced relations. */
+/** The words of the scene for outliers, and for the subjects of misplaced relations. */
 function alarmsOf(answer) {
   if (!answer) return [];
   const { outliers, misplaced } = answer;
-  const labels = new Map(outliers.map(({ object, label }) => [object, label]));
-  const found = [...outliers.filter((one) => one.is_outlier).map(({ label }) => label),
-    ...misplaced.filter((one) => one.is_misplaced).map(({ subject }) => `place of ${labels.get(subject) ?? subject}`)];
+  const words = new Map(outliers.map((one) => [one.object, wordOf(one)]));
+  const found = [...outliers.filter((one) => one.is_outlier).map(wordOf),
+    ...misplaced.filter((one) => one.is_misplaced).map(({ subject }) => `place of ${words.get(subject) ?? subject}`)];
   const names = [...new Set(found)];
   return names.length > MOST_NAMED ? [...names.slice(0, MOST_NAMED), '…'] : names;
 }

@@ -37,6 +37,9 @@ export function search(entries, text, limit = 12) {
 /** The name of an object: its id, with its label if the id does not begin with it, as in "desk (track_3)". */
 export const nameOf = ({ id, label }) => (`${plain(id)} `.startsWith(`${plain(label)} `) ? id : `${label} (${id})`);
 
+/** The word of the request for a class of an answer. */
+export const wordOf = ({ label, listed_as: word }) => word ?? label;
+
 /** A function from the id of an object to its name. */
 export function namesOf(things) {
   const names = new Map(things.map((thing) => [thing.id, nameOf(thing)]));

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final, Literal
 
 from pydantic import BaseModel
@@ -65,7 +65,7 @@ def missing(answer: schemas.MissingAnswer, *, asked_place: bool = False) -> Rend
     least = 0.0 if asked_place else LIKELY_PLACE
     rows = [
         (
-            *(entry.label, f"{entry.probability:.3f}", f"{entry.log_odds:+.2f}"),
+            *(_class(entry), f"{entry.probability:.3f}", f"{entry.log_odds:+.2f}"),
             "\n".join(_placement(p) for p in entry.placements if p.probability >= least),
             _reasons(entry.because),
         )
@@ -73,7 +73,7 @@ def missing(answer: schemas.MissingAnswer, *, asked_place: bool = False) -> Rend
     ]
     counts = [
         (
-            *(entry.label, str(entry.listed_count)),
+            *(_class(entry), str(entry.listed_count)),
             f"{entry.expected_count:.1f} ({entry.low} to {entry.high})",
             f"{entry.probability:.3f}",
         )
@@ -90,7 +90,7 @@ def outliers(answer: schemas.OutliersAnswer) -> RenderableType:
     """Return a table of objects, most probable outlier first, and a table of false relations."""
     rows = [
         (
-            *(entry.object, entry.label, f"{entry.probability:.3f}", f"{entry.log_odds:+.2f}"),
+            *(entry.object, _class(entry), f"{entry.probability:.3f}", f"{entry.log_odds:+.2f}"),
             "outlier" if entry.is_outlier else "",
             _reasons(entry.because),
             ", ".join(entry.usually_with),
@@ -120,8 +120,12 @@ def rooms(answer: schemas.RoomsAnswer) -> RenderableType:
 
 def generate(answer: schemas.GenerateAnswer) -> RenderableType:
     """Return a table of the sampled scenes."""
+    words = answer.listed_as or {}
     rows = [
-        (str(n), ", ".join(scene.objects), _relations(scene.relations), f"{scene.log_score:.1f}")
+        (
+            *(str(n), ", ".join(_named(label, words.get(label)) for label in scene.objects)),
+            *(_relations(scene.relations, words), f"{scene.log_score:.1f}"),
+        )
         for n, scene in enumerate(answer.scenes, 1)
     ]
     title = f"seed {answer.seed}"
@@ -197,9 +201,21 @@ def _relation(entry: schemas.ScoredRelation) -> tuple[str, str, str, str]:
     return entry.subject, entry.relation, entry.object, f"{entry.probability:.3f}"
 
 
-def _relations(relations: Sequence[schemas.Relation]) -> str:
+def _class(entry: schemas.MissingObject | schemas.MoreInstances | schemas.Outlier) -> str:
+    return _named(entry.label, entry.listed_as)
+
+
+def _named(label: str, word: str | None) -> str:
+    """Return the word of the request, with its class in parentheses if this has another name."""
+    return label if word is None else f"{word} ({label})"
+
+
+def _relations(relations: Sequence[schemas.Relation], words: Mapping[str, str]) -> str:
     ranked = sorted(relations, key=lambda entry: entry.relation in {"left", "front"})
-    lines = [f"{r.subject} {r.relation} {r.object}" for r in ranked[:MOST_RELATIONS]]
+    lines = [
+        f"{words.get(r.subject, r.subject)} {r.relation} {words.get(r.object, r.object)}"
+        for r in ranked[:MOST_RELATIONS]
+    ]
     if len(ranked) > MOST_RELATIONS:
         lines.append(f"… and {len(ranked) - MOST_RELATIONS} more")
     return "\n".join(lines)

@@ -155,16 +155,22 @@ class SceneComplete : public SceneCondition {
     std::string missing;
     for (const auto& thing : answer.at("missing"))
       if (thing.at("log_odds").get<double>() >= least)
-        missing += (missing.empty() ? "" : ", ") + thing.at("label").get<std::string>();
+        missing += (missing.empty() ? "" : ", ") + word_of(thing);
     if (missing.empty()) return {true, "nothing is missing"};
     return {false, "missing: " + missing};
+  }
+
+ private:
+  // The word of the request for a class: `listed_as`, or else `label`.
+  static std::string word_of(const scene::json& entry) {
+    return entry.value("listed_as", entry.at("label").get<std::string>());
   }
 };
 
 // SUCCESS if an object fits the scene and its place; FAILURE if it is an outlier, was moved to a
-// wrong place, or is not in the scene. The port `object` is an id or a label. With a label, every
-// object of this label must fit. The service judges places only of objects with positions or stated
-// relations.
+// wrong place, or is not in the scene. The port `object` is an id, a label or a class. With a label
+// or class, every such object must fit. The service judges places only of objects with positions or
+// stated relations.
 class ObjectBelongs : public SceneCondition {
  public:
   ObjectBelongs(const std::string& name, const BT::NodeConfig& config,
@@ -172,17 +178,19 @@ class ObjectBelongs : public SceneCondition {
       : SceneCondition(name, config, service, &scene::Client::outliers) {}
 
   static BT::PortsList providedPorts() {
-    return ports({BT::InputPort<std::string>("object", "id or label of the object")});
+    return ports({BT::InputPort<std::string>("object", "id, label or class of the object")});
   }
 
  protected:
   std::pair<bool, std::string> judge(const scene::json& answer) override {
     std::string named;
     if (!getInput("object", named)) return {false, "no object was named"};
-    for (const char* by : {"object", "label"}) {
+    for (const bool by_id : {true, false}) {
       std::set<std::string> seen;
       for (const auto& thing : answer.at("outliers")) {
-        if (thing.at(by) != named) continue;
+        if (by_id ? thing.at("object") != named
+                  : thing.at("label") != named && thing.value("listed_as", "") != named)
+          continue;
         const auto id = thing.at("object").get<std::string>();
         if (thing.at("is_outlier").get<bool>()) return {false, id + " is an outlier"};
         seen.insert(id);

@@ -41,7 +41,7 @@ class GeneratedRelation(Relation):
 
 
 class GeneratedScene(Reply):
-    """A sampled scene: labels, and relations between the labels."""
+    """A sampled scene: labels of classes, and relations between the labels."""
 
     room_type: str | None = None
     """room type of the scene; absent if it has none"""
@@ -58,6 +58,9 @@ class GenerateAnswer(Answer):
 
     seed: int
     scenes: list[GeneratedScene]
+    listed_as: dict[str, str] | None = None
+    """word of the request for each label of the scenes, if the words differ: the label of the first
+    object of the class. Absent if all words equal the labels"""
 
 
 class GenerateFields(SceneFields, total=False):

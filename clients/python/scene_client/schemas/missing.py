@@ -97,6 +97,9 @@ class MissingObject(Reply):
     """
 
     label: str
+    """class of the vocabulary"""
+    listed_as: str | None = None
+    """first entry of `candidates` that names the class; absent if it equals `label`"""
     probability: Probability
     log_odds: Finite
     placements: list[Placement] = []
@@ -116,6 +119,9 @@ class MoreInstances(Reply):
     """
 
     label: str
+    """class of the vocabulary"""
+    listed_as: str | None = None
+    """label of the first object of the class in the request; absent if it equals `label`"""
     listed_count: Annotated[int, Field(ge=1)]
     """number of listed objects of the class"""
     expected_count: Finite

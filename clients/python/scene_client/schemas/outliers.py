@@ -41,6 +41,9 @@ class Outlier(Reply):
 
     object: str
     label: str
+    """class of the object in the vocabulary"""
+    listed_as: str | None = None
+    """label of the object in the request; absent if it equals `label`"""
     probability: Probability
     log_odds: Finite
     is_outlier: bool

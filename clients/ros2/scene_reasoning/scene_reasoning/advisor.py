@@ -91,5 +91,7 @@ class Advisor:
         answers = {}
         for question in self.questions:
             answer = getattr(self.client, question)(**fields, **self.own.get(question, {}))
-            answers[question] = answer.model_dump(mode="json", exclude={"frame_id", "stamp"})
+            answers[question] = answer.model_dump(
+                mode="json", exclude={"frame_id", "stamp"}, exclude_none=True
+            )
         return Advice(fields, answers)

@@ -120,7 +120,8 @@ class SceneComplete(SceneCondition):
         return self.client.missing(**fields)
 
     def judge(self, answer: MissingAnswer) -> tuple[bool, str]:
-        missing = [thing.label for thing in answer.missing if thing.log_odds >= self.log_odds]
+        likely = [thing for thing in answer.missing if thing.log_odds >= self.log_odds]
+        missing = [thing.listed_as or thing.label for thing in likely]
         return not missing, f"missing: {', '.join(missing)}" if missing else "nothing is missing"
 
 
@@ -131,7 +132,8 @@ class ObjectBelongs(SceneCondition):
     service judges places only of objects with positions or stated relations.
 
     Args:
-        thing: id or label of the object. With a label, every object of this label must fit.
+        thing: id or label of the object, or its class. With a label or class, every such object
+            must fit.
         own: extra fields, such as ``threshold``, the smallest probability of an outlier.
     """
 
@@ -146,7 +148,7 @@ class ObjectBelongs(SceneCondition):
 
     def judge(self, answer: OutliersAnswer) -> tuple[bool, str]:
         named = [entry for entry in answer.outliers if entry.object == self.thing] or [
-            entry for entry in answer.outliers if entry.label == self.thing
+            entry for entry in answer.outliers if self.thing in (entry.listed_as, entry.label)
         ]
         if not named:
             return False, f"no {self.thing} was seen"

@@ -16,7 +16,8 @@ class Ghost:
     """A marker for a missing object.
 
     Attributes:
-        text: label of the missing object, and its relation to the anchor.
+        text: word of the request for the missing object, or else its class; and its relation to
+            the anchor.
         position: x, y, z in metres in the frame of the detections. If the offset from the anchor is
             unknown, this is the position of the anchor.
         extent: x, y, z in metres: two standard deviations of the position; None if unknown.
@@ -44,7 +45,8 @@ def ghosts(advice: Advice, most: int) -> list[Ghost]:
 
 
 def _ghost(missing: dict[str, Any], placement: dict[str, Any], label: str, anchor: Any) -> Ghost:
-    text = f"{missing['label']}? {placement['relation']} {label}"
+    name = missing.get("listed_as") or missing["label"]
+    text = f"{name}? {placement['relation']} {label}"
     offset = placement.get("offset")
     if offset is None:
         return Ghost(text, (anchor["x"], anchor["y"], anchor["z"]), None)
