@@ -177,7 +177,7 @@ def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Opti
         errors.add(InvalidRequestError, ("top_k",), message)
     candidates, at, view = None, None, request.viewpoint
     if request.candidates is not None:
-        candidates = reading.unknown.resolve_all(request.candidates, "candidates", errors)
+        candidates = [*reading.unknown.resolve_all(request.candidates, "candidates", errors)]
     if request.at is not None:
         at = _at(request.at, artifact, reading, errors)
     errors.raise_any()

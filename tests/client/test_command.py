@@ -97,7 +97,7 @@ def test_json_is_the_service_s_answer(
         ("models", ("home@1.0.0", "default", "triway", "ready")),
         ("vocabulary", ("garbage bin", "trash can, waste basket", "structure", "homes, shops")),
         ("outliers bed toilet sink", ("toilet", "because")),
-        ("rooms bed", ("room type", "probability", "bedroom")),
+        ("rooms bed --candidates study", ("room type", "listed as", "office", "study", "1.000")),
         ("relations bed lamp --relations 'lamp on-top bed'", ("if not observed", "on-top")),
         ("outliers bed lamp --relations 'lamp on-top bed'", ("on-top", "bed")),
     ],
