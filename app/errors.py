@@ -261,8 +261,8 @@ class UnknownLabelsError(RequestError, slug="unknown-labels", status=422, steps=
     GET /models/{name}/vocabulary lists every known label. With `unknown_labels` set to `ignore`,
     the service ignores unknown labels and lists them in `ignored`. With `nearest`, it maps misspelt
     labels and phrases to a class and lists them in `mapped`. It refuses a label that could be
-    several classes. With `nearest-or-ignore`, it ignores such a label. With all three, it ignores an
-    unknown room type, but POST /generate always refuses it.
+    several classes. With `nearest-or-ignore`, it ignores such a label. All three ignore an unknown
+    room type, but POST /generate always refuses it.
     """
 
     example = _example("#/objects/1", "the model does not know this label", "nightstand")

@@ -25,8 +25,8 @@ class RoomsRequest(SceneRequest):
     top_k: Annotated[int, Field(ge=1, le=4096)] = 5
     """maximum number of room types in the answer"""
     candidates: Annotated[list[Label] | None, Field(min_length=1, max_length=4096)] = None
-    """the possible room types, such as the rooms of a flat. Their probabilities sum to one. Names of
-    one room type share one entry of the answer"""
+    """the possible room types, such as the rooms of a flat. Their probabilities sum to one. Names
+    of one room type share one entry of the answer"""
     detail: Detail = "full"
     """`scores` leaves `because` out of the answer"""
 
