@@ -25,6 +25,7 @@ from app.inference.chains import ChainState, ConditionedChains, Conditions, rand
 from app.inference.kernels import select_consistent
 from app.inference.relations import context_of
 from app.questions.answer import Fields, rounded_number
+from app.questions.names import ErrorList
 from app.questions.outliers import intruders
 from app.questions.posterior import Present, given_relations, present
 from app.questions.question import BEDROOM, POSES, REFUSED, Example, Options, Question
@@ -220,6 +221,10 @@ def room_fit(artifact: Artifact, classes: list[int], room: int) -> float:
 
 
 def _read(request: GenerateRequest, artifact: Artifact, reading: Reading) -> Options:
+    if (name := request.room_type) is not None and reading.scene.room_type is None:
+        errors = ErrorList()
+        reading.unknown.refuse(name, ("room_type",), errors, is_room=True)
+        errors.raise_any()
     if reading.scene.room_type in artifact.calibration.rare_rooms:
         message = "the model has too few training scenes of this room type to sample such a room"
         raise RareRoomTypeError([LocatedError(("room_type",), message)])
@@ -270,7 +275,8 @@ GENERATE: Final = Question(
     description="""
 Sample scenes that contain the given objects and relations. Equal seeds give equal scenes.
 
-The request is refused if too few training scenes have its room type (`rare_room_types` of `GET
+The request is refused if the model does not know its room type, with any `unknown_labels`. The same
+holds if too few training scenes have this room type (`rare_room_types` of `GET
 /models/{name}/vocabulary`).
 """,
     ask_all=_ask_all,

@@ -122,7 +122,7 @@ class Unknown:
         vocabulary: classes and room types of the model.
         treatment: value of the field `unknown_labels` of the request.
         look_ups: searches for similar classes, shared by all scenes of the request.
-        ignored: names of the ignored objects.
+        ignored: names of the ignored objects, candidates and room type.
         mapped: the class that replaces each label, also for aliases of candidates and room types. A
             key consists of the label and whether it is a room type.
         guessed: labels for which the service has searched the nearest class.
@@ -155,10 +155,12 @@ class Unknown:
         found = self.vocabulary.read(label, is_room=is_room)
         if found is None and self._may_guess(label, is_room=is_room):
             found = self.vocabulary.guess(label, is_room=is_room)
-        if found is None and self.treatment.endswith("ignore"):
+        # An answer without the room type is a good answer, so `nearest` ignores it too.
+        is_ignored = self.treatment != "error" if is_room else self.treatment.endswith("ignore")
+        if found is None and is_ignored:
             self.ignored.append(name)
         elif found is None:
-            self._refuse(label, location, errors, is_room=is_room)
+            self.refuse(label, location, errors, is_room=is_room)
         # Answers name objects by id, but room types and candidates by their canonical names.
         elif found.rule not in (_SPELLINGS if location[0] == "objects" else ("label",)):
             names = self.vocabulary.room_types if is_room else self.vocabulary.labels
@@ -195,7 +197,8 @@ class Unknown:
             guessed.add(key)
         return True
 
-    def _refuse(self, label: str, location: Location, errors: ErrorList, *, is_room: bool) -> None:
+    def refuse(self, label: str, location: Location, errors: ErrorList, *, is_room: bool) -> None:
+        """Add the error of an unknown label, with similar names."""
         names = self.vocabulary.room_types if is_room else self.vocabulary.labels
         message = "the model does not know this label"
         if not is_room and self.vocabulary.room_index(label) is not None:

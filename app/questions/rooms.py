@@ -6,7 +6,7 @@ of the request. The machine's probability of a room type t (`app.inference.objec
     p(t) ∝ p_machine(t | objects)^s,   s = slope + log_count · log(number of listed classes)
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -28,7 +28,7 @@ def rooms(
     scene: Scene,
     *,
     top_k: int = 5,
-    candidates: Sequence[int] | None = None,
+    candidates: Mapping[int, Sequence[str]] | None = None,
     details: bool = True,
 ) -> Fields:
     """Rank the room types by their probability, likeliest first.
@@ -36,8 +36,8 @@ def rooms(
     Args:
         scene: the listed objects. Its relations and its room type are not used.
         top_k: maximum number of room types in the answer.
-        candidates: indices of the possible room types; their probabilities sum to 1. None means all
-            room types.
+        candidates: names of the possible room types in the request, by the index of the room type;
+            the probabilities of these types sum to 1. None means all room types.
         details: whether the answer contains `because`.
 
     Returns:
@@ -52,11 +52,12 @@ def rooms(
     sharpness = artifact.calibration.rooms.of(posterior.listed)
     p = softmax(sharpness * posterior.room_log_p()[among])
     first = np.argsort(-p, kind="stable")[:top_k]
-    names = [artifact.vocabulary.room_types[t] for t in among[first].tolist()]
-    entries: list[Fields] = [
-        {"room_type": name, "probability": probability}
-        for name, probability in zip(names, significant(p[first]), strict=True)
-    ]
+    entries: list[Fields] = []
+    for t, probability in zip(among[first].tolist(), significant(p[first]), strict=True):
+        name = artifact.vocabulary.room_types[t]
+        entries.append({"room_type": name, "probability": probability})
+        if candidates is not None and candidates[t] != [name]:
+            entries[-1]["listed_as"] = candidates[t]
     if details:
         change = posterior.room_reasons()[among[first]]
         causes = reasons(scene, posterior.present, change, least=LEAST_CHANGE)
@@ -91,6 +92,10 @@ _EXAMPLES: Final[dict[str, Any]] = {
     "candidates": Example(
         "only the rooms of this flat",
         {"objects": ["desk", "lamp"], "candidates": ["bedroom", "bathroom", "office"], "top_k": 2},
+    ),
+    "one-type": Example(
+        "two names of one room type",
+        {"objects": ["pillow"], "candidates": ["toilet", "bathroom", "bedroom"]},
     ),
     "scores": Example(
         "probabilities only, for a fast and short answer", {**LABELS, "detail": "scores"}
@@ -129,7 +134,8 @@ ROOMS: Final = Question(
 Rank the room types by their probability given the objects, most probable first.
 
 For a single object, the answer is where such an object usually is. The probabilities of all room
-types, or of all candidates, sum to one. The answer uses neither relations nor the room type of the
-request.
+types, or of all candidates, sum to one. Candidates that name one room type, such as toilet and
+bathroom, share one entry and its probability. The entry lists these names in `listed_as`. The
+answer uses neither relations nor the room type of the request.
 """,
 )

@@ -57,7 +57,7 @@ _IMITATIONS: Final = frozenset(("toy", "stuffed", "plush", "puppet"))
 _AMBIGUOUS: Final = frozenset(
     "bar board boat burner button can cap card cell chip cleaner conditioner console controller "  # noqa: SIM905
     "cooker cover cream cube cycle die disc dish disk draw dressing dryer equipment file "
-    "filing foundation frame glass ground handle hanger holder hood horse iron island jam "
+    "filing foundation frame glass ground hall handle hanger holder hood horse iron island jam "
     "jelly keyboard letter mail maker marble mint mold monitor nail nut oil pack pad part paste "
     "pepper phone plate player plug pole polish present rail receiver register ring roll salt "
     "scooter screen self shade sheet shower slab spray stand stick stopper string switch "

@@ -176,5 +176,8 @@ def test_unknown_names_are_mapped_or_left_out_visibly(open_board: OpenBoard) -> 
     expect(board.column("missing").locator("header + .problem + p")).to_be_empty()
     board.put('{"objects": ["bed"], "room_type": "submarine"}')
     expect(board.page.locator("#room-error")).to_contain_text("submarine not known, left out")
-    assert "room_type" not in board.scene
     assert board.rows("missing")
+    board.tab("Generate")
+    board.click("Generate a scene")
+    problem = board.page.locator(".problem:visible")
+    expect(problem).to_contain_text("the model does not know this room type")

@@ -103,7 +103,7 @@ def test_json_is_the_service_s_answer(
             "generate Couches bed --relations 'Couches on-top bed' --seed 1",
             ("Couches (sofa)", "Couches on-top bed"),
         ),
-        ("rooms bed", ("room type", "probability", "bedroom")),
+        ("rooms bed --candidates study", ("room type", "listed as", "office", "study", "1.000")),
         ("relations bed lamp --relations 'lamp on-top bed'", ("if not observed", "on-top")),
         ("outliers bed lamp --relations 'lamp on-top bed'", ("on-top", "bed")),
     ],

@@ -32,7 +32,7 @@ VOCABULARY = Vocabulary(
         ObjectClass("object", structure=True),
     ],
     ("bedroom", "bathroom", "office"),
-    {"office": ("study",)},
+    {"bathroom": ("toilet",), "office": ("study",)},
 )
 V, A, C = len(VOCABULARY), len(CANONICAL), len(VOCABULARY.room_types)
 TRIPLES = torch.tensor([(0, 0, 1), (0, 1, 0), (1, 3, 5), (2, 2, 1), (2, 7, 5), (3, 2, 0)])

@@ -6,6 +6,7 @@ from typing import Any
 import httpx
 import pytest
 
+from scene_client.schemas import RoomsAnswer
 from tests.http.test_problems import pointers, problem
 from tests.http.test_questions import LAMP_ON_DESK, ask, at, triples
 from tests.scene.turns import Turn, about, after
@@ -116,8 +117,8 @@ async def test_unknown_labels_can_be_taken_for_the_nearest_class(client: httpx.A
     misspelt = {f"nigthstand_{k}": "nigthstand" for k in (1, 2)}
     assert words == {"bed": None, "x": "big lamp", **misspelt}
     assert answer["outliers"] == expected["outliers"]
-    # A label that is like none is refused all the same.
-    scene["objects"].append("droid")
+    # A label that is like none is refused all the same. Such a room type is ignored.
+    scene |= {"objects": [*scene["objects"], "droid"], "room_type": "hangar"}
     response = await client.post("/outliers", json=scene)
     assert pointers(response, "unknown-labels") == ["#/objects/4"]
 
@@ -214,6 +215,42 @@ async def test_a_sampled_scene_has_classes_and_the_answer_their_words(
     assert {"bed", "sofa"} <= set(scene["objects"])
     assert ("sofa", "left", "bed") in triples(scene["relations"])
     assert "listed_as" not in await ask(client, "generate", objects=["bed", "sofa"], steps=1)
+
+
+@pytest.mark.parametrize("treatment", ["ignore", "nearest", "nearest-or-ignore"])
+async def test_unknown_room_types_are_ignored_and_named(
+    client: httpx.AsyncClient, treatment: str
+) -> None:
+    """Without a room type that it knows, `/generate` has no question to answer."""
+    scene: dict[str, Any] = {"objects": ["bed", "lamp"], "unknown_labels": treatment}
+    for question in ("missing", "outliers", "relations", "rooms"):
+        known = await ask(client, question, **scene)
+        answer = await ask(client, question, **scene, room_type="Room 17")
+        assert answer["ignored"] == ["Room 17"]
+        assert answer | {"request_id": "", "ignored": []} == known | {"request_id": ""}
+    response = await client.post("/generate", json=scene | {"room_type": "Room 17"})
+    assert pointers(response, "unknown-labels") == ["#/room_type"]
+    # Candidates of `/rooms` are room types too.
+    answer = await ask(client, "rooms", **scene, candidates=["hangar", "office"])
+    assert answer["ignored"] == ["hangar"]
+    assert [(one["room_type"], one["probability"]) for one in answer["room_types"]] == [
+        ("office", 1.0)
+    ]
+
+
+async def test_candidates_of_one_room_type_share_its_probability(client: httpx.AsyncClient) -> None:
+    names = ["toilet", "bedroom", "bathroom", "Toilet", "toilet", "study"]
+    answer = await ask(client, "rooms", objects=["bed", "lamp"], candidates=names)
+    found = {one.room_type: one for one in RoomsAnswer.model_validate(answer).room_types}
+    assert {name: one.listed_as for name, one in found.items()} == {
+        "bathroom": ["toilet", "bathroom", "Toilet"],
+        "bedroom": None,
+        "office": ["study"],
+    }
+    every = await ask(client, "rooms", objects=["bed", "lamp"])
+    p = {one["room_type"]: one["probability"] for one in every["room_types"]}
+    assert {name: one.probability for name, one in found.items()} == p
+    assert sum(p.values()) == pytest.approx(1, abs=1e-3)
 
 
 async def test_a_scene_of_the_training_is_a_request(client: httpx.AsyncClient) -> None:

@@ -51,11 +51,11 @@ def test_probabilities_are_those_of_the_machine_to_a_power(artifact, profile):
 
 def test_probabilities_of_candidates_sum_to_one(artifact):
     every = by_type(artifact, rooms(artifact, scene_of(CLASSES)))
-    (only,) = rooms(artifact, scene_of(CLASSES), candidates=[1])
+    (only,) = rooms(artifact, scene_of(CLASSES), candidates={1: []})
     assert (only.room_type, only.probability) == (artifact.vocabulary.room_types[1], 1.0)
-    both = by_type(artifact, rooms(artifact, scene_of(CLASSES), candidates=[1, 0]))
+    both = by_type(artifact, rooms(artifact, scene_of(CLASSES), candidates={1: [], 0: []}))
     np.testing.assert_allclose(both, every[:2] / every[:2].sum(), rtol=1e-4)
-    assert rooms(artifact, scene_of(CLASSES), candidates=[]) == ()
+    assert rooms(artifact, scene_of(CLASSES), candidates={}) == ()
 
 
 def test_reasons_are_changes_of_log_odds(artifact):

@@ -185,8 +185,7 @@ class _Encoder:
         # Relations of structure classes are uninformative: every room has walls on all sides.
         for array in (holds, observed):
             array[:, structure[kept]] = array[:, :, structure[kept]] = False
-        room = curated_names().canonical_room(scene.room_type)
-        room_type = None if room is None else self.vocabulary.room_index(room)
+        room_type = curated_names().room_index(scene.room_type, self.vocabulary)
         evidence = pool_instances(classes, holds, observed, room_type)
         if any(thing.count > 1 for thing in scene.objects):
             # One object entry can mean several instances.

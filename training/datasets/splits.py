@@ -12,8 +12,8 @@ The percentages are the shares of the training, test and validation part.
 - ``paper groups`` has the shares of ``paper`` and keeps groups together.
 
 All protocols except ``stable`` stratify by room type. Their parts depend on the seed and on the set
-of scenes, but not on the order of scenes. Data sources with common groups must be split together;
-others do not affect each other's parts.
+of scenes, but neither on the order of scenes nor on the vocabulary. Data sources with common groups
+must be split together; others do not affect each other's parts.
 """
 
 from __future__ import annotations
@@ -102,8 +102,7 @@ def _families(
     names = curated_names()
     for scene, unit in zip(scenes, units, strict=True):
         if scene.source == max(sources_of[unit], key=lambda source: (sizes[source], source)):
-            room = names.canonical_room(scene.room_type) or ""
-            families[family_of[scene.source]][unit][room] += 1
+            families[family_of[scene.source]][unit][names.stratum(scene.room_type)] += 1
     return list(families.values())
 
 

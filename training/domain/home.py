@@ -161,7 +161,8 @@ def _with_new_words(model: Artifact, recorded: Sequence[AnnotatedScene]) -> Arti
         scenes_of.update(
             {names.canonical(x) for x in labels.values() if vocabulary.look_up(x) is None}
         )
-        if (room := names.canonical_room(scene.room_type)) and vocabulary.room_index(room) is None:
+        room = names.canonical_room(scene.room_type)
+        if room is not None and names.room_index(scene.room_type, vocabulary) is None:
             rooms.setdefault(label_key(room), room)
     excluded = set(map(label_key, (*names.not_objects, *names.structure)))
     classes = [
@@ -177,8 +178,7 @@ def _read(parent: Artifact, scene: AnnotatedScene) -> HomeScene:
     found = [vocabulary.look_up(thing.label) for thing in scene.objects]
     classes = np.unique([entry.entry for entry in found if entry is not None]).astype(np.int64)
     classes = classes[~vocabulary.structure[classes]]
-    name = names.canonical_room(scene.room_type)
-    room = None if name is None or not parent.spec.C else vocabulary.room_index(name)
+    room = names.room_index(scene.room_type, vocabulary) if parent.spec.C else None
     left_out = classes[:0]
     if not scene.confirmed and len(classes):
         left_out = alarms_of(parent, of_classes(parent, classes, room))

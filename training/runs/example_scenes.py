@@ -152,9 +152,9 @@ def _make_example(
     kept = [(index, thing) for index, thing in usable if index in classes and first[index] is thing]
     names = {thing.id: vocabulary.labels[index] for index, thing in kept}
     values: dict[str, Any] = {}
-    room = curated_names().canonical_room(scene.room_type)
-    if room is not None and vocabulary.room_index(room) is not None:
-        values["room_type"] = room
+    room = curated_names().room_index(scene.room_type, vocabulary)
+    if room is not None:
+        values["room_type"] = vocabulary.room_types[room]
     if any(thing.position for _, thing in kept):
         values |= {"frame_id": "map", "viewpoint": _viewpoint(scene)}
     elif relations := _relations(scene, names):

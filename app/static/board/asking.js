@@ -63,18 +63,17 @@ export function startAsking(store) {
     }
   }
 
-  /** Remembers the names that a model refused. The next request to this model leaves them out. */
+  /** Remembers the labels that a model refused. The next request to this model leaves them out. */
   function learn({ type, errors = [] }, body) {
     if (!type?.endsWith('/unknown-labels')) return false;
     const state = store.get();
     const known = refusedBy(state, body.model);
-    const found = { objects: new Map(known.objects), rooms: new Map(known.rooms) };
+    const found = new Map(known);
     for (const { pointer, suggestions = [] } of errors) {
       const place = /^#\/objects\/(\d+)/.exec(pointer);
-      if (place) found.objects.set(body.objects[place[1]].label, suggestions);
-      else if (pointer === '#/room_type') found.rooms.set(body.room_type, suggestions);
+      if (place) found.set(body.objects[place[1]].label, suggestions);
     }
-    const learnt = found.objects.size > known.objects.size || found.rooms.size > known.rooms.size;
+    const learnt = found.size > known.size;
     if (learnt) store.set({ refused: { ...state.refused, [body.model]: found } });
     return learnt;
   }

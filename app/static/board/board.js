@@ -102,7 +102,7 @@ export function createBoard(node, store, actions, takeGhost) {
     each
       .classed('selected', (box) => box.id === state.selected)
       .classed('outlier', (box) => !state.draft && Boolean(wrong.get(box.id)?.is_outlier))
-      .classed('unknown', (box) => !state.draft && refusedBy(state, state.models[state.shown]).objects.has(box.label))
+      .classed('unknown', (box) => !state.draft && refusedBy(state, state.models[state.shown]).has(box.label))
       .classed('new', (box) => Boolean(state.draft?.fresh.has(box.id)))
       .classed('anchor', (box) => state.at?.object === box.id)
       .classed('loose', (box) => !state.draft && state.posed && !box.placed)
@@ -127,7 +127,7 @@ export function createBoard(node, store, actions, takeGhost) {
   /** Draws labels inside their boxes if they fit, else beside them. Upper objects take precedence. */
   function drawLabels(state, boxes, places, wrong) {
     const texts = [];
-    const left = refusedBy(state, state.models[state.shown]).objects;
+    const left = refusedBy(state, state.models[state.shown]);
     const half = ROBOT_SIDE / 2;
     const named = (box) => (boxes.some(({ id, label }) => label === box.label && id !== box.id) ? nameOf(box) : box.label);
     const { x, y } = state.viewer;

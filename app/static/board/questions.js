@@ -22,12 +22,12 @@ export const LIKELY = 0.25;
 /** Typical sizes of a model's classes, by label. */
 export const sizesOf = (state, model) => state.words[model]?.sizes ?? new Map();
 
-/** The labels and room types that a model refused. @returns {{objects: Map, rooms: Map}} name → similar names */
-export const refusedBy = (state, model) => state.refused[model] ?? { objects: new Map(), rooms: new Map() };
+/** The labels that a model refused. @returns {Map<string, string[]>} label → similar names */
+export const refusedBy = (state, model) => state.refused[model] ?? new Map();
 
 /** The objects of the board that a model knows, or may know. */
 export const knownTo = (state, model) =>
-  state.things.filter((thing) => !refusedBy(state, model).objects.has(thing.label));
+  state.things.filter((thing) => !refusedBy(state, model).has(thing.label));
 
 /** The classes that both models can propose; null with one model or with equal vocabularies. */
 export function common(state) {
@@ -51,11 +51,9 @@ const OWN = {
 /** The parts of a scene that are no evidence about its room type. A change of them asks nothing again. */
 const NO_EVIDENCE = { rooms: { room: '', relations: [], posed: false } };
 
-/** The scene as a model gets it, without the labels and the room type that it refused. */
-export function sceneFor(state, model) {
-  const room = refusedBy(state, model).rooms.has(state.room) ? '' : state.room;
-  return toScene({ ...state, room, things: knownTo(state, model) }, sizesOf(state, state.models[0]));
-}
+/** The scene as a model gets it, without the labels that it refused. */
+export const sceneFor = (state, model) =>
+  toScene({ ...state, things: knownTo(state, model) }, sizesOf(state, state.models[0]));
 
 /** @returns {object | null} null if there is nothing to ask; `whyNot` gives the reason */
 export function bodyOf(state, question, model) {
@@ -75,9 +73,13 @@ export function whyNot(state, question, model) {
   return common(state)?.length === 0 ? 'The two models have no class in common.' : '';
 }
 
+/** The entries of a field in all answers of a model. */
+const inAnswers = (state, column, field) =>
+  QUESTIONS.flatMap((question) => state.answers[column][question]?.answer?.[field] ?? []);
+
 /** How a model reads a name that is no label of its own: {class, similarity}, or undefined. */
-export const mappedBy = (state, column, name) => QUESTIONS
-  .flatMap((question) => state.answers[column][question]?.answer?.mapped ?? []).find(({ label }) => label === name);
+export const mappedBy = (state, column, name) =>
+  inAnswers(state, column, 'mapped').find(({ label }) => label === name);
 
 /** Whether the shown model reads a name for certain as one of its classes, such as "hall" as "corridor". */
 export const isCertain = (state, name) => Boolean(state.answers) && mappedBy(state, state.shown, name)?.similarity === 1;
@@ -88,7 +90,10 @@ export const isCertain = (state, name) => Boolean(state.answers) && mappedBy(sta
  * @returns {string[]} words, then similar names
  */
 export function reading(state, column, kind, name) {
-  const similar = refusedBy(state, state.models[column])[kind].get(name);
+  // The service ignores an unknown room type, and refuses unknown labels with similar names.
+  const similar = kind === 'rooms'
+    ? inAnswers(state, column, 'ignored').includes(name) && []
+    : refusedBy(state, state.models[column]).get(name);
   if (similar) return [`${name} not known, left out${similar.length ? ':' : ''}`, ...similar];
   const found = mappedBy(state, column, name);
   if (!found) return [];

@@ -112,10 +112,13 @@ def outliers(answer: schemas.OutliersAnswer) -> RenderableType:
 def rooms(answer: schemas.RoomsAnswer) -> RenderableType:
     """Return a table of room types, most probable first."""
     rows = [
-        (entry.room_type, f"{entry.probability:.3f}", _reasons(entry.because))
+        (
+            *(entry.room_type, ", ".join(entry.listed_as or ()), f"{entry.probability:.3f}"),
+            _reasons(entry.because),
+        )
         for entry in answer.room_types
     ]
-    return _table("room type", "probability", "because", rows=rows)
+    return _table("room type", "listed as", "probability", "because", rows=rows)
 
 
 def generate(answer: schemas.GenerateAnswer) -> RenderableType:

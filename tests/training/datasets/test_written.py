@@ -22,6 +22,12 @@ def named(vocabulary, word):
     return None if index is None else vocabulary.labels[index]
 
 
+def room_type(vocabulary, name):
+    """The room type that a request with `nearest-or-ignore` reads."""
+    found = vocabulary.read(name, is_room=True) or vocabulary.guess(name, is_room=True)
+    return None if found is None else vocabulary.room_types[found.entry]
+
+
 def test_common_things_and_indoor_classes_are_classes(vocabulary):
     assert 1_400 < len(vocabulary) < 1_700
     assert {label_key(x) for x in indoor_vocabulary().labels} <= set(
@@ -86,4 +92,61 @@ def test_every_class_has_a_size_and_rooms_have_types(vocabulary):
     assert vocabulary.structure[vocabulary.index("wall")]
     assert vocabulary.anywhere[vocabulary.index("person")]
     assert {"workshop", "warehouse", "nursery", "operating room"} <= set(vocabulary.room_types)
-    assert vocabulary.room_index("hallway") == vocabulary.room_index("corridor")
+
+
+def test_few_room_types_of_written_places_are_folded(vocabulary):
+    """A folded type has the things of the other one."""
+    names = {place.room_type for place in read_places(KNOWLEDGE / "inventories.csv")}
+    folded = {name: room_type(vocabulary, name) for name in names - {*vocabulary.room_types}}
+    assert folded == {"lounge": "living room", "lobby": "reception"}
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("Primary Bedroom", "bedroom"),
+        ("Secondary Bedroom", "bedroom"),
+        ("kids_bedroom", "bedroom"),
+        ("Kid's Bedroom", "bedroom"),
+        ("childs_room_0", "bedroom"),
+        ("Guest Room", "bedroom"),
+        ("Nursery", "nursery"),
+        ("hotel_room", "hotel room"),
+        ("Upstairs Bathroom", "bathroom"),
+        ("Downstairs toilet", "bathroom"),
+        ("En-suite", "bathroom"),
+        ("WC", "bathroom"),
+        ("Cloakroom", "closet"),
+        ("Entryway", "entrance hall"),
+        ("entryway/foyer/lobby", "entrance hall"),
+        ("Entrance", "entrance hall"),
+        ("Hall", "corridor"),
+        ("Landing", "stairs"),
+        ("Dining Hall", "dining room"),
+        ("Kitchen/Dining", "kitchen"),
+        ("Lounge", "living room"),
+        ("Recreation Area", "recreation room"),
+        ("workout/gym/exercise", "gym"),
+        ("Fitness Area", "gym"),
+        ("Laundry", "laundry room"),
+        ("Utility Room", "utility room"),
+        ("pantry_room_0", "pantry"),
+        ("porch/terrace/deck", "porch"),
+        ("Front Yard", "garden"),
+        ("Ward 5", "hospital room"),
+        ("museum", "museum room"),
+        ("rest_space", "waiting room"),
+        ("study_space", "library"),
+        ("Room1", None),
+        ("Room 17", None),
+        ("Anna's room", None),
+        ("Open plan", None),
+        ("Salon", None),
+        ("Town Hall", None),
+        ("empty_room", None),
+        ("hospital", None),  # a building
+        ("airport", None),
+    ],
+)
+def test_room_types_are_read_as_people_say_them(vocabulary, name, expected):
+    assert room_type(vocabulary, name) == expected

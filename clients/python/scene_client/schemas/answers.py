@@ -138,8 +138,9 @@ class Answer(Reply):
     stamp: Stamp | None = None
     """`stamp` of the request"""
     ignored: list[str] = []
-    """with `ignore` or `nearest-or-ignore` as `unknown_labels`: ids of the objects, candidates and
-    room type that the model does not know. The answer ignores them"""
+    """ids of the objects, candidates and room type that the model does not know. The answer ignores
+    them. Room types need another `unknown_labels` than `error`, and objects need `ignore` or
+    `nearest-or-ignore`"""
     mapped: list[Mapped] = []
     """each label that the vocabulary does not list, and each alias of a candidate or room type. The
     class replaces the label. Aliases of objects are not listed, because answers name objects by id.

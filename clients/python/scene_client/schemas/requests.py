@@ -282,7 +282,8 @@ class SceneRequest(Request):
     """treatment of labels that the model does not know. `error` refuses the request. `ignore`
     leaves these objects out of the scene. `nearest` corrects misspelt words and reads phrases by
     their last words (see `mapped`); it refuses a label that could be several classes.
-    `nearest-or-ignore` leaves such a label out"""
+    `nearest-or-ignore` leaves such a label out. All but `error` leave out an unknown room type, but
+    `/generate` always refuses it"""
 
     scene_id: Unused = None
     """id of a training scene. Without `frame_id` and `viewer_frame`, its positions are in the frame

@@ -25,7 +25,8 @@ class RoomsRequest(SceneRequest):
     top_k: Annotated[int, Field(ge=1, le=4096)] = 5
     """maximum number of room types in the answer"""
     candidates: Annotated[list[Label] | None, Field(min_length=1, max_length=4096)] = None
-    """the possible room types, such as the rooms of a flat. Their probabilities sum to one"""
+    """the possible room types, such as the rooms of a flat. Their probabilities sum to one. Names
+    of one room type share one entry of the answer"""
     detail: Detail = "full"
     """`scores` leaves `because` out of the answer"""
 
@@ -35,6 +36,9 @@ class RoomType(Reply):
 
     room_type: str
     probability: Probability
+    listed_as: list[str] | None = None
+    """names of this room type in `candidates`. They share the probability. Absent if `room_type` is
+    the only name"""
     because: list[Because] = []
     """objects that change the odds of the room type by a factor of at least 3, largest change
     first, at most 3"""
