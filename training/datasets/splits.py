@@ -102,7 +102,8 @@ def _families(
     names = curated_names()
     for scene, unit in zip(scenes, units, strict=True):
         if scene.source == max(sources_of[unit], key=lambda source: (sizes[source], source)):
-            families[family_of[scene.source]][unit][names.stratum(scene.room_type)] += 1
+            room = names.canonical_room(scene.room_type) or ""
+            families[family_of[scene.source]][unit][room] += 1
     return list(families.values())
 
 

@@ -38,8 +38,6 @@ class Names:
     kinds: dict[str, tuple[str, ...]] = field(default_factory=dict)
     # Other names of each room type. The key "" lists names without a room type.
     rooms: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    # Other names of each stratum of a split, as in `rooms`.
-    strata: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     def canonical(self, label: str) -> str:
         """Return the curated name of a label, or the label in lower case with single spaces."""
@@ -64,10 +62,6 @@ class Names:
         indices = (vocabulary.room_index(name) for name in names if name is not None)
         return next((index for index in indices if index is not None), None)
 
-    def stratum(self, room: str | None) -> str:
-        """Return the stratum of a scene with this room type; "" without a room type."""
-        return "" if room is None else self._strata_by_key.get(label_key(room), _plain(room))
-
     @cached_property
     def broader(self) -> dict[str, str]:
         """The broader class of each kind."""
@@ -81,10 +75,6 @@ class Names:
     @cached_property
     def _rooms_by_key(self) -> dict[str, str]:
         return _by_any_name(self.rooms)
-
-    @cached_property
-    def _strata_by_key(self) -> dict[str, str]:
-        return _by_any_name(self.strata)
 
 
 def _plain(name: str) -> str:
