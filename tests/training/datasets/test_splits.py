@@ -1,6 +1,5 @@
 import random
 from collections import Counter
-from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -8,7 +7,6 @@ from hypothesis import strategies as st
 
 from training.datasets import AnnotatedScene, split
 from training.datasets.splits import FRACTIONS, Protocol, stable_part
-from training.datasets.vocabulary import curated_names
 
 ROOMS = ("bedroom", "kitchen", "office", None)
 
@@ -87,15 +85,6 @@ def test_scenes_of_rare_room_types_occur_in_all_parts() -> None:
     scenes = [AnnotatedScene(str(k), "a", str(k), f"room {k}", ()) for k in range(40)]
     sizes = {part: len(members) for part, members in split(scenes, seed=0).items()}
     assert sizes == {"train": 30, "test": 6, "validation": 4}
-
-
-def test_curated_names_of_room_types_move_no_scene(monkeypatch: pytest.MonkeyPatch) -> None:
-    rooms = ("hotel room", "bedroom", "toilet", "pantry", "storage room")
-    scenes = [AnnotatedScene(str(k), "a", str(k), rooms[k % 5], ()) for k in range(60)]
-    found = parts_of(scenes, seed=1)
-    names = replace(curated_names(), rooms={})
-    monkeypatch.setattr("training.datasets.splits.curated_names", lambda: names)
-    assert parts_of(scenes, seed=1) == found
 
 
 def test_the_split_of_the_paper_divides_groups() -> None:
