@@ -118,7 +118,8 @@ def _judged(
     `because` lists up to three other objects, in order of their effect on `log_odds`. For an
     outlier, these objects lower its log-odds. For other objects, they raise the log-odds.
     """
-    present, labels = posterior.present, artifact.vocabulary.labels
+    present, vocabulary = posterior.present, artifact.vocabulary
+    labels, broader = vocabulary.labels, vocabulary.broader_labels
     log_odds, change = posterior.given_rest(explained=details)
     logits, p = _intruder_odds(artifact, entry, posterior, log_odds)
     reaches = p >= threshold
@@ -143,6 +144,8 @@ def _judged(
         fields: Fields = {"object": thing.id, "label": labels[classes[row]]}
         if thing.label != fields["label"]:
             fields["listed_as"] = thing.label
+        if broader[classes[row]]:
+            fields["broader"] = broader[classes[row]]
         fields["probability"], fields["log_odds"] = probabilities[row], values[row]
         fields["is_outlier"] = flags[row]
         if details:

@@ -175,6 +175,18 @@ class Vocabulary:
         return _read_only(is_broader)
 
     @cached_property
+    def broader_labels(self) -> tuple[tuple[str, ...], ...]:
+        """The labels of the broader classes of each class, nearest first."""
+        chains: list[tuple[str, ...]] = []
+        for parent in self.parents.tolist():
+            chain = []
+            while parent >= 0:
+                chain.append(self.labels[parent])
+                parent = int(self.parents[parent])
+            chains.append(tuple(chain))
+        return tuple(chains)
+
+    @cached_property
     def related(self) -> NDArray[np.bool_]:
         """(V, V) True if one of the classes i and j is broader than the other: one family."""
         return _read_only(self.broader | self.broader.T)

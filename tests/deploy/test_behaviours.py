@@ -92,6 +92,15 @@ def test_an_object_has_its_label_and_its_class(make: Make, client: Client, thing
     assert condition.feedback_message.startswith("s: an outlier")
 
 
+def test_a_kind_counts_as_its_broader_class(make: Make, client: Client) -> None:
+    scene = {"objects": ["bed", "desk"]}
+    condition = make("ObjectBelongs", client, scene, "table", threshold=0.0)
+    assert settle(condition) is Status.FAILURE
+    assert condition.feedback_message.startswith("desk: an outlier")
+    complete = make("SceneComplete", client, scene, candidates=["table"], **ANY)
+    assert settle(complete) is Status.SUCCESS
+
+
 def test_a_condition_fails_with_a_reason(make: Make, client: Client, scene: SceneFields) -> None:
     with Client("http://127.0.0.1:9") as unreachable:
         conditions = {

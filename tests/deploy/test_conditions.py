@@ -90,6 +90,10 @@ def test_a_thing_belongs_unless_it_is_an_outlier(
     words = [couch | {"object": word} for word in ("Couches", "sofa", "couch")]
     found = tick(program, url, "ObjectBelongs", *words)
     assert [entry["because"] for entry in found] == ["s belongs"] * 2 + ["no couch was seen"]
+    # A desk is a table.
+    desk = {"scene": '{"objects": ["bed", "desk"], "threshold": 1}', "object": "table"}
+    (found,) = tick(program, url, "ObjectBelongs", desk)
+    assert found["because"] == "desk belongs"
 
 
 def test_a_service_that_does_not_answer_fails_the_condition(program: Path) -> None:

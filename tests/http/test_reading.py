@@ -197,6 +197,8 @@ async def test_an_entry_has_the_class_and_the_word_of_the_request(
         ("desk", "desk", None),
         ("table", "table", None),
     }
+    broader = {one["object"]: one["broader"] for one in answer["outliers"] if "broader" in one}
+    assert broader == {"desk": ["table"]}
     # Candidates of one class have one entry, with the word of the first.
     candidates = ["desk", "Sofas", "couch", "tv", "television", "table"]
     answer = await ask(client, "missing", objects=["bed"], candidates=candidates)

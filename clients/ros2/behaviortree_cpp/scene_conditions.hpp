@@ -15,6 +15,7 @@
 
 #include <behaviortree_cpp/action_node.h>
 
+#include <algorithm>
 #include <condition_variable>
 #include <mutex>
 #include <optional>
@@ -22,6 +23,7 @@
 #include <string>
 #include <thread>
 #include <utility>
+#include <vector>
 
 #include "scene_client.hpp"
 
@@ -168,9 +170,9 @@ class SceneComplete : public SceneCondition {
 };
 
 // SUCCESS if an object fits the scene and its place; FAILURE if it is an outlier, was moved to a
-// wrong place, or is not in the scene. The port `object` is an id, a label or a class. With a label
-// or class, every such object must fit. The service judges places only of objects with positions or
-// stated relations.
+// wrong place, or is not in the scene. The port `object` is an id, a label, a class or a
+// broader class. Except with an id, every such object must fit. The service judges places only of
+// objects with positions or stated relations.
 class ObjectBelongs : public SceneCondition {
  public:
   ObjectBelongs(const std::string& name, const BT::NodeConfig& config,
@@ -178,7 +180,7 @@ class ObjectBelongs : public SceneCondition {
       : SceneCondition(name, config, service, &scene::Client::outliers) {}
 
   static BT::PortsList providedPorts() {
-    return ports({BT::InputPort<std::string>("object", "id, label or class of the object")});
+    return ports({BT::InputPort<std::string>("object", "id, label, class or broader class")});
   }
 
  protected:
@@ -188,9 +190,7 @@ class ObjectBelongs : public SceneCondition {
     for (const bool by_id : {true, false}) {
       std::set<std::string> seen;
       for (const auto& thing : answer.at("outliers")) {
-        if (by_id ? thing.at("object") != named
-                  : thing.at("label") != named && thing.value("listed_as", "") != named)
-          continue;
+        if (by_id ? thing.at("object") != named : !is_a(thing, named)) continue;
         const auto id = thing.at("object").get<std::string>();
         if (thing.at("is_outlier").get<bool>()) return {false, id + " is an outlier"};
         seen.insert(id);
@@ -207,6 +207,14 @@ class ObjectBelongs : public SceneCondition {
   }
 
  private:
+  // Whether the object has the word as its label, its class or a broader class: a floor lamp is a
+  // lamp.
+  static bool is_a(const scene::json& thing, const std::string& word) {
+    const auto broader = thing.value("broader", std::vector<std::string>{});
+    return thing.at("label") == word || thing.value("listed_as", "") == word ||
+           std::find(broader.begin(), broader.end(), word) != broader.end();
+  }
+
   static std::string words(const scene::json& relation) {
     return relation.at("subject").get<std::string>() + " " +
            relation.at("relation").get<std::string>() + " " +

@@ -44,6 +44,8 @@ class Outlier(Reply):
     """class of the object in the vocabulary"""
     listed_as: str | None = None
     """label of the object in the request; absent if it equals `label`"""
+    broader: list[str] | None = None
+    """broader classes, nearest first, such as lamp and light of a floor lamp; absent without any"""
     probability: Probability
     log_odds: Finite
     is_outlier: bool

@@ -132,8 +132,8 @@ class ObjectBelongs(SceneCondition):
     service judges places only of objects with positions or stated relations.
 
     Args:
-        thing: id or label of the object, or its class. With a label or class, every such object
-            must fit.
+        thing: id or label of the object, its class, or a broader class: "lamp" names a floor lamp
+            too. Except with an id, every such object must fit.
         own: extra fields, such as ``threshold``, the smallest probability of an outlier.
     """
 
@@ -148,7 +148,9 @@ class ObjectBelongs(SceneCondition):
 
     def judge(self, answer: OutliersAnswer) -> tuple[bool, str]:
         named = [entry for entry in answer.outliers if entry.object == self.thing] or [
-            entry for entry in answer.outliers if self.thing in (entry.listed_as, entry.label)
+            entry
+            for entry in answer.outliers
+            if self.thing in (entry.listed_as, entry.label, *(entry.broader or ()))
         ]
         if not named:
             return False, f"no {self.thing} was seen"
