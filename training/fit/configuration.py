@@ -153,7 +153,9 @@ class RelationsConfig(_Section):
     weight_prior: float = Field(default=16.0, ge=0, description="precision of the weights")
     word_weight: float = Field(default=1.0, ge=0, description="scale of the word-vector term")
     source_weights: dict[str, float] = Field(
-        default={}, description="weight of relations by source, default 1"
+        default={},
+        description="weight of relations by source, default 1; below 1: share of its scenes that an "
+        "epoch draws",
     )
 
 

@@ -6,7 +6,8 @@
 Relations without an annotation have no term (`training.datasets.sources`). Data sources annotate
 different relations. For example, people mention notable relations, and generated rooms list all
 relations. Each source therefore has a trained logit correction δ, called offset, for each relation
-a. The service leaves the offsets out.
+a. The service leaves the offsets out. An epoch draws each scene of a source with the weight of the
+source as probability; a weight above 1 multiplies the terms of its scenes.
 
 Weights and offsets have normal priors, with the precisions `weight_prior` and `offset_prior`. The
 relation weights of a class can depend on its word vector. With the matrix X of word vectors, the
@@ -83,6 +84,8 @@ class RelationFit:
         self._source_weights = torch.tensor(
             [config.source_weights.get(name, 1.0) for name in train.source_names]
         )
+        self._shares = self._source_weights.clamp(max=1)[self.train.source]
+        self._size = float(self._shares.sum())  # expected scenes of an epoch
         named = machine.named_parameters()
         self._weights = {name: weight for name, weight in named if weight.requires_grad}
         self._weights["offsets"] = self.offsets
@@ -94,7 +97,7 @@ class RelationFit:
     def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         """Return the negative log-likelihood plus the negative log prior, divided by scenes.
 
-        The likelihood is divided by the scenes of the batch, and the prior by all training scenes.
+        The likelihood is divided by the scenes of the batch, and the prior by those of an epoch.
         """
         machine = self.machine
         if self.config.count_dropout:
@@ -105,7 +108,7 @@ class RelationFit:
         offsets = self.offsets[batch.source]
         logits = machine.relation_logits(edges, batch.v, h1)
         logits = logits + offsets.gather(1, edges.relation.expand(len(batch), -1))
-        weight = self._source_weights[batch.source].unsqueeze(1)
+        weight = self._source_weights[batch.source].clamp(min=1).unsqueeze(1)
         weight = observed * machine.gate(edges, batch.v) * weight
         nll = _nll(logits, r, weight)
         if machine.spec.G:
@@ -113,7 +116,7 @@ class RelationFit:
             condition = r * observed * (torch.rand(r.shape, generator=generator) < share)
             shifted = logits + machine.implied(edges, condition, h1)
             nll = nll + _nll(shifted, r, weight * (1 - condition))
-        return nll / len(batch) + self._prior() / max(len(self.train), 1)
+        return nll / len(batch) + self._prior() / max(self._size, 1)
 
     def _prior(self) -> Tensor:
         """Return the negative log prior of weights and offsets, up to a constant."""
@@ -154,9 +157,9 @@ class RelationFit:
 
     def _batches(self) -> list[Tensor]:
         """Return an epoch in random batches of similar scenes: large ones make a batch slow."""
-        noise = torch.rand(len(self.train), generator=self._generator)
+        noise, draw = torch.rand(2, len(self.train), generator=self._generator)
         order = (self._log_sizes + _MIXING * noise).argsort()
-        batches = order.split(self.config.batch_size)
+        batches = order[draw[order] < self._shares[order]].split(self.config.batch_size)
         turn = torch.randperm(len(batches), generator=self._generator).tolist()
         return [batches[k] for k in turn]
 

@@ -74,6 +74,8 @@ def data_folder(reference: str, config: Config, given: Path | None = None) -> Pa
 def load_config(reference: str, *, seed: int | None = None) -> Config:
     """Read a configuration. `config_path` describes the possible references.
 
+    The entry `base` names a shipped configuration, whose entries apply where the file has none.
+
     Raises:
         ConfigError: the file is missing, is not TOML, or has an invalid entry.
     """
@@ -82,9 +84,23 @@ def load_config(reference: str, *, seed: int | None = None) -> Config:
         choice = f"pass a TOML file or one of {', '.join(shipped_configs())}"
         raise ConfigError(f"there is no configuration {reference!r}: {choice}")
     values = read_toml(path)
+    if (base := values.pop("base", None)) is not None:
+        if base not in shipped_configs():
+            raise ConfigError(f"{path.name}: base must be one of {', '.join(shipped_configs())}")
+        values = _merged(read_toml(shipped_configs()[base]), values)
     if seed is not None:
         values.setdefault("training", {})["seed"] = seed
     return _validated(values, f"{path.name}:")
+
+
+def _merged(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of both; an own entry replaces that of the base, but joins a section."""
+    both = {
+        name: _merged(value, own[name])
+        for name, value in base.items()
+        if isinstance(value, Mapping) and isinstance(own.get(name), Mapping)
+    }
+    return {**base, **own, **both}
 
 
 def stored_config(artifact: Artifact) -> Config:
