@@ -157,6 +157,8 @@ def _mean_rank(z: Floats, candidates: Flags, hidden: Flags) -> float:
     """Return the mean reciprocal rank of hidden classes among the other candidates."""
     ranks = []
     for row, usable, truth in zip(z, candidates, hidden, strict=True):
+        if not truth.any():
+            continue
         others = np.sort(row[usable & ~truth])
         above = len(others) - np.searchsorted(others, row[truth], side="right")
         ranks.append((1.0 / (1.0 + above)).mean())
