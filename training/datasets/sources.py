@@ -224,7 +224,8 @@ SOURCES: Final[dict[str, Source]] = {
         predicates={},
     ),
     "meetup_ade20k": Source(
-        "MeetUp (Ilinykh, Zarrieß, Schlangen, 2019): dialogues about photographs of rooms; MIT",
+        "MeetUp (Ilinykh, Zarrieß, Schlangen, 2019): dialogues about photographs of rooms; "
+        "BSD-3-Clause",
         meaning=_MENTIONS,
         left_out=_AIMED_AT,
         predicates={},

@@ -45,7 +45,7 @@ from training.fit.calibrate_objects import calibrate_objects, recalibrated
 from training.fit.configuration import ObjectsConfig
 from training.fit.objects import ObjectScenes, served_popularity
 
-_SCENES = 2500
+_SCENES = 1500
 _LISTED = 20  # relations that an answer of the service lists by default
 _MOST_OF_A_PART = 8  # classes of a part of a scene
 _POSSIBLE = -3.5  # least log-odds of a relation that may well hold

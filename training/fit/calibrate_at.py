@@ -33,7 +33,7 @@ from training.evaluation.calibration_task import place_question
 from training.evaluation.missing_tasks import removed_places
 from training.evaluation.model import Places
 
-_QUESTIONS: Final = 150  # maximum questions of each source in the fit of the weights
+_QUESTIONS: Final = 80  # maximum questions of each source in the fit of the weights
 _LISTED: Final = 10  # classes that an answer lists by default
 _LEAST_TRUE: Final = 10  # minimum true examples of a fit of intercept and slope
 _ALL_BUT_ONE: Final = 1.0  # coverage of a scene from which one class is removed
