@@ -114,6 +114,27 @@ def test_scenes_keep_classes_that_their_source_shows():
         ObjectScenes.of(tensors([scene([1])]), torch.arange(5) == 4, config)
 
 
+def test_a_present_class_says_nothing_about_its_family():
+    """2 < 1 < 0: class 2 is a kind of 1, and 1 a kind of 0; class 3 has no family."""
+    related = torch.zeros(4, 4)
+    for i, j in ((1, 0), (2, 1), (2, 0)):
+        related[i, j] = related[j, i] = 1
+    rows = [[1, 3], [2, 3], [0, 2]]
+    data = replace(tensors([scene(row, source="house") for row in rows], 4), related=related)
+    found = ObjectScenes.of(data, torch.zeros(4, dtype=torch.bool), CONFIG)
+    # Present classes are known, and so are absent classes without a relative.
+    assert found.known.int().tolist() == [[0, 1, 0, 1], [0, 0, 1, 1], [1, 0, 1, 1]]
+    # The log-odds of an unknown class change no loss.
+    machine = machine_of("coupled", scale=0.7)
+    losses = []
+    for bias in (0.0, 3.0):
+        with torch.no_grad():
+            machine.b[0] = bias
+        fit = ObjectFit(machine, replace(found, weight=torch.tensor([1.0, 1, 0])), CONFIG, seed=1)
+        losses.append(float(fit._conditional_loss(torch.tensor([0, 1])).detach()))
+    assert losses[0] == losses[1]
+
+
 @given(st.integers(0, 2**32), st.floats(0, 1), st.integers(2, 30), st.floats(0.1, 1))
 def test_parts_list_and_hide_at_least_one_class(seed, leave_one_out, classes, density):
     generator = torch.Generator().manual_seed(seed)
