@@ -154,8 +154,8 @@ class RelationsConfig(_Section):
     word_weight: float = Field(default=1.0, ge=0, description="scale of the word-vector term")
     source_weights: dict[str, float] = Field(
         default={},
-        description="weight of relations by source, default 1; below 1: share of its scenes that an "
-        "epoch draws",
+        description="weight of relations by source, default 1; below 1: share of the scenes that "
+        "an epoch draws",
     )
 
 
