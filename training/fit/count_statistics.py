@@ -35,6 +35,8 @@ _DRAWS: Final = 2  # listings of each training and validation scene
 _PRIOR: Final = 8.0  # weight of the shares over all classes in s(n), in scenes
 # Penalties on the squares of the terms of a class and of the shared terms.
 _OWN, _SHARED = 0.3, 0.15
+# A class has a term of its own for a listed class, or a room type, of this many cases.
+_OWN_CASES: Final = 10
 _PRECISION: Final = 1e-6  # a smaller relative change of the loss ends the fit
 # A class needs this many scenes, and this many groups that have several instances.
 _SCENES, _GROUPS = 20, 10
@@ -188,7 +190,7 @@ def _shares(cases: _Cases, V: int) -> Floats:
 def _weights(cases: _Cases, share: Floats, fitted: Flags) -> Floats:
     """Return the weights of each class, (V, 2, 3 + C + V), by maximum penalised likelihood.
 
-    A class has terms of its own only where `fitted`, (V,), is true.
+    A class has terms of its own only where `fitted`, (V,), is true and `_OWN_CASES` cases show it.
     """
     features, (N, width), V = cases.features, cases.features.shape, len(fitted)
     # The terms of a class act only on cases of this class.
@@ -198,7 +200,8 @@ def _weights(cases: _Cases, share: Floats, fitted: Flags) -> Floats:
     class_terms = sparse.csr_matrix(
         (entries.data[own], (row, cases.index[row] * width + column)), shape=(N, V * width)
     )
-    used_columns = np.unique(class_terms.indices)
+    columns, cases_of = np.unique(class_terms.indices, return_counts=True)
+    used_columns = columns[cases_of >= _OWN_CASES]
     all_terms = sparse.hstack([class_terms[:, used_columns], features]).tocsr()
     penalty = np.repeat([_OWN, _SHARED], [len(used_columns), width])[:, None]
     numbers, of_number = np.arange(1, MOST + 1), functions(MOST)
