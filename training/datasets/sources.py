@@ -193,6 +193,7 @@ SOURCES: Final[dict[str, Source]] = {
         meaning=replace(LISTS, scenes_per_group=1.0),
         left_out=_AIMED_AT,
         predicates={},
+        of_one_view=True,
     ),
     "vg_vlchecklist": Source(
         "Visual Genome (Krishna et al., IJCV 2017), changed: objects and triples of photographs "

@@ -79,7 +79,8 @@ def folds(
 def _fit(
     scenes: Sequence[EncodedScene], most: Ints, counting: dict[str, Flags], vocabulary: Vocabulary
 ) -> Counts:
-    """Fit the statistics to all cases of the scenes. Return those of the classes with a `most`."""
+    """Fit the statistics to the cases of the classes with a `most`, and return those."""
+    counting = {source: counted & (most > 0) for source, counted in counting.items()}
     cases = _Cases.of(scenes, counting, vocabulary)
     share = _shares(cases, len(vocabulary))
     weights = _weights(cases, share, most > 0)
