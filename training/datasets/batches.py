@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from zlib import crc32
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from app.scene import CANONICAL, RoleCounts, Vocabulary
 from training.datasets import EncodedScene
+from training.datasets.encoding import ClassEvidence
 from training.machines import BoltzmannMachine
 from training.machines.edges import Edges
 
@@ -37,6 +38,10 @@ class Batch:
     def rows(self, index: Tensor) -> Batch:
         """Return the scenes at the given indices. A mask selects the scenes where it is True."""
         return Batch(*(tensor[index] for tensor in vars(self).values()))
+
+
+def _whole(evidence: ClassEvidence) -> ClassEvidence:
+    return evidence
 
 
 @dataclass(frozen=True)
@@ -73,9 +78,14 @@ class SceneTensors:
     def __len__(self) -> int:
         return len(self.scenes)
 
-    def batch(self, index: Tensor, width: int = 0) -> Batch:
-        """Return the scenes at the given indices as one batch, with at least `width` classes."""
-        evidence = [self.scenes[k].evidence for k in index.tolist()]
+    def batch(
+        self, index: Tensor, width: int = 0, part: Callable[[ClassEvidence], ClassEvidence] = _whole
+    ) -> Batch:
+        """Return the scenes at the given indices as one batch, with at least `width` classes.
+
+        `part` returns the evidence of a scene that the batch has. Its `v` has all classes.
+        """
+        evidence = [part(self.scenes[k].evidence) for k in index.tolist()]
         n = max([width, *(len(e.classes) for e in evidence)])
         relations = self.scenes[0].evidence.holds.shape[0] if self.scenes else 0
         shape = (len(evidence), relations, n, n)

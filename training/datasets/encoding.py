@@ -60,6 +60,12 @@ class ClassEvidence:
     observed: Flags
     room_type: int | None
 
+    def only(self, rows: Ints) -> ClassEvidence:
+        """Return the evidence about some of the classes; `rows` are ascending indices of them."""
+        pairs = np.ix_(range(len(self.holds)), rows, rows)
+        holds, observed = self.holds[pairs], self.observed[pairs]
+        return ClassEvidence(self.classes[rows], self.counts[rows], holds, observed, self.room_type)
+
 
 def pool_instances(
     classes: Ints, holds: Flags, observed: Flags, room_type: int | None = None

@@ -47,6 +47,7 @@ from torch.nn.utils.parametrize import (
 )
 
 from training.datasets.batches import Batch, SceneTensors, relation_units, subset
+from training.datasets.encoding import ClassEvidence
 from training.fit.configuration import RelationsConfig
 from training.fit.residuals import lower_unseen_roles, means_of_parts, with_counted_residuals
 from training.machines import BoltzmannMachine
@@ -56,6 +57,8 @@ _WITHOUT_PRIOR = frozenset({*OBJECT_WEIGHTS, "gamma", "B", "usual", "d"})
 # Factor of the prior precision for the map of word vectors. All classes share the map, so its prior
 # is weaker than the prior of the weights of a class.
 _MAP_PRIOR = 0.1
+# Most classes of a scene whose relations one batch has; the time grows with their third power.
+_MOST_CLASSES = 20
 # Random change of the log of the number of classes by which scenes are sorted into batches.
 _MIXING = 0.5
 # Weights that classes share; see `training.fit.relations`.
@@ -77,7 +80,7 @@ class RelationFit:
         annotated = [k for k, scene in enumerate(train.scenes) if scene.evidence.observed.any()]
         self.train = subset(train, torch.tensor(annotated, dtype=torch.int64))
         sizes = [len(scene.evidence.classes) for scene in self.train.scenes]
-        self._log_sizes = torch.tensor(sizes, dtype=torch.float32).clamp(min=1).log()
+        self._log_sizes = torch.tensor(sizes).clamp(1, _MOST_CLASSES).log()
         self.epochs = self._updates = 0
         self._generator = torch.Generator().manual_seed(seed)
         self.offsets = nn.Parameter(torch.zeros(len(train.source_names), machine.spec.A))
@@ -163,9 +166,17 @@ class RelationFit:
         turn = torch.randperm(len(batches), generator=self._generator).tolist()
         return [batches[k] for k in turn]
 
+    def _part(self, evidence: ClassEvidence) -> ClassEvidence:
+        """Return the evidence about at most `_MOST_CLASSES` random classes of a scene."""
+        count = len(evidence.classes)
+        if count <= _MOST_CLASSES:
+            return evidence
+        order = torch.randperm(count, generator=self._generator)
+        return evidence.only(order[:_MOST_CLASSES].sort().values.numpy())
+
     def _update(self, index: Tensor, total: int) -> float:
         with cached():
-            loss = self.loss(self.train.batch(index), self._generator)
+            loss = self.loss(self.train.batch(index, part=self._part), self._generator)
         for group in self._optimiser.param_groups:
             group["lr"] = self.config.learning_rate * self._schedule(total)
         self._optimiser.zero_grad()

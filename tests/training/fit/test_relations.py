@@ -361,3 +361,20 @@ def test_classes_with_few_annotated_scenes_keep_their_weights():
     subjects, objects = lowered(scenes, NO_PARENTS)
     for a in STACKED:
         assert subjects[a] == objects[a] == {DESK, LAMP}
+
+
+def test_a_batch_has_the_relations_of_some_classes_of_a_large_scene() -> None:
+    """Every pair of 30 classes occurs in some of 400 parts; by chance, one is absent at p < 1e-70."""
+    triples = [(ON_TOP, k, k + 1) for k in range(29)]
+    large = tensors([scene(range(30), triples), scene([0, 1], [(ON_TOP, 0, 1)])], 30)
+    machine = build(MachineSpec("triway", V=30, A=len(CANONICAL), units=2, K=1))
+    fit = RelationFit(machine, large, RelationsConfig(), seed=0)
+    held = torch.zeros(30, 30)
+    for _ in range(400):
+        batch = large.batch(torch.arange(2), part=fit._part)
+        assert (batch.classes >= 0).sum(1).tolist() == [20, 2]
+        assert batch.v.sum(1).tolist() == [30, 2]
+        classes = batch.classes[0]
+        subject, other = batch.holds[0, ON_TOP].nonzero(as_tuple=True)
+        held[classes[subject], classes[other]] += 1
+    assert {(i, j) for i, j in held.nonzero().tolist()} == {(k, k + 1) for _, k, _ in triples}
