@@ -126,9 +126,9 @@ def _ranked(
     if candidates is None:
         usable &= ~vocabulary.related[listed].any(0)
     else:
-        chosen = np.zeros_like(usable)
-        chosen[list(candidates)] = True
-        usable &= chosen & ~vocabulary.broader[listed].any(0)
+        named = np.zeros_like(usable)
+        named[list(candidates)] = True
+        usable &= named & ~vocabulary.broader[listed].any(0)
     if not usable.any():
         return np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
     log_odds = posterior.absent_log_odds(np.arange(len(usable)), coverage)

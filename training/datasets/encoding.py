@@ -62,7 +62,7 @@ class ClassEvidence:
 
     def only(self, rows: Ints) -> ClassEvidence:
         """Return the evidence about some of the classes; `rows` are ascending indices of them."""
-        pairs = np.ix_(range(len(self.holds)), rows, rows)
+        pairs = np.ix_(np.arange(len(self.holds)), rows, rows)
         holds, observed = self.holds[pairs], self.observed[pairs]
         return ClassEvidence(self.classes[rows], self.counts[rows], holds, observed, self.room_type)
 
