@@ -127,7 +127,7 @@ def test_from_rooms_to_answers(tmp_path):
         (("train", "nowhere.toml"), "no configuration"),
         (
             ("train", "indoor-triway", "--data", "nowhere"),
-            "16 of 16 files of scenes are missing in nowhere: sunrgbd.jsonl.gz",
+            "15 of 15 files of scenes are missing in nowhere: sunrgbd.jsonl.gz",
         ),
         (("train", "open-triway", "--data", "nowhere"), "docs/training.md (The public data sets)"),
         (("publish", "nowhere", "1.0.0"), "no finished run"),

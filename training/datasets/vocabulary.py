@@ -105,10 +105,8 @@ def curated_names() -> Names:
 
 INDOOR_FILE = Path(__file__).resolve().parent / "vocabularies" / "indoor.json"
 
-# Minimum number of objects of a class in the scenes. Classes of indoor vocabularies also have word
-# vectors, so a smaller minimum is enough for these vocabularies.
+# Minimum number of objects of a class in the scenes, and of scenes of a room type.
 MINIMUM_MENTIONS = 8
-INDOOR_MINIMUM_MENTIONS = 5
 MINIMUM_BOXES = 5  # from which a typical size is computed
 
 
@@ -117,13 +115,11 @@ def build_vocabulary(
     names: Names,
     *,
     minimum: int = MINIMUM_MENTIONS,
-    minimum_rooms: int | None = None,
 ) -> Vocabulary:
     """Collect the frequent classes of scenes with their aliases, most frequent class first.
 
     A label counts for its curated name. The base and household classes of ``names`` are always
-    included, and labels in ``names.not_objects`` excluded. ``minimum_rooms`` is the minimum number
-    of scenes of a room type, by default ``minimum``.
+    included, and labels in ``names.not_objects`` excluded.
 
     Raises:
         ValueError: every class has fewer objects than the minimum.
@@ -148,24 +144,12 @@ def build_vocabulary(
         )
         if label_key(label) not in excluded
     ]
-    fewest = minimum if minimum_rooms is None else minimum_rooms
-    return Vocabulary(classes, sorted(room for room, count in rooms.items() if count >= fewest))
+    return Vocabulary(classes, sorted(room for room, count in rooms.items() if count >= minimum))
 
 
 def most_frequent(counts: Counter[str]) -> str:
     """Return the most frequent name; of several, the alphabetically first."""
     return min(counts, key=lambda name: (-counts[name], name))
-
-
-def build_indoor_vocabulary(scenes: Iterable[AnnotatedScene]) -> Vocabulary:
-    """Build the vocabulary of `INDOOR_FILE` from the scenes of all data sources.
-
-    Photographs contain relations between indoor objects and outdoor surroundings. Surroundings are
-    therefore ordinary classes.
-    """
-    names = replace(curated_names(), surroundings=())
-    minima = {"minimum": INDOOR_MINIMUM_MENTIONS, "minimum_rooms": MINIMUM_MENTIONS}
-    return with_aliases(build_vocabulary(scenes, names, **minima))
 
 
 def vocabulary_json(vocabulary: Vocabulary) -> str:

@@ -227,16 +227,26 @@ def test_an_unlisted_class_of_a_coarse_source_is_unobserved() -> None:
 def test_a_floor_plan_counts_as_a_few_scenes() -> None:
     objects = things("desk", "pencil", count=[4, 1])
     scenes = [AnnotatedScene(f"s{k}", "alfred", f"g{k // 6}", None, objects) for k in range(8)]
-    scenes += [AnnotatedScene(f"v{k}", "vsr", "g", None, objects, ()) for k in range(5)]
+    scenes += [AnnotatedScene(f"v{k}", "bddl_goal", "g", None, objects, ()) for k in range(5)]
     found = encode(scenes, VOCABULARY)
     assert [scene.weight for scene in found] == [0.5] * 6 + [1.0] * 2 + [1.0] * 5
     assert found[0].evidence.counts.tolist() == [4, 1]
     assert found[0].instance_classes.tolist() == [0, 2]
     tensors = scene_tensors(found, annotated_classes(found, VOCABULARY), VOCABULARY)
-    assert tensors.source_names == ("alfred", "vsr")
+    assert tensors.source_names == ("alfred", "bddl_goal")
     batch = tensors.batch(torch.tensor([12, 0]))
     assert batch.source.tolist() == [1, 0]
     assert batch.counts.tolist() == [[4, 1], [4, 1]]
     assert batch.rows(torch.tensor([False, True])).source.tolist() == [0]
     assert tensors.weight[[12, 0]].tolist() == [1.0, 0.5]
     assert tensors.complete[[12, 0]].tolist() == [False, True]
+
+
+def test_a_photograph_of_several_sources_counts_as_one_scene() -> None:
+    objects = things("desk", "pencil")
+    sources = ("coco_captions", "coco_labels", "vsr", "vsr")
+    scenes = [
+        AnnotatedScene(f"{k}", source, "coco-1", None, objects) for k, source in enumerate(sources)
+    ]
+    scenes.append(AnnotatedScene("other", "coco_labels", "coco-2", None, objects))
+    assert [scene.weight for scene in encode(scenes, VOCABULARY)] == [0.25] * 4 + [1.0]

@@ -1,23 +1,18 @@
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from app.scene import ObjectClass, Vocabulary, label_key
 from tests.training.scenes import scene
-from training.datasets import AnnotatedObject, AnnotatedScene, read_scenes, source_vocabulary
-from training.datasets.sources import SOURCES
+from training.datasets import AnnotatedObject, AnnotatedScene, source_vocabulary
 from training.datasets.vocabulary import (
-    INDOOR_FILE,
     MINIMUM_MENTIONS,
     Names,
-    build_indoor_vocabulary,
     build_vocabulary,
     coverage,
     curated_names,
     indoor_vocabulary,
-    vocabulary_json,
     with_room_aliases,
     with_typical_sizes,
 )
@@ -151,15 +146,6 @@ def test_the_committed_vocabulary_follows_the_curated_names() -> None:
         assert not vocabulary.structure[vocabulary.index(label)]
     assert all(entry.size is None for entry in vocabulary.objects)
     assert all(names.canonical_room(room) == room for room in vocabulary.room_types)
-
-
-def test_the_committed_vocabulary_is_what_the_data_give(repository: Path) -> None:
-    found = sorted((repository.parent / "shared" / "data").rglob("*.jsonl.gz"))
-    files = [file for file in found if file.name.removesuffix(".jsonl.gz") in SOURCES]
-    if not files:
-        pytest.skip("the real scenes of ../shared/data are not here")
-    written = build_indoor_vocabulary(scene for file in files for scene in read_scenes(file))
-    assert vocabulary_json(written) == INDOOR_FILE.read_text(encoding="utf-8")
 
 
 def test_the_curated_synonyms_of_rooms_are_added() -> None:

@@ -364,7 +364,7 @@ def test_classes_with_few_annotated_scenes_keep_their_weights():
 
 
 def test_a_batch_has_the_relations_of_some_classes_of_a_large_scene() -> None:
-    """Every pair of 30 classes occurs in some of 400 parts; by chance, one is absent at p < 1e-70."""
+    """Every pair of 30 classes occurs in some of 400 parts; one is absent with p < 1e-70."""
     triples = [(ON_TOP, k, k + 1) for k in range(29)]
     large = tensors([scene(range(30), triples), scene([0, 1], [(ON_TOP, 0, 1)])], 30)
     machine = build(MachineSpec("triway", V=30, A=len(CANONICAL), units=2, K=1))
