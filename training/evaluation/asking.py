@@ -124,13 +124,17 @@ def missing_probabilities(
 ) -> Floats:
     """Return the probability that each class is missing, (V,).
 
-    The value is -inf for classes that `/missing` cannot propose.
+    The value is -inf for classes that `/missing` cannot propose. All classes are candidates, so a
+    class has a value beside a likelier one of its family.
 
     Args:
         at: place of the missing object: its relation to the object with an index.
     """
     p = np.full(len(artifact.vocabulary), -np.inf)
-    answer = questions.missing(artifact, scene, top_k=len(p), at=at, details=False)
+    every = range(len(p))
+    answer = questions.missing(
+        artifact, scene, top_k=len(p), candidates=every, at=at, details=False
+    )
     for entry in answer["missing"]:
         p[artifact.vocabulary.index(entry["label"])] = entry["probability"]
     return p
