@@ -115,3 +115,26 @@ def test_terms_of_shipped_sources_and_of_own_files() -> None:
     words, research_only = terms_of("sunrgbd", unstated)
     assert research_only
     assert "without stated terms" in words
+
+
+def test_a_base_gives_the_entries_that_a_file_lacks(tmp_path) -> None:
+    path = tmp_path / "mine.toml"
+    text = 'base = "places-triway"\nname = "mine"\n[machine]\nunits = 3\n[objects.source_weights]\n'
+    path.write_text(text + "alfred = 0.0\n")
+    base, mine = load_config("places-triway"), load_config(str(path))
+    assert (mine.name, mine.machine.units, mine.machine.states) == ("mine", 3, base.machine.states)
+    assert mine.data == base.data
+    weights = base.objects.source_weights
+    assert mine.objects.source_weights == {**weights, "alfred": 0.0} != weights
+    path.write_text(text.replace("places-triway", "nowhere"))
+    with pytest.raises(ConfigError, match=r"mine\.toml: base must be one of .*places-triway"):
+        load_config(str(path))
+
+
+def test_knowledge_alone_needs_no_data(tmp_path) -> None:
+    config = with_settings(load_config("knowledge-triway"), {"data.written": 1})
+    scenes = prepare(config, tmp_path)
+    assert {scene.source for scenes_ in scenes.parts.values() for scene in scenes_} == {
+        "inventories"
+    }
+    assert len(scenes.vocabulary) > 1500
