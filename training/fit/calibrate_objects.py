@@ -40,6 +40,7 @@ from training.evaluation.intruders import draw_intruders, intruder_weights
 from training.evaluation.parts import Parts, draw_parts, exactly, up_to_longest
 from training.fit.calibrate_rooms import calibrate_rooms, posterior_of
 from training.fit.configuration import ObjectsConfig
+from training.fit.objects import SERVED
 
 COVERAGES = (0.15, 0.3, 0.45, 0.6, 0.8)
 # Tested exponents alpha of the prior of intruders.
@@ -50,7 +51,7 @@ LENGTHS = (1, 2, 3, 4, 5, 6, 8, 10, 12)
 _LEAST_SCENES = 20  # from which objects are judged
 _SEEDS = (0, 1, 2)
 _LISTED = 10  # classes in the fit of each part; an answer of the service lists ten by default
-_SOURCE_SCENES = 400  # maximum scenes of each source
+_SOURCE_SCENES = 200  # maximum scenes of each source
 
 
 def calibrate_objects(
@@ -103,8 +104,8 @@ def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
 def served_scenes(scenes: SceneTensors, served: Mapping[str, float]) -> SceneTensors:
     """Return the scenes of the sources for which the answers stand; see `ObjectsConfig`.
 
-    These are the sources with at least half of the largest weight in `served` and at least 20
-    scenes. Without such a source, they are all scenes with complete object lists. At most 400
+    These are the sources with at least a quarter of the largest weight in `served` and at least 20
+    scenes. Without such a source, they are all scenes with complete object lists. At most 200
     scenes of a source take part.
     """
     names, size = scenes.source_names, scenes.source.bincount(minlength=len(scenes.source_names))
@@ -112,7 +113,7 @@ def served_scenes(scenes: SceneTensors, served: Mapping[str, float]) -> SceneTen
     chosen = [
         names.index(name)
         for name, weight in served.items()
-        if weight >= largest / 2 and name in names and size[names.index(name)] >= _LEAST_SCENES
+        if weight >= largest * SERVED and name in names and size[names.index(name)] >= _LEAST_SCENES
     ]
     if not chosen:
         scenes = complete_scenes(scenes)

@@ -18,7 +18,7 @@ from app.inference.weights import Weights
 from app.registry import Metric
 from training.datasets.array_types import Flags, Floats, Ints
 from training.fit.configuration import ObjectsConfig
-from training.fit.objects import ObjectScenes, served_weights
+from training.fit.objects import SERVED, ObjectScenes, served_weights
 
 RECORDED: Final = 5
 """Number of sweeps between two recorded states."""
@@ -183,8 +183,8 @@ def measure_drift(
 ) -> list[Drift]:
     """Run 3,000 sweeps from the training scenes of each served source, and compare them.
 
-    Served sources have at least half of the largest weight in the served mix. The states of the
-    last 1,000 sweeps count.
+    Served sources have at least a quarter of the largest weight in the served mix. The states of
+    the last 1,000 sweeps count.
 
     Args:
         labels: label of each class, (classes,).
@@ -193,7 +193,7 @@ def measure_drift(
     drifts = []
     for population in populations(scenes, config):
         q = population.profile
-        if q is None or served[q] < served.max() / 2:
+        if q is None or served[q] < served.max() * SERVED:
             continue
         long = LongChains(chains, scenes, population, _CHAINS, seed=1)
         long.run(_SETTLED, every=_SETTLED)

@@ -129,16 +129,16 @@ def test_scenes_count_by_weight_and_incomplete_ones_not_at_all():
 
 
 def test_real_rooms_come_before_generated_ones():
-    """At most 400 scenes of each source; sources of the user count if no room is real."""
+    """At most 200 scenes of each source; sources of the user count if no room is real."""
     made = [scene([0, 1], source="procthor") for _ in range(500)]
     real = [scene([0, 1], source=name) for name in ["3dssg"] * 30 + ["sunrgbd"] * 450]
     few = [scene([0, 1], source="nr3d") for _ in range(19)]
     served = {"3dssg": 1.0, "sunrgbd": 1.0, "nr3d": 1.0, "procthor": 0.1}
     kept = served_scenes(tensors([*made, *real, *few], WIDE), served)
     sources = [one.source for one in kept.scenes]
-    assert {name: sources.count(name) for name in set(sources)} == {"3dssg": 30, "sunrgbd": 400}
-    assert len(served_scenes(tensors(made, WIDE), served)) == 400
-    assert len(served_scenes(tensors(made, WIDE), {})) == 400
+    assert {name: sources.count(name) for name in set(sources)} == {"3dssg": 30, "sunrgbd": 200}
+    assert len(served_scenes(tensors(made, WIDE), served)) == 200
+    assert len(served_scenes(tensors(made, WIDE), {})) == 200
 
 
 BARE = torch.zeros(WIDE, dtype=torch.bool)
