@@ -18,15 +18,16 @@ from app.inference.weights import Weights
 from app.registry import Metric
 from training.datasets.array_types import Flags, Floats, Ints
 from training.fit.configuration import ObjectsConfig
-from training.fit.objects import SERVED, ObjectScenes, served_weights
+from training.fit.objects import ObjectScenes, served_weights
 
 RECORDED: Final = 5
 """Number of sweeps between two recorded states."""
 
-_CHAINS, _SWEEPS = 128, 3000
+_CHAINS, _SWEEPS = 256, 3000
 _SETTLED = 2000  # sweeps before the first recorded state of the test
 _COMMONEST = 50
 _SIZE_LIMIT, _SHARE_LIMIT = 0.10, 0.20
+_MIX: Final = "served mix"
 _CERTAIN = 3.0  # standard errors beyond a limit
 
 
@@ -136,7 +137,7 @@ def scene_chains(weights: Weights) -> SceneChains:
 
 @dataclass(frozen=True)
 class Drift:
-    """How far long chains are from the scenes of a data source.
+    """How far long chains are from the scenes of the served mix of data sources.
 
     Attributes:
         size, size_error: relative change of the number of classes in a scene, and its standard
@@ -145,7 +146,6 @@ class Drift:
         share, share_error: relative change of this share, and its standard error.
     """
 
-    source: str
     size: float
     size_error: float
     label: str
@@ -160,7 +160,7 @@ class Drift:
         )
         return [
             Metric(
-                task="Long chains", source=self.source, metric=name, value=round(value, 4),
+                task="Long chains", source=_MIX, metric=name, value=round(value, 4),
                 low=round(value - 2 * error, 4), high=round(value + 2 * error, 4), n=_CHAINS,
             )
             for name, value, error in values
@@ -170,42 +170,34 @@ class Drift:
         """Return why samples of the model are unlike the scenes, or None."""
         after = f"after {_SWEEPS} sweeps,"
         if abs(self.size) - _CERTAIN * self.size_error > _SIZE_LIMIT:
-            scenes = f"generated scenes of {self.source} have {self.size:+.0%} classes"
+            scenes = f"generated scenes have {self.size:+.0%} classes"
             return f"{after} {scenes}; at most {_SIZE_LIMIT:.0%} are allowed"
         if abs(self.share) - _CERTAIN * self.share_error > _SHARE_LIMIT:
-            scenes = f"{self.share:+.0%} generated scenes of {self.source} have the class"
+            scenes = f"{self.share:+.0%} generated scenes have the class"
             return f"{after} {scenes} {self.label}; at most {_SHARE_LIMIT:.0%} are allowed"
         return None
 
 
 def measure_drift(
     weights: Weights, labels: Sequence[str], scenes: ObjectScenes, config: ObjectsConfig
-) -> list[Drift]:
-    """Run 3,000 sweeps from the training scenes of each served source, and compare them.
+) -> Drift:
+    """Run 3,000 sweeps from training scenes of the served mix, and compare chains and scenes.
 
-    Served sources have at least a quarter of the largest weight in the served mix. The states of
-    the last 1,000 sweeps count.
+    The states of the last 1,000 sweeps count.
 
     Args:
         labels: label of each class, (classes,).
     """
-    served, chains = served_weights(scenes, config), scene_chains(weights)
-    drifts = []
-    for population in populations(scenes, config):
-        q = population.profile
-        if q is None or served[q] < served.max() * SERVED:
-            continue
-        long = LongChains(chains, scenes, population, _CHAINS, seed=1)
-        long.run(_SETTLED, every=_SETTLED)
-        drawn = long.run(_SWEEPS - _SETTLED)
-        sizes = drawn[:, population.shows].sum(1) / population.p[population.shows].sum()
-        top = np.argsort(-np.where(population.shows, population.p, 0))[:_COMMONEST]
-        top = top[population.p[top] > 0]
-        change = drawn[:, top] / population.p[top] - 1
-        share, error = change.mean(0), change.std(0) / np.sqrt(_CHAINS)
-        # The class that is most certainly beyond the limit.
-        k = int(np.argmax(np.abs(share) - _CERTAIN * error))
-        size, size_error = float(sizes.mean() - 1), float(sizes.std() / np.sqrt(_CHAINS))
-        worst = labels[top[k]], float(share[k]), float(error[k])
-        drifts.append(Drift(scenes.sources[q], size, size_error, *worst))
-    return drifts
+    *_, population = populations(scenes, config)
+    long = LongChains(scene_chains(weights), scenes, population, _CHAINS, seed=1)
+    long.run(_SETTLED, every=_SETTLED)
+    drawn = long.run(_SWEEPS - _SETTLED)
+    sizes = drawn[:, population.shows].sum(1) / population.p[population.shows].sum()
+    top = np.argsort(-np.where(population.shows, population.p, 0))[:_COMMONEST]
+    top = top[population.p[top] > 0]
+    change = drawn[:, top] / population.p[top] - 1
+    share, error = change.mean(0), change.std(0) / np.sqrt(_CHAINS)
+    # The class that is most certainly beyond the limit.
+    k = int(np.argmax(np.abs(share) - _CERTAIN * error))
+    size, size_error = float(sizes.mean() - 1), float(sizes.std() / np.sqrt(_CHAINS))
+    return Drift(size, size_error, labels[top[k]], float(share[k]), float(error[k]))

@@ -96,15 +96,15 @@ def publish_run(
     progress("running long chains")
     learnt = ObjectScenes.of(data.train, data.structure, run.config.objects)
     labels = scenes.vocabulary.labels
-    drifts = measure_drift(calibrated.weights, labels, learnt, run.config.objects)
-    objections = [entry.objection() for entry in alarms] + [drift.objection() for drift in drifts]
+    drift = measure_drift(calibrated.weights, labels, learnt, run.config.objects)
+    objections = [*(entry.objection() for entry in alarms), drift.objection()]
     reasons = [*filter(None, objections), *judge(calibrated, progress)]
     for reason in reasons:
         if accept is None:
             raise RefusedError(reasons)
         accept(reason)
     rows = _measure(evaluated, test, progress)
-    rows += [metric for drift in drifts for metric in drift.metrics()]
+    rows += drift.metrics()
     progress("publishing")
     sources = data_sources(scenes)
     description = Description(
