@@ -6,7 +6,8 @@ The percentages are the shares of the training, test and validation part.
   several data sources contain the group.
 - ``stable`` (75 / 15 / 10 %) derives the part of a group only from the seed and the group name, so
   all groups keep their parts when a data set grows. This protocol does not stratify.
-- ``final`` (90 / 0 / 10 %) is ``group`` without a test part, for shipped weights.
+- ``final`` (90 / 0 / 10 %) is ``group`` without a test part, for shipped weights. Written scenes
+  are assigned separately: otherwise shipped weights would miss whole kinds of written places.
 - ``paper`` (60 / 30 / 10 %) is the protocol of Bozcan et al. (ICRA 2018). Each scene is assigned
   separately.
 - ``paper groups`` has the shares of ``paper`` and keeps groups together.
@@ -24,6 +25,7 @@ from collections.abc import Mapping, Sequence
 from typing import Final, Literal
 
 from training.datasets.records import AnnotatedScene
+from training.datasets.sources import source_of
 from training.datasets.vocabulary import curated_names
 
 Part = Literal["train", "test", "validation"]
@@ -54,7 +56,9 @@ def split(
         )
     # All scenes of a unit have the same part.
     units = [
-        f"{scene.source}/{scene.scene_id}" if protocol == "paper" else scene.group
+        f"{scene.source}/{scene.scene_id}"
+        if protocol == "paper" or (protocol == "final" and source_of(scene.source).written)
+        else scene.group
         for scene in scenes
     ]
     part_of: dict[str, Part] = {}

@@ -87,6 +87,14 @@ def test_scenes_of_rare_room_types_occur_in_all_parts() -> None:
     assert sizes == {"train": 30, "test": 6, "validation": 4}
 
 
+def test_the_final_split_divides_written_places_alone() -> None:
+    written, real = collection("inventories", 60), collection("a", 60)
+    found = parts_of([*written, *real], seed=0, protocol="final")
+    assert divides_groups(written, found)
+    assert not divides_groups(real, found)
+    assert not divides_groups(written, parts_of([*written, *real], seed=0))
+
+
 def test_the_split_of_the_paper_divides_groups() -> None:
     scenes = collection("a", 60)
     assert divides_groups(scenes, parts_of(scenes, seed=0, protocol="paper"))
