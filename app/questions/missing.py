@@ -132,7 +132,9 @@ def _ranked(
     if not usable.any():
         return np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
     log_odds = posterior.absent_log_odds(np.arange(len(usable)), coverage)
-    entry, count = artifact.calibration.missing, 2 * top_k
+    entry = artifact.calibration.missing
+    # Relatives of likelier classes are left out of twice as many, unless candidates are named.
+    count = 2 * top_k if candidates is None else top_k
     while True:
         if place is None:
             first = best(entry.slope * log_odds, usable, count)

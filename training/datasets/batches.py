@@ -79,14 +79,14 @@ class SceneTensors:
         return len(self.scenes)
 
     def batch(
-        self, index: Tensor, width: int = 0, part: Callable[[ClassEvidence], ClassEvidence] = _whole
+        self, index: Tensor, part: Callable[[ClassEvidence], ClassEvidence] = _whole
     ) -> Batch:
-        """Return the scenes at the given indices as one batch, with at least `width` classes.
+        """Return the scenes at the given indices as one batch.
 
         `part` returns the evidence of a scene that the batch has. Its `v` has all classes.
         """
         evidence = [part(self.scenes[k].evidence) for k in index.tolist()]
-        n = max([width, *(len(e.classes) for e in evidence)])
+        n = max((len(e.classes) for e in evidence), default=0)
         relations = self.scenes[0].evidence.holds.shape[0] if self.scenes else 0
         shape = (len(evidence), relations, n, n)
         classes, counts = np.full(shape[::3], -1), np.ones(shape[::3], dtype=np.int64)

@@ -209,7 +209,7 @@ SOURCES: Final[dict[str, Source]] = {
         predicates={},
     ),
     "robocasa": Source(
-        "RoboCasa (Nasiriany et al., RSS 2024): designed kitchens and what stands in them; MIT",
+        "RoboCasa (Nasiriany et al., RSS 2024): designed kitchens with their objects; MIT",
         meaning=replace(_SUPPORTS, scenes_per_group=3.0),
         predicates={},
     ),

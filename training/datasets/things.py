@@ -30,7 +30,7 @@ class Thing:
         large: how much longer a large one is, as a factor.
         stands: share of each place where it stands: floor, wall, ceiling, surface, inside.
         surface, container: whether things are commonly put on it or into it: no, sometimes or yes.
-        carried: hand, hands, people (two of them), or no if nobody can carry it.
+        carried: who carries it: one hand, two hands, two people, or nobody ("no").
         parent: label of the broader thing, or "".
         other_names: names that detectors use for it.
     """

@@ -83,14 +83,19 @@ def load_config(reference: str, *, seed: int | None = None) -> Config:
     if not path.is_file():
         choice = f"pass a TOML file or one of {', '.join(shipped_configs())}"
         raise ConfigError(f"there is no configuration {reference!r}: {choice}")
-    values = read_toml(path)
-    if (base := values.pop("base", None)) is not None:
-        if base not in shipped_configs():
-            raise ConfigError(f"{path.name}: base must be one of {', '.join(shipped_configs())}")
-        values = _merged(read_toml(shipped_configs()[base]), values)
+    values = _with_base(path)
     if seed is not None:
         values.setdefault("training", {})["seed"] = seed
     return _validated(values, f"{path.name}:")
+
+
+def _with_base(path: Path) -> dict[str, Any]:
+    values = read_toml(path)
+    if (base := values.pop("base", None)) is None:
+        return values
+    if base not in shipped_configs():
+        raise ConfigError(f"{path.name}: base must be one of {', '.join(shipped_configs())}")
+    return _merged(_with_base(shipped_configs()[base]), values)
 
 
 def _merged(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:

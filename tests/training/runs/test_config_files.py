@@ -126,6 +126,10 @@ def test_a_base_gives_the_entries_that_a_file_lacks(tmp_path) -> None:
     assert mine.data == base.data
     weights = base.objects.source_weights
     assert mine.objects.source_weights == {**weights, "alfred": 0.0} != weights
+    # A base may have a base of its own.
+    path.write_text('base = "knowledge-triway"\nname = "mine"\n')
+    again = load_config(str(path))
+    assert (again.data.sources, again.objects) == (("inventories",), base.objects)
     path.write_text(text.replace("places-triway", "nowhere"))
     with pytest.raises(ConfigError, match=r"mine\.toml: base must be one of .*places-triway"):
         load_config(str(path))
