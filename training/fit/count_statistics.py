@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
 from itertools import product
 from typing import Final
 
@@ -58,30 +59,26 @@ def fit_counts(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> Counts
     counting = {source: counted for source, counted in counting.items() if source not in unfit}
     counted = [scene for scene in scenes if scene.source in counting]
     most = _most_listed(counted, counting, vocabulary)
-    if (most > 1).any():
-        counted = _limit_groups(counted)
-        most *= _is_better_than_mean(counted, most, counting, vocabulary)
-    return _fit(counted, most, counting, vocabulary) if (most > 1).any() else None
+    if not (most > 1).any():
+        return None
+    counted = _limit_groups(counted)
+    counting = {source: of_source & (most > 0) for source, of_source in counting.items()}
+    cases = _Cases.of(counted, counting, vocabulary)
+    most *= _is_better_than_mean(counted, cases, most, counting, vocabulary)
+    cases = cases.where(most[cases.index] > 0)
+    return _fit(cases, most, vocabulary) if (most > 1).any() else None
 
 
-def folds(
-    scenes: Sequence[EncodedScene],
-) -> Iterator[tuple[list[EncodedScene], list[EncodedScene]]]:
-    """Yield the training and the test scenes of five folds. A group is in the test of one fold."""
+def _folds(scenes: Sequence[EncodedScene]) -> Ints:
+    """Return the number of the fold, of five, that tests each scene. A group is in one fold."""
     groups = sorted({scene.group for scene in scenes})
     order = np.random.default_rng(0).permutation(len(groups)) % _FOLDS
     fold = dict(zip(groups, order.tolist(), strict=True))
-    for number in range(_FOLDS):
-        test = [scene for scene in scenes if fold[scene.group] == number]
-        yield [scene for scene in scenes if fold[scene.group] != number], test
+    return np.array([fold[scene.group] for scene in scenes])
 
 
-def _fit(
-    scenes: Sequence[EncodedScene], most: Ints, counting: dict[str, Flags], vocabulary: Vocabulary
-) -> Counts:
-    """Fit the statistics to the cases of the classes with a `most`, and return those."""
-    counting = {source: counted & (most > 0) for source, counted in counting.items()}
-    cases = _Cases.of(scenes, counting, vocabulary)
+def _fit(cases: _Cases, most: Ints, vocabulary: Vocabulary) -> Counts:
+    """Fit the statistics to the cases, which are of the classes with a `most`."""
     share = _shares(cases, len(vocabulary))
     weights = _weights(cases, share, most > 0)
     # The exponent -1 stands for the listed number, which is uniform from 1 to n.
@@ -134,14 +131,15 @@ class _Cases:
         index: (N,) the class.
         listed, number: (N,) numbers of instances, listed (from 1 to `number`) and in the scene.
         features: (N, 3 + C + V) features of the listed part, in the columns of `Counts.weights`.
-        weight: (N,) weight that balances the data sources.
+        scene, source: (N,) indices of the scene and of its data source.
     """
 
     index: Ints
     listed: Ints
     number: Ints
     features: sparse.csr_matrix
-    weight: Floats
+    scene: Ints
+    source: Ints
 
     @classmethod
     def of(
@@ -163,7 +161,16 @@ class _Cases:
         bounds = np.cumsum([0, *(len(row) for row, _ in rows)])
         shape = (len(cases), start + len(vocabulary))
         features = sparse.csr_matrix((values, columns, bounds), shape=shape)
-        return cls(index, listed, number, features, source_weights(sources, scene_rows) / _DRAWS)
+        return cls(index, listed, number, features, scene_rows, sources)
+
+    def where(self, chosen: Flags) -> _Cases:
+        """Return the chosen cases; `chosen` is a mask, (N,)."""
+        return _Cases(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
+    @cached_property
+    def weight(self) -> Floats:
+        """Weight of each case, (N,), that balances the data sources."""
+        return source_weights(self.source, self.scene) / _DRAWS
 
 
 def _features(part: Part, k: int, start: int) -> tuple[Ints, Floats]:
@@ -232,13 +239,18 @@ def _weights(cases: _Cases, share: Floats, fitted: Flags) -> Floats:
 
 
 def _is_better_than_mean(
-    scenes: Sequence[EncodedScene], most: Ints, counting: dict[str, Flags], vocabulary: Vocabulary
+    scenes: Sequence[EncodedScene],
+    cases: _Cases,
+    most: Ints,
+    counting: dict[str, Flags],
+    vocabulary: Vocabulary,
 ) -> Flags:
     """Return the classes, (V,), whose expected number is closer than the class mean."""
-    V = len(vocabulary)
+    V, fold = len(vocabulary), _folds(scenes)
     gain = np.zeros(V)
-    for train, test in folds(scenes):
-        counts = _fit(train, most, counting, vocabulary)
+    for number in range(_FOLDS):
+        counts = _fit(cases.where(fold[cases.scene] != number), most, vocabulary)
+        test = [scenes[k] for k in np.flatnonzero(fold == number).tolist()]
         for scene, seed in product(test, range(_DRAWS)):
             counted = counting[scene.source]
             part, indices = listed_cases(scene, counted, vocabulary.structure, seed)
@@ -246,7 +258,7 @@ def _is_better_than_mean(
             rows, p = distribution(counts, V, part.classes, part.listed, room)
             is_asked = np.isin(rows, indices)
             rows, expected = rows[is_asked], p[is_asked] @ np.arange(1, MOST + 1)
-            classes, number = part.classes[rows], part.number[rows]
+            classes, truth = part.classes[rows], part.number[rows]
             mean = class_mean(counts, np.searchsorted(counts.classes, classes), part.listed[rows])
-            gain[classes] -= np.abs(expected - number) - np.abs(mean - number)
+            gain[classes] -= np.abs(expected - truth) - np.abs(mean - truth)
     return gain > 0

@@ -6,9 +6,11 @@ A machine whose chains drift away from the scenes learnt a wrong distribution: t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 import torch
@@ -19,6 +21,8 @@ from app.registry import Metric
 from training.datasets.array_types import Flags, Floats, Ints
 from training.fit.configuration import ObjectsConfig
 from training.fit.objects import ObjectScenes, served_weights
+
+T = TypeVar("T")
 
 RECORDED: Final = 5
 """Number of sweeps between two recorded states."""
@@ -112,15 +116,25 @@ class LongChains:
         """
         count = np.zeros(self.on.shape)  # number of records with each class
         records = range(0, sweeps, every)
-        for room in np.unique(self._rooms).tolist():
-            conditions = conditions_of(None if room < 0 else room, self._profile)
-            conditioned = self._chains.under(conditions)
-            for k in np.flatnonzero(self._rooms == room).tolist():
-                for _ in records:
-                    conditioned.sweep(self.on[k], every, self._streams[k])
-                    count[k] += self.on[k]
+        conditioned = {
+            room: self._chains.under(conditions_of(None if room < 0 else room, self._profile))
+            for room in np.unique(self._rooms).tolist()
+        }
+
+        def run_chain(k: int) -> None:
+            for _ in records:
+                conditioned[int(self._rooms[k])].sweep(self.on[k], every, self._streams[k])
+                count[k] += self.on[k]
+
+        in_threads(run_chain, len(count))
         share: Floats = count / len(records)
         return share
+
+
+def in_threads(run: Callable[[int], T], count: int) -> list[T]:
+    """Return the results of `run` for 0 to count - 1. The sweeps of chains use every core."""
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        return list(threads.map(run, range(count)))
 
 
 def conditions_of(room: int | None, profile: int | None = None) -> Conditions:

@@ -23,11 +23,17 @@ import numpy as np
 import torch
 from scipy.special import logit
 
-from app.inference.chains import random_stream
+from app.inference.chains import Bits, random_stream
 from app.inference.weights import pack_scenes
 from training.datasets.array_types import Floats
 from training.fit.configuration import ObjectsConfig
-from training.fit.long_chains import RECORDED, LongChains, populations, scene_chains
+from training.fit.long_chains import (
+    RECORDED,
+    LongChains,
+    in_threads,
+    populations,
+    scene_chains,
+)
 from training.fit.objects import ObjectScenes
 from training.machines import BoltzmannMachine
 from training.machines.arrays import weights_of
@@ -78,9 +84,11 @@ def store_samples(machine: BoltzmannMachine, scenes: ObjectScenes, seed: int) ->
     index = scenes.draw(machine.spec.N, generator)
     chains = scene_chains(weights_of(machine))
     v, rooms = scenes.v[index].numpy(), scenes.room[index].numpy()
-    samples = [
-        chains.continued(present, None if room < 0 else int(room), _SWEEPS, random_stream(seed, k))
-        for k, (present, room) in enumerate(zip(v, rooms, strict=True))
-    ]
+
+    def sample(k: int) -> Bits:
+        room = None if rooms[k] < 0 else int(rooms[k])
+        return chains.continued(v[k], room, _SWEEPS, random_stream(seed, k))
+
+    samples = in_threads(sample, len(v))
     machine.fantasies.copy_(torch.from_numpy(pack_scenes(np.stack(samples))))
     machine.fantasy_rooms.copy_(torch.from_numpy(rooms.astype(np.int32)))
