@@ -8,7 +8,7 @@ from math import prod
 
 from app.inference import MachineSpec
 from app.registry.counts import Counts
-from app.registry.description import Description
+from app.registry.description import DataSource, Description
 from app.registry.manifest import TensorEntry, of_machine
 from app.registry.offsets import Offsets
 
@@ -115,9 +115,13 @@ def render_card(description: Description, tensors: Mapping[str, TensorEntry]) ->
         *([_ADAPTED.format_map(parent)] if isinstance(parent, dict) else []),
         _metrics(description),
         "## Data and terms",
+        *_shares(description.data),
         _table(
-            ("Source", "Scenes", "Terms", "SHA-256"),
-            [(s.source, f"{s.scenes:,}", s.terms, f"`{s.digest[:16]}…`") for s in description.data],
+            ("Source", "Scenes", "Share", "Terms", "SHA-256"),
+            [
+                (s.source, f"{s.scenes:,}", _share(s.share), s.terms, f"`{s.digest[:16]}…`")
+                for s in description.data
+            ],
         ),
         f"Terms of the weights: {description.terms}",
         "## Limits",
@@ -127,6 +131,22 @@ def render_card(description: Description, tensors: Mapping[str, TensorEntry]) ->
         or "not recorded",
     ]
     return "\n\n".join(sections) + "\n"
+
+
+def _shares(data: Sequence[DataSource]) -> list[str]:
+    """Return a sentence about the shares of written and of seen scenes, if they are recorded."""
+    shares = [(source.written, source.share) for source in data]
+    if not shares or any(share is None for _, share in shares):
+        return []
+    written = sum(share or 0.0 for is_written, share in shares if is_written)
+    return [
+        f"Scenes drawn from written places have {_share(written)} of the weight of all scenes that "
+        f"teach objects, and seen scenes have {_share(1 - written)}. Shares by source:"
+    ]
+
+
+def _share(share: float | None) -> str:
+    return "" if share is None else f"{share:.1%}".replace("%", " %")
 
 
 def _machine(spec: MachineSpec) -> list[tuple[str, str]]:

@@ -258,13 +258,20 @@ class VocabularyEntry(Frozen):
 
 
 class DataSource(Frozen):
-    """One source of training scenes. ``digest`` is the SHA-256 of the data."""
+    """One source of training scenes. ``digest`` is the SHA-256 of the data.
+
+    Attributes:
+        share: share of the weight of all scenes that teach objects; None if it is not recorded.
+        written: True for scenes drawn from written places. Other scenes were seen.
+    """
 
     source: Text
     scenes: Count
     digest: Sha256
     terms: Text
     research_only: bool
+    share: float | None = None
+    written: bool = False
 
 
 class Metric(Frozen):

@@ -293,9 +293,8 @@ TENSORS = {
 }
 
 
-def source(name: str, *, research_only: bool = False) -> dict[str, Any]:
-    changes = {"scenes": 8133, "terms": f"terms of {name}"}
-    return DATA | changes | {"source": name, "research_only": research_only}
+def source(name: str, **changes: Any) -> dict[str, Any]:
+    return DATA | {"scenes": 8133, "terms": f"terms of {name}", "source": name} | changes
 
 
 def card(**changes: Any) -> str:
@@ -307,12 +306,22 @@ def test_names_data_terms_sizes_and_limits() -> None:
     page = card(variant="triway", spec=spec, data=[source("rooms")])
     assert page.startswith("# tiny 1.0.0\n")
     for text in (
-        *("| rooms | 8,133 | terms of rooms |", "Terms of the weights: Apache-2.0"),
+        *("| rooms | 8,133 |  | terms of rooms |", "Terms of the weights: Apache-2.0"),
         *("(stored as float16, int32)", "3, of which 2 may be proposed", "bedroom, office"),
         *("2 units of 4 states", "17,969 triples", "1,024, where chains start", "homes, shops"),
         *("\n## Intended use\n", "\n## Limits\n"),
     ):
         assert text in page
+
+
+def test_states_the_shares_of_written_and_of_seen_scenes() -> None:
+    written, seen = source("lists", share=0.4, written=True), source("rooms", share=0.6)
+    page = card(data=[written, seen])
+    assert "written places have 40.0 % of the weight" in page
+    assert "seen scenes have 60.0 %" in page
+    assert "| rooms | 8,133 | 60.0 % | terms of rooms |" in page
+    # An adapted model adds scenes of its own, whose share is unknown.
+    assert "written places" not in card(data=[written, seen, source("home")])
 
 
 def test_warns_of_research_data_by_name_before_anything_else() -> None:

@@ -19,7 +19,7 @@ from app.registry import (
     VocabularyEntry,
 )
 from training.datasets.batches import TrainingData
-from training.datasets.sources import SOURCES
+from training.datasets.sources import SOURCES, source_of
 from training.datasets.vocabulary import with_aliases, with_room_aliases
 from training.evaluation.alarms import untouched_alarms
 from training.evaluation.everyday_task import EVERYDAY
@@ -106,7 +106,7 @@ def publish_run(
     rows = _measure(evaluated, test, progress)
     rows += drift.metrics()
     progress("publishing")
-    sources = data_sources(scenes)
+    sources = data_sources(scenes, learnt)
     description = Description(
         name=run.config.name,
         version=version,
@@ -233,15 +233,22 @@ def _measure(
     )
 
 
-def data_sources(scenes: SplitScenes) -> tuple[DataSource, ...]:
-    """Return the data sources with the digests of their scenes and their terms of use."""
+def data_sources(scenes: SplitScenes, learnt: ObjectScenes) -> tuple[DataSource, ...]:
+    """Return the data sources with the digests of their scenes, their terms of use and shares.
+
+    Args:
+        learnt: the scenes that teach objects.
+    """
     sources = []
+    shares = dict(zip(learnt.sources, (learnt.source_sizes / learnt.size).tolist(), strict=True))
     for name, count in scenes.counts.items():
         words, research_only = terms_of(name, scenes.data)
         digest = scenes.digests[name]
         source = DataSource(
-            source=name, scenes=count, digest=digest, terms=words, research_only=research_only
-        )
+            source=name, scenes=count, digest=digest, terms=words, research_only=research_only,
+            share=round(shares.get(name, 0.0), 4),
+            written=name in scenes.data.sources and source_of(name).written,
+        )  # fmt: skip
         sources.append(source)
     return tuple(sources)
 
