@@ -13,9 +13,10 @@ Each row of the table is one thing at one usual location in a place:
 training uses parts of the drawn scenes (`listed_part`).
 """
 
+import math
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -26,6 +27,7 @@ from app.scene import label_key
 from training.datasets.array_types import Rng
 from training.datasets.records import MAX_COUNT, AnnotatedObject, AnnotatedScene, DatasetError
 from training.datasets.tables import Row, read_table
+from training.datasets.things import Thing
 
 SOURCE: Final = "inventories"
 """Source name of all written scenes."""
@@ -36,8 +38,9 @@ COLUMNS: Final = (
 )
 _AT_ANCHOR: Final = ("on-top", "inside", "under", "above")
 _BY_ITSELF: Final = ("floor", "wall", "ceiling")
-_LISTED: Final = 0.55
-"""Probability that a detector lists a thing of a written place."""
+LISTED: Final = 0.55
+"""Probability that a detector lists a thing of unknown size."""
+_SMALLEST, _LENGTH = 0.3, 0.4  # share of the smallest things that are listed; decay length, metres
 _COUNT: Final = re.compile(r"(\d{1,7})(?:-(\d{1,7}))?")
 
 
@@ -175,13 +178,29 @@ def draw_scene(place: Place, scene_id: str, rng: Rng) -> AnnotatedScene:
     )
 
 
-def listed_part(scene: AnnotatedScene, rng: Rng) -> AnnotatedScene:
+def listed_shares(things: Iterable[Thing]) -> dict[str, float]:
+    """Return the probability that a detector lists a thing of a written place, by key of its name.
+
+    It is 1 - .7 exp(-length / .4 m): nearly all of the large things, and a third of the smallest.
+    """
+    shares: dict[str, float] = {}
+    for thing in things:
+        for name in (thing.label, *thing.other_names):
+            share = 1 - (1 - _SMALLEST) * math.exp(-max(thing.size) / _LENGTH)
+            shares.setdefault(label_key(name), share)
+    return shares
+
+
+def listed_part(scene: AnnotatedScene, shares: Mapping[str, float], rng: Rng) -> AnnotatedScene:
     """Return a part of a scene, as a detector lists it.
 
     All objects with one label are in the part, or none. The floor stays.
+
+    Args:
+        shares: see `listed_shares`.
     """
     labels = list(dict.fromkeys(label_key(thing.label) for thing in scene.objects))
-    drawn = rng.random(len(labels)) < _LISTED
+    drawn = rng.random(len(labels)) < np.array([shares.get(label, LISTED) for label in labels])
     is_listed = dict(zip(labels, drawn.tolist(), strict=True)) | {"floor": True}
     kept = [k for k, thing in enumerate(scene.objects) if is_listed[label_key(thing.label)]]
     index_of = {old: new for new, old in enumerate(kept)}
@@ -198,11 +217,17 @@ def listed_part(scene: AnnotatedScene, rng: Rng) -> AnnotatedScene:
     return replace(scene, objects=objects, relations=relations, supported=tuple(sorted(supported)))
 
 
-def written_scenes(places: Sequence[Place], each: int, seed: int) -> list[AnnotatedScene]:
-    """Draw parts of a number of scenes of each place. The scenes of a place are one group."""
+def written_scenes(
+    places: Sequence[Place], shares: Mapping[str, float], each: int, seed: int
+) -> list[AnnotatedScene]:
+    """Draw parts of a number of scenes of each place. The scenes of a place are one group.
+
+    Args:
+        shares: see `listed_shares`.
+    """
     rngs = np.random.default_rng(seed).spawn(len(places))
     return [
-        listed_part(draw_scene(place, f"{place.name} {number}", rng), rng)
+        listed_part(draw_scene(place, f"{place.name} {number}", rng), shares, rng)
         for place, rng in zip(places, rngs, strict=True)
         for number in range(each)
     ]

@@ -104,7 +104,7 @@ def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
 def served_scenes(scenes: SceneTensors, served: Mapping[str, float]) -> SceneTensors:
     """Return the scenes of the sources for which the answers stand; see `ObjectsConfig`.
 
-    These are the sources with at least a quarter of the largest weight in `served` and at least 20
+    These are the sources with at least a tenth of the largest weight in `served` and at least 20
     scenes. Without such a source, they are all scenes with complete object lists. At most 200
     scenes of a source take part.
     """

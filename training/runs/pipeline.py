@@ -31,6 +31,7 @@ from training.datasets.batches import TrainingData, scene_tensors
 from training.datasets.files import KNOWLEDGE
 from training.datasets.records import digest_of
 from training.datasets.roles import count_roles
+from training.datasets.things import read_things
 from training.datasets.vocabulary import indoor_vocabulary, read_vocabulary, with_typical_sizes
 from training.datasets.words import class_vectors, read_word_vectors
 from training.datasets.written import written_vocabulary
@@ -118,7 +119,8 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
             own = generate_rooms(data.rooms, seed=data.split_seed)
         elif source == inventories.SOURCE:
             places = inventories.read_places(path)
-            own = inventories.written_scenes(places, data.written, seed=data.split_seed)
+            shares = inventories.listed_shares(read_things(KNOWLEDGE / "things.csv").values())
+            own = inventories.written_scenes(places, shares, data.written, seed=data.split_seed)
         elif source == priors.SOURCE:
             own = priors.read_prior_scenes(path)
         else:

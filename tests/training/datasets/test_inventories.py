@@ -1,5 +1,7 @@
 """Written inventories and things: the reader, its errors, and the law of the sampler."""
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +12,12 @@ from training.datasets import DatasetError
 from training.datasets.files import KNOWLEDGE
 from training.datasets.inventories import (
     COLUMNS,
+    LISTED,
     Group,
     Item,
     Place,
     draw_scene,
+    listed_shares,
     read_places,
     written_scenes,
 )
@@ -135,19 +139,23 @@ def test_scenes_follow_the_written_law():
 
 
 def test_a_detector_lists_a_part_of_each_scene():
-    """Each label is listed with probability .55; 4,000 scenes, five standard errors, p < 1e-5."""
+    """Large things are listed more often; 4,000 scenes, five standard errors, p < 1e-5."""
     items = (
         Item("table", 1, 1, 1, "floor", ""),
         Item("mug", 1, 1, 1, "on-top", "table"),
         Item("mugs", 1, 2, 2, "inside", "table"),
     )
     place = Place("den", "study", (Group("basics", 1, items),))
-    scenes = written_scenes([place], 4000, seed=3)
+    things = read_things(KNOWLEDGE / "things.csv")
+    shares = listed_shares([replace(things["table"], size=(0.5, 2.0, 0.7))])
+    assert shares["table"] == pytest.approx(1 - 0.7 * math.exp(-5))
+    scenes = written_scenes([place], shares, 4000, seed=3)
     assert len({scene.scene_id for scene in scenes}) == 4000
     assert {scene.group for scene in scenes} == {"den"}
     names = [[thing.label for thing in scene.objects] for scene in scenes]
-    for labels in (["table"], ["mug", "mugs"]):
-        assert np.mean([labels[0] in own for own in names]) == pytest.approx(0.55, abs=0.04)
+    # The size of a mug is unknown.
+    for label, share in (("table", shares["table"]), ("mug", LISTED)):
+        assert np.mean([label in own for own in names]) == pytest.approx(share, abs=0.04)
     # Both rows of one thing are listed together, and relations keep their ends.
     pairs = (("table", "floor"), ("mug", "table"), ("mugs", "table"))
     for own, scene in zip(names, scenes, strict=True):
@@ -179,8 +187,8 @@ def test_things_stand_where_the_table_says():
 
 def test_a_seed_gives_the_same_scenes():
     places = read_places(KNOWLEDGE / "inventories.csv")[:3]
-    assert written_scenes(places, 2, seed=1) == written_scenes(places, 2, seed=1)
-    assert written_scenes(places, 2, seed=1) != written_scenes(places, 2, seed=2)
+    assert written_scenes(places, {}, 2, seed=1) == written_scenes(places, {}, 2, seed=1)
+    assert written_scenes(places, {}, 2, seed=1) != written_scenes(places, {}, 2, seed=2)
 
 
 def test_places_are_a_data_source_without_a_data_folder(tmp_path):

@@ -133,7 +133,7 @@ def test_real_rooms_come_before_generated_ones():
     made = [scene([0, 1], source="procthor") for _ in range(500)]
     real = [scene([0, 1], source=name) for name in ["3dssg"] * 30 + ["sunrgbd"] * 450]
     few = [scene([0, 1], source="nr3d") for _ in range(19)]
-    served = {"3dssg": 1.0, "sunrgbd": 1.0, "nr3d": 1.0, "procthor": 0.1}
+    served = {"3dssg": 1.0, "sunrgbd": 1.0, "nr3d": 1.0, "procthor": 0.05}
     kept = served_scenes(tensors([*made, *real, *few], WIDE), served)
     sources = [one.source for one in kept.scenes]
     assert {name: sources.count(name) for name in set(sources)} == {"3dssg": 30, "sunrgbd": 200}
