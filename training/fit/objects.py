@@ -309,6 +309,9 @@ class ObjectFit:
         for name, weight in self._weights.items():
             weight.copy_(self._average[name])
         machine, scenes = self.machine, self.scenes
+        if (couplings := machine.couplings) is not None:
+            # The optimiser rounds the two halves differently, in its last bits.
+            couplings.copy_((couplings + couplings.T).div_(2))
         served = served_weights(scenes, self.config)
         for rates, bias, shows in (
             (machine.a, machine.b, scenes.shows),
