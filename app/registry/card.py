@@ -146,7 +146,7 @@ def _shares(data: Sequence[DataSource]) -> list[str]:
 
 
 def _share(share: float | None) -> str:
-    return "" if share is None else f"{share:.1%}".replace("%", " %")
+    return "" if share is None else f"{100 * share:.1f} %"
 
 
 def _machine(spec: MachineSpec) -> list[tuple[str, str]]:

@@ -40,7 +40,6 @@ from training.evaluation.intruders import draw_intruders, intruder_weights
 from training.evaluation.parts import Parts, draw_parts, exactly, up_to_longest
 from training.fit.calibrate_rooms import calibrate_rooms, posterior_of
 from training.fit.configuration import ObjectsConfig
-from training.fit.objects import SERVED
 
 COVERAGES = (0.15, 0.3, 0.45, 0.6, 0.8)
 # Tested exponents alpha of the prior of intruders.
@@ -52,6 +51,7 @@ _LEAST_SCENES = 20  # from which objects are judged
 _SEEDS = (0, 1, 2)
 _LISTED = 10  # classes in the fit of each part; an answer of the service lists ten by default
 _SOURCE_SCENES = 200  # maximum scenes of each source
+_SERVED = 0.1  # least weight of a source, as a share of the largest weight in the served mix
 
 
 def calibrate_objects(
@@ -113,7 +113,9 @@ def served_scenes(scenes: SceneTensors, served: Mapping[str, float]) -> SceneTen
     chosen = [
         names.index(name)
         for name, weight in served.items()
-        if weight >= largest * SERVED and name in names and size[names.index(name)] >= _LEAST_SCENES
+        if weight >= largest * _SERVED
+        and name in names
+        and size[names.index(name)] >= _LEAST_SCENES
     ]
     if not chosen:
         scenes = complete_scenes(scenes)

@@ -52,8 +52,6 @@ _SHOWN = 3  # scenes of a source in which a class must occur
 _LEAST_SHARE = 0.05
 _AVERAGED = 0.3  # last share of the steps whose weights are averaged
 _RARE = -9.0  # least initial bias of a class
-SERVED = 0.1
-"""Share of the largest weight in the served mix from which answers are calibrated to a source."""
 _UNSERVED = 1e-9  # weight of a source outside of the served mix
 
 

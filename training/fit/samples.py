@@ -27,13 +27,7 @@ from app.inference.chains import Bits, random_stream
 from app.inference.weights import pack_scenes
 from training.datasets.array_types import Floats
 from training.fit.configuration import ObjectsConfig
-from training.fit.long_chains import (
-    RECORDED,
-    LongChains,
-    in_threads,
-    populations,
-    scene_chains,
-)
+from training.fit.long_chains import RECORDED, LongChains, in_threads, populations, scene_chains
 from training.fit.objects import ObjectScenes
 from training.machines import BoltzmannMachine
 from training.machines.arrays import weights_of
