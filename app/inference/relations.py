@@ -36,7 +36,7 @@ Table = tuple[NDArray[np.int32], NDArray[np.int32]]
 NO_VALUES: Final[Floats] = np.zeros((0, 0, 0), dtype=np.float32)
 
 # Maximum variance of a logit, averaged over units, that `_directions` may neglect. Neglecting a
-# variance changes a probability by about 1/20 of this variance. The model `indoor-triway` keeps 5
+# variance changes a probability by about 1/20 of this variance. The model `places-triway` keeps 6
 # of 33 directions.
 _LEFT_OUT: Final = 1.6e-2
 

@@ -30,7 +30,7 @@ def test_axe_finds_nothing_in_any_state(open_board: OpenBoard, scheme: str) -> N
     found = {"example": complaints(board)}
     # Another model that knows all of the example's labels.
     references = [str(one.get_attribute("value")) for one in page.locator("#second option").all()]
-    (second,) = [name for name in references if name.startswith("indoor-rbm@")]
+    (second,) = [name for name in references if name.startswith("places-rbm@")]
     page.get_by_label("compare with").select_option(second)
     page.locator("#list .name").first.click()
     board.use_positions()

@@ -347,7 +347,9 @@ def test_a_suggestion_at_another_place_or_none_says_so(open_board: OpenBoard) ->
     board.alter(
         "missing",
         lambda answer: (
-            answer | {"missing": [answer["missing"][0] | {"label": "cup", "placements": [place]}]}
+            answer
+            | {"more": []}
+            | {"missing": [answer["missing"][0] | {"label": "cup", "placements": [place]}]}
         ),
     )
     board.add("laptop")
@@ -367,14 +369,34 @@ def test_a_suggestion_at_another_place_or_none_says_so(open_board: OpenBoard) ->
     assert board.column("missing").get_by_role("button", name="Put ").count() == 0
 
 
-def test_no_suggestion_stands_at_an_outlier(open_board: OpenBoard, api: httpx.Client) -> None:
+def test_other_suggestions_lie_on_a_sheet(open_board: OpenBoard) -> None:
+    board = open_board({"objects": ["bed", "nightstand"]})
+    place = {"relation": "on-top", "object": "bed", "probability": 0.9}
+    board.alter(
+        "missing",
+        lambda answer: (
+            answer
+            | {
+                "more": [],
+                "missing": [
+                    answer["missing"][0] | {"label": label, "placements": [place]}
+                    for label in ("sheet", "pillow")
+                ],
+            }
+        ),
+    )
+    board.add("wardrobe")
+    assert board.ghosts == ["sheet", "pillow"]
+
+
+def test_no_suggestion_stands_at_an_outlier(open_board: OpenBoard) -> None:
     board = open_board({"objects": ["bed", "nightstand", "lamp", "toilet"]})
-    (toilet,) = [
-        one["object"]
-        for one in api.post("/outliers", json=board.scene).json()["outliers"]
-        if one["is_outlier"]
-    ]
-    missing = api.post("/missing", json=board.scene | {"top_k": 5}).json()["missing"]
-    places = [place for one in missing for place in one["placements"]]
-    assert any(place["object"] == toilet and place["probability"] >= 0.25 for place in places)
+    (toilet,) = [thing["id"] for thing in board.scene["objects"] if thing["label"] == "toilet"]
+    place = {"relation": "above", "object": toilet, "probability": 0.9}
+    board.alter(
+        "missing",
+        lambda answer: answer | {"missing": [answer["missing"][0] | {"placements": [place]}]},
+    )
+    board.add("wardrobe")
+    assert board.ghosts == []
     assert not any(re.search(rf"{toilet} \d+ %", row) for row in board.rows("missing"))

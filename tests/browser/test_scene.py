@@ -24,7 +24,7 @@ def place(board: Board, name: str, question: str = "missing") -> tuple[float, fl
 def test_an_object_is_found_by_any_of_its_names(open_board: OpenBoard) -> None:
     board = open_board()
     box = board.page.get_by_role("combobox", name="Add an object")
-    box.fill("trash c")
+    box.fill("trash can")
     options = board.page.locator("#found [role=option]")
     expect(options.first).to_contain_text("garbage bin trash can")
     assert box.get_attribute("aria-expanded") == "true"

@@ -50,7 +50,7 @@ def test_the_shell_program_adapts_a_model_that_a_service_serves(
     assert len((home / "scenes.jsonl").read_text("utf-8").splitlines()) == 3
     objects = ["bed", "pillow", "lamp", "bicycle"]
     with launch(home / "store", tmp_path / "log") as service, Client(service.url) as client:
-        for model, expected in (("indoor-triway", ["bicycle"]), ("default", [])):
+        for model, expected in (("places-triway", ["bicycle"]), ("default", [])):
             answer = client.outliers(objects, room_type="bedroom", model=model, timeout=60)
             assert [thing.label for thing in answer.outliers if thing.is_outlier] == expected
 

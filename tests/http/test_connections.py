@@ -6,6 +6,7 @@ import socket
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
+import httpx
 import pytest
 
 from tests.chaos.wire import BODY, LIVE, Wire, exchange
@@ -78,9 +79,15 @@ def test_unfinished_bodies_use_bounded_memory(shared_store: Path, tmp_path: Path
         # Small bodies that arrive at once are accepted.
         assert service.control() == answers
         batch = {"scenes": [{"objects": ["bed"] * 60}] * 256}
-        response = service.client.post("/missing/batch", json=batch)
-        problem(response, 503, "bodies-full")
-        assert int(response.headers["retry-after"]) > 0
+
+        def asked() -> httpx.Response:
+            return service.client.post("/missing/batch", json=batch)
+
+        # The service reads the last bytes of the held bodies after the client sent them.
+        wait_until(lambda: asked().status_code == 503)
+        refused = asked()
+        problem(refused, 503, "bodies-full")
+        assert int(refused.headers["retry-after"]) > 0
         held.close()
         # The service notices the end of the connections after the client.
-        wait_until(lambda: service.client.post("/missing/batch", json=batch).status_code == 200)
+        wait_until(lambda: asked().status_code == 200)

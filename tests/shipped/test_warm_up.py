@@ -53,7 +53,7 @@ async def main(store):
 
         before = compiled()
         assert sum(before.values()) > 20
-        for model in ("indoor-triway", "indoor-rbm"):
+        for model in ("places-triway", "places-rbm"):
             vocabulary = Store(store).load(*Store(store).resolve(model)).vocabulary
             labels, rooms = vocabulary.labels, vocabulary.room_types
             for scene in scenes(labels):

@@ -118,14 +118,17 @@ def test_an_upgrade_copies_the_shipped_models_into_the_volume_of_the_service(
     (tmp_path / "model_store").symlink_to(repository / "model_store")
     old = AliasTarget(name="indoor-triway", version="1.0.0")
     (tmp_path / "models" / "indoor-triway" / "1.0.0").mkdir(parents=True)
-    (tmp_path / "models" / "indoor-triway" / "1.0.0" / "manifest.json").touch()
+    manifest = tmp_path / "models" / "indoor-triway" / "1.0.0" / "manifest.json"
+    manifest.write_text('{"format": 1}', "utf-8")
     (tmp_path / "models" / "aliases.json").write_bytes(aliases_to_bytes({"default": old}))
     program, *arguments = copy["command"]
     assert program == "python"
     environment = os.environ | {"PYTHONPATH": str(repository)}
     run_program(sys.executable, *arguments, cwd=tmp_path, env=environment)
-    models = load_model_set(Store(tmp_path / "models"))
-    assert models.resolve("default").key == Store(repository / "model_store").resolve("default")
+    release = Store(repository / "model_store")
+    models = load_model_set(Store(tmp_path / "models"), release=release)
+    assert models.is_outdated("default"), "so the shipped default answers"
+    assert models.resolve(str(models.shipped.default)).key == release.resolve("default")
     assert list(models.failures) == [("indoor-triway", "1.0.0")]
 
 

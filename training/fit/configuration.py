@@ -42,8 +42,8 @@ class DataConfig(_Section):
 
     sources: tuple[str, ...] = Field(min_length=1)
     vocabulary: str = Field(
-        default="indoor",
-        description="written, indoor, source, rooms, or a file that ends in .json",
+        default="written",
+        description="written, source, rooms, or a file that ends in .json",
     )
     split: Literal["group", "stable", "final"] = "group"
     split_seed: int = 0
@@ -115,6 +115,9 @@ class ObjectsConfig(_Section):
     )
     generative_weight: float = Field(default=0.2, ge=0, description="weight of PCD")
     chains: int = Field(default=256, ge=1, description="number of persistent chains (PCD)")
+    served_sweeps: int = Field(
+        default=20, ge=1, description="sweeps of a round of chains that fits u of the served mix"
+    )
     classes_per_sweep: int = Field(
         default=250, ge=1, description="random classes that a sweep of coupled classes draws"
     )

@@ -35,7 +35,7 @@ from training.machines.arrays import weights_of
 _SWEEPS = 200  # sweeps of a stored sample
 _CHAINS = 64  # chains of each data source in the fit of u
 _ROUNDS = 50
-_ROUND_SWEEPS = 20
+_ROUND_SWEEPS = 20  # of the chains of a source; those of the served mix: `served_sweeps`
 _FIRST_STEP, _LAST_STEP = 0.7, 0.1  # of u, as a share of the difference of log-odds
 
 
@@ -47,11 +47,12 @@ def fit_scene_rates(
     u = chains.machine["u"]
     for row, population in enumerate(populations(scenes, config)):
         long = LongChains(chains, scenes, population, _CHAINS, seed)
+        sweeps = _ROUND_SWEEPS if population.profile is not None else config.served_sweeps
         average = np.zeros(u.shape[1])
         for number in range(_ROUNDS):
-            drawn = long.run(_ROUND_SWEEPS).mean(0)
+            drawn = long.run(sweeps).mean(0)
             step = _FIRST_STEP * (_LAST_STEP / _FIRST_STEP) ** (number / (_ROUNDS - 1))
-            change = step * (_log_odds(population.p) - _log_odds(drawn))
+            change = step * (_log_odds(population.p, sweeps) - _log_odds(drawn, sweeps))
             u[row] += np.where(population.shows, np.clip(change, -1, 1), 0)
             if number >= _ROUNDS / 2:
                 average += u[row] / (_ROUNDS - _ROUNDS // 2)
@@ -59,9 +60,9 @@ def fit_scene_rates(
     machine.u.copy_(torch.from_numpy(u))
 
 
-def _log_odds(p: Floats) -> Floats:
+def _log_odds(p: Floats, sweeps: int) -> Floats:
     """Return the log-odds of shares of the states in a round, with half a state added."""
-    states = _CHAINS * _ROUND_SWEEPS / RECORDED / 2  # neighbouring states are similar
+    states = _CHAINS * sweeps / RECORDED / 2  # neighbouring states are similar
     log_odds: Floats = logit((p * states + 0.5) / (states + 1))
     return log_odds
 

@@ -25,7 +25,7 @@ from training.research.plots import write_plots
 from training.runs.config_files import data_folder, load_config, with_settings
 from training.runs.pipeline import SplitScenes, prepare
 
-DEFAULT = ("indoor-triway", "indoor-gbm", "indoor-rbm")
+DEFAULT = ("places-triway", "places-gbm", "places-rbm")
 """Configurations that the command measures if it is called without configurations."""
 
 Data = Annotated[Path | None, typer.Option("--data", help="folder with the scene files")]
@@ -41,7 +41,7 @@ def benchmark(
         list[str] | None,
         typer.Argument(
             help="configurations with the same data section; the first is the reference. "
-            "Default: the indoor machines."
+            "Default: the shipped machines."
         ),
     ] = None,
     data: Data = None,
@@ -71,7 +71,7 @@ def benchmark(
         baselines = None if baseline is None else [name for name in baseline if name != "none"]
         names = machines or DEFAULT
         configs = read_configs(names)
-        # The first name without its last word: "indoor".
+        # The first name without its last word: "places".
         results = folder / (configs[0].name.rpartition("-")[0] or configs[0].name)
         compare_machines(
             configs, data_folder(names[0], configs[0], data), results, shown,

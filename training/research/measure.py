@@ -35,6 +35,7 @@ from rich.console import Console
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bar
 
+from app.registry import RegistryError
 from training.datasets import DatasetError
 from training.datasets.batches import TrainingData
 from training.evaluation.report import Progress, SourceReport, digest, measure, pooled, silent
@@ -56,7 +57,8 @@ POOLED = "pooled"
 def resumable(console: Console) -> Iterator[None]:
     """Print expected errors; after Ctrl-C, print how to continue."""
     expected = (
-        ConfigError, DatasetError, RunError, BrokenProcessPool, ValueError, FloatingPointError
+        ConfigError, DatasetError, RunError, RegistryError, BrokenProcessPool, ValueError,
+        FloatingPointError,
     )  # fmt: skip
     try:
         yield

@@ -32,7 +32,7 @@ from training.datasets.files import KNOWLEDGE
 from training.datasets.records import digest_of
 from training.datasets.roles import count_roles
 from training.datasets.things import read_things
-from training.datasets.vocabulary import indoor_vocabulary, read_vocabulary, with_typical_sizes
+from training.datasets.vocabulary import read_vocabulary, with_typical_sizes
 from training.datasets.words import class_vectors, read_word_vectors
 from training.datasets.written import written_vocabulary
 from training.fit.configuration import Config, ConfigError, DataConfig, is_file, source_name
@@ -167,7 +167,6 @@ def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path)
     name = data.vocabulary
     makers: dict[str, Callable[[], Vocabulary]] = {
         "written": written_vocabulary,
-        "indoor": indoor_vocabulary,
         "source": partial(source_vocabulary, scenes),
         "rooms": rooms_vocabulary,
     }

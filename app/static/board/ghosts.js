@@ -19,6 +19,7 @@ const HIGHEST = 1.2; // share of the container's height that contents may have, 
 /** The part of half a suggestion that stays over the anchor at its learnt offset. */
 const HELD = 0.6;
 const GAP = 0.15; // metres between neighbours without a learnt offset
+const COVER = 0.05; // maximum height in metres of sheets and cloths, on which other suggestions may lie
 const EXACT = 0.01; // metres; a ghost this near to its learnt offset stands there
 const MARGINS = [0.3, 0.05]; // metres that stay free between two ghosts, preferred first
 /** Suggestions may overlap lower and higher boxes, such as floors, rugs and ceilings. */
@@ -76,7 +77,7 @@ export function likely(own, state) {
 /**
  * Missing objects at the first of their placements with free space, or at the place `at` of the question.
  * A ghost stands at the offset of the answer, else at the free place nearest to it. It overlaps neither the
- * robot nor another ghost nor a box, except those it stands on, under or in, or contains.
+ * robot nor another ghost (but a sheet) nor a box, except those it stands on, under or in, or contains.
  * Missing objects without a free place have no ghost.
  * @returns {Ghost[]}
  */
@@ -127,7 +128,7 @@ function freeAt(anchor, { relation, offset }, size, viewer, boxes, ghosts) {
     return obstacles.every((box) => box === support || !overlap(place, box));
   });
   const isLearnt = ({ x, y }) => learnt && Math.hypot(x - learnt.x, y - learnt.y) < EXACT;
-  const clear = (margin) => (one) => !ghosts.some((ghost) => overlap(wider(one, margin), ghost));
+  const clear = (margin) => (one) => !ghosts.some((ghost) => ghost.size.z > COVER && overlap(wider(one, margin), ghost));
   const place = free.filter(isLearnt).find(clear(0)) ?? MARGINS.map((margin) => free.find(clear(margin))).find(Boolean);
   if (!place) return undefined;
   const support = supportOf(place);

@@ -208,7 +208,7 @@ def test_each_invalid_line_is_named_up_to_a_bound(tmp_path) -> None:
     ("name", "file_name", "message"),
     [
         ("Lab One", "scenes.jsonl", "lower-case words"),
-        ("indoor-triway", "scenes.jsonl", "shipped configuration"),
+        ("places-triway", "scenes.jsonl", "shipped configuration"),
         ("lab", "scenes.txt", "fits no known format"),
     ],
 )

@@ -78,7 +78,7 @@ needs_facts = pytest.mark.skipif(facts_file(FOLDER) is None, reason="the facts a
 
 @needs_facts
 @pytest.mark.slow
-@pytest.mark.parametrize(("model", "made"), [("indoor-triway", False), ("indoor-rbm", True)])
+@pytest.mark.parametrize(("model", "made"), [("places-triway", False), ("places-rbm", True)])
 def test_the_service_gives_the_same_eleven_lines(shipped, model, made, folder, monkeypatch, capsys):
     place = folder if made else FOLDER
     artifact = load_model_set(Store(STORE)).resolve(model)

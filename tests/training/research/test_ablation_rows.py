@@ -6,7 +6,7 @@ from training.fit.configuration import ConfigError
 from training.research.ablate import load_rows
 from training.runs.config_files import load_config, shipped_files
 
-FULL = load_config("indoor-triway")
+FULL = load_config("places-triway")
 
 
 @pytest.mark.parametrize("name", shipped_files("ablations"))
@@ -32,7 +32,7 @@ def changed(before, after):
 
 
 def test_a_row_differs_from_the_full_model_in_one_setting():
-    rows = load_rows(shipped_files("ablations")["indoor-triway"], FULL)
+    rows = load_rows(shipped_files("ablations")["places-triway"], FULL)
     several = {
         row.name: names
         for row in rows
@@ -54,12 +54,12 @@ def rows(tmp_path, text):
 def test_a_row_changes_what_it_names_and_nothing_else(tmp_path):
     text = (
         '[[row]]\nname = "wide"\nwhat = "50 units"\nchanges = { "machine.units" = 50 }\n'
-        '[[row]]\nname = "open"\nwhat = "open-triway"\nfrom = "open-triway"\n'
+        '[[row]]\nname = "open"\nwhat = "knowledge-triway"\nfrom = "knowledge-triway"\n'
     )
     wide, other = rows(tmp_path, text)
     assert (wide.name, wide.description, wide.machine.units) == ("wide", "50 units", 50)
     assert changed(FULL, wide) == {"machine.units"}
-    start = load_config("open-triway")
+    start = load_config("knowledge-triway")
     assert not changed(start, other)
     assert other.data == FULL.data != start.data
 
@@ -74,17 +74,17 @@ ONE = '[[row]]\nname = "{name}"\nwhat = ""\n{rest}\n'
         ("", "row: Field required"),
         ('[[row]]\nname = "x"', "row.0.what: Field required"),
         (ONE.format(name="x", rest="change = {}"), "row.0.change: Extra inputs"),
-        (ONE.format(name="x", rest=""), "x: the row has the same settings as indoor-triway"),
-        (ONE.format(name="x y", rest='from = "indoor-rbm"'), "x y: String should match"),
+        (ONE.format(name="x", rest=""), "x: the row has the same settings as places-triway"),
+        (ONE.format(name="x y", rest='from = "places-rbm"'), "x y: String should match"),
         (ONE.format(name="x", rest='from = "nobody"'), "x: there is no configuration 'nobody'"),
         (ONE.format(name="x", rest='changes = { "a.b" = 1 }'), "x: there is no setting 'a.b'"),
         (ONE.format(name="x", rest='changes = { "machine.K" = -1 }'), "x: .*machine.K: Input"),
         (ONE.format(name="x", rest='changes = { "machine.without" = ["g"] }'), "no weights g"),
         (
-            ONE.format(name="indoor-triway", rest='from = "indoor-rbm"'),
-            "the name indoor-triway occurs twice",
+            ONE.format(name="places-triway", rest='from = "places-rbm"'),
+            "the name places-triway occurs twice",
         ),
-        (ONE.format(name="x", rest='from = "indoor-rbm"') * 2, "the name x occurs twice"),
+        (ONE.format(name="x", rest='from = "places-rbm"') * 2, "the name x occurs twice"),
     ],
 )
 def test_bad_rows_say_what_is_wrong(tmp_path, text, message):

@@ -122,10 +122,10 @@ def test_bad_requests_are_named(tmp_path, others, message):
 
 def test_configurations_of_other_scenes_are_refused():
     assert [config.name for config in read_configs(DEFAULT)] == [*DEFAULT]
-    with pytest.raises(ConfigError, match="two configurations have the name indoor-rbm"):
-        read_configs(["indoor-rbm", "indoor-rbm"])
+    with pytest.raises(ConfigError, match="two configurations have the name places-rbm"):
+        read_configs(["places-rbm", "places-rbm"])
     with pytest.raises(ConfigError, match="different data sections"):
-        read_configs(["indoor-rbm", "open-triway"])
+        read_configs(["places-rbm", "knowledge-triway"])
 
 
 def test_baselines_that_no_seed_changes_are_trained_once():

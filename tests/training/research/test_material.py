@@ -43,7 +43,7 @@ def test_all_that_decides_what_is_learnt_is_in_the_digest(tmp_path):
     others = [
         material(tmp_path, sources=("flats", "sheds")),
         material(tmp_path, sources=("sheds",)),
-        material(tmp_path, vocabulary="indoor"),
+        material(tmp_path, vocabulary="written"),
         material(tmp_path, split="stable"),
         material(tmp_path, split_seed=1),
         material(tmp_path, limit=40),

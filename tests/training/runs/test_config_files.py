@@ -25,8 +25,8 @@ def test_shipped_configurations_load(name: str) -> None:
     assert all(source in SOURCES for source in config.data.sources)
 
 
-def test_the_indoor_variants_learn_from_the_same_scenes() -> None:
-    variants = [load_config(f"indoor-{variant}") for variant in ("triway", "gbm", "rbm")]
+def test_the_shipped_variants_learn_from_the_same_scenes() -> None:
+    variants = [load_config(f"places-{variant}") for variant in ("triway", "gbm", "rbm")]
     assert [config.machine.variant for config in variants] == ["triway", "gbm", "rbm"]
     assert len({config.data.model_dump_json() for config in variants}) == 1
 
@@ -87,7 +87,7 @@ def test_files_are_read_from_the_folder_of_their_configuration(tmp_path) -> None
         assert [source_name(source) for source in config.data.sources] == ["day", "3dssg"]
         assert data_folder(reference, config) == folder
         assert data_folder(reference, config, tmp_path) == tmp_path
-    assert data_folder("indoor-rbm", load_config("indoor-rbm")) == DATA
+    assert data_folder("places-rbm", load_config("places-rbm")) == DATA
     with pytest.raises(ConfigError, match=r"missing in .*: \.\./day\.one\.jsonl\.gz, 3dssg"):
         prepare(config, folder)
 
@@ -99,14 +99,14 @@ def test_two_sources_of_one_name_are_refused(tmp_path) -> None:
 
 
 def test_stated_terms_change_the_digest() -> None:
-    config = load_config("indoor-rbm")
+    config = load_config("places-rbm")
     assert "terms" not in config.model_dump_json()
     assert with_settings(config, {"data.terms": ""}).digest == config.digest
     assert with_settings(config, {"data.terms": "ours"}).digest != config.digest
 
 
 def test_terms_of_shipped_sources_and_of_own_files() -> None:
-    data = load_config("indoor-rbm").data
+    data = load_config("research-triway").data
     assert terms_of("sunrgbd", data) == (SOURCES["sunrgbd"].terms, True)
     # A file of a known source's name is another source.
     own = data.model_copy(update={"sources": ("sunrgbd.jsonl",), "terms": "ours"})
