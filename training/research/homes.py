@@ -74,17 +74,17 @@ def homes(
 ) -> None:
     """Measure `adapt` on houses that the training of the model never saw.
 
-    The command writes results.json into the folder. It takes a quarter of an hour on two cores.
+    The command writes results.json into the folder.
     """
     with resumable(console):
         models = Store(store)
         parent = models.load(*models.resolve(model))
         if _SOURCE in (one.source for one in parent.manifest.data):
             raise ConfigError(f"{parent.key} has learnt from the houses of {_SOURCE}")
-        rooms = _houses(parent, data or DATA)
-        measure = partial(_measure_house, parent, rooms, scenes or [20])
+        houses = _houses(parent, data or DATA)
+        measure = partial(_measure_house, parent, scenes or [20])
         with ProcessPoolExecutor(workers) as pool:
-            rows = [row for part in pool.map(measure, sorted(rooms)) for row in part]
+            rows = [row for part in pool.map(measure, *zip(*houses, strict=True)) for row in part]
         folder.mkdir(parents=True, exist_ok=True)
         write_whole(folder / "results.json", json.dumps([asdict(row) for row in rows], indent=1))
         for line in summary(rows):
@@ -106,20 +106,20 @@ def summary(rows: Sequence[Row]) -> Iterator[str]:
                 yield f"  {name:12} {before:.3f} → {after:.3f}"
 
 
-def _houses(parent: Artifact, root: Path) -> dict[str, list[EncodedScene]]:
-    """Return the rooms of each house with at least `_ROOMS` rooms, in classes of the parent."""
+def _houses(parent: Artifact, root: Path) -> list[tuple[str, list[EncodedScene]]]:
+    """Return each house with at least `_ROOMS` rooms, and its rooms in classes of the parent."""
     rooms: dict[str, list[EncodedScene]] = {}
     annotated = read_sources(DataConfig(sources=(_SOURCE,)), root)[_SOURCE]
     for scene in encode(annotated, parent.vocabulary):
         rooms.setdefault(scene.group, []).append(scene)
-    return {name: own for name, own in rooms.items() if len(own) >= _ROOMS}
+    return sorted((name, own) for name, own in rooms.items() if len(own) >= _ROOMS)
 
 
 def _measure_house(
-    parent: Artifact, rooms: dict[str, list[EncodedScene]], counts: Sequence[int], name: str
+    parent: Artifact, counts: Sequence[int], name: str, rooms: Sequence[EncodedScene]
 ) -> list[Row]:
     torch.set_num_threads(1)
-    return [_measure(parent, name, rooms[name], count) for count in counts]
+    return [_measure(parent, name, rooms, count) for count in counts]
 
 
 def _measure(parent: Artifact, name: str, rooms: Sequence[EncodedScene], count: int) -> Row:

@@ -14,7 +14,7 @@ from training.datasets.jsonl import write_jsonl
 
 @pytest.mark.slow
 def test_homes_are_measured_with_a_model_that_never_saw_them(tmp_path, monkeypatch):
-    """Two houses, of twelve rooms and of one. The latter is no home."""
+    """Two houses, of twelve rooms and of one. A home has ten rooms or more."""
     monkeypatch.setattr("training.research.homes._INTRUDERS", 1)
     monkeypatch.setattr("training.research.homes.ProcessPoolExecutor", ThreadPoolExecutor)
     scenes = [
