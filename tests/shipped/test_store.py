@@ -11,7 +11,7 @@ from training.evaluation.everyday_task import EVERYDAY, LINES, ask_everyday, fac
 from training.runs.config_files import load_config
 
 STORE = Store(REPOSITORY / "model_store")
-SHIPPED = ["places-gbm", "places-rbm", "places-triway"]
+SHIPPED = ["places-gbm", "places-rbm", "places-triway", "research-triway"]
 
 
 @pytest.fixture(scope="module")
