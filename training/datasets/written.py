@@ -65,7 +65,7 @@ def written_vocabulary() -> Vocabulary:
 def with_things(vocabulary: Vocabulary, things: Mapping[str, Thing]) -> Vocabulary:
     """Return the vocabulary with the sizes, parents and other names of described things.
 
-    What the vocabulary states itself stays. Of several things with the same other name, the first counts.
+    What the vocabulary states itself stays. Of things with the same other name, the first counts.
     """
     described = {label_key(thing.label): thing for thing in things.values()}
     for thing in things.values():
@@ -80,7 +80,8 @@ def with_things(vocabulary: Vocabulary, things: Mapping[str, Thing]) -> Vocabula
         aliases.add(entry.label, entry.aliases)
     objects = []
     for entry in vocabulary.objects:
-        if (found := described.get(label_key(entry.label))) is not None:
+        keys = map(label_key, (entry.label, *entry.aliases))
+        if (found := next(filter(None, map(described.get, keys)), None)) is not None:
             aliases.add(entry.label, (found.label, *found.other_names))
             parent = names.get(_broader(found, things, known) or "")
             if parents[entry.label] is None and entry.label not in _ancestors(parent, parents):
