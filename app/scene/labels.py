@@ -181,13 +181,18 @@ _PROMPT: Final = re.compile(
     r"(?:(?:an?|the|some|one)[\s_])?",
     re.IGNORECASE,
 )
-# Prefixes of instances: numbers ("011_banana"). Suffixes: coordinates ("Bed|-01.0|+00.0"), numbers
-# ("chair_12", "cup.001", "chair12") and hexadecimal ids that contain a digit ("Mug_b045e42b").
+# Prefixes of instances: folders ("objects/bed"), scopes ("kitchen::table_1::link") and numbers
+# ("011_banana"). Suffixes: senses of WordNet ("sofa.n.01"), coordinates ("Bed|-01.0|+00.0"),
+# numbers ("chair_12", "cup.001", "chair12"), versions ("couch_v2") and hexadecimal ids that
+# contain a digit ("Mug_b045e42b").
+_FOLDER: Final = re.compile(r"(?:objects?|models?|assets?|meshes)/", re.IGNORECASE)
+_LINKS: Final = frozenset({"", "link", "base_link", "body", "visual", "collision"})
+_SENSE: Final = re.compile(r"([^\W\d][\w\-]*)\.[nvars]\.\d\d(?!\d)")
 _NUMBER: Final = re.compile(r"\d+_")
 _COORDINATES: Final = re.compile(r"[^\W\d_]\|")
 # This pattern matches the reversed label. A search from the front would start at each letter.
 _IDS: Final = re.compile(
-    r"(?:(?:%?(?=[a-f]*\d)[\da-f]+[\s_\-#.:]+)+|\d*)(?=[^\W\d_])", re.IGNORECASE
+    r"(?:(?:(?:%?(?=[a-f]*\d)[\da-f]+|\d+v)[\s_\-#.:]+)+|\d*)(?=[^\W\d_])", re.IGNORECASE
 )
 
 
@@ -221,7 +226,7 @@ def _by_one_rule(label: str) -> list[tuple[Rule, str]]:
     prompt, article = _PROMPT.match(label), _ARTICLE.match(label)
     if prompt is None and article is not None:
         pairs.append(("article", label[article.end() :]))
-    if (name := _without_instance(label)) != label:
+    if (name := without_instance(label)) != label:
         pairs.append(("instance", name))
     if prompt is not None:
         pairs.append(("prompt", label[prompt.end() :]))
@@ -230,7 +235,7 @@ def _by_one_rule(label: str) -> list[tuple[Rule, str]]:
 
 def _alternatives(label: str) -> list[str]:
     """Return the alternatives. In "coffee/side table", the alternatives share the last word."""
-    parts = [part for part in map(str.strip, _OR.split(label, _MOST_READINGS)) if part]
+    parts = [p for p in map(str.strip, _OR.split(_in_folder(label), _MOST_READINGS)) if p]
     if len(parts) < 2:
         return []
     last_words = parts[-1].split()
@@ -239,11 +244,20 @@ def _alternatives(label: str) -> list[str]:
     return parts
 
 
-def _without_instance(label: str) -> str:
-    """Return the label without the number, coordinates and ids of an instance."""
-    number = _NUMBER.match(label)
-    name = label if number is None else label[number.end() :]
+def _in_folder(label: str) -> str:
+    """Return the label without a folder of all objects, such as "objects/"."""
+    return label if (folder := _FOLDER.match(label)) is None else label[folder.end() :]
+
+
+def without_instance(label: str) -> str:
+    """Return the label without the folder, scopes, sense, number, coordinates and ids."""
+    scopes = [part for part in _in_folder(label).split("::") if part.casefold() not in _LINKS]
+    whole = scopes[-1] if scopes else label
+    if (sense := _SENSE.match(whole)) is not None:
+        return sense[1]
+    number = _NUMBER.match(whole)
+    name = whole if number is None else whole[number.end() :]
     if (coordinates := _COORDINATES.search(name)) is not None:
         return name[: coordinates.start() + 1]
     ids = _IDS.match(name[::-1])
-    return label if ids is None else name[: len(name) - ids.end()]
+    return whole if ids is None else name[: len(name) - ids.end()]

@@ -3,11 +3,16 @@
 Each row of the table is one thing at one usual location in a place:
 
 - A place, such as "teenager's bedroom", has a room type and groups of things that come together.
-- ``group_share`` is the share of such places that have the group.
-- ``share`` is the share of places with the group that have the thing. Things are independent.
-- ``count`` is a number, such as 2, or an interval, such as 1-3, of equally likely numbers.
+  Without the column, each room type is one place.
+- ``group_share`` is the share of such places that have the group; 1 if no row of it has a value.
+- ``share`` is the share of places with the group that have the thing; .5 if empty. Things are
+  independent.
+- ``count`` is a number, such as 2, or an interval, such as 1-3, of equally likely numbers; 1 if
+  empty.
 - ``relation`` is on-top, inside, under or above the ``anchor``, another thing of the place; or
-  floor, wall or ceiling, without an anchor.
+  floor, wall or ceiling, without an anchor. If it is empty, the location is unknown.
+
+A table `things.csv` in the same folder describes the things (`training.datasets.things`).
 
 `draw_scene` samples this model exactly. A careful visitor's list is longer than any detector's, so
 training uses parts of the drawn scenes (`listed_part`).
@@ -15,9 +20,10 @@ training uses parts of the drawn scenes (`listed_part`).
 
 import math
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -25,17 +31,20 @@ import numpy as np
 
 from app.scene import label_key
 from training.datasets.array_types import Rng
+from training.datasets.files import KNOWLEDGE
+from training.datasets.placeholders import is_placeholder
 from training.datasets.records import MAX_COUNT, AnnotatedObject, AnnotatedScene, DatasetError
-from training.datasets.tables import Row, read_table
-from training.datasets.things import Thing
+from training.datasets.tables import Errors, Row, read_table
+from training.datasets.things import Thing, read_things
 
 SOURCE: Final = "inventories"
-"""Source name of all written scenes."""
+"""Source name of the written scenes of the repository."""
 
-COLUMNS: Final = (
-    *("place", "room_type", "group", "group_share", "label", "share", "count"),
-    *("relation", "anchor"),
-)
+COLUMNS: Final = ("room_type", "label")
+OPTIONAL: Final = ("place", "group", "group_share", "share", "count", "relation", "anchor")
+THINGS: Final = "things.csv"
+SHARE: Final = 0.5
+"""Share of the places that have a thing whose row states no share."""
 _AT_ANCHOR: Final = ("on-top", "inside", "under", "above")
 _BY_ITSELF: Final = ("floor", "wall", "ceiling")
 LISTED: Final = 0.55
@@ -51,7 +60,7 @@ class Item:
     Attributes:
         share: share of the places with the group that have the thing.
         least, most: limits of the number of instances.
-        relation: relation to the anchor, or floor, wall or ceiling.
+        relation: relation to the anchor, or floor, wall or ceiling; "" means unknown.
         anchor: label of another thing, or "".
     """
 
@@ -86,57 +95,116 @@ class Place:
         return ((group, item) for group in self.groups for item in group.items)
 
 
-def read_places(path: Path) -> tuple[Place, ...]:
-    """Read the places of an inventory, in the order of the file.
+@dataclass(frozen=True, slots=True)
+class Inventory:
+    """The places of a file, and the things of the table beside it.
+
+    Attributes:
+        things: things of `things.csv` by label; empty without this file.
+        left_out: labels of rows that name no kind of object, and how often each occurs.
+    """
+
+    places: tuple[Place, ...]
+    things: Mapping[str, Thing]
+    left_out: Counter[str]
+
+    def scenes(self, each: int, seed: int) -> list[AnnotatedScene]:
+        """Draw parts of a number of scenes of each place. The scenes of a place are one group."""
+        described = (*self.things.values(), *shipped_things().values())
+        return written_scenes(self.places, listed_shares(described), each, seed)
+
+
+@cache
+def shipped_things() -> Mapping[str, Thing]:
+    """Read the things of the repository, by label."""
+    return read_things(KNOWLEDGE / THINGS)
+
+
+def read_inventory(path: Path) -> Inventory:
+    """Read the places of a file in its order, and the things of the table beside it.
+
+    A label that names no kind of object (`is_placeholder`) is left out, also as an anchor.
 
     Raises:
-        DatasetError: the file cannot be read, or a value is invalid. The error names the file, the
-            line and the column.
+        DatasetError: a file cannot be read, or a value is invalid. The error names the file, the
+            line and the column. It is an InvalidLinesError if there are several errors.
     """
-    rooms: dict[str, str] = {}
-    shares: dict[tuple[str, str], float] = {}
-    items: dict[str, dict[str, list[Item]]] = defaultdict(lambda: defaultdict(list))
-    labels: dict[str, set[str]] = defaultdict(set)
-    anchored: list[tuple[Row, str, str]] = []
-    for row in read_table(path, COLUMNS):
-        place, group = row.text("place"), row.text("group")
-        if (room := rooms.setdefault(place, row.text("room_type"))) != row.text("room_type"):
-            raise row.error("room_type", f"is {room!r} in other rows of the place")
-        share = row.number("group_share", 1)
-        if shares.setdefault((place, group), share) != share:
-            raise row.error("group_share", f"is {shares[place, group]:g} in other rows of {group}")
-        item = _item(row)
-        items[place][group].append(item)
-        labels[place].add(label_key(item.label))
-        if item.anchor:
-            anchored.append((row, place, item.anchor))
-    for row, place, anchor in anchored:
-        if label_key(anchor) not in labels[place]:
-            raise row.error("anchor", f"the place {place!r} has no row with the label {anchor!r}")
-    if not rooms:
+    beside = path.with_name(THINGS)
+    things: Mapping[str, Thing] = read_things(beside) if beside.is_file() else {}
+    errors, table, left_out = Errors(path), _Places(), Counter[str]()
+    for row in read_table(path, COLUMNS, errors, OPTIONAL):
+        with errors:
+            if is_placeholder(label := row.text("label")):
+                left_out[label] += 1
+            else:
+                table.add(row)
+    for row, place, anchor in table.anchored:
+        with errors:
+            if label_key(anchor) not in table.labels[place]:
+                problem = f"the place {place!r} has no row with the label {anchor!r}"
+                raise row.error("anchor", problem)
+    errors.check()
+    if not table.rooms:
         raise DatasetError(path, "", "has no rows")
-    return tuple(
-        Place(
-            place,
-            room,
-            tuple(Group(name, shares[place, name], tuple(of)) for name, of in items[place].items()),
+    return Inventory(table.places(), things, left_out)
+
+
+class _Places:
+    """The places of the rows so far."""
+
+    def __init__(self) -> None:
+        self.rooms: dict[str, str] = {}
+        self.labels: defaultdict[str, set[str]] = defaultdict(set)
+        self.anchored: list[tuple[Row, str, str]] = []
+        self._shares: dict[tuple[str, str], float] = {}
+        self._items: dict[str, dict[str, list[Item]]] = defaultdict(lambda: defaultdict(list))
+
+    def add(self, row: Row) -> None:
+        """Add a row. Raise DatasetError if a value is invalid."""
+        room = row.text("room_type")
+        place, group = row.text("place") if "place" in row else room, row.optional("group")
+        self.labels[place].add(label_key(row.text("label")))
+        if (first := self.rooms.setdefault(place, room)) != room:
+            raise row.error("room_type", f"is {first!r} in other rows of the place")
+        if row.optional("group_share"):
+            share = row.number("group_share", 1)
+            if (other := self._shares.setdefault((place, group), share)) != share:
+                raise row.error("group_share", f"is {other:g} in other rows of {group or 'it'}")
+        item = _item(row)
+        self._items[place][group].append(item)
+        if item.anchor:
+            self.anchored.append((row, place, item.anchor))
+
+    def places(self) -> tuple[Place, ...]:
+        """Return the places, in the order of their first rows."""
+        return tuple(
+            Place(
+                place,
+                room,
+                tuple(
+                    Group(name, self._shares.get((place, name), 1.0), tuple(items))
+                    for name, items in self._items[place].items()
+                ),
+            )
+            for place, room in self.rooms.items()
         )
-        for place, room in rooms.items()
-    )
 
 
 def _item(row: Row) -> Item:
-    relation = row.one_of("relation", (*_AT_ANCHOR, *_BY_ITSELF))
+    relation = row.one_of("relation", (*_AT_ANCHOR, *_BY_ITSELF, ""))
     anchor = row.optional("anchor")
     if relation in _AT_ANCHOR and not anchor:
         raise row.error("anchor", f"is empty, but the relation is {relation}")
-    if relation in _BY_ITSELF and anchor:
-        raise row.error("anchor", f"must be empty, because the relation is {relation}")
-    found = _COUNT.fullmatch(row.text("count"))
+    if relation not in _AT_ANCHOR and anchor:
+        raise row.error("anchor", f"must be empty, because the relation is {relation or 'empty'}")
+    if anchor and is_placeholder(anchor):
+        relation = anchor = ""
+    found = _COUNT.fullmatch(row.optional("count") or "1")
     least, most = (int(found[1]), int(found[2] or found[1])) if found else (0, 0)
     if not 1 <= least <= most <= MAX_COUNT:
         raise row.error("count", "must be a number such as 2, or an interval such as 1-3")
-    return Item(row.text("label"), row.number("share", 1), least, most, relation, anchor)
+    share = row.number("share", 1) if row.optional("share") else SHARE
+    return Item(row.text("label"), share, least, most, relation, anchor)
 
 
 def draw_scene(place: Place, scene_id: str, rng: Rng) -> AnnotatedScene:
@@ -153,18 +221,28 @@ def draw_scene(place: Place, scene_id: str, rng: Rng) -> AnnotatedScene:
                 for item in group.items
                 if rng.random() < item.share
             ]
+    return _scene(place, scene_id, drawn)
+
+
+def complete_scene(place: Place) -> AnnotatedScene:
+    """Return a scene with all things of a place, each in its least number."""
+    return _scene(place, place.name, [(item, item.least) for _, item in place.items])
+
+
+def _scene(place: Place, scene_id: str, things: Sequence[tuple[Item, int]]) -> AnnotatedScene:
+    """Return a scene with these things and their numbers."""
     objects = [
         AnnotatedObject(str(index), item.label, count=count)
-        for index, (item, count) in enumerate(drawn)
+        for index, (item, count) in enumerate(things)
     ]
     first: dict[str, int] = {}
-    for index, (item, _) in enumerate(drawn):
+    for index, (item, _) in enumerate(things):
         first.setdefault(label_key(item.label), index)
     floor = first.get("floor", len(objects))
     if floor == len(objects):
         objects.append(AnnotatedObject(str(floor), "floor"))
     relations, supported = [], []
-    for index, (item, _) in enumerate(drawn):
+    for index, (item, _) in enumerate(things):
         if item.relation == "floor":
             relations.append((index, "on-top", floor))
         elif item.relation in _BY_ITSELF:
@@ -203,18 +281,12 @@ def listed_part(scene: AnnotatedScene, shares: Mapping[str, float], rng: Rng) ->
     drawn = rng.random(len(labels)) < np.array([shares.get(label, LISTED) for label in labels])
     is_listed = dict(zip(labels, drawn.tolist(), strict=True)) | {"floor": True}
     kept = [k for k, thing in enumerate(scene.objects) if is_listed[label_key(thing.label)]]
-    index_of = {old: new for new, old in enumerate(kept)}
-    relations = tuple(
-        (index_of[i], name, index_of[j])
-        for i, name, j in scene.relations or ()
-        if i in index_of and j in index_of
-    )
+    part = scene.only(kept)
     # A thing whose anchor is left out has no listed support: it does not hang on a wall.
     stands = {i for i, _, _ in scene.relations or ()}
-    supported = {index_of[i] for i in scene.supported if i in index_of and i not in stands}
-    supported |= {i for i, name, _ in relations if name in ("on-top", "inside")}
-    objects = tuple(scene.objects[k] for k in kept)
-    return replace(scene, objects=objects, relations=relations, supported=tuple(sorted(supported)))
+    hangs = {new for new, old in enumerate(kept) if old in scene.supported and old not in stands}
+    supported = {i for i, name, _ in part.relations or () if name in ("on-top", "inside")} | hangs
+    return replace(part, supported=tuple(sorted(supported)))
 
 
 def written_scenes(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -37,6 +37,26 @@ class DatasetError(ValueError):
         if isinstance(error, FileNotFoundError):
             return cls(path, "", "no such file")
         return cls(path, "", f"cannot be read: {getattr(error, 'strerror', None) or error}")
+
+
+MAX_LISTED: Final = 32
+"""Maximum number of listed errors of a file. Further errors are only counted."""
+
+
+class InvalidLinesError(DatasetError):
+    """Lines of a file are invalid.
+
+    Attributes:
+        errors: the first `MAX_LISTED` errors, in the order of the lines.
+        count: number of all errors.
+    """
+
+    def __init__(self, path: Path, errors: Sequence[DatasetError], count: int) -> None:
+        first = errors[0]
+        more = f" (and {count - 1} more errors)" if count > 1 else ""
+        super().__init__(path, first.where, first.problem + more)
+        self.errors = tuple(errors[:MAX_LISTED])
+        self.count = count
 
 
 def _of_request(values: Any) -> Any:
@@ -125,6 +145,34 @@ class AnnotatedScene:
                 raise ValueError(
                     f"a relation has object index {unknown[0]}, but the scene has {size} objects"
                 )
+
+    def only(self, kept: Sequence[int]) -> AnnotatedScene:
+        """Return the scene with some of its objects, whose indices are given in ascending order.
+
+        A relation or support link to another object is left out.
+        """
+        index_of = {old: new for new, old in enumerate(kept)}
+        ids = {self.objects[k].id for k in kept}
+
+        def among(triples: Sequence[tuple[int, str, int]]) -> tuple[tuple[int, str, int], ...]:
+            return tuple(
+                (index_of[i], name, index_of[j])
+                for i, name, j in triples
+                if i in index_of and j in index_of
+            )
+
+        return replace(
+            self,
+            objects=tuple(
+                thing
+                if thing.supported_by is None or thing.supported_by in ids
+                else replace(thing, supported_by=None)
+                for thing in (self.objects[k] for k in kept)
+            ),
+            relations=None if self.relations is None else among(self.relations),
+            false_relations=among(self.false_relations),
+            supported=tuple(index_of[i] for i in self.supported if i in index_of),
+        )
 
 
 def digest_of(scenes: Sequence[AnnotatedScene]) -> str:

@@ -309,11 +309,20 @@ SOURCES: Final[dict[str, Source]] = {
 
 
 _UNKNOWN: Final = Source("")
+_OWN_INVENTORY: Final = replace(SOURCES["inventories"], terms="", left_out=())
+
+
+def is_inventory(name: str) -> bool:
+    """Return True for the name of a written inventory: of a user's table, or of the repository's.
+
+    The table of a user is a source that keeps the name of its file, such as "ward.csv".
+    """
+    return name == "inventories" or name.casefold().endswith(".csv")
 
 
 def source_of(name: str) -> Source:
     """Return the data source of this name. Unknown sources have the default attributes."""
-    return SOURCES.get(name, _UNKNOWN)
+    return SOURCES.get(name, _OWN_INVENTORY if is_inventory(name) else _UNKNOWN)
 
 
 def meaning_of(source: str, *, listed: bool = True) -> Meaning:

@@ -6,8 +6,8 @@ The percentages are the shares of the training, test and validation part.
   several data sources contain the group.
 - ``stable`` (75 / 15 / 10 %) derives the part of a group only from the seed and the group name, so
   all groups keep their parts when a data set grows. This protocol does not stratify.
-- ``final`` (90 / 0 / 10 %) is ``group`` without a test part, for shipped weights. Written scenes
-  are assigned separately: otherwise shipped weights would miss whole kinds of written places.
+- ``final`` (90 / 0 / 10 %) is ``group`` without a test part, for shipped weights.
+  Both assign written scenes separately: otherwise the weights would miss whole written places.
 - ``paper`` (60 / 30 / 10 %) is the protocol of Bozcan et al. (ICRA 2018). Each scene is assigned
   separately.
 - ``paper groups`` has the shares of ``paper`` and keeps groups together.
@@ -54,16 +54,10 @@ def split(
         raise ValueError(
             "two scenes of one source have the same scene_id; give each scene a distinct id"
         )
-    # All scenes of a unit have the same part.
-    units = [
-        f"{scene.source}/{scene.scene_id}"
-        if protocol == "paper" or (protocol == "final" and source_of(scene.source).written)
-        else scene.group
-        for scene in scenes
-    ]
+    units = [_unit(scene, protocol) for scene in scenes]
     part_of: dict[str, Part] = {}
     if protocol == "stable":
-        part_of = {unit: stable_part(unit, seed) for unit in units}
+        part_of = {unit: _stable_part(unit, seed) for unit in units}
     else:
         for family in _families(scenes, units):
             part_of |= _assign(family, FRACTIONS[protocol], seed)
@@ -73,9 +67,19 @@ def split(
     return parts
 
 
-def stable_part(group: str, seed: int) -> Part:
-    """Return the part of a group in the ``stable`` protocol. It depends on no other scenes."""
-    fraction = int.from_bytes(_rank(seed, group)[:8], "big") / 2**64
+def _unit(scene: AnnotatedScene, protocol: Protocol) -> str:
+    """Return the name of the scenes that have the same part as a scene."""
+    is_alone = protocol in ("stable", "final") and source_of(scene.source).written
+    return f"{scene.source}/{scene.scene_id}" if protocol == "paper" or is_alone else scene.group
+
+
+def stable_part(scene: AnnotatedScene, seed: int) -> Part:
+    """Return the part of a scene in the ``stable`` protocol. It depends on no other scenes."""
+    return _stable_part(_unit(scene, "stable"), seed)
+
+
+def _stable_part(unit: str, seed: int) -> Part:
+    fraction = int.from_bytes(_rank(seed, unit)[:8], "big") / 2**64
     for part, share in FRACTIONS["stable"].items():
         if fraction < share:
             return part

@@ -1,16 +1,59 @@
-"""Read tables of comma-separated values. Errors name the file, the line and the column."""
+"""Read tables of a spreadsheet. Errors name the file, the line and the column.
+
+Values are separated by commas, by semicolons or by tabs, as the first line is. A number may have a
+decimal comma, because spreadsheets of many countries write semicolons and decimal commas.
+"""
 
 import csv
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import TracebackType
 from typing import Final
 
 from training.datasets.files import read_lines
-from training.datasets.records import DatasetError
+from training.datasets.records import MAX_LISTED, DatasetError, InvalidLinesError
 
 MAX_LINE: Final = 4096
 MAX_ROWS: Final = 1_000_000
+_SEPARATORS: Final = (",", ";", "\t")
+
+
+class Errors:
+    """Errors of the rows of a table. A `with` block collects the `DatasetError` that ends it."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._listed: list[DatasetError] = []
+        self._count = 0
+
+    def add(self, error: DatasetError) -> None:
+        """Count an error, and list it if it is one of the first."""
+        self._count += 1
+        if len(self._listed) < MAX_LISTED:
+            self._listed.append(error)
+
+    def check(self) -> None:
+        """Raise the collected errors: a DatasetError for one, InvalidLinesError for several."""
+        if self._count == 1:
+            raise self._listed[0]
+        if self._count:
+            raise InvalidLinesError(self._path, self._listed, self._count)
+
+    def __enter__(self) -> None:
+        """Begin a block."""
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> bool:
+        """Collect a DatasetError. Other exceptions leave the block."""
+        if isinstance(error, DatasetError):
+            self.add(error)
+            return True
+        return False
 
 
 class Row:
@@ -19,7 +62,7 @@ class Row:
     Args:
         path: path of the file.
         line: number of the line, from 1.
-        values: value of each column.
+        values: value of each column of the file.
     """
 
     def __init__(self, path: Path, line: int, values: dict[str, str]) -> None:
@@ -29,59 +72,93 @@ class Row:
         """Return an error about a value of the row."""
         return DatasetError(self._path, f"line {self._line}, column {column}", problem)
 
+    def __contains__(self, column: str) -> bool:
+        return column in self._values
+
     def optional(self, column: str) -> str:
-        """Return a text, which may be empty."""
-        return self._values[column]
+        """Return a text, which is empty for an empty cell and for a column that the file lacks."""
+        return self._values.get(column, "")
 
     def text(self, column: str) -> str:
         """Return a text. Raise DatasetError if it is empty."""
-        if not (value := self._values[column]):
+        if not (value := self.optional(column)):
             raise self.error(column, "is empty")
         return value
 
     def one_of(self, column: str, choices: Sequence[str]) -> str:
         """Return one of the choices. Raise DatasetError for another value."""
-        if (value := self._values[column]) not in choices:
-            raise self.error(column, f"must be one of {', '.join(choices)}, not {value!r}")
+        if (value := self.optional(column)) not in choices:
+            named = ", ".join(choice or "empty" for choice in choices)
+            raise self.error(column, f"must be one of {named}, not {value!r}")
         return value
 
     def number(self, column: str, most: float = math.inf) -> float:
         """Return a number above 0 and up to ``most``. Raise DatasetError for another value."""
+        shown = self.optional(column)
         try:
-            value = float(self._values[column])
+            value = float(shown.replace(",", "."))
         except ValueError:
             value = math.nan
         if not 0 < value <= most or math.isinf(value):
             limit = "" if math.isinf(most) else f" and at most {most:g}"
-            shown = self._values[column]
             raise self.error(column, f"must be a number above 0{limit}, not {shown!r}")
         return value
 
 
-def read_table(path: Path, columns: Sequence[str]) -> Iterator[Row]:
+def read_table(
+    path: Path, columns: Sequence[str], errors: Errors, optional: Sequence[str] = ()
+) -> Iterator[Row]:
     """Yield the rows of a table in UTF-8, whose first line names the columns.
 
-    Spaces around values are removed. Blank lines are skipped.
+    Spaces around values are removed. Blank lines are skipped. A row with another number of values
+    is left out, and an error of the file ends the table. Both are added to the errors.
 
-    Raises:
-        DatasetError: the file cannot be read, lacks a column, or has a row of another length.
+    Args:
+        columns: columns that the file must have.
+        optional: columns that it may have. Any other named column is an error.
     """
-    lines = read_lines(path, MAX_LINE)
-    reader = csv.reader((line.decode("utf-8-sig") for line in lines), strict=True)
+    line = 1
     try:
-        names = [name.strip() for name in next(reader, [])]
-        if missing := [name for name in columns if name not in names]:
-            raise DatasetError(path, "line 1", f"must name the columns {', '.join(missing)}")
+        lines = _decoded(path)
+        head = next(lines, "")
+        separator = max(_SEPARATORS, key=head.count)
+        names = [name.strip() for name in next(csv.reader([head], delimiter=separator), [])]
+        _check_names(path, names, columns, optional)
+        reader = csv.reader(lines, delimiter=separator, strict=True)
         for values in reader:
-            if reader.line_num > MAX_ROWS:
+            line = 1 + reader.line_num
+            if line > MAX_ROWS:
                 raise DatasetError(path, "", f"has more than {MAX_ROWS} lines")
-            if len(values) not in (0, len(names)):
+            if not any(map(str.strip, values)):
+                continue
+            if len(values) != len(names):
                 problem = f"the row has {len(values)} values, not {len(names)}"
-                raise DatasetError(path, f"line {reader.line_num}", problem)
-            if any(values):
-                row = dict(zip(names, map(str.strip, values), strict=True))
-                yield Row(path, reader.line_num, row)
-    except UnicodeDecodeError as error:
-        raise DatasetError(path, f"line {reader.line_num + 1}", f"is not UTF-8: {error}") from error
+                errors.add(DatasetError(path, f"line {line}", problem))
+                continue
+            yield Row(path, line, dict(zip(names, map(str.strip, values), strict=True)))
     except csv.Error as error:
-        raise DatasetError(path, f"line {reader.line_num}", f"is no row: {error}") from error
+        errors.add(DatasetError(path, f"line {line + 1}", f"is no row: {error}"))
+    except DatasetError as error:
+        errors.add(error)
+
+
+def _decoded(path: Path) -> Iterator[str]:
+    for number, line in enumerate(read_lines(path, MAX_LINE), 1):
+        try:
+            yield line.decode("utf-8-sig")
+        except UnicodeDecodeError as error:
+            problem = f"is not UTF-8: {error}; save the table as CSV UTF-8"
+            raise DatasetError(path, f"line {number}", problem) from error
+
+
+def _check_names(
+    path: Path, names: Sequence[str], columns: Sequence[str], optional: Sequence[str]
+) -> None:
+    if missing := [name for name in columns if name not in names]:
+        raise DatasetError(path, "line 1", f"must name the columns {', '.join(missing)}")
+    named = [name for name in names if name]  # a spreadsheet may write empty columns
+    if twice := sorted({name for name in named if named.count(name) > 1}):
+        raise DatasetError(path, "line 1", f"names the column {twice[0]} twice")
+    if unknown := [name for name in named if name not in (*columns, *optional)]:
+        known = ", ".join((*columns, *optional))
+        raise DatasetError(path, "line 1", f"has the unknown column {unknown[0]!r}; known: {known}")

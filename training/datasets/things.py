@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from app.scene import label_key
-from training.datasets.tables import Row, read_table
+from training.datasets.tables import Errors, Row, read_table
 
 COLUMNS: Final = (
     *("label", "long", "wide", "high", "large", "stands", "surface", "container", "carried"),
@@ -52,27 +52,36 @@ def read_things(path: Path) -> dict[str, Thing]:
     Raises:
         DatasetError: the file cannot be read, a value is invalid, a label occurs twice, a parent
             has no row, or the parents of a thing lead back to it. The error names the file, the
-            line and the column.
+            line and the column. It is an InvalidLinesError if there are several errors.
     """
     things: dict[str, Thing] = {}
     rows: dict[str, Row] = {}
     keys: set[str] = set()
-    for row in read_table(path, COLUMNS):
-        thing = _thing(row)
-        if (key := label_key(thing.label)) in keys:
-            raise row.error("label", f"{thing.label!r} has two rows")
-        keys.add(key)
-        things[thing.label], rows[thing.label] = thing, row
-    for label, thing in things.items():
-        seen, at = {label}, thing.parent
-        while at:
-            if at not in things:
-                raise rows[label].error("parent", f"{at!r} has no row")
-            if at in seen:
-                raise rows[label].error("parent", f"the parents of {label!r} lead back to {at!r}")
-            seen.add(at)
-            at = things[at].parent
+    errors = Errors(path)
+    for row in read_table(path, COLUMNS, errors):
+        with errors:
+            thing = _thing(row)
+            if (key := label_key(thing.label)) in keys:
+                raise row.error("label", f"{thing.label!r} has two rows")
+            keys.add(key)
+            things[thing.label], rows[thing.label] = thing, row
+    errors.check()
+    for label, row in rows.items():
+        with errors:
+            _check_parents(label, things, row)
+    errors.check()
     return things
+
+
+def _check_parents(label: str, things: Mapping[str, Thing], row: Row) -> None:
+    seen, at = {label}, things[label].parent
+    while at:
+        if at not in things:
+            raise row.error("parent", f"{at!r} has no row")
+        if at in seen:
+            raise row.error("parent", f"the parents of {label!r} lead back to {at!r}")
+        seen.add(at)
+        at = things[at].parent
 
 
 def _thing(row: Row) -> Thing:

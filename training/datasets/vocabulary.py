@@ -39,6 +39,10 @@ class Names:
     # Other names of each room type. The key "" lists names without a room type.
     rooms: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
+    def knows(self, label: str) -> bool:
+        """Return True if a label is a curated name of a class in any spelling."""
+        return label_key(label) in self._by_key
+
     def canonical(self, label: str) -> str:
         """Return the curated name of a label, or the label in lower case with single spaces."""
         if (name := self._by_key.get(label_key(label))) is not None:
@@ -155,11 +159,12 @@ def most_frequent(counts: Counter[str]) -> str:
 def vocabulary_json(vocabulary: Vocabulary) -> str:
     """Return a vocabulary as JSON text that people can edit, with one class on each line.
 
-    The text contains no typical sizes, because `with_typical_sizes` computes them from scenes.
+    The text contains the sizes of described things only: `with_typical_sizes` computes others.
     """
     values = vocabulary.to_dict()
     for entry in values["objects"]:
-        del entry["size"]
+        if entry["size"] is None:
+            del entry["size"]
     return vocabulary_text({name: values[name] for name in ("objects", "room_types")})
 
 
@@ -219,18 +224,23 @@ def indoor_vocabulary() -> Vocabulary:
 
 
 def source_vocabulary(
-    scenes: Iterable[AnnotatedScene], *, minimum: int = MINIMUM_MENTIONS
+    scenes: Iterable[AnnotatedScene],
+    *,
+    minimum: int = MINIMUM_MENTIONS,
+    certain: Iterable[str] = (),
 ) -> Vocabulary:
     """Build a vocabulary of the classes of one data source, without the base classes.
 
-    Because it has few classes, more specific names become aliases. For example, "coffee table"
+    A label that is `certain` becomes a class, also with fewer objects than the minimum. Because the
+    vocabulary has few classes, more specific names become aliases. For example, "coffee table"
     becomes an alias of "table".
     """
     names = curated_names()
     # An empty entry preserves the curated spelling of a class without aliases.
     spellings = dict.fromkeys((*names.base, *names.household, *names.structure), ())
     aliases = spellings | names.aliases
-    mentioned_only = replace(names, base=(), household=(), kinds={}, aliases=aliases)
+    base = tuple({label_key(name): name for name in map(names.canonical, certain)}.values())
+    mentioned_only = replace(names, base=base, household=(), kinds={}, aliases=aliases)
     return _with_kinds(build_vocabulary(scenes, mentioned_only, minimum=minimum))
 
 

@@ -1,14 +1,16 @@
-"""The vocabulary of written knowledge, from `things.csv` and `inventories.csv` alone."""
+"""The vocabulary of written knowledge, from `things.csv` and inventories alone."""
 
 import math
 from collections import defaultdict
+from collections.abc import Container, Iterable, Mapping
+from dataclasses import replace
 from functools import cache
 from typing import Final
 
 from app.scene import ObjectClass, Vocabulary, label_key
 from training.datasets.files import KNOWLEDGE
-from training.datasets.inventories import read_places
-from training.datasets.things import Thing, read_things
+from training.datasets.inventories import read_inventory
+from training.datasets.things import Thing
 from training.datasets.vocabulary import curated_names, indoor_vocabulary, with_room_aliases
 
 # A thing becomes a class if so many kinds of places are expected to have it.
@@ -25,8 +27,8 @@ def written_vocabulary() -> Vocabulary:
     with the same other name, `things.csv` comes before the curated names.
     """
     names, indoor = curated_names(), indoor_vocabulary()
-    things = read_things(KNOWLEDGE / "things.csv")
-    places = read_places(KNOWLEDGE / "inventories.csv")
+    inventory = read_inventory(KNOWLEDGE / "inventories.csv")
+    things, places = inventory.things, inventory.places
     expected: defaultdict[str, float] = defaultdict(float)
     for place in places:
         for group, item in place.items:
@@ -60,10 +62,52 @@ def written_vocabulary() -> Vocabulary:
     return with_room_aliases(Vocabulary(objects, sorted(rooms.union(indoor.room_types))))
 
 
+def with_things(vocabulary: Vocabulary, things: Mapping[str, Thing]) -> Vocabulary:
+    """Return the vocabulary with the sizes, parents and other names of described things.
+
+    What the vocabulary states itself stays. Of things with the same other name, the first counts.
+    """
+    described = {label_key(thing.label): thing for thing in things.values()}
+    for thing in things.values():
+        for name in thing.other_names:
+            described.setdefault(label_key(name), thing)
+    classes = {label_key(label): label for label in vocabulary.labels}
+    names = {thing.label: classes.get(label_key(thing.label)) for thing in things.values()}
+    known = {label for label, name in names.items() if name is not None}
+    parents = {entry.label: entry.parent for entry in vocabulary.objects}
+    aliases = _Aliases(vocabulary.labels)
+    for entry in vocabulary.objects:
+        aliases.add(entry.label, entry.aliases)
+    objects = []
+    for entry in vocabulary.objects:
+        keys = map(label_key, (entry.label, *entry.aliases))
+        if (found := next(filter(None, map(described.get, keys)), None)) is not None:
+            aliases.add(entry.label, (found.label, *found.other_names))
+            parent = names.get(_broader(found, things, known) or "")
+            if parents[entry.label] is None and entry.label not in _ancestors(parent, parents):
+                parents[entry.label] = parent
+            entry = replace(entry, size=entry.size or _size(found))
+        objects.append(entry)
+    objects = [
+        replace(entry, parent=parents[entry.label], aliases=tuple(aliases.of[entry.label]))
+        for entry in objects
+    ]
+    return Vocabulary(objects, vocabulary.room_types, vocabulary.room_aliases)
+
+
+def _ancestors(label: str | None, parents: Mapping[str, str | None]) -> set[str]:
+    """Return a class and its broader classes."""
+    found: set[str] = set()
+    while label is not None:
+        found.add(label)
+        label = parents[label]
+    return found
+
+
 class _Aliases:
     """Names of classes; the first class that claims a name has it."""
 
-    def __init__(self, classes: dict[str, Thing]) -> None:
+    def __init__(self, classes: Iterable[str]) -> None:
         self.of: dict[str, list[str]] = {label: [] for label in classes}
         self._taken = set(map(label_key, classes))
 
@@ -75,7 +119,7 @@ class _Aliases:
                 self.of[label].append(name)
 
 
-def _broader(thing: Thing, things: dict[str, Thing], classes: dict[str, Thing]) -> str | None:
+def _broader(thing: Thing, things: Mapping[str, Thing], classes: Container[str]) -> str | None:
     """Return the nearest broader thing that is a class, or None."""
     at = thing.parent
     while at and at not in classes:

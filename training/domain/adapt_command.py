@@ -26,10 +26,12 @@ from app.registry import (
 )
 from app.registry.references import AliasTarget
 from training.datasets import AnnotatedScene, DatasetError
+from training.datasets.placeholders import left_out_line
 from training.datasets.records import digest_of
 from training.domain.adaptation import FEWEST, Adapted, Measured, adapted
-from training.domain.home import JUDGED, Home
-from training.domain.init_command import ROWS, StorePath, console, fail, read_or_exit
+from training.domain.home import JUDGED, Home, confirmed_scene
+from training.domain.init_command import ROWS, StorePath, console, fail
+from training.domain.material import read_material
 from training.evaluation.metrics import Ratio
 from training.fit.configuration import ConfigError
 from training.runs.example_scenes import choose_examples
@@ -48,7 +50,10 @@ def adapt_command(
     model: Annotated[str, typer.Argument(help="model to adapt: an alias, name or name@version")],
     files: Annotated[
         list[Path],
-        typer.Argument(help="recorded scenes of one home; a later file corrects earlier scenes"),
+        typer.Argument(
+            help="recorded scenes of one home; a later file corrects earlier scenes. A table *.csv "
+            "with room_type and label tells what belongs where"
+        ),
     ],
     name: Annotated[str, typer.Option("--name", help="name of the home's model")] = "home",
     store: StorePath = DEFAULT_STORE,
@@ -64,12 +69,12 @@ def adapt_command(
 
     A robot records scenes with `Client(record=...)`, and a person confirms scenes on the web page
     (docs/own-home.md). An unconfirmed scene does not teach the objects that the model reports as
-    outliers there.
+    outliers there. Each place of a written table is a confirmed scene.
 
-    From 20 scenes on, the weights change. The command compares old and new weights on scenes that
-    the fit did not see, and refuses weights that are not certainly better. With fewer scenes, the
-    new version only stops to report the objects of confirmed scenes. If nothing can be learnt, no
-    version is published, and the exit code is 3.
+    From 20 recorded scenes on, the weights change. The command compares old and new weights on
+    scenes that the fit did not see, and refuses weights that are not certainly better. With fewer
+    scenes, the new version only stops to report the objects of confirmed scenes. If nothing can be
+    learnt, no version is published, and the exit code is 3.
     """
     torch.set_num_threads(1)
     try:
@@ -79,17 +84,20 @@ def adapt_command(
         parent = _parent(models, model, name)
         version = _next_version(models, name)
         models.require_new(name, version)
-        recorded = _corrected(read_or_exit(file, recorded=True) for file in files)
+        material = read_material(files, recorded=True)
+        recorded, places = _corrected(material.files), material.places
         with console.status("reading the scenes") as status:
-            home = Home.of(parent, recorded)
+            home = Home.of(parent, recorded, places)
             _print_home(home, parent)
+            _print(filter(None, [left_out_line(material.left_out, ROWS)]))
             result = adapted(home, seed=seed, progress=status.update)
         _print_result(result)
         if result.artifact is None:
             console.print(_NOTHING, soft_wrap=True)
             raise typer.Exit(3)
         artifact, measured = result.artifact, result.measured
-        description = _describe(parent, home, artifact, measured, recorded, name, version, seed)
+        scenes = recorded, [*map(confirmed_scene, places)]
+        description = _describe(parent, home, artifact, measured, scenes, name, version, seed)
         published = publish_rounded(models, description, artifact)
         _print_next(models, store, published, alias or "default" if promote else None)
     except (ConfigError, DatasetError, RegistryError, ValueError) as error:
@@ -134,9 +142,11 @@ def _corrected(files: Iterable[Sequence[AnnotatedScene]]) -> list[AnnotatedScene
 
 def _print_home(home: Home, parent: Artifact) -> None:
     lines = [
-        f"{home.recorded} recorded scenes; {len(home.scenes)} distinct scenes, {home.confirmed} of "
-        f"these confirmed; model {_reference(parent)}"
+        f"{home.recorded} recorded scenes; {len(home.scenes) - len(home.written)} distinct scenes, "
+        f"{home.confirmed} of these confirmed; model {_reference(parent)}"
     ]
+    if n := len(home.written):
+        lines.append(f"{n} written place{'s' if n > 1 else ''}, each as one confirmed scene")
     if home.new_classes:
         lines.append(
             f"new classes, judged after {JUDGED} scenes: {', '.join(home.new_classes[:ROWS])}"
@@ -164,7 +174,7 @@ def _print_result(result: Adapted) -> None:
     lines = []
     if (measured := result.measured) is None:
         lines.append(
-            f"the weights stay: fewer than {FEWEST} distinct scenes with two known objects"
+            f"the weights stay: fewer than {FEWEST} distinct recorded scenes with two known objects"
         )
     else:
         alarms, rank = measured.alarms.mean(0), measured.rank.mean(0)
@@ -189,20 +199,29 @@ def _describe(
     home: Home,
     artifact: Artifact,
     measured: Measured | None,
-    recorded: Sequence[AnnotatedScene],
+    scenes: tuple[Sequence[AnnotatedScene], Sequence[AnnotatedScene]],
     name: str,
     version: str,
     seed: int,
 ) -> Description:
-    """Return the description of the adapted model. Its terms are those of the parent."""
-    manifest = parent.manifest
-    own = DataSource(
-        source=recorded[0].source if recorded[0].source != "jsonl" else name,
-        scenes=len(recorded),
-        digest=digest_of(recorded),
-        terms="recorded in the home",
-        research_only=False,
-    )
+    """Return the description of the adapted model. Its terms are those of the parent.
+
+    Args:
+        scenes: recorded scenes, and scenes of written places.
+    """
+    manifest, (recorded, written) = parent.manifest, scenes
+    own = next((scene.source for scene in recorded if scene.source != "jsonl"), name)
+    sources = [
+        DataSource(
+            source=source, scenes=len(part), digest=digest_of(part), terms=terms,
+            research_only=False, written=part is written,
+        )
+        for source, part, terms in (
+            (own, recorded, "recorded in the home"),
+            (f"{own}, written", written, "written by a person of the home"),
+        )
+        if part
+    ]  # fmt: skip
     origin: JsonValue = {"name": parent.key[0], "version": parent.key[1], "digest": parent.digest}
     return Description(
         name=name,
@@ -214,11 +233,11 @@ def _describe(
         ),
         calibration=_calibration(home, artifact),
         training={"parent": origin, "seed": seed, "confirmed": home.confirmed},
-        data=(*manifest.data, own),
-        metrics=tuple(_metrics(measured, own.source)),
+        data=(*manifest.data, *sources),
+        metrics=tuple(_metrics(measured, own)),
         terms=manifest.terms,
         libraries={library: importlib.metadata.version(library) for library in _LIBRARIES},
-        examples=choose_examples(recorded, artifact.vocabulary) or manifest.examples,
+        examples=choose_examples([*recorded, *written], artifact.vocabulary) or manifest.examples,
     )
 
 

@@ -1,9 +1,9 @@
 """Adapt a model to a home, and admit the result only if folds of the recordings show a gain.
 
-- With at least `FEWEST` scenes, the weights adapt (`training.fit.adapt`). Five folds of the groups
-  of scenes measure the gain on scenes that the fit did not see. The gate refuses the new weights if
-  the log loss of hidden objects is not certainly lower (t > 2), if they raise more alarms, or if
-  rooms that the home never showed change.
+- With at least `FEWEST` recorded scenes, the weights adapt (`training.fit.adapt`). Five folds of
+  the groups of scenes measure the gain on scenes that the fit did not see. The gate refuses the new
+  weights if the log loss of hidden objects is not certainly lower (t > 2), if they raise more
+  alarms, or if rooms that the home never showed change.
 - With fewer scenes, or if the gate refuses, the weights stay.
 - Classes of confirmed scenes that the model still reports as outliers become exceptions: the new
   version never reports them.
@@ -32,7 +32,7 @@ from training.fit.objects import random_parts
 from training.machines.arrays import machine_of
 
 FEWEST = 20
-"""Number of distinct scenes from which the weights adapt."""
+"""Number of distinct recorded scenes from which the weights adapt."""
 
 _FOLDS = 5
 _LEAST_T = 2.0
@@ -102,7 +102,7 @@ def adapted(
     measured: Measured | None = None
     objections: tuple[str, ...] = ()
     artifact = home.parent
-    if int((home.tensors.v.sum(1) >= 2).sum()) >= FEWEST:
+    if len(home.measurable) >= FEWEST:
         measured = measure(home, seed, progress)
         objections = tuple(measured.objections())
         if not objections:
@@ -122,10 +122,10 @@ def adapted(
 def measure(home: Home, seed: int, progress: Callable[[str], None]) -> Measured:
     """Compare the parent with adapted weights in folds of groups.
 
-    Scenes with fewer than two classes have no part in it. If a fold of groups has no other scene,
-    the folds are made of scenes.
+    Scenes with fewer than two classes have no part in it. Written places take part in each fit, and
+    are never asked about. If a fold of groups has no other scene, the folds are made of scenes.
     """
-    index = np.flatnonzero((home.tensors.v.sum(1) >= 2).numpy())
+    index = home.measurable
     names, group = np.unique([home.scenes[k].group for k in index], return_inverse=True)
     rng = np.random.default_rng(seed)
     fold_of = rng.permutation(len(names))[group] % _FOLDS
@@ -135,7 +135,7 @@ def measure(home: Home, seed: int, progress: Callable[[str], None]) -> Measured:
     for fold in range(_FOLDS):
         progress(f"comparing in folds: {fold + 1} of {_FOLDS}")
         held_out, seen = index[fold_of == fold], index[fold_of != fold]
-        scenes = home.tensors.rows(torch.from_numpy(seen))
+        scenes = home.tensors.rows(torch.from_numpy(np.concatenate([seen, home.written])))
         weights = adapt(home.parent.weights, scenes, known=home.learnt, seed=seed)
         sides = home.parent, replace(home.parent, weights=weights)
         loss.append(_losses(home, held_out, sides, seed))

@@ -4,6 +4,10 @@ A robot also records objects that do not belong there. Only a person can tell a 
 from a fault. So an unconfirmed scene does not teach the objects that the model reports as outliers:
 they are neither present nor absent there. A confirmed scene teaches all its objects.
 
+A person can also write down the things of a room (`training.datasets.inventories`). Each written
+place is one confirmed scene. A thing that most such places lack teaches nothing there, but the
+model never reports it.
+
 A label that the model cannot read becomes a new class. It is judged once `JUDGED` scenes show it.
 """
 
@@ -22,6 +26,7 @@ from app.registry import Artifact
 from app.scene import ObjectClass, Scene, SceneObject, label_key
 from training.datasets import AnnotatedScene
 from training.datasets.array_types import Ints
+from training.datasets.inventories import SHARE, Place, complete_scene
 from training.datasets.vocabulary import curated_names
 from training.domain.confirmed_relations import Triple, reported_relations
 from training.fit.adapt import HomeScenes, Known
@@ -41,6 +46,7 @@ class HomeScene:
         room: index of the room type, or None.
         group: name that near-duplicates share.
         confirmed: whether a person has confirmed the scene.
+        written: whether a person has written the scene. Other scenes were recorded.
     """
 
     classes: Ints
@@ -48,6 +54,7 @@ class HomeScene:
     room: int | None
     group: str
     confirmed: bool
+    written: bool = False
 
     def question(self, artifact: Artifact) -> Scene:
         """Return the scene as a request of labels."""
@@ -61,7 +68,7 @@ class Home:
     Attributes:
         parent: the model before it knows the home, with the new classes and room types.
         known: number of classes and of room types of the model itself.
-        scenes: distinct recorded scenes.
+        scenes: distinct recorded scenes, and the written places.
         recorded: number of recorded scenes, with the repeated ones.
         left_out: ids of the unconfirmed scenes in which each label is left out.
         relations: confirmed relations of classes that the parent reports as misplaced.
@@ -75,12 +82,18 @@ class Home:
     relations: frozenset[Triple] = frozenset()
 
     @classmethod
-    def of(cls, model: Artifact, recorded: Sequence[AnnotatedScene]) -> Home:
-        """Read recorded scenes in the classes of a model.
+    def of(
+        cls,
+        model: Artifact,
+        recorded: Sequence[AnnotatedScene],
+        places: Sequence[Place] = (),
+    ) -> Home:
+        """Read recorded scenes and written places in the classes of a model.
 
         Scenes with equal classes and room type count once, because a robot sees a room many times.
         """
-        parent = _with_new_words(model, recorded)
+        confirmed = [*recorded, *map(confirmed_scene, places)]
+        parent = _with_new_words(model, confirmed)
         scenes: dict[tuple[object, ...], tuple[HomeScene, str]] = {}
         for scene in recorded:
             read = _read(parent, scene)
@@ -92,8 +105,8 @@ class Home:
             for c in read.left_out.tolist():
                 left_out[parent.vocabulary.labels[c]].append(scene_id)
         known = len(model.vocabulary), model.spec.C
-        relations = frozenset(reported_relations(parent, recorded))
-        distinct = tuple(read for read, _ in scenes.values())
+        relations = frozenset(reported_relations(parent, confirmed))
+        distinct = (*(read for read, _ in scenes.values()), *(_written(parent, x) for x in places))
         return cls(parent, known, distinct, len(recorded), left_out, relations)
 
     @property
@@ -115,8 +128,19 @@ class Home:
 
     @property
     def confirmed(self) -> int:
-        """Number of distinct scenes that a person has confirmed."""
-        return sum(scene.confirmed for scene in self.scenes)
+        """Number of distinct recorded scenes that a person has confirmed."""
+        return sum(scene.confirmed and not scene.written for scene in self.scenes)
+
+    @cached_property
+    def written(self) -> Ints:
+        """Indices of the written places in `scenes`."""
+        return np.flatnonzero([scene.written for scene in self.scenes])
+
+    @cached_property
+    def measurable(self) -> Ints:
+        """Indices of the recorded scenes with two classes: they can measure a gain."""
+        several = np.flatnonzero((self.tensors.v.sum(1) >= 2).numpy())
+        return np.setdiff1d(several, self.written)
 
     @cached_property
     def tensors(self) -> HomeScenes:
@@ -183,6 +207,22 @@ def _read(parent: Artifact, scene: AnnotatedScene) -> HomeScene:
     if not scene.confirmed and len(classes):
         left_out = alarms_of(parent, of_classes(parent, classes, room))
     return HomeScene(classes, left_out, room, scene.group, scene.confirmed)
+
+
+def confirmed_scene(place: Place) -> AnnotatedScene:
+    """Return a confirmed scene with all things of a written place."""
+    return replace(complete_scene(place), confirmed=True)
+
+
+def _written(parent: Artifact, place: Place) -> HomeScene:
+    """Return the scene of a written place, in which things with a small share teach nothing."""
+    scene = _read(parent, confirmed_scene(place))
+    shares: dict[int, float] = defaultdict(float)
+    for group, item in place.items:
+        if (found := parent.vocabulary.look_up(item.label)) is not None:
+            shares[found.entry] = max(shares[found.entry], group.share * item.share)
+    rare = [c for c in scene.classes.tolist() if shares[c] < SHARE]
+    return replace(scene, left_out=np.array(rare, dtype=np.int64), written=True)
 
 
 def alarms_of(artifact: Artifact, scene: Scene) -> Ints:

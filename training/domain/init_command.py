@@ -1,4 +1,4 @@
-"""Two commands: `init` proposes a configuration for your scenes, `example` generates scenes."""
+"""Two commands: `init` proposes a configuration for your material, `example` generates scenes."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from rich.markup import escape
 
 from app.registry import RegistryError
 from app.scene import label_key
-from training.datasets import AnnotatedScene, DatasetError, generate_rooms
+from training.datasets import DatasetError, generate_rooms
 from training.datasets.files import write_whole
-from training.datasets.jsonl import scan_jsonl, write_jsonl
-from training.datasets.readers import guess_format, read_scenes
+from training.datasets.jsonl import write_jsonl
+from training.datasets.placeholders import left_out_line
+from training.datasets.records import InvalidLinesError
 from training.datasets.rooms import DOMAINS
 from training.datasets.vocabulary import vocabulary_json
 from training.domain.look import Label
+from training.domain.material import read_material
 from training.domain.proposal import Proposal, propose
 from training.domain.update import PROPOSED, proposed_json, update
 from training.fit.configuration import ConfigError
 from training.runs.config_files import shipped_configs
 from training.runs.example_scenes import examples_json
 
-# Maximum number of invalid lines that are printed. Further invalid lines are only counted.
-BAD_LINES = 20
 ROWS = 12
 """Maximum number of entries of a printed list."""
 
@@ -47,17 +47,22 @@ def init(
             "capitals, underscores, dots and spaces are refused"
         ),
     ],
-    files: Annotated[list[Path], typer.Argument(help="files with the scenes of one domain")],
+    files: Annotated[
+        list[Path],
+        typer.Argument(help="files with the scenes of one domain, and written inventories (*.csv)"),
+    ],
     output: Annotated[
         Path | None, typer.Option(help="output folder; default: a folder named like the model")
     ] = None,
-    terms: Annotated[str, typer.Option(help="terms of use of the scenes (model card)")] = "",
+    terms: Annotated[str, typer.Option(help="terms of use of the files (model card)")] = "",
     force: Annotated[bool, typer.Option("--force", help="overwrite existing files")] = False,
     extend: Annotated[
         bool, typer.Option("--update", help="add new files and classes, and keep your edits")
     ] = False,
 ) -> None:
-    """Analyse your scenes, and propose a vocabulary and a training configuration.
+    """Analyse your scenes or written inventories, and propose a vocabulary and a configuration.
+
+    An inventory is a table of the things in your kinds of places (docs/your-place.md).
 
     The command writes NAME.toml, vocabulary.json and examples.json (scenes for the visual page)
     into the output folder. You can edit these files. The command overwrites existing files only
@@ -78,8 +83,8 @@ def init(
                 raise ConfigError(f"--update keeps your files, so {option} cannot be used with it")
             _update(name, folder, files)
             return
-        with console.status("reading scenes"):
-            scenes = [scene for file in files for scene in read_or_exit(file)]
+        with console.status("reading the files"):
+            material = read_material(files)
         existing = [str(path) for path in targets if path.exists()]
         if existing and not force:
             raise ConfigError(
@@ -87,8 +92,8 @@ def init(
                 "folder with --output"
             )
         sources = [Path(os.path.relpath(file, folder)).as_posix() for file in files]
-        with console.status("analysing scenes"):
-            proposal = propose(name, scenes, sources, terms=terms)
+        with console.status("analysing the files"):
+            proposal = propose(name, material, sources, terms=terms)
     except (ConfigError, DatasetError, ValueError) as error:
         fail(error)
     folder.mkdir(parents=True, exist_ok=True)
@@ -100,14 +105,16 @@ def init(
     )
     for path, text in zip(targets, texts, strict=True):
         write_whole(path, text)
-    _show(proposal, f"classes with at least {proposal.minimum} mentions")
-    _print_lines(f"\nwritten: {', '.join(map(str, targets))}", *_next(name, folder))
+    written = "of written things or " if proposal.places else ""
+    _show(proposal, f"classes {written}with at least {proposal.minimum} mentions")
+    lines = _next(name, folder, promoted=not proposal.places)
+    _print_lines(f"\nwritten: {', '.join(map(str, targets))}", *lines)
 
 
 def _update(name: str, folder: Path, files: Sequence[Path]) -> None:
     """Extend the proposal in a folder, and report what was added and what was kept."""
     with console.status("reading and analysing scenes"):
-        result = update(name, folder, files, read_or_exit)
+        result = update(name, folder, files)
     for path, text in result.files.items():
         write_whole(path, text)
     _show(result.proposal, "classes in the vocabulary")
@@ -121,12 +128,14 @@ def _update(name: str, folder: Path, files: Sequence[Path]) -> None:
         *lines,
         f"\nwritten: {', '.join(map(str, result.files)) or 'nothing'}",
         f"kept as they are: the earlier classes, {kept} and the examples",
-        *_next(name, folder),
+        *_next(name, folder, promoted=not result.proposal.places),
     )
 
 
-def _next(name: str, folder: Path) -> list[str]:
-    lines = [f"next: check these files, then run  python -m training train {folder}"]
+def _next(name: str, folder: Path, *, promoted: bool = True) -> list[str]:
+    """Return the next command; without a promotion, it also publishes the model."""
+    publish = "" if promoted else " --publish 1.0.0 --store my-store"
+    lines = [f"next: check these files, then run  python -m training train {folder}{publish}"]
     if folder.resolve().name != name:
         lines.append(f"      (the configuration is {folder / f'{name}.toml'})")
     return lines
@@ -151,28 +160,6 @@ def _check_name(name: str) -> None:
         raise ConfigError(f"{name} is the name of a shipped configuration; choose another name")
 
 
-def read_or_exit(path: Path, *, recorded: bool = False) -> list[AnnotatedScene]:
-    """Read the scenes of a file, or print all invalid lines of a JSONL file and exit.
-
-    A recorded file is JSONL, whatever its name.
-    """
-    is_jsonl = recorded or guess_format(path) == "jsonl"
-    lines = list(scan_jsonl(path) if is_jsonl else read_scenes(path))
-    errors = [line for line in lines if isinstance(line, DatasetError)]
-    if errors:
-        n = len(errors)
-        count = "1 line is not a scene" if n == 1 else f"{n} lines are not scenes"
-        console.print(f"[red]error:[/red] {count}; no file was written", soft_wrap=True)
-        for error in errors[:BAD_LINES]:
-            console.print(f"  {path.name}, {error.where}: {error.problem}", markup=False)
-        if n > BAD_LINES:
-            console.print(f"  and {n - BAD_LINES} more")
-        raise typer.Exit(1)
-    if not lines:
-        raise DatasetError(path, "", "the file contains no scene")
-    return [line for line in lines if isinstance(line, AnnotatedScene)]
-
-
 def _show(proposal: Proposal, classes: str) -> None:
     """Print the facts about the scenes, joined labels, and what the user must check."""
     facts = proposal.facts
@@ -180,6 +167,7 @@ def _show(proposal: Proposal, classes: str) -> None:
     rooms = ", ".join(f"{room} {count}" for room, count in list(facts.rooms.items())[:ROWS])
     shares = ", ".join(f"{name} {share:.0%}" for name, share in facts.shares.items())
     lines = [
+        *proposal.written_lines(),
         f"{facts.scenes} scenes in {facts.groups} groups, with {least} to {most} objects each "
         f"({mean:.1f} on average)",
         f"room types: {rooms or 'none'}",
@@ -192,6 +180,7 @@ def _show(proposal: Proposal, classes: str) -> None:
         [f"{label.spellings[0]} = {label.name}" for label in joined],
     )
     lines += _listing("labels without a class:", _mentions(proposal.dropped))
+    lines += filter(None, [left_out_line(proposal.left_out, ROWS)])
     console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
     console.print("Please check:" if facts.findings else "no contradictions found")
     for finding in facts.findings:
@@ -210,9 +199,19 @@ def _listing(title: str, entries: Sequence[str]) -> list[str]:
 
 
 def fail(error: Exception) -> NoReturn:
-    """Print the error, without the code of a registry error, and exit with code 1."""
-    reason = error.reason if isinstance(error, RegistryError) else error
-    console.print(f"[red]error:[/red] {escape(str(reason))}", soft_wrap=True)
+    """Print the error, without the code of a registry error, and exit with code 1.
+
+    Of invalid lines, the first ones are listed.
+    """
+    reason = error.reason if isinstance(error, RegistryError) else str(error)
+    further: list[str] = []
+    if isinstance(error, InvalidLinesError):
+        reason = f"{error.path.name} has {error.count} errors; nothing was written"
+        further = [f"  {error.path.name}, {one.where}: {one.problem}" for one in error.errors]
+        more = error.count - len(error.errors)
+        further += [f"  and {more} more"] if more else []
+    console.print(f"[red]error:[/red] {escape(reason)}", soft_wrap=True)
+    _print_lines(*further)
     raise typer.Exit(1) from None
 
 

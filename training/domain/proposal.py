@@ -1,4 +1,7 @@
-"""Propose a vocabulary and a training configuration for scenes, with a reason for each entry.
+"""Propose a vocabulary and a training configuration, with a reason for each entry.
+
+The material are scenes, written inventories, or both. Scenes are drawn of each written place, at
+least as many in all as there are seen scenes. Every written thing becomes a class.
 
 Few scenes get a small machine, and many scenes a larger one (docs/decisions/own-scenes.md). The
 command `training tune` searches for a better configuration.
@@ -15,9 +18,12 @@ from typing import Any, Final
 from app.registry import Example
 from app.scene import Vocabulary, label_key
 from training.datasets import AnnotatedScene, source_vocabulary, split
+from training.datasets.inventories import complete_scene
 from training.datasets.splits import FRACTIONS
 from training.datasets.vocabulary import coverage
+from training.datasets.written import with_things
 from training.domain.look import Facts, Label, count_labels, look
+from training.domain.material import Material
 from training.evaluation.metrics import FEWEST_GROUPS
 from training.fit.configuration import Config, ConfigError
 from training.runs.config_files import sections_toml
@@ -35,6 +41,8 @@ _SPLIT_SEEDS: Final = 50
 _TOLERANCE: Final = 0.2
 # Number of training scenes from which a larger machine is proposed (docs/decisions/own-scenes.md).
 _MANY_SCENES: Final = 1000
+# Least numbers of scenes that are drawn of all written places together, and of each place.
+_DRAWN, _OF_PLACE = 800, 30
 
 
 @dataclass(frozen=True)
@@ -54,10 +62,25 @@ class Proposal:
     parts: dict[str, int]  # number of scenes of each part of the split
     test_groups: int  # number of groups of near-duplicates in the test part
     examples: tuple[Example, ...]
+    seen: int  # number of seen scenes
+    places: int  # number of written places
+    left_out: Counter[str]  # labels that name no kind of object
+
+    def written_lines(self) -> list[str]:
+        """Return a line about the written places, if there are any."""
+        if not self.places:
+            return []
+        each = self.config.data.written
+        return [
+            f"{self.places} written places, of which training draws {each} scenes each; "
+            f"{self.seen} seen scenes. The lines below count a written place as one complete scene"
+        ]
 
     @property
     def warning(self) -> str:
         """A warning if the scenes are few, or ""."""
+        if self.places:
+            return ""  # written scenes are drawn in sufficient number
         if self.facts.scenes >= FEW_SCENES and self.test_groups >= FEWEST_GROUPS:
             return ""
         return (
@@ -77,30 +100,39 @@ class Proposal:
         )
 
 
-def propose(
-    name: str, scenes: Sequence[AnnotatedScene], sources: Sequence[str], *, terms: str = ""
-) -> Proposal:
-    """Analyse the scenes, and propose a vocabulary and a configuration.
+def propose(name: str, material: Material, sources: Sequence[str], *, terms: str = "") -> Proposal:
+    """Analyse scenes and inventories, and propose a vocabulary and a configuration.
 
     Raises:
-        ConfigError: there are fewer than `FEWEST_SCENES` scenes, no label occurs often enough, or
-            the scenes cannot be split.
+        ConfigError: without an inventory, there are fewer than `FEWEST_SCENES` scenes; or no label
+            occurs often enough, or the scenes cannot be split.
     """
-    if len(scenes) < FEWEST_SCENES:
+    seen, places = material.scenes, material.places
+    if len(seen) < FEWEST_SCENES and not places:
         raise ConfigError(
-            f"{len(scenes)} scenes are too few: from fewer than {FEWEST_SCENES} scenes, a model "
+            f"{len(seen)} scenes are too few: from fewer than {FEWEST_SCENES} scenes, a model "
             "may learn no more than the frequency of each class. Provide at least "
             f"{FEWEST_SCENES} scenes, better {FEW_SCENES} scenes of {FEW_SCENES // 2} places"
         )
-    labels = count_labels(scenes)
-    facts = look(scenes, labels)
-    minimum, found = _choose_vocabulary(scenes)
+    written = max(_OF_PLACE, math.ceil(max(_DRAWN, len(seen)) / len(places))) if places else 0
+    described = [*seen, *map(complete_scene, places)]
+    scenes = [*seen, *material.drawn(written)]
+    labels = count_labels(described)
+    facts = look(described, labels)
+    minimum, found = _choose_vocabulary(scenes, material.things)
     vocabulary = use_frequent_names(found, scenes)
+    if places:
+        vocabulary = with_things(vocabulary, material.descriptions)
     seed, parts, test_groups = _split(scenes)
     settings, reasons = _configuration(facts, parts)
+    if not seen:
+        settings["objects"] |= {"weight_prior": 0.3, "rate_prior": 2.0}
+        reasons["objects.weight_prior"] = (
+            "weaker than for seen scenes: of written places, as many scenes as needed are drawn"
+        )
     reasons |= {
-        "data.vocabulary": f"{len(vocabulary)} classes with at least {minimum} mentions; edit the "
-        "file to change them",
+        "data.vocabulary": f"{len(vocabulary)} classes of at least {minimum} mentions, or written; "
+        "edit the file to change them",
         "data.split": "the group name fixes the part: you can add scenes, and versions stay "
         "comparable",
         "data.split_seed": f"{parts['train']} training scenes, {parts['validation']} validation "
@@ -108,6 +140,11 @@ def propose(
     }
     data: dict[str, Any] = {"sources": list(sources), "vocabulary": "vocabulary.json"}
     data |= {"split": "stable", "split_seed": seed} | ({"terms": terms} if terms else {})
+    if places:
+        data["written"] = written
+        reasons["data.written"] = (
+            f"scenes drawn of each written place, {written * len(places)} in all"
+        )
     variant = settings["machine"]["variant"].capitalize()
     values = {"name": name, "description": f"{variant} machine over {name} scenes."}
     values |= {"examples": "examples.json", "data": data} | settings
@@ -116,7 +153,7 @@ def propose(
         facts=facts,
         labels=tuple(labels),
         minimum=minimum,
-        coverage=coverage(found, scenes),
+        coverage=coverage(found, described),
         vocabulary=vocabulary,
         dropped=tuple(label for label in labels if vocabulary.index(label.name) is None),
         values=values,
@@ -125,14 +162,22 @@ def propose(
         parts=parts,
         test_groups=test_groups,
         examples=choose_examples(scenes, vocabulary),
+        seen=len(seen),
+        places=len(places),
+        left_out=material.left_out,
     )
 
 
-def _choose_vocabulary(scenes: Sequence[AnnotatedScene]) -> tuple[int, Vocabulary]:
-    """Return the largest minimum that covers enough objects, else the smallest; its classes."""
+def _choose_vocabulary(
+    scenes: Sequence[AnnotatedScene], certain: Sequence[str]
+) -> tuple[int, Vocabulary]:
+    """Return the largest minimum that covers enough objects, else the smallest; its classes.
+
+    Every `certain` label has a class.
+    """
     for minimum in _MINIMA:
         try:
-            vocabulary = source_vocabulary(scenes, minimum=minimum)
+            vocabulary = source_vocabulary(scenes, minimum=minimum, certain=certain)
         except ValueError:
             continue  # no label has so many mentions
         if minimum == _MINIMA[-1] or coverage(vocabulary, scenes) >= _COVERED:

@@ -1,4 +1,4 @@
-"""Extend a proposal of `init` with new scenes, and keep what a person has edited.
+"""Extend a proposal of `init` with new files, and keep what a person has edited.
 
 `proposed.json` contains every name that a proposal had. A name that is in `proposed.json` but not
 in the vocabulary was removed by a person, so no update adds it again.
@@ -10,7 +10,7 @@ import json
 import os
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -24,6 +24,7 @@ from training.datasets import AnnotatedScene, DatasetError, source_vocabulary
 from training.datasets.records import AnnotatedObject
 from training.datasets.vocabulary import coverage, vocabulary_text
 from training.domain.look import Label
+from training.domain.material import read_material
 from training.domain.proposal import Proposal, propose, use_frequent_names
 from training.fit.configuration import ConfigError, DataConfig, is_file
 from training.runs.config_files import load_config, read_toml
@@ -54,16 +55,14 @@ class Update:
     sources: tuple[str, ...]
 
 
-def update(
-    name: str, folder: Path, files: Sequence[Path], read: Callable[[Path], Sequence[AnnotatedScene]]
-) -> Update:
-    """Extend the proposal in a folder with the scenes of files.
+def update(name: str, folder: Path, files: Sequence[Path]) -> Update:
+    """Extend the proposal in a folder with the scenes and inventories of files.
 
-    The scenes of the sources of the configuration are read again, together with new files.
+    The sources of the configuration are read again, together with new files.
 
     Raises:
         ConfigError: the folder has no proposal, or one of its files cannot be read or extended.
-        DatasetError: a file has no scenes.
+        DatasetError: a file cannot be read, or has no scenes.
     """
     config_file = folder / f"{name}.toml"
     data = _data_of(config_file)
@@ -71,11 +70,12 @@ def update(
     known = {path.resolve() for path in own}
     new = [file for file in files if file.resolve() not in known]
     added = tuple(Path(os.path.relpath(file, folder)).as_posix() for file in new)
-    scenes = [scene for file in (*own, *new) for scene in read(file)]
-    proposal = propose(name, scenes, (*data.sources, *added))
+    material = read_material((*own, *new))
+    proposal = propose(name, material, (*data.sources, *added))
+    scenes = [*material.scenes, *material.drawn(proposal.config.data.written)]
     proposed = _proposed(folder / PROPOSED)
     values, edited = _edited(folder / data.vocabulary)
-    classes = _new_classes(edited, proposed, scenes, proposal.minimum)
+    classes = _new_classes(edited, proposed, scenes, proposal.minimum, material.things)
     rooms = tuple(
         room
         for room in proposal.vocabulary.room_types
@@ -88,7 +88,8 @@ def update(
         texts[folder / data.vocabulary] = vocabulary_text(values)
         texts[folder / PROPOSED] = proposed_json(classes, rooms, proposed)
     if added:
-        texts[config_file] = _with_sources(config_file, [*data.sources, *added])
+        written = proposal.config.data.written if not data.written else 0
+        texts[config_file] = _with_sources(config_file, [*data.sources, *added], written)
     without = [label for label in proposal.labels if not _has(extended, label)]
     removed = tuple(label for label in without if _keys(label) & proposed["objects"])
     dropped = tuple(label for label in without if label not in removed)
@@ -167,8 +168,9 @@ def _new_classes(
     proposed: dict[str, set[str]],
     scenes: Sequence[AnnotatedScene],
     minimum: int,
+    written: Iterable[str],
 ) -> tuple[ObjectClass, ...]:
-    """Return the frequent classes of the labels that are in no earlier proposal and no class."""
+    """Return the frequent or written classes that are in no earlier proposal and no class."""
 
     def is_new(label: str) -> bool:
         return edited.index(label) is None and label_key(label) not in proposed["objects"]
@@ -178,7 +180,9 @@ def _new_classes(
         things = [AnnotatedObject(x.id, x.label) for x in scene.objects if is_new(x.label)]
         rest.append(AnnotatedScene(scene.scene_id, scene.source, scene.group, None, tuple(things)))
     try:
-        found = use_frequent_names(source_vocabulary(rest, minimum=minimum), rest)
+        certain = filter(is_new, written)
+        found = source_vocabulary(rest, minimum=minimum, certain=certain)
+        found = use_frequent_names(found, rest)
     except ValueError:
         return ()  # no new label is frequent
     new = [entry for entry in found.objects if is_new(entry.label)]
@@ -201,11 +205,18 @@ def _has(vocabulary: Vocabulary, label: Label) -> bool:
     return any(vocabulary.index(x) is not None for x in (label.name, *label.spellings))
 
 
-def _with_sources(path: Path, sources: Sequence[str]) -> str:
-    """Return the text of a configuration with other sources. All other entries stay."""
+def _with_sources(path: Path, sources: Sequence[str], written: int) -> str:
+    """Return the text of a configuration with other sources. All other entries stay.
+
+    Args:
+        written: new value of `data.written`; 0 keeps the entry as it is.
+    """
     expected = read_toml(path)
     expected["data"]["sources"] = list(sources)
     array = json.dumps(list(sources), ensure_ascii=False)
+    if written:
+        expected["data"]["written"] = written
+        array += f"\nwritten = {written}"
     text = re.sub(
         r"^(\s*sources\s*=\s*)\[[^\]]*\]",
         lambda match: match[1] + array,
@@ -218,4 +229,5 @@ def _with_sources(path: Path, sources: Sequence[str]) -> str:
             return text
     except tomllib.TOMLDecodeError:
         pass
-    raise ConfigError(f"{path}: write sources = {array} into [data] yourself, then repeat")
+    entries = array.replace("\n", " and ")
+    raise ConfigError(f"{path}: write sources = {entries} into [data] yourself, then repeat")

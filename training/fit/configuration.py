@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from app.inference.variants import VARIANTS, Variant
 from training.datasets.files import position_and_problem
+from training.datasets.sources import is_inventory
 from training.machines import MachineSpec, build
 
 
@@ -24,8 +25,12 @@ def is_file(source: str) -> bool:
 
 
 def source_name(source: str) -> str:
-    """Return the name of a source; for a file, the part of its name before the first dot."""
-    return Path(source).name.partition(".")[0] if is_file(source) else source
+    """Return the name of a source; for a file of scenes, its name before the first dot.
+
+    An inventory keeps the whole name of its file (`is_inventory`).
+    """
+    name = Path(source).name
+    return name.partition(".")[0] if is_file(source) and not is_inventory(name) else name
 
 
 class _Section(BaseModel):
@@ -35,9 +40,9 @@ class _Section(BaseModel):
 class DataConfig(_Section):
     """The data sources of a run, their vocabulary and the split of their scenes.
 
-    A data source is a name or a file in any known format. The name `rooms` means the built-in
-    generator of rooms, and `inventories` the written places of the repository. Any other name means
-    the file `<name>.jsonl.gz` in the data folder (`data_folder`).
+    A data source is a name or a file in any known format; a file *.csv is a written inventory. The
+    name `rooms` means the built-in generator of rooms, and `inventories` the written places of the
+    repository. Any other name means the file `<name>.jsonl.gz` in the data folder (`data_folder`).
     """
 
     sources: tuple[str, ...] = Field(min_length=1)
@@ -52,7 +57,7 @@ class DataConfig(_Section):
         default=0,
         ge=0,
         exclude_if=not_,
-        description="scenes to draw of each place where `inventories` is a source",
+        description="scenes to draw of each place of a written inventory",
     )
     limit: int | None = Field(default=None, ge=10, description="maximum scenes of each source")
     words: bool = Field(default=False, description="whether word vectors tell similar classes")
@@ -204,8 +209,8 @@ class Config(_Section):
             "data.rooms must be at least 1, because `rooms` is a source": (
                 "rooms" in self.data.sources and not self.data.rooms
             ),
-            "data.written must be at least 1, because `inventories` is a source": (
-                "inventories" in self.data.sources and not self.data.written
+            "data.written must be at least 1, because a source is a written inventory": (
+                any(map(is_inventory, self.data.sources)) and not self.data.written
             ),
         }
         if broken := next((message for message, breaks in rules.items() if breaks), None):

@@ -27,7 +27,7 @@ from app.scene import Vocabulary
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.cases import MOST, Part, counted_classes, listed_cases
-from training.datasets.sources import SOURCES
+from training.datasets.sources import source_of
 from training.evaluation.count_task import class_mean
 from training.fit.offset_statistics import half_precision, source_weights
 
@@ -54,9 +54,11 @@ def fit_counts(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> Counts
     statistics only if, in a cross-validation, the expected number is closer to the truth than the
     class mean.
     """
-    unfit = {name for name, source in SOURCES.items() if source.of_one_view or source.written}
-    counting = counted_classes(scenes, vocabulary)
-    counting = {source: counted for source, counted in counting.items() if source not in unfit}
+    counting = {
+        name: counted
+        for name, counted in counted_classes(scenes, vocabulary).items()
+        if not (source_of(name).of_one_view or source_of(name).written)
+    }
     counted = [scene for scene in scenes if scene.source in counting]
     most = _most_listed(counted, counting, vocabulary)
     if not (most > 1).any():

@@ -29,9 +29,10 @@ from training.datasets import (
 )
 from training.datasets.batches import TrainingData, scene_tensors
 from training.datasets.files import KNOWLEDGE
+from training.datasets.placeholders import plain_scenes
 from training.datasets.records import digest_of
 from training.datasets.roles import count_roles
-from training.datasets.things import read_things
+from training.datasets.sources import is_inventory
 from training.datasets.vocabulary import read_vocabulary, with_typical_sizes
 from training.datasets.words import class_vectors, read_word_vectors
 from training.datasets.written import written_vocabulary
@@ -106,6 +107,7 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
 
     A data source is a file, or a name. A name means `<name>.jsonl.gz` in `root` or in `root/extra`
     (`<name>.tsv.gz` for the placing priors). `rooms` and `inventories` come from the repository.
+    The scenes of a file have plain labels, and no placeholders (`plain_scenes`).
 
     Raises:
         ConfigError: a file is missing.
@@ -117,15 +119,15 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
         name, path = source_name(source), _path(source, root)
         if source == "rooms":
             own = generate_rooms(data.rooms, seed=data.split_seed)
-        elif source == inventories.SOURCE:
-            places = inventories.read_places(path)
-            shares = inventories.listed_shares(read_things(KNOWLEDGE / "things.csv").values())
-            own = inventories.written_scenes(places, shares, data.written, seed=data.split_seed)
+        elif is_inventory(source):
+            own = inventories.read_inventory(path).scenes(data.written, seed=data.split_seed)
         elif source == priors.SOURCE:
             own = priors.read_prior_scenes(path)
         else:
-            own = [replace(scene, source=name) for scene in read_scenes(path)]
-        scenes[name] = own[: data.limit]
+            own = read_scenes(path)
+            if is_file(source):
+                own, _ = plain_scenes(own)
+        scenes[name] = [replace(scene, source=name) for scene in own[: data.limit]]
     return scenes
 
 

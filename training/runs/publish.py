@@ -19,7 +19,7 @@ from app.registry import (
     VocabularyEntry,
 )
 from training.datasets.batches import TrainingData
-from training.datasets.sources import SOURCES, source_of
+from training.datasets.sources import SOURCES, is_inventory
 from training.datasets.vocabulary import with_aliases, with_room_aliases
 from training.evaluation.alarms import untouched_alarms
 from training.evaluation.everyday_task import EVERYDAY
@@ -27,7 +27,7 @@ from training.evaluation.report import Progress, evaluate, silent
 from training.evaluation.tasks import STATISTICS
 from training.fit.calibrate import calibrate
 from training.fit.calibrate_objects import refitted_lines
-from training.fit.configuration import DataConfig
+from training.fit.configuration import DataConfig, source_name
 from training.fit.count_statistics import fit_counts
 from training.fit.draft import placed_draft
 from training.fit.long_chains import measure_drift
@@ -241,13 +241,14 @@ def data_sources(scenes: SplitScenes, learnt: ObjectScenes) -> tuple[DataSource,
     """
     sources = []
     shares = dict(zip(learnt.sources, (learnt.source_sizes / learnt.size).tolist(), strict=True))
+    written = {source_name(source) for source in scenes.data.sources if is_inventory(source)}
     for name, count in scenes.counts.items():
         words, research_only = terms_of(name, scenes.data)
         digest = scenes.digests[name]
         source = DataSource(
             source=name, scenes=count, digest=digest, terms=words, research_only=research_only,
             share=round(shares.get(name, 0.0), 4),
-            written=name in scenes.data.sources and source_of(name).written,
+            written=name in written,
         )  # fmt: skip
         sources.append(source)
     return tuple(sources)
@@ -258,7 +259,8 @@ def terms_of(source: str, data: DataConfig) -> tuple[str, bool]:
     # A user's file may have the name of a known source. `data.sources` then contains its path.
     if source in SOURCES and source in data.sources:
         return SOURCES[source].terms, SOURCES[source].research_only
-    return data.terms or "the user's own scenes, without stated terms of use", data.research_only
+    own = "inventory" if is_inventory(source) else "scenes"
+    return data.terms or f"the user's own {own}, without stated terms of use", data.research_only
 
 
 def terms(sources: Sequence[DataSource]) -> str:

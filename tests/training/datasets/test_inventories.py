@@ -8,31 +8,44 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from app.scene import ObjectClass, Vocabulary
 from training.datasets import DatasetError
 from training.datasets.files import KNOWLEDGE
 from training.datasets.inventories import (
     COLUMNS,
     LISTED,
+    OPTIONAL,
     Group,
     Item,
     Place,
+    complete_scene,
     draw_scene,
     listed_shares,
-    read_places,
+    read_inventory,
+    shipped_things,
     written_scenes,
 )
+from training.datasets.records import MAX_LISTED, InvalidLinesError
 from training.datasets.things import COLUMNS as THING_COLUMNS
 from training.datasets.things import read_things
+from training.datasets.written import with_things
 from training.fit.configuration import Config, DataConfig, MachineConfig
 from training.runs.pipeline import prepare
 
 LAMP = "den,study,desk things,.5,lamp,.4,1-3,on-top,desk"
 DESK = "den,study,basics,1,desk,.8,1,floor,"
 CUP = "cup,.1,.09,.1,1.3,surface .7 inside .3,no,yes,hand,vessel,mug"
+SPORT = (("bicycle", 0.25), ("helmet", 0.5))
 VESSEL = "vessel,.2,.2,.2,2,surface 1,no,yes,hand,,"
 
 
-def write(folder: Path, *rows: str, columns=COLUMNS) -> Path:
+NINE = (
+    *("place", "room_type", "group", "group_share", "label", "share", "count"),
+    *("relation", "anchor"),
+)
+
+
+def write(folder: Path, *rows: str, columns=NINE) -> Path:
     path = folder / "table.csv"
     path.write_text("\n".join([",".join(columns), *rows]) + "\n", "utf-8")
     return path
@@ -40,9 +53,10 @@ def write(folder: Path, *rows: str, columns=COLUMNS) -> Path:
 
 def test_places_are_read_in_order(tmp_path):
     # A blank line, spaces and quotes of a spreadsheet change nothing.
-    (place,) = read_places(
+    assert {*COLUMNS, *OPTIONAL} == {*NINE}
+    (place,) = read_inventory(
         write(tmp_path, DESK, "", '"den", study ' + LAMP.removeprefix("den,study"))
-    )
+    ).places
     assert place == Place(
         "den",
         "study",
@@ -62,7 +76,7 @@ def test_places_are_read_in_order(tmp_path):
             LAMP.replace(",.4,", ",1.4,"),
             "line 3, column share: must be a number above 0 and at most 1",
         ),
-        (LAMP.replace(",.4,", ",,"), "line 3, column share: must be a number above 0"),
+        (LAMP.replace("lamp", " "), "line 3, column label: is empty"),
         (LAMP.replace(",.4,", ",nan,"), "line 3, column share: must be a number above 0"),
         (LAMP.replace(".5", "0"), "line 3, column group_share: must be a number above 0"),
         (LAMP.replace("desk things", "basics"), "line 3, column group_share: is 1 in other rows"),
@@ -71,6 +85,7 @@ def test_places_are_read_in_order(tmp_path):
         (LAMP.replace("on-top", "beside"), "line 3, column relation: must be one of on-top"),
         (LAMP.removesuffix("desk"), "line 3, column anchor: is empty, but the relation is on-top"),
         (LAMP.replace("on-top", "wall"), "line 3, column anchor: must be empty"),
+        (LAMP.replace("on-top", ""), "line 3, column anchor: must be empty, because the relation"),
         (
             LAMP.replace(",desk", ",table"),
             "line 3, column anchor: the place 'den' has no row with the label 'table'",
@@ -83,17 +98,77 @@ def test_places_are_read_in_order(tmp_path):
 def test_errors_name_line_and_column(tmp_path, row, message):
     path = write(tmp_path, DESK, row)
     with pytest.raises(DatasetError) as caught:
-        read_places(path)
+        read_inventory(path)
     assert str(caught.value).startswith(f"{path}, {message}")
+
+
+def test_empty_cells_have_defaults(tmp_path):
+    """A spreadsheet of a country with decimal commas, with empty columns at its right."""
+    path = tmp_path / "table.csv"
+    rows = ["room_type;label;share;group;group_share;;", "hall;coat;;;;;"]
+    rows += ["hall;bicycle;0,25;sport;;;", "hall;helmet;;sport;0,5;;"]
+    path.write_text("\ufeff" + "\r\n".join(rows), "utf-8")
+    (place,) = read_inventory(path).places
+    assert place == Place(
+        "hall",
+        "hall",
+        (
+            Group("", 1.0, (Item("coat", 0.5, 1, 1, "", ""),)),
+            Group("sport", 0.5, tuple(Item(x, y, 1, 1, "", "") for x, y in SPORT)),
+        ),
+    )
+    scene = complete_scene(place)
+    assert [thing.label for thing in scene.objects] == ["coat", "bicycle", "helmet", "floor"]
+    assert (scene.relations, scene.supported) == ((), ())
+
+
+def test_placeholders_are_left_out_and_counted(tmp_path):
+    rows = [DESK, DESK.replace("desk", "object_7"), LAMP.replace(",desk", ",REMOVE")]
+    rows += [DESK.replace("desk", "object_7"), DESK.replace("desk", "n03001627")]
+    inventory = read_inventory(write(tmp_path, *rows))
+    (place,) = inventory.places
+    assert [item.label for _, item in place.items] == ["desk", "lamp"]
+    assert [item.relation for _, item in place.items] == ["floor", ""]
+    assert inventory.left_out == {"object_7": 2, "n03001627": 1}
+
+
+def test_all_errors_are_found_and_the_first_32_listed(tmp_path):
+    bad = [LAMP.replace(".4", "0"), LAMP + ",more", LAMP.replace("on-top", "beside")]
+    path = write(tmp_path, DESK, *bad * 12, LAMP.replace(",desk", ",table"))
+    with pytest.raises(InvalidLinesError) as caught:
+        read_inventory(path)
+    assert (caught.value.count, len(caught.value.errors)) == (37, MAX_LISTED)
+    where = [error.where for error in caught.value.errors[:3]]
+    assert where == ["line 3, column share", "line 4", "line 5, column relation"]
+    assert str(caught.value).startswith(f"{path}, line 3, column share: must be a number above 0")
+
+
+def test_things_beside_an_inventory_describe_its_classes(tmp_path):
+    """Sizes, parents and other names: of the table beside the file, then of the repository."""
+    path = write(tmp_path, *(DESK.replace("desk", x) for x in ("cup", "gizmo", "vessel")))
+    gizmo = CUP.replace("cup,.1,.09", "gizmo,.4,.1").replace("mug", '"gadget, cup"')
+    (tmp_path / "things.csv").write_text("\n".join([",".join(THING_COLUMNS), VESSEL, gizmo]))
+    inventory = read_inventory(path)
+    assert list(inventory.things) == ["vessel", "gizmo"]
+    plain = Vocabulary([ObjectClass(label) for label in ("cup", "gizmo", "vessel")])
+    vocabulary = with_things(plain, {**inventory.things, **shipped_things()})
+    sizes = dict(zip(vocabulary.labels, vocabulary.sizes.tolist(), strict=True))
+    assert sizes["gizmo"] == [0.2, 0.2, 0.1]
+    assert sizes["cup"] == [0.097, 0.097, 0.1], "of the repository"
+    assert vocabulary.labels[vocabulary.index("gadget")] == "gizmo"
+    assert vocabulary.labels[vocabulary.index("cup")] == "cup", "no alias of another class"
+    assert vocabulary.broader_labels == (("vessel",), ("vessel",), ())
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "line 1: must name the columns place, room_type"),
+        (b"", "line 1: must name the columns room_type, label"),
         (b"place,share\n", "line 1: must name the columns room_type"),
-        (",".join(COLUMNS).encode() + b"\n", ": has no rows"),
-        (",".join(COLUMNS).encode() + b"\n\xff\n", "line 2: is not UTF-8"),
+        (b"room_type,label,shares\n", "line 1: has the unknown column 'shares'; known: room_type"),
+        (b"label,room_type,label\n", "line 1: names the column label twice"),
+        (",".join(NINE).encode() + b"\n", ": has no rows"),
+        (",".join(NINE).encode() + b"\n\xff\n", "line 2: is not UTF-8"),
         (None, "no such file"),
     ],
 )
@@ -102,7 +177,7 @@ def test_a_file_that_is_no_table_is_named(tmp_path, content, message):
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(DatasetError, match=message):
-        read_places(path)
+        read_inventory(path)
 
 
 def test_scenes_follow_the_written_law():
@@ -146,7 +221,7 @@ def test_a_detector_lists_a_part_of_each_scene():
         Item("mugs", 1, 2, 2, "inside", "table"),
     )
     place = Place("den", "study", (Group("basics", 1, items),))
-    things = read_things(KNOWLEDGE / "things.csv")
+    things = shipped_things()
     shares = listed_shares([replace(things["table"], size=(0.5, 2.0, 0.7))])
     assert shares["table"] == pytest.approx(1 - 0.7 * math.exp(-5))
     scenes = written_scenes([place], shares, 4000, seed=3)
@@ -186,7 +261,7 @@ def test_things_stand_where_the_table_says():
 
 
 def test_a_seed_gives_the_same_scenes():
-    places = read_places(KNOWLEDGE / "inventories.csv")[:3]
+    places = read_inventory(KNOWLEDGE / "inventories.csv").places[:3]
     assert written_scenes(places, {}, 2, seed=1) == written_scenes(places, {}, 2, seed=1)
     assert written_scenes(places, {}, 2, seed=1) != written_scenes(places, {}, 2, seed=2)
 
@@ -243,7 +318,10 @@ def test_a_long_loop_of_parents_is_found(tmp_path):
 
 
 def test_the_shipped_tables_are_valid():
-    places = read_places(KNOWLEDGE / "inventories.csv")
+    inventory = read_inventory(KNOWLEDGE / "inventories.csv")
+    places = inventory.places
+    assert inventory.things == shipped_things()
+    assert not inventory.left_out
     assert len(places) == 265
     assert sum(1 for place in places for _ in place.items) == 32_680
-    assert len(read_things(KNOWLEDGE / "things.csv")) == 1_859
+    assert len(shipped_things()) == 1_859

@@ -110,7 +110,7 @@ def test_a_stable_split_has_its_shares_and_moves_no_group_as_the_data_grow() -> 
     shared = set(fewer) & set(found)
     assert len(shared) > 900
     assert all(fewer[scene] == found[scene] for scene in shared)
-    assert all(found[scene.scene_id] == stable_part(scene.group, 3) for scene in scenes)
+    assert all(found[scene.scene_id] == stable_part(scene, 3) for scene in scenes)
     assert found != parts_of(scenes, seed=4, protocol="stable")
 
 

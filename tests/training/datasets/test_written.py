@@ -6,8 +6,7 @@ import pytest
 
 from app.scene import label_key
 from training.datasets.files import KNOWLEDGE
-from training.datasets.inventories import read_places
-from training.datasets.things import read_things
+from training.datasets.inventories import read_inventory, shipped_things
 from training.datasets.vocabulary import indoor_vocabulary
 from training.datasets.written import LEAST_PLACES, written_vocabulary
 
@@ -34,11 +33,11 @@ def test_common_things_and_indoor_classes_are_classes(vocabulary):
         map(label_key, vocabulary.labels)
     )
     expected = Counter()
-    for place in read_places(KNOWLEDGE / "inventories.csv"):
+    for place in read_inventory(KNOWLEDGE / "inventories.csv").places:
         for group, item in place.items:
             expected[item.label] += group.share * item.share
     indoor = set(indoor_vocabulary().labels)
-    things = [label for label in read_things(KNOWLEDGE / "things.csv") if label not in indoor][::40]
+    things = [label for label in shipped_things() if label not in indoor][::40]
     assert len(things) > 20
     for label in things:
         assert (label in vocabulary.labels) == (expected[label] >= LEAST_PLACES), label
@@ -70,7 +69,7 @@ def test_no_word_of_the_indoor_vocabulary_is_lost(vocabulary):
     """A name moves to another class only where that class is written to have it."""
     other = {
         label_key(name): thing
-        for thing in read_things(KNOWLEDGE / "things.csv").values()
+        for thing in shipped_things().values()
         for name in (thing.label, *thing.other_names)
     }
     moved = 0
@@ -96,7 +95,7 @@ def test_every_class_has_a_size_and_rooms_have_types(vocabulary):
 
 def test_few_room_types_of_written_places_are_folded(vocabulary):
     """A folded type has the things of the other one."""
-    names = {place.room_type for place in read_places(KNOWLEDGE / "inventories.csv")}
+    names = {place.room_type for place in read_inventory(KNOWLEDGE / "inventories.csv").places}
     folded = {name: room_type(vocabulary, name) for name in names - {*vocabulary.room_types}}
     assert folded == {"lounge": "living room", "lobby": "reception"}
 

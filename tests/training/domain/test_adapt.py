@@ -15,7 +15,10 @@ from app.scene.relations import ON_TOP
 from tests.registry.small_artifacts import rewrite_manifest
 from tests.training.commands import invoke
 from tests.training.domain.homes import home_scenes, write
-from training.domain.home import alarms_of
+from training.datasets.inventories import read_inventory
+from training.datasets.jsonl import scan_jsonl
+from training.domain.adaptation import FEWEST, adapted
+from training.domain.home import Home, alarms_of
 from training.evaluation.asking import score_misplaced
 
 INTRUDER = ["toilet", "bed", "nightstand", "pillow", "wardrobe", "lamp", "curtain"]
@@ -152,6 +155,48 @@ def test_a_later_file_confirms_a_scene(store, tmp_path):
     corrected = write([scene | {"confirmed": True} for scene in scenes], tmp_path / "scenes.jsonl")
     said = adapt(store, recorded, corrected)
     assert "2 recorded scenes; 1 distinct scenes, 1 of these confirmed" in said
+
+
+def test_a_written_room_is_one_confirmed_scene(store, tmp_path):
+    """A thing of a small share is excused too, but teaches nothing. Placeholders are no classes."""
+    rows = [*(f"bedroom,{label}," for label in INTRUDER[1:]), "bedroom,toilet,.2"]
+    rows += ["bedroom,object_7,", "hall,stairlift,"]
+    path = tmp_path / "places.csv"
+    path.write_text("\n".join(["room_type,label,share", *rows]))
+    assert alarms(default(store), INTRUDER, "bedroom") == ["toilet"]
+    said = adapt(store, path)
+    assert "0 recorded scenes; 0 distinct scenes, 0 of these confirmed" in said
+    assert "2 written places, each as one confirmed scene" in said
+    assert "left out, because they name no kind of object: object_7 (1)" in said
+    assert "the weights stay: fewer than 20 distinct recorded scenes" in said
+    assert "never reported from now on: toilet (1)" in said
+    assert alarms(home(store), INTRUDER, "bedroom") == []
+    assert home(store).vocabulary.index("stairlift") is not None
+    source = home(store).manifest.data[-1]
+    assert (source.source, source.scenes, source.written) == ("home, written", 2, True)
+
+    bedroom = Home.of(default(store), [], read_inventory(path).places).scenes[0]
+    labels = default(store).vocabulary.labels
+    assert [labels[c] for c in bedroom.left_out] == ["toilet"]
+    path.write_text("room_type,label,share\nhall,coat,often\n")
+    assert "places.csv, line 2, column share: must be a number" in adapt(store, path, code=1)
+
+
+def test_written_rooms_never_count_towards_the_scenes_of_a_home(store, tmp_path):
+    """They are in no fold that measures the gain, but every fit learns them."""
+    scenes = [*scan_jsonl(write(home_scenes(19, 7), tmp_path / "scenes.jsonl"))]
+    rows = [f"room {n},{label}" for n in range(30) for label in ("bed", "lamp", f"box {n}")]
+    (tmp_path / "places.csv").write_text("\n".join(["room_type,label", *rows]))
+    places = read_inventory(tmp_path / "places.csv").places
+    with_places = Home.of(default(store), scenes, places)
+    recorded = Home.of(default(store), scenes)
+    assert len(with_places.scenes) == len(recorded.scenes) + 30
+    assert with_places.measurable.tolist() == recorded.measurable.tolist()
+    assert len(with_places.measurable) < FEWEST
+    assert with_places.confirmed == recorded.confirmed
+    first = len(recorded.scenes)
+    assert with_places.written.tolist() == list(range(first, first + 30))
+    assert adapted(with_places).measured is None
 
 
 def test_words_that_the_model_cannot_read_become_classes(store, tmp_path):

@@ -105,7 +105,7 @@ def test_after_a_change_of_the_data_only_a_stable_split_is_certain(protocol, sou
     learnt = LEARNT if len(sources) > 1 else {"rooms": "0" * 64}
     before = candidate("before", learnt, split=protocol, sources=sources)
     scenes, notes = held_out(candidate("now", split="stable"), before, SCENES)
-    assert {stable_part(scene.group, 0) for scene in scenes} == {"test"}
+    assert {stable_part(scene, 0) for scene in scenes} == {"test"}
     uncertain = any("may have learnt from these" in note for note in notes)
     assert uncertain == (protocol == "group")
 

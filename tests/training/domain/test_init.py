@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,12 +14,17 @@ from tests.training.scenes import scene
 from training.datasets import generate_rooms
 from training.datasets.jsonl import write_jsonl
 from training.datasets.rooms import DOMAINS
+from training.domain.material import Material
 from training.domain.proposal import propose
 from training.fit.configuration import ConfigError
 from training.runs.config_files import data_folder, load_config
 from training.runs.pipeline import prepare
 
 SCENES = generate_rooms(80, 0, DOMAINS["workplaces"])
+
+
+def of_scenes(scenes: list) -> Material:
+    return Material((tuple(scenes),), {}, Counter())
 
 
 def init(*files: Path, folder: Path, code: int = 0, name: str = "lab", options=()) -> str:
@@ -191,17 +197,17 @@ def test_each_invalid_line_is_named_up_to_a_bound(tmp_path) -> None:
     path = tmp_path / "scenes.jsonl"
     path.write_text("\n".join([*map(json.dumps, lines), "{", *["[]"] * 30]))
     output = init(path, folder=tmp_path / "lab", code=1)
-    assert "34 lines are not scenes" in output
+    assert "scenes.jsonl has 34 errors; nothing was written" in output
     for line, reason in (
         (4, "objects.0.label: Field required"), (5, "names an object that is not in the scene"),
-        (6, "is on line 1 already"), (7, "Invalid JSON"), (23, ""),
+        (6, "is on line 1 already"), (7, "Invalid JSON"), (35, ""),
     ):  # fmt: skip
         assert reason in output.split(f"line {line}: ")[1]
-    assert "line 24" not in output
-    assert "and 14 more" in output
+    assert "line 36" not in output
+    assert "and 2 more" in output
     assert not (tmp_path / "lab").exists()
     path.write_text("[]")
-    assert "1 line is not a scene;" in init(path, folder=tmp_path / "lab", code=1)
+    assert f"error: {path}, line 1: " in init(path, folder=tmp_path / "lab", code=1)
 
 
 @pytest.mark.parametrize(
@@ -239,7 +245,7 @@ def test_many_scenes_get_a_larger_machine(copies, states) -> None:
         for room in SCENES
         for k in range(copies)
     ]
-    proposal = propose("lab", rooms, ["scenes.jsonl"])
+    proposal = propose("lab", of_scenes(rooms), ["scenes.jsonl"])
     config, n = proposal.config, proposal.parts["train"]
     assert config.machine.variant == "triway"
     assert (config.machine.states, config.machine.coupled) == (states, False)
@@ -254,13 +260,13 @@ def test_without_relations_and_positions_the_variant_is_rbm() -> None:
         replace(room, objects=tuple(replace(thing, **bare) for thing in room.objects))
         for room in SCENES
     ]
-    assert propose("lab", rooms, ["scenes.jsonl"]).config.machine.variant == "rbm"
+    assert propose("lab", of_scenes(rooms), ["scenes.jsonl"]).config.machine.variant == "rbm"
 
 
 def test_a_rare_label_is_no_class() -> None:
     scenes = [scene(f"s{k}", "workbench", "multimeter", "vice") for k in range(60)]
     scenes.append(scene("rare", "unicorn", "workbench"))
-    proposal = propose("lab", scenes, ["scenes.jsonl"])
+    proposal = propose("lab", of_scenes(scenes), ["scenes.jsonl"])
     assert (proposal.minimum, len(proposal.vocabulary)) == (8, 3)
     assert [label.name for label in proposal.dropped] == ["unicorn"]
 
@@ -272,7 +278,7 @@ def test_a_class_has_the_name_of_most_of_its_objects() -> None:
         labels = [label.replace("_", " ") for label, n in counts.items() for _ in range(n)]
         labels += ["fork"] * 40
         scenes = [scene(str(k), x, "cup", "spoon", "plate") for k, x in enumerate(labels)]
-        vocabulary = propose("lab", scenes, ["scenes.jsonl"]).vocabulary
+        vocabulary = propose("lab", of_scenes(scenes), ["scenes.jsonl"]).vocabulary
         return vocabulary.labels[vocabulary.index(labels[0])]
 
     assert name(waste_bins=12, garbage_bin=9) == "waste bin"
@@ -282,7 +288,7 @@ def test_a_class_has_the_name_of_most_of_its_objects() -> None:
 
 def test_kinds_have_the_most_frequent_name_of_their_class_as_parent() -> None:
     scenes = [scene(f"s{k}", "cutlery", "spoon", "plate") for k in range(40)]
-    vocabulary = propose("lab", scenes, ["scenes.jsonl"]).vocabulary
+    vocabulary = propose("lab", of_scenes(scenes), ["scenes.jsonl"]).vocabulary
     cutlery = vocabulary.labels.index("cutlery")
     assert vocabulary.index("utensil") == cutlery
     assert vocabulary.parents[vocabulary.index("spoon")] == cutlery

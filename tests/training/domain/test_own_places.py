@@ -1,0 +1,199 @@
+"""`init` on written inventories: alone, together with scenes, and from the file to answers."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app import questions
+from app.registry import Artifact, Store
+from app.scene import Scene, SceneObject
+from tests.training.commands import invoke
+from tests.training.scenes import scene
+from training.datasets import generate_rooms
+from training.datasets.inventories import read_inventory
+from training.datasets.jsonl import write_jsonl
+from training.datasets.rooms import DOMAINS
+from training.domain.home import Home
+from training.domain.material import read_material
+from training.fit.count_statistics import fit_counts
+from training.fit.objects import ObjectScenes
+from training.runs.config_files import data_folder, load_config
+from training.runs.pipeline import SplitScenes, prepare
+from training.runs.publish import data_sources
+
+HEAD = "room_type,label,relation,anchor"
+
+
+def init(*files: Path, folder: Path, code: int = 0, options=()) -> str:
+    return invoke("init", "ward", *files, "--output", folder, *options, code=code)
+
+
+def material_of(folder: Path) -> SplitScenes:
+    config = load_config(str(folder))
+    return prepare(config, data_folder(str(folder), config))
+
+
+@pytest.fixture
+def ward(repository) -> Path:
+    """The example of the page: 63 rows of five places."""
+    return repository / "examples" / "ward.csv"
+
+
+def test_an_inventory_alone_makes_a_proposal(ward, tmp_path) -> None:
+    folder = tmp_path / "ward"
+    output = init(ward, folder=folder, options=("--terms", "ours"))
+    config = load_config(str(folder))
+    each = config.data.written
+    assert f"5 written places, of which training draws {each} scenes each; 0 seen" in output
+    assert "warning" not in output
+    assert "no contradictions found" in output
+    assert f"python -m training train {folder} --publish 1.0.0 --store my-store" in output
+    scenes = material_of(folder)
+    assert scenes.counts == {"ward.csv": 5 * each}
+    # Every place is in every part, and every written thing is a class.
+    for part in scenes.parts.values():
+        assert len({one.group for one in part}) == 5
+        assert all(one.room_type >= 0 for one in part)
+        assert not any(one.unknown for one in part)
+    written = {item.label for place in read_inventory(ward).places for _, item in place.items}
+    assert all(scenes.vocabulary.index(label) is not None for label in written)
+    assert np.isfinite(scenes.vocabulary.sizes[scenes.vocabulary.index("hospital bed")]).all()
+    assert fit_counts(scenes.parts["train"], scenes.vocabulary) is None, "numbers are judgements"
+    (source,) = data_sources(scenes, learnt(scenes))
+    assert (source.source, source.written, source.share, source.terms) == (
+        *("ward.csv", True, 1.0, "ours"),
+    )
+
+
+def learnt(scenes: SplitScenes) -> ObjectScenes:
+    data, config = scenes.training_data(), load_config("places-triway").objects
+    own = config.model_copy(update={"source_weights": {}, "open_sources": ()})
+    return ObjectScenes.of(data.train, data.structure, own)
+
+
+def test_an_inventory_joins_scenes(ward, tmp_path) -> None:
+    """The card says which share was written. Ten seen scenes are enough beside an inventory."""
+    rooms = [scene(f"s{k}", "hospital bed", "robot", f"object_{k}", room="ward") for k in range(10)]
+    write_jsonl(rooms, tmp_path / "seen.jsonl")
+    output = init(tmp_path / "seen.jsonl", ward, folder=tmp_path / "ward")
+    assert "10 seen scenes" in output
+    assert "left out, because they name no kind of object: object_0 (1), object_1 (1)" in output
+    scenes = material_of(tmp_path / "ward")
+    each = load_config(str(tmp_path / "ward")).data.written
+    assert scenes.counts == {"seen": 10, "ward.csv": 5 * each}
+    assert "robot" in scenes.vocabulary.labels
+    assert not any(label.startswith("object") for label in scenes.vocabulary.labels)
+    shares = {source.source: source for source in data_sources(scenes, learnt(scenes))}
+    assert (shares["seen"].written, shares["ward.csv"].written) == (False, True)
+    assert shares["seen"].share + shares["ward.csv"].share == pytest.approx(1, abs=1e-3)
+
+
+def test_as_many_written_scenes_are_drawn_as_seen_ones(tmp_path) -> None:
+    write_jsonl(generate_rooms(900, 0, DOMAINS["workplaces"]), tmp_path / "seen.jsonl")
+    rows = ["hall,coat,,", "hall,shoe,,", "hall,bag,,", "shed,rake,,"]
+    (tmp_path / "two.csv").write_text("\n".join([HEAD, *rows]))
+    init(tmp_path / "seen.jsonl", tmp_path / "two.csv", folder=tmp_path / "ward")
+    assert load_config(str(tmp_path / "ward")).data.written == 450
+
+
+def test_errors_are_listed_and_nothing_is_written(tmp_path) -> None:
+    rows = ["hall,coat,beside,", "hall,,,", "hall,cup,on-top,table", "hall,pen,,desk", "hall,a"]
+    path = tmp_path / "places.csv"
+    path.write_text("\n".join([HEAD, *rows]))
+    output = init(path, folder=tmp_path / "ward", code=1)
+    assert "places.csv has 5 errors; nothing was written" in output
+    for where, problem in (
+        ("line 2, column relation", "must be one of on-top, inside, under, above, floor, wall"),
+        ("line 3, column label", "is empty"),
+        ("line 5, column anchor", "must be empty, because the relation is empty"),
+        ("line 6", "the row has 2 values, not 4"),
+        ("line 4, column anchor", "the place 'hall' has no row with the label 'table'"),
+    ):
+        assert f"places.csv, {where}: {problem}" in output
+    assert not (tmp_path / "ward").exists()
+    path.write_text("room_type,label\nhall,object_7\n")
+    assert "has no rows" in init(path, folder=tmp_path / "ward", code=1)
+    path.write_text("scene,label\nhall,cup\n")
+    assert "must name the columns room_type" in init(path, folder=tmp_path / "ward", code=1)
+    path.write_text(f"{HEAD}\nhall,cup,,\n")
+    (tmp_path / "things.csv").write_text("label\n")
+    assert "things.csv, line 1: must name" in init(path, folder=tmp_path / "ward", code=1)
+    (tmp_path / "again").mkdir()
+    (tmp_path / "things.csv").unlink()
+    (again := tmp_path / "again" / "places.csv").write_text(path.read_text())
+    assert "two sources are called places.csv" in init(path, again, folder=tmp_path / "w", code=1)
+
+
+def test_an_update_adds_an_inventory_to_scenes(tmp_path) -> None:
+    write_jsonl(generate_rooms(80, 0, DOMAINS["workplaces"]), tmp_path / "seen.jsonl")
+    init(tmp_path / "seen.jsonl", folder=tmp_path / "ward")
+    before = load_config(str(tmp_path / "ward"))
+    (tmp_path / "new.csv").write_text("room_type,label\nattic,trunk\nattic,rocking horse\n")
+    output = init(tmp_path / "new.csv", folder=tmp_path / "ward", options=["--update"])
+    assert "new room types: attic new sources: ../new.csv" in output
+    config = load_config(str(tmp_path / "ward"))
+    assert config.data.sources == ("../seen.jsonl", "../new.csv")
+    assert config.objects == before.objects
+    scenes = material_of(tmp_path / "ward")
+    assert scenes.counts == {"seen": 80, "new.csv": config.data.written}
+    assert {"trunk", "rocking horse"} <= set(scenes.vocabulary.labels)
+    values = json.loads((tmp_path / "ward" / "vocabulary.json").read_text())
+    assert "attic" in values["room_types"]
+    again = init(tmp_path / "new.csv", folder=tmp_path / "ward", options=["--update"])
+    assert "no new classes" in again
+
+
+def test_junk_labels_become_no_classes(tmp_path, repository) -> None:
+    """A quarter of the labels of the recordings are placeholders. The others are read."""
+    junk = ["REMOVE", "SPLIT", "unknown", "Undefined", "object_7", "n03001627", "/m/01mzpv"]
+    named = ["sofa.n.01", "couch_v2", "chair_12", "objects/bed_a1b2", "kitchen::table_1::link"]
+    rooms = [scene(f"s{k}", *named, junk[k % 7], "BACKGROUND", "ground_plane") for k in range(40)]
+    write_jsonl(rooms, path := tmp_path / "scenes.jsonl")
+    output = init(path, folder=tmp_path / "ward")
+    assert "BACKGROUND (40), ground_plane (40), REMOVE (6)" in output
+    scenes = material_of(tmp_path / "ward")
+    assert len(scenes.vocabulary) == 4, "a couch is a sofa"
+    for name in ("sofa", "couch", "chair", "bed", "table"):
+        assert scenes.vocabulary.index(name) is not None
+    store = Store(repository / "model_store")
+    recorded = read_material([path], recorded=True)
+    assert Home.of(store.load(*store.resolve("default")), recorded.scenes).new_classes == ()
+    assert recorded.left_out["/m/01mzpv"] == 5
+
+
+@pytest.mark.slow
+def test_from_the_table_to_answers(ward, tmp_path) -> None:
+    folder, store = tmp_path / "ward", Store(tmp_path / "store")
+    init(ward, folder=folder)
+    runs = ("--runs", tmp_path / "runs", "--store", store.root)
+    said = invoke("train", folder, "--publish", "1.0.0", *runs)
+    assert "published ward@1.0.0" in said
+    model = store.load("ward", "1.0.0")
+    assert "Scenes drawn from written places have 100.0 %" in " ".join(model.card.split())
+    assert model.calibration.outlier_lines is not None
+    words = model.vocabulary
+    places = read_inventory(ward).places
+    things = {place.name: {x.label for _, x in place.items} for place in places}
+    asked = {
+        "patient room": ["hospital bed", "pillow", "IV stand", "bedside cabinet", "visitor chair"],
+        "nurse station": ["desk", "computer", "telephone", "folder", "whiteboard"],
+        "patient bathroom": ["toilet", "mirror", "towel", "soap dispenser", "grab bar"],
+    }
+    for place, labels in asked.items():
+        answer = questions.missing(model, of(model, labels), top_k=5)
+        own = {words.labels[index] for x in things[place] if (index := words.index(x)) is not None}
+        assert {entry["label"] for entry in answer["missing"]} <= own
+    intruded = questions.outliers(model, of(model, [*asked["patient room"], "toilet"]))
+    assert [x["object"] for x in intruded["outliers"] if x["is_outlier"]] == ["toilet"]
+    rooms = questions.rooms(model, of(model, ["toilet", "mirror"]))["room_types"]
+    assert rooms[0]["room_type"] == "bathroom"
+    room = words.room_index("nurse station")
+    generated = questions.generate(model, Scene((), room_type=room), seed=1)["scenes"][0]
+    assert len(generated["objects"]) > 2
+
+
+def of(model: Artifact, labels: list[str]) -> Scene:
+    words = model.vocabulary
+    return Scene(tuple(SceneObject(x, x, words.index(x)) for x in labels))

@@ -1,0 +1,104 @@
+"""What a user gives to `init` and `adapt`: files of scenes, and written inventories."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from training.datasets import AnnotatedScene, DatasetError
+from training.datasets.inventories import Inventory, Place, read_inventory, shipped_things
+from training.datasets.jsonl import scan_jsonl
+from training.datasets.placeholders import plain_scenes
+from training.datasets.readers import guess_format, read_scenes
+from training.datasets.records import InvalidLinesError
+from training.datasets.sources import is_inventory
+from training.datasets.things import Thing
+from training.fit.configuration import ConfigError, source_name
+
+
+@dataclass(frozen=True)
+class Material:
+    """The content of files.
+
+    Attributes:
+        files: the scenes of each file of scenes, with plain labels.
+        inventories: the inventories by the name of their data source.
+        left_out: labels that name no kind of object, and how often each occurs.
+    """
+
+    files: tuple[tuple[AnnotatedScene, ...], ...]
+    inventories: Mapping[str, Inventory]
+    left_out: Counter[str]
+
+    @property
+    def scenes(self) -> list[AnnotatedScene]:
+        """The scenes of all files of scenes."""
+        return [scene for file in self.files for scene in file]
+
+    @property
+    def places(self) -> list[Place]:
+        """The written places."""
+        return [place for inventory in self.inventories.values() for place in inventory.places]
+
+    @property
+    def things(self) -> list[str]:
+        """The labels of all written things."""
+        return [item.label for place in self.places for _, item in place.items]
+
+    @property
+    def descriptions(self) -> Mapping[str, Thing]:
+        """The described things by label: of the tables beside the inventories, then the shipped."""
+        found: dict[str, Thing] = {}
+        own = (inventory.things for inventory in self.inventories.values())
+        for things in (*own, shipped_things()):
+            for label, thing in things.items():
+                found.setdefault(label, thing)
+        return found
+
+    def drawn(self, each: int) -> list[AnnotatedScene]:
+        """Draw a number of scenes of each written place. Training draws others, of the same law."""
+        return [
+            replace(scene, source=name)
+            for name, inventory in self.inventories.items()
+            for scene in inventory.scenes(each, seed=0)
+        ]
+
+
+def read_material(paths: Iterable[Path], *, recorded: bool = False) -> Material:
+    """Read files of scenes and inventories.
+
+    Args:
+        recorded: True if every file of scenes is JSONL, whatever its name.
+
+    Raises:
+        DatasetError: a file cannot be read, or has no scene.
+        InvalidLinesError: lines of a file are invalid.
+        ConfigError: two inventories have the same name.
+    """
+    files, inventories, left_out = [], dict[str, Inventory](), Counter[str]()
+    for path in paths:
+        if is_inventory(path.name):
+            if (name := source_name(path.name)) in inventories:
+                raise ConfigError(f"two sources are called {name}: rename a file")
+            inventories[name] = inventory = read_inventory(path)
+            left_out.update(inventory.left_out)
+        else:
+            scenes, empty = plain_scenes(_read_scenes(path, recorded))
+            files.append(tuple(scenes))
+            left_out.update(empty)
+    return Material(tuple(files), inventories, left_out)
+
+
+def _read_scenes(path: Path, recorded: bool) -> list[AnnotatedScene]:
+    is_jsonl = recorded or guess_format(path) == "jsonl"
+    lines = list(scan_jsonl(path) if is_jsonl else read_scenes(path))
+    errors = [line for line in lines if isinstance(line, DatasetError)]
+    if len(errors) > 1:
+        raise InvalidLinesError(path, errors, len(errors))
+    if errors:
+        raise errors[0]
+    if not lines:
+        raise DatasetError(path, "", "the file contains no scene")
+    return [line for line in lines if isinstance(line, AnnotatedScene)]
