@@ -54,6 +54,8 @@ def new_labels(request: SceneRequest, vocabulary: Vocabulary) -> int:
     new = sum(not vocabulary.remembers(label, searches) for label in labels)
     is_room = isinstance(request, RoomsRequest)
     candidates: Sequence[str] = getattr(request, "candidates", None) or ()
+    if is_room:
+        searches = tuple(search for search in searches if search != "meaning")
     new += sum(not vocabulary.remembers(label, searches, is_room=is_room) for label in candidates)
     return new * (MAX_SUGGESTED if "meaning" in searches else 1)
 

@@ -8,7 +8,8 @@ rows of the known classes predict the row of a word, by kernel ridge regression 
 
 x are the word vectors without their mean over the classes, scaled to length 1. The regression
 shrinks the rows, and the stretch s of W undoes that. The couplings of a word to other classes are
-0, because predicted couplings did not improve the answers.
+0, and its base rate is the same in all data sources, because predicted ones did not improve the
+answers.
 
 The relations of a word and its places are those of its nearest class (`Vocabulary.stand_in`).
 docs/decisions/words.md has the measurements.
@@ -30,7 +31,7 @@ _STRETCH: Final = {"W": 1.7}  # s of each array, 1 by default
 
 # Predicted arrays. An array has one row for each class, or else one column.
 _ROWS: Final = ("W",)
-_COLUMNS: Final = ("b", "a", "u", "kappa", "Y")
+_COLUMNS: Final = ("b", "kappa", "Y")
 
 Floats = NDArray[np.float32]
 

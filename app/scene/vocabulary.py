@@ -303,13 +303,13 @@ class Vocabulary:
         pairs = list(readings(label))
         alternatives = [name for rule, name in pairs if rule == "alternative"]
         for text in alternatives[:_MOST_GUESSED] or [name for _, name in pairs][-1:] or [label]:
-            vector = word_vectors().of(text)
-            vectors, known = self.vectors
+            name = " ".join(split_words(text))
+            vector, (vectors, known) = word_vectors().of(name), self.vectors
             if vector is not None and known.any():
                 cosines = np.where(known, vectors @ vector, -1.0)
                 nearest = int(cosines.argmax())
                 similarity = round(min(max(float(cosines[nearest]), 0.0), 1.0), 3)
-                return Word(" ".join(split_words(text)), vector, nearest, similarity)
+                return Word(name, vector, nearest, similarity)
         return None
 
     def with_words(self, words: Sequence[Word]) -> "Vocabulary":

@@ -58,7 +58,7 @@ class WordVectors:
 
     @cached_property
     def _rows(self) -> dict[str, int]:
-        rows = self.vectors.any(axis=1).nonzero()[0].tolist()
+        rows = np.flatnonzero(self.vectors.any(axis=1)).tolist()
         return {self.words[row]: row for row in rows}
 
 

@@ -11,6 +11,9 @@ without it. The command measures the mean AUC over the classes of these scores:
 - trained: the log-odds of the class in the model,
 - list length: the number of listed classes.
 
+It also measures the MRR of the hidden classes in lists that show a left-out class: with the word,
+with its nearest class instead, with the trained class, and without it.
+
 By default, the map of the predicted weights does not see the rows of the left-out classes, but the
 training of the other rows did. With `--train`, a model without these classes is trained for each
 part.
@@ -22,6 +25,7 @@ import csv
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -35,13 +39,13 @@ from app.registry import DEFAULT_STORE, Artifact, Store
 from app.registry.meaning import RowMap
 from app.scene import Vocabulary
 from app.scene.vocabulary import Word
-from app.scene.words import word_vectors
+from app.scene.words import Vectors, word_vectors
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.cases import scene_rng
 from training.datasets.files import DATA, write_whole
 from training.domain.init_command import StorePath
-from training.evaluation.metrics import Figure, Ratio, paired_difference
+from training.evaluation.metrics import Ratio, paired_difference
 from training.fit.configuration import Config, ConfigError
 from training.fit.draft import draft_artifact
 from training.fit.trainer import Trainer
@@ -61,7 +65,9 @@ LEFT_OUT: Final = Path(__file__).with_name("words.csv")
 
 _LISTS: Final = 3  # lists of each scene
 _LEAST: Final = 3  # least number of classes of a scene
+_SHOWN: Final = 20  # most lists with a class, of which the MRR is measured
 METHODS: Final = ("predicted", "nearest class", "trained", "list length")
+EVIDENCE: Final = ("predicted", "nearest class", "trained", "left out")
 
 
 @dataclass(frozen=True)
@@ -105,6 +111,23 @@ class Lists:
             values.append((ranks.sum() - n * (n + 1) / 2) / (n * (int(used.sum()) - n)))
         return np.array(values)
 
+    def mrr(self, scores: Floats, rows: Ints, classes: Ints) -> float:
+        """Return the mean reciprocal rank of the classes that some lists hide, NaN without any.
+
+        Other hidden classes do not count as errors.
+
+        Args:
+            scores: (rows, classes) scores of the candidates.
+            rows: indices of the lists.
+            classes: indices of the candidates.
+        """
+        ranks: list[float] = []
+        for row, values in zip(rows, scores, strict=True):
+            hides, shows = self.hides[row, classes], self.shows[row, classes]
+            others = values[~hides & ~shows]
+            ranks += [1 / (1 + int((others > value).sum())) for value in values[hides]]
+        return float(np.mean(ranks)) if ranks else float("nan")
+
 
 def words(
     model: Annotated[str, typer.Argument(help="NAME or NAME@VERSION in the store")] = "default",
@@ -134,25 +157,38 @@ def words(
         parts = prepare(settings, root, artifact.vocabulary).parts
         scenes = [s for name in ("validation", "test") for s in parts[name] if s.source in REAL]
         lists = Lists.draw(scenes, artifact.vocabulary)
-        labels, auc = [], {name: np.zeros(0) for name in METHODS}
+        labels: list[str] = []
+        auc: dict[str, list[float]] = {}
+        mrr: dict[str, list[float]] = {}
         for left_out in read_parts(LEFT_OUT, artifact.vocabulary):
             reader = _trained_without(left_out, artifact, settings, root) if train else artifact
             labels += [artifact.vocabulary.labels[index] for index in left_out.tolist()]
             vectors = vectors_of(artifact.vocabulary, left_out, aliases=aliases)
-            for name, values in measure(artifact, reader, lists, left_out, vectors).items():
-                auc[name] = np.append(auc[name], values)
+            for total, part in zip(
+                (auc, mrr), measure(artifact, reader, lists, left_out, vectors), strict=True
+            ):
+                for name, values in part.items():
+                    total.setdefault(name, []).extend(values)
         folder.mkdir(parents=True, exist_ok=True)
-        rows = {label: {name: auc[name][k] for name in METHODS} for k, label in enumerate(labels)}
-        write_whole(folder / "results.json", json.dumps(rows, indent=1))
-        for line in summary(auc, len(scenes), len(lists.listed)):
-            console.print(line, highlight=False)
+        results = {"classes": labels, "auc": auc, "mrr": mrr}
+        write_whole(folder / "results.json", json.dumps(results, indent=1))
+        count = len(lists.listed)
+        console.print(f"{len(labels)} classes, {count // _LISTS} scenes, {count} lists")
+        for title, table in (("AUC", auc), ("MRR of hidden classes", mrr)):
+            for line in summary(title, table):
+                console.print(line, highlight=False)
 
 
-def summary(auc: dict[str, Floats], scenes: int, lists: int) -> list[str]:
-    """Return the mean AUC of each method with its interval over the classes, as lines."""
-    means = {name: Ratio.of_scenes(values) for name, values in auc.items()}
-    lead: Figure = paired_difference(means["predicted"], means["nearest class"])
-    lines = [f"{len(auc['trained'])} classes, {scenes} scenes, {lists} lists; mean AUC:"]
+def summary(title: str, values: dict[str, list[float]]) -> list[str]:
+    """Return the mean of each method with its interval over the classes, as lines.
+
+    NaN is the value of a class without lists.
+    """
+    table = {name: np.array(column) for name, column in values.items()}
+    known = np.isfinite(table["predicted"])
+    means = {name: Ratio.of_scenes(column[known]) for name, column in table.items()}
+    lead = paired_difference(means["predicted"], means["nearest class"])
+    lines = [f"{title}, mean over {int(known.sum())} classes:"]
     lines += [f"  {name:24} {mean.figure()}" for name, mean in means.items()]
     return [*lines, f"  {'predicted - nearest class':24} {lead}"]
 
@@ -174,9 +210,9 @@ def read_parts(path: Path, vocabulary: Vocabulary) -> list[Ints]:
 
 
 def measure(
-    artifact: Artifact, reader: Artifact, lists: Lists, left_out: Ints, vectors: Floats
-) -> dict[str, Floats]:
-    """Return the AUC of the left-out classes for each of the `METHODS`, (n,) each.
+    artifact: Artifact, reader: Artifact, lists: Lists, left_out: Ints, vectors: Vectors
+) -> tuple[dict[str, list[float]], dict[str, list[float]]]:
+    """Return the AUC of each left-out class by `METHODS`, and the MRR by `EVIDENCE`.
 
     Args:
         artifact: model with all classes.
@@ -184,26 +220,42 @@ def measure(
             these classes.
         vectors: (n, dimensions) word vectors of the left-out classes.
     """
-    vocabulary = reader.vocabulary
+    vocabulary, labels = reader.vocabulary, artifact.vocabulary.labels
     index_of = {label: index for index, label in enumerate(vocabulary.labels)}
-    own = np.array([index_of.get(label, -1) for label in artifact.vocabulary.labels])
+    own = np.array([index_of.get(label, -1) for label in labels])
     unseen = own[left_out][own[left_out] >= 0].tolist()
-    labels = [artifact.vocabulary.labels[index] for index in left_out.tolist()]
-    read = [_word(*word, vocabulary, unseen) for word in zip(labels, vectors, strict=True)]
-    row_map = RowMap.fit(reader.weights, vocabulary, unseen)
+    words = [labels[index] for index in left_out.tolist()]
+    read = [_word(*word, vocabulary, unseen) for word in zip(words, vectors, strict=True)]
+    weights = RowMap.fit(reader.weights, vocabulary, unseen).with_words(reader.weights, read)
     listed = [own[classes][own[classes] >= 0] for classes in lists.listed]
-    columns = np.array([*range(len(vocabulary), len(vocabulary) + len(read))])
+    columns = np.arange(len(vocabulary), len(vocabulary) + len(read))
     nearest = np.array([word.nearest for word in read])
-    weights = row_map.with_words(reader.weights, read)
     of_words = log_odds(weights, listed, np.concatenate([columns, nearest]))
     trained = log_odds(artifact.weights, lists.listed, left_out)
     length = np.repeat([[float(len(one))] for one in lists.listed], len(left_out), axis=1)
     n = len(left_out)
-    scores = dict(zip(METHODS, (of_words[:, :n], of_words[:, n:], trained, length), strict=True))
-    return {name: lists.auc(values, left_out) for name, values in scores.items()}
+    scores = (of_words[:, :n], of_words[:, n:], trained, length)
+    auc = [lists.auc(values, left_out).tolist() for values in scores]
+    things = np.flatnonzero(~artifact.vocabulary.structure & (own >= 0))
+    mrr: dict[str, list[float]] = {name: [] for name in EVIDENCE}
+    for k, index in enumerate(left_out.tolist()):
+        rows = np.flatnonzero(lists.shows[:, index])[:_SHOWN]
+        rest = [lists.listed[row][lists.listed[row] != index] for row in rows]
+        known = [own[classes][own[classes] >= 0] for classes in rest]
+        with_word, with_nearest = (
+            [np.union1d(classes, [one[k]]) for classes in known] for one in (columns, nearest)
+        )
+        for name, one, parts, targets in (
+            ("predicted", weights, with_word, own[things]),
+            ("nearest class", weights, with_nearest, own[things]),
+            ("trained", artifact.weights, [lists.listed[row] for row in rows], things),
+            ("left out", weights, known, own[things]),
+        ):
+            mrr[name].append(lists.mrr(log_odds(one, parts, targets), rows, things))
+    return dict(zip(METHODS, auc, strict=True)), mrr
 
 
-def vectors_of(vocabulary: Vocabulary, left_out: Ints, *, aliases: bool) -> Floats:
+def vectors_of(vocabulary: Vocabulary, left_out: Ints, *, aliases: bool) -> Vectors:
     """Return the word vectors of the labels of some classes, or of the labels and aliases.
 
     Raises:
@@ -218,7 +270,7 @@ def vectors_of(vocabulary: Vocabulary, left_out: Ints, *, aliases: bool) -> Floa
     return np.stack(vectors)
 
 
-def _word(label: str, vector: Floats, vocabulary: Vocabulary, unseen: Sequence[int]) -> Word:
+def _word(label: str, vector: Vectors, vocabulary: Vocabulary, unseen: Sequence[int]) -> Word:
     """Return a label as a word of its own, which no unseen class may explain."""
     vectors, known = vocabulary.vectors
     usable = known & ~vocabulary.structure
@@ -227,14 +279,20 @@ def _word(label: str, vector: Floats, vocabulary: Vocabulary, unseen: Sequence[i
     return Word(label, vector, int(cosines.argmax()), float(cosines.max()))
 
 
+@lru_cache(maxsize=4)
+def scorer_of(weights: Weights) -> ObjectScorer:
+    """Return the log-odds of a machine, prepared once."""
+    return ObjectScorer(weights)
+
+
 def log_odds(weights: Weights, listed: Sequence[Ints], columns: Ints) -> Floats:
     """Return the log-odds of some classes given each list, (lists, columns)."""
-    scorer, rows = ObjectScorer(weights), []
-    for classes in listed:
+    scorer, scores = scorer_of(weights), np.zeros((len(listed), len(columns)))
+    for row, classes in enumerate(listed):
         x = weights["c1"] + weights["W"][classes].sum(0)
         presence = np.ones(len(classes), np.float32)
-        rows.append(scorer.absent(x, classes, presence, None, coverage=0.5)[columns])
-    return np.array(rows)
+        scores[row] = scorer.absent(x, classes, presence, None, coverage=0.5)[columns]
+    return scores
 
 
 def _trained_without(left_out: Ints, artifact: Artifact, config: Config, root: Path) -> Artifact:

@@ -283,8 +283,8 @@ class SceneRequest(Request):
     leaves these objects out of the scene. `nearest` corrects misspelt words and reads phrases by
     their last words (see `mapped`); it refuses a label that could be several classes.
     `nearest-or-ignore` leaves such a label out. `by-meaning` reads it as a word whose weights the
-    model predicts from its word vector, and leaves out a label without a vector. All but `error` leave out an unknown room type, but `/generate`
-    always refuses it"""
+    model predicts from its word vector, and leaves out a label without a vector. All but `error`
+    leave out an unknown room type, but `/generate` always refuses it"""
 
     scene_id: Unused = None
     """id of a training scene. Without `frame_id` and `viewer_frame`, its positions are in the frame
