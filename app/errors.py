@@ -271,15 +271,16 @@ class UnknownLabelsError(RequestError, slug="unknown-labels", status=422, steps=
     GET /models/{name}/vocabulary lists every known label. With `unknown_labels` set to `ignore`,
     the service ignores unknown labels and lists them in `ignored`. With `nearest`, it maps misspelt
     labels and phrases to a class and lists them in `mapped`. It refuses a label that could be
-    several classes. With `nearest-or-ignore`, it ignores such a label. All three ignore an unknown
-    room type, but POST /generate always refuses it.
+    several classes. With `nearest-or-ignore`, it ignores such a label. With `by-meaning`, it
+    predicts the weights of the label from its word vector. All four ignore an unknown room type,
+    but POST /generate always refuses it.
     """
 
     example = _example("#/objects/1", "the model does not know this label", "nightstand")
     _hint = (
         " GET /models/{name}/vocabulary lists the known names. With `unknown_labels` set to "
         "`ignore`, the service leaves unknown names out, except the room type of POST /generate. "
-        "`nearest-or-ignore` corrects them first. "
+        "`nearest-or-ignore` corrects them first, and `by-meaning` reads them by word vectors. "
         "`python -m training adapt` adds the names of your home to a model. For a model of your "
         "own, add synonyms to vocabulary.json, or new classes with `init --update`."
     )

@@ -350,6 +350,31 @@ class SharedUnits(RelationUnits):
         return weight.reshape(-1, self._A)
 
 
+class StandIns(RelationUnits):
+    """The relation units of a model with further classes, in which known classes stand in for them.
+
+    Args:
+        weights: weights with the further classes.
+        units: relation units of the known classes.
+        stand_in: (V,) known class that stands in for each class.
+    """
+
+    def __init__(self, weights: Weights, units: RelationUnits, stand_in: Indices) -> None:
+        super().__init__(weights)
+        self._units, self._stand_in = units, stand_in
+
+    def normal(
+        self, means: Floats, ends: Ends, only: int | None = None, *, certain: bool = False
+    ) -> tuple[Floats, Floats]:
+        """See `RelationUnits`."""
+        i, j = self._stand_in[ends.i], self._stand_in[ends.j]
+        return self._units.normal(means, ends._replace(i=i, j=j), only, certain=certain)
+
+    def implication_weights(self, x: Floats, beta: float = 1.0) -> Floats:
+        """See `RelationUnits`."""
+        return self._units.implication_weights(x, beta)
+
+
 def relation_units(weights: Weights) -> RelationUnits:
     """Return the relation units of a machine."""
     return SharedUnits(weights) if weights.spec.kind.factorised else FreeUnits(weights)

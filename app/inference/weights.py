@@ -10,7 +10,7 @@ For Z = 2, p is sigmoid(x).
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -121,6 +121,16 @@ class Weights:
         """(N, H1) means of h1 given each stored scene, without its room type."""
         return state_means(self["c1"] + self.scenes @ self["W"], self.spec.states)
 
+    def enlarged(self, V: int, C: int) -> "Weights":
+        """Return the weights with further classes and room types at the end, whose weights are 0.
+
+        Args:
+            V, C: numbers of classes and room types.
+        """
+        spec = replace(self.spec, V=V, C=C)
+        arrays = {name: _padded(self[name], shape) for name, (_, shape) in layout(spec).items()}
+        return Weights(spec, arrays)
+
     def room_bias(self, room: int | None) -> NDArray[Any]:
         """Return the bias of h1 for a room type t, (H1,): c1 + Q[t].
 
@@ -175,6 +185,13 @@ class Weights:
         else:
             bias = bias + self["u"][-1]
         return bias, 0.0 if room is None or not self.spec.C else float(of_room[room])
+
+
+def _padded(array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """Return a copy of an array with zeros behind the end of its axes."""
+    padded = np.zeros(shape, array.dtype)
+    padded[tuple(slice(old) for old in array.shape)] = array
+    return padded
 
 
 def state_means(x: NDArray[Any], states: int) -> NDArray[Any]:

@@ -71,14 +71,14 @@ def more(
     """
     if artifact.counts is None:
         return []
-    plain = ~artifact.vocabulary.structure[listing.classes]
+    # Words without a class have no statistics; their classes follow those of the statistics.
+    size = artifact.vocabulary.known
+    plain = ~artifact.vocabulary.structure[listing.classes] & (listing.classes < size)
     classes, listed = listing.classes[plain], listing.counts[plain]
     usual, unlisted = artifact.calibration.coverage, 1.0
     if coverage is not None and coverage > usual:
         unlisted = (1 - coverage) / (1 - usual)
-    rows, p = distribution(
-        artifact.counts, artifact.spec.V, classes, listed, scene.room_type, unlisted
-    )
+    rows, p = distribution(artifact.counts, size, classes, listed, scene.room_type, unlisted)
     classes, listed = classes[rows], listed[rows]
     numbers, cumulative = np.arange(1, p.shape[1] + 1), p.cumsum(axis=1)
     p_more = 1 - cumulative[np.arange(len(p)), listed - 1]

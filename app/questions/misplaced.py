@@ -110,7 +110,7 @@ def entries_of(
         flipped: relations of the scene that the request states by their opposite.
     """
     row, A, places = posterior.present.row, artifact.spec.A, artifact.places
-    classes = posterior.present.classes[row]
+    classes = artifact.vocabulary.stand_in[posterior.present.classes][row]
     is_thing = (~artifact.vocabulary.structure[classes]).tolist()
     stated = [t for t in scene.relations or () if t[0] < A and is_thing[t[1]] and is_thing[t[2]]]
     if not stated and scene.poses is None:
@@ -190,7 +190,8 @@ def _stands(
     stands, zeros = np.full(len(present.row), UNKNOWN), np.zeros(len(present.row))
     if places is None:
         return stands, zeros, zeros
-    classes = present.classes[present.row]
+    listed = artifact.vocabulary.stand_in[present.classes]
+    classes = listed[present.row]
     shares = places.stands[classes].astype(np.float64)
     if heights is not None and scene.poses is not None:
         floor = floor_level(heights.bottoms, shares[:, FLOOR])
@@ -199,7 +200,7 @@ def _stands(
         stands[[i for i, _ in supports]] = SUPPORTED
     if (stands == UNKNOWN).all():
         return stands, zeros, zeros
-    by_class = places.supporters(classes, present.classes)
+    by_class = places.supporters(classes, listed)
     by_class[:, artifact.vocabulary.structure[present.classes]] = 0.0
     is_supported = stands == SUPPORTED
     q = np.where(is_supported, 0.0, 1.0)

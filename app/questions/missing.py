@@ -185,9 +185,10 @@ def _logits_at(
     entry = artifact.calibration.at[place.relation]
     bound = log_odds.astype(np.float64)
     if artifact.places is not None and entry.counts:
-        anchor = int(posterior.present.classes[posterior.present.row[place.anchor]])
+        stand_in = artifact.vocabulary.stand_in
+        anchor = int(stand_in[posterior.present.classes[posterior.present.row[place.anchor]]])
         ratio = artifact.places.log_ratio(place.relation, anchor, outgoing=place.outgoing)
-        bound = bound + entry.counts * ratio
+        bound = bound + entry.counts * ratio[stand_in]
     scores = np.full_like(bound, -np.inf)
     order = np.flatnonzero(usable)
     order = order[np.argsort(-bound[order], kind="stable")]
@@ -236,7 +237,7 @@ def _at(
     anchor = reading.names.find(at.object, ("at", "object"), errors)
     if anchor is not None:
         index = reading.scene.objects[anchor].class_index
-        if index is not None and artifact.vocabulary.structure[index]:
+        if index is not None and reading.vocabulary.structure[index]:
             message = "the model knows no relations to floor, wall and ceiling"
             errors.add(InvalidRequestError, ("at", "object"), message)
     return None if anchor is None else (at.relation, anchor)

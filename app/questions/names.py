@@ -20,17 +20,17 @@ from app.errors import (
 from app.scene.labels import label_key
 from app.scene.nearest import spelt_alike
 from app.scene.scene import SceneObject
-from app.scene.vocabulary import Vocabulary
+from app.scene.vocabulary import Vocabulary, Word
 from scene_client.schemas import Mapped, RoomsRequest, SceneRequest, UnknownLabels
 from scene_client.validation import MAX_ERRORS, PLAIN
 
 MAX_SUGGESTED: Final = 32
-"""Maximum number of unknown labels that the service maps to the nearest class, per scene.
+"""Maximum number of unknown labels that the service maps or reads by meaning, per scene.
 
 The same number limits the errors with suggestions, per request.
 """
 MAX_MAPPED: Final = 256
-"""Maximum number of unknown labels per request that the service maps to the nearest class."""
+"""Maximum number of unknown labels that the service maps or reads by meaning, per request."""
 # Rules for the spellings of a name that the vocabulary lists.
 _SPELLINGS: Final = ("label", "alias", "phrase")
 _SEARCHES: Final[dict[UnknownLabels, tuple[str, ...]]] = {
@@ -38,20 +38,26 @@ _SEARCHES: Final[dict[UnknownLabels, tuple[str, ...]]] = {
     "ignore": ("read",),
     "nearest": ("read", "guess", "nearest"),
     "nearest-or-ignore": ("read", "guess"),
+    "by-meaning": ("read", "guess", "meaning"),
 }
 """Names of the methods of `Vocabulary` that search for a label, for each treatment."""
 
 
 def new_labels(request: SceneRequest, vocabulary: Vocabulary) -> int:
-    """Return how many labels of objects and candidates need a search, which takes up to 1 ms."""
+    """Return how many labels of objects and candidates need a search, which takes up to 1 ms.
+
+    A label that is read by its meaning counts each time, and as `MAX_SUGGESTED` labels, because the
+    model then needs predicted weights.
+    """
     searches = _SEARCHES[request.unknown_labels]
     labels = [entry if isinstance(entry, str) else entry.label for entry in request.objects]
     new = sum(not vocabulary.remembers(label, searches) for label in labels)
     is_room = isinstance(request, RoomsRequest)
     candidates: Sequence[str] = getattr(request, "candidates", None) or ()
-    return new + sum(
-        not vocabulary.remembers(label, searches, is_room=is_room) for label in candidates
-    )
+    if is_room:
+        searches = tuple(search for search in searches if search != "meaning")
+    new += sum(not vocabulary.remembers(label, searches, is_room=is_room) for label in candidates)
+    return new * (MAX_SUGGESTED if "meaning" in searches else 1)
 
 
 @dataclass(slots=True)
@@ -126,6 +132,8 @@ class Unknown:
         mapped: the class that replaces each label, also for aliases of candidates and room types. A
             key consists of the label and whether it is a room type.
         guessed: labels for which the service has searched the nearest class.
+        words: the words that are read by their meaning, by name. Their classes follow those of the
+            vocabulary.
     """
 
     vocabulary: Vocabulary
@@ -134,6 +142,7 @@ class Unknown:
     ignored: list[str] = field(default_factory=list)
     mapped: dict[tuple[str, bool], Mapped] = field(default_factory=dict)
     guessed: set[_Key] = field(default_factory=set)
+    words: dict[str, Word] = field(default_factory=dict)
 
     def resolve(
         self, label: str, name: str, location: Location, errors: ErrorList, *, is_room: bool = False
@@ -155,8 +164,10 @@ class Unknown:
         found = self.vocabulary.read(label, is_room=is_room)
         if found is None and self._may_guess(label, is_room=is_room):
             found = self.vocabulary.guess(label, is_room=is_room)
+            if found is None and not is_room and (index := self._by_meaning(label)) is not None:
+                return index
         # An answer without the room type is a good answer, so `nearest` ignores it too.
-        is_ignored = self.treatment != "error" if is_room else self.treatment.endswith("ignore")
+        is_ignored = self.treatment != "error" and (is_room or self.treatment != "nearest")
         if found is None and is_ignored:
             self.ignored.append(name)
         elif found is None:
@@ -185,9 +196,32 @@ class Unknown:
                 break
         return labels_of
 
+    def _by_meaning(self, label: str) -> int | None:
+        """Return the class of the word that a label names, or None without a word vector."""
+        if "meaning" not in _SEARCHES[self.treatment]:
+            return None
+        if (word := self.vocabulary.meaning(label)) is None:
+            return None
+        self.words.setdefault(word.name, word)
+        self.mapped[label, False] = Mapped(
+            label=label,
+            class_=self.vocabulary.labels[word.nearest],
+            similarity=word.similarity,
+            rule="meaning",
+        )
+        return len(self.vocabulary) + list(self.words).index(word.name)
+
+    def index(self, name: str) -> int | None:
+        """Return the index of the class with this name, also of a word that the scene names."""
+        index = self.vocabulary.index(name)
+        if index is None and self.words and (word := self.vocabulary.meaning(name)) is not None:
+            names = list(self.words)
+            return len(self.vocabulary) + names.index(word.name) if word.name in names else None
+        return index
+
     def _may_guess(self, label: str, *, is_room: bool) -> bool:
         """Return whether the service may search the class nearest to a label, and count it."""
-        if not self.treatment.startswith("nearest"):
+        if "guess" not in _SEARCHES[self.treatment]:
             return False
         key = id(self.vocabulary), label, is_room
         limits = ((self.guessed, MAX_SUGGESTED), (self.look_ups.guessed, MAX_MAPPED))
@@ -270,7 +304,7 @@ class Names:
             return index
         indices = self._by_name.get(name)
         if indices is None:
-            of_class = self._unknown.vocabulary.index(name)
+            of_class = self._unknown.index(name)
             indices = [] if of_class is None else self._by_name.get(of_class, [])
         if len(indices) == 1:
             return indices[0]

@@ -60,7 +60,8 @@ def outliers(
 
     The model knows little about a class that few training scenes show (`Artifact.rarely_shown`). At
     a sensitivity, an object of such a class is never an outlier. If its probability reaches the
-    threshold, a warning names the object. A stated threshold applies to all classes.
+    threshold, a warning names the object. A stated threshold applies to all classes, but a word
+    that is read by its meaning never is an outlier.
 
     Args:
         scene: the objects and stated relations to judge.
@@ -80,6 +81,7 @@ def outliers(
     can_alarm = ~artifact.rarely_shown
     if threshold is not None:
         can_alarm = np.ones_like(can_alarm)
+    can_alarm[artifact.vocabulary.known :] = False
     judged: list[Fields] = []
     wrong: list[Fields] = []
     warnings = _unjudged(artifact, scene)

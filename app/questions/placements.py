@@ -98,7 +98,8 @@ def placements(
     if not len(anchors):
         return [[] for _ in candidates]
     forward, backward = posterior.placement_log_odds(candidates, anchors)
-    A, classes, objects = forward.shape[1], present.classes[anchors], present.first[anchors]
+    A, objects, stand_in = forward.shape[1], present.first[anchors], artifact.vocabulary.stand_in
+    classes, candidates = stand_in[present.classes[anchors]], stand_in[candidates]
     first = -1  # number of the requested place in `likeliest_places`; -1 without a request
     if A > ON_TOP and scene.relations:
         held = held_objects(artifact, posterior, scene)
@@ -149,7 +150,8 @@ def held_objects(artifact: Artifact, posterior: Posterior, scene: Scene) -> list
     The list does not contain a desk with a bin under it, although its relation is on-top as well.
     """
     places = artifact.places
-    classes = posterior.present.classes[posterior.present.row].tolist()
+    present = posterior.present
+    classes = artifact.vocabulary.stand_in[present.classes][present.row].tolist()
     return [
         i
         for a, i, j in scene.relations or ()

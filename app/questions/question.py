@@ -142,6 +142,10 @@ SCENES: Final[dict[str, Example]] = {
             "unknown_labels": "nearest-or-ignore",
         },
     ),
+    "by-meaning": Example(
+        "labels without a class are read by their meaning",
+        {"objects": ["sofa", "tv", "tractor", "nigthstand"], "unknown_labels": "by-meaning"},
+    ),
     "training": Example(
         "a scene in the format of the training",
         {

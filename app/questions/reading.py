@@ -64,6 +64,11 @@ class Reading:
     flipped: frozenset[Triple] = frozenset()
     warnings: list[SceneWarning] = field(default_factory=list)
 
+    @property
+    def vocabulary(self) -> Vocabulary:
+        """The classes of the model, and those of the words that are read by their meaning."""
+        return self.unknown.vocabulary.with_words(list(self.unknown.words.values()))
+
     @cached_property
     def names(self) -> Names:
         """Look-up of objects by id or label. The first access builds the look-up tables."""
@@ -119,12 +124,14 @@ def read_scene(
         errors.raise_any()
         reading.scene = Scene(objects, triples, request.relations_complete, room, profile)
     if detections:
+        vocabulary = reading.vocabulary
         in_frame, view = reading.scene, request.viewpoint
         reading.scene = observe(
             in_frame,
             viewpoint=None if view is None else Viewpoint(view.x, view.y, view.yaw),
             has_viewer=view is not None or not is_world_fixed(request.frame_id),
             typical_sizes=vocabulary.sizes,
+            stand_in=vocabulary.stand_in,
             roles=roles,
         )
         if reading.scene.poses is not None:

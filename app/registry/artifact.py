@@ -6,8 +6,8 @@ Every load reads each file once and checks it against its checksum. Symbolic lin
 import errno
 import hashlib
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from app.inference import MachineSpec, Weights
 from app.inference.chains import SceneChains
 from app.inference.objects import LARGEST_WEIGHT, ObjectScorer
-from app.inference.relations import RelationUnits, relation_units
+from app.inference.relations import RelationUnits, StandIns, relation_units
 from app.inference.weights import layout
 from app.registry.card import render_card
 from app.registry.counts import Counts
@@ -26,10 +26,11 @@ from app.registry.description import Calibration, Description, RelationSlopes
 from app.registry.durable import read_file, sync_directory, write_file
 from app.registry.errors import ArtifactError, cause
 from app.registry.manifest import CARD, MANIFEST, WEIGHTS, FileEntry, Manifest
+from app.registry.meaning import RowMap
 from app.registry.offsets import Offsets
 from app.registry.places import Places
 from app.registry.tensors import StorageDtype, pack, require_equal, unpack
-from app.scene.vocabulary import Vocabulary
+from app.scene.vocabulary import Vocabulary, Word
 from scene_client.schemas import ModelReference
 
 MAX_MANIFEST_BYTES: Final = 4 * 2**20
@@ -37,6 +38,8 @@ MAX_MANIFEST_BYTES: Final = 4 * 2**20
 MAX_CARD_BYTES: Final = 2**20
 MAX_WEIGHTS_BYTES: Final = 2**30
 """Default maximum size of the weights file in bytes."""
+
+_MOST_KEPT: Final = 4  # models with words that a model keeps, of about 20 MB each
 
 RARELY: Final = 1 / 500
 """A class is rarely shown if a smaller share of the training scenes shows it."""
@@ -128,6 +131,42 @@ class Artifact:
             return np.zeros(self.spec.V, np.bool_)
         popularity = np.array(self.calibration.popularity, dtype=np.float64)
         return ~(popularity >= math.log(RARELY / (1 - RARELY)))  # NaN: no training scene
+
+    @cached_property
+    def row_map(self) -> RowMap:
+        """Regression from word vectors to weights. The first access takes about 0.5 s."""
+        return RowMap.fit(self.weights, self.vocabulary)
+
+    def with_words(self, words: Sequence[Word]) -> "Artifact":
+        """Return the model with a further class for each word, in the order of the words.
+
+        The weights of such a class are predicted (`RowMap`). Its relations and its places are those
+        of the nearest class. It never raises an alarm.
+        """
+        if not words:
+            return self
+        names = tuple(word.name for word in words)
+        kept = self._with_words.get(names)
+        if kept is None:
+            popularity = self.calibration.popularity
+            popularity = (*popularity, *(None for _ in words if popularity))
+            kept = replace(
+                self,
+                weights=self.row_map.with_words(self.weights, words),
+                vocabulary=self.vocabulary.with_words(words),
+                calibration=self.calibration.model_copy(update={"popularity": popularity}),
+            )
+            # A reference to this model would close a cycle; see `app.serving.runtime`.
+            stand_in = kept.vocabulary.stand_in
+            vars(kept)["relation_units"] = StandIns(kept.weights, self.relation_units, stand_in)
+            if len(self._with_words) >= _MOST_KEPT:
+                self._with_words.clear()  # in one step, because other threads read it
+            self._with_words[names] = kept
+        return kept
+
+    @cached_property
+    def _with_words(self) -> dict[tuple[str, ...], "Artifact"]:
+        return {}
 
     @cached_property
     def scene_chains(self) -> SceneChains:

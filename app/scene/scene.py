@@ -96,6 +96,7 @@ def observe(
     viewpoint: Viewpoint | None = None,
     has_viewer: bool = True,
     typical_sizes: NDArray[np.float64] | None = None,
+    stand_in: NDArray[np.int64] | None = None,
     roles: RoleCounts | None = None,
 ) -> Scene:
     """Derive the relations of a scene from the poses of its objects.
@@ -110,18 +111,22 @@ def observe(
         has_viewer: whether the viewer's pose is known. Otherwise, left and front are undefined.
         typical_sizes: (V, 3) typical extents of each class in metres (`Vocabulary.sizes`). They
             replace missing sizes of objects, and sizes below `SMALLEST`. NaN means an unknown size.
+        stand_in: (V,) class whose roles each class has (`Vocabulary.stand_in`); None means itself.
         roles: counts that decide between on-top, under and inside; see `derive_relations`.
     """
     if all(thing.position is None for thing in scene.objects):
         return scene
     objects = scene.objects if viewpoint is None else _in_viewer_frame(scene.objects, viewpoint)
     points, sizes = boxes_of(objects, typical_sizes)
+    classes = np.array([-1 if one.class_index is None else one.class_index for one in objects])
+    if stand_in is not None:
+        classes = np.where(classes >= 0, stand_in[classes], classes)
     poses = derive_relations(
         points,
         sizes,
         [thing.yaw for thing in objects],
         horizontal=has_viewer,
-        classes=np.array([-1 if one.class_index is None else one.class_index for one in objects]),
+        classes=classes,
         roles=roles,
     )
     excluded = poses.observed & ~poses.holds

@@ -2,16 +2,17 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, wraps
-from typing import Any, ClassVar, Final, TypeVar, cast
+from typing import Any, ClassVar, Final, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from app.scene.labels import LookUp, Rule, head_of, label_key, readings
+from app.scene.labels import LookUp, Rule, head_of, label_key, readings, split_words
 from app.scene.nearest import Match, NameIndex
 from app.scene.scene import SceneObject
+from app.scene.words import Vectors, class_vectors, word_vectors
 
 Extents = tuple[float, float, float]
 
@@ -19,6 +20,23 @@ _TIGHT: Final = 1.2  # ratio of extents up to which a box fits into another box
 _MOST_REMEMBERED: Final = 4096  # results of searches
 _LONGEST: Final = 100  # characters of a remembered label, the maximum in a request
 _MOST_GUESSED: Final = 3  # alternatives of a label
+
+
+class Word(NamedTuple):
+    """A word without a class, and its meaning.
+
+    Attributes:
+        name: the word in lower case and in the singular.
+        vector: (dimensions,) word vector of length 1.
+        nearest: index of the class with the most similar word vector.
+        similarity: cosine of the angle between both vectors, from 0 to 1.
+    """
+
+    name: str
+    vector: Vectors
+    nearest: int
+    similarity: float
+
 
 SearchT = TypeVar("SearchT", bound=Callable[..., Any])
 
@@ -84,6 +102,9 @@ class Vocabulary:
         room_types: canonical names of the room types. Their order defines the room indices.
         room_aliases: maps room types to their synonyms.
         parents: (V,) index of the parent of each class, -1 without a parent.
+        known: number of classes without those of words (`with_words`), which come last.
+        stand_in: (V,) class whose counts and relations each class has: itself, or the nearest class
+            for a word of `with_words`.
 
     Raises:
         ValueError: the list of classes is empty, a name is empty, a key of `room_aliases` is not a
@@ -108,6 +129,8 @@ class Vocabulary:
         self._by_spelling, self._by_key = _tables(names, "an object class", clash)
         self._bare = {name: SceneObject(name, name, k) for name, k in self._by_spelling.items()}
         self.parents = self._parent_indices()
+        self.known = len(self.objects)
+        self.stand_in = _read_only(np.arange(self.known))
         names = [(room, *self.room_aliases.get(room, ())) for room in self.room_types]
         clash = "room types {first!r} and {second!r} have the same name"
         self._room_by_spelling, self._room_by_key = _tables(names, "a room type", clash)
@@ -265,6 +288,38 @@ class Vocabulary:
                 return guess
         return None
 
+    @cached_property
+    def vectors(self) -> tuple[Vectors, NDArray[np.bool_]]:
+        """Word vectors of the classes, (V, dimensions), and True for known vectors, (V,)."""
+        names = [(entry.label, *entry.aliases) for entry in self.objects]
+        return class_vectors(word_vectors(), names, self.parents.tolist())
+
+    def meaning(self, label: str) -> Word | None:
+        """Return the word that a label names and the class nearest to it by word vectors, or None.
+
+        The method is for labels that `read` and `guess` do not know. It compares the label with all
+        classes. The result is None for a label without a word vector.
+        """
+        pairs = list(readings(label))
+        alternatives = [name for rule, name in pairs if rule == "alternative"]
+        for text in alternatives[:_MOST_GUESSED] or [name for _, name in pairs][-1:] or [label]:
+            name = " ".join(split_words(text))
+            vector, (vectors, known) = word_vectors().of(name), self.vectors
+            if vector is not None and known.any():
+                cosines = np.where(known, vectors @ vector, -1.0)
+                nearest = int(cosines.argmax())
+                similarity = round(min(max(float(cosines[nearest]), 0.0), 1.0), 3)
+                return Word(name, vector, nearest, similarity)
+        return None
+
+    def with_words(self, words: Sequence[Word]) -> "Vocabulary":
+        """Return a vocabulary with a further class for each word, in the order of the words.
+
+        Such a class is structure, or belongs anywhere, as its nearest class does. It has no
+        relatives and no known size. The methods that read labels do not find it.
+        """
+        return _WithWords(self, words) if words else self
+
     def remembers(self, label: str, searches: Sequence[str], *, is_room: bool = False) -> bool:
         """Return whether methods, tried one after the other, know a label without a new search."""
         if label in (self._room_by_spelling if is_room else self._by_spelling):
@@ -289,6 +344,68 @@ class Vocabulary:
             ],
             "room_types": list(self.room_types),
         } | ({"room_aliases": aliases} if aliases else {})
+
+
+class _WithWords(Vocabulary):
+    """A vocabulary and the classes of some words; see `Vocabulary.with_words`.
+
+    Its arrays extend those of the known classes, because a new vocabulary would take 0.1 s.
+    """
+
+    def __init__(self, known: Vocabulary, words: Sequence[Word]) -> None:
+        vars(self).update({name: vars(known)[name] for name in _SHARED})
+        self._base, self._nearest = known, [word.nearest for word in words]
+        self.known = len(known)
+        nearest = [known.objects[index] for index in self._nearest]
+        self.objects = (
+            *known.objects,
+            *(
+                replace(entry, label=word.name, aliases=(), size=None, parent=None)
+                for word, entry in zip(words, nearest, strict=True)
+            ),
+        )
+        self.parents = _read_only([*known.parents, *(-1 for _ in words)])
+        self.stand_in = _read_only([*known.stand_in, *self._nearest])
+
+    @cached_property
+    def labels(self) -> tuple[str, ...]:
+        new = self.objects[self.known :]
+        return (*self._base.labels, *(entry.label for entry in new))
+
+    @cached_property
+    def structure(self) -> NDArray[np.bool_]:
+        return _read_only(self._base.structure[self.stand_in])
+
+    @cached_property
+    def anywhere(self) -> NDArray[np.bool_]:
+        return _read_only(self._base.anywhere[self.stand_in])
+
+    @cached_property
+    def sizes(self) -> NDArray[np.float64]:
+        return np.pad(self._base.sizes, ((0, len(self._nearest)), (0, 0)), constant_values=math.nan)
+
+    @cached_property
+    def too_large(self) -> NDArray[np.bool_]:
+        return np.pad(self._base.too_large, (0, len(self._nearest)))
+
+    @cached_property
+    def broader(self) -> NDArray[np.bool_]:
+        return np.pad(self._base.broader, (0, len(self._nearest)))
+
+    @cached_property
+    def related(self) -> NDArray[np.bool_]:
+        return np.pad(self._base.related, (0, len(self._nearest)))
+
+    @cached_property
+    def broader_labels(self) -> tuple[tuple[str, ...], ...]:
+        return (*self._base.broader_labels, *(() for _ in self._nearest))
+
+
+# Attributes of a vocabulary that words leave as they are.
+_SHARED: Final = (
+    *("room_types", "room_aliases", "_by_spelling", "_by_key", "_bare"),
+    *("_room_by_spelling", "_room_by_key", "_memory"),
+)
 
 
 def do_not_fit(inner: NDArray[np.float64], outer: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -107,7 +107,8 @@ class Request:
                 may_be_empty=question.samples,
             )
             options = question.read(scene, artifact, reading)
-            return reading, partial(question.answer, artifact, reading.scene, **options)
+            model = artifact.with_words(list(reading.unknown.words.values()))
+            return reading, partial(question.answer, model, reading.scene, **options)
 
         def finish(reading: Reading, ask: Callable[[], Fields], began: float) -> _Computed:
             fields = ask()

@@ -131,7 +131,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
         monkeypatch.setattr(owner, name, counted)
 
-    for name in ("index", "read", "guess", "nearest"):
+    for name in ("index", "read", "guess", "nearest", "meaning"):
         count(Vocabulary, name)
     count(names, "spelt_alike")
     return found
@@ -153,7 +153,12 @@ async def test_a_batch_has_few_suggestions(client: httpx.AsyncClient) -> None:
 
 @pytest.mark.parametrize(
     ("treatment", "guesses"),
-    [("error", 0), ("nearest", MAX_MAPPED), ("nearest-or-ignore", MAX_MAPPED)],
+    [
+        ("error", 0),
+        ("nearest", MAX_MAPPED),
+        ("nearest-or-ignore", MAX_MAPPED),
+        ("by-meaning", MAX_MAPPED),
+    ],
 )
 async def test_a_batch_looks_few_labels_up(
     client: httpx.AsyncClient, calls: Counter[str], treatment: str, guesses: int
@@ -165,9 +170,10 @@ async def test_a_batch_looks_few_labels_up(
         for _ in range(64)
     ]
     answer = await client.post("/missing/batch", json={"scenes": scenes})
-    ignores = treatment == "nearest-or-ignore"
+    ignores = treatment in ("nearest-or-ignore", "by-meaning")
     assert {entry["status"] for entry in answer.json()["results"]} == {200 if ignores else 422}
     assert calls["guess"] == guesses
+    assert calls["meaning"] == (guesses if treatment == "by-meaning" else 0)
     assert calls["nearest"] == (0 if ignores else MAX_SUGGESTED)
 
 

@@ -191,6 +191,21 @@ def test_new_labels_leave_the_event_loop_until_they_are_remembered(treatment: An
     assert [is_quick(one, vocabulary) for one in requests] == [True, True, False]
 
 
+def test_words_that_are_read_by_meaning_leave_the_event_loop() -> None:
+    """Each time, because the model needs their weights."""
+    vocabulary, options = fresh(), {"unknown_labels": "by-meaning"}
+    scene = MissingRequest(objects=["bed", "ottoman"], **options)
+    candidates = MissingRequest(objects=["bed"], candidates=["ottoman"], **options)
+    for _ in range(2):
+        assert not is_quick(scene, vocabulary)
+        assert not is_quick(candidates, vocabulary)
+        read_scene(scene, vocabulary, Limits())
+    spelt = MissingRequest(objects=["bed", "nigthstand"], **options)
+    assert not is_quick(spelt, vocabulary)
+    read_scene(spelt, vocabulary, Limits())
+    assert is_quick(spelt, vocabulary)
+
+
 def test_lists_of_candidates_leave_the_event_loop() -> None:
     request = MissingRequest(objects=["bed"], candidates=["bed"] * 257)
     assert not is_quick(request, VOCABULARY)

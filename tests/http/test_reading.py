@@ -123,6 +123,89 @@ async def test_unknown_labels_can_be_taken_for_the_nearest_class(client: httpx.A
     assert pointers(response, "unknown-labels") == ["#/objects/4"]
 
 
+WORDS: dict[str, Any] = {
+    "objects": ["bed", {"id": "o", "label": "Futon_3"}, "futons", "zxqvw", "nigthstand"],
+    "unknown_labels": "by-meaning",
+}
+
+
+@pytest.mark.parametrize("model", ["home", "candidate", "plain"])
+async def test_a_word_without_a_class_is_read_by_its_meaning(
+    client: httpx.AsyncClient, model: str
+) -> None:
+    """Two spellings are one word. A spelling is corrected first, and nonsense is left out."""
+    scene = WORDS | {"model": model, "relations": [relation("o", "on-top", "bed")]}
+    answer = await ask(client, "outliers", **scene)
+    assert answer["ignored"] == ["zxqvw"]
+    *read, spelt = answer["mapped"]
+    assert [(one["label"], one["rule"]) for one in read] == [
+        ("Futon_3", "meaning"),
+        ("futons", "meaning"),
+    ]
+    assert {one["class"] for one in read} < {"bed", "table", "chair", "sofa", "pillow"}
+    assert all(0 < one["similarity"] < 1 for one in read)
+    assert (spelt["class"], spelt["rule"]) == ("nightstand", "spelling")
+    listed = {one["object"]: (one["label"], one.get("listed_as")) for one in answer["outliers"]}
+    expected = {"o": ("futon", "Futon_3"), "futons": ("futon", "futons")}
+    assert expected.items() <= listed.items()
+    assert not any(one["is_outlier"] for one in answer["outliers"] if one["object"] in expected)
+    for question in ("missing", "rooms", "relations", "generate"):
+        other = await ask(client, question, **scene, **({"seed": 1} if "gen" in question else {}))
+        assert (other["mapped"], other["ignored"]) == (answer["mapped"], answer["ignored"])
+    drawn = await ask(client, "generate", **scene, seed=1)
+    assert drawn["listed_as"]["futon"] == "Futon_3"
+    assert all("futon" in one["objects"] for one in drawn["scenes"])
+
+
+async def test_a_candidate_is_read_by_its_meaning(client: httpx.AsyncClient) -> None:
+    body = WORDS | {"objects": ["bed"], "candidates": ["Mugs", "lamp", "zxqvw"], "coverage": 0.5}
+    answer = await ask(client, "missing", **body)
+    assert answer["ignored"] == ["zxqvw"]
+    assert {one["label"]: one.get("listed_as") for one in answer["missing"]} == {
+        "lamp": None,
+        "mug": "Mugs",
+    }
+    (mapped,) = answer["mapped"]
+    assert (mapped["label"], mapped["rule"]) == ("Mugs", "meaning")
+    # A place may be at a word, and a word may be at a place.
+    at_word = WORDS | {"at": {"relation": "on-top", "object": "FUTONS"}, "top_k": 3}
+    at_word["objects"] = ["bed", "futon"]
+    assert len((await ask(client, "missing", **at_word))["missing"]) == 3
+    body |= {"at": {"relation": "on-top", "object": "bed"}}
+    assert {"lamp", "mug"} == {
+        one["label"] for one in (await ask(client, "missing", **body))["missing"]
+    }
+
+
+async def test_a_word_needs_its_own_treatment(client: httpx.AsyncClient) -> None:
+    """The others refuse or ignore it, and answers without such words do not change."""
+    for treatment in ("error", "nearest"):
+        response = await client.post("/rooms", json=WORDS | {"unknown_labels": treatment})
+        assert "#/objects/2" in pointers(response, "unknown-labels")
+    answer = await ask(client, "rooms", **WORDS | {"unknown_labels": "nearest-or-ignore"})
+    assert answer["ignored"] == ["o", "futons", "zxqvw"]
+    known = {"objects": ["bed", "lamp", "nigthstand"]}
+    first, second = [
+        await ask(client, "missing", **known, unknown_labels=treatment)
+        for treatment in ("nearest-or-ignore", "by-meaning")
+    ]
+    assert first | {"request_id": ""} == second | {"request_id": ""}
+
+
+async def test_poses_of_words_give_relations(client: httpx.AsyncClient) -> None:
+    """A word has no typical size."""
+    placed = [
+        *LAMP_ON_DESK,
+        {"id": "m", "label": "mug", "position": at(2, 0, 0.85), "size": at(0.1, 0.1, 0.1)},
+        {"id": "p", "label": "spaceship", "position": at(2, -0.4, 0.85)},
+    ]
+    answer = await ask(client, "outliers", objects=placed, unknown_labels="by-meaning")
+    found = triples(answer["observed_relations"])
+    assert ("m", "on-top", "d") in found
+    unsized = [one for one in answer["warnings"] if one["code"] == "unknown-sizes"]
+    assert [one["objects"] for one in unsized] == [["p"]]
+
+
 @pytest.mark.parametrize(
     ("label", "expected", "rule"),
     [

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from app.inference import Weights
 from app.inference.kernels import ROOM
-from app.inference.weights import layout, pack_scenes
 from app.registry import Artifact, Calibration, Counts, Offsets, Places
 from app.scene import CANONICAL, ObjectClass, Vocabulary
 
@@ -50,26 +49,15 @@ def extended(artifact: Artifact, classes: Sequence[ObjectClass], rooms: Sequence
 
 
 def _weights(weights: Weights, V: int, C: int) -> Weights:
-    old, spec = weights.spec, replace(weights.spec, V=V, C=C if weights.spec.C else 0)
-    arrays = {
-        name: _padded(weights[name], shape)
-        for name, (_, shape) in layout(spec).items()
-        if name != "fantasies"
-    }
+    old, larger = weights.spec, weights.enlarged(V, C if weights.spec.C else 0)
+    arrays = larger.arrays
     arrays["b"][old.V :] = np.quantile(weights["b"], _RARE)
     if old.C:
         arrays["e"][old.C :] = np.quantile(weights["e"], _RARE)
     for name in _AVERAGED:
         if name in arrays:
             arrays[name][..., old.V :] = weights[name].mean(-1, keepdims=True)
-    if spec.N:
-        arrays["fantasies"] = pack_scenes(_padded(weights.scenes, (spec.N, V)))
-    return Weights(spec, arrays)
-
-
-def _padded(array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """Return a copy of an array with zeros behind the end of its axes."""
-    return np.pad(array, [(0, new - old) for old, new in zip(array.shape, shape, strict=True)])
+    return larger
 
 
 def _calibration(calibration: Calibration, classes: int, C: int, rooms: int) -> Calibration:

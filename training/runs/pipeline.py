@@ -34,7 +34,6 @@ from training.datasets.records import digest_of
 from training.datasets.roles import count_roles
 from training.datasets.sources import is_inventory
 from training.datasets.vocabulary import read_vocabulary, with_typical_sizes
-from training.datasets.words import class_vectors, read_word_vectors
 from training.datasets.written import written_vocabulary
 from training.fit.configuration import Config, ConfigError, DataConfig, is_file, source_name
 
@@ -213,8 +212,7 @@ def split_and_encode(
         vocabulary = build_vocabulary(data, parts["train"], root)
     words = None
     if data.words:
-        vectors, _ = class_vectors(read_word_vectors(KNOWLEDGE / "words.npz"), vocabulary)
-        words = torch.from_numpy(vectors)
+        words = torch.from_numpy(vocabulary.vectors[0])
     roles = count_roles(parts["train"], vocabulary)
     return SplitScenes(
         data=data,

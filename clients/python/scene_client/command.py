@@ -188,7 +188,8 @@ TopK = Annotated[int | None, typer.Option(help="Maximum number of results.")]
 Unknown = Annotated[
     UnknownLabels | None,
     typer.Option(
-        help="Unknown labels: refuse them, ignore them, or map them to the nearest class."
+        help="Unknown labels: refuse them, ignore them, map them to the nearest class, or read "
+        "them by their meaning."
     ),
 ]
 LabelMap = Annotated[

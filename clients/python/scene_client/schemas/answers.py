@@ -81,7 +81,7 @@ class ObservedRelation:
 
 Rule = Literal[
     "alias", "phrase", "qualifier", "alternative", "article", "instance", "prompt",
-    "spelling", "head",
+    "spelling", "head", "meaning",
 ]  # fmt: skip
 """how the service reads a label that is not a label of the vocabulary"""
 
@@ -94,14 +94,17 @@ class Mapped(Reply):
     label: str
     """label of an object or candidate, or room type"""
     class_: Annotated[str, Field(alias="class")]
-    """canonical label of the class, or room type of the model"""
+    """canonical label of the class, or room type of the model. With the rule `meaning`, the label
+    is a word of its own, and this class only stands in for it; see `rule`"""
     similarity: Annotated[float, Field(ge=0, le=1)]
     """similarity of the label and the class. 1 means that the rule is certain"""
     rule: Rule
     """how the service read the label. Certain rules: alias (`hall`), phrase (`bottle of milk`),
     qualifier (`mouse_(computer_equipment)`), alternative (`sofa/couch`), article (`a chair`),
     instance (`chair_12`), prompt (`a photo of a chair`). Guesses: spelling (`nigthstand`), head
-    (`office table`)"""
+    (`office table`). `meaning`: the model predicts the weights of the word (`ottoman`) from the
+    classes of similar words. Its relations and places are those of `class`, the nearest of them.
+    Such an object is never an outlier"""
 
 
 WarningCode = Literal[
@@ -139,12 +142,12 @@ class Answer(Reply):
     """`stamp` of the request"""
     ignored: list[str] = []
     """ids of the objects, candidates and room type that the model does not know. The answer ignores
-    them. Room types need another `unknown_labels` than `error`, and objects need `ignore` or
-    `nearest-or-ignore`"""
+    them. Room types need another `unknown_labels` than `error`, and objects need `ignore`,
+    `nearest-or-ignore` or `by-meaning`"""
     mapped: list[Mapped] = []
     """each label that the vocabulary does not list, and each alias of a candidate or room type. The
     class replaces the label. Aliases of objects are not listed, because answers name objects by id.
-    Guesses need `nearest` or `nearest-or-ignore` as `unknown_labels`"""
+    Guesses need `nearest`, `nearest-or-ignore` or `by-meaning` as `unknown_labels`"""
     warnings: list[SceneWarning] = []
     """probable mistakes in the scene"""
     observed_relations: list[ObservedRelation] | None = None

@@ -40,7 +40,7 @@ MAX_RELATIONS = 65536
 The validation of a million invalid relations would take seconds.
 """
 
-UnknownLabels = Literal["error", "ignore", "nearest", "nearest-or-ignore"]
+UnknownLabels = Literal["error", "ignore", "nearest", "nearest-or-ignore", "by-meaning"]
 Detail = Literal["scores", "full"]
 RelationName = Literal[
     "left", "right", "front", "behind", "on-top", "under", "above", "below", "inside", "contains"
@@ -282,8 +282,9 @@ class SceneRequest(Request):
     """treatment of labels that the model does not know. `error` refuses the request. `ignore`
     leaves these objects out of the scene. `nearest` corrects misspelt words and reads phrases by
     their last words (see `mapped`); it refuses a label that could be several classes.
-    `nearest-or-ignore` leaves such a label out. All but `error` leave out an unknown room type, but
-    `/generate` always refuses it"""
+    `nearest-or-ignore` leaves such a label out. `by-meaning` reads it as a word whose weights the
+    model predicts from its word vector, and leaves out a label without a vector. All but `error`
+    leave out an unknown room type, but `/generate` always refuses it"""
 
     scene_id: Unused = None
     """id of a training scene. Without `frame_id` and `viewer_frame`, its positions are in the frame

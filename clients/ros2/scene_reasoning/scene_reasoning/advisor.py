@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from scene_client.ros_fields import LabelMap, read_label_map
-from scene_client.schemas import Answer
+from scene_client.schemas import Answer, UnknownLabels
 from scene_client.vision_msgs import SceneFields, Viewpoint, from_message
 
 QUESTIONS = ("missing", "outliers", "relations", "rooms")
@@ -53,6 +53,7 @@ class Advisor:
         questions: one or more of `QUESTIONS`.
         label_map: labels of the class ids; may be replaced at any time.
         min_score: detections with a lower score are left out.
+        unknown_labels: treatment of labels that the model does not know.
         boxes: False if boxes are in pixels; positions are then taken from the hypotheses.
         own: extra fields for each question, such as ``{"missing": {"top_k": 5}}``.
 
@@ -64,6 +65,7 @@ class Advisor:
     questions: Sequence[str] = ("missing", "outliers")
     label_map: LabelMap | None = None
     min_score: float = 0.0
+    unknown_labels: UnknownLabels = "nearest-or-ignore"
     boxes: bool = True
     own: dict[str, dict[str, Any]] = field(default_factory=dict)
 
@@ -83,6 +85,7 @@ class Advisor:
             message,
             self.label_map,
             min_score=self.min_score,
+            unknown_labels=self.unknown_labels,
             boxes=self.boxes,
             viewpoint=viewpoint,
         )

@@ -55,6 +55,7 @@ class SceneNode(Node):
             questions=tuple(self._parameter("questions", ["missing", "outliers"])),
             label_map=self._parameter("label_map", "") or (names if any(names) else None),
             min_score=self._parameter("min_score", 0.2),
+            unknown_labels=self._parameter("unknown_labels", "nearest-or-ignore"),
             boxes=self._parameter("boxes", True),
         )
         self.latest: Latest[Seen, Advice] = Latest(lambda seen: self.advisor.advise(*seen))
