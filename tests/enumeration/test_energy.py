@@ -151,7 +151,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("name", "room", "source"), CASES)
-def test_object_log_odds_are_exact(name, room, source):
+def test_object_log_odds_are_those_of_the_joint(name, room, source):
     """Of v_i, for every v and i."""
     machine = small_machine(name)
     joint = enumerate_joint(machine, *range(-1, machine.spec.C), source=source)
