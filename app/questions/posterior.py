@@ -107,10 +107,10 @@ class Posterior:
     """Log-odds of objects and relations given a scene and a published model.
 
     Shapes contain V (classes of the vocabulary), A (canonical relations) and n (classes of the
-    scene). With a profile and without observed relations, the log-odds of objects are exact. Without
-    a profile, they have the mean base rates of the sources (docs/models.md, An unknown source). The
-    logits of relations are approximated by normal variables. The smallest log-odds of a relation is
-    `NO_UNIT`.
+    scene). With a profile and without observed relations, the log-odds of objects are exact.
+    Without a profile, they have the mean base rates of the sources (docs/models.md, An unknown
+    source). The logits of relations are approximated by normal variables. The smallest log-odds of
+    a relation is `NO_UNIT`.
 
     Attributes:
         present: the classes of the scene.

@@ -84,6 +84,7 @@ class Model:
         relations, completion, false_relations: scores of T1a, T1b and T3b. The batch observes no
             relation, the given triples, or all triples with one false triple.
         misplaced: score of T3c, moved objects.
+        lateral: change of the log-odds of left and front in T1 pairs, see `lateral_shift`.
         rooms: log-probabilities of the room types.
         generate: sampler of T4 for a setting.
         artifact: model for Calibration and for all questions to the service.
@@ -98,6 +99,7 @@ class Model:
     completion: RelationScore | None = None
     false_relations: RelationScore | None = None
     misplaced: MisplacedScore | None = None
+    lateral: float = 0.0
     rooms: RoomScore | None = None
     generate: SamplerOf | None = None
     artifact: Artifact | None = None

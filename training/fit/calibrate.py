@@ -30,7 +30,7 @@ from app.registry import Artifact, Calibration, CountSlope
 from app.scene.relations import CANONICAL, LATERAL, ON_TOP, STACKED
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Rng
-from training.datasets.batches import TrainingData, subset
+from training.datasets.batches import SceneTensors, TrainingData, subset
 from training.datasets.cases import (
     Triple,
     annotated_relations,
@@ -39,6 +39,7 @@ from training.datasets.cases import (
     removed_class,
     scene_of,
 )
+from training.evaluation.pair_task import ScenePairs, both_ways, lateral_shift, listed_pairs
 from training.fit.calibrate_at import fit_at
 from training.fit.calibrate_misplaced import fit_misplaced
 from training.fit.calibrate_objects import calibrate_objects, recalibrated
@@ -50,7 +51,6 @@ _LISTED = 20  # relations that an answer of the service lists by default
 _MOST_OF_A_PART = 8  # classes of a part of a scene
 _POSSIBLE = -3.5  # least log-odds of a relation that may well hold
 _OF_THE_REST = 0.02
-_SHIFTS = (0.0, -0.4, -0.8, -1.2)  # changes of the log-odds of left and front
 _ROUNDS = 3
 # Column indices of the table of examples. Column 0 is the scene.
 _RELATION, _LOGIT, _TRUTH, _SOURCE = 1, 2, 4, 5
@@ -83,7 +83,7 @@ def calibrate(
     relation = fit_relations(artifact, complete, seed)
     return recalibrated(
         artifact,
-        relation=with_lower_lateral(artifact, relation, related.scenes),
+        relation=with_lower_lateral(artifact, relation, related),
         placement=fit_placements(artifact, complete, seed),
         relation_given=fit_with_observed(artifact, complete, seed),
         at=fit_at(artifact, related, seed),
@@ -112,41 +112,25 @@ def fit_with_observed(
 
 
 def with_lower_lateral(
-    artifact: Artifact, slopes: tuple[CountSlope, ...], scenes: Sequence[EncodedScene]
+    artifact: Artifact, slopes: tuple[CountSlope, ...], scenes: SceneTensors
 ) -> tuple[CountSlope, ...]:
     """Lower the log-odds of left and front until the likeliest relations are the listed ones.
 
-    Of two stacked objects, an annotator lists the stacked relation. The function tries `_SHIFTS`
-    for the intercept of left and front. It takes the first shift with the highest accuracy of the
-    likeliest relation of such pairs, averaged over the data sources.
+    Of two stacked objects, an annotator lists the stacked relation. `lateral_shift` finds the
+    change of the intercept of left and front.
     """
-    structure = artifact.vocabulary.structure
-    sources: list[str] = []
-    hits: list[Flags] = []
-    for encoded in scenes:
-        evidence = encoded.evidence
-        is_thing = ~structure[evidence.classes]
-        stacked = evidence.holds[[*STACKED]].any(0) & is_thing[:, None] & is_thing
-        i, j = np.nonzero(stacked & ~np.eye(len(is_thing), dtype=np.bool_))
-        if not len(i):
-            continue
-        posterior = _posterior(artifact, encoded, range(len(encoded.instance_classes)))
+    table = np.array([(s.intercept, s.slope, s.log_count) for s in slopes])[:, :, None, None]
+
+    def score(question: ScenePairs) -> Floats:
+        scene = question.scene
+        posterior = _posterior(artifact, scene, range(len(scene.instance_classes)))
         log_odds = posterior.relation_log_odds().astype(np.float64)
-        logs = np.log(evidence.counts)
-        table = np.array([(s.intercept, s.slope, s.log_count) for s in slopes])[:, :, None, None]
+        logs = np.log(scene.evidence.counts)
         logits = table[:, 0] + table[:, 1] * log_odds + table[:, 2] * (logs[:, None] + logs)
-        both = np.concatenate([logits[:, i, j], logits[:, j, i]]).T
-        listed = np.concatenate([evidence.holds[:, i, j], evidence.holds[:, j, i]]).T
-        is_lateral = np.isin(np.arange(both.shape[1]) % len(slopes), LATERAL)
-        shifted = both + np.where(is_lateral, np.array(_SHIFTS)[:, None, None], 0.0)
-        best = shifted.argmax(2)
-        hits.append(np.stack([listed[np.arange(len(i)), row] for row in best], 1))
-        sources += [encoded.source] * len(i)
-    if not hits:
-        return slopes
-    table_of_hits, names = np.concatenate(hits), np.array(sources)
-    means = [table_of_hits[names == name].mean(0) for name in np.unique(names)]
-    shift = _SHIFTS[int(np.mean(means, axis=0).argmax())]
+        return both_ways(logits, question.ends)
+
+    structure = torch.from_numpy(artifact.vocabulary.structure.copy())
+    shift = lateral_shift(score, listed_pairs(scenes, structure, STACKED))
     return tuple(
         entry.model_copy(update={"intercept": entry.intercept + shift}) if a in LATERAL else entry
         for a, entry in enumerate(slopes)

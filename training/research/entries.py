@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from app.scene.relations import STACKED
 from training.datasets.batches import SceneTensors, TrainingData, subset
 from training.datasets.cases import some_scenes
 from training.evaluation.artifact_model import artifact_model, floor_model, independent_model
@@ -22,6 +23,7 @@ from training.evaluation.baselines.fitting import TRIALS, Baseline
 from training.evaluation.intruders import intruder_weights
 from training.evaluation.model import Model, ObjectScore, suspicion_of
 from training.evaluation.outlier_tasks import first_shares, with_intruders
+from training.evaluation.pair_task import SHIFTS, baseline_log_odds, lateral_shift, listed_pairs
 from training.evaluation.report import Progress, silent
 from training.fit.calibrate import calibrate
 from training.fit.configuration import Config, ObjectsConfig
@@ -34,7 +36,7 @@ from training.runs.folder import RunError, load_run, save_run
 
 # Weights of log popularity in the ranking of intruders: scores of baselines have different scales.
 _WEIGHTS = (0.0, *np.geomspace(0.005, 2.0, TRIALS - 1).tolist())
-_SCENES = 300  # maximum scenes that choose a weight
+_SCENES = 300  # maximum scenes that choose a weight or a shift
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +82,7 @@ def baseline_entries(
         is_selected = names is None or name in names
         if is_usable and is_selected and (baseline.stochastic or seed == 0):
             make = partial(_baseline_model, baseline, seed, config)
-            yield Entry(name, seed, f"{name}, seed {seed}, {decisive}", make)
+            yield Entry(name, seed, f"{name}, seed {seed}, {decisive}, {SHIFTS}", make)
 
 
 def reference_entries() -> Iterator[Entry]:
@@ -119,7 +121,7 @@ def _baseline_model(
         return baseline.fit(*parts, seed=seed, progress=say)
 
     if baseline.scores not in (("missing",), ("rooms",)):
-        return fit(baseline, data)
+        return with_lateral_shift(fit(baseline, data), data)
     objects = replace(data, train=object_scenes(data.train, data.structure, learning))
     model = fit(baseline, objects)
     if model.missing is None:
@@ -129,6 +131,16 @@ def _baseline_model(
         return model
     product = fit(placed_product(baseline.name, model, fit(PLACED, data)), objects)
     return replace(model, at_place=product.at_place)
+
+
+def with_lateral_shift(model: Model, data: TrainingData) -> Model:
+    """Return a model of relations with the shift of left and front that a machine also gets."""
+    if model.relations is None:
+        return model
+    scenes = some_scenes(data.validation, _SCENES, 0)
+    log_odds = baseline_log_odds(scenes, model.relations)
+    shift = lateral_shift(log_odds, listed_pairs(scenes, data.structure, STACKED))
+    return replace(model, lateral=shift)
 
 
 def object_scenes(train: SceneTensors, structure: Tensor, config: ObjectsConfig) -> SceneTensors:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from app.scene import CANONICAL
-from app.scene.relations import INSIDE
+from app.scene.relations import INSIDE, STACKED
 from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
 from tests.training.evaluation.scenes import (
     NO_STRUCTURE,
@@ -24,6 +24,8 @@ from training.evaluation.asking import labels_alone, relation_probabilities
 from training.evaluation.model import Model
 from training.evaluation.pair_task import (
     RARE,
+    baseline_log_odds,
+    lateral_shift,
     listed_pairs,
     pairs_task,
     service_score,
@@ -173,3 +175,25 @@ def test_the_limit_counts_scenes_with_such_a_pair():
     assert pairs_task(Model(relations=flat), setting).scenes == 2
     assert pairs_task(Model(relations=flat), replace(setting, scenes=tensors(silent))) is None
     assert pairs_task(Model(), setting) is None
+
+
+@pytest.mark.parametrize(("side", "shift"), [(-0.2, 0.0), (0.2, -0.4), (0.5, -0.8), (5.0, 0.0)])
+def test_a_rival_gets_the_shift_of_left_and_front_of_the_service(side, shift):
+    """On-top has the log-odds 0, left the log-odds `side`. With a shift, both are right."""
+    scenes = tensors([scene([0, 1], [(ON, 1, 0)], name=f"stack {k}") for k in range(4)])
+
+    def relations(batch):
+        log_odds = torch.full(batch.holds.shape, -9.0)
+        log_odds[:, ON, 1, 0], log_odds[:, LEFT, 0, 1] = 0.0, side
+        return log_odds
+
+    questions = listed_pairs(scenes, NO_STRUCTURE, STACKED)
+    found = lateral_shift(baseline_log_odds(scenes, relations), questions)
+    assert found == shift
+    setting = Setting(scenes, NO_STRUCTURE)
+    values = [
+        pairs_task(Model(relations=relations, lateral=x), setting).metrics["accuracy"].value
+        for x in (0.0, found)
+    ]
+    assert values == [float(side < 0), float(side < 1)]
+    assert lateral_shift(baseline_log_odds(scenes, relations), []) == 0.0

@@ -348,9 +348,9 @@ def test_sides_are_lowered_until_the_listed_relation_of_stacked_objects_is_likel
     sides = CountSlope(intercept=intercept)
     slopes = tuple(sides if a in LATERAL else CountSlope() for a in range(A))
     stacked = scene([0, 1, 2], [(ON_TOP, 1, 0), (LEFT, 2, 0)])
-    lowered = with_lower_lateral(artifact, slopes, [stacked] * 3)
+    lowered = with_lower_lateral(artifact, slopes, tensors([stacked] * 3, 9))
     for a in range(A):
         expected = intercept + shift if a in LATERAL else 0.0
         assert lowered[a].intercept == pytest.approx(expected)
     beside = scene([0, 1], [(LEFT, 1, 0)])
-    assert with_lower_lateral(artifact, slopes, [beside]) == slopes
+    assert with_lower_lateral(artifact, slopes, tensors([beside], 9)) == slopes
