@@ -15,8 +15,9 @@ import torch
 
 from app.registry import Artifact
 from app.registry import Metric as CardMetric
+from app.scene import Vocabulary
 from training.datasets import AnnotatedScene, DatasetError, annotated_classes, encode, read_scenes
-from training.datasets.batches import scene_tensors
+from training.datasets.batches import SceneTensors, scene_tensors
 from training.datasets.records import digest_of
 from training.evaluation.artifact_model import artifact_model
 from training.evaluation.report import Progress, card_figures, measure, silent
@@ -47,19 +48,24 @@ class RoomList:
     source: str
     scenes: Sequence[AnnotatedScene]
 
-    def measure(self, artifact: Artifact, progress: Progress = silent) -> list[CardMetric]:
-        """Return the metrics of `ROOM_TASKS` that the scenes support.
+    def tensors(self, vocabulary: Vocabulary) -> SceneTensors:
+        """Return the scenes in the classes of a vocabulary.
 
-        Intervals are over groups, or over rooms if the file has one group. The intruders of T3
-        have the popularity and the typical rooms of the file itself.
+        Each room is a group of its own if the file has one group.
         """
-        vocabulary = artifact.vocabulary
         encoded = encode(self.scenes, vocabulary)
         if len({scene.group for scene in encoded}) == 1:
             encoded = [replace(scene, group=scene.scene_id) for scene in encoded]
-        annotated = annotated_classes(encoded, vocabulary)
-        scenes = scene_tensors(encoded, annotated, vocabulary)
-        structure = torch.from_numpy(vocabulary.structure.copy())
+        return scene_tensors(encoded, annotated_classes(encoded, vocabulary), vocabulary)
+
+    def measure(self, artifact: Artifact, progress: Progress = silent) -> list[CardMetric]:
+        """Return the metrics of `ROOM_TASKS` that the scenes support.
+
+        Intervals are over groups. The intruders of T3 have the popularity and the typical rooms of
+        the file itself.
+        """
+        scenes = self.tensors(artifact.vocabulary)
+        structure = torch.from_numpy(artifact.vocabulary.structure.copy())
         setting = Setting(scenes, structure, train=scenes, limit=None)
         model = artifact_model(artifact)
         return card_figures(

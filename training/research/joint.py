@@ -9,7 +9,7 @@ the sources, sum_q p(q | listed) a_q. With q as one more unit of the machine, th
 
 and its conditionals average the odds instead: log sum_q p(q | listed) exp(a_q). Answers about
 objects also leave out observed relations. In the joint, these change the hidden units. The sum over
-all states of h1 is too large there, so it is estimated by importance sampling.
+all states of h1 is too large to compute, so importance sampling estimates it.
 
 The command prints the mean difference of the log-odds over random lists of the scenes of a file,
 and the mean reciprocal rank of hidden classes by both log-odds. The weights u of whole scenes and
@@ -18,7 +18,6 @@ kappa take no part: they belong to sampling and to the questions.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -28,8 +27,7 @@ import typer
 from torch import Tensor
 
 from app.registry import DEFAULT_STORE, Store
-from training.datasets import annotated_classes, encode
-from training.datasets.batches import SceneTensors, scene_tensors
+from training.datasets.batches import SceneTensors
 from training.datasets.cases import some_scenes
 from training.domain.init_command import StorePath
 from training.evaluation.outside import read_test
@@ -168,10 +166,8 @@ def main(
     """Print the differences between served log-odds and those of the joint."""
     models = Store(store)
     artifact = models.load(*models.resolve(model))
-    vocabulary, rooms = artifact.vocabulary, read_test(file)
-    encoded = [replace(scene, weight=1.0) for scene in encode(rooms.scenes, vocabulary)]
-    scenes = scene_tensors(encoded, annotated_classes(encoded, vocabulary), vocabulary)
-    structure = torch.from_numpy(vocabulary.structure.copy())
+    scenes = read_test(file).tensors(artifact.vocabulary)
+    structure = torch.from_numpy(artifact.vocabulary.structure.copy())
     machine = machine_of(artifact.weights).double()
     for length in _LENGTHS:
         _show(

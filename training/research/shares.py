@@ -25,8 +25,7 @@ import typer
 
 from app.inference.weights import Weights
 from app.registry import DEFAULT_STORE, Artifact, Store
-from training.datasets import annotated_classes, encode
-from training.datasets.batches import scene_tensors
+from app.registry.description import KINDS
 from training.domain.init_command import StorePath
 from training.evaluation.artifact_model import artifact_model
 from training.evaluation.outside import read_test
@@ -34,7 +33,6 @@ from training.evaluation.setting import Setting
 from training.evaluation.tasks import TASKS
 
 _LIMIT = 600
-_KINDS = ("lateral", "support", "above", "under", "stand")
 _SHOWN = {
     "T1a relations": ("R-precision, distinct classes",),
     "T1 pairs": ("accuracy",),
@@ -65,7 +63,7 @@ def misplaced(**entries: float) -> Callable[[Artifact], Artifact]:
 
     def change(artifact: Artifact) -> Artifact:
         judged = artifact.calibration.misplaced
-        kinds = {kind: getattr(judged, kind) for kind in _KINDS}
+        kinds = {kind: getattr(judged, kind) for kind in KINDS}
         update = {kind: one and one.model_copy(update=entries) for kind, one in kinds.items()}
         return _recalibrated(artifact, misplaced=judged.model_copy(update=update))
 
@@ -106,10 +104,8 @@ def main(
     """Print the metrics of a model and of its variants on the scenes of a file."""
     models = Store(store)
     artifact = models.load(*models.resolve(model))
-    vocabulary = artifact.vocabulary
-    encoded = encode(read_test(file).scenes, vocabulary)
-    scenes = scene_tensors(encoded, annotated_classes(encoded, vocabulary), vocabulary)
-    structure = torch.from_numpy(vocabulary.structure.copy())
+    scenes = read_test(file).tensors(artifact.vocabulary)
+    structure = torch.from_numpy(artifact.vocabulary.structure.copy())
     setting = Setting(scenes, structure, train=scenes, limit=_LIMIT)
     for task, variants in VARIANTS.items():
         for name, change in variants.items():
