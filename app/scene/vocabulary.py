@@ -305,7 +305,8 @@ class Vocabulary:
         for text in alternatives[:_MOST_GUESSED] or [name for _, name in pairs][-1:] or [label]:
             name = " ".join(split_words(text))
             vector, (vectors, known) = word_vectors().of(name), self.vectors
-            if vector is not None and known.any():
+            # Structure has no weights, so it cannot predict those of a word.
+            if vector is not None and (known & ~self.structure).any():
                 cosines = np.where(known, vectors @ vector, -1.0)
                 nearest = int(cosines.argmax())
                 similarity = round(min(max(float(cosines[nearest]), 0.0), 1.0), 3)

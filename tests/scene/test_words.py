@@ -66,3 +66,10 @@ def test_the_shipped_vectors_tell_similar_words() -> None:
     sofa, couch, whale = (found.of(word) for word in ("sofa", "couch", "whale"))
     assert sofa @ couch > 0.6 > 0.3 > sofa @ whale
     assert found.of("qwrtzx") is None
+
+
+@pytest.mark.parametrize("label", ["bed", "zxqvwa"])
+def test_a_word_has_a_meaning_only_beside_a_known_class_that_is_no_structure(label: str) -> None:
+    floor = ObjectClass("floor", structure=True)
+    word = Vocabulary([floor, ObjectClass(label)]).meaning("sofa")
+    assert (word is None) == (label == "zxqvwa")
