@@ -29,6 +29,7 @@ int main(int argc, char** argv) {
   json room;
   room["objects"] = {"bed", "nightstand", lamp};
   room["relations"] = json::array({on});
+  room["unknown_labels"] = "by-meaning";  // reads every word of a detector
 
   try {
     scene::Client service(options);  // throws where the URL is none

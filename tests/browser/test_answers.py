@@ -30,10 +30,10 @@ SPOKEN = {
 }
 
 
-def reasons(because: list[dict[str, Any]]) -> str:
-    """Reasons as the page writes them."""
+def reasons(because: list[dict[str, Any]], raised: int = 1) -> str:
+    """Reasons as the page writes them. `raised` is -1 for an outlier."""
     sides = []
-    for side, sign in (("for", 1), ("against", -1)):
+    for side, sign in (("for", raised), ("against", -raised)):
         names = [one["object"] for one in because if sign * one["log_odds_change"] > 0]
         if names:
             sides.append(f"{', '.join(names)} speak{'s' * (len(names) == 1)} {side} it")
@@ -157,7 +157,7 @@ def test_outliers_are_marked_with_reasons_in_words(bedroom: Board, api: httpx.Cl
         assert row.startswith(one["object"])
         assert percent(one["probability"]) in row
         assert ("does not belong" in row) == one["is_outlier"]
-        assert reasons(one["because"]) in row
+        assert reasons(one["because"], -1) in row
         assert ("usually seen with " + ", ".join(one["usually_with"]) in row) or not one[
             "is_outlier"
         ]

@@ -152,21 +152,23 @@ def test_a_model_of_one_s_own_opens_without_errors(
 
 
 def test_unknown_names_are_mapped_or_left_out_visibly(open_board: OpenBoard) -> None:
-    scene = {"objects": ["bed", "fridgee", "flux capacitor"], "room_type": "bedrom"}
+    scene = {"objects": ["bed", "fridgee", "qwxzkvj", "tractor"], "room_type": "bedrom"}
     board = open_board(scene, allow=("422",))
     assert notes(board, 0) == ""
     assert notes(board, 1) == "fridgee → fridge?"
-    assert notes(board, 2).startswith("flux capacitor not known, left out")
+    assert notes(board, 2) == "qwxzkvj not known, left out"
+    assert notes(board, 3).startswith("tractor read by its meaning, like ")
     expect(board.page.locator("#room-error")).to_have_text("bedrom → bedroom?")
     names = board.page.locator("#board .labels text.name").all_text_contents()
-    assert {"fridgee → fridge?", "flux capacitor"} < set(names)
-    expect(board.thing("flux capacitor")).to_have_class(re.compile("unknown"))
+    assert {"fridgee → fridge?", "qwxzkvj", "tractor"} < set(names)
+    assert [thing["label"] for thing in board.scene["objects"]] == scene["objects"]
+    expect(board.thing("qwxzkvj")).to_have_class(re.compile("unknown"))
     expect(board.page.locator("#legend .unknown")).to_have_text("not known to the model, left out")
-    assert [thing["label"] for thing in board.scene["objects"]] == ["bed", "fridgee"]
     assert board.rows("missing")
-    expect(board.column("missing")).to_contain_text("fridgee → fridge? flux capacitor not known")
+    expect(board.column("missing")).to_contain_text("fridgee → fridge? qwxzkvj not known")
     board.page.locator("#room").select_option("bedroom")
-    board.click("Remove flux capacitor")
+    board.click("Remove qwxzkvj")
+    board.click("Remove tractor")
     board.page.get_by_role("button", name="Rename fridgee to fridge").press("Enter")
     board.settle()
     assert board.things == ["bed", "fridge"]
@@ -174,6 +176,9 @@ def test_unknown_names_are_mapped_or_left_out_visibly(open_board: OpenBoard) -> 
     expect(board.page.locator("#list .name").nth(1)).to_be_focused()
     expect(board.page.locator("#list .error:visible, #room-error:visible")).to_have_count(0)
     expect(board.column("missing").locator("header + .problem + p")).to_be_empty()
+    board.put('{"objects": ["qwxzkvj"]}')
+    assert notes(board, 0) == "qwxzkvj not known, left out"
+    expect(board.thing("qwxzkvj")).to_have_class(re.compile("unknown"))
     board.put('{"objects": ["bed"], "room_type": "submarine"}')
     expect(board.page.locator("#room-error")).to_contain_text("submarine not known, left out")
     assert board.rows("missing")

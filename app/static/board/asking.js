@@ -4,7 +4,7 @@
  */
 
 import { call, ProblemError, UnreachableError } from './api.js';
-import { ASKED, bodyOf, DEPENDS, refusedBy } from './questions.js';
+import { ASKED, bodyOf, DEPENDS } from './questions.js';
 import { changed } from './store.js';
 
 const STILL = 120; // ms
@@ -41,12 +41,11 @@ export function startAsking(store) {
       put(column, question, { status: 'answered', answer, problem: null, body });
     } catch (error) {
       if (controller.signal.aborted) return;
-      fail(column, question, error, place, body);
+      fail(column, question, error, place);
     }
   }
 
-  function fail(column, question, error, place, body) {
-    if (error instanceof ProblemError && learn(error.problem, body)) return;
+  function fail(column, question, error, place) {
     if (error instanceof UnreachableError) {
       put(column, question, { status: 'down', problem: null });
       store.set({ down: true });
@@ -61,21 +60,6 @@ export function startAsking(store) {
     } else {
       throw error;
     }
-  }
-
-  /** Remembers the labels that a model refused. The next request to this model leaves them out. */
-  function learn({ type, errors = [] }, body) {
-    if (!type?.endsWith('/unknown-labels')) return false;
-    const state = store.get();
-    const known = refusedBy(state, body.model);
-    const found = new Map(known);
-    for (const { pointer, suggestions = [] } of errors) {
-      const place = /^#\/objects\/(\d+)/.exec(pointer);
-      if (place) found.set(body.objects[place[1]].label, suggestions);
-    }
-    const learnt = found.size > known.size;
-    if (learnt) store.set({ refused: { ...state.refused, [body.model]: found } });
-    return learnt;
   }
 
   function askAll() {

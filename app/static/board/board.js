@@ -7,7 +7,7 @@ import { drawGhosts } from './ghost_drawing.js';
 import { UNKNOWN_SIZE } from './geometry.js';
 import { ghostsOf, ROBOT_SIDE } from './ghosts.js';
 import { labelPlaces, LINE, Places, widthOf } from './labels.js';
-import { inWords, reading, refusedBy, sizesOf } from './questions.js';
+import { inWords, leftOut, reading, sizesOf } from './questions.js';
 import { sizer } from './scene.js';
 import { changed } from './store.js';
 import { fit, gridStep, onScreen, ROUND } from './view.js';
@@ -16,7 +16,7 @@ import { nameOf } from './words.js';
 const MARK = 9; // radius of the mark of an outlier, in pixels
 const FONT = '500 13px system-ui, sans-serif';
 const SEEN = [
-  'things', 'viewer', 'answers', 'shown', 'tab', 'selected', 'draft', 'words', 'at', 'models', 'posed', 'refused',
+  'things', 'viewer', 'answers', 'shown', 'tab', 'selected', 'draft', 'words', 'at', 'models', 'posed',
   'right', 'line',
 ];
 
@@ -87,6 +87,7 @@ export function createBoard(node, store, actions, takeGhost) {
   }
 
   function drawObjects(state, boxes, wrong) {
+    const left = leftOut(state, state.shown);
     const focused = node.contains(document.activeElement) ? document.activeElement : null;
     const ordered = [...boxes].sort((a, b) => a.z - b.z || b.size.x * b.size.y - a.size.x * a.size.y);
     const each = objects.selectAll('g.object').data(ordered, (box) => box.id).join((enter) => {
@@ -102,7 +103,7 @@ export function createBoard(node, store, actions, takeGhost) {
     each
       .classed('selected', (box) => box.id === state.selected)
       .classed('outlier', (box) => !state.draft && Boolean(wrong.get(box.id)?.is_outlier))
-      .classed('unknown', (box) => !state.draft && refusedBy(state, state.models[state.shown]).has(box.label))
+      .classed('unknown', (box) => !state.draft && left.has(box.id))
       .classed('new', (box) => Boolean(state.draft?.fresh.has(box.id)))
       .classed('anchor', (box) => state.at?.object === box.id)
       .classed('loose', (box) => !state.draft && state.posed && !box.placed)
@@ -127,7 +128,6 @@ export function createBoard(node, store, actions, takeGhost) {
   /** Draws labels inside their boxes if they fit, else beside them. Upper objects take precedence. */
   function drawLabels(state, boxes, places, wrong) {
     const texts = [];
-    const left = refusedBy(state, state.models[state.shown]);
     const half = ROBOT_SIDE / 2;
     const named = (box) => (boxes.some(({ id, label }) => label === box.label && id !== box.id) ? nameOf(box) : box.label);
     const { x, y } = state.viewer;
@@ -138,7 +138,8 @@ export function createBoard(node, store, actions, takeGhost) {
       places.reserve({ left: at - MARK, right: at + MARK, top: top - MARK, bottom: top + MARK });
     }
     for (const box of [...boxes].sort((a, b) => b.z - a.z || a.size.x * a.size.y - b.size.x * b.size.y)) {
-      const words = (!state.draft && !left.has(box.label) && inWords(reading(state, state.shown, 'objects', box.label))) || named(box);
+      const read = state.draft ? [] : reading(state, state.shown, 'objects', box.label);
+      const words = read.length > 1 ? inWords(read) : named(box); // A guess names its class.
       const width = widthOf(words, FONT) + 6;
       const rect = onScreen(box, view);
       const at = places.take(width, LINE, labelPlaces(rect, width), [rect]);

@@ -8,17 +8,17 @@ import { common, inWords, QUESTIONS, reading, whyNot } from './questions.js';
 import { changed } from './store.js';
 import { namesOf, percent, SPOKEN, wordOf } from './words.js';
 
-const SEEN = ['answers', 'shown', 'models', 'things', 'tab', 'draft', 'words', 'at', 'refused', 'posed', 'relations', 'room', 'right', 'line'];
+const SEEN = ['answers', 'shown', 'models', 'things', 'tab', 'draft', 'words', 'at', 'posed', 'relations', 'room', 'right', 'line'];
 
 const PLACES = 2; // listed places of a missing object, likeliest first
 
 const spoken = ({ subject, relation, object }, name) => `${name(subject)} ${SPOKEN[relation]} ${name(object)}`;
 
-/** Reasons in words: "bed, lamp speak for it; oven speaks against it". */
-function reasons(because, name, company = []) {
+/** Reasons in words: "bed, lamp speak for it; oven speaks against it". What raises the log-odds of an outlier speaks against it. */
+function reasons(because, name, { company = [], raised = 1 } = {}) {
   const speak = (side, objects) =>
     objects.length ? `${objects.join(', ')} ${objects.length > 1 ? 'speak' : 'speaks'} ${side} it` : '';
-  const named = (sign) => because.filter((one) => sign * one.log_odds_change > 0).map(({ object }) => name(object));
+  const named = (sign) => because.filter((one) => sign * raised * one.log_odds_change > 0).map(({ object }) => name(object));
   const words = [
     company.length ? `usually seen with ${company.join(', ')}` : '',
     speak('for', named(1)), speak('against', named(-1)),
@@ -93,7 +93,7 @@ const ROWS = {
       }, name(one.object)), one.probability, one.is_outlier
         ? { kind: 'alarm', words: 'does not belong', buttons: [verdict('Belongs here', name(one.object), () => verdicts.belongs(one.object))] }
         : { words: one.confirmed ? 'confirmed' : '' },
-      classOf(one), reasons(one.because, name, one.usually_with)));
+      classOf(one), reasons(one.because, name, { company: one.usually_with, raised: -1 })));
     const misplaced = answer.misplaced.filter((one) => one.is_misplaced || one.confirmed).map((one) =>
       row('outliers', el('b', {}, spoken(one, name)), one.probability, one.confirmed
         ? { words: 'confirmed' }

@@ -4,7 +4,7 @@ import { call, ProblemError, UnreachableError } from './api.js';
 import { calls, problemWords } from './columns.js';
 import { el } from './dom.js';
 import { layOut } from './layout.js';
-import { sceneFor, sizesOf } from './questions.js';
+import { sceneFor, sizesOf, UNKNOWN_LABELS } from './questions.js';
 import { newLine } from './records.js';
 import { freshId, FULL, MOST_OBJECTS, sizer } from './scene.js';
 import { changed } from './store.js';
@@ -20,12 +20,12 @@ export function createGeneration(form, drawn, store, say) {
 
   function bodyOf(state) {
     const model = state.models[state.shown];
-    const { objects, room_type: room, ...scene } = sceneFor(state, model);
+    const { objects, room_type: room, ...scene } = sceneFor(state);
     return {
       objects: [],
       ...(evidence.checked && { objects, ...scene }),
       ...(room && { room_type: room }),
-      model, seed, unknown_labels: 'nearest-or-ignore',
+      model, seed, unknown_labels: UNKNOWN_LABELS,
     };
   }
 

@@ -7,7 +7,7 @@ import { isCertain, readings } from './questions.js';
 import { changed } from './store.js';
 import { nameOf } from './words.js';
 
-const SEEN = ['things', 'selected', 'answers', 'shown', 'viewer', 'draft', 'refused', 'models', 'posed', 'line'];
+const SEEN = ['things', 'selected', 'answers', 'shown', 'viewer', 'draft', 'models', 'posed', 'line'];
 
 export function createList(list, empty, count, actions) {
   function row({ id }) {

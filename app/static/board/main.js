@@ -32,7 +32,7 @@ const say = (words) => (get('live').textContent = words);
 
 const store = createStore({
   things: [], relations: [], posed: false, viewer: { x: 0, y: 0, yaw: 0 }, room: '', models: ['default', ''], shown: 0,
-  tab: 'missing', selected: null, at: null, sensitivity: 'medium', refused: {}, answers: [{}, {}], draft: null, words: {},
+  tab: 'missing', selected: null, at: null, sensitivity: 'medium', answers: [{}, {}], draft: null, words: {},
   down: false, complaint: '', epoch: 0, canUndo: false,
   line: newLine(), right: [],
 });

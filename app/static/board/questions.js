@@ -1,7 +1,6 @@
 /** The bodies of the questions that the page asks about every scene. */
 
 import { toScene } from './scene.js';
-import { namesOf } from './words.js';
 
 /** The questions with a tab of their own. */
 export const QUESTIONS = ['missing', 'outliers', 'relations'];
@@ -10,7 +9,7 @@ export const ASKED = [...QUESTIONS, 'rooms'];
 
 /** The parts of the state that the answers depend on. */
 export const DEPENDS = [
-  'things', 'relations', 'posed', 'viewer', 'room', 'models', 'at', 'sensitivity', 'refused', 'words', 'epoch',
+  'things', 'relations', 'posed', 'viewer', 'room', 'models', 'at', 'sensitivity', 'words', 'epoch',
 ];
 
 const SUGGESTIONS = 5;
@@ -22,12 +21,8 @@ export const LIKELY = 0.25;
 /** Typical sizes of a model's classes, by label. */
 export const sizesOf = (state, model) => state.words[model]?.sizes ?? new Map();
 
-/** The labels that a model refused. @returns {Map<string, string[]>} label → similar names */
-export const refusedBy = (state, model) => state.refused[model] ?? new Map();
-
-/** The objects of the board that a model knows, or may know. */
-export const knownTo = (state, model) =>
-  state.things.filter((thing) => !refusedBy(state, model).has(thing.label));
+/** How a model reads a label of no class: as a similar class, then by its meaning, else it leaves the object out. */
+export const UNKNOWN_LABELS = 'by-meaning';
 
 /** The classes that both models can propose; null with one model or with equal vocabularies. */
 export function common(state) {
@@ -51,31 +46,34 @@ const OWN = {
 /** The parts of a scene that are no evidence about its room type. A change of them asks nothing again. */
 const NO_EVIDENCE = { rooms: { room: '', relations: [], posed: false } };
 
-/** The scene as a model gets it, without the labels that it refused. */
-export const sceneFor = (state, model) =>
-  toScene({ ...state, things: knownTo(state, model) }, sizesOf(state, state.models[0]));
+/** The scene as a model gets it. */
+export const sceneFor = (state) => toScene(state, sizesOf(state, state.models[0]));
 
 /** @returns {object | null} null if there is nothing to ask; `whyNot` gives the reason */
 export function bodyOf(state, question, model) {
   if (whyNot(state, question, model)) return null;
-  const scene = sceneFor({ ...state, ...NO_EVIDENCE[question] }, model);
-  return { ...scene, model, unknown_labels: 'nearest', ...OWN[question](state) };
+  const scene = sceneFor({ ...state, ...NO_EVIDENCE[question] });
+  return { ...scene, model, unknown_labels: UNKNOWN_LABELS, ...OWN[question](state) };
 }
 
 /** The reason why the page does not ask this question, or ''. */
 export function whyNot(state, question, model) {
   if (!model) return 'Choose a model first.';
   if (!state.things.length) return 'Put an object on the board first.';
-  const known = knownTo(state, model);
-  if (!known.length) return 'The model knows none of the objects.';
-  if (question !== 'missing') return '';
-  if (state.at && !known.some(({ id }) => id === state.at.object)) return `The model does not know ${namesOf(state.things)(state.at.object)}.`;
-  return common(state)?.length === 0 ? 'The two models have no class in common.' : '';
+  return question === 'missing' && common(state)?.length === 0 ? 'The two models have no class in common.' : '';
 }
 
 /** The entries of a field in all answers of a model. */
 const inAnswers = (state, column, field) =>
   QUESTIONS.flatMap((question) => state.answers[column][question]?.answer?.[field] ?? []);
+
+/** The ids of the objects that a model left out, because it knows neither their labels nor their meanings. */
+export function leftOut(state, column) {
+  const errors = QUESTIONS.flatMap((question) => state.answers[column][question]?.problem?.errors ?? []);
+  // The service refuses a request without any known object.
+  const all = errors.some(({ pointer }) => pointer === '#/objects');
+  return new Set(all ? state.things.map(({ id }) => id) : inAnswers(state, column, 'ignored'));
+}
 
 /** How a model reads a name that is no label of its own: {class, similarity}, or undefined. */
 export const mappedBy = (state, column, name) =>
@@ -85,18 +83,18 @@ export const mappedBy = (state, column, name) =>
 export const isCertain = (state, name) => Boolean(state.answers) && mappedBy(state, state.shown, name)?.similarity === 1;
 
 /**
- * How a model reads an unknown name: ["fridgee →", "fridge"], ["hall → corridor"] for certain, ["flux not known, left out"], or [].
+ * How a model reads an unknown name: ["fridgee →", "fridge"], ["hall → corridor"] for certain, ["flux not known, left out"],
+ * ["tractor read by its meaning, like forklift"], or [].
  * @param {'objects' | 'rooms'} kind
- * @returns {string[]} words, then similar names
+ * @returns {string[]} words, then the similar class of a guess
  */
 export function reading(state, column, kind, name) {
-  // The service ignores an unknown room type, and refuses unknown labels with similar names.
-  const similar = kind === 'rooms'
-    ? inAnswers(state, column, 'ignored').includes(name) && []
-    : refusedBy(state, state.models[column]).get(name);
-  if (similar) return [`${name} not known, left out${similar.length ? ':' : ''}`, ...similar];
+  const left = leftOut(state, column);
+  const names = kind === 'rooms' ? [name] : state.things.filter(({ label }) => label === name).map(({ id }) => id);
+  if (names.some((one) => left.has(one))) return [`${name} not known, left out`];
   const found = mappedBy(state, column, name);
   if (!found) return [];
+  if (found.rule === 'meaning') return [`${name} read by its meaning, like ${found.class}`];
   return found.similarity < 1 ? [`${name} →`, found.class] : [`${name} → ${found.class}`];
 }
 

@@ -6,7 +6,7 @@
 import { call } from './api.js';
 import { el } from './dom.js';
 import { asRequest } from './importing.js';
-import { sizesOf } from './questions.js';
+import { sizesOf, UNKNOWN_LABELS } from './questions.js';
 import { fromScene, toScene } from './scene.js';
 import { changed } from './store.js';
 import { wordOf } from './words.js';
@@ -54,7 +54,7 @@ export function createRecorded(store, records, go) {
       const board = fromScene(asRequest(line), sizes);
       if (!board.things.length) return null;
       const posed = !board.relations.length && board.things.some(({ placed }) => placed);
-      return { ...toScene({ ...board, posed }, sizes), model, sensitivity, unknown_labels: 'nearest-or-ignore', detail: 'scores' };
+      return { ...toScene({ ...board, posed }, sizes), model, sensitivity, unknown_labels: UNKNOWN_LABELS, detail: 'scores' };
     } catch {
       return null; // The board shows the error of this scene.
     }

@@ -21,7 +21,7 @@ export function watchService(store, banner, whenBack) {
     }
     banner.hidden = true;
     waiting = false;
-    store.set({ down: false, refused: {}, epoch: store.get().epoch + 1 });
+    store.set({ down: false, epoch: store.get().epoch + 1 });
     whenBack();
   }
 

@@ -5,7 +5,7 @@ import { el } from './dom.js';
 import { edgesOf, judgedBy, wrongIn } from './edges.js';
 import { UNKNOWN_SIZE } from './geometry.js';
 import { ghostsOf } from './ghosts.js';
-import { inWords, isCertain, knownTo, mappedBy, readings, sizesOf } from './questions.js';
+import { inWords, isCertain, leftOut, mappedBy, readings, sizesOf } from './questions.js';
 import { sizer } from './scene.js';
 import { changed } from './store.js';
 import { namesOf, percent, plain, SPOKEN } from './words.js';
@@ -25,7 +25,7 @@ function visible(state) {
   const edges = new Set(edgesOf(state).map(({ kind }) => kind));
   const seen = {
     robot: true, selected, outlier: [...outliersOf(state).values()].some((one) => one.is_outlier),
-    unknown: knownTo(state, state.models[state.shown]).length < things.length,
+    unknown: things.some(({ id }) => leftOut(state, state.shown).has(id)),
     guess: [...things.map(sizer(sizesOf(state, state.models[0]))), ...ghostsOf(state)].some(({ size }) => size === UNKNOWN_SIZE),
     loose: posed && things.some(({ placed }) => !placed), anchor: at, ghost: ghostsOf(state).length,
   };
@@ -35,7 +35,8 @@ function visible(state) {
 /** What counts as evidence, in words. */
 function evidence(state) {
   const { posed, things, relations } = state;
-  const known = knownTo(state, state.models[state.shown]);
+  const left = leftOut(state, state.shown);
+  const known = things.filter(({ id }) => !left.has(id));
   const given = known.filter(({ placed }) => placed).length;
   if (posed) {
     const rest = given < known.length ? ' Move an object to give its position.' : '';
