@@ -157,10 +157,11 @@ def publish(
 ) -> None:
     """Calibrate, evaluate and publish a finished run, or refit the statistics of a version.
 
-    With name@version, the command fits the offsets, the counts of instances and the alarm lines
-    again. The new version keeps the weights and the other calibration and metrics of the old
-    version. For a version of `train --final`, the shares of flagged intruders and of alarms are
-    left out, because its weights know the test scenes.
+    With name@version, the command fits the offsets, the counts of instances, the alarm lines and
+    the limits of generated scenes again. The new version keeps the weights and the other
+    calibration and metrics of the old version. For a version of `train --final`, the shares of
+    flagged intruders, of alarms and of refused rooms are left out, because its weights know the
+    test scenes.
 
     The command asks the model about untouched validation scenes, and refuses a model that certainly
     raises more alarms than its sensitivities promise. A refused version is not published, and the

@@ -67,6 +67,7 @@ def reasons(
     rows: NDArray[np.int64] | None = None,
     *,
     least: float = 0.0,
+    scale: float = 1.0,
 ) -> list[list[Fields]]:
     """Return the strongest reasons for the log-odds of each of N explained classes.
 
@@ -79,12 +80,14 @@ def reasons(
         rows: (N,) index of each explained class among the n classes. None means that the explained
             classes are absent.
         least: minimum absolute value of a change. Rounding errors of a change of 0 are left out.
+        scale: slope of the calibration, so that an answer's changes are those of its `log_odds`.
 
     Returns:
         For each explained class, a list of reasons with the fields of
         `scene_client.schemas.Because`.
     """
     columns, values = strongest(change, np.zeros(0, np.int64) if rows is None else rows, REASONS)
+    values = scale * values
     strong = np.abs(values) >= max(least, _ROUNDING)
     entries: list[list[Fields]] = [[] for _ in change]
     numbers, changes = present.first[columns[strong]].tolist(), significant(values[strong])

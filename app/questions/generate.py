@@ -5,12 +5,13 @@ of the stored scene where its chain starts. A Gibbs chain sometimes ends in a st
 kinds of rooms. The drawn scene is then almost empty, or contains an object that fits neither kind
 of room. A scene is drawn again if one of these conditions is met:
 
-- The scene has fewer classes than 90 % of the real rooms of its type (`Calibration.smallest`).
-- The scene fits its room type worse than 85 % of the real rooms do (`Calibration.room_fit`).
+- The scene has fewer classes than 95 % of short lists of its room type (`Calibration.smallest`).
+- The scene fits its room type worse than 95 % of lists of its length (`Calibration.room_fit`).
 - The question `outliers` reports a drawn class as an intruder at the default sensitivity. Classes
   that the request lists do not count.
 
-After `ATTEMPTS` draws for the same scene, the last draw is accepted in any case.
+The lists are random parts of whole rooms (`training.fit.calibrate_rooms`). After `ATTEMPTS`
+draws for the same scene, the last draw is accepted in any case.
 """
 
 import secrets
@@ -94,18 +95,32 @@ def generate(
     scenes: list[Fields] = []
     while len(scenes) < count and not stop():
         stream = random_stream(seed, len(scenes))
-        for attempt in range(ATTEMPTS):
-            state = chains.draw(steps, stream)
-            is_shown = shown[state.classes]
-            classes = state.classes[is_shown].tolist()
-            is_last = attempt == ATTEMPTS - 1
-            if _is_plausible(artifact, scene, classes, state.room) or stop() or is_last:
-                scenes.append(_scene(artifact, chains, state, is_shown, evidence))
-                break
+        state = draw_plausible(artifact, chains, scene, steps, stream, stop)
+        scenes.append(_scene(artifact, chains, state, shown[state.classes], evidence))
     fields: Fields = {"seed": seed, "scenes": scenes}
     if listed_as := _words(artifact, scene, listing):
         fields["listed_as"] = listed_as
     return fields
+
+
+def draw_plausible(
+    artifact: Artifact,
+    chains: ConditionedChains,
+    evidence: Scene,
+    steps: int,
+    stream: np.random.Generator,
+    stop: Callable[[], bool] = lambda: False,
+) -> ChainState:
+    """Draw scenes until one is plausible, at most `ATTEMPTS` times. Return the last one.
+
+    After ``stop`` returns True, the function draws no further scene.
+    """
+    state = chains.draw(steps, stream)
+    for _ in range(ATTEMPTS - 1):
+        if is_plausible(artifact, evidence, state.classes, state.room) or stop():
+            break
+        state = chains.draw(steps, stream)
+    return state
 
 
 def _words(artifact: Artifact, scene: Scene, listing: Present) -> dict[str, str]:
@@ -188,23 +203,39 @@ def staying(
     return stay
 
 
-def _is_plausible(
-    artifact: Artifact, evidence: Scene, classes: list[int], room: int | None
+def is_plausible(
+    artifact: Artifact, evidence: Scene, present: NDArray[np.int64], room: int | None
 ) -> bool:
-    """Return whether a drawn scene meets none of the three conditions of the module."""
-    calibration = artifact.calibration
-    smallest, limits = calibration.smallest or (0,), calibration.room_fit
-    # The last entry is for scenes without a room type.
-    if len(classes) < smallest[-1 if room is None else min(room, len(smallest) - 1)]:
-        return False
-    if room is not None and limits and room_fit(artifact, classes, room) < limits[room]:
+    """Return whether a drawn scene meets none of the three conditions of the module.
+
+    Args:
+        present: (n,) indices of the classes of the drawn scene. Structural classes count only if
+            the evidence lists them.
+        room: index of the room type of the drawn scene, or None if unknown.
+    """
+    listed = {thing.class_index for thing in evidence.objects}
+    is_structure = artifact.vocabulary.structure
+    classes = [index for index in present.tolist() if not is_structure[index] or index in listed]
+    if not is_within_limits(artifact, classes, room):
         return False
     if not classes:
         return True
     labels = artifact.vocabulary.labels
     objects = [SceneObject(labels[index], labels[index], index) for index in classes]
     drawn = intruders(artifact, Scene(tuple(objects), room_type=room)).tolist()
-    return {thing.class_index for thing in evidence.objects}.issuperset(drawn)
+    return listed.issuperset(drawn)
+
+
+def is_within_limits(artifact: Artifact, classes: list[int], room: int | None) -> bool:
+    """Return whether a scene reaches the minima of its room type: `smallest` and `room_fit`."""
+    calibration = artifact.calibration
+    smallest, fits = calibration.smallest or (0,), calibration.room_fit
+    # The last entry is for scenes without a room type.
+    if len(classes) < smallest[-1 if room is None else min(room, len(smallest) - 1)]:
+        return False
+    if room is None or not fits:
+        return True
+    return room_fit(artifact, classes, room) >= fits[room].of(len(classes))
 
 
 def room_fit(artifact: Artifact, classes: list[int], room: int) -> float:
@@ -274,6 +305,10 @@ GENERATE: Final = Question(
     _EXAMPLE_ANSWER,
     description="""
 Sample scenes that contain the given objects and relations. Equal seeds give equal scenes.
+
+A filter draws an implausible scene again, at most seven times. A scene is implausible if it has an
+outlier that the request does not list, fewer classes than nearly all lists of its room type, or
+classes that fit its room type worse than nearly all lists do.
 
 The request is refused if the model does not know its room type, with any `unknown_labels`. The same
 holds if too few training scenes have this room type (`rare_room_types` of `GET

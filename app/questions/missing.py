@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import InvalidRequestError
+from app.inference.elementary import sigmoid
 from app.inference.kernels import best
 from app.questions.answer import EXPLAINED, Fields, named, reasons, significant
 from app.questions.counts import more
 from app.questions.names import ErrorList
 from app.questions.placements import Place, place_log_p, placements
-from app.questions.posterior import LEAST_CHANGE, Posterior, calibrated
+from app.questions.posterior import LEAST_CHANGE, Posterior, calibrated_missing, log_odds_of
 from app.questions.question import LABELS, REFUSED, SCENES, Example, Options, Question
 from app.questions.reading import Reading
 from app.registry.artifact import Artifact
@@ -61,9 +62,11 @@ def missing(
             any probability. None means all classes.
         listed_as: the word of the request for each candidate, by class index.
         at: a place, as (relation, index of the anchor object). If set, `probability` is the
-            probability that the class is present *and* has this relation to the anchor.
-        coverage: listed share of the classes of the scene. None means the model's value. At 1, at
-            most one class is missing.
+            probability that the class is present *and* has this relation to the anchor: the
+            probability of the class, multiplied by that of the place if the class is present.
+        coverage: listed share of the classes of the scene. At 1, at most one class is missing. None
+            means an unknown share: the base rates are those of the model's coverage, and the
+            calibration is that of lists of any share.
         axes: viewer's axes in the frame of the offsets; see `viewer_axes`. None means that the
             viewing direction is unknown.
         details: whether the answer contains `placements` and `because`.
@@ -71,14 +74,12 @@ def missing(
     Returns:
         The fields `coverage`, `missing` and `more` of `scene_client.schemas.MissingAnswer`.
     """
-    used_coverage = artifact.calibration.coverage if coverage is None else coverage
     place = None if at is None else Place.of(*at)
     posterior = Posterior(artifact, scene)
-    classes, probabilities, log_odds = _ranked(
-        artifact, posterior, top_k, candidates, place, used_coverage
-    )
+    calibration = artifact.calibration
+    classes, log_odds, placed = _ranked(artifact, posterior, top_k, candidates, place, coverage)
     labels = artifact.vocabulary.labels
-    columns = classes.tolist(), significant(probabilities), significant(log_odds)
+    columns = classes.tolist(), significant(sigmoid(log_odds)), significant(log_odds)
     entries: list[Fields] = []
     for index, probability, value in zip(*columns, strict=True):
         entry = named(labels[index], listed_as.get(index))
@@ -88,10 +89,15 @@ def missing(
         places = placements(artifact, posterior, scene, classes, axes, place)
         for entry, class_places in zip(entries, places, strict=True):
             entry["placements"], entry["because"] = class_places, []
+        if place is not None:
+            for entry, p in zip(entries, significant(placed), strict=True):
+                for requested in entry["placements"][:1]:
+                    requested["probability"] = p
         if len(posterior.present.classes):
             explained = classes[:EXPLAINED]
             change = posterior.reasons_for_absent(explained)
-            causes = reasons(scene, posterior.present, change, least=LEAST_CHANGE)
+            slope = (calibration.missing if coverage is None else calibration.covered).slope
+            causes = reasons(scene, posterior.present, change, least=LEAST_CHANGE, scale=slope)
             for entry, because in zip(entries, causes, strict=False):
                 entry["because"] = because
     further: list[Fields] = []
@@ -104,6 +110,7 @@ def missing(
             candidates=candidates,
             coverage=coverage,
         )
+    used_coverage = calibration.coverage if coverage is None else coverage
     return {"coverage": used_coverage, "missing": entries, "more": further}
 
 
@@ -113,12 +120,13 @@ def _ranked(
     top_k: int,
     candidates: Sequence[int] | None,
     place: Place | None,
-    coverage: float,
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.floating[Any]]]:
+    coverage: float | None,
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """Return the likeliest candidates, likeliest first.
 
     Returns:
-        The class indices, their probabilities, and their log-odds before calibration, each (k,).
+        The class indices, the log-odds that they are present (and at the place), and the
+        probabilities of the place if they are present (1 without a place), each (k,).
     """
     vocabulary, listed = artifact.vocabulary, posterior.present.classes
     usable = ~vocabulary.structure
@@ -131,27 +139,31 @@ def _ranked(
         usable &= named & ~vocabulary.broader[listed].any(0)
     if not usable.any():
         return np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
-    log_odds = posterior.absent_log_odds(np.arange(len(usable)), coverage)
-    entry = artifact.calibration.missing
+    calibration = artifact.calibration
+    used_coverage = calibration.coverage if coverage is None else coverage
+    raw = posterior.absent_log_odds(np.arange(len(usable)), used_coverage).astype(np.float64)
+    log_odds = calibrated_missing(calibration, raw, posterior.listed, coverage)
     # Relatives of likelier classes are left out of twice as many, unless candidates are named.
     count = 2 * top_k if candidates is None else top_k
     while True:
-        if place is None:
-            first = best(entry.slope * log_odds, usable, count)
-            logits = calibrated(entry, log_odds[first], max(1, posterior.listed))
-        else:
-            every = _logits_at(artifact, posterior, place, usable, log_odds, count)
-            first = best(every, usable, count)
-            logits = every[first]
+        score = log_odds
+        if place is not None:
+            score = _log_p_at(artifact, posterior, place, usable, log_odds, count)
+        first = best(score, usable, count)
         chosen = np.arange(len(first))
         if candidates is None:
             chosen = _one_of_a_family(vocabulary.related[first[:, None], first])
         if len(chosen) >= top_k or len(first) < count:
             break
         count *= 2
-    chosen = chosen[:top_k]
-    first, logits = first[chosen], logits[chosen]
-    return first, 1.0 / (1.0 + np.exp(-logits.astype(np.float64))), log_odds[first]
+    first = first[chosen[:top_k]]
+    if place is None:
+        return first, log_odds[first], np.ones(len(first))
+    return (
+        first,
+        log_odds_of(score[first]),
+        np.exp(score[first] + np.logaddexp(0, -log_odds[first])),
+    )
 
 
 def _one_of_a_family(related: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -167,39 +179,43 @@ def _one_of_a_family(related: NDArray[np.bool_]) -> NDArray[np.int64]:
     return np.flatnonzero(~left_out)
 
 
-def _logits_at(
+def _log_p_at(
     artifact: Artifact,
     posterior: Posterior,
     place: Place,
     usable: NDArray[np.bool_],
     log_odds: NDArray[np.floating[Any]],
     top_k: int,
-) -> NDArray[np.floating[Any]]:
-    """Return the logits of p(present and at the place), (V,); see `PlaceFit`.
+) -> NDArray[np.float64]:
+    """Return log p(present and at the place), (V,): log p(present) + log p(place | present).
 
-    The log probability of the relation is at most 0. So the other terms give an upper bound of the
-    logit. The function scores candidates in blocks, in descending order of this bound. It stops
-    when the bound of the next candidate is below the `top_k` largest logits. The remaining
-    candidates get the logit -inf.
+    The log probability of the relation is at most 0. So the other terms of `PlaceFit` give an upper
+    bound. The function scores candidates in blocks, in descending order of this bound. It stops
+    when the bound of the next candidate is below the `top_k` largest values. The remaining
+    candidates get the value -inf.
+
+    Args:
+        log_odds: (V,) log-odds that each class is present.
     """
-    entry = artifact.calibration.at[place.relation]
-    bound = log_odds.astype(np.float64)
+    entry, log_p = artifact.calibration.at[place.relation], -np.logaddexp(0.0, -log_odds)
+    at_most = np.full_like(log_p, entry.intercept)
     if artifact.places is not None and entry.counts:
         stand_in = artifact.vocabulary.stand_in
         anchor = int(stand_in[posterior.present.classes[posterior.present.row[place.anchor]]])
         ratio = artifact.places.log_ratio(place.relation, anchor, outgoing=place.outgoing)
-        bound = bound + entry.counts * ratio[stand_in]
-    scores = np.full_like(bound, -np.inf)
+        at_most += entry.counts * ratio[stand_in]
+    bound = log_p - np.logaddexp(0.0, -at_most)
+    joint = np.full_like(log_p, -np.inf)
     order = np.flatnonzero(usable)
     order = order[np.argsort(-bound[order], kind="stable")]
     for start in range(0, len(order), _BLOCK):
         block = order[start : start + _BLOCK]
-        largest = np.sort(scores[order[:start]])[-top_k:]
+        largest = np.sort(joint[order[:start]])[-top_k:]
         if len(largest) == top_k and bound[block[0]] < largest[0]:
             break
-        log_p = place_log_p(posterior, block, place)
-        scores[block] = bound[block] + entry.relation * log_p
-    return entry.intercept + entry.slope * scores
+        logits = at_most[block] + entry.relation * place_log_p(posterior, block, place)
+        joint[block] = log_p[block] - np.logaddexp(0.0, -logits)
+    return joint
 
 
 def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Options:
@@ -284,7 +300,7 @@ _EXAMPLE_ANSWER: Final = {
         {
             "label": "pillow",
             "probability": 0.46,
-            "log_odds": 1.9,
+            "log_odds": -0.16,
             "placements": [
                 {
                     "relation": "on-top",

@@ -314,6 +314,9 @@ class Names:
                 "numbers objects without an id, such as chair_1 and chair_2"
             )
             errors.add(InvalidRequestError, location, message)
+        elif self.is_ignored(name):
+            message = "the service ignored this object, because the model does not know its label"
+            errors.add(InvalidRequestError, location, message)
         else:
             message = "no entry of `objects` has this id or label"
             errors.add(InvalidRequestError, location, message, self._similar(name))

@@ -25,7 +25,7 @@ from app.questions.posterior import Posterior, calibrated
 from app.questions.question import REFUSED, SCENES, WITH_TOILET, Example, Options, Question
 from app.questions.reading import Reading, Triple
 from app.registry.artifact import Artifact
-from app.registry.description import AlarmLine, CountSlope, Sensitivity
+from app.registry.description import CountSlope, Sensitivity
 from app.scene.scene import Scene, SceneObject
 from scene_client.schemas import OutliersAnswer, OutliersRequest, SceneWarning
 
@@ -56,7 +56,8 @@ def outliers(
     training scene has the class. So the function subtracts alpha times the log of the popularity.
     A class that no training scene shows counts as the rarest other class. Structural classes, such
     as wall, and classes that belong anywhere, such as cat or bag, always have the probability 0. A
-    scene with few objects gives little evidence, so its threshold is higher.
+    scene with few objects gives little evidence, so its threshold is higher. A single class without
+    structure is never an outlier, because no other object says whether it belongs.
 
     The model knows little about a class that few training scenes show (`Artifact.rarely_shown`). At
     a sensitivity, an object of such a class is never an outlier. If its probability reaches the
@@ -73,11 +74,11 @@ def outliers(
 
     Returns:
         The fields `threshold`, `outliers` and `misplaced` of `scene_client.schemas.OutliersAnswer`.
-        A list is empty if the model gives no such judgement. `warnings` names this case, and the
-        objects of rare classes that reach the threshold.
+        A list is empty if the model gives no such judgement. `warnings` names this case, a single
+        class, and the objects of rare classes that reach the threshold.
         `threshold` is left out if the model judges no object and the caller states no threshold.
     """
-    entry, lines = artifact.calibration.outlier, artifact.calibration.outlier_lines
+    entry = artifact.calibration.outlier
     can_alarm = ~artifact.rarely_shown
     if threshold is not None:
         can_alarm = np.ones_like(can_alarm)
@@ -86,16 +87,16 @@ def outliers(
     wrong: list[Fields] = []
     warnings = _unjudged(artifact, scene)
     posterior = Posterior(artifact, scene) if scene.objects else None
-    if lines is not None and threshold is None:
-        line: AlarmLine = getattr(lines, sensitivity)
-        threshold = line.threshold(0 if posterior is None else posterior.listed)
+    if threshold is None:
+        n, in_room = posterior.listed if posterior else 0, scene.room_type is not None
+        threshold = artifact.calibration.outlier_threshold(sensitivity, n, in_room=in_room)
     if posterior is not None:
         wrong = misplaced_fields(artifact, posterior, scene, sensitivity, flipped)
         if entry is not None and threshold is not None:
             judged, unsure = _judged(
                 artifact, entry, posterior, scene, threshold, can_alarm, details=details
             )
-            warnings += _too_rare(artifact, unsure)
+            warnings += _too_rare(artifact, unsure) + _alone(artifact, posterior, scene)
     fields: Fields = {"warnings": warnings}
     if threshold is not None:
         fields["threshold"] = rounded_number(threshold)
@@ -118,13 +119,13 @@ def _judged(
     `can_alarm` is True for the classes that raise an alarm, (V,).
 
     `because` lists up to three other objects, in order of their effect on `log_odds`. For an
-    outlier, these objects lower its log-odds. For other objects, they raise the log-odds.
+    outlier, these objects raise its log-odds. For other objects, they lower the log-odds.
     """
     present, vocabulary = posterior.present, artifact.vocabulary
     labels, broader = vocabulary.labels, vocabulary.broader_labels
     log_odds, change = posterior.given_rest(explained=details)
     logits, p = _intruder_odds(artifact, entry, posterior, log_odds)
-    reaches = p >= threshold
+    reaches = (p >= threshold) & (posterior.listed > 1)
     is_outlier = reaches & can_alarm[present.classes]
     # The order follows the logits, because probabilities near 0 or 1 may round to the same number.
     order = (-logits[present.row]).argsort(kind="stable")
@@ -134,10 +135,10 @@ def _judged(
     if details and n > 1:
         lowered, raised = np.minimum(change, 0), np.maximum(change, 0)
         change = np.where(is_outlier[:, None], lowered, raised)
-        causes = reasons(scene, present, change, np.arange(n))
+        causes = reasons(scene, present, change, np.arange(n), scale=entry.slope)
     usual: list[list[str]] = [[] for _ in flags]
     judged: list[Fields] = []
-    classes, probabilities, values = present.classes.tolist(), significant(p), significant(log_odds)
+    classes, probabilities, values = present.classes.tolist(), significant(p), significant(logits)
     for row in explained if details else ():
         if flags[row]:
             usual[row] = _companions(artifact, present.classes, classes[row])
@@ -148,7 +149,9 @@ def _judged(
             fields["listed_as"] = thing.label
         if broader[classes[row]]:
             fields["broader"] = broader[classes[row]]
-        fields["probability"], fields["log_odds"] = probabilities[row], values[row]
+        fields["probability"] = probabilities[row]
+        if probabilities[row]:
+            fields["log_odds"] = values[row]
         fields["is_outlier"] = flags[row]
         if details:
             fields["because"] = causes[row] if row in explained else []
@@ -169,13 +172,13 @@ def misplaced(
 
 def intruders(artifact: Artifact, scene: Scene) -> NDArray[np.int64]:
     """Return the classes that reach the threshold of medium sensitivity, rare classes included."""
-    entry, lines = artifact.calibration.outlier, artifact.calibration.outlier_lines
-    posterior = Posterior(artifact, scene)
-    classes = posterior.present.classes
-    if entry is None or lines is None:
+    calibration, posterior = artifact.calibration, Posterior(artifact, scene)
+    classes, in_room = posterior.present.classes, scene.room_type is not None
+    threshold = calibration.outlier_threshold("medium", posterior.listed, in_room=in_room)
+    if calibration.outlier is None or threshold is None:
         return classes[:0]
-    _, p = _intruder_odds(artifact, entry, posterior, posterior.given_rest()[0])
-    return classes[p >= lines.medium.threshold(posterior.listed)]
+    _, p = _intruder_odds(artifact, calibration.outlier, posterior, posterior.given_rest()[0])
+    return classes[(p >= threshold) & (posterior.listed > 1)]
 
 
 def _intruder_odds(
@@ -215,8 +218,21 @@ def _too_rare(artifact: Artifact, objects: list[SceneObject]) -> list[SceneWarni
         return []
     classes = {thing.class_index for thing in objects}
     labels = sorted(artifact.vocabulary.labels[index] for index in classes if index is not None)
-    message = f"too few training scenes show {', '.join(labels)}, so the service raises no alarm"
+    message = (
+        f"too few or no training scenes show {', '.join(labels)}, so the service raises no alarm"
+    )
     ids = [thing.id for thing in objects]
+    return [SceneWarning(code="not-judged", message=message, objects=ids)]
+
+
+def _alone(artifact: Artifact, posterior: Posterior, scene: Scene) -> list[SceneWarning]:
+    """Return a warning if the scene lists a single class without structure, and it is judged."""
+    present, vocabulary = posterior.present, artifact.vocabulary
+    if posterior.listed != 1 or not vocabulary.judged[present.classes].any():
+        return []
+    rows = ~vocabulary.structure[present.classes][present.row]
+    ids = [thing.id for thing, is_thing in zip(scene.objects, rows, strict=True) if is_thing]
+    message = "the scene has objects of one class, so nothing says whether they belong to it"
     return [SceneWarning(code="not-judged", message=message, objects=ids)]
 
 
@@ -275,18 +291,18 @@ _EXAMPLE_ANSWER: Final = {
             "label": "toilet",
             "listed_as": "WC",
             "probability": 0.94,
-            "log_odds": -5.2,
+            "log_odds": 2.75,
             "is_outlier": True,
-            "because": [{"object": "bed", "log_odds_change": -2.7}],
+            "because": [{"object": "bed", "log_odds_change": 1.8}],
             "usually_with": ["toilet paper", "sink", "faucet"],
         },
         {
             "object": "bed",
             "label": "bed",
             "probability": 0.03,
-            "log_odds": 2.4,
+            "log_odds": -3.48,
             "is_outlier": False,
-            "because": [{"object": "lamp_1", "log_odds_change": 0.9}],
+            "because": [{"object": "lamp_1", "log_odds_change": -0.6}],
             "usually_with": [],
         },
     ],

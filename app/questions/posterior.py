@@ -23,7 +23,7 @@ from app.inference import MachineSpec
 from app.inference.kernels import pool_classes, pool_relations
 from app.inference.relations import Between, ObservedRelations, context_of, to_log_odds
 from app.registry.artifact import Artifact
-from app.registry.description import CountSlope
+from app.registry.description import LEAST_COVERAGE, Calibration, CountSlope, CoverageFit
 from app.scene.scene import Scene, instance_evidence
 
 Floats = NDArray[np.floating[Any]]
@@ -170,7 +170,7 @@ class Posterior:
         # Row k has the logits of h1 and the presence of the classes in the scene without class k.
         x, presence = self.context.x - self.context.shares, self.present.presence
         without = self._room_log_p(x, presence * (1 - np.eye(len(presence), dtype=np.float32)))
-        return (_log_odds(self.room_log_p()) - _log_odds(without)).T
+        return (log_odds_of(self.room_log_p()) - log_odds_of(without)).T
 
     def relation_log_odds(self) -> Floats:
         """Return the log-odds of every relation between the classes of the scene, (A, n, n).
@@ -212,7 +212,7 @@ class Posterior:
         return self._units.between(self.context)
 
 
-def _log_odds(log_p: Doubles) -> Doubles:
+def log_odds_of(log_p: Doubles) -> Doubles:
     """Return log p - log(1 - p). A p of nearly 1 counts as 1 - 1e-12."""
     return log_p - np.log(-np.expm1(np.minimum(log_p, -1e-12)))
 
@@ -231,3 +231,32 @@ def calibrated(entry: CountSlope, z: Floats, n: int | NDArray[np.integer[Any]]) 
         n: number n of the formula, or an array (N,) with a number for each logit.
     """
     return entry.intercept + entry.log_count * np.log(n) + entry.slope * z
+
+
+def calibrated_missing(
+    calibration: Calibration, z: Floats, n: int, coverage: float | None
+) -> Floats:
+    """Return the calibrated log-odds that N unlisted classes are present, (N,).
+
+    Args:
+        z: (N,) log-odds of the classes at the coverage.
+        n: number of listed classes without structure.
+        coverage: share of the scene that the request states; None if it states none.
+    """
+    n = max(1, n)
+    if coverage is None:
+        return calibrated(calibration.missing, z, n)
+    return calibrated_at_coverage(calibration.covered, z, n, coverage)
+
+
+def calibrated_at_coverage(
+    entry: CoverageFit,
+    z: Floats,
+    n: int | NDArray[np.integer[Any]],
+    coverage: float | NDArray[np.floating[Any]],
+) -> Floats:
+    """Return the calibrated log-odds of N logits, (N,); see `CoverageFit` for the formula."""
+    log_n, log_s = np.log(n), np.log(np.maximum(coverage, LEAST_COVERAGE))
+    change = entry.log_share * log_s + entry.both * log_n * log_s
+    last = entry.last * (np.asarray(coverage) == 1)
+    return entry.intercept + entry.slope * z + entry.log_count * log_n + change + last

@@ -7,9 +7,11 @@ from app.registry.description import (
     AlarmLines,
     Calibration,
     CountSlope,
+    CoverageFit,
     DataSource,
     Description,
     Example,
+    FitLimit,
     Judgement,
     Metric,
     Misplaced,
@@ -28,8 +30,8 @@ from app.registry.store import DEFAULT_STORE, Store, StoreState
 
 __all__ = [
     "DEFAULT_STORE", "AlarmLine", "AlarmLines", "AliasTarget", "Artifact", "ArtifactError",
-    "Calibration", "CountSlope", "Counts", "DataSource", "Description", "Example", "Judgement",
-    "Manifest", "Metric", "Misplaced", "ModelSet", "Offsets", "PlaceFit", "Places",
-    "RegistryError", "Sensitivity", "Sharpness", "Store", "StoreError", "StoreState",
+    "Calibration", "CountSlope", "Counts", "CoverageFit", "DataSource", "Description", "Example",
+    "FitLimit", "Judgement", "Manifest", "Metric", "Misplaced", "ModelSet", "Offsets", "PlaceFit",
+    "Places", "RegistryError", "Sensitivity", "Sharpness", "Store", "StoreError", "StoreState",
     "VocabularyEntry", "load_artifact", "load_model_set", "write_artifact",
 ]  # fmt: skip

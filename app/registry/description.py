@@ -1,7 +1,7 @@
 """The description of a model, as training writes it: metadata without weights and files."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Final, NamedTuple, Self
 
 import numpy as np
@@ -38,6 +38,26 @@ class CountSlope(Frozen):
     log_count: float = 0.0
 
 
+class CoverageFit(Frozen):
+    """Calibration of a logit z about a scene of which a list of n classes is the share s:
+
+        log-odds = intercept + slope·z + log_count·log n + log_share·log s
+                   + both·log n·log s + last·[s = 1]
+
+    A share below `LEAST_COVERAGE` counts as this share.
+    """
+
+    intercept: float = 0.0
+    slope: float = 1.0
+    log_count: float = 0.0
+    log_share: float = 0.0
+    both: float = 0.0
+    last: float = 0.0
+
+
+LEAST_COVERAGE: Final = 0.15
+"""Least share of a scene that the base rates of `/missing` tell apart."""
+
 PairSlopes = Annotated[Many[CountSlope], Field(max_length=len(CANONICAL))]
 
 PAIR_CALIBRATIONS: Final = ("relation", "relation_given", "placement")
@@ -48,18 +68,17 @@ n of this entry is the number of object pairs with the two classes of the relati
 
 
 class PlaceFit(Frozen):
-    """The log-odds that an unlisted class stands at the place that a request names.
+    """The log-odds that a class, if it is present, stands at the place that a request names.
 
-    With the log-odds z that the class is present, the log probability p of its relation to the
-    anchor if it is present, and the log ratio c of the counts (`Places.log_ratio`), they are
+    With the model's log probability p of the relation to the anchor, and the log ratio c of the
+    counts (`Places.log_ratio`), they are
 
-        intercept + slope · (z + relation·p + counts·c)
+        intercept + relation·p + counts·c
     """
 
     relation: Annotated[float, Field(ge=0)] = 1.0
     counts: Annotated[float, Field(ge=0)] = 0.0
     intercept: float = 0.0
-    slope: Annotated[float, Field(gt=0)] = 1.0
 
 
 PlaceFits = Annotated[Many[PlaceFit], Field(max_length=len(CANONICAL))]
@@ -79,16 +98,45 @@ class Sharpness(Frozen):
         return max(self.slope + self.log_count * math.log(max(n, 1)), 0.05)
 
 
-class AlarmLine(Frozen):
-    """Minimum log-odds of an alarm in a list of n entries: intercept + log_count·log n."""
+class FitLimit(Frozen):
+    """Minimum of `app.questions.generate.room_fit` for a scene of n classes.
+
+    It is intercept + log_count·log n.
+    """
 
     intercept: float
     log_count: float = 0.0
 
+    def of(self, n: int) -> float:
+        """Return the minimum for a scene of n classes."""
+        return self.intercept + self.log_count * math.log(max(n, 1))
+
+
+NO_LIMIT: Final = FitLimit(intercept=-1e9)
+
+LONGEST_JUDGED: Final = 36
+"""Maximum number of listed classes to which alarm lines are fitted. Longer lists count as such."""
+
+LEAST_ALARM: Final[Mapping[Sensitivity, float]] = {"low": 0.5, "medium": 0.3, "high": 0.15}
+"""Minimum probability of an alarm. If right and wrong objects or relations hardly overlap, the
+permitted shares of alarms would need alarms about what is probably right."""
+
+
+class AlarmLine(Frozen):
+    """Minimum log-odds of an alarm in a list of n entries.
+
+    They are intercept + log_count·log n + curve·log² n.
+    """
+
+    intercept: float
+    log_count: float = 0.0
+    curve: float = 0.0
+
     def threshold(self, n: int) -> float:
         """Return the minimum probability of an alarm in a list of n entries."""
-        # tanh cannot overflow.
-        return 0.5 + 0.5 * math.tanh((self.intercept + self.log_count * math.log(max(n, 1))) / 2)
+        log_n = math.log(max(n, 1))
+        log_odds = self.intercept + (self.log_count + self.curve * log_n) * log_n
+        return 0.5 + 0.5 * math.tanh(log_odds / 2)  # tanh cannot overflow
 
 
 class AlarmLines(Frozen):
@@ -148,22 +196,25 @@ class Calibration(Frozen):
     classes or C room types may be empty: all classes are equally popular, or there is no minimum.
 
     Attributes:
-        coverage: default share of the classes of a scene that a request lists.
-        missing: calibration of the log-odds that an unlisted class is present. n is the number of
-            listed classes without structure.
+        coverage: share of the classes of a scene that the base rates of `/missing` assume if a
+            request states no coverage.
+        missing: calibration of the log-odds that an unlisted class is present, if a request states
+            no coverage. n is the number of listed classes without structure.
+        covered: the same if a request states the coverage.
         popularity: (V,) log-odds that a training scene has each class; None for a class that no
             source shows in training.
         popularity_weight: exponent alpha. The prior probability of an intruder's class is
             proportional to popularity^alpha, where popularity is the odds of the class.
         outlier_lines: minimum log-odds of an outlier, by the number of listed classes without
             structure. None exactly if `outlier` is None.
+        room_lines: the same if a request states the room type; None: as `outlier_lines`.
         rooms: calibration of the probabilities of the room types.
         rare_rooms: indices of the room types with too few training scenes for `/generate`.
         written_rooms: indices of the room types that written scenes alone show.
-        smallest: (C + 1,) minimum number of classes in a generated scene of each room type, which
-            90 % of the real rooms reach. The last entry is for scenes without a room type.
-        room_fit: (C,) minimum of `app.questions.generate.room_fit` for a generated scene of each
-            room type, which 85 % of the real rooms reach.
+        smallest: (C + 1,) minimum number of classes in a generated scene of each room type. The
+            last entry is for scenes without a room type.
+        room_fit: (C,) minimum fit of a generated scene of each room type. About 95 % of the lists
+            of whole rooms reach both limits (`training.fit.calibrate_rooms`).
         outlier: calibration that converts a class's log-odds of presence to the log-odds that its
             object is an intruder. n is the number of classes in the scene without structure. None:
             training had too few scenes for the fit, so the model judges no object.
@@ -176,14 +227,16 @@ class Calibration(Frozen):
 
     coverage: Annotated[float, Field(ge=0, le=1)] = 0.5
     missing: CountSlope = CountSlope()
+    covered: CoverageFit = CoverageFit()
     popularity: Many[float | None] = ()
     popularity_weight: Annotated[float, Field(ge=0, le=1)] = 0.0
     outlier_lines: AlarmLines | None = None
+    room_lines: AlarmLines | None = None
     rooms: Sharpness = Sharpness()
     rare_rooms: Many[Count] = ()
     written_rooms: Many[Count] = ()
     smallest: Many[Count] = ()
-    room_fit: Many[float] = ()
+    room_fit: Many[FitLimit] = ()
     outlier: CountSlope | None = None
     relation: PairSlopes
     relation_given: PairSlopes
@@ -196,6 +249,17 @@ class Calibration(Frozen):
         if (self.outlier is None) != (self.outlier_lines is None):
             raise ValueError("outlier and outlier_lines must both have a value, or neither")
         return self
+
+    def outlier_threshold(self, sensitivity: Sensitivity, n: int, *, in_room: bool) -> float | None:
+        """Return the minimum probability of an outlier in a list of n classes without structure.
+
+        It is at least `LEAST_ALARM`. It is None if the model judges no object.
+        """
+        lines = (self.room_lines if in_room else None) or self.outlier_lines
+        if lines is None:
+            return None
+        line: AlarmLine = getattr(lines, sensitivity)
+        return max(line.threshold(min(n, LONGEST_JUDGED)), LEAST_ALARM[sensitivity])
 
     @classmethod
     def neutral(cls, relations: int) -> Self:

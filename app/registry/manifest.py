@@ -21,7 +21,7 @@ from app.registry.fields import Count, Frozen, Many, Sha256, first_error, to_jso
 from app.registry.offsets import Offsets
 from app.registry.places import Places
 
-FORMAT: Final = 9
+FORMAT: Final = 10
 MAX_TENSORS: Final = 10_000
 WEIGHTS: Final = "model.safetensors"
 CARD: Final = "card.md"
@@ -53,7 +53,7 @@ class FileEntry(Frozen):
 class Manifest(Description):
     """The description of a model, its stored tensors and the checksums of its other files."""
 
-    format: Literal[9] = FORMAT
+    format: Literal[10] = FORMAT
     tensors: Annotated[dict[str, TensorEntry], Field(max_length=MAX_TENSORS)]
     files: dict[str, FileEntry]
 

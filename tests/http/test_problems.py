@@ -170,6 +170,8 @@ INVALID: dict[str, list[tuple[Any, ...]]] = {
         ({"at": {"relation": "in front of", "object": "bed"}}, "at/relation", "must", "front"),
         ({"at": ["ontop", "bed"]}, "at/0", "must be", "on-top"),
         ({"at": ["on-top", "desk"]}, "at/1", "no entry of `objects`"),
+        ({"objects": ["bed", "qqq"], "unknown_labels": "ignore", "at": ["on-top", "qqq"]}, "at/1",
+         "ignored this object"),
         ({"objects": ["bed", "floor"], "at": ["on-top", "floor"]}, "at/1"),
         ({"object": ["bed"]}, "object", "unknown field", "objects"),
         ({"objects": "bed"}, "objects", "a JSON array, not a string"),

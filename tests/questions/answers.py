@@ -45,7 +45,18 @@ def _more(artifact: Artifact, scene: Scene, **options: Any) -> Any:
 
 
 # The answer to `outliers` has all its fields. The other functions return one list of an answer.
-outliers = _question(questions.outliers)
+def _judged(entry: dict[str, Any]) -> dict[str, Any]:
+    return {"object": entry["object"], "log_odds": None} | entry
+
+
+def outliers(artifact: Artifact, scene: Scene, **options: Any) -> Any:
+    """Return the answer, with `log_odds` None for objects that are not judged."""
+    answer = questions.outliers(artifact, scene, **options)
+    answer["outliers"] = [_judged(entry) for entry in answer["outliers"]]
+    return _converted(answer, {thing.id: k for k, thing in enumerate(scene.objects)})
+
+
+# These functions return one list of an answer.
 misplaced = _question(questions.misplaced)
 missing = _question(questions.missing, "missing")
 more = _question(_more)

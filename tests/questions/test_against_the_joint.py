@@ -162,7 +162,7 @@ def test_outliers(name, room, profile):
         for entry in entries:
             i = classes[entry.object]
             log_odds = exact.object(i, classes) + exact.kappa(i, 1.0)
-            assert entry.log_odds == close(log_odds)
+            assert entry.log_odds == close(-log_odds)
             assert entry.probability == close(sigmoid(-log_odds))
 
 

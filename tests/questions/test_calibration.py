@@ -5,9 +5,11 @@ import math
 import pytest
 from scipy.special import expit as sigmoid
 
-from app.registry.description import CountSlope, PlaceFit
+from app.registry.description import CountSlope, CoverageFit, PlaceFit
 from tests.questions.answers import missing, outliers, relations, without_minimums
 from tests.questions.artifacts import LARGER, STRUCTURE, larger_artifact, lines, scene_of
+
+PLAIN = larger_artifact("triway")
 
 
 def test_scenes_with_relations_have_entries_of_their_own():
@@ -23,9 +25,10 @@ def test_scenes_with_relations_have_entries_of_their_own():
 
 
 def test_placements_have_entries_of_their_own():
-    """The place of `at` comes first, and counts the two instances of its class."""
+    """The place of `at` comes first, with an entry of its own."""
     placement = (CountSlope(intercept=-1.0, slope=0.0, log_count=-0.5),) * 5
-    artifact = larger_artifact("triway", placement=placement)
+    at = (PlaceFit(intercept=-2.0, relation=0.0),) * 5
+    artifact = larger_artifact("triway", placement=placement, at=at)
     p = sigmoid(-1)
     for entry in missing(artifact, scene_of([0, 1, 2])):
         assert [place.probability for place in entry.placements] == [pytest.approx(p, rel=1e-5)] * 3
@@ -34,7 +37,7 @@ def test_placements_have_entries_of_their_own():
     for entry in entries:
         first, *others = entry.placements
         assert (first.relation, first.object) == ("left", 1)
-        assert first.probability == pytest.approx(sigmoid(-1 - 0.5 * math.log(2)), rel=1e-5)
+        assert first.probability == pytest.approx(sigmoid(-2), rel=1e-5)
         assert [place.probability for place in others] == [pytest.approx(p, rel=1e-5)] * 2
 
 
@@ -52,12 +55,47 @@ def test_instances_count_in_relations():
     ("classes", "listed"), [([0, 1, 1, 8], 2), ([0, 1, 2], 3), ([8], 1), ([], 1)]
 )
 def test_missing_classes_by_log_odds_and_number_of_listed_classes(classes, listed):
-    """Structure and further instances do not count. The number is at least 1."""
+    """Structure and further instances do not count. The number is at least 1.
+
+    The second artifact has the entry without effect, so its `log_odds` are those of the machine.
+    """
     slope = CountSlope(intercept=0.4, slope=0.6, log_count=-0.5)
-    artifact = larger_artifact("triway", missing=slope)
-    for entry in missing(artifact, scene_of(classes), top_k=9):
-        z = 0.4 + 0.6 * entry.log_odds - 0.5 * math.log(listed)
-        assert entry.probability == pytest.approx(sigmoid(z), rel=1e-5)
+    z = {entry.label: entry.log_odds for entry in missing(PLAIN, scene_of(classes), top_k=9)}
+    for entry in missing(larger_artifact("triway", missing=slope), scene_of(classes), top_k=9):
+        expected = 0.4 + 0.6 * z[entry.label] - 0.5 * math.log(listed)
+        assert entry.log_odds == pytest.approx(expected, rel=1e-4, abs=1e-5)
+        assert entry.probability == pytest.approx(sigmoid(expected), rel=1e-4)
+
+
+@pytest.mark.parametrize("coverage", [0.1, 0.15, 0.4, 0.9, 1.0])
+def test_missing_classes_at_a_stated_coverage(coverage):
+    """All but one listed class counts as complete. A share below .15 counts as .15."""
+    entry = CoverageFit(intercept=0.4, slope=0.6, log_count=-0.5, log_share=0.3, both=0.2, last=-1)
+    artifact = larger_artifact("triway", covered=entry)
+    scene = scene_of([0, 1, 2])
+    raw = {e.label: e.log_odds for e in missing(PLAIN, scene, coverage=coverage, top_k=9)}
+    log_n, log_s = math.log(3), math.log(max(coverage, 0.15))
+    change = 0.4 - 0.5 * log_n + 0.3 * log_s + 0.2 * log_n * log_s - (coverage == 1)
+    for found in missing(artifact, scene, coverage=coverage, top_k=9):
+        expected = change + 0.6 * raw[found.label]
+        assert found.log_odds == pytest.approx(expected, rel=1e-4, abs=1e-5)
+        assert found.probability == pytest.approx(sigmoid(expected), rel=1e-4)
+
+
+@pytest.mark.parametrize("coverage", [None, 0.4])
+@pytest.mark.parametrize("name", ["on-top", "left", "contains"])
+@pytest.mark.usefixtures("without_minimums")
+def test_a_class_at_a_place_has_the_product_of_both_probabilities(artifact, name, coverage):
+    scene = scene_of([0, 1, 2])
+    alone = {e.label: e.probability for e in missing(artifact, scene, coverage=coverage, top_k=9)}
+    entries = missing(artifact, scene, at=(name, 1), coverage=coverage, top_k=9)
+    assert {entry.label for entry in entries} == set(alone)
+    for entry in entries:
+        product = alone[entry.label] * entry.placements[0].probability
+        assert entry.probability == pytest.approx(product, rel=1e-5, abs=1e-6)
+        assert entry.probability == pytest.approx(sigmoid(entry.log_odds), rel=1e-4)
+    order = [entry.probability for entry in entries]
+    assert order == sorted(order, reverse=True)
 
 
 # Every calibration depends on the number of classes.
@@ -66,7 +104,7 @@ COUNTS = {
     "missing": CountSlope(intercept=0.1, slope=0.9, log_count=-0.5),
     "outlier": CountSlope(intercept=0.2, slope=-0.8, log_count=0.3),
     "outlier_lines": lines(2.0, 1.0, 0.0, log_count=-0.4),
-    "at": (PlaceFit(relation=0.5, counts=0.5, intercept=-0.2, slope=0.9),) * 5,
+    "at": (PlaceFit(relation=0.5, counts=0.5, intercept=-0.2),) * 5,
     **dict.fromkeys(("relation", "relation_given", "placement"), (COUNTED,) * 5),
 }
 STATED = [(2, 1, 0), (0, 1, 2)]

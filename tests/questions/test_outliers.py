@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from app.questions.posterior import Posterior
 from app.registry.description import CountSlope
 from tests.questions.answers import misplaced, missing, outliers
 from tests.questions.artifacts import LABELS, STRUCTURE, judging, larger_artifact, lines, scene_of
@@ -17,6 +18,14 @@ LEVELS = ("low", "medium", "high")
 VARIANTS = ["rbm", "gbm", "triway-states"]
 SLOPE = -0.6
 LINES = lines(2.0, 0.9, -0.4, log_count=SLOPE)
+ROOM_LINES = lines(3.0, 1.9, 0.4, log_count=0.1)
+
+
+def presence_of(artifact, scene):
+    """The log-odds of each listed class given the rest of its scene, by label."""
+    posterior = Posterior(artifact, scene)
+    labels = [LABELS[k] for k in posterior.present.classes.tolist()]
+    return dict(zip(labels, posterior.given_rest()[0].tolist(), strict=True))
 
 
 @pytest.mark.parametrize("alpha", [0.0, 0.5, 1.0])
@@ -25,11 +34,14 @@ def test_the_popularity_of_a_class_counts_by_its_weight(alpha):
     artifact = larger_artifact(
         "triway", outlier=LINE, popularity=popularity, popularity_weight=alpha
     )
-    entries = outliers(artifact, scene_of([0, 1, 1, 2])).outliers
+    scene = scene_of([0, 1, 1, 2])
+    entries = outliers(artifact, scene).outliers
+    presence = presence_of(artifact, scene)
     for entry in entries:
-        z = entry.log_odds - alpha * popularity[LABELS.index(entry.label)]
+        z = presence[entry.label] - alpha * popularity[LABELS.index(entry.label)]
         logit = 0.2 - 0.8 * z + 0.1 * math.log(3)
-        assert entry.probability == pytest.approx(1 / (1 + math.exp(-logit)), rel=1e-5)
+        assert entry.log_odds == pytest.approx(logit, rel=1e-4)
+        assert entry.probability == pytest.approx(1 / (1 + math.exp(-logit)), rel=1e-4)
     probabilities = [entry.probability for entry in entries]
     assert probabilities == sorted(probabilities, reverse=True)
 
@@ -43,8 +55,10 @@ def test_a_class_without_training_scene_counts_as_the_rarest():
     empty = missing(artifact, scene_of([]), coverage=1.0, top_k=len(LABELS))
     (alone,) = (entry.log_odds for entry in empty if entry.label == "lamp")
     priors = {"bed": -0.5, "lamp": alone + 0.5 * 9, "desk": -1.5}
-    for entry in outliers(artifact, scene_of([0, unseen, 2])).outliers:
-        logit = 0.2 - 0.8 * (entry.log_odds - priors[entry.label]) + 0.1 * math.log(3)
+    scene = scene_of([0, unseen, 2])
+    presence = presence_of(artifact, scene)
+    for entry in outliers(artifact, scene).outliers:
+        logit = 0.2 - 0.8 * (presence[entry.label] - priors[entry.label]) + 0.1 * math.log(3)
         assert entry.probability == pytest.approx(1 / (1 + math.exp(-logit)), rel=1e-4)
 
 
@@ -96,13 +110,40 @@ def test_the_threshold_is_the_alarm_line_at_the_number_of_listed_things(name, cl
         threshold = line(level, listed)
         assert answer.threshold == pytest.approx(threshold, rel=1e-5)
         for one in answer.outliers:
-            assert one.is_outlier == (one.probability >= threshold)
+            assert one.is_outlier == (one.probability >= threshold and listed > 1)
             flags.add(one.is_outlier)
         own = outliers(artifact, scene, sensitivity=level, threshold=0.5)
         assert own.threshold == 0.5
-        assert all(one.is_outlier == (one.probability >= 0.5) for one in own.outliers)
+        for one in own.outliers:
+            assert one.is_outlier == (one.probability >= 0.5 and listed > 1)
     assert outliers(artifact, scene) == outliers(artifact, scene, sensitivity="medium")
     assert listed < 5 or flags == {True, False}
+
+
+@pytest.mark.parametrize("threshold", [None, 0.0])
+@pytest.mark.parametrize("classes", [[0], [0, 0, 8]])
+def test_objects_of_a_single_class_are_not_judged(classes, threshold):
+    artifact = larger_artifact("triway", outlier=LINE, outlier_lines=lines(-9.0, -9.0, -9.0))
+    answer = outliers(artifact, scene_of(classes), threshold=threshold)
+    assert not any(one.is_outlier for one in answer.outliers)
+    (warning,) = answer.warnings
+    ids = [thing.id for thing in scene_of(classes).objects]
+    assert (warning.code, warning.objects) == ("not-judged", ids[: classes.count(0)])
+    assert any(one.is_outlier for one in outliers(artifact, scene_of([0, 1])).outliers)
+
+
+def test_a_stated_room_type_has_alarm_lines_of_its_own():
+    artifact = larger_artifact("triway", outlier=LINE, outlier_lines=LINES, room_lines=ROOM_LINES)
+    for room, own in ((None, LINES), (1, ROOM_LINES)):
+        answer = outliers(artifact, scene_of([0, 1, 2], room=room), sensitivity="low")
+        assert answer.threshold == pytest.approx(own.low.threshold(3), rel=1e-5)
+
+
+def test_what_probably_belongs_is_no_outlier():
+    """A line may lie so low that it would flag what probably belongs."""
+    artifact = larger_artifact("triway", outlier=LINE, outlier_lines=lines(-9.0, -9.0, -9.0))
+    for level, least in {"low": 0.5, "medium": 0.3, "high": 0.15}.items():
+        assert outliers(artifact, scene_of([0, 1, 2]), sensitivity=level).threshold == least
 
 
 @pytest.mark.parametrize("name", VARIANTS)

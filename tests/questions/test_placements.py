@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scipy.special import logit
 
 from app.inference.kernels import UNOBSERVED, rotated_offsets
-from app.questions.placements import Place, place_log_p
+from app.questions.placements import Place, place_log_p, placements
 from app.questions.posterior import Posterior
 from app.registry import CountSlope, Offsets
 from app.registry.description import PlaceFit
@@ -193,8 +193,13 @@ def test_relations_that_training_never_shows_are_lowered_by_the_stand_of_the_sub
     stand_of = {ON_TOP: SUPPORTED, ABOVE: HANGS, INSIDE: SUPPORTED}
 
     def log_odds(artifact, anchor, name):
-        entries = missing(artifact, scene_of([anchor]), at=(name, 0), top_k=V)
-        return {LABELS.index(e.label): logit(e.placements[0].probability) for e in entries}
+        scene = scene_of([anchor])
+        classes = np.array([k for k in range(V - 1) if k != anchor])
+        posterior, place = Posterior(artifact, scene), Place.of(name, 0)
+        found = placements(artifact, posterior, scene, classes, None, place)
+        return {
+            k: logit(places[0]["probability"]) for k, places in zip(classes, found, strict=True)
+        }
 
     for name, anchor in itertools.product(RELATIONS, range(V - 1)):
         before = log_odds(bare, anchor, name)
@@ -227,10 +232,7 @@ def test_no_place_is_inside_an_object_that_is_too_small():
 
 module = import_module("app.questions.missing")  # the package has a function of this name
 NAMES = ["rbm", "triway", "triway-states"]
-FITS = tuple(
-    PlaceFit(relation=0.3 + 0.2 * a, counts=0.1 * a, intercept=0.5 - a, slope=0.6 + 0.1 * a)
-    for a in range(5)
-)
+FITS = tuple(PlaceFit(relation=0.3 + 0.2 * a, counts=0.1 * a, intercept=0.5 - a) for a in range(5))
 STATED = [(2, 1, 0), (0, 0, 3)]
 
 
@@ -250,8 +252,8 @@ def by_hand(artifact, scene, name, anchor, coverage):
     ratio = artifact.places.log_ratio(relation, of_anchor, outgoing=is_subject)
     probabilities = {}
     for k, odds, p in zip(classes, z.tolist(), log_p.tolist(), strict=True):
-        value = odds + fit.relation * p + fit.counts * float(ratio[k])
-        probabilities[LABELS[k]] = 1 / (1 + math.exp(-(fit.intercept + fit.slope * value)))
+        value = fit.intercept + fit.relation * p + fit.counts * float(ratio[k])
+        probabilities[LABELS[k]] = 1 / (1 + math.exp(-odds)) / (1 + math.exp(-value))
     return probabilities
 
 

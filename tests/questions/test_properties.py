@@ -156,19 +156,20 @@ def test_outliers(artifact, scene, threshold):
     assert sorted(entry.object for entry in answer.outliers) == list(range(len(scene.objects)))
     is_structure = [entry.label in STRUCTURE for entry in answer.outliers]
     assert is_structure == sorted(is_structure), "structure comes last"
-    scores = [(e.log_odds, e.object) for e in answer.outliers if e.label not in STRUCTURE]
+    scores = [(-e.log_odds, e.object) for e in answer.outliers if e.label not in STRUCTURE]
     assert scores == sorted(scores)
     labels = {thing.label for thing in scene.objects}
     entries_of_classes = {entry[1:] for entry in answer.outliers}
     assert len(entries_of_classes) == len(labels)
     for entry in answer.outliers:
         assert entry.label == scene.objects[entry.object].label
-        assert math.isfinite(entry.log_odds)
+        assert (entry.log_odds is None) == (entry.label in STRUCTURE)
         assert (entry.probability == 0) == (entry.label in STRUCTURE)
         if entry.probability != pytest.approx(least, rel=1e-5):
-            assert entry.is_outlier == (entry.probability > least)
+            alone = len(labels - STRUCTURE) == 1
+            assert entry.is_outlier == (entry.probability > least and not alone)
         changes = [reason.log_odds_change for reason in entry.because]
-        assert all((change < 0) == entry.is_outlier for change in changes)
+        assert all((change > 0) == entry.is_outlier for change in changes)
         assert is_descending(map(abs, changes))
         others = [scene.objects[reason.object].label for reason in entry.because]
         assert len(set(others)) == len(others) <= 3

@@ -108,6 +108,9 @@ class Source:
     of_one_view: bool = False
     # Numbers of instances are the judgements of a writer, so statistics of counts leave them out.
     written: bool = False
+    # A scene lists nearly all things of a whole room, as people furnish it. Scenes drawn for
+    # `/generate` are compared with such rooms.
+    whole_rooms: bool = False
 
 
 _BEDROOMS: Final = Source(
@@ -151,6 +154,7 @@ SOURCES: Final[dict[str, Source]] = {
             *("hanging on", "attached to", "leaning against", "build in", "connected to"),
             *("part of", "belonging to"),
         ),
+        whole_rooms=True,
     ),
     "procthor": Source(
         "ProcTHOR (Deitke et al., NeurIPS 2022): procedural rooms; Apache-2.0",
@@ -212,6 +216,7 @@ SOURCES: Final[dict[str, Source]] = {
         "RoboCasa (Nasiriany et al., RSS 2024): designed kitchens with their objects; MIT",
         meaning=replace(_SUPPORTS, scenes_per_group=3.0),
         predicates={},
+        whole_rooms=True,
     ),
     "twc": Source(
         "TextWorld Commonsense (Murugesan et al., AAAI 2021): where things belong; Apache-2.0",
@@ -267,6 +272,7 @@ SOURCES: Final[dict[str, Source]] = {
         "BEHAVIOR-1K (Li et al., CoRL 2022): object lists of rooms; MIT",
         meaning=LISTS,  # its scenes list no relations
         predicates={},
+        whole_rooms=True,
     ),
     "matterport_rooms": Source(
         "Matterport3D (Chang et al., 3DV 2017): object lists of rooms, from REVERIE (Qi et al., "
@@ -274,11 +280,13 @@ SOURCES: Final[dict[str, Source]] = {
         research_only=True,
         meaning=LISTS,  # its scenes list no relations
         left_out=("wall", "door"),
+        whole_rooms=True,
     ),
     "virtualhome": Source(
         "VirtualHome (Puig et al., CVPR 2018): rooms of designed apartments; MIT",
         meaning=_SUPPORTS,
         predicates={},
+        whole_rooms=True,
     ),
     "vsr": Source(
         "Visual Spatial Reasoning (Liu, Emerson, Collier, TACL 2023): voted relations in "
@@ -291,7 +299,7 @@ SOURCES: Final[dict[str, Source]] = {
         "placed; MIT and Apache-2.0",
         meaning=_MENTIONS,
     ),
-    "rooms": Source("Rooms made by this project's own generator; no restriction"),
+    "rooms": Source("Rooms made by this project's own generator; no restriction", whole_rooms=True),
     "inventories": Source(
         "Inventories of places, written for this project from general knowledge; their shares are "
         "judgements; Apache-2.0",
@@ -304,11 +312,12 @@ SOURCES: Final[dict[str, Source]] = {
         ),
         open_vocabulary=True,
         written=True,
+        whole_rooms=True,
     ),
 }
 
 
-_UNKNOWN: Final = Source("")
+_UNKNOWN: Final = Source("", whole_rooms=True)
 _OWN_INVENTORY: Final = replace(SOURCES["inventories"], terms="", left_out=())
 
 

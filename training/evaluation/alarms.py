@@ -1,6 +1,6 @@
 """Alarms of `/outliers` in untouched parts of scenes, against the promise of each sensitivity.
 
-A part lists one to twelve random classes without structure, and their relations. Every object and
+A part lists two to twelve random classes without structure, and their relations. Every object and
 relation of an untouched scene is right, so each alarm is false. A sensitivity promises a maximum
 share of parts with an alarm about an object, and the same share of parts with an alarm about a
 relation (`ALARMS`). A model is refused only if its share is certainly too large: the exact 95 %
@@ -30,7 +30,7 @@ from training.evaluation.asking import thing_instances
 from training.evaluation.parts import LONGEST
 
 ALARMS: dict[Sensitivity, float] = {"low": 0.02, "medium": 0.1, "high": 0.2}
-"""Maximum shares of unaltered scenes with an alarm, on the large source with the most alarms."""
+"""Maximum shares of unaltered scenes with an alarm."""
 
 EXCESS = 1.5
 
@@ -93,10 +93,10 @@ def untouched_alarms(artifact: Artifact, scenes: Sequence[EncodedScene]) -> Iter
 
 
 def _random_part(encoded: EncodedScene, structure: Flags, rng: Rng) -> Scene:
-    """Return the instances of one to `LONGEST` random classes, with their relations."""
+    """Return the instances of two to `LONGEST` random classes, with their relations."""
     classes = encoded.evidence.classes
     order = rng.permutation(classes[~structure[classes]])
-    hidden = order[rng.integers(1, min(LONGEST, max(len(order), 1)) + 1) :]
+    hidden = order[rng.integers(2, min(LONGEST, max(len(order), 2)) + 1) :]
     kept = thing_instances(encoded, structure, hidden)
     index_of = {instance: index for index, instance in enumerate(kept)}
     triples = [

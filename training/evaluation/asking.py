@@ -141,17 +141,16 @@ def missing_probabilities(
 
 
 def judge(artifact: Artifact, scene: Scene, sensitivity: Sensitivity = "medium") -> Floats:
-    """Return the answers of `/outliers` about the n objects of a scene, (n, 3).
+    """Return the answers of `/outliers` about the n objects of a scene, (n, 2).
 
-    The columns are the probability that the object is an outlier, the log-odds of the object given
-    the rest of the scene, and 1 if the service reports the object as an outlier.
+    The columns are the probability that the object is an outlier, and 1 if the service reports the
+    object as an outlier.
     """
-    columns = np.zeros((len(scene.objects), 3))
+    columns = np.zeros((len(scene.objects), 2))
     index = index_of_ids(scene)
     answer = questions.outliers(artifact, scene, sensitivity=sensitivity, details=False)
     for entry in answer["outliers"]:
-        fields = ("probability", "log_odds", "is_outlier")
-        columns[index[entry["object"]]] = [entry[field] for field in fields]
+        columns[index[entry["object"]]] = entry["probability"], entry["is_outlier"]
     return columns
 
 
@@ -193,7 +192,7 @@ def score_suspicion(artifact: Artifact, v: Tensor) -> Tensor:
 
 def flag_outliers(artifact: Artifact, v: Tensor, sensitivity: Sensitivity) -> Tensor:
     """Return the reported outliers, (B, V) bool, for lists v (B, V)."""
-    return _judged(artifact, v, 2, sensitivity, 0.0) > 0
+    return _judged(artifact, v, 1, sensitivity, 0.0) > 0
 
 
 def _judged(

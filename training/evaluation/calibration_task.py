@@ -63,7 +63,14 @@ from training.evaluation.asking import (
 )
 from training.evaluation.intruders import draw_intruder_choices
 from training.evaluation.metrics import Metric, Scored
-from training.evaluation.parts import Size, draw_parts, exactly, up_to_longest
+from training.evaluation.parts import (
+    Size,
+    all_but_one,
+    draw_parts,
+    exactly,
+    share_of,
+    up_to_longest,
+)
 from training.evaluation.setting import Outcome, Setting
 
 # Number of removed objects per scene in `ask_placements`. A removed object gives only 3 answers.
@@ -177,15 +184,22 @@ def ask_placements(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answe
     return answers or None
 
 
-def collect_missing(artifact: Artifact, scenes: SceneTensors, size: Size, seed: int = 0) -> Items:
-    """Ask for the missing classes of random parts of this size, and collect the answers."""
+def collect_missing(
+    artifact: Artifact, scenes: SceneTensors, size: Size, seed: int = 0, *, stated: bool = False
+) -> Items:
+    """Ask for the missing classes of random parts of this size, and collect the answers.
+
+    With `stated`, each request states the coverage: 1 if one class is hidden, otherwise the share.
+    """
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
     parts = draw_parts(scenes, structure, size, (seed,))
     able = scenes.annotated_classes[scenes.source[parts.scene]].numpy()
     columns: list[tuple[int, float, bool]] = []
     for row, (k, v) in enumerate(zip(parts.scene.tolist(), parts.v, strict=True)):
-        scene = of_classes(v.nonzero().squeeze(1).tolist())
-        for entry in missing(artifact, scene, details=False)["missing"]:
+        scene, hidden = of_classes(v.nonzero().squeeze(1).tolist()), int(parts.hidden[row].sum())
+        share = 1.0 if hidden == 1 else float(v.sum()) / (float(v.sum()) + hidden)
+        answer = missing(artifact, scene, coverage=share if stated else None, details=False)
+        for entry in answer["missing"]:
             index = artifact.vocabulary.index(entry["label"])
             if able[row, index]:
                 columns.append((k, entry["probability"], bool(parts.hidden[row, index])))
@@ -293,8 +307,12 @@ def ask_misplaced(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answer
     ] or None
 
 
-# Numbers of listed classes in questions about missing classes, by name.
-LISTED = {f"missing, {listed} classes": listed for listed in (2, 4, 8)}
+# Sizes of the lists in questions about missing classes, and whether the requests state the share.
+LISTED: dict[str, tuple[Size, bool]] = {
+    **{f"missing, {listed} classes": (exactly(listed), False) for listed in (2, 4, 8)},
+    **{f"missing, {share:.0%} stated": (share_of(share), True) for share in (0.25, 0.5, 0.75)},
+    "missing, all but one": (all_but_one, True),
+}
 
 QUESTIONS: dict[str, Ask] = {
     "relations": ask_relations,
@@ -327,7 +345,8 @@ def calibration_task(artifact: Artifact, setting: Setting) -> Outcome | None:
             if name in QUESTIONS:
                 answers = collect(model, scenes, ask[name], seed)
             else:
-                answers = collect_missing(model, scenes, exactly(LISTED[name]), seed)
+                size, stated = LISTED[name]
+                answers = collect_missing(model, scenes, size, seed, stated=stated)
             skipped += 0 if suffix else answers.skipped
             if not len(answers.scene):
                 break

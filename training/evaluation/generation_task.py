@@ -22,17 +22,19 @@ Sources: Gretton et al., "A kernel two-sample test" (2012), eq. 3.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from app.inference.chains import Conditions, random_stream
-from app.questions.generate import STEPS
+from app.questions.generate import STEPS, draw_plausible
 from app.registry import Artifact
 from training.datasets.array_types import Floats, Ints
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.cases import some_scenes
+from training.evaluation.asking import of_classes
 from training.evaluation.contradictions import contradiction_metrics, count_contradictions
 from training.evaluation.metrics import Metric, Ratio, Resampled
 from training.evaluation.model import Drawn, Sampler, SamplerOf
@@ -83,7 +85,7 @@ def scene_sampler(scenes: SceneTensors) -> Sampler:
 
 
 def machine_sampler(artifact: Artifact) -> Sampler:
-    """Return a sampler that runs the Gibbs chains of the service, and also samples relations.
+    """Return a sampler that draws scenes as the service does, and also samples relations.
 
     Of two contradictory relations a(x, y) and a(y, x), the service keeps only one. This sampler
     keeps both.
@@ -93,13 +95,12 @@ def machine_sampler(artifact: Artifact) -> Sampler:
     def sample(given: Tensor, room: Tensor, seed: int) -> Drawn:
         objects, contradictions = torch.zeros(given.shape), []
         for row, (classes, room_type) in enumerate(zip(given, room.tolist(), strict=True)):
-            index = classes.nonzero().squeeze(1).numpy()
-            conditions = Conditions(
-                index,
-                observed=None,
-                room=room_type if room_type >= 0 and artifact.spec.C else None,
-            )
-            state = chains.under(conditions).draw(STEPS, random_stream(seed, row))
+            index = classes.nonzero().squeeze(1)
+            known = room_type if room_type >= 0 and artifact.spec.C else None
+            conditions = Conditions(index.numpy(), observed=None, room=known)
+            evidence = replace(of_classes(index.tolist()), room_type=known)
+            stream = random_stream(seed, row)
+            state = draw_plausible(artifact, chains.under(conditions), evidence, STEPS, stream)
             objects[row, torch.from_numpy(state.classes)] = 1.0
             grid = torch.from_numpy(state.r).float().unsqueeze(0)
             contradictions.append(count_contradictions(grid))

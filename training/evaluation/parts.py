@@ -76,6 +76,11 @@ def all_but_one(classes: int, _: Rng) -> int:
     return classes - 1
 
 
+def share_of(share: float) -> Size:
+    """List a share of the classes, at least one; at least one is hidden."""
+    return lambda classes, _: min(max(round(share * classes), 1), classes - 1)
+
+
 def one_quarter(classes: int, _: Rng) -> int:
     """List 25 % of the classes, at least one; at least one is hidden."""
     return min(max(int(0.25 * classes + 0.5), 1), classes - 1)

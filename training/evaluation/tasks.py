@@ -15,6 +15,13 @@ from training.evaluation import offset_task as offsets
 from training.evaluation.asking import SENSITIVITIES
 from training.evaluation.calibration_task import NAMES, calibration_task
 from training.evaluation.everyday_task import LINES, everyday_task
+from training.evaluation.generated_rooms_task import (
+    FREE,
+    REFUSED,
+    ROOMS,
+    SIZE,
+    generated_rooms_task,
+)
 from training.evaluation.generation_task import generation_task
 from training.evaluation.intruders import LAWS
 from training.evaluation.missing_tasks import SIZES, missing_task, placed_task
@@ -144,6 +151,11 @@ TASKS: dict[str, Task] = {
             "on-top cycles, free",
         ),
         ("MMD², free", "pair correlation, free"),
+    ),
+    "T4 rooms": _task(
+        *("generated rooms", "artifact", generated_rooms_task),
+        (REFUSED, *_each((REFUSED,), ROOMS), *_each((SIZE,), (FREE, *ROOMS))),
+        (REFUSED, *_each((SIZE,), (FREE,))),
     ),
     "Calibration": _task(
         *("calibration", "artifact", calibration_task),

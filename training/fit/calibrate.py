@@ -71,7 +71,7 @@ def calibrate(
     popularity = served_popularity(ObjectScenes.of(data.train, data.structure, config), config)
     scenes = data.validation
     objects = calibrate_objects(
-        *(artifact, scenes, data.train, popularity, config.served_sources, seed, chosen)
+        *(artifact, scenes, data.train, popularity, config.calibrated_sources, seed, chosen)
     )
     artifact = replace(artifact, calibration=objects)
     pick = torch.randperm(len(scenes), generator=torch.Generator().manual_seed(seed))
@@ -86,7 +86,7 @@ def calibrate(
         relation=with_lower_lateral(artifact, relation, related),
         placement=fit_placements(artifact, complete, seed),
         relation_given=fit_with_observed(artifact, complete, seed),
-        at=fit_at(artifact, related, seed),
+        at=fit_at(artifact, related.scenes, seed),
         misplaced=fit_misplaced(artifact, related.scenes, seed),
     ).calibration
 

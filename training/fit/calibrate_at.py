@@ -1,133 +1,108 @@
 """Fit the answers to `/missing` at a place: which unlisted class stands on the desk?
 
-Two fits determine the entries `at` of the calibration (`app.registry.PlaceFit`):
+    p(class and place) = p(class) p(place | class)
 
-1. The weights of the relation and of the counts rank the classes. They maximise the likelihood of a
-   removed class under a softmax over all absent classes. All data sources have the same weight.
-   Relations of stacked objects share their weights, and so do left and front.
-2. Intercept and slope turn the score into log-odds. They are fitted to the classes that an answer
-   lists, in scenes whose data source also shows that a relation does not hold.
+The first factor is that of `/missing` without a place. The entries `at` of the calibration give the
+second factor (`app.registry.PlaceFit`). They are fitted by maximum likelihood of the product, over
+all classes that may stand at places in parts of scenes. Data sources have equal weights. Relations
+of stacked objects share an entry, and so do left and front.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
-import torch
 from scipy.optimize import minimize
-from scipy.special import logsumexp
 
-from app.questions.placements import Place, place_log_p
-from app.questions.posterior import Posterior
+from app.questions.placements import place_log_p
+from app.questions.posterior import Posterior, calibrated_missing
 from app.registry import Artifact, PlaceFit
-from app.scene import Scene
 from app.scene.relations import LATERAL, STACKED
 from training.datasets import EncodedScene
-from training.datasets.array_types import Floats, Ints
-from training.datasets.batches import SceneTensors
-from training.datasets.cases import RIDGE, logistic
-from training.evaluation.asking import instances_of
-from training.evaluation.calibration_task import place_question
-from training.evaluation.missing_tasks import removed_places
-from training.evaluation.model import Places
+from training.datasets.array_types import Flags, Floats
+from training.evaluation.calibration_task import PlaceQuestion, place_question
 
-_QUESTIONS: Final = 80  # maximum questions of each source in the fit of the weights
-_LISTED: Final = 10  # classes that an answer lists by default
-_LEAST_TRUE: Final = 10  # minimum true examples of a fit of intercept and slope
-_ALL_BUT_ONE: Final = 1.0  # coverage of a scene from which one class is removed
+_QUESTIONS: Final = 80  # maximum questions of each source
+_LEAST_TRUE: Final = 10  # minimum true examples of a fit
+_PENALTY: Final = 1e-3  # of the squared intercept, so that places without objects have a finite fit
 
 
-def fit_at(artifact: Artifact, scenes: SceneTensors, seed: int = 0) -> tuple[PlaceFit, ...]:
-    """Return the entry of each relation. Relations without questions keep the default entry."""
+class PlaceTerms(NamedTuple):
+    """The terms of `PlaceFit` for N classes at a place, (N,) each.
+
+    Attributes:
+        present: calibrated log-odds that the class is present.
+        relation, counts: terms p and c of `PlaceFit`.
+        placed: True if the class is at the place.
+    """
+
+    present: Floats
+    relation: Floats
+    counts: Floats
+    placed: Flags
+
+
+def fit_at(
+    artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
+) -> tuple[PlaceFit, ...]:
+    """Return the entry of each relation. Relations with few questions keep the default entry."""
     entries = [PlaceFit()] * artifact.spec.A
     for kind in (LATERAL, STACKED):
-        weights = _fit_weights(artifact, scenes, kind, seed)
-        entry = _fit_scale(artifact, scenes.scenes, kind, weights, seed)
+        rng = np.random.default_rng(seed)
+        questions: dict[str, list[PlaceTerms]] = defaultdict(list)
+        for k in rng.permutation(len(scenes)).tolist():
+            of_source = questions[scenes[k].source]
+            if len(of_source) < _QUESTIONS:
+                question = place_question(artifact.vocabulary, scenes[k], rng, kind)
+                if question is not None:
+                    of_source.append(place_terms(artifact, question))
+        entry = fit_place([terms for terms in questions.values() if terms])
         for a in kind:
             entries[a] = entry
     return tuple(entries)
 
 
-def place_terms(
-    artifact: Artifact, scene: Scene, place: Place, coverage: float
-) -> tuple[Floats, Floats, Floats]:
-    """Return the three terms of the score of each class at a place, (V,) each; see `PlaceFit`."""
-    posterior, every = Posterior(artifact, scene), np.arange(artifact.spec.V)
-    anchor = int(posterior.present.classes[posterior.present.row[place.anchor]])
-    ratio = np.zeros(len(every))
+def place_terms(artifact: Artifact, question: PlaceQuestion) -> PlaceTerms:
+    """Return the terms of the classes that may be asked for at a place."""
+    scene, place, placed, usable = question
+    posterior, classes = Posterior(artifact, scene), np.flatnonzero(usable)
+    coverage = artifact.calibration.coverage
+    z = posterior.absent_log_odds(classes, coverage).astype(np.float64)
+    counts = np.zeros(len(classes))
     if artifact.places is not None:
-        ratio = artifact.places.log_ratio(place.relation, anchor, outgoing=place.outgoing)
-    relation = place_log_p(posterior, every, place).astype(np.float64)
-    return posterior.absent_log_odds(every, coverage).astype(np.float64), relation, ratio
+        anchor = int(posterior.present.classes[posterior.present.row[place.anchor]])
+        counts = artifact.places.log_ratio(place.relation, anchor, outgoing=place.outgoing)[classes]
+    return PlaceTerms(
+        calibrated_missing(artifact.calibration, z, posterior.listed, None).astype(np.float64),
+        place_log_p(posterior, classes, place).astype(np.float64),
+        counts,
+        placed[classes],
+    )
 
 
-def _fit_weights(
-    artifact: Artifact, scenes: SceneTensors, relations: Sequence[int], seed: int
-) -> PlaceFit:
-    """Fit the weights of the relation and of the counts to removed classes."""
-    structure = torch.from_numpy(artifact.vocabulary.structure.copy())
-    row, target, places = removed_places(scenes, structure)
-    source = scenes.source[row].numpy()
-    usable = np.isin(places.relation.numpy(), relations)
-    rng = np.random.default_rng(seed)
-    chosen: list[int] = []
-    weight: list[float] = []
-    for name in np.unique(source[usable]):
-        index = rng.permutation(np.flatnonzero(usable & (source == name)))[:_QUESTIONS]
-        chosen += index.tolist()
-        weight += [1 / len(index)] * len(index)
-    if not chosen:
+def fit_place(sources: Sequence[Sequence[PlaceTerms]]) -> PlaceFit:
+    """Return the entry of the largest likelihood, with equal weights of the sources."""
+    columns = [map(np.concatenate, zip(*terms, strict=True)) for terms in sources]
+    if not columns:
         return PlaceFit()
-    terms = [_masked_terms(artifact, places.rows(torch.tensor([k]))) for k in chosen]
-    presence, relation, counts = (np.stack(column) for column in zip(*terms, strict=True))
-    hidden, rows = target[chosen].numpy(), np.arange(len(chosen))
-    share = np.array(weight) / sum(weight)
+    present, relation, counts, placed = map(np.concatenate, zip(*columns, strict=True))
+    if placed.sum() < _LEAST_TRUE:
+        return PlaceFit()
+    share = np.concatenate(
+        [np.full(sum(len(t.placed) for t in terms), 1 / len(terms)) for terms in sources]
+    )
+    log_present = -np.logaddexp(0.0, -present)
 
     def loss(weights: Floats) -> float:
-        score = presence + weights[0] * relation + weights[1] * counts
-        return float(share @ (logsumexp(score, axis=1) - score[rows, hidden]))
+        logits = weights[0] + weights[1] * relation + weights[2] * counts
+        log_p = log_present - np.logaddexp(0.0, -logits)
+        log_not = np.log(-np.expm1(np.minimum(log_p, -1e-12)))
+        likelihood = share @ np.where(placed, log_p, log_not)
+        return float(_PENALTY * weights[0] ** 2 - likelihood / len(sources))
 
-    best = minimize(loss, [0.5, 0.3], bounds=[(0, 1.5), (0, 1.5)]).x.tolist()
-    return PlaceFit(relation=best[0], counts=best[1])
-
-
-def _masked_terms(artifact: Artifact, places: Places) -> tuple[Floats, Floats, Floats]:
-    """Return `place_terms` of a place. The presence is -inf for classes that cannot be missing."""
-    classes = places.v[0].nonzero().squeeze(1)
-    scene, first = instances_of(classes, places.counts[0, classes])
-    anchor = int(first[int((classes == places.anchor[0]).nonzero())])
-    place = Place(int(places.relation[0]), anchor, bool(places.outgoing[0]))
-    presence, relation, counts = place_terms(artifact, scene, place, _ALL_BUT_ONE)
-    presence[(places.v[0] > 0).numpy() | artifact.vocabulary.structure] = -np.inf
-    return presence, relation, counts
-
-
-def _fit_scale(
-    artifact: Artifact,
-    scenes: Sequence[EncodedScene],
-    relations: Sequence[int],
-    weights: PlaceFit,
-    seed: int,
-) -> PlaceFit:
-    """Fit intercept and slope to the likeliest classes at places in parts of the scenes."""
-    rng = np.random.default_rng(seed)
-    rows: list[Floats] = []
-    for encoded in scenes:
-        question = place_question(artifact.vocabulary, encoded, rng, relations)
-        if question is None:
-            continue
-        scene, place, truth, usable = question
-        terms = place_terms(artifact, scene, place, artifact.calibration.coverage)
-        score = terms[0] + weights.relation * terms[1] + weights.counts * terms[2]
-        first: Ints = np.argsort(np.where(usable, -score, np.inf), kind="stable")[:_LISTED]
-        rows.append(np.stack([score[first], truth[first]], 1)[usable[first]])
-    examples = np.concatenate(rows or [np.zeros((0, 2))])
-    holds = examples[:, 1] > 0
-    if holds.sum() < _LEAST_TRUE or holds.all():
-        return weights
-    slope, intercept = logistic(examples[:, :1], holds, C=RIDGE)
-    if slope <= 0:
-        return weights
-    return weights.model_copy(update={"intercept": intercept, "slope": slope})
+    limits = [(None, None), (0, 1.5), (0, 1.5)]
+    best = minimize(loss, [0.0, 0.5, 0.3], bounds=limits).x.tolist()
+    return PlaceFit(intercept=best[0], relation=best[1], counts=best[2])

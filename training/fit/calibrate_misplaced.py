@@ -36,7 +36,7 @@ from app.questions.misplaced import (
 )
 from app.questions.posterior import Posterior
 from app.registry import AlarmLine, AlarmLines, Artifact, Judgement, Misplaced
-from app.registry.description import KINDS
+from app.registry.description import KINDS, LEAST_ALARM
 from app.scene import Scene
 from app.scene.relations import ON_TOP
 from app.scene.scene import observe
@@ -60,9 +60,6 @@ _SOURCE_SCENES: Final = 60  # minimum scenes of a source with its own alarm line
 _OF_WORDS: Final = 0.1  # weight of an altered on-top that is asked in the words "under"
 _LENGTHS: Final = (1, 2, 4, 8, 16, 32)
 """Numbers of entries to which the alarm lines are fitted."""
-# Minimum probabilities of an alarm. If right and wrong entries hardly overlap, the target shares
-# would need alarms for relations that probably hold.
-_LEAST: Final = {"low": 0.5, "medium": 0.3, "high": 0.15}
 # Share of the alarms that each kind of entry may raise. Wrong supports are the surest signs.
 _BUDGET: Final = {"lateral": 0.05, "support": 0.45, "above": 0.1, "under": 0.1, "stand": 0.3}
 
@@ -241,7 +238,7 @@ def _alarm_lines(judgement: Judgement, untouched: _Cases, budget: float) -> Alar
         for name, share in ALARMS.items():
             limit = hardest_quantile(highest, sources[kept], 1 - budget * share)
             points[name].append((float(np.log(n)), limit))
-    return AlarmLines(**{name: _line(points[name], _LEAST[name]) for name in ALARMS})
+    return AlarmLines(**{name: _line(points[name], LEAST_ALARM[name]) for name in ALARMS})
 
 
 def _line(points: Sequence[tuple[float, float]], least: float) -> AlarmLine:

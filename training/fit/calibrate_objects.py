@@ -1,16 +1,18 @@
 """Fit the calibration of answers about objects to short lists.
 
-A robot lists a few objects of a room. So all fits use random parts of validation scenes, of the
-sources for which the answers stand (`served_scenes`). Structure is not listed.
+A robot lists a few objects of a room. So all fits use random parts of validation scenes
+(`calibration_scenes`). Structure is not listed.
 
     coverage   Listed share that the answers assume: the share with the best rank of hidden classes.
     missing    Probability that an unlisted class is present, fitted to the first classes of parts
-               of each number of classes.
+               of each number of classes. Written places have far more things than a person or a
+               detector lists of a room. So these parts are not written, unless all scenes are.
+    covered    The same in parts of a stated share of the scene, written scenes included.
     outlier    Probability that a class is an intruder. Half of the parts contain an intruder.
     lines      An object is an outlier if its log-odds of being an intruder are above a line in the
                log of the number of listed classes. Each line raises alarms in a given share of the
-               untouched parts (`training.evaluation.alarms.ALARMS`). A class that few training
-               scenes show raises no alarm.
+               untouched parts (`training.evaluation.alarms.ALARMS`), with and without the room
+               type. A class that few training scenes show raises no alarm.
 
 The prior of an intruder class is proportional to (frequency of the class)^alpha. Alpha and the
 logistic regression are fitted to three kinds of intruders with equal weights. Intruders are drawn
@@ -22,36 +24,52 @@ Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from app.questions.posterior import calibrated
-from app.registry import AlarmLine, AlarmLines, Artifact, Calibration, CountSlope
+from app.registry import AlarmLine, AlarmLines, Artifact, Calibration, CountSlope, CoverageFit
+from app.registry.description import LEAST_COVERAGE, LONGEST_JUDGED
 from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.cases import RIDGE, logistic
+from training.datasets.sources import source_of
 from training.evaluation.alarms import ALARMS
 from training.evaluation.intruders import draw_intruders, intruder_weights
-from training.evaluation.parts import Parts, draw_parts, exactly, up_to_longest
-from training.fit.calibrate_rooms import calibrate_rooms, posterior_of
+from training.evaluation.parts import (
+    Parts,
+    Size,
+    all_but_one,
+    draw_parts,
+    exactly,
+    share_of,
+    up_to_longest,
+)
+from training.fit.calibrate_rooms import calibrate_rooms, posterior_of, quantile_of
 from training.fit.configuration import ObjectsConfig
 
 COVERAGES = (0.15, 0.3, 0.45, 0.6, 0.8)
 # Tested exponents alpha of the prior of intruders.
 ALPHAS = (0.0, 0.125, 0.25, 0.375, 0.5)
 LENGTHS = (1, 2, 3, 4, 5, 6, 8, 10, 12)
-"""Numbers of listed classes to which the alarm lines are fitted."""
+"""Numbers of listed classes to which `missing` is fitted."""
+JUDGED_LENGTHS = (*LENGTHS[1:], 16, 24, LONGEST_JUDGED)
+"""Numbers of listed classes to which the alarm lines are fitted: a single class is not judged."""
+COVERED = (0.15, 0.25, 0.5, 0.75, 0.9)
+"""Shares of a scene to which `covered` is fitted, besides all classes but one."""
+MARGIN = 0.65
+"""Share of the permitted alarms at which the lines aim, because foreign sources raise up to half as
+many alarms again as the sources of the fit."""
 
 _LEAST_SCENES = 20  # from which objects are judged
 _SEEDS = (0, 1, 2)
 _LISTED = 10  # classes in the fit of each part; an answer of the service lists ten by default
 _SOURCE_SCENES = 200  # maximum scenes of each source
-_SERVED = 0.1  # least weight of a source, as a share of the largest weight in the served mix
 
 
 def calibrate_objects(
@@ -59,7 +77,7 @@ def calibrate_objects(
     validation: SceneTensors,
     train: SceneTensors,
     popularity: Tensor,
-    served: Mapping[str, float],
+    sources: Collection[str],
     seed: int = 0,
     chosen: Calibration | None = None,
 ) -> Calibration:
@@ -71,10 +89,10 @@ def calibrate_objects(
     Args:
         popularity: log-odds of each class in the served mix of sources, (classes,); NaN for a
             class without a training scene.
-        served: weights of the sources in the served mix; empty means that all are equal.
+        sources: see `calibration_scenes`.
     """
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
-    scenes = served_scenes(validation, served)
+    scenes = calibration_scenes(validation, sources)
     learnt = complete_scenes(train, seed)
     rounded = tuple(None if math.isnan(x) else round(x, 4) for x in popularity.double().tolist())
     artifact = recalibrated(artifact, popularity=rounded)
@@ -101,21 +119,17 @@ def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
     return subset(scenes, torch.from_numpy(np.flatnonzero(mask)))
 
 
-def served_scenes(scenes: SceneTensors, served: Mapping[str, float]) -> SceneTensors:
-    """Return the scenes of the sources for which the answers stand; see `ObjectsConfig`.
+def calibration_scenes(scenes: SceneTensors, sources: Collection[str]) -> SceneTensors:
+    """Return the scenes of the named sources with at least 20 scenes.
 
-    These are the sources with at least a tenth of the largest weight in `served` and at least 20
-    scenes. Without such a source, they are all scenes with complete object lists. At most 200
-    scenes of a source take part.
+    Without such a source, they are all scenes with complete object lists. At most 200 scenes of a
+    source take part.
     """
     names, size = scenes.source_names, scenes.source.bincount(minlength=len(scenes.source_names))
-    largest = max(served.values(), default=0.0)
     chosen = [
-        names.index(name)
-        for name, weight in served.items()
-        if weight >= largest * _SERVED
-        and name in names
-        and size[names.index(name)] >= _LEAST_SCENES
+        index
+        for index, name in enumerate(names)
+        if name in sources and size[index] >= _LEAST_SCENES
     ]
     if not chosen:
         scenes = complete_scenes(scenes)
@@ -127,26 +141,78 @@ def served_scenes(scenes: SceneTensors, served: Mapping[str, float]) -> SceneTen
     return subset(scenes, torch.tensor(sorted(kept), dtype=torch.int64))
 
 
+def written_scenes(scenes: SceneTensors, *, written: bool = True) -> SceneTensors:
+    """Return the scenes of written sources, or of the other sources."""
+    chosen = torch.tensor([source_of(name).written == written for name in scenes.source_names])
+    return subset(scenes, chosen[scenes.source].nonzero().squeeze(1))
+
+
 def fit_missing(
     artifact: Artifact, scenes: SceneTensors, structure: Tensor, chosen: Calibration | None = None
 ) -> dict[str, Any]:
-    """Fit the entries `coverage` and `missing` of the calibration."""
-    parts = [draw_parts(scenes, structure, exactly(n)) for n in LENGTHS]
-    v, hidden, related = (
-        torch.cat([getattr(part, name) for part in parts]) for name in ("v", "hidden", "related")
-    )
-    if not len(v):
+    """Fit the entries `coverage`, `missing` and `covered` of the calibration."""
+    seen = written_scenes(scenes, written=False)
+    used = seen if len(seen) >= _LEAST_SCENES else scenes
+    lists = _joined(used, structure, map(exactly, LENGTHS))
+    if not len(lists.v):
         return {}
     coverages = COVERAGES if chosen is None else (chosen.coverage,)
-    log_odds = unlisted_log_odds(artifact, v, coverages)
-    masks = ((v == 0) & ~structure & ~related).numpy(), (hidden & ~related).numpy()
-    best = int(np.argmax([_mean_rank(z, *masks) for z in log_odds]))
-    features, truth = _first_classes(log_odds[best], *masks, v.sum(1).numpy())
-    entry = CountSlope()
+    log_odds = unlisted_log_odds(artifact, lists.v, coverages)
+    best = int(np.argmax([_mean_rank(z, lists) for z in log_odds]))
+    z, row, truth = _first_classes(log_odds[best], lists)
+    log_n = np.log(np.maximum(lists.v.sum(1).numpy(), 1))
+    entries: dict[str, Any] = {"coverage": coverages[best]}
     if len(np.unique(truth)) == 2:
-        slope, count, intercept = logistic(features, truth, C=RIDGE)
-        entry = CountSlope(intercept=intercept, slope=slope, log_count=count)
-    return {"coverage": coverages[best], "missing": entry}
+        slope, count, intercept = logistic(np.stack([z, log_n[row]], 1), truth, C=RIDGE)
+        entries["missing"] = CountSlope(intercept=intercept, slope=slope, log_count=count)
+    parts = _joined(scenes, structure, (*map(share_of, COVERED), all_but_one))
+    if len(parts.v):
+        entries["covered"] = _fit_covered(artifact, parts)
+    return entries
+
+
+def _fit_covered(artifact: Artifact, parts: _Lists) -> CoverageFit:
+    """Fit `covered` to the first classes of parts, each asked with its share of the scene."""
+    n, hidden = parts.v.sum(1).numpy(), parts.hidden.sum(1)
+    # The model's base rates for a complete list are those of all classes but one.
+    share = np.where(hidden == 1, 1.0, n / (n + hidden))
+    every = np.arange(artifact.spec.V)
+    asked = zip(parts.v, share.tolist(), strict=True)
+    rows = [posterior_of(artifact, v).absent_log_odds(every, s) for v, s in asked]
+    z, row, truth = _first_classes(np.array(rows, np.float64), parts)
+    if len(np.unique(truth)) < 2:
+        return CoverageFit()
+    log_n, log_s = np.log(n)[row], np.log(np.maximum(share, LEAST_COVERAGE))[row]
+    features = np.stack([z, log_n, log_s, log_n * log_s, share[row] == 1], 1)
+    *slopes, intercept = logistic(features, truth, C=RIDGE)
+    names = ("slope", "log_count", "log_share", "both", "last")
+    return CoverageFit(intercept=intercept, **dict(zip(names, slopes, strict=True)))
+
+
+class _Lists(NamedTuple):
+    """Parts of scenes as arrays over the classes, (parts, classes).
+
+    Attributes:
+        v: 1 for listed classes.
+        hidden, candidates: True for hidden classes, and for classes that an answer may list.
+        annotated: True for the classes that the data source of the scene can show.
+    """
+
+    v: Tensor
+    hidden: Flags
+    candidates: Flags
+    annotated: Flags
+
+
+def _joined(scenes: SceneTensors, structure: Tensor, sizes: Iterable[Size]) -> _Lists:
+    drawn = [draw_parts(scenes, structure, size) for size in sizes]
+    v, hidden, related, scene = (
+        torch.cat([getattr(parts, name) for parts in drawn])
+        for name in ("v", "hidden", "related", "scene")
+    )
+    candidates = (v == 0) & ~structure & ~related
+    annotated = scenes.annotated_classes[scenes.source[scene]]
+    return _Lists(v, (hidden & ~related).numpy(), candidates.numpy(), annotated.numpy())
 
 
 def unlisted_log_odds(artifact: Artifact, v: Tensor, coverages: Sequence[float]) -> Floats:
@@ -156,10 +222,10 @@ def unlisted_log_odds(artifact: Artifact, v: Tensor, coverages: Sequence[float])
     return np.stack(rows, 1)
 
 
-def _mean_rank(z: Floats, candidates: Flags, hidden: Flags) -> float:
+def _mean_rank(z: Floats, parts: _Lists) -> float:
     """Return the mean reciprocal rank of hidden classes among the other candidates."""
     ranks = []
-    for row, usable, truth in zip(z, candidates, hidden, strict=True):
+    for row, usable, truth in zip(z, parts.candidates, parts.hidden, strict=True):
         if not truth.any():
             continue
         others = np.sort(row[usable & ~truth])
@@ -168,16 +234,17 @@ def _mean_rank(z: Floats, candidates: Flags, hidden: Flags) -> float:
     return float(np.mean(ranks))
 
 
-def _first_classes(
-    z: Floats, candidates: Flags, hidden: Flags, listed: Floats
-) -> tuple[Floats, Flags]:
-    """Return features (log-odds, log of listed classes) and truth of each part's first classes."""
-    first = np.argsort(np.where(candidates, -z, np.inf), axis=1, kind="stable")[:, :_LISTED]
-    rows = np.arange(len(z))[:, None]
-    size = np.broadcast_to(np.log(np.maximum(listed, 1))[:, None], first.shape)
-    usable = candidates[rows, first]  # a small vocabulary has fewer candidates
-    features = np.stack([z[rows, first], size], -1).astype(np.float64)
-    return features[usable], hidden[rows, first][usable]
+def _first_classes(z: Floats, parts: _Lists) -> tuple[Floats, Ints, Flags]:
+    """Return log-odds, part and truth of the first classes of each part, (examples,) each.
+
+    Classes that the data source cannot show are left out, because their truth is unknown.
+    """
+    first = np.argsort(np.where(parts.candidates, -z, np.inf), axis=1, kind="stable")[:, :_LISTED]
+    rows = np.broadcast_to(np.arange(len(z))[:, None], first.shape)
+    # A small vocabulary has fewer candidates.
+    usable = (parts.candidates & parts.annotated)[rows, first]
+    row, classes = rows[usable], first[usable]
+    return z[row, classes].astype(np.float64), row, parts.hidden[row, classes]
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,8 +290,8 @@ def fit_outliers(
     The training scenes give the distributions of intruders. A `chosen` calibration gives alpha.
 
     Returns:
-        The fields `popularity_weight`, `outlier` and `outlier_lines` of a `Calibration`; none if
-        there are too few scenes or parts.
+        The fields `popularity_weight`, `outlier`, `outlier_lines` and `room_lines` of a
+        `Calibration`; none if there are too few scenes or parts.
     """
     if len(scenes) < _LEAST_SCENES:
         return {}
@@ -236,20 +303,19 @@ def fit_outliers(
         return {}
     alpha = chosen.popularity_weight if chosen else choose_alpha(untouched.values(), with_intruder)
     entry = _fit_intruders(untouched.values(), with_intruder, alpha)
-    lines = fit_lines(untouched, entry, alpha)
-    return {"popularity_weight": alpha, "outlier": entry, "outlier_lines": lines}
+    lines = fit_lines(artifact, scenes, structure, entry, alpha)
+    return {"popularity_weight": alpha, "outlier": entry, **lines}
 
 
 def refitted_lines(artifact: Artifact, validation: SceneTensors, config: ObjectsConfig) -> Artifact:
     """Return the model with alarm lines that are fitted again; a model without lines as it is."""
     calibration = artifact.calibration
-    scenes = served_scenes(validation, config.served_sources)
+    scenes = calibration_scenes(validation, config.calibrated_sources)
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
-    untouched = score_untouched(artifact, scenes, structure)
-    if calibration.outlier is None or not untouched:
+    entry, alpha = calibration.outlier, calibration.popularity_weight
+    if entry is None:
         return artifact
-    lines = fit_lines(untouched, calibration.outlier, calibration.popularity_weight)
-    return recalibrated(artifact, outlier_lines=lines)
+    return recalibrated(artifact, **fit_lines(artifact, scenes, structure, entry, alpha))
 
 
 def judged_classes(artifact: Artifact) -> Flags:
@@ -258,8 +324,16 @@ def judged_classes(artifact: Artifact) -> Flags:
     return artifact.vocabulary.judged & ~np.isnan(popularity)
 
 
-def score_lists(artifact: Artifact, parts: Parts, intruders: Tensor | None = None) -> ListScores:
-    """Return the scores of parts of scenes, each with an intruder (parts,) if these are given."""
+def score_lists(
+    artifact: Artifact,
+    parts: Parts,
+    intruders: Tensor | None = None,
+    rooms: Sequence[int] | None = None,
+) -> ListScores:
+    """Return the scores of parts of scenes, each with an intruder (parts,) if these are given.
+
+    The room type (parts,) of each scene is stated if these are given.
+    """
     popularity = np.array(artifact.calibration.popularity, dtype=np.float64)
     v = parts.v.numpy() > 0
     is_intruder = np.zeros_like(v)
@@ -267,23 +341,30 @@ def score_lists(artifact: Artifact, parts: Parts, intruders: Tensor | None = Non
         is_intruder[np.arange(len(v)), intruders.numpy()] = True
         v = v | is_intruder
     log_odds = np.zeros(v.shape)
-    for row, values in zip(v, log_odds, strict=True):
-        values[row] = posterior_of(artifact, torch.from_numpy(row)).given_rest()[0]
+    for k, (row, values) in enumerate(zip(v, log_odds, strict=True)):
+        room = None if rooms is None else rooms[k]
+        values[row] = posterior_of(artifact, torch.from_numpy(row), room).given_rest()[0]
     row, classes = at = np.nonzero(v & judged_classes(artifact))
     can_alarm = ~artifact.rarely_shown[classes]
     return ListScores(row, log_odds[at], popularity[classes], is_intruder[at], can_alarm, v.sum(1))
 
 
 def score_untouched(
-    artifact: Artifact, scenes: SceneTensors, structure: Tensor
+    artifact: Artifact, scenes: SceneTensors, structure: Tensor, *, in_room: bool = False
 ) -> dict[int, ListScores]:
-    """Return the scores of random parts of scenes by length, without lengths of too few parts."""
-    parts_by_length = {n: draw_parts(scenes, structure, exactly(n), _SEEDS) for n in LENGTHS}
-    return {
-        n: score_lists(artifact, parts)
-        for n, parts in parts_by_length.items()
-        if len(parts.v) >= _LEAST_SCENES
-    }
+    """Return the scores of random parts of scenes by length, without lengths of too few parts.
+
+    With `in_room`, the request states the room type, and scenes without a type are left out.
+    """
+    if in_room:
+        scenes = subset(scenes, (scenes.room >= 0).nonzero().squeeze(1))
+    scores: dict[int, ListScores] = {}
+    for n in JUDGED_LENGTHS:
+        parts = draw_parts(scenes, structure, exactly(n), _SEEDS)
+        if len(parts.v) >= _LEAST_SCENES:
+            rooms = scenes.room[parts.scene].tolist() if in_room else None
+            scores[n] = score_lists(artifact, parts, rooms=rooms)
+    return scores
 
 
 def score_intruders(
@@ -334,27 +415,53 @@ def _fit_intruders(
     return CountSlope(intercept=intercept, slope=slope, log_count=count)
 
 
-def fit_lines(untouched: Mapping[int, ListScores], entry: CountSlope, alpha: float) -> AlarmLines:
-    """Return the line of each sensitivity."""
-    lines = {name: fit_line(untouched, entry, alpha, share) for name, share in ALARMS.items()}
-    return AlarmLines(**lines)
+def fit_lines(
+    artifact: Artifact, scenes: SceneTensors, structure: Tensor, entry: CountSlope, alpha: float
+) -> dict[str, AlarmLines | None]:
+    """Return the fields `outlier_lines` and `room_lines` of a `Calibration`.
 
-
-def fit_line(
-    untouched: Mapping[int, ListScores], entry: CountSlope, alpha: float, share: float
-) -> AlarmLine:
-    """Return the line above which the given share of the untouched lists has an object.
-
-    The line is the least-squares line through the quantiles of all lengths. It is then raised until
-    the mean share over the lengths is right.
+    A field is None if there are too few lists for it.
     """
-    sizes, worst = np.log(list(untouched)), []
-    for scores in untouched.values():
+    fields: dict[str, AlarmLines | None] = {}
+    for name, in_room in (("outlier_lines", False), ("room_lines", True)):
+        untouched = score_untouched(artifact, scenes, structure, in_room=in_room)
+        worst = worst_log_odds(untouched, entry, alpha)
+        lines = {level: fit_line(worst, share) for level, share in ALARMS.items()} if worst else {}
+        fields[name] = AlarmLines(**lines) if lines else None
+    return fields
+
+
+def fit_line(worst: Mapping[int, Floats], share: float) -> AlarmLine:
+    """Return a line above which about `MARGIN` times the share of the lists has an object.
+
+    The shape of the line is the least-squares parabola in the log of the length through the
+    quantiles of the lengths, weighted by the square roots of their numbers of lists. A parabola,
+    because short lists say little, and long lists of written places contain rare things. With fewer
+    than five lengths, the shape is a straight line, and with fewer than three, it is constant. The
+    quantiles are those of medium sensitivity, so the lines of two sensitivities never cross. The
+    line is then moved until the mean share over the lengths is right.
+
+    Args:
+        worst: the largest log-odds of each list by the length of the lists.
+    """
+    sizes, lists = np.log(list(worst)), list(worst.values())
+    quantiles = [np.quantile(values, 1 - MARGIN * ALARMS["medium"]) for values in lists]
+    numbers = np.sqrt([len(values) for values in lists])
+    fit = np.polyfit(sizes, quantiles, min(2, (len(sizes) - 1) // 2), w=numbers)
+    curve, slope, _ = (0.0, 0.0, *fit.tolist())[-3:]
+    line = (curve * sizes + slope) * sizes
+    above = np.concatenate([values - height for values, height in zip(lists, line, strict=True)])
+    weight = np.concatenate([np.full(len(values), 1 / len(values)) for values in lists])
+    limit = quantile_of(above, weight, 1 - MARGIN * share)
+    return AlarmLine(intercept=limit, log_count=slope, curve=curve)
+
+
+def worst_log_odds(
+    untouched: Mapping[int, ListScores], entry: CountSlope, alpha: float
+) -> dict[int, Floats]:
+    """Return the largest log-odds of an alarm in each list, by the length of the lists."""
+    worst = {}
+    for n, scores in untouched.items():
         log_odds = calibrated(entry, scores.score(alpha), scores.size[scores.row])
-        worst.append(scores.extreme(np.where(scores.can_alarm, log_odds, -np.inf)))
-    quantiles = [np.quantile(values, 1 - share) for values in worst]
-    slope = float(np.polyfit(sizes, quantiles, 1)[0]) if len(worst) > 1 else 0.0
-    above = np.concatenate([v - slope * n for n, v in zip(sizes, worst, strict=True)])
-    weight = np.concatenate([np.full(len(values), 1 / len(values)) for values in worst])
-    limit = np.quantile(above, 1 - share, weights=weight, method="inverted_cdf")
-    return AlarmLine(intercept=float(limit), log_count=slope)
+        worst[n] = scores.extreme(np.where(scores.can_alarm, log_odds, -np.inf))
+    return worst

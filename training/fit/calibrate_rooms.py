@@ -7,12 +7,14 @@ rare_rooms   Room types of few training scenes (`rare_rooms`).
 written_rooms
              Room types that only written sources show.
 smallest, room_fit
-             Limits of a generated scene of each room type.
+             Limits of a generated scene of each room type, from parts of whole rooms (`limits`).
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -23,12 +25,13 @@ from torch import Tensor
 from app.inference.chains import random_stream
 from app.questions.generate import STEPS, room_fit
 from app.questions.posterior import Posterior
-from app.registry import Artifact, Sharpness
-from training.datasets.array_types import Flags, Floats
+from app.registry import Artifact, FitLimit, Sharpness
+from app.registry.description import NO_LIMIT
+from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.sources import source_of
 from training.evaluation.asking import of_classes
-from training.evaluation.parts import Size, draw_parts, exactly
+from training.evaluation.parts import Parts, Size, draw_parts, exactly
 from training.fit.long_chains import conditions_of
 
 _LENGTHS = (1, 2, 3, 5, 8)  # numbers of listed classes in the fit of `rooms`
@@ -37,11 +40,10 @@ _LEAST_SCENES = 20  # validation scenes with a room type in that fit
 _ENOUGH_SCENES, _FEW_SCENES = 50, 10
 _SPLITS = 20
 _SAMPLES = 64
-# Quantiles over real rooms of a room type. A generated scene is too small if its number of classes
-# is below quantile `_SMALL`. A generated scene does not suit its room type if its `room_fit` is
-# below quantile `_UNSUITED`. A room type needs `_ROOM_SCENES` scenes for separate limits.
-_SMALL = 0.1
-_UNSUITED = 0.15
+# The limits of generated scenes are the quantile `_LEAST` over parts of whole rooms that list these
+# shares of the classes. A room type needs `_ROOM_SCENES` scenes for separate limits.
+_LEAST = 0.05
+_PARTS = (0.3, 0.5, 0.75, 1.0)
 _ROOM_SCENES = 20
 
 
@@ -58,8 +60,7 @@ def calibrate_rooms(
         "rooms": fit_rooms(artifact, scenes, structure),
         "rare_rooms": rare_rooms(artifact, train, structure),
         "written_rooms": written_rooms(train),
-        "smallest": smallest_scenes(train, structure, artifact.spec.C),
-        "room_fit": room_limits(artifact, train),
+        **limits(artifact, train, structure),
     }
 
 
@@ -84,9 +85,10 @@ def fit_rooms(artifact: Artifact, scenes: SceneTensors, structure: Tensor) -> Sh
     return Sharpness(slope=slope, log_count=log_count)
 
 
-def posterior_of(artifact: Artifact, v: Tensor) -> Posterior:
-    """Return the posterior given the listed classes v, (classes,)."""
-    return Posterior(artifact, of_classes(v.nonzero().squeeze(1).tolist()))
+def posterior_of(artifact: Artifact, v: Tensor, room: int | None = None) -> Posterior:
+    """Return the posterior given the listed classes v, (classes,), and the room type."""
+    scene = of_classes(v.nonzero().squeeze(1).tolist())
+    return Posterior(artifact, replace(scene, room_type=room))
 
 
 def written_rooms(train: SceneTensors) -> tuple[int, ...]:
@@ -135,30 +137,106 @@ def _resemblance(first: Flags, second: Flags) -> float:
     return float(np.minimum(p, q).sum() / max(np.maximum(p, q).sum(), 1e-9))
 
 
-def smallest_scenes(train: SceneTensors, structure: Tensor, rooms: int) -> tuple[int, ...]:
-    """Return the 10 % quantile of the number of classes in a scene, for each room type.
+def refitted_limits(artifact: Artifact, train: SceneTensors) -> Artifact:
+    """Return the model with limits of generated scenes that are fitted again.
 
-    The last value is the quantile over all scenes. It also replaces the quantile of a room type
-    with fewer than 20 scenes.
+    Args:
+        train: training scenes with complete object lists.
     """
-    sizes = ((train.v > 0) & ~structure).sum(1).numpy()
-    limit = int(np.quantile(sizes, _SMALL)) if len(sizes) else 0
-    by_room = [sizes[train.room.numpy() == t] for t in range(rooms)]
-    quantiles = [int(np.quantile(n, _SMALL)) if len(n) >= _ROOM_SCENES else limit for n in by_room]
-    return (*quantiles, limit)
+    structure = torch.from_numpy(artifact.vocabulary.structure.copy())
+    update = limits(artifact, train, structure)
+    return replace(artifact, calibration=artifact.calibration.model_copy(update=update))
 
 
-def room_limits(artifact: Artifact, train: SceneTensors) -> tuple[float, ...]:
-    """Return the 15 % quantile of `room_fit` for each room type, (room types,).
+def limits(artifact: Artifact, train: SceneTensors, structure: Tensor) -> dict[str, Any]:
+    """Return the limits of a generated scene of each room type.
 
-    The value is -1e9 for a room type with fewer than 20 scenes.
+    A limit is a 5 % quantile over parts of whole rooms. The number of classes has the parts of 30 %
+    of the classes, as a robot lists a room, so rooms in short real lists also reach the limits. The
+    fit grows with the number of classes. Its limit is the least-squares line through the quantiles
+    of parts of 30, 50, 75 and 100 %, in the log of their mean numbers of classes. All sources have
+    equal weight. Sources of frames, sentences or procedural rooms do not take part, except in data
+    without whole rooms.
+
+    Args:
+        train: training scenes with complete object lists.
+
+    Returns:
+        The fields `smallest` and `room_fit` of a `Calibration`. A room type with fewer than 20
+        scenes has the number of classes of all rooms, and a fit of at least -1e9.
     """
-    limits = []
+    rooms = whole_rooms(train)
+    parts = [draw_parts(rooms, structure, _part_of(share)) for share in _PARTS]
+    lists = [_ListedRooms.of(rooms, part) for part in parts]
+    least = lists[0].smallest() if len(lists[0].size) else 0
+    smallest, fits = [], []
     for t in range(artifact.spec.C):
-        room_scenes = train.v[train.room == t]
-        limit = -1e9
-        if len(room_scenes) >= _ROOM_SCENES:
-            fits = [room_fit(artifact, v.nonzero().squeeze(1).tolist(), t) for v in room_scenes]
-            limit = float(np.quantile(fits, _UNSUITED))
-        limits.append(round(limit, 4))
-    return tuple(limits)
+        own = [each.of_type(t) for each in lists]
+        if len(np.unique(own[0].scene)) < _ROOM_SCENES:
+            smallest.append(least)
+            fits.append(NO_LIMIT)
+        else:
+            smallest.append(own[0].smallest())
+            fits.append(_fit_limit(artifact, own, t))
+    return {"smallest": (*smallest, least), "room_fit": tuple(fits)}
+
+
+class _ListedRooms(NamedTuple):
+    """Listed parts of rooms.
+
+    Attributes:
+        listed: True for listed classes, (parts, classes).
+        size: number of listed classes, (parts,).
+        scene, source, room: index of the scene, of its source and of its room type, (parts,) each.
+    """
+
+    listed: Flags
+    size: Ints
+    scene: Ints
+    source: Ints
+    room: Ints
+
+    @classmethod
+    def of(cls, scenes: SceneTensors, parts: Parts) -> Self:
+        listed, scene = parts.v.numpy() > 0, parts.scene.numpy()
+        source, room = scenes.source.numpy()[scene], scenes.room.numpy()[scene]
+        return cls(listed, listed.sum(1), scene, source, room)
+
+    def of_type(self, room: int) -> Self:
+        """Return the parts of scenes of a room type."""
+        return type(self)(*(values[self.room == room] for values in self))
+
+    def smallest(self) -> int:
+        return int(_low_quantile(self.size.astype(np.float64), self.source))
+
+
+def _fit_limit(artifact: Artifact, lists: Sequence[_ListedRooms], room: int) -> FitLimit:
+    """Return the limit of the fit from lists of a room type, one entry for each of `_PARTS`."""
+    quantiles = []
+    for parts in lists:
+        fits = [room_fit(artifact, np.flatnonzero(row).tolist(), room) for row in parts.listed]
+        quantiles.append(_low_quantile(np.array(fits), parts.source))
+    sizes = np.log([parts.size.mean() for parts in lists])
+    slope, intercept = np.polyfit(sizes, quantiles, 1) if np.ptp(sizes) else (0.0, quantiles[0])
+    return FitLimit(intercept=round(float(intercept), 4), log_count=round(float(slope), 4))
+
+
+def whole_rooms(scenes: SceneTensors) -> SceneTensors:
+    """Return the scenes of sources of whole rooms, or all scenes if there are none."""
+    is_whole = torch.tensor([source_of(name).whole_rooms for name in scenes.source_names])
+    mask = is_whole[scenes.source] if len(scenes) else torch.zeros(0, dtype=torch.bool)
+    return subset(scenes, mask.nonzero().squeeze(1)) if mask.any() else scenes
+
+
+def _part_of(share: float) -> Size:
+    return lambda classes, _: max(1, round(share * classes))
+
+
+def _low_quantile(values: Floats, source: Ints) -> float:
+    """Return the quantile `_LEAST` of the values, in which all sources have equal weight."""
+    return quantile_of(values, 1 / np.bincount(source)[source], _LEAST)
+
+
+def quantile_of(values: Floats, weights: Floats, share: float) -> float:
+    """Return the smallest value below or at which the given share of the weights lies."""
+    return float(np.quantile(values, share, weights=weights, method="inverted_cdf"))

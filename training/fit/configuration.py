@@ -134,6 +134,11 @@ class ObjectsConfig(_Section):
         default={},
         description="weights of the sources in the base rates that are served; empty: all equal",
     )
+    calibrated_sources: tuple[str, ...] = Field(
+        default=(),
+        description="sources whose validation scenes calibrate the answers about objects; empty: "
+        "all scenes with complete object lists",
+    )
     open_sources: tuple[str, ...] = Field(
         default=(),
         description="sources that show every class; empty: those with an open vocabulary",

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from app.inference import Weights
 from app.inference.kernels import ROOM
 from app.registry import Artifact, Calibration, Counts, Offsets, Places
+from app.registry.description import NO_LIMIT
 from app.scene import CANONICAL, ObjectClass, Vocabulary
 
 _RARE: Final = 0.1  # quantile of the known biases that a new class or room type gets
@@ -69,7 +70,7 @@ def _calibration(calibration: Calibration, classes: int, C: int, rooms: int) -> 
         of_rooms, unknown = calibration.smallest[:-1], calibration.smallest[-1]
         update = {**update, "smallest": (*of_rooms, *[unknown] * rooms, unknown)}
     if calibration.room_fit:
-        update = {**update, "room_fit": (*calibration.room_fit, *[0.0] * rooms)}
+        update = {**update, "room_fit": (*calibration.room_fit, *[NO_LIMIT] * rooms)}
     if not calibration.popularity:
         update = {**update, "popularity": ()}
     return calibration.model_copy(update=update)

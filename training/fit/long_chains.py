@@ -1,13 +1,14 @@
-"""Long Gibbs chains that start at scenes, and the test that they stay like these scenes.
+"""Long Gibbs chains that start at scenes, and the test that served scenes stay like these scenes.
 
 A machine whose chains drift away from the scenes learnt a wrong distribution: the samples of
-`/generate` are then good only as long as the chains are short.
+`/generate` are then good only as long as the chains are short. The test applies the filter of
+`/generate` to the states of long chains.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Final, TypeVar
@@ -17,8 +18,11 @@ import torch
 
 from app.inference.chains import Conditions, SceneChains, random_stream
 from app.inference.weights import Weights
-from app.registry import Metric
+from app.questions.generate import ATTEMPTS, STEPS, is_plausible
+from app.registry import Artifact, Metric
+from app.scene import Scene
 from training.datasets.array_types import Flags, Floats, Ints
+from training.datasets.sources import source_of
 from training.fit.configuration import ObjectsConfig
 from training.fit.objects import ObjectScenes, served_weights
 
@@ -67,10 +71,14 @@ class Population:
 def populations(scenes: ObjectScenes, config: ObjectsConfig) -> Iterator[Population]:
     """Yield the population of each data source, and that of the served mix.
 
-    Without a scene of a served source, the served mix has all scenes.
+    The served mix has the whole rooms of the served sources (`Source.whole_rooms`): lists of
+    photographs and sentences are parts of rooms. Without whole rooms, it has all scenes of the
+    served sources. Without a scene of a served source, it has all scenes.
     """
     served = served_weights(scenes, config)
     served = served if served.any() else torch.ones_like(served)
+    whole = served * torch.tensor([float(source_of(q).whole_rooms) for q in scenes.sources])
+    served = whole if whole.any() else served
     v = scenes.v.double().numpy()
     for profile in (*range(len(scenes.sources)), None):
         if profile is None:
@@ -103,7 +111,7 @@ class LongChains:
         index = population.draw(count, np.random.default_rng(seed))
         self.on = scenes.v[index].numpy().astype(np.uint8)
         self._chains, self._profile = chains, population.profile
-        self._rooms = population.room[index]
+        self.rooms = population.room[index]
         self._streams = [random_stream(seed, k) for k in range(count)]
 
     def run(self, sweeps: int, every: int = RECORDED) -> Floats:
@@ -118,12 +126,12 @@ class LongChains:
         records = range(0, sweeps, every)
         conditioned = {
             room: self._chains.under(conditions_of(None if room < 0 else room, self._profile))
-            for room in np.unique(self._rooms).tolist()
+            for room in np.unique(self.rooms).tolist()
         }
 
         def run_chain(k: int) -> None:
             for _ in records:
-                conditioned[int(self._rooms[k])].sweep(self.on[k], every, self._streams[k])
+                conditioned[int(self.rooms[k])].sweep(self.on[k], every, self._streams[k])
                 count[k] += self.on[k]
 
         in_threads(run_chain, len(count))
@@ -192,20 +200,16 @@ class Drift:
         return None
 
 
-def measure_drift(
-    weights: Weights, labels: Sequence[str], scenes: ObjectScenes, config: ObjectsConfig
-) -> Drift:
+def measure_drift(artifact: Artifact, scenes: ObjectScenes, config: ObjectsConfig) -> Drift:
     """Run 3,000 sweeps from training scenes of the served mix, and compare chains and scenes.
 
-    The states of the last 1,000 sweeps count.
-
-    Args:
-        labels: label of each class, (classes,).
+    The states of the last 1,000 sweeps count if the filter of `/generate` accepts them
+    (`accepted`).
     """
     *_, population = populations(scenes, config)
-    long = LongChains(scene_chains(weights), scenes, population, _CHAINS, seed=1)
+    long = LongChains(scene_chains(artifact.weights), scenes, population, _CHAINS, seed=1)
     long.run(_SETTLED, every=_SETTLED)
-    drawn = long.run(_SWEEPS - _SETTLED)
+    drawn = accepted(artifact, long, (_SWEEPS - _SETTLED) // STEPS)
     sizes = drawn[:, population.shows].sum(1) / population.p[population.shows].sum()
     top = np.argsort(-np.where(population.shows, population.p, 0))[:_COMMONEST]
     top = top[population.p[top] > 0]
@@ -214,4 +218,36 @@ def measure_drift(
     # The class that is most certainly beyond the limit.
     k = int(np.argmax(np.abs(share) - _CERTAIN * error))
     size, size_error = float(sizes.mean() - 1), float(sizes.std() / np.sqrt(_CHAINS))
-    return Drift(size, size_error, labels[top[k]], float(share[k]), float(error[k]))
+    label = artifact.vocabulary.labels[top[k]]
+    return Drift(size, size_error, label, float(share[k]), float(error[k]))
+
+
+def accepted(artifact: Artifact, long: LongChains, states: int) -> Floats:
+    """Continue the chains, and return the share of the served scenes with each class.
+
+    A state is recorded every `STEPS` sweeps, the length of a draw of `/generate`. A served scene is
+    the first plausible one of `ATTEMPTS` states, or the last of them.
+
+    Args:
+        states: number of recorded states of each chain, at least `ATTEMPTS`.
+
+    Returns:
+        The share of each class in the served scenes of each chain, (chains, classes).
+    """
+    evidence = Scene(())
+    count, served = np.zeros(long.on.shape), np.zeros(len(long.on))
+    refused = np.zeros(len(long.on), np.int64)  # states since the last served scene
+
+    def accepts(k: int) -> bool:
+        room = None if long.rooms[k] < 0 else int(long.rooms[k])
+        return is_plausible(artifact, evidence, np.flatnonzero(long.on[k]), room)
+
+    for _ in range(states):
+        long.run(STEPS, every=STEPS)
+        refused += 1
+        taken = np.array(in_threads(accepts, len(long.on))) | (refused == ATTEMPTS)
+        count[taken] += long.on[taken]
+        served[taken] += 1
+        refused[taken] = 0
+    share: Floats = count / served[:, None]
+    return share

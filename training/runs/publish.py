@@ -26,7 +26,8 @@ from training.evaluation.everyday_task import EVERYDAY
 from training.evaluation.report import Progress, evaluate, silent
 from training.evaluation.tasks import STATISTICS
 from training.fit.calibrate import calibrate
-from training.fit.calibrate_objects import refitted_lines
+from training.fit.calibrate_objects import complete_scenes, refitted_lines
+from training.fit.calibrate_rooms import refitted_limits
 from training.fit.configuration import DataConfig, source_name
 from training.fit.count_statistics import fit_counts
 from training.fit.draft import placed_draft
@@ -39,7 +40,7 @@ from training.runs.folder import FinishedRun, RunError
 from training.runs.pipeline import SplitScenes, read_sources, split_and_encode
 
 # Tasks with results that depend on the alarm lines, and the names of these results.
-_OF_ALARMS = ("T3 outliers", "T3 alarms", "Everyday")
+_OF_LIMITS = ("T3 outliers", "T3 alarms", "T4 rooms", "Everyday")
 _ALARM = re.compile(r"^flagged, (uniform|by popularity|signature)$|^alarms, |^outliers: .*default$")
 _LIBRARIES = ("numpy", "scikit-learn", "scipy", "torch")
 
@@ -95,8 +96,7 @@ def publish_run(
     alarms = untouched_alarms(calibrated, scenes.parts["validation"])
     progress("running long chains")
     learnt = ObjectScenes.of(data.train, data.structure, run.config.objects)
-    labels = scenes.vocabulary.labels
-    drift = measure_drift(calibrated.weights, labels, learnt, run.config.objects)
+    drift = measure_drift(calibrated, learnt, run.config.objects)
     objections = [*(entry.objection() for entry in alarms), drift.objection()]
     reasons = [*filter(None, objections), *judge(calibrated, progress)]
     for reason in reasons:
@@ -132,12 +132,12 @@ def refit(
 ) -> Artifact:
     """Publish a new version of a published model with refitted statistics, without training.
 
-    Only the statistics (offsets, counts, alarm lines), their metrics, the example scenes and the
-    built-in synonyms of classes are new. The examples are those of the shipped configuration with
-    the name of the model, otherwise those of its own configuration. The metrics of weights that
-    were trained on test scenes come from statistics that were not fitted to test scenes. The new
-    version has no shares of flagged intruders and of alarms of such weights, because they would
-    need other weights.
+    Only the statistics (offsets, counts, alarm lines, limits of generated scenes), their metrics,
+    the example scenes and the built-in synonyms of classes are new. The examples are those of the
+    shipped configuration with the name of the model, otherwise those of its own configuration. The
+    metrics of weights that were trained on test scenes come from statistics that were not fitted to
+    test scenes. The new version has no shares of flagged intruders, of alarms and of refused rooms
+    of such weights, because they would need other weights.
 
     Args:
         root: folder of the training scenes.
@@ -168,13 +168,14 @@ def refit(
         other = with_settings(config, {"data.split": split}).data
         evaluated_scenes = split_and_encode(other, annotated, root, artifact.vocabulary)
     progress("fitting statistics")
-    held_out, validation = evaluated_scenes.training_data(), scenes.training_data().validation
-    refitted = refitted_lines(with_statistics(artifact, scenes), validation, config.objects)
+    held_out, own = evaluated_scenes.training_data(), scenes.training_data()
+    refitted = refitted_lines(with_statistics(artifact, scenes), own.validation, config.objects)
+    refitted = refitted_limits(refitted, complete_scenes(own.train))
     evaluated = with_statistics(artifact, evaluated_scenes)
     rows = _measure(evaluated, held_out, progress, tuple(STATISTICS))
     if not split:
-        rows += _measure(refitted, held_out, progress, _OF_ALARMS)
-    again = {metric.task for metric in rows} | {*STATISTICS}
+        rows += _measure(refitted, held_out, progress, _OF_LIMITS)
+    again = {metric.task for metric in rows} | {*STATISTICS, "T4 rooms"}
     kept = [m for m in manifest.metrics if m.task not in again and not _ALARM.search(m.metric)]
     vocabulary = VocabularyEntry.of(
         with_aliases(artifact.vocabulary), artifact.spec.A, manifest.vocabulary.profiles

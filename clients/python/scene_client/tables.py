@@ -90,7 +90,8 @@ def outliers(answer: schemas.OutliersAnswer) -> RenderableType:
     """Return a table of objects, most probable outlier first, and a table of false relations."""
     rows = [
         (
-            *(entry.object, _class(entry), f"{entry.probability:.3f}", f"{entry.log_odds:+.2f}"),
+            *(entry.object, _class(entry), f"{entry.probability:.3f}"),
+            "" if entry.log_odds is None else f"{entry.log_odds:+.2f}",
             "outlier" if entry.is_outlier else "",
             _reasons(entry.because),
             ", ".join(entry.usually_with),

@@ -138,8 +138,8 @@ class SceneCondition : public BT::StatefulActionNode {
   std::thread thread_;  // declared last: it uses the other members
 };
 
-// SUCCESS if every unlisted object has log-odds of presence below the port `log_odds`. The default
-// 0 is a probability of 0.5.
+// SUCCESS if every unlisted object has `log_odds` below the port `log_odds`. The default 0 is a
+// probability of 0.5.
 class SceneComplete : public SceneCondition {
  public:
   SceneComplete(const std::string& name, const BT::NodeConfig& config,

@@ -147,7 +147,7 @@ def test_structure_and_equal_classes_are_not_asked():
 @pytest.mark.parametrize("name", ["rbm", "triway"])
 def test_the_question_names_the_place_as_a_robot_does(name, outgoing):
     """On-top of the first of two objects of class 2, by the relation as the missing object's."""
-    entry = PlaceFit(relation=0.8, intercept=0.2, slope=0.7)
+    entry = PlaceFit(relation=0.8, intercept=0.2)
     artifact = larger_artifact(name, at=(entry,) * LARGER[name].A, coverage=0.7)
     v = torch.zeros(2, artifact.spec.V)
     v[:, [0, 2, 5]] = 1.0

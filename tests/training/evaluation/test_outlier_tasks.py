@@ -131,7 +131,7 @@ def test_a_published_model_is_judged_as_the_service_ranks():
         place = int((classes == target).nonzero())
         first = answers[:, 0] == answers[:, 0].max()
         hits[k] += first[place] / first.sum()
-        flagged[k] += answers[place, 2]
+        flagged[k] += answers[place, 1]
     groups = np.unique(data.group_ids, return_inverse=True)[1]
     for name, values in (("hit@1", hits), ("flagged", flagged)):
         assert outcome.metrics[f"{name}, uniform"].numerators == pytest.approx(

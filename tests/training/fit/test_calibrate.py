@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from app.questions.posterior import calibrated
-from app.registry import Calibration, CountSlope
+from app.registry import Calibration, CountSlope, CoverageFit
 from app.scene import Vocabulary
 from app.scene.relations import ABOVE, INSIDE, LATERAL, LEFT, ON_TOP, STACKED
 from tests.questions.artifacts import artifact_of, random_machine
@@ -32,8 +32,11 @@ from training.fit.calibrate import (
 from training.fit.calibrate_objects import (
     ALPHAS,
     COVERAGES,
+    JUDGED_LENGTHS,
     LENGTHS,
+    MARGIN,
     ListScores,
+    calibration_scenes,
     choose_alpha,
     complete_scenes,
     fit_line,
@@ -41,7 +44,7 @@ from training.fit.calibrate_objects import (
     fit_outliers,
     score_intruders,
     score_lists,
-    served_scenes,
+    worst_log_odds,
 )
 from training.fit.configuration import ObjectsConfig
 from training.fit.draft import draft_artifact, fit_places
@@ -90,6 +93,7 @@ def test_every_entry_is_fitted(fitted):
     assert fitted.coverage in COVERAGES
     # The likelier a class, the likelier it is missing, and the less likely it is an intruder.
     assert fitted.missing.slope > 0
+    assert fitted.covered.slope > 0
     assert fitted.outlier.slope < 0
     # The likelier a stand, the less probably it is wrong.
     assert fitted.misplaced.stand.stand < 0
@@ -128,17 +132,17 @@ def test_scenes_count_by_weight_and_incomplete_ones_not_at_all():
     assert len(complete_scenes(tensors(cut, WIDE))) == 20
 
 
-def test_real_rooms_come_before_generated_ones():
-    """At most 200 scenes of each source; sources of the user count if no room is real."""
+def test_the_named_sources_calibrate_answers():
+    """At most 200 scenes of each source; without a named source of 20 scenes, all sources."""
     made = [scene([0, 1], source="procthor") for _ in range(500)]
     real = [scene([0, 1], source=name) for name in ["3dssg"] * 30 + ["sunrgbd"] * 450]
     few = [scene([0, 1], source="nr3d") for _ in range(19)]
-    served = {"3dssg": 1.0, "sunrgbd": 1.0, "nr3d": 1.0, "procthor": 0.05}
-    kept = served_scenes(tensors([*made, *real, *few], WIDE), served)
+    named = ["3dssg", "sunrgbd", "nr3d"]
+    kept = calibration_scenes(tensors([*made, *real, *few], WIDE), named)
     sources = [one.source for one in kept.scenes]
     assert {name: sources.count(name) for name in set(sources)} == {"3dssg": 30, "sunrgbd": 200}
-    assert len(served_scenes(tensors(made, WIDE), served)) == 200
-    assert len(served_scenes(tensors(made, WIDE), {})) == 200
+    assert len(calibration_scenes(tensors(made, WIDE), named)) == 200
+    assert len(calibration_scenes(tensors(made, WIDE), [])) == 200
 
 
 BARE = torch.zeros(WIDE, dtype=torch.bool)
@@ -163,6 +167,7 @@ def test_the_coverage_that_ranks_best_is_chosen(monkeypatch):
         return ranked + rng.normal(0, 0.5, (len(coverages), *hidden.shape))
 
     monkeypatch.setattr(of_objects, "unlisted_log_odds", log_odds)
+    monkeypatch.setattr(of_objects, "_fit_covered", lambda *_: CoverageFit())
     assert fit_missing(None, scenes, BARE)["coverage"] == 0.45
     chosen = Calibration.neutral(A).model_copy(update={"coverage": 0.8})
     assert fit_missing(None, scenes, BARE, chosen)["coverage"] == 0.8
@@ -222,9 +227,10 @@ def test_alarm_lines_keep_their_share_at_each_length(share):
     def lists(n):
         return scores_of(rng.logistic(2 + 0.8 * np.log(n), 1.0, (4000, n)), False)
 
-    line = fit_line({n: lists(n) for n in LENGTHS}, entry, 0.0, share)
+    worst = worst_log_odds({n: lists(n) for n in JUDGED_LENGTHS}, entry, 0.0)
+    line = fit_line(worst, share / MARGIN)
     shares = []
-    for n in LENGTHS:
+    for n in JUDGED_LENGTHS:
         scores = lists(n)
         z = calibrated(entry, scores.log_odds, scores.size[scores.row])
         alarm = 1 / (1 + np.exp(-z)) >= line.threshold(n)
@@ -233,18 +239,33 @@ def test_alarm_lines_keep_their_share_at_each_length(share):
     assert shares == pytest.approx([share] * len(shares), abs=0.02 + share / 10)
 
 
+def test_alarm_lines_of_few_lengths_are_straight():
+    """Three lengths give no parabola, and two no slope. A more sensitive line is never higher."""
+    worst = {n: np.arange(100.0) - 10 * n for n in (2, 3, 5, 8, 12)}
+    lengths = [*worst]
+    for number, curved in ((5, True), (4, False), (3, False), (2, False)):
+        some = {n: worst[n] for n in lengths[:number]}
+        low, medium, high = (fit_line(some, share) for share in ALARMS.values())
+        assert (medium.curve != 0, medium.log_count != 0) == (curved, number > 2)
+        assert low.intercept > medium.intercept > high.intercept
+        assert {(one.curve, one.log_count) for one in (low, high)} == {
+            (medium.curve, medium.log_count)
+        }
+
+
 def test_a_class_that_raises_no_alarm_does_not_raise_the_line():
     """The last class of each list is the most suspicious, but the service never flags it."""
     entry = CountSlope(slope=-1.0)
     log_odds = np.tile([0.1, 0.2, -5.0], (50, 1))
-    line = fit_line({3: scores_of(log_odds, False, can_alarm=~LAST)}, entry, 0.0, 0.1)
-    assert line.intercept == pytest.approx(-0.1)
-    assert fit_line({3: scores_of(log_odds, False)}, entry, 0.0, 0.1).intercept == 5.0
+    silent = worst_log_odds({3: scores_of(log_odds, False, can_alarm=~LAST)}, entry, 0.0)
+    assert fit_line(silent, 0.1).intercept == pytest.approx(-0.1)
+    every = worst_log_odds({3: scores_of(log_odds, False)}, entry, 0.0)
+    assert fit_line(every, 0.1).intercept == 5.0
 
 
 def test_one_length_has_a_line_without_slope():
-    line = fit_line({3: CLEAN}, CountSlope(slope=-1.0), 0.0, 0.1)
-    assert (line.intercept, line.log_count) == (pytest.approx(-0.1), 0.0)
+    line = fit_line(worst_log_odds({3: CLEAN}, CountSlope(slope=-1.0), 0.0), 0.1)
+    assert (line.intercept, line.log_count, line.curve) == (pytest.approx(-0.1), 0.0, 0.0)
 
 
 def test_intruders_are_as_likely_as_the_answer_states(judging):
@@ -278,9 +299,9 @@ def test_structure_and_classes_that_belong_anywhere_are_never_judged(judging):
 
 @pytest.mark.parametrize("count", [19, 20])
 def test_few_scenes_give_no_judgement_of_objects(judging, count):
-    some = tensors(served_scenes(rooms(60, 1), {}).scenes[:count], len(VOCABULARY))
+    some = tensors(calibration_scenes(rooms(60, 1), []).scenes[:count], len(VOCABULARY))
     entries = fit_outliers(judging, some, rooms(ROOM_COUNT, 2), STRUCTURE)
-    judged = {"popularity_weight", "outlier", "outlier_lines"}
+    judged = {"popularity_weight", "outlier", "outlier_lines", "room_lines"}
     assert set(entries) == (judged if count == 20 else set())
 
 

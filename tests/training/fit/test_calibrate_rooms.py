@@ -5,13 +5,21 @@ import pytest
 import torch
 
 from app.questions import rooms
+from app.questions.generate import is_within_limits, room_fit
 from app.registry import Sharpness
+from app.registry.description import NO_LIMIT
 from tests.questions.artifacts import LABELS, larger_artifact
-from tests.training.evaluation.scenes import WIDE, scene, tensors
+from tests.training.evaluation.scenes import scene, tensors
 from training.evaluation.asking import of_classes
 from training.fit import calibrate_rooms
 from training.fit.calibrate_objects import recalibrated
-from training.fit.calibrate_rooms import fit_rooms, rare_rooms, smallest_scenes, written_rooms
+from training.fit.calibrate_rooms import (
+    fit_rooms,
+    limits,
+    rare_rooms,
+    refitted_limits,
+    written_rooms,
+)
 
 V = len(LABELS)
 STRUCTURE = torch.arange(V) == V - 1
@@ -80,12 +88,57 @@ def test_the_fit_does_not_see_structure(model):
     assert both[0] != Sharpness()
 
 
-def test_the_smallest_scenes_are_those_of_their_room_type():
-    """Of a type of 20 scenes its own size, of fewer that of all; structure does not count."""
-    large, small = scene([0, 1, 2, 3, 4], room=0), scene([1, 2, 3], room=1)
-    data = tensors([large] * 20 + [small] * 19, WIDE)
-    structure = torch.zeros(data.v.shape[1], dtype=torch.bool)
-    assert smallest_scenes(data, structure, 3) == (5, 3, 3, 3)
-    structure[0] = True
-    assert smallest_scenes(data, structure, 2) == (4, 3, 3)
-    assert smallest_scenes(tensors([large] * 20 + [small], WIDE), structure, 2) == (4, 4, 4)
+def limits_of(model, scenes):
+    return limits(model, tensors(scenes, V), STRUCTURE)
+
+
+def test_limits_are_those_of_short_lists_of_a_room_type(model):
+    """Three of ten classes: two of seven, one of four. A type of 19 scenes has those of all."""
+    large, small = scene([*range(7), V - 1], room=0), scene([1, 2, 3, 4], room=1)
+    found = limits_of(model, [large] * 20 + [small] * 20)
+    assert found["smallest"] == (2, 1, 1)
+    few = limits_of(model, [large] * 20 + [small] * 19)
+    assert few["smallest"] == (2, 1, 1)
+    assert few["room_fit"] == (found["room_fit"][0], NO_LIMIT)
+    assert limits_of(model, [large] * 20 + [small])["smallest"] == (2, 2, 2)
+
+
+def test_sources_have_equal_weight_in_the_limits(model):
+    """Two small scenes of 102, but all those of a source."""
+    large, small = scene([*range(7)], room=0, source="house"), scene([1, 2, 3], room=0)
+    assert limits_of(model, [large] * 100 + [small] * 2)["smallest"][0] == 1
+    small = scene([1, 2, 3], room=0, source="house")
+    assert limits_of(model, [large] * 100 + [small] * 2)["smallest"][0] == 2
+
+
+def test_limits_are_those_of_whole_rooms(model):
+    """Procedural kitchens and camera frames do not count beside them, but they do alone."""
+    whole = [scene([*range(7)], room=0, source="virtualhome")] * 20
+    frames = [scene([1, 2], room=0, source=source) for source in ("procthor", "sunrgbd")] * 20
+    assert limits_of(model, whole + frames) == limits_of(model, whole)
+    assert limits_of(model, frames)["smallest"][0] == 1
+
+
+def test_the_fit_of_a_room_type_is_the_low_quantile(model):
+    """Of lists of one class; a tenth of the lists has another class."""
+    fits = [room_fit(model, [k], 1) for k in range(3)]
+    low, high = int(np.argmin(fits)), int(np.argmax(fits))
+    scenes = [scene([high], room=1)] * 18 + [scene([low], room=1)] * 2
+    limit = limits_of(model, scenes)["room_fit"][1]
+    assert (limit.intercept, limit.log_count) == (pytest.approx(fits[low], abs=1e-4), 0.0)
+    limited = refitted_limits(model, tensors([scene([high], room=1)] * 20, V))
+    assert is_within_limits(limited, [high], 1)
+    assert not is_within_limits(limited, [low], 1)
+    assert limited.calibration.rare_rooms == model.calibration.rare_rooms
+
+
+def test_the_limit_of_the_fit_depends_on_the_length_of_the_list(model, monkeypatch):
+    """Lists of 1 to 4 classes, whose fit is a line in the log of their length."""
+
+    def fit(_, classes, room):
+        return 2 * np.log(len(classes)) - room
+
+    monkeypatch.setattr(calibrate_rooms, "room_fit", fit)
+    limit = limits_of(model, [scene([0, 1, 2, 3], room=1)] * 20)["room_fit"][1]
+    assert (limit.intercept, limit.log_count) == pytest.approx((-1, 2), abs=1e-4)
+    assert limit.of(4) == pytest.approx(fit(model, [0, 1, 2, 3], 1), abs=1e-3)

@@ -29,7 +29,7 @@ def test_without_context_the_other_objects_change_no_relation():
 @pytest.mark.parametrize("left_out", [{"relation": 0.0}, {"counts": 0.0}])
 def test_a_score_at_a_place_is_left_out(left_out):
     """As in a model that was fitted without it."""
-    fit = PlaceFit(relation=0.7, counts=0.4, intercept=-1.0, slope=0.5)
+    fit = PlaceFit(relation=0.7, counts=0.4, intercept=-1.0)
     artifact = larger_artifact("triway-states", at=(fit,) * A)
     expected = larger_artifact("triway-states", at=(fit.model_copy(update=left_out),) * A)
     scene, place = scene_of([0, 2]), ("on-top", 1)

@@ -124,7 +124,8 @@ class SceneWarning(Reply):
     an upright object. flat-scene: all objects have the same depth in an optical frame.
     unknown-sizes: vertical relations of an object are unobserved, because its size is unknown.
     not-judged: the model has too few training scenes to judge objects or relations, and the list is
-    empty; or too few of them show the class of an object, and the object is no outlier"""
+    empty; or too few of them show the class of an object, and the object is no outlier; or the
+    scene lists a single class, and no object is an outlier"""
     message: str
     objects: list[str]
     """ids of the objects that the warning concerns; empty for the whole scene"""

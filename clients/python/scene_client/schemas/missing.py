@@ -93,7 +93,8 @@ class MissingObject(Reply):
     """A class that the request does not list.
 
     `probability` is the probability that an object of the class is in the scene, given `coverage`.
-    `log_odds` are the log-odds that the class is present, before calibration.
+    With `at`, the object must also stand at this place: the probability is that of the class,
+    multiplied by that of its first placement. `log_odds` is ln(p / (1 - p)) of the probability p.
     """
 
     label: str
@@ -104,7 +105,7 @@ class MissingObject(Reply):
     log_odds: Finite
     placements: list[Placement] = []
     """the likeliest place, and at most 2 further places that are at least 3/4 as probable. With
-    `at`, this place comes first"""
+    `at`, the requested place comes first. Its probability is the factor of `probability`"""
     because: list[Because] = []
     """objects that change the odds by a factor of at least 3, largest change first, at most 3. Only
     the first 32 classes of the answer have reasons"""

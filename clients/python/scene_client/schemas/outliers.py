@@ -35,8 +35,8 @@ class Outlier(Reply):
     """Result for one object: whether the object fits the scene.
 
     `probability` is the probability that the object does not belong in the scene, under the
-    assumption that half of all scenes contain an outlier. `log_odds` are the log-odds that the
-    class of the object is present, given the rest of the scene.
+    assumption that half of all scenes contain an outlier. `log_odds` is ln(p / (1 - p)) of this
+    probability p.
     """
 
     object: str
@@ -47,13 +47,15 @@ class Outlier(Reply):
     broader: list[str] | None = None
     """broader classes, nearest first, such as lamp and light of a floor lamp; absent without any"""
     probability: Probability
-    log_odds: Finite
+    log_odds: Finite | None = None
+    """absent for an object of probability 0, which is not judged"""
     is_outlier: bool
     """true if `probability` reaches the threshold. At a `sensitivity`, objects of a class that few
-    training scenes show are never outliers; the warning `not-judged` names them"""
+    training scenes show are never outliers, and objects of a single class never are; the warning
+    `not-judged` names them"""
     because: list[Because] = []
     """other objects that explain `is_outlier`, largest effect first, at most 3. For an outlier,
-    they lower its log-odds. Otherwise, they raise its log-odds"""
+    they raise its log-odds. Otherwise, they lower its log-odds"""
     usually_with: list[str] = []
     """for an outlier: absent classes that would make it likely, at most 3"""
 

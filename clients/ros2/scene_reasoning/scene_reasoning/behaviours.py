@@ -105,8 +105,8 @@ class SceneComplete(SceneCondition):
     """SUCCESS if no unlisted object is likely to be present.
 
     Args:
-        log_odds: an unlisted object counts as missing if its log-odds of being present are at least
-            this value. 0 is a probability of 0.5; 2.2 is a probability of 0.9.
+        log_odds: an unlisted object counts as missing if its `log_odds` are at least this value. 0
+            is a probability of 0.5; 2.2 is a probability of 0.9.
         own: extra fields, such as ``candidates`` (objects to consider) and ``at`` (place).
     """
 
