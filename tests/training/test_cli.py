@@ -54,10 +54,13 @@ def check_refit(artifact, store) -> None:
     check_equal(artifact.weights.arrays, again.weights.arrays)
     check_equal(artifact.counts.tensors(), again.counts.tensors())
     before, after = artifact.manifest, again.manifest
-    lines = [manifest.calibration.outlier_lines.model_dump() for manifest in (before, after)]
-    for level, line in lines[0].items():
-        assert lines[1][level] == pytest.approx(line, abs=0.01), level
-    same = {"outlier_lines": before.calibration.outlier_lines}
+    same = {}
+    for name in ("outlier_lines", "room_lines"):
+        first, again_fitted = (getattr(one.calibration, name) for one in (before, after))
+        assert (first is None) == (again_fitted is None)
+        for level, line in first.model_dump().items() if first else ():
+            assert again_fitted.model_dump()[level] == pytest.approx(line, abs=0.01), level
+        same[name] = first
     assert after.calibration.model_copy(update=same) == before.calibration
     assert set(after.metrics) == set(before.metrics)
     other = tuple(source.model_copy(update={"digest": "0" * 64}) for source in before.data)
