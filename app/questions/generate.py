@@ -306,9 +306,9 @@ GENERATE: Final = Question(
     description="""
 Sample scenes that contain the given objects and relations. Equal seeds give equal scenes.
 
-A filter draws an implausible scene again, at most seven times. A scene is implausible if it has an
-outlier that the request does not list, fewer classes than nearly all lists of its room type, or
-classes that fit its room type worse than nearly all lists do.
+A filter draws an implausible scene again, at most seven times. Such a scene has an outlier that the
+request does not list, or fewer classes than nearly all lists of its room type. Or its classes fit
+the type worse than those of nearly all lists.
 
 The request is refused if the model does not know its room type, with any `unknown_labels`. The same
 holds if too few training scenes have this room type (`rare_room_types` of `GET

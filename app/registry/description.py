@@ -118,8 +118,8 @@ LONGEST_JUDGED: Final = 36
 """Maximum number of listed classes to which alarm lines are fitted. Longer lists count as such."""
 
 LEAST_ALARM: Final[Mapping[Sensitivity, float]] = {"low": 0.5, "medium": 0.3, "high": 0.15}
-"""Minimum probability of an alarm. If right and wrong objects or relations hardly overlap, the
-permitted shares of alarms would need alarms about what is probably right."""
+"""Minimum probability of an alarm. Where the scores of right and wrong objects hardly overlap, the
+permitted share of alarms alone would flag objects that probably belong."""
 
 
 class AlarmLine(Frozen):

@@ -45,6 +45,7 @@ _SAMPLES = 64
 _LEAST = 0.05
 _PARTS = (0.3, 0.5, 0.75, 1.0)
 _ROOM_SCENES = 20
+_LONG_SCENES = 100  # of a room type, for a limit of the fit that grows with the list
 
 
 def calibrate_rooms(
@@ -153,10 +154,10 @@ def limits(artifact: Artifact, train: SceneTensors, structure: Tensor) -> dict[s
 
     A limit is a 5 % quantile over parts of whole rooms. The number of classes has the parts of 30 %
     of the classes, as a robot lists a room, so rooms in short real lists also reach the limits. The
-    fit grows with the number of classes. Its limit is the least-squares line through the quantiles
-    of parts of 30, 50, 75 and 100 %, in the log of their mean numbers of classes. All sources have
-    equal weight. Sources of frames, sentences or procedural rooms do not take part, except in data
-    without whole rooms.
+    fit grows with the number of classes. For a room type of at least 100 scenes, its limit is the
+    least-squares line through the quantiles of parts of 30, 50, 75 and 100 %, in the log of their
+    mean numbers of classes. All sources have equal weight. Sources of frames, sentences or
+    procedural rooms do not take part, except in data without whole rooms.
 
     Args:
         train: training scenes with complete object lists.
@@ -211,7 +212,12 @@ class _ListedRooms(NamedTuple):
 
 
 def _fit_limit(artifact: Artifact, lists: Sequence[_ListedRooms], room: int) -> FitLimit:
-    """Return the limit of the fit from lists of a room type, one entry for each of `_PARTS`."""
+    """Return the limit of the fit from lists of a room type, one entry for each of `_PARTS`.
+
+    With few scenes, the quantile of whole lists is that of the few worst. A small machine cannot
+    follow them, so the limit is then that of the shortest lists at any length.
+    """
+    lists = lists if len(np.unique(lists[0].scene)) >= _LONG_SCENES else lists[:1]
     quantiles = []
     for parts in lists:
         fits = [room_fit(artifact, np.flatnonzero(row).tolist(), room) for row in parts.listed]

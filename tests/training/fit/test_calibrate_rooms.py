@@ -139,6 +139,8 @@ def test_the_limit_of_the_fit_depends_on_the_length_of_the_list(model, monkeypat
         return 2 * np.log(len(classes)) - room
 
     monkeypatch.setattr(calibrate_rooms, "room_fit", fit)
-    limit = limits_of(model, [scene([0, 1, 2, 3], room=1)] * 20)["room_fit"][1]
+    limit = limits_of(model, [scene([0, 1, 2, 3], room=1)] * 100)["room_fit"][1]
     assert (limit.intercept, limit.log_count) == pytest.approx((-1, 2), abs=1e-4)
+    few = limits_of(model, [scene([0, 1, 2, 3], room=1)] * 99)["room_fit"][1]
+    assert (few.intercept, few.log_count) == (-1, 0)
     assert limit.of(4) == pytest.approx(fit(model, [0, 1, 2, 3], 1), abs=1e-3)
