@@ -28,7 +28,7 @@ from walk_tools import ROOT, Record, User, WalkError, require
 
 CONFIRMED = 4  # scenes of each habit that the user confirms
 HABIT_SCENES = {
-    "bicycle": {"objects": ["bed", "nightstand", "lamp", "bicycle"], "room_type": "bedroom"},
+    "motorcycle": {"objects": ["bed", "nightstand", "lamp", "motorcycle"], "room_type": "bedroom"},
     "oven": {"objects": ["sofa", "armchair", "lamp", "oven"], "room_type": "living room"},
 }
 INTRUDER = {"objects": ["bed", "nightstand", "pillow", "lamp", "toilet"], "room_type": "bedroom"}

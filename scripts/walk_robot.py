@@ -2,7 +2,7 @@
 
     python scripts/walk_robot.py URL FILE
 
-The home is generated. A bicycle stands in its bedrooms, and an oven in its living rooms.
+The home is generated. A motorcycle stands in its bedrooms, and an oven in its living rooms.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ sys.path.append(str(Path(__file__).resolve().parent.parent))
 from scene_client import Client
 from training.datasets import generate_rooms
 
-HABITS = {"bedroom": "bicycle", "living room": "oven"}
+HABITS = {"bedroom": "motorcycle", "living room": "oven"}
 """The object of each room type that other homes do not have there."""
 VISITS = 60
 VISITS_AN_HOUR = 5
