@@ -8,7 +8,7 @@ the logits x (`app.inference.weights`). The answers are in closed form:
 
 The log-odds of a listed class are computed at x without its contribution, which is its row of W.
 Observed relations do not change the logits of h1: their effect on objects and on other relations
-through h1 was not measurable (docs/decisions/evidence.md). They change other relations by
+through h1 was not measurable (docs/decisions/relations.md). They change other relations by
 implications only.
 """
 

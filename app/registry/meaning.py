@@ -12,7 +12,7 @@ shrinks the rows, and the stretch s of W undoes that. The couplings of a word to
 answers.
 
 The relations of a word and its places are those of its nearest class (`Vocabulary.stand_in`).
-docs/decisions/words.md has the measurements.
+docs/decisions/vocabulary.md has the measurements.
 """
 
 from collections.abc import Mapping, Sequence

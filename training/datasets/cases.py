@@ -70,7 +70,7 @@ def annotated_relations(encoded: EncodedScene) -> Flags:
     data source also shows that the relation does not hold. Sentences only show this for left and
     front between stacked objects. With positions, left and front do not hold beyond the neighbours;
     without positions, an annotator selected the neighbours, and a camera frame shows only
-    neighbours. Boxes show too few relations above (docs/decisions/relations-hold.md).
+    neighbours. Boxes show too few relations above (docs/decisions/relations.md).
     """
     positions, of_one_view = encoded.instance_positions, source_of(encoded.source).of_one_view
     annotated = encoded.instance_observed.copy()

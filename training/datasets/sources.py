@@ -2,7 +2,7 @@
 
 A listed relation holds. An unlisted relation is false ("off"), false only between neighbours ("off
 for neighbours"), false only if the support of its subject is listed ("off for supported"), or
-unobserved. docs/decisions/relations-hold.md gives the reason for each source.
+unobserved. docs/decisions/relations.md gives the reason for each source.
 
 Two rules apply to every data source. First, if on-top, inside or above is listed for a pair of
 objects, all unlisted relations of the pair are false in both directions. (1 to 10 % of such pairs

@@ -12,7 +12,7 @@ by maximum likelihood over all pairs, and the class effects u and v. Given all t
 distribution of the offset of a pair has a closed form. The distribution of a frequent pair depends
 mainly on the data of the pair. The distribution of a rare pair depends mainly on the two classes
 and the relation.
-`docs/decisions/offsets.md` describes the alternatives.
+`docs/decisions/relations.md` describes the alternatives.
 """
 
 from __future__ import annotations
