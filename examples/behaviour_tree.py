@@ -1,6 +1,6 @@
 """A behaviour tree (py_trees): does an object fit, and is the scene complete?
 
-The conditions are those of clients/ros2/scene_reasoning. docs/nav2.md has the tree for Nav2 in XML.
+The conditions are those of clients/ros2/scene_reasoning. docs/robots.md has the tree for Nav2.
 """
 
 from __future__ import annotations

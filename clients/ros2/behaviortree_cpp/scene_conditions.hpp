@@ -7,7 +7,7 @@
 //     <SceneComplete scene="{scene}" because="{why}"/>
 //     <ObjectBelongs scene="{scene}" object="cup_1"/>
 //
-// `scene` is a request as JSON text (docs/nav2.md). The first tick of a condition starts a
+// `scene` is a request as JSON text (docs/robots.md). The first tick of a condition starts a
 // question in a separate thread. The condition is RUNNING until the answer arrives, so a tick never
 // waits. A condition fails if the scene has no objects, or if no answer arrives within the client's
 // timeout. `because` gives the reason.
