@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from app.scene import CANONICAL
@@ -11,15 +12,12 @@ from training.evaluation.metrics import Metric, Ratio
 _ON_TOP = CANONICAL.index("on-top")
 
 
-def count_contradictions(holds: Tensor) -> Tensor:
-    """Count contradictory relations between different classes of each scene, (scenes, 4) int64.
+def count_contradictions(holds: Float[Tensor, "B A n n"]) -> Int[Tensor, "B 4"]:
+    """Count contradictory relations between different classes of each scene.
 
     The columns are, summed over the canonical relations: the pairs of classes with a relation in
     both directions, and the pairs with a relation in at least one direction. Then two truth values
     follow: the on-top relations form a cycle, and the scene has an on-top relation.
-
-    Args:
-        holds: (scenes, relations, classes, classes), above 0 for relations that hold.
     """
     n = holds.shape[-1]
     edges = (holds > 0) & ~torch.eye(n, dtype=torch.bool)
@@ -34,18 +32,18 @@ def count_contradictions(holds: Tensor) -> Tensor:
     return torch.stack([count.long() for count in counts], 1)
 
 
-def contradiction_metrics(counts: Tensor) -> dict[str, Metric]:
+def contradiction_metrics(counts: Int[Tensor, "B 4"]) -> dict[str, Metric]:
     """Return the share of mirrored relations and the share of scenes with an on-top cycle.
 
-    A share is left out if no scene has a relation for it. See `count_contradictions`.
+    A share is left out if no scene has a relation for it. `counts` are `count_contradictions`.
     """
     mirrored, related, cyclic, stacked = counts.double().numpy().T
-    shares = {"mirrored relations": (mirrored, related), "on-top cycles": (cyclic, stacked)}
-    return {name: Ratio(part, whole) for name, (part, whole) in shares.items() if whole.any()}
+    parts = {"mirrored relations": (mirrored, related), "on-top cycles": (cyclic, stacked)}
+    return {name: Ratio(part, whole) for name, (part, whole) in parts.items() if whole.any()}
 
 
-def transitive_closure(pairs: Tensor) -> Tensor:
-    """Return all pairs that a chain of given pairs connects, (..., n, n) bool."""
+def transitive_closure(pairs: Bool[Tensor, "*B n n"]) -> Bool[Tensor, "*B n n"]:
+    """Return all pairs that a chain of given pairs connects."""
     reach = pairs.float()
     while True:
         longer = ((reach + reach @ reach) > 0).float()

@@ -19,10 +19,11 @@ from typing import Final
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
 from app.scene import CANONICAL
-from training.datasets.array_types import Ints
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import scene_rng
 from training.evaluation.asking import ask_rows
@@ -50,7 +51,7 @@ TOP: Final = (1, 3, 5, 10)
 
 def rank_missing(
     scenes: SceneTensors,
-    structure: Tensor,
+    structure: Bool[Tensor, " V"],
     score: ObjectScore,
     size: Size = all_but_one,
     *,
@@ -85,15 +86,15 @@ def missing_task(score: ObjectScore, setting: Setting) -> Outcome | None:
 
 def _with_unknown(mrr: Ratio, scenes: SceneTensors, structure: Tensor) -> Ratio:
     """Return the MRR if unknown labels are removed too, which score 0."""
-    known = ((scenes.v > 0) & ~structure).sum(1).clamp(min=1).double().numpy()
+    things = ((scenes.v > 0) & ~structure).sum(1).clamp(min=1).double().numpy()
     unknown = np.array([len(scene.unknown) for scene in scenes.scenes])
-    return Ratio(mrr.numerators, mrr.denominators * (1 + unknown / known))
+    return Ratio(mrr.numerators, mrr.denominators * (1 + unknown / things))
 
 
 def removed_places(
-    scenes: SceneTensors, structure: Tensor, seed: int = 0
-) -> tuple[Tensor, Tensor, Places]:
-    """Return the indices of the scenes (N,), the removed classes (N,), and the places."""
+    scenes: SceneTensors, structure: Bool[Tensor, " V"], seed: int = 0
+) -> tuple[Int[Tensor, " N"], Int[Tensor, " N"], Places]:
+    """Return the indices of the scenes, the removed classes, and their places."""
     removals: list[tuple[int, int, int, int, bool]] = []
     for k, scene in enumerate(scenes.scenes):
         evidence = scene.evidence
@@ -118,9 +119,9 @@ def removed_places(
 
 
 def leave_one_out_at(
-    scenes: SceneTensors, structure: Tensor, score: PlacedScore, *, seed: int = 0
-) -> tuple[Ranking, Ints]:
-    """Return the rank of every removed class among the absent classes, and its relation (N,).
+    scenes: SceneTensors, structure: Bool[Tensor, " V"], score: PlacedScore, *, seed: int = 0
+) -> tuple[Ranking, Int[NDArray, " N"]]:
+    """Return the rank of every removed class among the absent classes, and its relation.
 
     Classes of one family with a listed class are neither ranked nor candidates.
     """

@@ -8,7 +8,7 @@ compared by paired resampling, without the models.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from hashlib import sha256
 from pathlib import Path
@@ -164,39 +164,32 @@ def evaluate(
     selected = [
         name for name, task in EVERY_TASK.items() if task.card and (tasks is None or name in tasks)
     ]
-    settings = dict(settings_by_source(scenes, structure, train, None, limit=limit))
-    together = next(iter(settings)) if len(settings) == 1 else "pooled"
-    questions = [
-        (setting, source, [task for task in selected if task not in WHOLE_SET])
-        for source, setting in settings.items()
-    ]
-    whole = [task for task in selected if task in WHOLE_SET and task not in ONCE]
-    questions.append((Setting(scenes, structure, train, limit=limit), together, whole))
+    of_source = [task for task in selected if task not in WHOLE_SET]
     once = [task for task in selected if task in ONCE]
-    questions.append((Setting(scenes, structure, limit=limit, everyday=everyday), SOURCE, once))
+    whole = [task for task in selected if task in WHOLE_SET and task not in ONCE]
+    by_name = dict(settings_by_source(scenes, structure, train, None, limit=limit))
+    together = next(iter(by_name)) if len(by_name) == 1 else "pooled"
+    everyday_setting = Setting(scenes, structure, limit=limit, everyday=everyday)
+    questions = [
+        *((source, setting, of_source) for source, setting in by_name.items()),
+        (together, Setting(scenes, structure, train, limit=limit), whole),
+        (SOURCE, everyday_setting, once),
+    ]
     return [
         row
-        for setting, source, names in questions
+        for source, setting, names in questions
         for row in card_figures(measure(model, setting, source, tasks=names, progress=progress))
     ]
 
 
 def card_figures(report: SourceReport) -> list[CardMetric]:
-    """Return the figures of a model card. A data source may lack data for some of them."""
-    rows: list[CardMetric] = []
-    for task, outcome in report.outcomes.items():
-        metrics = outcome.metrics if outcome else {}
-        shown = {name: metrics[name] for name in EVERY_TASK[task].card if name in metrics}
-        rows += card_rows(task, report.source, shown)
-    return rows
-
-
-def card_rows(task: str, source: str, metrics: Mapping[str, Metric]) -> list[CardMetric]:
-    """Return the metrics of a task with an interval, which needs two groups."""
+    """Return the figures of a model card that have an interval, which needs two groups."""
     return [
-        CardMetric(task=task, source=source, metric=name, **asdict(metric.figure()))
-        for name, metric in metrics.items()
-        if len(metric.groups) > 1
+        CardMetric(task=task, source=report.source, metric=name, **asdict(metric.figure()))
+        for task, outcome in report.outcomes.items()
+        if outcome is not None
+        for name in EVERY_TASK[task].card
+        if (metric := outcome.metrics.get(name)) and len(metric.groups) > 1
     ]
 
 

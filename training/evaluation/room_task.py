@@ -21,6 +21,7 @@ from typing import Final
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from training.datasets.batches import SceneTensors, subset
@@ -99,7 +100,7 @@ def rooms_task(score: RoomScore, setting: Setting) -> Outcome | None:
     return Outcome.over(scenes, metrics, 0)
 
 
-def mean_log_p(scenes: SceneTensors, structure: Tensor, score: RoomScore) -> float:
+def mean_log_p(scenes: SceneTensors, structure: Bool[Tensor, " V"], score: RoomScore) -> float:
     """Return the mean over real sources and lists of log p of the room type.
 
     Each list counts without and with the named profile. If the scenes contain no source of

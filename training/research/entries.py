@@ -166,12 +166,12 @@ def tuned_suspicion(score: ObjectScore, data: TrainingData, seed: int) -> Object
     log_popularity = frequency(data.train.v, data.train.weight).logit()
     hits = dict.fromkeys(_WEIGHTS, 0.0)
     for weights in intruder_weights(scenes, data.train).values():
-        _, v, intruder = with_intruders(scenes, data.structure, weights)
-        if len(v):
-            plain = ask_rows(suspicion_of(score), v, block=32)
+        cases = with_intruders(scenes, data.structure, weights)
+        if len(cases.v):
+            plain = ask_rows(suspicion_of(score), cases.v, block=32)
             for weight in _WEIGHTS:
                 values = plain + weight * log_popularity
-                hits[weight] += float(first_shares(values, intruder).mean())
+                hits[weight] += float(first_shares(values, cases.intruder).mean())
     return suspicion_of(score, log_popularity, max(hits, key=lambda weight: hits[weight]))
 
 

@@ -30,12 +30,14 @@ def only_intruders(v):
 
 def test_suspicions_that_know_everything_or_nothing():
     data = tensors([scene([0, 1, 2]) for _ in range(5)])
-    hits = hit_at_1(data, NO_STRUCTURE, only_intruders, None)
-    assert (hits.value, hits.n) == (1.0, 5 * len(SEEDS))
+    cases = with_intruders(data, NO_STRUCTURE, None)
     wrong = lambda v: (-only_intruders(v)).masked_fill(v == 0, -torch.inf)  # noqa: E731
-    assert hit_at_1(data, NO_STRUCTURE, wrong, None).value == 0.0
-    assert hit_at_1(data, NO_STRUCTURE, suspicion_of(torch.zeros_like), None).value == 1 / 4
-    assert hit_at_1(tensors([scene([0, 1])]), NO_STRUCTURE, wrong, None) is None
+    scores = (only_intruders, 1.0), (wrong, 0.0), (suspicion_of(torch.zeros_like), 1 / 4)
+    for suspicion, value in scores:
+        hits = hit_at_1(data, cases, suspicion)
+        assert (hits.value, hits.n) == (value, 5 * len(SEEDS))
+    small = Setting(tensors([scene([0, 1])]), NO_STRUCTURE)
+    assert outliers_task(Model(suspicion=wrong), small) is None
 
 
 def test_an_object_is_judged_by_the_rest_without_itself():

@@ -60,7 +60,7 @@ def test_only_vertical_relations_between_two_things_are_asked():
         ]
     )
     (asked,) = listed_pairs(data, structure)
-    assert asked.scene.evidence.classes[asked.ends].tolist() == [[0, 1]]
+    assert asked.scene.evidence.classes[asked.pairs].tolist() == [[0, 1]]
     # left(0, 1) and on-top(1, 0): the first to the second, then back.
     assert np.flatnonzero(asked.listed[0]).tolist() == [LEFT, A + ON]
 
@@ -157,11 +157,11 @@ def test_rare_classes_are_those_that_training_relates_to_few():
 
 
 def test_the_service_is_asked_about_its_first_instances():
-    asked = next(one for one in listed_pairs(rooms(20, 2), STRUCTURE) if len(one.ends) > 2)
+    asked = next(one for one in listed_pairs(rooms(20, 2), STRUCTURE) if len(one.pairs) > 2)
     p = service_score(room_model())(asked)
     every = relation_probabilities(room_model(), labels_alone(asked.scene))
     own = asked.scene.instance_classes
-    classes = asked.scene.evidence.classes[asked.ends]
+    classes = asked.scene.evidence.classes[asked.pairs]
     for (i, j), row in zip(classes.tolist(), p, strict=True):
         x, y = (int(np.flatnonzero(own == c)[0]) for c in (i, j))
         assert row == pytest.approx([*every[:, x, y], *every[:, y, x]])

@@ -29,7 +29,7 @@ from training.evaluation.relation_tasks import (
     false_hits,
     r_precision,
     score_scenes,
-    telling,
+    with_observed,
     unseen,
 )
 
@@ -175,7 +175,7 @@ def test_classes_related_both_ways_are_stated_of_different_instances():
     both = scene(classes, [(0, 0, 1), (0, 1, 0)], relations=known)
     data = tensors([both, scene(classes, [(0, 0, 1)], relations=known)], artifact.spec.V)
     batch = data.batch(torch.arange(2))
-    told = telling(batch, batch.holds > 0)
+    told = with_observed(batch, batch.holds > 0)
     values = score_relations(artifact, told, given=True)
     blind = score_relations(artifact, told, given=False)
     assert torch.isfinite(values).all()

@@ -6,7 +6,7 @@ import pytest
 from app.questions.posterior import Posterior
 from app.registry.description import CountSlope, PlaceFit
 from tests.questions.artifacts import larger_artifact, scene_of
-from training.evaluation.asking import missing_probabilities
+from training.evaluation.asking import missing_log_p_at
 from training.research.shares import VARIANTS, at_a_place, misplaced, without_context
 
 A = 5
@@ -32,11 +32,11 @@ def test_a_score_at_a_place_is_left_out(left_out):
     fit = PlaceFit(relation=0.7, counts=0.4, intercept=-1.0)
     artifact = larger_artifact("triway-states", at=(fit,) * A)
     expected = larger_artifact("triway-states", at=(fit.model_copy(update=left_out),) * A)
-    scene, place = scene_of([0, 2]), ("on-top", 1)
-    found = missing_probabilities(at_a_place(**left_out)(artifact), scene, place)
-    np.testing.assert_array_equal(found, missing_probabilities(expected, scene, place))
+    question = scene_of([0, 2]), "on-top", 1
+    found = missing_log_p_at(at_a_place(**left_out)(artifact), *question)
+    np.testing.assert_array_equal(found, missing_log_p_at(expected, *question))
     proposed = np.isfinite(found)
-    change = found[proposed] - missing_probabilities(artifact, scene, place)[proposed]
+    change = found[proposed] - missing_log_p_at(artifact, *question)[proposed]
     assert np.abs(change).max() > 1e-4
 
 

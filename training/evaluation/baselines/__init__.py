@@ -6,9 +6,6 @@ The baselines are the class frequencies, EASE, and frequency tables for relation
 Baselines for objects learn from the same scenes as a machine: with its weights of scenes, without
 structure, and without classes that a data source cannot show. They are selected by the same
 `validation_score`.
-
-`v` is the presence of classes in the training scenes, (scenes, classes), and `structure` a mask of
-structure classes such as walls, (classes,) bool.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, embedding_bag, normalize, softplus
 
@@ -28,7 +29,9 @@ _SMOOTHING = (30.0, 300.0)
 _EXPONENTS = (0.2, 0.3, 0.5)
 
 
-def evidence(v: Tensor, smoothing: float, weight: Tensor | None = None) -> Tensor:
+def evidence(
+    v: Float[Tensor, "scenes V"], smoothing: float, weight: Float[Tensor, " scenes"] | None = None
+) -> Float[Tensor, "V V"]:
     """Return log p(j | i) / p(j | not i) for present class j (row) and scored class i (column).
 
     The diagonal is zero. `smoothing` average scenes are added to the scenes with, and without, i.
@@ -63,7 +66,7 @@ _SHARPNESS = (4.0, 8.0, 12.0)
 
 
 def nearest_score(lists: Lists, *, neighbours: int, sharpness: float) -> ObjectScore:
-    """Return a score function from presence to log-odds, both (scenes, classes)."""
+    """Return a score function from presence to log-odds."""
     popularity, v = lists.frequency(), lists.filled()
     index = normalize(lists.v, dim=1).T.contiguous()
 
@@ -167,22 +170,23 @@ _BLOCK = 8
 
 @dataclass(frozen=True, eq=False)
 class RbmScore:
-    """Log-odds of each class of an RBM with biases b (V,), c (H,) and weights W (H, V)."""
+    """Log-odds of each class of an RBM with biases b and c and weights W."""
 
-    b: Tensor
-    c: Tensor
-    W: Tensor
+    b: Float[Tensor, " V"]
+    c: Float[Tensor, " H1"]
+    W: Float[Tensor, "H1 V"]
 
     @property
     def parameter_count(self) -> int:
         """Number of trained weights."""
         return self.b.numel() + self.c.numel() + self.W.numel()
 
-    def __call__(self, v: Tensor) -> Tensor:
-        """Return the log-odds of each unlisted class, (scenes, classes)."""
-        return torch.cat([self._gain(self.c + x @ self.W.T) for x in v.split(_BLOCK)]) + self.b
+    def __call__(self, v: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
+        """Return the log-odds of each unlisted class."""
+        blocks = [self._hidden_log_odds(self.c + x @ self.W.T) for x in v.split(_BLOCK)]
+        return torch.cat(blocks) + self.b
 
-    def _gain(self, x: Tensor) -> Tensor:
+    def _hidden_log_odds(self, x: Float[Tensor, "B H1"]) -> Float[Tensor, "B V"]:
         with_class = softplus(x.unsqueeze(2) + self.W)
         return (with_class - softplus(x).unsqueeze(2)).sum(1)
 

@@ -7,6 +7,7 @@ from itertools import product
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import one_hot
 
@@ -31,20 +32,22 @@ _EXPONENTS = (0.5, 0.75)
 
 
 class _Counts(NamedTuple):
-    """Weighted counts of the scenes of each room type: all (C,), with and labelled (C, V)."""
+    """Weighted counts of the scenes of each room type: all, with a class, and labelled."""
 
-    scenes: Tensor
-    present: Tensor
-    labelled: Tensor
+    scenes: Float[Tensor, " C"]
+    present: Float[Tensor, "C V"]
+    labelled: Float[Tensor, "C V"]
 
     @classmethod
-    def of(cls, lists: Lists, room: Tensor, types: int) -> _Counts:
-        """Count lists whose scenes have these room types, (scenes,)."""
+    def of(cls, lists: Lists, room: Int[Tensor, " scenes"], types: int) -> _Counts:
+        """Count lists whose scenes have these room types."""
         member = one_hot(room, types).float().T * lists.weight
         return cls(member.sum(1), member @ lists.v, member @ lists.labelled.float())
 
-    def table(self, alpha: float, exponent: float, absent: bool) -> tuple[Tensor, Tensor]:
-        """Return the bias of each room type (C,) and the weights of the classes (C, V)."""
+    def table(
+        self, alpha: float, exponent: float, absent: bool
+    ) -> tuple[Float[Tensor, " C"], Float[Tensor, "C V"]]:
+        """Return the bias of each room type and the weights of the classes."""
         average = (self.present.sum(0) + 0.5) / (self.labelled.sum(0) + 1.0)
         p = (self.present + alpha * average) / (self.labelled + alpha)
         prior = ((self.scenes + 0.5) / (self.scenes + 0.5).sum()).log()

@@ -27,7 +27,7 @@ from training.evaluation.baselines.triples import (
 )
 from training.evaluation.contradictions import transitive_closure
 from training.evaluation.model import Places
-from training.evaluation.relation_tasks import telling
+from training.evaluation.relation_tasks import with_observed
 from training.research.baselines.networks import draw_lists, hidden_loss
 from training.research.baselines.object_models import (
     bernoulli_rbm,
@@ -195,8 +195,8 @@ def related():
 
 def test_triples_by_hand(related):
     counts = count_triples(related, STRUCTURE)
-    assert counts.held.nonzero().tolist() == [[LEFT, 0, 2], [ON_TOP, 0, 1]]
-    assert counts.held[ON_TOP, 0, 1] == 2
+    assert counts.holds.nonzero().tolist() == [[LEFT, 0, 2], [ON_TOP, 0, 1]]
+    assert counts.holds[ON_TOP, 0, 1] == 2
     assert counts.together[0, 1] == counts.together[1, 0] == 3
     assert counts.together[0, 2] == 1
     assert counts.together[0, 9] == 0, "structure is no end"
@@ -205,7 +205,7 @@ def test_triples_by_hand(related):
 
 def test_the_frequency_table_by_hand(related):
     counts = count_triples(related, STRUCTURE)
-    p = smoothed_log_odds(counts, pair=4.0, end=2.0).sigmoid()
+    p = smoothed_log_odds(counts, of_pair=4.0, of_class=2.0).sigmoid()
     # Ordered pairs together: 3 + 3 of (0, 1), 1 + 1 each of (0, 2) and (1, 2).
     overall = (2 + 1) / (10 + 2)
     subject = (2 + 2 * overall) / (4 + 2)
@@ -239,7 +239,7 @@ def test_closure_is_warshalls():
 
 def test_closure_moves_what_follows_and_its_mirror_image_alone():
     batch = tensors([scene([0, 1, 2, 3], [(LEFT, 0, 1), (LEFT, 1, 2)])]).batch(torch.tensor([0]))
-    given = telling(batch, batch.holds > 0)
+    given = with_observed(batch, batch.holds > 0)
     moved = closure_score(table_score(torch.zeros(A, V, V)), bonus=2.0, penalty=3.0)(given)
     expected = torch.zeros(1, A, 4, 4)
     expected[0, LEFT, 0, 2] = 2.0

@@ -22,7 +22,7 @@ from training.evaluation.baselines import PLACED, RELATIONS, placed_product
 from training.evaluation.baselines.fitting import TRIALS, Baseline, drawn_settings, halving
 from training.evaluation.missing_tasks import removed_places
 from training.evaluation.moved_task import moved_cases
-from training.evaluation.relation_tasks import telling
+from training.evaluation.relation_tasks import with_observed
 from training.research.baselines import BASELINES
 
 EVERY = tuple(BASELINES.values())
@@ -159,7 +159,7 @@ def test_relations_beat_popularity(baseline):
 def test_relation_scores_ignore_the_true_relations(baseline, validation):
     """The truth in a batch changes nothing."""
     batch = validation.batch(torch.arange(10))
-    blank = telling(batch)
+    blank = with_observed(batch)
     score = fitted(baseline).relations
     assert score(batch).shape == batch.holds.shape
     assert torch.equal(score(batch), score(blank))
