@@ -29,8 +29,8 @@ from training.evaluation.relation_tasks import (
     false_hits,
     r_precision,
     score_scenes,
-    with_observed,
     unseen,
+    with_observed,
 )
 
 A = len(CANONICAL)
