@@ -123,6 +123,7 @@ def relations_evidence_task(artifact: Artifact, setting: Setting) -> Outcome | N
 
 
 def _changes(metric: str, kind: str, without: Ratio, informed: Ratio) -> dict[str, Metric]:
+    """Return a metric with and without one kind of evidence, and its change, which comes first."""
     return {
         f"change of {metric}, {kind}": informed - without,
         f"{metric}, {kind}": informed,

@@ -50,7 +50,9 @@ def with_intruders(
     return Cases(scene, v, intruder)
 
 
-def first_shares(values: Float[Tensor, "N V"], target: Int[Tensor, " N"]) -> Float[NDArray, " N"]:
+def expected_hit_at_1(
+    values: Float[Tensor, "N V"], target: Int[Tensor, " N"]
+) -> Float[NDArray, " N"]:
     """Return 1 where the target has the highest value of its row; 1/m for m highest values."""
     is_highest = values == values.max(1, keepdim=True).values
     hit = is_highest.gather(1, target.unsqueeze(1)).squeeze(1)
@@ -60,7 +62,7 @@ def first_shares(values: Float[Tensor, "N V"], target: Int[Tensor, " N"]) -> Flo
 def hit_at_1(scenes: SceneTensors, cases: Cases, suspicion: ObjectScore) -> Ratio:
     """Return the share of cases whose intruder ranks first."""
     values = ask_rows(suspicion, cases.v, block=32).masked_fill(cases.v == 0, -torch.inf)
-    hits = first_shares(values, cases.intruder)
+    hits = expected_hit_at_1(values, cases.intruder)
     return Ratio.of_items(cases.scene.numpy(), hits, len(scenes))
 
 

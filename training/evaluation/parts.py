@@ -69,8 +69,8 @@ class Parts:
     def of_listed_families(self) -> Ratio:
         """Return the share of hidden classes of one family with a listed class."""
         row, target = self.hidden.nonzero(as_tuple=True)
-        shares = self.related[row, target].double().numpy()
-        return Ratio.of_items(self.scene[row].numpy(), shares, self.scenes)
+        is_related = self.related[row, target].numpy()
+        return Ratio.of_items(self.scene[row].numpy(), is_related, self.scenes)
 
 
 def all_but_one(classes: int, _: Rng) -> int:

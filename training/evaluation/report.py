@@ -230,6 +230,7 @@ def metric_from_dict(values: dict[str, Any]) -> Metric:
 
 
 def _plain(value: Any) -> Any:
+    """Return an array as a list for JSON, with null for values that are not finite."""
     if isinstance(value, np.ndarray) and value.dtype == np.float64:
         return [float(f"{x:.9g}") if np.isfinite(x) else None for x in value.tolist()]
     if isinstance(value, np.ndarray):

@@ -118,6 +118,7 @@ class Results:
         return "\n\n".join(parts) + "\n"
 
     def _table(self, task: str, metric: str) -> str:
+        """Return the Markdown table of a metric by row and data source, or "" without values."""
         worse = {
             (difference.row, difference.source)
             for difference in self.differences

@@ -22,7 +22,7 @@ from training.evaluation.baselines.classes import frequency
 from training.evaluation.baselines.fitting import TRIALS, Baseline
 from training.evaluation.intruders import intruder_weights
 from training.evaluation.model import Model, ObjectScore, suspicion_of
-from training.evaluation.outlier_tasks import first_shares, with_intruders
+from training.evaluation.outlier_tasks import expected_hit_at_1, with_intruders
 from training.evaluation.pair_task import SHIFTS, baseline_log_odds, lateral_shift, listed_pairs
 from training.evaluation.report import Progress, silent
 from training.fit.calibrate import calibrate
@@ -171,11 +171,12 @@ def tuned_suspicion(score: ObjectScore, data: TrainingData, seed: int) -> Object
             plain = ask_rows(suspicion_of(score), cases.v, block=32)
             for weight in _WEIGHTS:
                 values = plain + weight * log_popularity
-                hits[weight] += float(first_shares(values, cases.intruder).mean())
+                hits[weight] += float(expected_hit_at_1(values, cases.intruder).mean())
     return suspicion_of(score, log_popularity, max(hits, key=lambda weight: hits[weight]))
 
 
 def _machine_model(config: Config, data: TrainingData, folder: Path, say: Progress) -> Model:
+    """Train or load a machine, and calibrate it. Its weights that are held at 0 do not count."""
     run, seed = folder / "run", config.training.seed
     machine = train_once(config, data, run, say)
     draft = placed_draft(machine, data)

@@ -147,6 +147,7 @@ def load_space(path: Path, config: Config) -> dict[str, BaseDistribution]:
 
 
 def _distribution(entry: Any) -> BaseDistribution:
+    """Return the distribution of a list of choices or of an interval."""
     from optuna import distributions
 
     if isinstance(entry, list):
@@ -242,6 +243,7 @@ class Search:
         }
 
     def _measure(self, machine: BoltzmannMachine, folder: Path) -> None:
+        """Write the reports of a machine on the validation scenes of each data source."""
         data, artifact = self.data, draft_artifact(machine, self.data.vocabulary)
         relations = partial(score_relations, artifact, given=False)
         model = Model(missing=partial(score_missing, artifact), relations=relations)

@@ -1,4 +1,4 @@
-"""T1 pairs by hand: what is asked, what is right, and what is new."""
+"""T1 pairs by hand: questions, accuracy and log-loss, unseen pairs and rare classes."""
 
 from dataclasses import replace
 
@@ -18,6 +18,7 @@ from tests.training.evaluation.scenes import (
     random_scenes,
     scene,
     tensors,
+    values_of,
 )
 from training.datasets.batches import seen_triples
 from training.evaluation.asking import labels_alone, relation_probabilities
@@ -122,8 +123,7 @@ def test_inside_pairs_have_ten_candidates():
         ({(INSIDE, True): 0.5, (ON, True): 0.6}, 0),
     ):
         outcome = pairs_task(Model(relations=log_odds(p)), setting)
-        values = {name: metric.value for name, metric in outcome.metrics.items()}
-        assert values == {"accuracy of ten, inside pairs": accuracy}
+        assert values_of(outcome) == {"accuracy of ten, inside pairs": accuracy}
         assert outcome.scenes == 2
     ignorant = pairs_task(Model(relations=flat), setting).metrics
     assert ignorant["accuracy of ten, inside pairs"].value == pytest.approx(1 / 10)

@@ -17,7 +17,7 @@ from training.evaluation.baselines.triples import (
     smoothed_log_odds,
     table_score,
 )
-from training.evaluation.contradictions import transitive_closure
+from training.evaluation.generation_task import transitive_closure
 from training.evaluation.model import RelationScore
 
 
