@@ -78,7 +78,7 @@ def baseline_entries(
     config = learning or ObjectsConfig()
     decisive = config.model_dump(include={"source_weights", "open_sources"})
     for name, baseline in BASELINES.items():
-        is_usable = related or not baseline.learns_relations
+        is_usable = related or not baseline.answer.of_relations
         is_selected = names is None or name in names
         if is_usable and is_selected and (baseline.stochastic or seed == 0):
             make = partial(_baseline_model, baseline, seed, config)
@@ -120,7 +120,7 @@ def _baseline_model(
         parts = data.train, data.validation, data.structure
         return baseline.fit(*parts, seed=seed, progress=say)
 
-    if baseline.scores not in (("missing",), ("rooms",)):
+    if baseline.answer.of_relations:
         return with_lateral_shift(fit(baseline, data), data)
     objects = replace(data, train=object_scenes(data.train, data.structure, learning))
     model = fit(baseline, objects)

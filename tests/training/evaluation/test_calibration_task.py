@@ -31,7 +31,7 @@ DATA = tensors(random_scenes(30, V - 1), V)
 
 
 @pytest.mark.parametrize("question", [*QUESTIONS, 2])
-def test_every_question_is_asked_and_some_answers_are_true(question):
+def test_every_question_has_true_and_false_answers(question):
     if question == 2:
         found = collect_missing(ARTIFACT, DATA, exactly(2))
     else:
@@ -44,7 +44,7 @@ def test_every_question_is_asked_and_some_answers_are_true(question):
     assert found.metric("Brier skill").value <= 1
 
 
-def test_relations_are_compared_with_what_was_listed():
+def test_the_truth_of_a_relation_is_its_annotation():
     found = collect(ARTIFACT, DATA, QUESTIONS["relations"])
     entry = DATA.scenes[4]
     asked = replace(scene_of(entry, range(len(entry.instance_classes)), ()), room_type=None)

@@ -1,4 +1,4 @@
-"""With and without evidence: what is told, what is asked, and that these never meet."""
+"""Metrics with and without evidence; evidence and queried relations are disjoint."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ TASKS = {"MRR": missing_evidence_task, "R-precision": relations_evidence_task}
 
 
 @pytest.mark.parametrize("kind", ["relations", "poses"])
-def test_no_asked_pair_is_told(kind):
+def test_evidence_contains_no_queried_relation(kind):
     cases = list(halves(DATA, PLAIN, kind))
     assert cases
     for case in cases:

@@ -81,7 +81,7 @@ def test_a_planted_cheater_is_caught(first):
         rank_missing(data, WIDE_STRUCTURE, lambda v: torch.stack([next(turns) for _ in v]))
 
 
-def test_every_class_in_a_relation_is_asked_for_once_by_one_of_its_relations():
+def test_every_class_in_a_relation_is_removed_once_with_one_of_its_relations():
     data = tensors([scene([0, 1, 1, 2, 3], [(0, 0, 1), (2, 2, 1)]), scene([0], [])])
     row, target, places = removed_places(data, NO_STRUCTURE)
     assert (row.tolist(), target.tolist()) == ([0, 0, 0], [0, 1, 2])
@@ -121,7 +121,7 @@ def test_ranks_at_a_place_by_hand():
     assert none.mrr(relation == 0).value == pytest.approx((1 + 1 / 2 + 1 / 3) / 3)
 
 
-def test_structure_and_equal_classes_are_not_asked():
+def test_structure_and_equal_classes_give_no_place():
     structure = torch.arange(len(NO_STRUCTURE)) == 4
     found = scene([0, 0, 1, 4], [(0, 0, 4), (3, 0, 1)])
     found.evidence.holds[2, 0, 0] = True

@@ -1,4 +1,4 @@
-"""T3c by hand: what is asked, and what counts."""
+"""T3c by hand: cases, metrics and thresholds."""
 
 from itertools import count
 
@@ -42,7 +42,7 @@ def oracle(scenes, structure, *, names=("moved", "subject")):
 
 
 @pytest.mark.parametrize(("scenes", "structure"), BOTH)
-def test_each_scene_is_asked_twice(scenes, structure):
+def test_each_scene_gives_a_moved_and_an_untouched_case(scenes, structure):
     cases = moved_cases(scenes, structure)
     assert len(cases) == (len(POSED) if scenes is POSED else 8)
     for case in cases:

@@ -27,7 +27,7 @@ def outcome(train, test):
     return offsets_task(artifact_of(train), Setting(tensors(test, V), NO_STRUCTURE))
 
 
-def test_draws_of_a_known_normal_are_covered_as_promised():
+def test_the_regions_cover_80_percent_of_normal_draws():
     """2,000 scenes: .8 within .05 is 5.6 standard errors of .009, and 400 draws are learnt from,
     which moves the share by less than .02; the seeds are fixed, and others would fail with
     probability below 1e-3."""
@@ -39,7 +39,7 @@ def test_draws_of_a_known_normal_are_covered_as_promised():
     assert found.metrics["in the ellipse, left"].n == 2000
 
 
-def test_distances_are_from_the_mean_and_from_what_the_relation_says():
+def test_distances_from_the_mean_of_the_pair_and_of_the_relation():
     """Two kinds of pairs, 1 and 3 m away: the relation alone says 2."""
     train = draws((0, 1, 0), 0.01, 40, 0) + draws((0, 3, 0), 0.01, 40, 1, i=2, j=3)
     found = values_of(outcome(train, [apart((0, 1, 0)), apart((0, 3, 0), 2, 3)]))

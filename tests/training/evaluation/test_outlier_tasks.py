@@ -94,7 +94,7 @@ TOY = tensors(
 )
 
 
-def test_the_signature_of_a_room_is_what_is_often_there_and_seldom_elsewhere():
+def test_signature_classes_are_frequent_in_their_room_type_and_rare_elsewhere():
     """Lift of its own class 180 / 30 = 6; of class 4 in rooms 0 and 1 3; of class 3 1."""
     typical, share = signatures(TOY)
     assert [np.flatnonzero(row).tolist() for row in typical] == [[0], [1], [2], [], [], []]

@@ -52,7 +52,7 @@ def log_odds(p):
     return score
 
 
-def test_only_vertical_relations_between_two_things_are_asked():
+def test_questions_are_pairs_of_things_with_a_vertical_relation():
     structure = torch.arange(len(NO_STRUCTURE)) == 3
     data = tensors(
         [
@@ -156,7 +156,7 @@ def test_rare_classes_are_those_that_training_relates_to_few():
     assert "accuracy, rare classes" not in metrics
 
 
-def test_the_service_is_asked_about_its_first_instances():
+def test_the_service_score_is_that_of_the_first_instances():
     asked = next(one for one in listed_pairs(rooms(20, 2), STRUCTURE) if len(one.pairs) > 2)
     p = service_score(room_model())(asked)
     every = relation_probabilities(room_model(), labels_alone(asked.scene))

@@ -13,7 +13,7 @@ def figure(value):
     return Figure(value, value, value, 1)
 
 
-def test_precision_of_relations_says_what_counts_as_wrong():
+def test_tables_of_relations_say_that_unlisted_relations_count_as_wrong():
     for task, metric in (("T1b completion", "R-precision"), ("T2 missing", "MRR, one removed")):
         text = Results("a", (Cell("a", task, "x", metric, figure(0.5), (0.5,)),), ()).markdown()
         assert ("An unlisted relation counts as wrong" in text) is task.startswith("T1")
@@ -48,7 +48,7 @@ def test_results_list_the_questions():
     }  # fmt: skip
 
 
-def test_skipped_scenes_are_told_by_source():
+def test_skipped_scenes_are_listed_by_source():
     skipped = (("x", 8), ("x", 9), ("y", 0))
     asked = [{"task": "T2", "source": source, "skipped": count} for source, count in skipped]
     cells = (Cell("a", "T2", "x", "MRR", figure(0.1), (0.1,)),)

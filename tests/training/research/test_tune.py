@@ -119,6 +119,6 @@ def test_choices_and_intervals_are_read(tmp_path):
         ("", "contains no settings"),
     ],
 )
-def test_bad_spaces_say_what_is_wrong(tmp_path, text, message):
+def test_invalid_spaces_are_refused_with_the_reason(tmp_path, text, message):
     with pytest.raises(ConfigError, match=message):
         read_space(tmp_path, text)

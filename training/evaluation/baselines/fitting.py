@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, Final, TypeAlias, TypeVar
+from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from torch import Tensor
@@ -37,6 +37,7 @@ from training.evaluation.relation_tasks import (
     r_precision,
     score_scenes,
 )
+from training.evaluation.room_task import mean_log_p
 
 _SCENES = 1000
 
@@ -123,27 +124,41 @@ def named_moved(scenes: SceneTensors, structure: Tensor, score: MisplacedScore) 
     return float(ask_moved(score, cases)[:, 0].mean()) if cases else 0.0
 
 
+class Answer(NamedTuple):
+    """What a score answers.
+
+    Attributes:
+        fields: fields of `Model` that the score fills.
+        judge: function of validation scenes, structure classes and score; higher is better.
+        of_relations: True if the score learns from scenes with annotated relations.
+    """
+
+    fields: tuple[str, ...]
+    judge: Callable[[SceneTensors, Tensor, Any], float]
+    of_relations: bool = True
+
+
+OBJECTS: Final = Answer(("missing",), missing_mrr, of_relations=False)
+ROOMS: Final = Answer(("rooms",), mean_log_p, of_relations=False)
+RELATIONS: Final = Answer(("relations", "false_relations"), relation_precision)
+COMPLETION: Final = Answer(("completion",), completion_precision)
+AT_PLACE: Final = Answer(("at_place",), placed_mrr)
+MISPLACED: Final = Answer(("misplaced",), named_moved)
+
+
 @dataclass(frozen=True)
 class Baseline:
     """One baseline, shown as one row of a result table.
 
     Attributes:
         propose: function of training scenes, structure classes and seed, see the module.
-        judge: function of validation scenes, structure classes and score; higher is better.
-        scores: fields of `Model` that the score answers.
         stochastic: True if the fit depends on the seed.
     """
 
     name: str
     propose: Callable[[SceneTensors, Tensor, int], Proposals[Any]]
-    judge: Callable[[SceneTensors, Tensor, Any], float] = missing_mrr
-    scores: tuple[str, ...] = ("missing",)
+    answer: Answer = OBJECTS
     stochastic: bool = False
-
-    @property
-    def learns_relations(self) -> bool:
-        """True if the baseline needs scenes with annotated relations."""
-        return self.scores not in (("missing",), ("rooms",))
 
     def fit(
         self,
@@ -171,7 +186,7 @@ class Baseline:
         proposal = next(proposals, None)
         while proposal is not None:
             parameters, score = proposal
-            metric = self.judge(validation, structure, score)
+            metric = self.answer.judge(validation, structure, score)
             if math.isnan(metric):
                 raise FloatingPointError(
                     f"{self.name}: the validation metric with {dict(parameters)} is NaN; leave "
@@ -185,6 +200,6 @@ class Baseline:
                 proposal = proposals.send(metric)
             except StopIteration:
                 proposal = None
-        answers: dict[str, Any] = dict.fromkeys(self.scores, best)
-        count = getattr(best, "parameter_count", None) if "missing" in answers else None
-        return Model(**answers, parameters=count)
+        scores: dict[str, Any] = dict.fromkeys(self.answer.fields, best)
+        count = getattr(best, "parameter_count", None) if "missing" in scores else None
+        return Model(**scores, parameters=count)

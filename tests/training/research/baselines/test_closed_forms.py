@@ -223,7 +223,7 @@ def test_closure_is_warshalls():
     assert torch.equal(transitive_closure(given), expected)
 
 
-def test_closure_moves_what_follows_and_its_mirror_image_alone():
+def test_closure_changes_implied_relations_and_mirror_images_alone():
     batch = tensors([scene([0, 1, 2, 3], [(LEFT, 0, 1), (LEFT, 1, 2)])]).batch(torch.tensor([0]))
     given = with_observed(batch, batch.holds > 0)
     moved = closure_score(table_score(torch.zeros(A, V, V)), bonus=2.0, penalty=3.0)(given)
