@@ -91,7 +91,7 @@ def independent_sampler(train: SceneTensors) -> Sampler:
     """Return a sampler that draws each class independently, with its frequency in training."""
     frequency = train.v.mean(0)
 
-    def sample(given: Tensor, room: Tensor, seed: int) -> Drawn:  # noqa: ARG001
+    def sample(given: Bool[Tensor, "B V"], room: Int[Tensor, " B"], seed: int) -> Drawn:  # noqa: ARG001
         generator = torch.Generator().manual_seed(seed)
         v = torch.rand(given.shape, generator=generator) < frequency
         return Drawn((v | given).to(train.v.dtype), torch.zeros(len(v), 4))
@@ -110,7 +110,7 @@ def scene_sampler(scenes: SceneTensors) -> Sampler:
         [count_contradictions(scenes.batch(index).holds) for index in blocks]
     )
 
-    def sample(given: Tensor, room: Tensor, seed: int) -> Drawn:  # noqa: ARG001
+    def sample(given: Bool[Tensor, "B V"], room: Int[Tensor, " B"], seed: int) -> Drawn:  # noqa: ARG001
         if not given.any():
             return Drawn(scenes.v, contradictions)
         rng = np.random.default_rng(seed)
@@ -129,7 +129,7 @@ def machine_sampler(artifact: Artifact) -> Sampler:
     """
     chains = artifact.scene_chains
 
-    def sample(given: Tensor, room: Tensor, seed: int) -> Drawn:
+    def sample(given: Bool[Tensor, "B V"], room: Int[Tensor, " B"], seed: int) -> Drawn:
         objects, contradictions = torch.zeros(given.shape), []
         for row, (classes, room_type) in enumerate(zip(given, room.tolist(), strict=True)):
             index = classes.nonzero().squeeze(1)

@@ -30,6 +30,7 @@ from torch import Tensor
 
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import scene_rng
+from training.evaluation.setting import Structure
 
 LAWS = ("uniform", "by popularity", "signature")
 """Distributions of intruders."""
@@ -50,7 +51,7 @@ def by_popularity(scenes: SceneTensors, train: SceneTensors) -> Float[Tensor, "s
 
 def draw_intruders(
     scenes: SceneTensors,
-    structure: Bool[Tensor, " V"],
+    structure: Structure,
     weights: Float[Tensor, "scenes V"] | None = None,
     seed: int = 0,
 ) -> Int[Tensor, " scenes"]:
@@ -116,7 +117,7 @@ def intruder_weights(
 
 
 def draw_intruder_choices(
-    scenes: SceneTensors, structure: Tensor, train: SceneTensors | None, seed: int = 0
+    scenes: SceneTensors, structure: Structure, train: SceneTensors | None, seed: int = 0
 ) -> dict[tuple[str, str], Int[NDArray, " choices"]]:
     """Draw up to three classes for each scene, by (source, scene id), for `ask_outliers`.
 

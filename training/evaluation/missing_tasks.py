@@ -19,7 +19,7 @@ from typing import Final
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -37,7 +37,7 @@ from training.evaluation.parts import (
     one_quarter,
     rank_hidden,
 )
-from training.evaluation.setting import Outcome, Setting
+from training.evaluation.setting import Outcome, Setting, Structure
 
 SEEDS: Final = (0, 1, 2)
 """Seeds of the draws of a question, for each scene."""
@@ -51,7 +51,7 @@ TOP: Final = (1, 3, 5, 10)
 
 def rank_missing(
     scenes: SceneTensors,
-    structure: Bool[Tensor, " V"],
+    structure: Structure,
     score: ObjectScore,
     size: Size = all_but_one,
     *,
@@ -84,7 +84,7 @@ def missing_task(score: ObjectScore, setting: Setting) -> Outcome | None:
     return Outcome.over(scenes, metrics, skipped)
 
 
-def _with_unknown(mrr: Ratio, scenes: SceneTensors, structure: Tensor) -> Ratio:
+def _with_unknown(mrr: Ratio, scenes: SceneTensors, structure: Structure) -> Ratio:
     """Return the MRR if unknown labels are removed too, which score 0."""
     things = ((scenes.v > 0) & ~structure).sum(1).clamp(min=1).double().numpy()
     unknown = np.array([len(scene.unknown) for scene in scenes.scenes])
@@ -92,7 +92,7 @@ def _with_unknown(mrr: Ratio, scenes: SceneTensors, structure: Tensor) -> Ratio:
 
 
 def removed_places(
-    scenes: SceneTensors, structure: Bool[Tensor, " V"], seed: int = 0
+    scenes: SceneTensors, structure: Structure, seed: int = 0
 ) -> tuple[Int[Tensor, " N"], Int[Tensor, " N"], Places]:
     """Return the indices of the scenes, the removed classes, and their places."""
     removals: list[tuple[int, int, int, int, bool]] = []
@@ -119,7 +119,7 @@ def removed_places(
 
 
 def leave_one_out_at(
-    scenes: SceneTensors, structure: Bool[Tensor, " V"], score: PlacedScore, *, seed: int = 0
+    scenes: SceneTensors, structure: Structure, score: PlacedScore, *, seed: int = 0
 ) -> tuple[Ranking, Int[NDArray, " N"]]:
     """Return the rank of every removed class among the absent classes, and its relation.
 

@@ -123,7 +123,7 @@ def suspicion_of(
     log popularity of the class, as `/outliers` does.
     """
 
-    def suspicion(v: Tensor) -> Tensor:
+    def suspicion(v: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
         row, listed = (v > 0).nonzero(as_tuple=True)
         values = torch.full(v.shape, -torch.inf)
         if len(row):

@@ -24,7 +24,6 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
-from torch import Tensor
 
 from app.scene import Scene
 from training.datasets.batches import SceneTensors
@@ -33,7 +32,7 @@ from training.datasets.moved import moved_scene, untouched_scene
 from training.evaluation.asking import ask_every
 from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.model import MisplacedScore
-from training.evaluation.setting import Outcome, Setting
+from training.evaluation.setting import Outcome, Setting, Structure
 
 ALARMS: Final = 0.05
 """Share of untouched scenes with an alarm at the threshold."""
@@ -56,9 +55,7 @@ class MovedCase:
     untouched: Scene
 
 
-def moved_cases(
-    scenes: SceneTensors, structure: Bool[Tensor, " V"], seed: int = 0
-) -> list[MovedCase]:
+def moved_cases(scenes: SceneTensors, structure: Structure, seed: int = 0) -> list[MovedCase]:
     """Return a case for each scene in which an object can move."""
     is_structure = structure.numpy()
     cases = []

@@ -14,7 +14,7 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -25,7 +25,7 @@ from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.missing_tasks import SEEDS
 from training.evaluation.model import Flagged, Model, ObjectScore
 from training.evaluation.parts import draw_parts, exactly
-from training.evaluation.setting import Outcome, Setting
+from training.evaluation.setting import Outcome, Setting, Structure
 
 LENGTHS: Final = (1, 2, 3, 5, 8)
 """Numbers of listed classes in which alarms are measured."""
@@ -40,7 +40,7 @@ class Cases(NamedTuple):
 
 
 def with_intruders(
-    scenes: SceneTensors, structure: Bool[Tensor, " V"], weights: Float[Tensor, "scenes V"] | None
+    scenes: SceneTensors, structure: Structure, weights: Float[Tensor, "scenes V"] | None
 ) -> Cases:
     """Add the intruders of the sampling weights to the scenes, for each of `SEEDS`."""
     drawn = torch.stack([draw_intruders(scenes, structure, weights, seed) for seed in SEEDS])

@@ -25,7 +25,6 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from numpy.typing import NDArray
 from scipy.special import expit
-from torch import Tensor
 
 from app.registry import Artifact
 from app.scene.relations import INSIDE, LATERAL, VERTICAL
@@ -35,7 +34,7 @@ from training.evaluation.asking import ask_every, labels_alone, relation_probabi
 from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.model import Model, RelationScore
 from training.evaluation.relation_tasks import with_observed
-from training.evaluation.setting import Outcome, Setting
+from training.evaluation.setting import Outcome, Setting, Structure
 
 RARE = 10
 """A class is rare if training relates it to at most this many classes."""
@@ -69,7 +68,7 @@ PairScore: TypeAlias = Callable[[ScenePairs], Float[NDArray, "P 2*A"]]
 
 
 def listed_pairs(
-    scenes: SceneTensors, structure: Bool[Tensor, " V"], relations: Sequence[int] = VERTICAL
+    scenes: SceneTensors, structure: Structure, relations: Sequence[int] = VERTICAL
 ) -> list[ScenePairs]:
     """Return the pairs with one of these listed relations, for every scene that has such pairs."""
     questions = []

@@ -24,6 +24,7 @@ from training.datasets.array_types import Rng
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.cases import scene_rng, some_scenes
 from training.evaluation.metrics import Metric, Ratio
+from training.evaluation.setting import Structure
 
 REAL_SOURCES: Final = ("sunrgbd", "3dssg", "sunrgbd_bedrooms_3d", "matterport_rooms")
 """Data sources of real rooms with nearly complete object lists."""
@@ -100,7 +101,7 @@ def up_to_longest(classes: int, rng: Rng) -> int:
 
 
 def draw_parts(
-    scenes: SceneTensors, structure: Bool[Tensor, " V"], size: Size, seeds: Sequence[int] = (0,)
+    scenes: SceneTensors, structure: Structure, size: Size, seeds: Sequence[int] = (0,)
 ) -> Parts:
     """Draw a part of each scene for each seed."""
     is_thing = ~structure.numpy()
@@ -186,9 +187,7 @@ class Ranking:
         return Ratio.of_items(self.scene[selection], self.reciprocal_rank()[selection], self.scenes)
 
 
-def rank_hidden(
-    parts: Parts, structure: Bool[Tensor, " V"], values: Float[Tensor, "N V"]
-) -> Ranking:
+def rank_hidden(parts: Parts, structure: Structure, values: Float[Tensor, "N V"]) -> Ranking:
     """Rank each hidden class among the unlisted classes, by scores.
 
     Classes of one family with a listed class are neither ranked nor candidates.
@@ -212,7 +211,7 @@ def real_sources(scenes: SceneTensors) -> Iterator[tuple[str, SceneTensors]]:
 
 @torch.no_grad()
 def validation_score(
-    score_function: ListScore, scenes: SceneTensors, structure: Bool[Tensor, " V"]
+    score_function: ListScore, scenes: SceneTensors, structure: Structure
 ) -> float:
     """Return the mean over real sources of the MRR of hidden classes; NaN without hidden classes.
 

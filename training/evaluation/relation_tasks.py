@@ -36,7 +36,7 @@ from training.datasets.batches import Batch, SceneTensors
 from training.datasets.cases import Triple, scene_rng
 from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.model import RelationScore
-from training.evaluation.setting import Outcome, Setting
+from training.evaluation.setting import Outcome, Setting, Structure
 from training.machines.edges import triple_keys
 
 FIRST = (20, 50, 100)
@@ -68,7 +68,7 @@ class Candidates:
         return Candidates(scene, *(column[mask] for column in columns))
 
 
-def scorable(batch: Batch, structure: Bool[Tensor, " V"]) -> Bool[Tensor, "B A n n"]:
+def scorable(batch: Batch, structure: Structure) -> Bool[Tensor, "B A n n"]:
     """Return a mask of the triples between two different classes without structure."""
     n = batch.classes.shape[1]
     is_thing = (batch.classes >= 0) & ~structure[batch.classes.clamp(min=0)]
@@ -113,7 +113,7 @@ def _scored(
 
 
 def score_scenes(
-    scenes: SceneTensors, structure: Tensor, score: RelationScore, *, counts: bool = True
+    scenes: SceneTensors, structure: Structure, score: RelationScore, *, counts: bool = True
 ) -> list[Candidates]:
     """Score the T1a candidates of annotated scenes. Without `counts`, all counts are 0, unknown."""
 
@@ -127,7 +127,7 @@ def score_scenes(
 
 
 def complete_scenes(
-    scenes: SceneTensors, structure: Tensor, score: RelationScore, *, seed: int = 0
+    scenes: SceneTensors, structure: Structure, score: RelationScore, *, seed: int = 0
 ) -> list[Candidates]:
     """Score the T1b candidates of scenes with at least two triples, given half of the triples."""
 
@@ -218,7 +218,7 @@ def alter(
 
 @torch.no_grad()
 def false_hits(
-    scenes: SceneTensors, structure: Tensor, score: RelationScore, *, seed: int = 0
+    scenes: SceneTensors, structure: Structure, score: RelationScore, *, seed: int = 0
 ) -> Ratio | None:
     """Return the share of false triples that rank first in their scene; None without any.
 

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from app.registry import Artifact
@@ -26,7 +27,7 @@ from training.evaluation.artifact_model import artifact_model
 from training.evaluation.everyday_task import SOURCE, facts_file
 from training.evaluation.metrics import Metric, Ratio, Resampled, Scored
 from training.evaluation.model import Model
-from training.evaluation.setting import Outcome, Setting
+from training.evaluation.setting import Outcome, Setting, Structure
 from training.evaluation.tasks import EVERY_TASK, ONCE, TASKS, WHOLE_SET
 
 _LIMIT = 200  # maximum number of scenes per data source in slow tasks
@@ -86,9 +87,9 @@ def by_source(scenes: SceneTensors) -> Iterator[tuple[str, SceneTensors]]:
 
 def settings_by_source(
     scenes: SceneTensors,
-    structure: Tensor,
+    structure: Structure,
     train: SceneTensors,
-    seen: Tensor | None,
+    seen: Int[Tensor, "triples 3"] | None,
     *,
     limit: int | None = 600,
 ) -> Iterator[tuple[str, Setting]]:
@@ -143,7 +144,7 @@ def pooled(reports: Sequence[SourceReport], source: str = "pooled") -> SourceRep
 def evaluate(
     artifact: Artifact,
     scenes: SceneTensors,
-    structure: Tensor,
+    structure: Structure,
     train: SceneTensors,
     *,
     limit: int = _LIMIT,

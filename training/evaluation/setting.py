@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TypeAlias
 
 import torch
 from jaxtyping import Bool, Int
@@ -15,6 +16,9 @@ from training.datasets.batches import SceneTensors, subset
 from training.datasets.cases import some_scenes
 from training.evaluation.metrics import Metric
 
+Structure: TypeAlias = Bool[Tensor, " V"]
+"""Mask of structure classes, such as walls. They are evidence, but never questions."""
+
 
 @dataclass(frozen=True, eq=False)
 class Setting:
@@ -22,7 +26,6 @@ class Setting:
 
     Attributes:
         scenes: held-out scenes.
-        structure: True for structure classes.
         train: training scenes of the same sources. If None, tasks that need them are left out.
         seen: triples that the model may have learnt from.
         limit: maximum number of scenes for slow tasks, which are all but T1a and T1b. The slowest
@@ -32,7 +35,7 @@ class Setting:
     """
 
     scenes: SceneTensors
-    structure: Bool[Tensor, " V"]
+    structure: Structure
     train: SceneTensors | None = None
     seen: Int[Tensor, "triples 3"] | None = None
     limit: int | None = 600

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from app.scene.relations import STACKED
 from training.datasets.batches import SceneTensors, TrainingData, subset
@@ -25,6 +24,7 @@ from training.evaluation.model import Model, ObjectScore, suspicion_of
 from training.evaluation.outlier_tasks import expected_hit_at_1, with_intruders
 from training.evaluation.pair_task import SHIFTS, baseline_log_odds, lateral_shift, listed_pairs
 from training.evaluation.report import Progress, silent
+from training.evaluation.setting import Structure
 from training.fit.calibrate import calibrate
 from training.fit.configuration import Config, ObjectsConfig
 from training.fit.draft import placed_draft
@@ -143,7 +143,7 @@ def with_lateral_shift(model: Model, data: TrainingData) -> Model:
     return replace(model, lateral=shift)
 
 
-def object_scenes(train: SceneTensors, structure: Tensor, config: ObjectsConfig) -> SceneTensors:
+def object_scenes(train: SceneTensors, structure: Structure, config: ObjectsConfig) -> SceneTensors:
     """Return the scenes from which a machine learns objects, with its weights and masks."""
     learnt = ObjectScenes.of(train, structure, config)
     shows = torch.zeros_like(train.annotated_classes)

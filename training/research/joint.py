@@ -33,7 +33,7 @@ from training.datasets.cases import some_scenes
 from training.domain.init_command import StorePath
 from training.evaluation.outside import read_test
 from training.evaluation.parts import draw_parts, exactly, rank_hidden
-from training.evaluation.setting import with_relations
+from training.evaluation.setting import Structure, with_relations
 from training.machines import BoltzmannMachine
 from training.machines.arrays import machine_of
 from training.machines.edges import Edges
@@ -100,7 +100,7 @@ def change_by_relations(
 
 @torch.no_grad()
 def compare_sources(
-    machine: BoltzmannMachine, scenes: SceneTensors, structure: Bool[Tensor, " V"], length: int
+    machine: BoltzmannMachine, scenes: SceneTensors, structure: Structure, length: int
 ) -> dict[str, float]:
     """Return the mean differences of log-odds by the source unit in lists of some length."""
     parts = draw_parts(some_scenes(scenes, _LISTS, 0), structure, exactly(length))
@@ -128,7 +128,7 @@ def compare_sources(
 
 @torch.no_grad()
 def compare_relations(
-    machine: BoltzmannMachine, scenes: SceneTensors, structure: Bool[Tensor, " V"]
+    machine: BoltzmannMachine, scenes: SceneTensors, structure: Structure
 ) -> dict[str, float]:
     """Return the mean differences of log-odds by the observed relations of whole scenes."""
     related = with_relations(scenes)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
-from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors, values_of
+from tests.training.evaluation.scenes import FLOOR, NO_STRUCTURE, scene, tensors, values_of
 from training.evaluation.artifact_model import artifact_model
 from training.evaluation.asking import SENSITIVITIES, judge, of_classes
 from training.evaluation.intruders import (
@@ -55,21 +55,16 @@ def test_an_object_is_judged_by_the_rest_without_itself():
     assert values.tolist() == [[3, -2, -3, -inf, -inf], [-inf, -inf, -inf, -4, -5]]
 
 
-def test_a_request_lists_the_scene_and_its_intruder_without_structure():
-    structure = torch.tensor([True, False, False, False, False])
-    data = tensors([scene([0, 1, 2, 3]), scene([0, 1, 2])])
-    index, v, intruder = with_intruders(data, structure, None)
+def test_a_request_lists_the_things_of_a_scene_and_an_absent_one():
+    """Scenes of fewer than three things have no intruder."""
+    data = tensors([scene([0, 1, 2, 3]), scene([0, 2]), scene([0, 1, 2])])
+    index, v, intruder = with_intruders(data, FLOOR, None)
     assert index.tolist() == [0] * len(SEEDS)
     assert intruder.tolist() == [4] * len(SEEDS)
-    assert v.tolist() == [[0, 1, 1, 1, 1]] * len(SEEDS)
-
-
-def test_intruders_are_absent_and_no_structure():
-    structure = torch.arange(len(NO_STRUCTURE)) == 4
-    data = tensors([scene([0, 1, 2]) for _ in range(20)])
-    assert set(draw_intruders(data, structure).tolist()) == {3}
-    small = tensors([scene([0, 1]), scene([0, 1, 4])])
-    assert draw_intruders(small, structure).tolist() == [-1, -1]
+    assert v.tolist() == [[1, 0, 1, 1, 1]] * len(SEEDS)
+    absent = torch.arange(len(FLOOR)) == 4
+    drawn = draw_intruders(tensors([scene([0, 1, 2]) for _ in range(20)]), absent)
+    assert set(drawn.tolist()) == {3}
 
 
 def test_popular_intruders_follow_training():

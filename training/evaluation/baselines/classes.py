@@ -12,6 +12,7 @@ from torch import Tensor
 from training.datasets.batches import SceneTensors
 from training.evaluation.baselines.fitting import Proposals
 from training.evaluation.model import ObjectScore
+from training.evaluation.setting import Structure
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +59,7 @@ class Lists:
         return torch.where(self.labelled, self.v, self.frequency())
 
 
-def training_lists(train: SceneTensors, structure: Tensor) -> Iterator[tuple[str, Lists]]:
+def training_lists(train: SceneTensors, structure: Structure) -> Iterator[tuple[str, Lists]]:
     """Yield sets of training scenes with their names. A baseline chooses between the sets.
 
     A set has all scenes, or only those with complete object lists. A class that a data source
@@ -89,7 +90,7 @@ def frequency(
     return (weight @ v + 0.5) / (total + 1.0)
 
 
-def popularity(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
+def popularity(train: SceneTensors, structure: Structure, _seed: int) -> Proposals[ObjectScore]:
     """Yield the log-odds of the class frequencies."""
     V = train.v.shape[1]
     for name, lists in training_lists(train, structure):
@@ -119,7 +120,7 @@ def fit_ease(
     return LinearScore((mean - mean @ weights).float(), weights.float())
 
 
-def ease(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
+def ease(train: SceneTensors, structure: Structure, _seed: int) -> Proposals[ObjectScore]:
     """Yield a score for each ridge penalty. Unlabelled classes have their mean."""
     for name, lists in training_lists(train, structure):
         v = lists.filled()

@@ -38,6 +38,7 @@ from training.evaluation.relation_tasks import (
     score_scenes,
 )
 from training.evaluation.room_task import mean_log_p
+from training.evaluation.setting import Structure
 
 _SCENES = 1000
 
@@ -80,7 +81,7 @@ def halving(
         settings = [settings[k] for k in np.argsort(best)[::-1]]
 
 
-def missing_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> float:
+def missing_mrr(scenes: SceneTensors, structure: Structure, score: ObjectScore) -> float:
     """Return the `validation_score` of missing objects. Without such, raise a ValueError."""
     value = validation_score(lambda v, _: score(v), scenes, structure)
     if math.isnan(value):
@@ -88,17 +89,17 @@ def missing_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> 
     return value
 
 
-def placed_mrr(scenes: SceneTensors, structure: Tensor, score: PlacedScore) -> float:
+def placed_mrr(scenes: SceneTensors, structure: Structure, score: PlacedScore) -> float:
     """Return the mean reciprocal rank (MRR) of T2-at in at most `_SCENES` scenes."""
     return leave_one_out_at(some_scenes(scenes, _SCENES), structure, score)[0].mrr().value
 
 
-def relation_precision(scenes: SceneTensors, structure: Tensor, score: RelationScore) -> float:
+def relation_precision(scenes: SceneTensors, structure: Structure, score: RelationScore) -> float:
     """Return the R-precision of relations, given the instance counts of classes (task T1a)."""
     return _precision(score_scenes(scenes, structure, score), scenes)
 
 
-def completion_precision(scenes: SceneTensors, structure: Tensor, score: RelationScore) -> float:
+def completion_precision(scenes: SceneTensors, structure: Structure, score: RelationScore) -> float:
     """Return the R-precision of half of the relations, given the other half (task T1b)."""
     return _precision(complete_scenes(scenes, structure, score), scenes)
 
@@ -110,7 +111,7 @@ def _precision(scored: list[Candidates], scenes: SceneTensors) -> float:
     return ratio.value
 
 
-def named_moved(scenes: SceneTensors, structure: Tensor, score: MisplacedScore) -> float:
+def named_moved(scenes: SceneTensors, structure: Structure, score: MisplacedScore) -> float:
     """Return the share of moved objects that are named first (T3c); 0 if no object can move.
 
     At most `_SCENES` scenes take part.
@@ -164,7 +165,7 @@ class Baseline:
         self,
         train: SceneTensors,
         validation: SceneTensors,
-        structure: Tensor,
+        structure: Structure,
         *,
         seed: int = 0,
         progress: Callable[[str], None] = lambda _: None,

@@ -8,13 +8,14 @@ from itertools import product
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from training.datasets.batches import Batch, SceneTensors
 from training.evaluation.baselines.classes import frequency
 from training.evaluation.baselines.fitting import Proposals
 from training.evaluation.model import ObjectScore, PlacedScore, Places, RelationScore
+from training.evaluation.setting import Structure
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +35,7 @@ class TripleCounts:
         return (self.holds.sum((1, 2)) + 1.0) / (self.together.sum() + 2.0)
 
 
-def count_triples(scenes: SceneTensors, structure: Bool[Tensor, " V"]) -> TripleCounts:
+def count_triples(scenes: SceneTensors, structure: Structure) -> TripleCounts:
     """Count triples over the scenes with annotated relations.
 
     An unlisted relation counts as false, as in task T1, even if the pair is unobserved. Some data
@@ -70,7 +71,7 @@ def table_score(log_odds: Float[Tensor, "A V V"], multiplicity: float = 0.0) -> 
     observed relations. It is arbitrary for padding.
     """
 
-    def score(batch: Batch) -> Tensor:
+    def score(batch: Batch) -> Float[Tensor, "B A n n"]:
         index = batch.classes.clamp(min=0)
         values = log_odds[:, index[:, :, None], index[:, None, :]].movedim(0, 1)
         if multiplicity:
@@ -107,7 +108,9 @@ def smoothed_log_odds(
     return ((counts.holds + of_pair * back_off) / (counts.together + of_pair)).logit(eps=1e-7)
 
 
-def frequency_table(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[RelationScore]:
+def frequency_table(
+    train: SceneTensors, structure: Structure, _seed: int
+) -> Proposals[RelationScore]:
     """Yield a score for each smoothing of pairs and of classes, and each weight of the counts."""
     counts = count_triples(train, structure)
     for of_pair, of_class in product(_PAIR, _CLASS):
@@ -152,7 +155,7 @@ def smoothed_log_p(
     return (table / (holds.sum(-1, keepdim=True) + place)).log()
 
 
-def placed_table(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[PlacedScore]:
+def placed_table(train: SceneTensors, structure: Structure, _seed: int) -> Proposals[PlacedScore]:
     """Yield a score for each smoothing s of places and each smoothing m of relations."""
     counts = count_triples(train, structure)
     for place, relation in product(_PLACE, _RELATION):
@@ -171,15 +174,17 @@ def times(
     if objects is None or table is None:
         raise ValueError("the product needs an object score and a table of places")
 
-    def product_score(weight: float, correction: float, log_popularity: Tensor) -> PlacedScore:
+    def product_score(
+        weight: float, correction: float, log_popularity: Float[Tensor, " V"]
+    ) -> PlacedScore:
         # Both factors depend on the class frequency. The last term corrects for this.
-        def score(places: Places) -> Tensor:
+        def score(places: Places) -> Float[Tensor, "B V"]:
             added = weight * table(places) - correction * log_popularity
             return objects(places.v) + added
 
         return score
 
-    def propose(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[PlacedScore]:
+    def propose(train: SceneTensors, _structure: Structure, _seed: int) -> Proposals[PlacedScore]:
         log_popularity = frequency(train.v, train.weight).log()
         for weight, correction in product(_WEIGHTS, _CORRECTIONS):
             score = product_score(weight, correction, log_popularity)

@@ -18,6 +18,7 @@ from training.datasets.batches import SceneTensors
 from training.evaluation.baselines.classes import Lists, training_lists
 from training.evaluation.baselines.fitting import TRIALS, Proposals, drawn_settings, halving
 from training.evaluation.model import ObjectScore, Parameters
+from training.evaluation.setting import Structure
 
 # The network learns to predict the hidden classes of random parts of scenes, as a machine does.
 #
@@ -47,7 +48,7 @@ class NetworkScore:
     """The score of each unlisted class: its logit, or log p under a softmax over these classes."""
 
     network: nn.Module
-    structure: Bool[Tensor, " V"]
+    structure: Structure
     softmax: bool
 
     @property
@@ -67,7 +68,7 @@ class NetworkScore:
 def train_network(
     network: nn.Module,
     lists: Lists,
-    structure: Tensor,
+    structure: Structure,
     seed: int,
     *,
     learning_rate: float,
@@ -157,7 +158,7 @@ def build_autoencoder(popularity: Float[Tensor, " V"], width: int, dropout: floa
     )  # fmt: skip
 
 
-def autoencoder(train: SceneTensors, structure: Tensor, seed: int) -> Proposals[ObjectScore]:
+def autoencoder(train: SceneTensors, structure: Structure, seed: int) -> Proposals[ObjectScore]:
     """Yield the score of an autoencoder for `TRIALS` settings, losses and sets of scenes."""
     lists = dict(training_lists(train, structure))
 

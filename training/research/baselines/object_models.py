@@ -17,6 +17,7 @@ from training.datasets.batches import SceneTensors
 from training.evaluation.baselines.classes import LinearScore, Lists, frequency, training_lists
 from training.evaluation.baselines.fitting import TRIALS, Proposals, drawn_settings, halving
 from training.evaluation.model import ObjectScore, Parameters
+from training.evaluation.setting import Structure
 
 # Co-occurrence: Bernoulli naive Bayes, with the present classes as evidence.
 #
@@ -44,7 +45,7 @@ def evidence(
     return (with_class / without_class).log().fill_diagonal_(0.0)
 
 
-def naive_bayes(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
+def naive_bayes(train: SceneTensors, structure: Structure, _seed: int) -> Proposals[ObjectScore]:
     """Yield a score for each set of scenes, smoothing and factor t."""
     for name, lists in training_lists(train, structure):
         for smoothing, t in product(_SMOOTHING, _EXPONENTS):
@@ -70,7 +71,7 @@ def nearest_score(lists: Lists, *, neighbours: int, sharpness: float) -> ObjectS
     popularity, v = lists.frequency(), lists.filled()
     index = normalize(lists.v, dim=1).T.contiguous()
 
-    def score(query: Tensor) -> Tensor:
+    def score(query: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
         cosine = normalize(query, dim=1) @ index
         similarity, neighbour = cosine.topk(min(neighbours, len(v)), dim=1)
         # The vote of a training scene without a class of the query is 0.
@@ -82,7 +83,7 @@ def nearest_score(lists: Lists, *, neighbours: int, sharpness: float) -> ObjectS
     return score
 
 
-def nearest(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
+def nearest(train: SceneTensors, structure: Structure, _seed: int) -> Proposals[ObjectScore]:
     """Yield a score for each set of scenes, number of neighbours and sharpness."""
     for name, lists in training_lists(train, structure):
         for k, power in product(_NEIGHBOURS, _SHARPNESS):
@@ -125,10 +126,10 @@ def fit_pairwise(
         [bias, half], max_iter=iterations, history_size=10, line_search_fn="strong_wolfe"
     )
 
-    def symmetric() -> Tensor:
+    def symmetric() -> Float[Tensor, "V V"]:
         return (half + half.T) * (1.0 - torch.eye(V))
 
-    def loss() -> Tensor:
+    def loss() -> Float[Tensor, ""]:
         optimiser.zero_grad()
         W = symmetric()
         logits = bias + torch.sparse.mm(sparse, W) + (unlabelled @ W)[pattern]
@@ -142,7 +143,7 @@ def fit_pairwise(
         return LinearScore(bias.detach(), symmetric().detach())
 
 
-def pairwise(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[LinearScore]:
+def pairwise(train: SceneTensors, structure: Structure, _seed: int) -> Proposals[LinearScore]:
     """Yield a score for each L2 penalty, largest first. A fit starts at the last solution."""
     for name, lists in training_lists(train, structure):
         score = None
@@ -214,7 +215,7 @@ def fit_annealed(
     return RbmScore(*(torch.as_tensor(w, dtype=torch.float32) for w in weights))
 
 
-def bernoulli_rbm(train: SceneTensors, structure: Tensor, seed: int) -> Proposals[ObjectScore]:
+def bernoulli_rbm(train: SceneTensors, structure: Structure, seed: int) -> Proposals[ObjectScore]:
     """Yield the score of a trained RBM for each setting and number of epochs."""
     lists = dict(training_lists(train, structure))
 

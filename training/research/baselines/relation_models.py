@@ -19,10 +19,11 @@ from training.evaluation.baselines.triples import (
 )
 from training.evaluation.generation_task import transitive_closure
 from training.evaluation.model import RelationScore
+from training.evaluation.setting import Structure
 
 
 def relation_popularity(
-    train: SceneTensors, structure: Tensor, _seed: int
+    train: SceneTensors, structure: Structure, _seed: int
 ) -> Proposals[RelationScore]:
     """Yield a single score: the log-odds of each relation over all pairs of classes."""
     counts = count_triples(train, structure)
@@ -56,7 +57,7 @@ def fit_complex(
     generator = torch.Generator().manual_seed(seed)
     A, V, _ = counts.holds.shape
 
-    def factors(rows: int, scale: float) -> Tensor:
+    def factors(rows: int, scale: float) -> Complex[Tensor, "rows rank"]:
         values = torch.randn(rows, rank, dtype=torch.cfloat, generator=generator)
         return (scale * values).requires_grad_()
 
@@ -92,7 +93,7 @@ def complex_logits(
 
 
 def complex_embedding(
-    train: SceneTensors, structure: Tensor, seed: int
+    train: SceneTensors, structure: Structure, seed: int
 ) -> Proposals[RelationScore]:
     """Yield a ComplEx score for each rank, penalty and weight of the instance counts."""
     counts = count_triples(train, structure)
@@ -125,7 +126,7 @@ def closure_score(table: RelationScore, bonus: float, penalty: float) -> Relatio
     relations lose the penalty.
     """
 
-    def score(batch: Batch) -> Tensor:
+    def score(batch: Batch) -> Float[Tensor, "B A n n"]:
         observed = (batch.holds > 0) & batch.observed
         closed = transitive_closure(observed)
         implied, mirror = closed & ~observed, closed.mT & ~closed
@@ -135,7 +136,7 @@ def closure_score(table: RelationScore, bonus: float, penalty: float) -> Relatio
 
 
 def frequency_table_with_closure(
-    train: SceneTensors, structure: Tensor, _seed: int
+    train: SceneTensors, structure: Structure, _seed: int
 ) -> Proposals[RelationScore]:
     """Yield a score for each smoothing, weight of the instance counts, bonus and penalty."""
     counts = count_triples(train, structure)

@@ -16,6 +16,7 @@ from training.evaluation.baselines.classes import Lists, training_lists
 from training.evaluation.baselines.fitting import Proposals
 from training.evaluation.model import Parameters, RoomScore
 from training.evaluation.room_task import with_room_type
+from training.evaluation.setting import Structure
 
 # Naive Bayes over room types:
 #
@@ -58,14 +59,14 @@ class _Counts(NamedTuple):
 def room_table(tables: Mapping[str, tuple[Tensor, Tensor]]) -> RoomScore:
     """Return the log p of linear scores for each data source; "" stands for all data sources."""
 
-    def score(v: Tensor, profile: str) -> Tensor:
+    def score(v: Float[Tensor, "B V"], profile: str) -> Float[Tensor, "B C"]:
         bias, weights = tables.get(profile, tables[""])
         return (bias + v @ weights.T).log_softmax(1)
 
     return score
 
 
-def _counts(train: SceneTensors, structure: Tensor) -> Iterator[tuple[str, dict[str, _Counts]]]:
+def _counts(train: SceneTensors, structure: Structure) -> Iterator[tuple[str, dict[str, _Counts]]]:
     """Yield each set of scenes with its counts for all data sources, and for each data source."""
     scenes = with_room_type(train)
     if not len(scenes):
@@ -80,7 +81,7 @@ def _counts(train: SceneTensors, structure: Tensor) -> Iterator[tuple[str, dict[
         yield name, counts
 
 
-def naive_bayes(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[RoomScore]:
+def naive_bayes(train: SceneTensors, structure: Structure, _seed: int) -> Proposals[RoomScore]:
     """Yield a score for each set of scenes, smoothing, kind of evidence and exponent."""
     grid = tuple(product(_ALPHA, _SOURCE_ALPHA, (False, True), _EXPONENTS))
     for name, counts in _counts(train, structure):
@@ -93,7 +94,7 @@ def naive_bayes(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals
             yield {**kind, "alpha": alpha, "source_alpha": source_alpha}, room_table(tables)
 
 
-def most_common(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[RoomScore]:
+def most_common(train: SceneTensors, structure: Structure, _seed: int) -> Proposals[RoomScore]:
     """Yield the frequencies of the room types for each set of scenes."""
     for name, counts in _counts(train, structure):
         yield {"scenes": name}, room_table({q: c.table(1.0, 0.0, False) for q, c in counts.items()})

@@ -19,7 +19,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from scipy.special import expit
-from torch import Tensor
 
 from app.scene import Scene, observe
 from app.scene.relations import SUPPORTS
@@ -29,6 +28,7 @@ from training.datasets.cases import scene_of
 from training.datasets.moved import has_boxes, posed_scene
 from training.evaluation.baselines.fitting import Proposals
 from training.evaluation.model import MisplacedScore
+from training.evaluation.setting import Structure
 
 _ALPHA: Final = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 _GAMMA: Final = (0.0, 0.25, 0.5, 1.0)
@@ -83,7 +83,7 @@ def _annotated(encoded: EncodedScene) -> Scene:
 
 
 def supporter_table(
-    train: SceneTensors, structure: Tensor, _seed: int
+    train: SceneTensors, structure: Structure, _seed: int
 ) -> Proposals[MisplacedScore]:
     """Yield a score for each smoothing α and weight γ. Relations are needed, else ValueError."""
     if not any(encoded.evidence.observed.any() for encoded in train.scenes):
