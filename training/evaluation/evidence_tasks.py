@@ -73,7 +73,7 @@ def missing_evidence_task(artifact: Artifact, setting: Setting) -> Outcome | Non
     return Outcome.over(scenes, metrics, parts.skipped)
 
 
-def halves(
+def evidence_cases(
     scenes: SceneTensors, structure: Bool[NDArray, " V"], kind: str, seed: int = 0
 ) -> Iterator[Case]:
     """Generate the T1 questions: evidence about half of the classes, all other pairs queried."""
@@ -110,7 +110,7 @@ def relations_evidence_task(artifact: Artifact, setting: Setting) -> Outcome | N
         return np.array([expected_hits(x[case.queried], truth, count) for x in p])
 
     for kind in OF_RELATIONS:
-        cases = list(halves(scenes, structure, kind, setting.seed))
+        cases = list(evidence_cases(scenes, structure, kind, setting.seed))
         if not cases:
             continue
         without, informed, items = np.zeros((3, len(scenes)))

@@ -78,7 +78,7 @@ def contradiction_metrics(counts: Int[Tensor, "B 4"]) -> dict[str, Metric]:
 
 
 def transitive_closure(pairs: Bool[Tensor, "*B n n"]) -> Bool[Tensor, "*B n n"]:
-    """Return all pairs that a chain of given pairs connects."""
+    """Return the pairs of nodes that a chain of the given pairs connects."""
     reach = pairs.float()
     while True:
         longer = ((reach + reach @ reach) > 0).float()
@@ -92,6 +92,7 @@ def independent_sampler(train: SceneTensors) -> Sampler:
     frequency = train.v.mean(0)
 
     def sample(given: Bool[Tensor, "B V"], room: Int[Tensor, " B"], seed: int) -> Drawn:  # noqa: ARG001
+        """Add independent classes to the given classes."""
         generator = torch.Generator().manual_seed(seed)
         v = torch.rand(given.shape, generator=generator) < frequency
         return Drawn((v | given).to(train.v.dtype), torch.zeros(len(v), 4))
@@ -111,6 +112,7 @@ def scene_sampler(scenes: SceneTensors) -> Sampler:
     )
 
     def sample(given: Bool[Tensor, "B V"], room: Int[Tensor, " B"], seed: int) -> Drawn:  # noqa: ARG001
+        """Return all scenes, or a random scene with the given classes for each row."""
         if not given.any():
             return Drawn(scenes.v, contradictions)
         rng = np.random.default_rng(seed)
@@ -130,6 +132,7 @@ def machine_sampler(artifact: Artifact) -> Sampler:
     chains = artifact.scene_chains
 
     def sample(given: Bool[Tensor, "B V"], room: Int[Tensor, " B"], seed: int) -> Drawn:
+        """Draw a scene for each row by the chains of the service."""
         objects, contradictions = torch.zeros(given.shape), []
         for row, (classes, room_type) in enumerate(zip(given, room.tolist(), strict=True)):
             index = classes.nonzero().squeeze(1)
@@ -189,6 +192,7 @@ def discrepancy(
     np.fill_diagonal(yy, 0.0)
 
     def squared_mmd(weight: Float[NDArray, " scenes"]) -> float:
+        """Return MMD² with weighted held-out scenes; NaN with fewer than two scenes."""
         pairs_weight = weight.sum() ** 2 - (weight**2).sum()
         if not pairs_weight > 0:
             return float("nan")
@@ -204,6 +208,7 @@ def marginal_error(held_out: Float[NDArray, "scenes V"], drawn: Float[NDArray, "
     p = drawn.mean(0)
 
     def error(weight: Float[NDArray, " scenes"]) -> float:
+        """Return the marginal error with weighted held-out scenes; NaN without a class."""
         count = weight @ held_out  # total weight of the held-out scenes with each class
         if not count.sum() > 0:
             return float("nan")
@@ -227,6 +232,7 @@ def pair_correlation(
     def covariances(
         v: Float[NDArray, "scenes common"], weight: Float[NDArray, " scenes"]
     ) -> Float[NDArray, " pairs"]:
+        """Return the weighted covariance of each pair of common classes."""
         total = weight.sum()
         mean = weight @ v / total
         return ((v.T * weight) @ v / total - np.outer(mean, mean))[pairs]
@@ -235,6 +241,7 @@ def pair_correlation(
     held_out_common = held_out[:, common]
 
     def correlation(weight: Float[NDArray, " scenes"]) -> float:
+        """Return the correlation of both covariances; NaN if it is undefined."""
         if not weight.sum() > 0:
             return float("nan")
         of_held_out = covariances(held_out_common, weight)

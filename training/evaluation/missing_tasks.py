@@ -136,7 +136,7 @@ def leave_one_out_at(
 
 
 def placed_task(score: PlacedScore, setting: Setting) -> Outcome | None:
-    """Measure T2-at."""
+    """Measure T2-at: the MRR of removed classes at their places, also by relation."""
     scenes, structure = setting.some(related=True, share=3), setting.structure
     ranking, relation = leave_one_out_at(scenes, structure, score, seed=setting.seed)
     if not len(relation):

@@ -124,6 +124,7 @@ def suspicion_of(
     """
 
     def suspicion(v: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
+        """Score each listed class given the other classes of its list."""
         row, listed = (v > 0).nonzero(as_tuple=True)
         values = torch.full(v.shape, -torch.inf)
         if len(row):

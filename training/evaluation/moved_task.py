@@ -112,7 +112,7 @@ def flagged(
 
 
 def moved_task(score: MisplacedScore, setting: Setting) -> Outcome | None:
-    """Measure T3c."""
+    """Measure T3c: the shares of moved objects that are named first, and flagged."""
     scenes = some_scenes(setting.some(related=True), _SCENES, setting.seed)
     cases = moved_cases(scenes, setting.structure, setting.seed)
     if not cases:

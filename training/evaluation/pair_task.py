@@ -86,6 +86,7 @@ def service_score(artifact: Artifact) -> PairScore:
     """Return a score: probabilities of `/relations` between the first instances of both classes."""
 
     def score(question: ScenePairs) -> Float[NDArray, "P 2*A"]:
+        """Ask the service about the first instances of the classes of each pair."""
         scene, classes = question.scene, question.scene.evidence.classes
         first = np.array([np.flatnonzero(scene.instance_classes == c)[0] for c in classes])
         pairs = first[question.pairs]
@@ -96,7 +97,7 @@ def service_score(artifact: Artifact) -> PairScore:
 
 
 def baseline_log_odds(scenes: SceneTensors, relations: RelationScore) -> PairScore:
-    """Return the log-odds of a score of relations between classes, in place of probabilities."""
+    """Return a score: the log-odds of a relation score between the two classes of a pair."""
 
     @torch.no_grad()
     def score(question: ScenePairs) -> Float[NDArray, "P 2*A"]:

@@ -132,6 +132,7 @@ def complete_scenes(
     """Score the T1b candidates of scenes with at least two triples, given half of the triples."""
 
     def ask(batch: Batch, index: list[int]) -> tuple[Tensor, Tensor]:
+        """Score the triples that neither the given half nor its mirror image contains."""
         mask = scorable(batch, structure)
         given = random_half((batch.holds > 0) & mask, scenes, index, seed)
         # With a single triple the observed half is empty: the scene is left out.
@@ -188,7 +189,7 @@ def expected_hits(score: Float[NDArray, " k"], truth: Bool[NDArray, " k"], count
     return float(truth[is_above].sum() + share * truth[is_tied].sum())
 
 
-def alter(
+def draw_false_triple(
     holds: Bool[NDArray, "A n n"], usable: Bool[NDArray, "A n n"], rng: Rng
 ) -> tuple[Triple, Triple] | None:
     """Draw a true triple (relation, subject, object) of a scene and a false replacement.
@@ -231,7 +232,7 @@ def false_hits(
         observed, is_false = torch.zeros_like(truth), torch.zeros_like(truth)
         for row, k in enumerate(index):
             rng = scene_rng(scenes.scenes[k], seed)
-            if case := alter(batch.holds[row].numpy() > 0, mask[row].numpy(), rng):
+            if case := draw_false_triple(batch.holds[row].numpy() > 0, mask[row].numpy(), rng):
                 true_triple, false_triple = case
                 observed[row] = truth[row]
                 observed[row][true_triple] = False
@@ -249,7 +250,7 @@ def false_hits(
 
 
 def relations_task(score: RelationScore, setting: Setting) -> Outcome | None:
-    """Measure T1a."""
+    """Measure T1a: R-precision of the relations of a scene, given its classes."""
     scenes, structure = setting.scenes, setting.structure
     with_counts = score_scenes(scenes, structure, score)
     uncounted = score_scenes(scenes, structure, score, counts=False)
@@ -266,7 +267,7 @@ def relations_task(score: RelationScore, setting: Setting) -> Outcome | None:
 
 
 def completion_task(score: RelationScore, setting: Setting) -> Outcome | None:
-    """Measure T1b."""
+    """Measure T1b: R-precision of half of the relations, given the other half."""
     scenes = setting.scenes
     candidates = complete_scenes(scenes, setting.structure, score, seed=setting.seed)
     ranking = r_precision(candidates, len(scenes))
@@ -296,7 +297,7 @@ def _details(scored: list[Candidates], setting: Setting) -> dict[str, Metric]:
 
 
 def placement_task(score: RelationScore, setting: Setting) -> Outcome | None:
-    """Measure T3b."""
+    """Measure T3b: the share of scenes whose false triple is the least likely one."""
     scenes = setting.some(related=True)
     hits = false_hits(scenes, setting.structure, score, seed=setting.seed)
     return None if hits is None else Outcome.over(scenes, {"hit@1": hits}, hits.skipped)

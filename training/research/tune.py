@@ -198,6 +198,7 @@ class Search:
         scores: dict[str, float] = {}
 
         def report(point: CurvePoint) -> None:
+            """Report the sum of the latest scores, and stop a trial below the median."""
             scores[SCORES[point.phase]] = point.score
             step = round(100 * point.done) + 100 * (point.phase == "relations")
             trial.report(float(np.nansum(list(scores.values()))), step)

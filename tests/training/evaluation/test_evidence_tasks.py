@@ -8,7 +8,7 @@ from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, roo
 from tests.training.evaluation.scenes import scene, tensors
 from training.evaluation import evidence_tasks as evidence
 from training.evaluation.evidence_tasks import (
-    halves,
+    evidence_cases,
     missing_evidence_task,
     relations_evidence_task,
 )
@@ -21,7 +21,7 @@ TASKS = {"MRR": missing_evidence_task, "R-precision": relations_evidence_task}
 
 @pytest.mark.parametrize("kind", ["relations", "poses"])
 def test_evidence_contains_no_queried_relation(kind):
-    cases = list(halves(DATA, PLAIN, kind))
+    cases = list(evidence_cases(DATA, PLAIN, kind))
     assert cases
     for case in cases:
         for a, i, j in case.scene.relations:

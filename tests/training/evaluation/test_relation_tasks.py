@@ -23,8 +23,8 @@ from training.datasets import AnnotatedObject, AnnotatedScene, encode
 from training.datasets.batches import seen_triples
 from training.evaluation.artifact_model import score_relations
 from training.evaluation.relation_tasks import (
-    alter,
     complete_scenes,
+    draw_false_triple,
     expected_hits,
     false_hits,
     r_precision,
@@ -190,10 +190,10 @@ def test_one_triple_is_replaced_by_a_false_one():
 def test_without_a_false_triple_there_is_no_case():
     rng = np.random.default_rng(0)
     holds, off = np.ones((1, 2, 2), np.bool_), ~np.eye(2, dtype=np.bool_)
-    assert alter(holds & off, np.broadcast_to(off, holds.shape), rng) is None
+    assert draw_false_triple(holds & off, np.broadcast_to(off, holds.shape), rng) is None
     one = np.zeros((1, 2, 2), np.bool_)
     one[0, 0, 1] = True
-    assert alter(one, np.broadcast_to(off, one.shape), rng) is None
+    assert draw_false_triple(one, np.broadcast_to(off, one.shape), rng) is None
     data = tensors([scene([0, 1], [(0, 0, 1)]), scene([0, 1], [(0, 0, 1), (1, 0, 1)])])
     hits = false_hits(data, NO_STRUCTURE, flat)
     assert (hits.numerators.tolist(), hits.skipped) == ([0, 1 / 2], 1)

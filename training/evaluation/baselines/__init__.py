@@ -24,5 +24,5 @@ PLACED: Final = Baseline("frequency table p(i | a, j)", triples.placed_table, AT
 
 def placed_product(name: str, objects: Model, table: Model) -> Baseline:
     """Return the baseline of T2-at that multiplies a score of missing objects by `PLACED`."""
-    propose = triples.times(objects.missing, table.at_place)
+    propose = triples.propose_products(objects.missing, table.at_place)
     return Baseline(f"{PLACED.name} × {name}", propose, AT_PLACE)

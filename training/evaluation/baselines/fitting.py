@@ -82,7 +82,7 @@ def halving(
 
 
 def missing_mrr(scenes: SceneTensors, structure: Structure, score: ObjectScore) -> float:
-    """Return the `validation_score` of missing objects. Without such, raise a ValueError."""
+    """Return the `validation_score` of missing objects; a ValueError if none can be hidden."""
     value = validation_score(lambda v, _: score(v), scenes, structure)
     if math.isnan(value):
         raise ValueError("no scene has two classes, so no class can be hidden")

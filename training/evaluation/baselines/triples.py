@@ -72,6 +72,7 @@ def table_score(log_odds: Float[Tensor, "A V V"], multiplicity: float = 0.0) -> 
     """
 
     def score(batch: Batch) -> Float[Tensor, "B A n n"]:
+        """Look up the log-odds of the classes of a batch, and add the weighted counts."""
         index = batch.classes.clamp(min=0)
         values = log_odds[:, index[:, :, None], index[:, None, :]].movedim(0, 1)
         if multiplicity:
@@ -163,7 +164,7 @@ def placed_table(train: SceneTensors, structure: Structure, _seed: int) -> Propo
         yield {"place": place, "relation": relation}, place_score(log_p)
 
 
-def times(
+def propose_products(
     objects: ObjectScore | None, table: PlacedScore | None
 ) -> Callable[[SceneTensors, Tensor, int], Proposals[PlacedScore]]:
     """Return a generator function for objects(v) + weight · table - correction · log popularity.
@@ -177,7 +178,11 @@ def times(
     def product_score(
         weight: float, correction: float, log_popularity: Float[Tensor, " V"]
     ) -> PlacedScore:
-        # Both factors depend on the class frequency. The last term corrects for this.
+        """Return the score of one weight and one correction for the class frequency.
+
+        Both factors depend on the class frequency.
+        """
+
         def score(places: Places) -> Float[Tensor, "B V"]:
             added = weight * table(places) - correction * log_popularity
             return objects(places.v) + added

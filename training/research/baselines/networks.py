@@ -163,6 +163,7 @@ def autoencoder(train: SceneTensors, structure: Structure, seed: int) -> Proposa
     lists = dict(training_lists(train, structure))
 
     def fit(setting: dict[str, Any], share: float) -> Iterator[tuple[Parameters, ObjectScore]]:
+        """Train one setting for a share of the steps."""
         chosen, options = lists[setting["scenes"]], setting.copy()
         options.pop("scenes")
         sizes = {name: options.pop(name) for name in ("width", "dropout")}

@@ -72,6 +72,7 @@ def nearest_score(lists: Lists, *, neighbours: int, sharpness: float) -> ObjectS
     index = normalize(lists.v, dim=1).T.contiguous()
 
     def score(query: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
+        """Let the nearest scenes of each list vote for their classes."""
         cosine = normalize(query, dim=1) @ index
         similarity, neighbour = cosine.topk(min(neighbours, len(v)), dim=1)
         # The vote of a training scene without a class of the query is 0.
@@ -130,6 +131,7 @@ def fit_pairwise(
         return (half + half.T) * (1.0 - torch.eye(V))
 
     def loss() -> Float[Tensor, ""]:
+        """Compute the penalised loss and its gradients."""
         optimiser.zero_grad()
         W = symmetric()
         logits = bias + torch.sparse.mm(sparse, W) + (unlabelled @ W)[pattern]

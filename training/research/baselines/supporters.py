@@ -43,6 +43,7 @@ def supporter_score(
     """
 
     def score(scene: Scene) -> list[dict[str, Any]]:
+        """Return an entry for each object with its least suspicious supporter."""
         entries = [
             {"subject": name, "moved": name, "probability": float(expit(values.min()))}
             for index, object_class, supporters in _supporters(scene, structure)
