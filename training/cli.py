@@ -31,6 +31,7 @@ from training.fit.trainer import Trainer
 from training.research.ablate import ablate
 from training.research.benchmark import benchmark
 from training.research.tune import tune
+from training.research.words import words
 from training.runs.config_files import data_folder, load_config, with_settings
 from training.runs.example_scenes import known_examples, read_examples
 from training.runs.folder import FinishedRun, RunError, load_run, save_run
@@ -49,6 +50,7 @@ app.command()(tune)
 app.command(name="compare")(compare_command)
 app.command()(benchmark)
 app.command()(ablate)
+app.command()(words)
 app.command(name="evaluate")(evaluate_command)
 app.command(name="seed")(seed_command)
 console = Console()

@@ -1,0 +1,77 @@
+"""`python -m training words` on a small model."""
+
+import numpy as np
+import pytest
+
+from app.registry.meaning import RowMap
+from app.scene import ObjectClass, Vocabulary
+from tests.questions.artifacts import LABELS, larger_artifact
+from training.fit.configuration import ConfigError
+from training.research.words import (
+    EVIDENCE,
+    METHODS,
+    Lists,
+    log_odds,
+    measure,
+    read_parts,
+    summary,
+    vectors_of,
+)
+
+SHOWN = ((0, 1), (0, 2, 3), (4,), (1, 5), (0, 6), (2, 4, 7))
+HIDDEN = ((2, 3), (4,), (0, 5), (0, 2), (4, 7), (1,))
+
+
+@pytest.fixture
+def lists() -> Lists:
+    masks = np.zeros((2, len(SHOWN), len(LABELS)), np.bool_)
+    for mask, parts in zip(masks, (HIDDEN, SHOWN), strict=True):
+        for row, classes in enumerate(parts):
+            mask[row, list(classes)] = True
+    return Lists([np.array(one) for one in SHOWN], *masks)
+
+
+def test_auc_and_mrr_count_pairs_and_ranks(lists: Lists) -> None:
+    scores = np.random.default_rng(0).normal(size=(len(SHOWN), len(LABELS))).round(1)
+    (auc,) = lists.auc(scores[:, 4:5], np.array([4]))
+    hides = [row for row, classes in enumerate(HIDDEN) if 4 in classes]
+    others = [row for row in range(6) if row not in hides and 4 not in SHOWN[row]]
+    pairs = [(scores[a, 4], scores[b, 4]) for a in hides for b in others]
+    assert auc == pytest.approx(np.mean([(a > b) + (a == b) / 2 for a, b in pairs]))
+    ranks = []
+    for row in (0, 3):
+        rivals = [k for k in range(8) if k not in (*HIDDEN[row], *SHOWN[row])]
+        ranks += [
+            1 / (1 + sum(scores[row, k] > scores[row, t] for k in rivals)) for t in HIDDEN[row]
+        ]
+    rows, things = np.array([0, 3]), np.arange(8)
+    assert lists.mrr(scores[rows][:, :8], rows, things) == pytest.approx(np.mean(ranks))
+    assert np.isnan(lists.mrr(scores[:0], rows[:0], things))
+
+
+def test_left_out_classes_are_read_as_words(lists: Lists) -> None:
+    """Whether the model knows them or not, the map never sees their rows."""
+    artifact, left_out = larger_artifact("triway"), np.array([4, 0])
+    vectors = vectors_of(artifact.vocabulary, left_out, aliases=False)
+    auc, mrr = measure(artifact, artifact, lists, left_out, vectors)
+    assert {*auc} == {*METHODS}
+    assert {*mrr} == {*EVIDENCE}
+    words = [artifact.vocabulary.meaning("sofa"), artifact.vocabulary.meaning("bed")]
+    row_map = RowMap.fit(artifact.weights, artifact.vocabulary, left_out)
+    larger = row_map.with_words(artifact.weights, words)
+    expected = lists.auc(log_odds(larger, lists.listed, np.array([9, 10])), left_out)
+    assert auc["predicted"] == pytest.approx(expected.tolist())
+    trained = lists.auc(log_odds(artifact.weights, lists.listed, left_out), left_out)
+    assert auc["trained"] == pytest.approx(trained.tolist())
+    text = "\n".join(summary("AUC", auc))
+    assert f"{np.mean(auc['predicted']):.3f}" in text
+
+
+def test_a_table_of_parts_names_classes_of_the_model(tmp_path) -> None:
+    path = tmp_path / "parts.csv"
+    path.write_text("part,label\n1,sofa\n2,bed\n1,lamp\n", encoding="utf-8")
+    vocabulary = Vocabulary([ObjectClass(label) for label in LABELS])
+    assert [part.tolist() for part in read_parts(path, vocabulary)] == [[4, 1], [0]]
+    path.write_text("part,label\n1,submarine\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match="no class 'submarine'"):
+        read_parts(path, vocabulary)
