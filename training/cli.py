@@ -30,7 +30,6 @@ from training.fit.configuration import Config, ConfigError
 from training.fit.trainer import Trainer
 from training.research.ablate import ablate
 from training.research.benchmark import benchmark
-from training.research.homes import homes
 from training.research.tune import tune
 from training.research.words import words
 from training.runs.config_files import data_folder, load_config, with_settings
@@ -51,7 +50,6 @@ app.command()(tune)
 app.command(name="compare")(compare_command)
 app.command()(benchmark)
 app.command()(ablate)
-app.command()(homes)
 app.command()(words)
 app.command(name="evaluate")(evaluate_command)
 app.command(name="seed")(seed_command)

@@ -1,7 +1,7 @@
 """Evaluation tasks for models. Each module measures one task and documents its protocol.
 
-`structure` is always a mask of structure classes such as walls, (V,) bool. They are evidence, but
-never questions. `v` is the presence of classes in scenes, (scenes, V).
+In signatures, V, A and C are the numbers of classes, relations and room types, and n is the largest
+number of classes of a scene. `v` is the presence of classes.
 """
 
 from __future__ import annotations

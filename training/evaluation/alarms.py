@@ -18,13 +18,15 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
+from jaxtyping import Bool
+from numpy.typing import NDArray
 from scipy.special import betaincinv
 
 from app import questions
 from app.registry import Artifact, Sensitivity
 from app.scene import Scene
 from training.datasets import EncodedScene
-from training.datasets.array_types import Flags, Rng
+from training.datasets.array_types import Rng
 from training.datasets.cases import draw_true_relations, scene_of
 from training.evaluation.asking import thing_instances
 from training.evaluation.parts import LONGEST
@@ -92,7 +94,7 @@ def untouched_alarms(artifact: Artifact, scenes: Sequence[EncodedScene]) -> Iter
             yield Alarms(source, about, sensitivity, len(flags), sum(flags))
 
 
-def _random_part(encoded: EncodedScene, structure: Flags, rng: Rng) -> Scene:
+def _random_part(encoded: EncodedScene, structure: Bool[NDArray, " V"], rng: Rng) -> Scene:
     """Return the instances of two to `LONGEST` random classes, with their relations."""
     classes = encoded.evidence.classes
     order = rng.permutation(classes[~structure[classes]])

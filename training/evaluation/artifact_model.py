@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from app.questions.misplaced import wrong_relations
@@ -17,8 +18,8 @@ from training.datasets.batches import Batch
 from training.evaluation.asking import (
     flag_outliers,
     instances_of,
-    log_of,
-    missing_probabilities,
+    missing_log_p,
+    missing_log_p_at,
     score_misplaced,
     score_missing,
     score_rooms,
@@ -55,8 +56,8 @@ def artifact_model(artifact: Artifact, *, profiles: Sequence[str] = ()) -> Model
     )
 
 
-def score_relations(artifact: Artifact, batch: Batch, *, given: bool) -> Tensor:
-    """Return the log-odds of each relation between two present classes, (B, A, n, n).
+def score_relations(artifact: Artifact, batch: Batch, *, given: bool) -> Float[Tensor, "B A n n"]:
+    """Return the log-odds of each relation between two present classes.
 
     With `given`, the other observed relations that hold are evidence. The log-odds of a relation
     never use the observed value of this relation.
@@ -69,16 +70,16 @@ def score_relations(artifact: Artifact, batch: Batch, *, given: bool) -> Tensor:
     return log_odds
 
 
-def score_false_relations(artifact: Artifact, batch: Batch) -> Tensor:
-    """Return the log-odds that observed relations hold, (B, A, n, n); others are -inf.
+def score_false_relations(artifact: Artifact, batch: Batch) -> Float[Tensor, "B A n n"]:
+    """Return the log-odds that observed relations hold; others are -inf.
 
     `/outliers` ranks the observed relations by these log-odds.
     """
     log_odds = torch.full(batch.holds.shape, -torch.inf)
     for row, (scene, triples) in enumerate(_scenes(batch)):
         wrong = wrong_relations(artifact, scene)
-        for pair, stated in triples.items():
-            log_odds[(row, *pair)] = -wrong.get(stated, 0.0)
+        for triple, of_instances in triples.items():
+            log_odds[(row, *triple)] = -wrong.get(of_instances, 0.0)
     return log_odds
 
 
@@ -103,24 +104,22 @@ def _scenes(batch: Batch, given: bool = True) -> Iterator[tuple[Scene, dict[Trip
         yield Scene(scene.objects, tuple(triples.values()) or None), triples
 
 
-def score_placed(artifact: Artifact, places: Places) -> Tensor:
-    """Return the log-probability of each class at B places by `/missing`, (B, V).
-
-    The value is -inf for classes it cannot propose.
-    """
-    rows = []
+def score_placed(artifact: Artifact, places: Places) -> Float[Tensor, "B V"]:
+    """Return the log-probability of `/missing` for each class at B places; else -inf."""
+    log_p = torch.empty_like(places.v)
     for row, v in enumerate(places.v):
         classes = v.nonzero().squeeze(1)
         scene, first = instances_of(classes, places.counts[row, classes])
+        if places.relation[row] >= artifact.spec.A:
+            # A model without this relation cannot use the place.
+            log_p[row] = torch.from_numpy(missing_log_p(artifact, scene))
+            continue
         relation = CANONICAL[int(places.relation[row])]
-        anchor = int(first[int((classes == places.anchor[row]).nonzero())])
         # The request names the relation from the missing object to the anchor.
         name = relation if places.outgoing[row] else OPPOSITES[relation]
-        # A model without this relation cannot use the place.
-        at = (name, anchor) if places.relation[row] < artifact.spec.A else None
-        p = missing_probabilities(artifact, scene, at=at)
-        rows.append(log_of(p).masked_fill(torch.from_numpy(p < 0), -torch.inf))
-    return torch.stack(rows).to(places.v.dtype)
+        anchor = int(first[classes == places.anchor[row]])
+        log_p[row] = torch.from_numpy(missing_log_p_at(artifact, scene, name, anchor))
+    return log_p
 
 
 def floor_model() -> Model:

@@ -13,13 +13,16 @@ from typing import Any, TypeVar, get_args
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
 from app import questions
+from app.inference.elementary import log_softmax
+from app.questions.posterior import Posterior, calibrated_missing
 from app.registry import Artifact, Sensitivity
 from app.scene import CANONICAL, Scene, SceneObject, canonicalise, observe
 from training.datasets import EncodedScene
-from training.datasets.array_types import Flags, Floats
 from training.datasets.cases import scene_of
 
 Case = TypeVar("Case")
@@ -28,6 +31,7 @@ SENSITIVITIES: tuple[Sensitivity, ...] = get_args(Sensitivity)
 """Sensitivities of the outlier alarm; "medium" is the default."""
 
 _PROBED_CASES, _PROBED_ROWS = 32, 64
+_LEAST_P = np.finfo(np.float64).tiny
 _LEAK = "the answer for a scene depends on the order of the queries: the score leaks information"
 
 
@@ -35,7 +39,7 @@ class LeakError(ValueError):
     """A score uses information that is not part of the question."""
 
 
-def ask_every(ask: Callable[[Case], Floats], cases: Sequence[Case]) -> list[Floats]:
+def ask_every(ask: Callable[[Case], NDArray[Any]], cases: Sequence[Case]) -> list[NDArray[Any]]:
     """Return the answers to all cases, in the order of the cases.
 
     Raises:
@@ -52,21 +56,19 @@ def ask_every(ask: Callable[[Case], Floats], cases: Sequence[Case]) -> list[Floa
 
 
 @torch.no_grad()
-def ask_rows(score: Callable[..., Tensor], *columns: Tensor, block: int = 256) -> Tensor:
-    """Return the scores (N, ...) of N cases, computed in blocks of the rows of each column.
+def ask_rows(
+    score: Callable[..., Tensor], *columns: Tensor, block: int = 256
+) -> Float[Tensor, N * scores]:
+    """Return the scores of N cases, computed in blocks of the rows of each column.
 
     Raises:
         LeakError: a case gets another score when it is queried in another block.
     """
     count = len(columns[0])
-    blocks = [
-        score(*(column[index] for column in columns))
-        for index in torch.arange(count).split(block)
-        if len(index)
-    ]
-    if not blocks:
+    if not count:
         return torch.zeros_like(columns[0])
-    scores = torch.cat(blocks)
+    blocks = torch.arange(count).split(block)
+    scores = torch.cat([score(*(column[index] for column in columns)) for index in blocks])
     probed = torch.from_numpy(np.random.default_rng(0).permutation(count)[:_PROBED_ROWS])
     again = score(*(column[probed] for column in columns))
     if not torch.allclose(again, scores[probed], rtol=1e-3, atol=1e-3, equal_nan=True):
@@ -81,12 +83,11 @@ def labels_alone(encoded: EncodedScene, kept: Sequence[int] | None = None) -> Sc
 
 
 def thing_instances(
-    encoded: EncodedScene, structure: Flags, hidden: Collection[int] = ()
+    encoded: EncodedScene, structure: Bool[NDArray, " V"], hidden: Collection[int] = ()
 ) -> list[int]:
     """Return the instances without structure, such as walls, and without hidden classes."""
     classes = encoded.instance_classes
-    is_kept = ~structure[classes] & ~np.isin(classes, list(hidden))
-    return np.flatnonzero(is_kept).tolist()
+    return np.flatnonzero(~structure[classes] & ~np.isin(classes, list(hidden))).tolist()
 
 
 def of_classes(classes: Sequence[int]) -> Scene:
@@ -94,7 +95,9 @@ def of_classes(classes: Sequence[int]) -> Scene:
     return Scene(tuple(SceneObject(str(k), str(c), c) for k, c in enumerate(classes)))
 
 
-def instances_of(classes: Tensor, counts: Tensor) -> tuple[Scene, Tensor]:
+def instances_of(
+    classes: Int[Tensor, " n"], counts: Float[Tensor, " n"] | Int[Tensor, " n"]
+) -> tuple[Scene, Int[Tensor, " n"]]:
     """Return a scene with `counts` objects of each class, and the first object index per class."""
     copies = counts.clamp(min=1).long()
     return of_classes(classes.repeat_interleave(copies).tolist()), copies.cumsum(0) - copies
@@ -114,34 +117,48 @@ def index_of_ids(scene: Scene) -> dict[str, int]:
 def canonical_triple(index: Mapping[str, int], entry: Mapping[str, Any]) -> tuple[int, int, int]:
     """Return (canonical relation, subject, object) of a relation in an answer about a scene.
 
-    `index`: see `index_of_ids`.
+    `index` is the object index by id, as from `index_of_ids`.
     """
     return canonicalise(index[entry["subject"]], entry["relation"], index[entry["object"]])
 
 
-def missing_probabilities(
-    artifact: Artifact, scene: Scene, at: tuple[str, int] | None = None
-) -> Floats:
-    """Return the probability that each class is missing, (V,).
+def missing_log_p(artifact: Artifact, scene: Scene) -> Float[NDArray, " V"]:
+    """Return the log-probability of `/missing` that each class is missing; else -inf.
 
-    The value is -inf for classes that `/missing` cannot propose. All classes are candidates, so a
-    class has a value beside a likelier one of its family.
-
-    Args:
-        at: place of the missing object: its relation to the object with an index.
+    All classes are candidates, so a class has a value beside a likelier one of its family.
     """
-    p = np.full(len(artifact.vocabulary), -np.inf)
-    every = range(len(p))
+    posterior, vocabulary = Posterior(artifact, scene), artifact.vocabulary
+    listed, calibration = posterior.present.classes, artifact.calibration
+    raw = posterior.absent_log_odds(np.arange(len(vocabulary)), calibration.coverage)
+    log_odds = calibrated_missing(calibration, raw.astype(np.float64), posterior.listed, None)
+    log_p = -np.logaddexp(0.0, -log_odds)
+    log_p[vocabulary.structure | vocabulary.broader[listed].any(0)] = -np.inf
+    log_p[listed] = -np.inf
+    return log_p
+
+
+def missing_log_p_at(
+    artifact: Artifact, scene: Scene, relation: str, anchor: int
+) -> Float[NDArray, " V"]:
+    """Return the log-probability of `/missing` that each class is missing at a place; else -inf.
+
+    The missing object has the relation to the object with the index `anchor`.
+    """
+    vocabulary, place = artifact.vocabulary, (relation, anchor)
+    every = range(len(vocabulary))
     answer = questions.missing(
-        artifact, scene, top_k=len(p), candidates=every, at=at, details=False
+        artifact, scene, top_k=len(every), candidates=every, at=place, details=False
     )
+    log_p = np.full(len(every), -np.inf)
     for entry in answer["missing"]:
-        p[artifact.vocabulary.index(entry["label"])] = entry["probability"]
-    return p
+        log_p[vocabulary.index(entry["label"])] = np.log(max(entry["probability"], _LEAST_P))
+    return log_p
 
 
-def judge(artifact: Artifact, scene: Scene, sensitivity: Sensitivity = "medium") -> Floats:
-    """Return the answers of `/outliers` about the n objects of a scene, (n, 2).
+def judge(
+    artifact: Artifact, scene: Scene, sensitivity: Sensitivity = "medium"
+) -> Float[NDArray, "objects 2"]:
+    """Return the answers of `/outliers` about the objects of a scene.
 
     The columns are the probability that the object is an outlier, and 1 if the service reports the
     object as an outlier.
@@ -154,58 +171,50 @@ def judge(artifact: Artifact, scene: Scene, sensitivity: Sensitivity = "medium")
     return columns
 
 
-def log_of(p: Floats) -> Tensor:
-    """Return the log of probabilities; a finite value for 0 and for -inf."""
-    return torch.from_numpy(np.log(np.maximum(p, np.finfo(np.float64).tiny)))
-
-
-def score_missing(artifact: Artifact, v: Tensor, room: Tensor | None = None) -> Tensor:
-    """Return the log-probabilities of `/missing`, (B, V), for lists v (B, V).
-
-    `room` (B,) are the room types to state. None states no room type.
-    """
+def score_missing(
+    artifact: Artifact, v: Float[Tensor, "B V"], room: Int[Tensor, " B"] | None = None
+) -> Float[Tensor, "B V"]:
+    """Return the log-probabilities of `/missing` for lists, with the room types or without any."""
     types = [None] * len(v) if room is None else room.tolist()
     scenes = (replace(s, room_type=t) for s, t in zip(_scenes(v), types, strict=True))
-    return log_of(np.stack([missing_probabilities(artifact, scene) for scene in scenes]))
+    return torch.from_numpy(np.stack([missing_log_p(artifact, scene) for scene in scenes]))
 
 
-def score_rooms(artifact: Artifact, profiles: Sequence[str], v: Tensor, profile: str) -> Tensor:
-    """Return the log-probabilities of `/rooms`, (B, room types), for lists v (B, V).
+def score_rooms(
+    artifact: Artifact, profiles: Sequence[str], v: Float[Tensor, "B V"], profile: str
+) -> Float[Tensor, "B C"]:
+    """Return the log-probabilities of `/rooms` for lists.
 
     The requests name the profile if it is one of the `profiles` of the model.
     """
-    names = artifact.vocabulary.room_types
     index = profiles.index(profile) if profile in profiles else None
-    p = np.zeros((len(v), artifact.spec.C))
-    for row, scene in zip(p, _scenes(v), strict=True):
-        scene = replace(scene, profile=index)
-        answer = questions.rooms(artifact, scene, top_k=len(row), details=False)
-        for entry in answer["room_types"]:
-            row[names.index(entry["room_type"])] = entry["probability"]
-    return log_of(p)
+    log_p = np.zeros((len(v), artifact.spec.C))
+    for row, scene in zip(log_p, _scenes(v), strict=True):
+        posterior = Posterior(artifact, replace(scene, profile=index))
+        sharpness = artifact.calibration.rooms.of(posterior.listed)
+        row[:] = log_softmax(sharpness * posterior.room_log_p())
+    return torch.from_numpy(log_p)
 
 
-def score_suspicion(artifact: Artifact, v: Tensor) -> Tensor:
-    """Return the probabilities of `/outliers`, or -inf, (B, V), for lists v (B, V)."""
-    return _judged(artifact, v, 0, "medium", -torch.inf)
-
-
-def flag_outliers(artifact: Artifact, v: Tensor, sensitivity: Sensitivity) -> Tensor:
-    """Return the reported outliers, (B, V) bool, for lists v (B, V)."""
-    return _judged(artifact, v, 1, sensitivity, 0.0) > 0
-
-
-def _judged(
-    artifact: Artifact, v: Tensor, column: int, sensitivity: Sensitivity, unlisted: float
-) -> Tensor:
-    values = torch.full(v.shape, unlisted, dtype=torch.float64)
+def score_suspicion(artifact: Artifact, v: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
+    """Return the probabilities of `/outliers` for lists; -inf for unlisted classes."""
+    values = torch.full(v.shape, -torch.inf, dtype=torch.float64)
     for row, scene in enumerate(_scenes(v)):
-        answers = judge(artifact, scene, sensitivity)[:, column]
-        values[row, v[row] > 0] = torch.from_numpy(answers)
+        values[row, v[row] > 0] = torch.from_numpy(judge(artifact, scene)[:, 0])
     return values
 
 
-def _scenes(v: Tensor) -> Iterator[Scene]:
+def flag_outliers(
+    artifact: Artifact, v: Float[Tensor, "B V"], sensitivity: Sensitivity
+) -> Bool[Tensor, "B V"]:
+    """Return the listed classes that `/outliers` reports as outliers."""
+    flags = torch.zeros(v.shape, dtype=torch.bool)
+    for row, scene in enumerate(_scenes(v)):
+        flags[row, v[row] > 0] = torch.from_numpy(judge(artifact, scene, sensitivity)[:, 1] > 0)
+    return flags
+
+
+def _scenes(v: Float[Tensor, "B V"]) -> Iterator[Scene]:
     return (of_classes(row.nonzero().squeeze(1).tolist()) for row in v)
 
 
@@ -221,8 +230,8 @@ def score_misplaced(artifact: Artifact, scene: Scene) -> list[dict[str, Any]]:
 
 def relation_probabilities(
     artifact: Artifact, scene: Scene, pairs: Sequence[tuple[int, int]] | None = None
-) -> Floats:
-    """Return the probability of each canonical relation, (relations, objects, objects).
+) -> Float[NDArray, "A objects objects"]:
+    """Return the probability of each canonical relation.
 
     The value is 0 outside `pairs`, ordered pairs of object indices. None means all pairs.
     """

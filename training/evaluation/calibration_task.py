@@ -28,6 +28,8 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 
 from app.questions import misplaced, missing, outliers, relations
 from app.questions.placements import Place
@@ -42,7 +44,7 @@ from app.registry import (
 )
 from app.scene import CANONICAL, Scene, Vocabulary, canonicalise
 from training.datasets import EncodedScene
-from training.datasets.array_types import Flags, Floats, Ints, Rng
+from training.datasets.array_types import Rng
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import (
     altered_case,
@@ -77,23 +79,29 @@ from training.evaluation.setting import Outcome, Setting
 # With one per scene, chance alone gives a calibration error (ECE) of .02 to .03.
 _REMOVALS = 4
 _NO_ALARM = AlarmLine(intercept=1e3)
-# (probability, truth) of each answer about one scene.
-Answered = list[tuple[float, bool]]
-Ask = Callable[[Artifact, EncodedScene, Rng], Answered | None]
+Answers = list[tuple[float, bool]]
+"""Probability and truth value of each answer about one scene."""
+Ask = Callable[[Artifact, EncodedScene, Rng], Answers | None]
 
 
 @dataclass(frozen=True, eq=False)
 class Items:
-    """N scored items of some scenes, such as answers: scene, score and truth value, all (N,).
+    """N scored items of some scenes, such as answers.
 
     `skipped` is the number of scenes that could not be scored.
     """
 
-    scene: Ints
-    score: Floats
-    truth: Flags
+    scene: Int[NDArray, " N"]
+    score: Float[NDArray, " N"]
+    truth: Bool[NDArray, " N"]
     scenes: int
     skipped: int = 0
+
+    @classmethod
+    def of(cls, answers: list[tuple[int, float, bool]], scenes: int, skipped: int) -> Items:
+        """Return the items of answers with the index of their scene."""
+        index, probability, truth = np.array(answers, dtype=np.float64).reshape(-1, 3).T
+        return cls(index.astype(np.int64), probability, truth > 0, scenes, skipped)
 
     def metric(self, statistic: str) -> Scored:
         """Return one of `STATISTICS`."""
@@ -121,41 +129,38 @@ def uncalibrated(artifact: Artifact) -> Artifact:
 
 def collect(artifact: Artifact, scenes: SceneTensors, ask: Ask, seed: int = 0) -> Items:
     """Ask one of `QUESTIONS` about every scene, and collect the answers with their truth."""
-    answers: list[tuple[int, float, bool]] = []
-    skipped = 0
-    for k, scene in enumerate(scenes.scenes):
-        scene_answers = ask(artifact, scene, scene_rng(scene, seed))
-        skipped += scene_answers is None
-        answers += [(k, probability, truth) for probability, truth in scene_answers or ()]
-    return _items(answers, len(scenes), skipped)
-
-
-def _items(answers: list[tuple[int, float, bool]], scenes: int, skipped: int) -> Items:
-    index, probability, truth = np.array(answers, dtype=np.float64).reshape(-1, 3).T
-    return Items(index.astype(np.int64), probability, truth > 0, scenes, skipped)
+    answers = [ask(artifact, scene, scene_rng(scene, seed)) for scene in scenes.scenes]
+    items = [(k, *answer) for k, of_scene in enumerate(answers) for answer in of_scene or ()]
+    return Items.of(items, len(scenes), answers.count(None))
 
 
 def ask_relations(
     artifact: Artifact,
     encoded: EncodedScene,
     rng: Rng,  # noqa: ARG001
-) -> Answered | None:
+) -> Answers | None:
     """Ask for all relations of a scene. The request contains only the labels of the objects."""
-    is_known = annotated_relations(encoded)
-    return _answers_on(artifact, encoded, labels_alone(encoded), is_known) or None
+    mask = annotated_relations(encoded)
+    return _answers_on(artifact, encoded, labels_alone(encoded), mask) or None
 
 
-def ask_given(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
+def ask_given(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answers | None:
     """Ask for the relations of half of the pairs. The relations of the other half are evidence."""
-    is_asked, evidence = observed_pairs(encoded, artifact.vocabulary.structure, rng)
+    is_queried, evidence = observed_pairs(encoded, artifact.vocabulary.structure, rng)
     if not evidence:
         return None
-    scene = replace(scene_of(encoded, range(len(is_asked)), evidence), room_type=None)
-    return _answers_on(artifact, encoded, scene, annotated_relations(encoded) & is_asked) or None
+    scene = replace(scene_of(encoded, range(len(is_queried)), evidence), room_type=None)
+    mask = annotated_relations(encoded) & is_queried
+    return _answers_on(artifact, encoded, scene, mask) or None
 
 
-def _answers_on(artifact: Artifact, encoded: EncodedScene, scene: Scene, mask: Flags) -> Answered:
-    """Return the answers about the relations in `mask`, (relations, objects, objects) bool."""
+def _answers_on(
+    artifact: Artifact,
+    encoded: EncodedScene,
+    scene: Scene,
+    mask: Bool[NDArray, "A objects objects"],
+) -> Answers:
+    """Return the answers about the relations in the mask."""
     index = index_of_ids(scene)
     answers = [
         (entry["probability"], canonical_triple(index, entry))
@@ -164,11 +169,11 @@ def _answers_on(artifact: Artifact, encoded: EncodedScene, scene: Scene, mask: F
     return [(p, bool(encoded.instance_holds[triple])) for p, triple in answers if mask[triple]]
 
 
-def ask_placements(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
+def ask_placements(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answers | None:
     """Ask where an instance of a removed class belongs, for up to `_REMOVALS` removals."""
-    is_known = annotated_relations(encoded)
-    answers: Answered = []
-    for _ in range(_REMOVALS if is_known.any() else 0):
+    is_annotated = annotated_relations(encoded)
+    answers: Answers = []
+    for _ in range(_REMOVALS if is_annotated.any() else 0):
         removal = removed_class(encoded, artifact.vocabulary.structure, rng)
         if removal is None:
             continue
@@ -179,7 +184,7 @@ def ask_placements(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answe
         for entry in missing(artifact, scene, candidates=[target])["missing"]:
             for place in entry["placements"]:
                 triple = canonicalise(removed, place["relation"], kept[index[place["object"]]])
-                if is_known[triple]:
+                if is_annotated[triple]:
                     answers.append((place["probability"], bool(encoded.instance_holds[triple])))
     return answers or None
 
@@ -194,40 +199,40 @@ def collect_missing(
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
     parts = draw_parts(scenes, structure, size, (seed,))
     able = scenes.annotated_classes[scenes.source[parts.scene]].numpy()
-    columns: list[tuple[int, float, bool]] = []
+    items: list[tuple[int, float, bool]] = []
     for row, (k, v) in enumerate(zip(parts.scene.tolist(), parts.v, strict=True)):
-        scene, hidden = of_classes(v.nonzero().squeeze(1).tolist()), int(parts.hidden[row].sum())
-        share = 1.0 if hidden == 1 else float(v.sum()) / (float(v.sum()) + hidden)
-        answer = missing(artifact, scene, coverage=share if stated else None, details=False)
+        listed, hidden = v.nonzero().squeeze(1).tolist(), int(parts.hidden[row].sum())
+        share = 1.0 if hidden == 1 else len(listed) / (len(listed) + hidden)
+        coverage = share if stated else None
+        answer = missing(artifact, of_classes(listed), coverage=coverage, details=False)
         for entry in answer["missing"]:
             index = artifact.vocabulary.index(entry["label"])
             if able[row, index]:
-                columns.append((k, entry["probability"], bool(parts.hidden[row, index])))
-    return _items(columns, len(scenes), parts.skipped)
+                items.append((k, entry["probability"], bool(parts.hidden[row, index])))
+    return Items.of(items, len(scenes), parts.skipped)
 
 
 class PlaceQuestion(NamedTuple):
     """A question about the hidden classes at a place of a scene.
 
     Attributes:
-        placed: (V,) bool, the hidden classes at the place.
-        usable: (V,) bool, the classes that may be asked: neither structure, nor listed, nor hidden
-            with an unknown relation to the anchor.
+        placed: the hidden classes at the place.
+        usable: the classes that may be queried: neither structure, nor listed, nor hidden with an
+            unknown relation to the anchor.
     """
 
     scene: Scene
     place: Place
-    placed: Flags
-    usable: Flags
+    placed: Bool[NDArray, " V"]
+    usable: Bool[NDArray, " V"]
 
 
 def place_question(
     vocabulary: Vocabulary, encoded: EncodedScene, rng: Rng, relations: Collection[int]
 ) -> PlaceQuestion | None:
     """Draw a part of a scene and a place at one of its objects; None if there is none."""
-    structure = vocabulary.structure
-    classes = encoded.evidence.classes
-    order: Ints = rng.permutation(classes[~structure[classes]])
+    structure, classes = vocabulary.structure, encoded.evidence.classes
+    order = rng.permutation(classes[~structure[classes]])
     listed = up_to_longest(len(order), rng) if encoded.complete else 0
     if not listed:
         return None
@@ -248,25 +253,24 @@ def place_question(
     return PlaceQuestion(labels_alone(encoded, kept), at, placed, usable)
 
 
-def ask_placed(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
+def ask_placed(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answers | None:
     """Ask for the hidden classes at one place, without those of an unknown relation."""
     question = place_question(artifact.vocabulary, encoded, rng, range(artifact.spec.A))
     if question is None:
         return None
-    scene, place, placed, usable = question
-    at = CANONICAL[place.relation], place.anchor
+    at = CANONICAL[question.place.relation], question.place.anchor
     labels = artifact.vocabulary.labels
-    entries = missing(artifact, scene, at=at, details=False)["missing"]
+    entries = missing(artifact, question.scene, at=at, details=False)["missing"]
     answers = [(entry["probability"], labels.index(entry["label"])) for entry in entries]
-    return [(p, bool(placed[index])) for p, index in answers if usable[index]]
+    return [(p, bool(question.placed[index])) for p, index in answers if question.usable[index]]
 
 
 def ask_outliers(
     artifact: Artifact,
     encoded: EncodedScene,
     rng: Rng,
-    intruders: Mapping[tuple[str, str], Ints] | None = None,
-) -> Answered | None:
+    intruders: Mapping[tuple[str, str], Int[NDArray, " choices"]] | None = None,
+) -> Answers | None:
     """Ask for the outliers of a random part. Half of the parts contain an intruder.
 
     The intruder is drawn from `draw_intruder_choices`. Without these, it is any absent class.
@@ -294,7 +298,7 @@ def ask_outliers(
     ] or None
 
 
-def ask_misplaced(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
+def ask_misplaced(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answers | None:
     """Ask for misplaced relations. One relation is altered in half of the scenes."""
     case = altered_case(encoded, artifact.vocabulary.structure, rng)
     if case is None:
@@ -333,15 +337,16 @@ def calibration_task(artifact: Artifact, setting: Setting) -> Outcome | None:
     complete, complete_related = (
         setting.complete.some(related=related, share=3) for related in (False, True)
     )
-    train, seed = setting.complete.train, setting.seed
+    listed, train, seed = setting.complete.some(), setting.complete.train, setting.seed
     intruders = draw_intruder_choices(complete, setting.structure, train, seed)
     ask = QUESTIONS | {"outliers": partial(ask_outliers, intruders=intruders)}
     scenes_of = {"outliers": complete, "missing at a place": complete_related}
+    models = {"": artifact, ", uncalibrated": uncalibrated(artifact)}
     metrics: dict[str, Metric] = {}
     skipped = 0
     for name in NAMES:
-        scenes = scenes_of.get(name, related) if name in QUESTIONS else setting.complete.some()
-        for suffix, model in (("", artifact), (", uncalibrated", uncalibrated(artifact))):
+        scenes = scenes_of.get(name, related) if name in QUESTIONS else listed
+        for suffix, model in models.items():
             if name in QUESTIONS:
                 answers = collect(model, scenes, ask[name], seed)
             else:
@@ -351,8 +356,7 @@ def calibration_task(artifact: Artifact, setting: Setting) -> Outcome | None:
             if not len(answers.scene):
                 break
             for figure in ("ECE", "Brier skill"):
-                metric = answers.metric(figure).by(scenes.group_ids)
-                metrics[f"{figure}, {name}{suffix}"] = metric
+                metrics[f"{figure}, {name}{suffix}"] = answers.metric(figure).by(scenes.group_ids)
     # Brier skill is undefined if all answers are true or all answers are false.
     metrics = {name: metric for name, metric in metrics.items() if np.isfinite(metric.value)}
     return Outcome(metrics, max(len(related), len(complete)), skipped) if metrics else None

@@ -19,13 +19,14 @@ from typing import Final
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 
 from app.questions.counts import LIKELY, more
 from app.questions.posterior import present
 from app.registry import Artifact
 from app.registry.counts import Counts
 from training.datasets import EncodedScene
-from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.cases import MOST, counted_classes, listed_cases
 from training.evaluation.asking import of_classes
 from training.evaluation.metrics import Metric, Ratio
@@ -46,74 +47,74 @@ def counts_task(artifact: Artifact, setting: Setting) -> Outcome | None:
     train = setting.train
     if artifact.counts is None or train is None:
         return None
-    counting = counted_classes(train.scenes, artifact.vocabulary)
-    is_counted = torch.tensor([scene.source in counting for scene in setting.scenes.scenes])
+    counted = counted_classes(train.scenes, artifact.vocabulary)
+    is_counted = torch.tensor([scene.source in counted for scene in setting.scenes.scenes])
     scenes = setting.at(is_counted.nonzero().squeeze(1)).scenes
     answers = [
-        (scene_index, *answer)
-        for scene_index, scene in enumerate(scenes.scenes)
-        for answer in _ask_counts(artifact, scene, counting[scene.source], setting.seed)
+        (k, *answer)
+        for k, scene in enumerate(scenes.scenes)
+        for answer in _ask_counts(artifact, scene, counted[scene.source], setting.seed)
     ]
     if not answers:
         return None
-    scene_index, index, number, listed, expected, low, high, p = np.array(answers).T
-    scene_index, index, k = (x.astype(np.int64) for x in (scene_index, index, listed))
+    scene, index, number, listed, expected, low, high, p = np.array(answers).T
+    scene, index, listed_number = (x.astype(np.int64) for x in (scene, index, listed))
 
-    def error(guess: Floats) -> Ratio:
-        return Ratio.of_items(scene_index, np.abs(guess - number), len(scenes))
+    def mean(values: Float[NDArray, " N"]) -> Ratio:
+        return Ratio.of_items(scene, values, len(scenes))
 
     row = np.searchsorted(artifact.counts.classes, index)
-    ours, mean_error = error(expected), error(class_mean(artifact.counts, row, k))
-    of_source = error(np.maximum(_mean_counts(train.scenes, artifact)[index], listed))
-    is_inside = ((low <= number) & (number <= high)).astype(np.float64)
+    of_class = mean(np.abs(class_mean(artifact.counts, row, listed_number) - number))
+    source_mean = np.maximum(_mean_counts(train.scenes, artifact)[index], listed)
+    ours = mean(np.abs(expected - number))
     metrics: dict[str, Metric] = {
         "error of the expected count": ours,
-        "error of the class mean": mean_error,
-        "change of error, class mean": ours - mean_error,
-        "change of error, mean of the source": ours - of_source,
-        "count in the interval": Ratio.of_items(scene_index, is_inside, len(scenes)),
+        "error of the class mean": of_class,
+        "change of error, class mean": ours - of_class,
+        "change of error, mean of the source": ours - mean(np.abs(source_mean - number)),
+        "count in the interval": mean((low <= number) & (number <= high)),
     }
     if (is_likely := p >= LIKELY).any():
-        is_right = (number > listed)[is_likely].astype(np.float64)
-        hits = Ratio.of_items(scene_index[is_likely], is_right, len(scenes))
-        metrics["proposals that are right"] = hits
-    return Outcome.over(scenes, metrics, len(scenes) - len(np.unique(scene_index)))
+        is_right = (number > listed)[is_likely]
+        metrics["proposals that are right"] = Ratio.of_items(
+            scene[is_likely], is_right, len(scenes)
+        )
+    return Outcome.over(scenes, metrics, ours.skipped)
 
 
 def _ask_counts(
-    artifact: Artifact, scene: EncodedScene, counted: Flags, seed: int
+    artifact: Artifact, scene: EncodedScene, counted: Bool[NDArray, " V"], seed: int
 ) -> list[tuple[float, ...]]:
     """Return (class, number, listed, expected, low, high, probability) of each listed class."""
-    part, asked = listed_cases(scene, counted, artifact.vocabulary.structure, seed)
-    room = part.room if part.room >= 0 else None
-    scene_part = of_classes(np.repeat(part.classes, part.listed).tolist())
-    scene_part = replace(scene_part, room_type=room)
-    listing = present(scene_part, artifact.spec)
-    candidates = part.classes[asked].tolist()
+    part, is_candidate = listed_cases(scene, counted, artifact.vocabulary.structure, seed)
+    request = of_classes(np.repeat(part.classes, part.listed).tolist())
+    request = replace(request, room_type=part.room if part.room >= 0 else None)
+    candidates = part.classes[is_candidate].tolist()
     labels = artifact.vocabulary.labels
     pairs = zip(part.classes.tolist(), part.number.tolist(), strict=True)
     number_of = {labels[index]: (index, number) for index, number in pairs}
-    entries = more(artifact, scene_part, listing, top_k=len(candidates), candidates=candidates)
+    listing = present(request, artifact.spec)
+    entries = more(artifact, request, listing, top_k=len(candidates), candidates=candidates)
     fields = ("listed_count", "expected_count", "low", "high", "probability")
     return [(*number_of[entry["label"]], *(entry[name] for name in fields)) for entry in entries]
 
 
-def _mean_counts(scenes: Sequence[EncodedScene], artifact: Artifact) -> Floats:
-    """Return the mean number of instances of each class in the scenes with the class, (V,)."""
+def _mean_counts(scenes: Sequence[EncodedScene], artifact: Artifact) -> Float[NDArray, " V"]:
+    """Return the mean number of instances of each class in the scenes with the class."""
     times, total = np.zeros((2, len(artifact.vocabulary)))
     for scene in scenes:
         times[scene.evidence.classes] += 1
         total[scene.evidence.classes] += np.minimum(scene.evidence.counts, MOST)
-    means: Floats = total / np.maximum(times, 1)
-    return means
+    return total / np.maximum(times, 1)
 
 
-def class_mean(counts: Counts, row: Ints, listed: Ints) -> Floats:
-    """Return the mean number in training scenes with at least the listed number, (k,).
+def class_mean(
+    counts: Counts, row: Int[NDArray, " k"], listed: Int[NDArray, " k"]
+) -> Float[NDArray, " k"]:
+    """Return the mean number in training scenes with at least the listed number.
 
-    `row` (k,) are the rows of the classes in `counts`.
+    `row` are the rows of the classes in `counts`.
     """
     numbers = np.arange(1, counts.log_share.shape[1] + 1)
     p = np.exp(counts.log_share[row].astype(np.float64)) * (numbers >= listed[:, None])
-    mean: Floats = p @ numbers / p.sum(axis=1)
-    return mean
+    return p @ numbers / p.sum(axis=1)

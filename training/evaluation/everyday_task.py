@@ -8,7 +8,7 @@ parameters of the service. Labels outside the vocabulary are ignored.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -72,14 +72,11 @@ def everyday_task(artifact: Artifact, setting: Setting) -> Outcome | None:
     folder = setting.everyday
     if folder is None or facts_file(folder) is None:
         return None
-    metrics: dict[str, Metric] = {}
-    count = 0
-    for line, pairs in ask_everyday(artifact, folder).items():
-        hits, questions_asked = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
-        count += len(pairs)
-        if questions_asked.sum():
-            metrics[line] = Ratio(hits, questions_asked)
-    return Outcome(metrics, count, 0)
+    lines = {line: np.array(pairs, float) for line, pairs in ask_everyday(artifact, folder).items()}
+    metrics: dict[str, Metric] = {
+        line: Ratio(*pairs.T) for line, pairs in lines.items() if pairs.any()
+    }
+    return Outcome(metrics, sum(map(len, lines.values())), 0)
 
 
 def ask_everyday(artifact: Artifact, folder: Path = EVERYDAY) -> Lines:
@@ -91,28 +88,28 @@ def ask_everyday(artifact: Artifact, folder: Path = EVERYDAY) -> Lines:
     facts: dict[str, Any] = json.loads((folder / "facts.json").read_text(encoding="utf-8"))
     lines: Lines = {name: [] for name in LINES}
 
-    def add(names: Sequence[str], hits: Iterable[int], asked: int = 1) -> None:
+    def add(names: Sequence[str], *hits: int, questions: int = 1) -> None:
         for name, count in zip(names, hits, strict=True):
-            lines[name].append((int(count), asked))
+            lines[name].append((int(count), questions))
 
     for fact in facts["relations"]:
-        add(LINES[:3], _relation_hits(artifact, fact))
+        add(LINES[:3], *_relation_hits(artifact, fact))
     for name, line in (("missing", LINES[3]), ("missing_at", LINES[4])):
         for fact in facts[name]:
-            labels = _first_missing(artifact, fact)
-            add([line], [any(label in fact["expected"] for label in labels)])
+            add([line], not set(_first_missing(artifact, fact)).isdisjoint(fact["expected"]))
     for fact in facts["intruders"]:
         ranked, flagged = _outliers(artifact, [*fact["objects"], fact["intruder"]])
-        add(LINES[5:7], (ranked[:1] == [fact["intruder"]], fact["intruder"] in flagged))
+        add(LINES[5:7], ranked[:1] == [fact["intruder"]], fact["intruder"] in flagged)
     for fact in facts["plain"]:
-        add(LINES[7:8], [bool(_outliers(artifact, fact["objects"])[1])])
+        add(LINES[7:8], bool(_outliers(artifact, fact["objects"])[1]))
     for room, seed in product(facts["rooms"], facts["seeds"]):
         empty = Scene((), room_type=artifact.vocabulary.room_index(room["room"]))
         answer = questions.generate(artifact, empty, count=_DRAWN, seed=seed)
         scenes = [set(scene["objects"]) for scene in answer["scenes"]]
         typical = sum(bool(labels & set(room["one_of"])) for labels in scenes)
         foreign = sum(bool(labels & set(room["never"])) for labels in scenes)
-        add(LINES[8:], (typical, foreign, sum(len(s) < _FEW for s in scenes)), len(scenes))
+        small = sum(len(labels) < _FEW for labels in scenes)
+        add(LINES[8:], typical, foreign, small, questions=len(scenes))
     return lines
 
 

@@ -21,10 +21,11 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 
 from app.registry import Artifact
 from app.scene import PoseRelations, Scene
-from training.datasets.array_types import Flags, Floats
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import scene_of, scene_rng
 from training.evaluation.asking import ask_every, ask_rows, relation_probabilities, score_missing
@@ -45,14 +46,13 @@ class Case(NamedTuple):
     Attributes:
         scene_index: index of the scene in its set.
         scene: the scene with the evidence.
-        queried, truth: (relations, objects, objects) bool, the queried relations, and those of
-            them that hold.
+        queried, truth: the queried relations, and those of them that hold.
     """
 
     scene_index: int
     scene: Scene
-    queried: Flags
-    truth: Flags
+    queried: Bool[NDArray, "A objects objects"]
+    truth: Bool[NDArray, "A objects objects"]
 
 
 def missing_evidence_task(artifact: Artifact, setting: Setting) -> Outcome | None:
@@ -73,7 +73,9 @@ def missing_evidence_task(artifact: Artifact, setting: Setting) -> Outcome | Non
     return Outcome.over(scenes, metrics, parts.skipped)
 
 
-def halves(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -> Iterator[Case]:
+def evidence_cases(
+    scenes: SceneTensors, structure: Bool[NDArray, " V"], kind: str, seed: int = 0
+) -> Iterator[Case]:
     """Generate the T1 questions: evidence about half of the classes, all other pairs queried."""
     for index, encoded in enumerate(scenes.scenes):
         instances, classes = encoded.instance_classes, encoded.evidence.classes
@@ -101,14 +103,14 @@ def relations_evidence_task(artifact: Artifact, setting: Setting) -> Outcome | N
     metrics: dict[str, Metric] = {}
     skipped: list[int] = []
 
-    def ask(case: Case) -> Floats:
+    def ask(case: Case) -> Float[NDArray, " 2"]:
         count, truth = int(case.truth.sum()), case.truth[case.queried]
         bare = replace(case.scene, relations=None, poses=None)
         p = (relation_probabilities(artifact, scene) for scene in (bare, case.scene))
         return np.array([expected_hits(x[case.queried], truth, count) for x in p])
 
     for kind in OF_RELATIONS:
-        cases = list(halves(scenes, structure, kind, setting.seed))
+        cases = list(evidence_cases(scenes, structure, kind, setting.seed))
         if not cases:
             continue
         without, informed, items = np.zeros((3, len(scenes)))
@@ -121,6 +123,7 @@ def relations_evidence_task(artifact: Artifact, setting: Setting) -> Outcome | N
 
 
 def _changes(metric: str, kind: str, without: Ratio, informed: Ratio) -> dict[str, Metric]:
+    """Return a metric with and without one kind of evidence, and its change, which comes first."""
     return {
         f"change of {metric}, {kind}": informed - without,
         f"{metric}, {kind}": informed,

@@ -17,13 +17,14 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
 from app.inference.chains import Conditions, random_stream
 from app.questions.generate import STEPS, draw_plausible, is_within_limits
 from app.registry import Artifact
 from app.scene import Scene
-from training.datasets.array_types import Floats, Ints
 from training.datasets.sources import source_of
 from training.evaluation.metrics import Metric, Ratio, Resampled
 from training.evaluation.setting import Outcome, Setting
@@ -45,28 +46,28 @@ def generated_rooms_task(artifact: Artifact, setting: Setting) -> Outcome | None
     scenes, things = setting.some(), ~setting.structure
     room, present = scenes.room.numpy(), (scenes.v > 0) & things
     metrics: dict[str, Metric] = {}
-    asked = np.isin(room, list(types.values())) & present.any(1).numpy()
+    is_common = np.isin(room, list(types.values())) & present.any(1).numpy()
     refused = np.zeros(len(scenes))
-    for k in np.flatnonzero(asked):
+    for k in np.flatnonzero(is_common):
         classes = present[k].nonzero().squeeze(1).tolist()
         refused[k] = not is_within_limits(artifact, classes, int(room[k]))
-    of_type = {name: asked & (room == t) for name, t in types.items()}
-    for name, mask in (("", asked), *of_type.items()):
+    of_type = {name: is_common & (room == t) for name, t in types.items()}
+    of_name = {f"{REFUSED}, {name}": mask for name, mask in of_type.items()}
+    for name, mask in {REFUSED: is_common, **of_name}.items():
         if mask.sum() >= _FEWEST:
-            metrics[f"{REFUSED}, {name}" if name else REFUSED] = Ratio.of_scenes(
-                refused * mask, mask
-            )
+            metrics[name] = Ratio.of_scenes(refused * mask, mask)
     whole = np.array([source_of(scene.source).whole_rooms for scene in scenes.scenes], np.bool_)
     sizes = present.sum(1).double().numpy()
     for name, mask in {FREE: whole, **{n: m & whole for n, m in of_type.items()}}.items():
         if mask.sum() >= _FEWEST:
             drawn = _drawn_size(artifact, types.get(name), things, setting.seed)
-            change = _change(drawn, sizes[mask], scenes.group_ids[mask])
-            metrics[f"{SIZE}, {name}"] = change
-    return Outcome.over(scenes, metrics, int((~asked).sum()))
+            metrics[f"{SIZE}, {name}"] = _change(drawn, sizes[mask], scenes.group_ids[mask])
+    return Outcome.over(scenes, metrics, int((~is_common).sum()))
 
 
-def _drawn_size(artifact: Artifact, room: int | None, things: Tensor, seed: int) -> float:
+def _drawn_size(
+    artifact: Artifact, room: int | None, things: Bool[Tensor, " V"], seed: int
+) -> float:
     """Return the mean number of classes of generated scenes, without structure."""
     chains = artifact.scene_chains.under(Conditions(np.zeros(0, np.int64), None, room))
     evidence, is_thing = Scene((), room_type=room), things.numpy()
@@ -77,10 +78,12 @@ def _drawn_size(artifact: Artifact, room: int | None, things: Tensor, seed: int)
     return float(np.mean(sizes))
 
 
-def _change(drawn: float, sizes: Floats, groups: Ints) -> Metric:
-    """Return the relative change of a mean size against held-out sizes, (scenes,)."""
+def _change(
+    drawn: float, sizes: Float[NDArray, " scenes"], groups: Int[NDArray, " scenes"]
+) -> Metric:
+    """Return the relative change of a mean size against held-out sizes."""
 
-    def change(weight: Floats) -> float:
+    def change(weight: Float[NDArray, " scenes"]) -> float:
         return float(drawn * weight.sum() / (weight @ sizes) - 1)
 
     return Resampled.of(change, groups, _DRAWS, _RESAMPLES)

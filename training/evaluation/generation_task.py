@@ -21,22 +21,22 @@ Sources: Gretton et al., "A kernel two-sample test" (2012), eq. 3.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
 from app.inference.chains import Conditions, random_stream
 from app.questions.generate import STEPS, draw_plausible
 from app.registry import Artifact
-from training.datasets.array_types import Floats, Ints
+from app.scene import CANONICAL
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.cases import some_scenes
 from training.evaluation.asking import of_classes
-from training.evaluation.contradictions import contradiction_metrics, count_contradictions
-from training.evaluation.metrics import Metric, Ratio, Resampled
+from training.evaluation.metrics import Metric, Ratio, Resampled, Statistic
 from training.evaluation.model import Drawn, Sampler, SamplerOf
 from training.evaluation.setting import Outcome, Setting
 
@@ -44,20 +44,55 @@ _RESAMPLES = 200
 # Maximum number of held-out scenes for the bandwidth, and of classes for the covariances.
 _BANDWIDTH_SCENES = 1000
 _COMMON_CLASSES = 200
+_ON_TOP = CANONICAL.index("on-top")
 
 
-def drawn_of(scenes: SceneTensors) -> Drawn:
-    """Return held-out scenes in the format of generated scenes."""
-    blocks = torch.arange(len(scenes)).split(64)
-    counts = [count_contradictions(scenes.batch(index).holds) for index in blocks]
-    return Drawn(scenes.v, torch.cat(counts))
+def count_contradictions(holds: Float[Tensor, "B A n n"]) -> Int[Tensor, "B 4"]:
+    """Count contradictory relations between different classes of each scene.
+
+    The columns are, summed over the canonical relations: the pairs of classes with a relation in
+    both directions, and the pairs with a relation in at least one direction. Then two truth values
+    follow: the on-top relations form a cycle, and the scene has an on-top relation.
+    """
+    n = holds.shape[-1]
+    edges = (holds > 0) & ~torch.eye(n, dtype=torch.bool)
+    upper = torch.ones(n, n, dtype=torch.bool).triu(1)
+    mirrored, related = edges & edges.mT & upper, (edges | edges.mT) & upper
+    on_top = torch.zeros(len(holds), 1, 1, dtype=torch.bool)
+    if holds.shape[1] > _ON_TOP and n:
+        on_top = edges[:, _ON_TOP]
+    is_cyclic = transitive_closure(on_top).diagonal(dim1=-2, dim2=-1).any(1)
+    has_on_top = on_top.flatten(1).any(1)
+    counts = mirrored.flatten(1).sum(1), related.flatten(1).sum(1), is_cyclic, has_on_top
+    return torch.stack([count.long() for count in counts], 1)
+
+
+def contradiction_metrics(counts: Int[Tensor, "B 4"]) -> dict[str, Metric]:
+    """Return the share of mirrored relations and the share of scenes with an on-top cycle.
+
+    A share is left out if no scene has a relation for it. `counts` are `count_contradictions`.
+    """
+    mirrored, related, cyclic, stacked = counts.double().numpy().T
+    parts = {"mirrored relations": (mirrored, related), "on-top cycles": (cyclic, stacked)}
+    return {name: Ratio(part, whole) for name, (part, whole) in parts.items() if whole.any()}
+
+
+def transitive_closure(pairs: Bool[Tensor, "*B n n"]) -> Bool[Tensor, "*B n n"]:
+    """Return the pairs of nodes that a chain of the given pairs connects."""
+    reach = pairs.float()
+    while True:
+        longer = ((reach + reach @ reach) > 0).float()
+        if torch.equal(longer, reach):
+            return reach > 0
+        reach = longer
 
 
 def independent_sampler(train: SceneTensors) -> Sampler:
     """Return a sampler that draws each class independently, with its frequency in training."""
     frequency = train.v.mean(0)
 
-    def sample(given: Tensor, room: Tensor, seed: int) -> Drawn:  # noqa: ARG001
+    def sample(given: Bool[Tensor, "B V"], room: Int[Tensor, " B"], seed: int) -> Drawn:  # noqa: ARG001
+        """Add independent classes to the given classes."""
         generator = torch.Generator().manual_seed(seed)
         v = torch.rand(given.shape, generator=generator) < frequency
         return Drawn((v | given).to(train.v.dtype), torch.zeros(len(v), 4))
@@ -71,15 +106,19 @@ def scene_sampler(scenes: SceneTensors) -> Sampler:
     Without given classes, sample k is scene k, which has the given room type in `generation_task`.
     Otherwise it is a random scene with the given classes.
     """
-    drawn = drawn_of(scenes)
+    blocks = torch.arange(len(scenes)).split(64)
+    contradictions = torch.cat(
+        [count_contradictions(scenes.batch(index).holds) for index in blocks]
+    )
 
-    def sample(given: Tensor, room: Tensor, seed: int) -> Drawn:  # noqa: ARG001
+    def sample(given: Bool[Tensor, "B V"], room: Int[Tensor, " B"], seed: int) -> Drawn:  # noqa: ARG001
+        """Return all scenes, or a random scene with the given classes for each row."""
         if not given.any():
-            return drawn
+            return Drawn(scenes.v, contradictions)
         rng = np.random.default_rng(seed)
         fits = given.float() @ (scenes.v == 0).float().T == 0
         index = torch.tensor([int(rng.choice(row.nonzero().squeeze(1).numpy())) for row in fits])
-        return Drawn(drawn.v[index], drawn.contradictions[index])
+        return Drawn(scenes.v[index], contradictions[index])
 
     return sample
 
@@ -92,18 +131,19 @@ def machine_sampler(artifact: Artifact) -> Sampler:
     """
     chains = artifact.scene_chains
 
-    def sample(given: Tensor, room: Tensor, seed: int) -> Drawn:
+    def sample(given: Bool[Tensor, "B V"], room: Int[Tensor, " B"], seed: int) -> Drawn:
+        """Draw a scene for each row by the chains of the service."""
         objects, contradictions = torch.zeros(given.shape), []
         for row, (classes, room_type) in enumerate(zip(given, room.tolist(), strict=True)):
             index = classes.nonzero().squeeze(1)
-            known = room_type if room_type >= 0 and artifact.spec.C else None
-            conditions = Conditions(index.numpy(), observed=None, room=known)
-            evidence = replace(of_classes(index.tolist()), room_type=known)
+            stated = room_type if room_type >= 0 and artifact.spec.C else None
+            conditions = Conditions(index.numpy(), observed=None, room=stated)
+            evidence = replace(of_classes(index.tolist()), room_type=stated)
             stream = random_stream(seed, row)
             state = draw_plausible(artifact, chains.under(conditions), evidence, STEPS, stream)
             objects[row, torch.from_numpy(state.classes)] = 1.0
-            grid = torch.from_numpy(state.r).float().unsqueeze(0)
-            contradictions.append(count_contradictions(grid))
+            holds = torch.from_numpy(state.r).float().unsqueeze(0)
+            contradictions.append(count_contradictions(holds))
         return Drawn(objects, torch.cat(contradictions))
 
     return sample
@@ -121,29 +161,27 @@ def held_out_halves(setting: Setting) -> tuple[SceneTensors, SceneTensors]:
     return some_scenes(first, limit, seed), some_scenes(second, limit, seed)
 
 
-def hamming(x: Tensor, y: Tensor) -> Tensor:
-    """Return the Hamming distances (N, M) between the binary rows of `x` (N, V) and `y` (M, V)."""
+def hamming(x: Float[Tensor, "N V"], y: Float[Tensor, "M V"]) -> Float[Tensor, "N M"]:
+    """Return the Hamming distances between binary rows."""
     return (x.sum(1, keepdim=True) + y.sum(1) - 2 * x @ y.T).clamp(min=0)
 
 
-def median_distance(v: Tensor) -> float:
+def median_distance(v: Float[Tensor, "scenes V"]) -> float:
     """Return the median Hamming distance between two scenes, at least 1."""
     v = v[:_BANDWIDTH_SCENES]
     row, column = torch.triu_indices(len(v), len(v), 1)
     return max(1.0, float(hamming(v, v)[row, column].median()))
 
 
-def discrepancy(held_out: Tensor, drawn: Tensor, bandwidth: float) -> Callable[[Floats], float]:
+def discrepancy(
+    held_out: Float[Tensor, "scenes V"], drawn: Float[Tensor, "B V"], bandwidth: float
+) -> Statistic:
     """Return MMD² as a function of the weights of the held-out scenes.
 
     The statistic excludes pairs of a scene with itself, or with a copy of itself in a resample.
-
-    Args:
-        held_out, drawn: presence of each class, (scenes, classes).
-        bandwidth: bandwidth of the kernel, as a Hamming distance.
     """
 
-    def kernel(x: Tensor, y: Tensor) -> Floats:
+    def kernel(x: Float[Tensor, "N V"], y: Float[Tensor, "M V"]) -> Float[NDArray, "N M"]:
         return torch.exp(-hamming(x, y) / bandwidth).double().numpy()
 
     # MMD² = E k(x, x') + E k(y, y') - 2 E k(x, y) for generated scenes x and held-out scenes y.
@@ -153,7 +191,8 @@ def discrepancy(held_out: Tensor, drawn: Tensor, bandwidth: float) -> Callable[[
     mean_xx = float((xx.sum() - np.trace(xx)) / (n * (n - 1)))
     np.fill_diagonal(yy, 0.0)
 
-    def squared_mmd(weight: Floats) -> float:
+    def squared_mmd(weight: Float[NDArray, " scenes"]) -> float:
+        """Return MMD² with weighted held-out scenes; NaN with fewer than two scenes."""
         pairs_weight = weight.sum() ** 2 - (weight**2).sum()
         if not pairs_weight > 0:
             return float("nan")
@@ -164,15 +203,12 @@ def discrepancy(held_out: Tensor, drawn: Tensor, bandwidth: float) -> Callable[[
     return squared_mmd
 
 
-def marginal_error(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]:
-    """Return the marginal error as a function of the weights of the held-out scenes.
-
-    Args:
-        held_out, drawn: presence of each class, (scenes, classes).
-    """
+def marginal_error(held_out: Float[NDArray, "scenes V"], drawn: Float[NDArray, "B V"]) -> Statistic:
+    """Return the marginal error as a function of the weights of the held-out scenes."""
     p = drawn.mean(0)
 
-    def error(weight: Floats) -> float:
+    def error(weight: Float[NDArray, " scenes"]) -> float:
+        """Return the marginal error with weighted held-out scenes; NaN without a class."""
         count = weight @ held_out  # total weight of the held-out scenes with each class
         if not count.sum() > 0:
             return float("nan")
@@ -182,19 +218,21 @@ def marginal_error(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]
     return error
 
 
-def pair_correlation(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]:
+def pair_correlation(
+    held_out: Float[NDArray, "scenes V"], drawn: Float[NDArray, "B V"]
+) -> Statistic:
     """Return the pair correlation as a function of the weights of the held-out scenes.
 
     It counts the `_COMMON_CLASSES` most frequent held-out classes, and is NaN if r is undefined.
-
-    Args:
-        held_out, drawn: presence of each class, (scenes, classes).
     """
     most_frequent = np.argsort(-held_out.sum(0), kind="stable")[:_COMMON_CLASSES]
     common = most_frequent[held_out[:, most_frequent].any(0)]
     pairs = np.triu_indices(len(common), 1)
 
-    def covariances(v: Floats, weight: Floats) -> Floats:
+    def covariances(
+        v: Float[NDArray, "scenes common"], weight: Float[NDArray, " scenes"]
+    ) -> Float[NDArray, " pairs"]:
+        """Return the weighted covariance of each pair of common classes."""
         total = weight.sum()
         mean = weight @ v / total
         return ((v.T * weight) @ v / total - np.outer(mean, mean))[pairs]
@@ -202,7 +240,8 @@ def pair_correlation(held_out: Floats, drawn: Floats) -> Callable[[Floats], floa
     of_drawn = covariances(drawn[:, common], np.ones(len(drawn)))
     held_out_common = held_out[:, common]
 
-    def correlation(weight: Floats) -> float:
+    def correlation(weight: Float[NDArray, " scenes"]) -> float:
+        """Return the correlation of both covariances; NaN if it is undefined."""
         if not weight.sum() > 0:
             return float("nan")
         of_held_out = covariances(held_out_common, weight)
@@ -213,7 +252,7 @@ def pair_correlation(held_out: Floats, drawn: Floats) -> Callable[[Floats], floa
     return correlation
 
 
-def copies(drawn: Tensor, train: Tensor) -> Floats:
+def copies(drawn: Float[Tensor, "B V"], train: Float[Tensor, "scenes V"]) -> Float[NDArray, " B"]:
     """Return 1 for each generated scene whose classes are those of a training scene, else 0."""
     training_rows = {row.tobytes() for row in np.packbits(train.numpy() > 0, axis=1)}
     rows = np.packbits(drawn.numpy() > 0, axis=1)
@@ -222,25 +261,22 @@ def copies(drawn: Tensor, train: Tensor) -> Floats:
 
 def generation_metrics(
     drawn: Drawn,
-    held_out: Tensor,
-    groups: Ints,
-    train: Tensor,
-    mask: Tensor,
+    held_out: Float[Tensor, "scenes V"],
+    groups: Int[NDArray, " scenes"],
+    train: Float[Tensor, "train V"],
+    mask: Bool[Tensor, " V"],
     bandwidth: float,
-    emphasis: Tensor | None = None,
+    emphasis: Float[Tensor, " scenes"] | None = None,
 ) -> dict[str, Metric]:
-    """Compute all metrics of T4 over the classes in `mask`, (classes,), of two or more scenes.
+    """Compute all metrics of T4 over the classes in the mask, of two or more scenes.
 
-    Args:
-        groups: (held-out scenes,) group of each held-out scene.
-        bandwidth: bandwidth of the MMD kernel, as a Hamming distance.
-        emphasis: (held-out scenes,) weights of the held-out scenes. None means equal weights.
+    `emphasis` are weights of the held-out scenes. None means equal weights.
     """
     x, y, training = drawn.v[:, mask], held_out[:, mask], train[:, mask]
     ours, theirs = x.double().numpy(), y.double().numpy()
     base = np.ones(len(y)) if emphasis is None else emphasis.double().numpy()
 
-    def resampled(statistic: Callable[[Floats], float]) -> Resampled:
+    def resampled(statistic: Statistic) -> Resampled:
         return Resampled.of(lambda weight: statistic(weight * base), groups, len(x), _RESAMPLES)
 
     metrics: dict[str, Metric] = {

@@ -24,11 +24,13 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
-from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import scene_rng
+from training.evaluation.setting import Structure
 
 LAWS = ("uniform", "by popularity", "signature")
 """Distributions of intruders."""
@@ -42,18 +44,20 @@ _OFTEN = 0.2
 _FOREIGN = 0.01
 
 
-def by_popularity(scenes: SceneTensors, train: SceneTensors) -> Tensor:
-    """Return weights (scenes, classes): the number of training scenes with each class."""
+def by_popularity(scenes: SceneTensors, train: SceneTensors) -> Float[Tensor, "scenes V"]:
+    """Return the number of training scenes with each class as weights of each scene."""
     return train.v.sum(0).expand(len(scenes), -1)
 
 
 def draw_intruders(
-    scenes: SceneTensors, structure: Tensor, weights: Tensor | None = None, seed: int = 0
-) -> Tensor:
-    """Draw an intruder for each scene. Return its class, (scenes,) int64; -1 skips the scene.
+    scenes: SceneTensors,
+    structure: Structure,
+    weights: Float[Tensor, "scenes V"] | None = None,
+    seed: int = 0,
+) -> Int[Tensor, " scenes"]:
+    """Draw the class of an intruder for each scene; -1 skips the scene.
 
-    Args:
-        weights: (scenes, classes) sampling weights. None means equal weights.
+    `weights` are sampling weights. None means equal weights.
     """
     present = scenes.v > 0
     absent = (~present & ~structure).double()
@@ -68,12 +72,10 @@ def draw_intruders(
     return intruders
 
 
-def signatures(train: SceneTensors) -> tuple[Flags, Floats]:
-    """Return the signature classes and the class frequencies of every room type.
+def signatures(train: SceneTensors) -> tuple[Bool[NDArray, "C V"], Float[NDArray, "C V"]]:
+    """Return a mask of the signature classes of every room type, and p(class | room type).
 
-    Returns:
-        typical: (room types, classes) bool, True for the signature classes of each room type.
-        share: (room types, classes) p(class | room type). NaN for a room type with too few scenes.
+    The frequencies of a room type with too few scenes are NaN.
     """
     has_room = (train.room >= 0).numpy()
     v, room = train.v.numpy()[has_room] > 0, train.room.numpy()[has_room]
@@ -88,8 +90,8 @@ def signatures(train: SceneTensors) -> tuple[Flags, Floats]:
     return typical, share
 
 
-def by_signature(scenes: SceneTensors, train: SceneTensors) -> Tensor:
-    """Return the sampling probability of each signature intruder, (scenes, classes), or 0."""
+def by_signature(scenes: SceneTensors, train: SceneTensors) -> Float[Tensor, "scenes V"]:
+    """Return the sampling probability of each signature intruder of each scene; else 0."""
     typical, share = signatures(train)
     weights = np.zeros(scenes.v.shape)
     absent = scenes.v.numpy() == 0
@@ -104,8 +106,10 @@ def by_signature(scenes: SceneTensors, train: SceneTensors) -> Tensor:
     return torch.from_numpy(weights)
 
 
-def intruder_weights(scenes: SceneTensors, train: SceneTensors | None) -> dict[str, Tensor | None]:
-    """Return the sampling weights of each law, (scenes, classes); only uniform without `train`."""
+def intruder_weights(
+    scenes: SceneTensors, train: SceneTensors | None
+) -> dict[str, Float[Tensor, "scenes V"] | None]:
+    """Return the sampling weights of each law; only uniform without `train`."""
     if train is None:
         return {"uniform": None}
     weights = (None, by_popularity(scenes, train), by_signature(scenes, train))
@@ -113,8 +117,8 @@ def intruder_weights(scenes: SceneTensors, train: SceneTensors | None) -> dict[s
 
 
 def draw_intruder_choices(
-    scenes: SceneTensors, structure: Tensor, train: SceneTensors | None, seed: int = 0
-) -> dict[tuple[str, str], Ints]:
+    scenes: SceneTensors, structure: Structure, train: SceneTensors | None, seed: int = 0
+) -> dict[tuple[str, str], Int[NDArray, " choices"]]:
     """Draw up to three classes for each scene, by (source, scene id), for `ask_outliers`.
 
     They are a uniform, a popular and a signature intruder; without `train`, only a uniform one.

@@ -16,13 +16,18 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import Any, Self
+from typing import Self, TypeAlias
 
 import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
 from numpy.typing import NDArray
 from scipy.special import ndtri, stdtrit
 
-from training.datasets.array_types import Flags, Floats, Ints
+Statistic: TypeAlias = Callable[[Float[NDArray, " G"]], float]
+"""Function of the weights of groups or scenes."""
+
+Levels: TypeAlias = Float[NDArray, "3 levels"]
+"""The distinct scores, lowest first, and the weights of all and of the true items of each."""
 
 RESAMPLES = 1000
 BINS = 10
@@ -46,7 +51,7 @@ class Figure:
     n: int
 
     @classmethod
-    def of(cls, value: float, draws: Floats, n: int, groups: int) -> Figure:
+    def of(cls, value: float, draws: Float[NDArray, " resamples"], n: int, groups: int) -> Figure:
         """Compute the interval from resampled values; undefined values are left out.
 
         Raises:
@@ -65,22 +70,22 @@ class Metric:
     """A metric over a set of scenes that can be resampled.
 
     Attributes:
-        groups: (G,) int64 ids of the groups of scenes, with groups that could not be scored. A
-            metric per scene has one group for each scene.
+        groups: ids of the groups of scenes, with groups that could not be scored. A metric per
+            scene has one group for each scene.
         n: number of scored items.
-        draws: (resamples,) the metric over resampled groups; NaN where undefined.
+        draws: the metric over resampled groups; NaN where undefined.
     """
 
-    groups: Ints
+    groups: Int[NDArray, " G"]
     n: int
-    draws: Floats
+    draws: Float[NDArray, " resamples"]
 
-    def at(self, weight: Floats) -> float:
+    def at(self, weight: Float[NDArray, " G"]) -> float:
         """Return the metric with group k counted weight[k] times; NaN if undefined."""
         raise NotImplementedError
 
-    def by(self, groups: Ints) -> Metric:
-        """Return the metric with its values summed by group; `groups` (G,) has the new ids."""
+    def by(self, groups: Int[NDArray, " G"]) -> Metric:
+        """Return the metric with its values summed by the new ids of the groups."""
         return self
 
     @classmethod
@@ -126,8 +131,8 @@ def _widening(groups: int) -> float:
 
 
 @lru_cache(maxsize=4)  # many metrics resample the same groups one after the other
-def group_weights(groups: int, resamples: int = RESAMPLES) -> Floats:
-    """Return how often each resample draws each group, (resamples, groups); read-only."""
+def group_weights(groups: int, resamples: int = RESAMPLES) -> Float[NDArray, "resamples G"]:
+    """Return how often each resample draws each group, as a read-only array."""
     draws = np.random.default_rng(0).integers(groups, size=(resamples, groups))
     weights = np.array([np.bincount(row, minlength=groups) for row in draws], dtype=np.float64)
     weights.flags.writeable = False
@@ -135,27 +140,27 @@ def group_weights(groups: int, resamples: int = RESAMPLES) -> Floats:
 
 
 def resample(
-    statistic: Callable[[Floats], float], groups: int, resamples: int = RESAMPLES
-) -> Floats:
-    """Return a statistic of the group weights for each resample, (resamples,)."""
+    statistic: Statistic, groups: int, resamples: int = RESAMPLES
+) -> Float[NDArray, " resamples"]:
+    """Return a statistic of the group weights for each resample."""
     return np.array([statistic(weight) for weight in group_weights(groups, resamples)])
 
 
-def _centred(drawn: Floats, value: float) -> Floats:
+def _centred(drawn: Float[NDArray, " resamples"], value: float) -> Float[NDArray, " resamples"]:
     """Shift the resamples so that their mean equals the value."""
     return drawn + (value - np.nanmean(drawn)) if np.isfinite(drawn).any() else drawn
 
 
 @dataclass(frozen=True, eq=False)
 class Ratio(Metric):
-    """Micro-average: sum(numerators) / sum(denominators) over scenes, all arrays (G,).
+    """Micro-average: sum(numerators) / sum(denominators) over scenes.
 
     A skipped scene has denominator 0. If all denominators are 0, a ValueError is raised.
     """
 
-    numerators: Floats
-    denominators: Floats
-    groups: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    numerators: Float[NDArray, " G"]
+    denominators: Float[NDArray, " G"]
+    groups: Int[NDArray, " G"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def __post_init__(self) -> None:
         if not self.denominators.sum() > 0:
@@ -164,14 +169,18 @@ class Ratio(Metric):
             object.__setattr__(self, "groups", np.arange(len(self.numerators)))
 
     @classmethod
-    def of_items(cls, scene: Ints, values: NDArray[Any], scenes: int) -> Ratio:
-        """Return the mean of item values (N,); `scene` (N,) is the scene of each item."""
+    def of_items(
+        cls, scene: Int[NDArray, " N"], values: Shaped[NDArray, " N"], scenes: int
+    ) -> Ratio:
+        """Return the mean of the values of items, each of which belongs to a scene."""
         top = np.bincount(scene, weights=values, minlength=scenes).astype(np.float64)
         return cls(top, np.bincount(scene, minlength=scenes).astype(np.float64))
 
     @classmethod
-    def of_scenes(cls, values: NDArray[Any], mask: NDArray[Any] | None = None) -> Ratio:
-        """Return the mean of values (scenes,) over the scenes in ``mask``, by default all."""
+    def of_scenes(
+        cls, values: Shaped[NDArray, " G"], mask: Bool[NDArray, " G"] | None = None
+    ) -> Ratio:
+        """Return the mean of values over the scenes in `mask`, by default all."""
         below = np.ones(len(values)) if mask is None else mask.astype(np.float64)
         return cls(values.astype(np.float64), below)
 
@@ -179,11 +188,11 @@ class Ratio(Metric):
     def n(self) -> int:  # type: ignore[override]
         return round(float(self.denominators.sum()))
 
-    def at(self, weight: Floats) -> float:
+    def at(self, weight: Float[NDArray, " G"]) -> float:
         below = float(weight @ self.denominators)
         return float(weight @ self.numerators) / below if below > 0 else float("nan")
 
-    def by(self, groups: Ints) -> Ratio:
+    def by(self, groups: Int[NDArray, " G"]) -> Ratio:
         ids, index = np.unique(groups, return_inverse=True)
         top, below = np.zeros((2, len(ids)))
         np.add.at(top, index, self.numerators)
@@ -191,7 +200,7 @@ class Ratio(Metric):
         return Ratio(top, below, ids)
 
     @cached_property
-    def draws(self) -> Floats:  # type: ignore[override]
+    def draws(self) -> Float[NDArray, " resamples"]:  # type: ignore[override]
         # Two matrix products compute all resamples.
         weights = group_weights(len(self.groups))
         top, below = weights @ self.numerators, weights @ self.denominators
@@ -232,24 +241,23 @@ class Scored(Metric):
     For items of equal score, the statistic is the expectation under random order.
 
     Attributes:
-        unit: (N,) position of the scene or group of each item in `groups`.
-        score, truth: (N,) score and truth value of each item.
+        unit: position of the scene or group of each item in `groups`.
 
     Raises:
         ValueError: there are no items.
     """
 
     statistic: str
-    unit: Ints
-    score: Floats
-    truth: Flags
-    groups: Ints
+    unit: Int[NDArray, " N"]
+    score: Float[NDArray, " N"]
+    truth: Bool[NDArray, " N"]
+    groups: Int[NDArray, " G"]
 
     def __post_init__(self) -> None:
         if not len(self.unit):
             raise ValueError("no scene could be scored")
 
-    def by(self, groups: Ints) -> Scored:
+    def by(self, groups: Int[NDArray, " G"]) -> Scored:
         ids, index = np.unique(groups, return_inverse=True)
         return replace(self, unit=index[self.unit], groups=ids)
 
@@ -266,71 +274,66 @@ class Scored(Metric):
         return len(self.unit)
 
     @cached_property
-    def _levels(self) -> tuple[Floats, Ints]:
+    def _levels(self) -> tuple[Float[NDArray, " levels"], Int[NDArray, " N"]]:
         """The distinct scores, lowest first, and their index for each item."""
         scores, level = np.unique(self.score, return_inverse=True)
         return scores, level
 
-    def _weights(self, weight: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return the distinct scores, and the weights of all and of the true items of each."""
+    def _weights(self, weight: Float[NDArray, " G"]) -> Levels:
         scores, level = self._levels
         each = weight[self.unit]
-        total, true = (
-            np.bincount(level, w, len(scores)).astype(np.float64) for w in (each, each * self.truth)
-        )
-        return scores, total, true
+        counts = (np.bincount(level, w, len(scores)) for w in (each, each * self.truth))
+        return np.stack([scores, *counts])
 
-    def at(self, weight: Floats) -> float:
-        return STATISTICS[self.statistic](*self._weights(weight))
+    def at(self, weight: Float[NDArray, " G"]) -> float:
+        return STATISTICS[self.statistic](self._weights(weight))
 
-    def reliability(self) -> tuple[Floats, Floats]:
+    def reliability(self) -> tuple[Float[NDArray, " bins"], Float[NDArray, " bins"]]:
         """Return the mean score and the share of true items of each bin of the ECE."""
-        return reliability(*self._weights(np.ones(len(self.groups))))
+        return reliability(self._weights(np.ones(len(self.groups))))
 
     @cached_property
-    def draws(self) -> Floats:  # type: ignore[override]
+    def draws(self) -> Float[NDArray, " resamples"]:  # type: ignore[override]
         values = resample(self.at, len(self.groups))
         # Resampling inflates calibration errors, so these resamples are centred on the value.
         return _centred(values, self.value) if self.statistic == "ECE" else values
 
 
-def reliability(scores: Floats, totals: Floats, true: Floats) -> tuple[Floats, Floats]:
-    """Return the mean probability and the share of true items of each bin, both (bins,).
+def reliability(levels: Levels) -> tuple[Float[NDArray, " bins"], Float[NDArray, " bins"]]:
+    """Return the mean probability and the share of true items of each bin.
 
     The items are sorted by probability and divided into `BINS` bins of equal weight. If a bin
     border divides items of equal score, each bin gets a proportional part of the true items.
-
-    Args:
-        scores: the distinct scores, lowest first.
-        totals, true: weights of all and of the true items of each score.
     """
+    scores, totals, true = levels
     total = totals.sum()
     last = np.concatenate([[0.0], np.cumsum(totals)])
 
-    def means(values: Floats) -> Floats:
+    def means(values: Float[NDArray, " levels"]) -> Float[NDArray, " bins"]:
         upto = np.interp(total * _EDGES, last, np.concatenate([[0.0], np.cumsum(values)]))
         return (upto[1:] - upto[:-1]) * (BINS / total)
 
     return means(totals * scores), means(true)
 
 
-def calibration_error(scores: Floats, totals: Floats, true: Floats) -> float:
+def calibration_error(levels: Levels) -> float:
     """Return the expected calibration error (ECE) of probabilities; NaN without items.
 
     The ECE is the mean over the bins of |mean probability - share of true items|.
     """
-    if not totals.sum():
+    if not levels[1].sum():
         return float("nan")
-    p, y = reliability(scores, totals, true)
+    p, y = reliability(levels)
     return float(np.abs(p - y).mean())
 
 
-def brier_skill(scores: Floats, totals: Floats, true: Floats) -> float:
+def brier_skill(levels: Levels) -> float:
     """Return the Brier skill: 1 - Brier score / Brier score of the base rate.
 
     The base rate is the share of true items. The skill is 0 if all probabilities are the base rate.
     It is NaN if no item or every item is true.
     """
+    scores, totals, true = levels
     total = totals.sum()
     rate = true.sum() / total if total else 0.0
     base = rate * (1 - rate)
@@ -338,36 +341,30 @@ def brier_skill(scores: Floats, totals: Floats, true: Floats) -> float:
     return float(1 - brier / total / base) if base > 0 else float("nan")
 
 
-STATISTICS: dict[str, Callable[[Floats, Floats, Floats], float]] = {
+STATISTICS: dict[str, Callable[[Levels], float]] = {
     "ECE": calibration_error,
     "Brier skill": brier_skill,
 }
-"""Functions of scores and weights, see `reliability`."""
+"""Statistics of scored items by name."""
 
 
 @dataclass(frozen=True, eq=False)
 class Resampled(Metric):
     """A metric of which only its value and its resamples are kept, such as one of whole sets.
 
-    Attributes:
-        drawn: (resamples,) from `resample`.
-        items: number of scored items, such as scenes in the other set of a comparison.
+    `items` is the number of scored items, such as scenes in the other set of a comparison.
     """
 
     point: float
-    drawn: Floats
-    groups: Ints
+    drawn: Float[NDArray, " resamples"]
+    groups: Int[NDArray, " G"]
     items: int
 
     @classmethod
     def of(
-        cls, statistic: Callable[[Floats], float], groups: Ints, items: int, resamples: int
+        cls, statistic: Statistic, groups: Int[NDArray, " scenes"], items: int, resamples: int
     ) -> Resampled:
-        """Create the metric from a statistic of scene weights. The resamples are centred.
-
-        Args:
-            groups: (scenes,) id of the group of each scene.
-        """
+        """Create the metric from a statistic of scene weights. The resamples are centred."""
         ids, index = np.unique(groups, return_inverse=True)
         point = statistic(np.ones(len(groups)))
         drawn = resample(lambda weight: statistic(weight[index]), len(ids), resamples)
@@ -382,5 +379,5 @@ class Resampled(Metric):
         return self.point
 
     @property
-    def draws(self) -> Floats:  # type: ignore[override]
+    def draws(self) -> Float[NDArray, " resamples"]:  # type: ignore[override]
         return self.drawn

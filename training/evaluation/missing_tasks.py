@@ -19,10 +19,11 @@ from typing import Final
 
 import numpy as np
 import torch
+from jaxtyping import Int
+from numpy.typing import NDArray
 from torch import Tensor
 
 from app.scene import CANONICAL
-from training.datasets.array_types import Ints
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import scene_rng
 from training.evaluation.asking import ask_rows
@@ -36,7 +37,7 @@ from training.evaluation.parts import (
     one_quarter,
     rank_hidden,
 )
-from training.evaluation.setting import Outcome, Setting
+from training.evaluation.setting import Outcome, Setting, Structure
 
 SEEDS: Final = (0, 1, 2)
 """Seeds of the draws of a question, for each scene."""
@@ -50,7 +51,7 @@ TOP: Final = (1, 3, 5, 10)
 
 def rank_missing(
     scenes: SceneTensors,
-    structure: Tensor,
+    structure: Structure,
     score: ObjectScore,
     size: Size = all_but_one,
     *,
@@ -83,17 +84,17 @@ def missing_task(score: ObjectScore, setting: Setting) -> Outcome | None:
     return Outcome.over(scenes, metrics, skipped)
 
 
-def _with_unknown(mrr: Ratio, scenes: SceneTensors, structure: Tensor) -> Ratio:
+def _with_unknown(mrr: Ratio, scenes: SceneTensors, structure: Structure) -> Ratio:
     """Return the MRR if unknown labels are removed too, which score 0."""
-    known = ((scenes.v > 0) & ~structure).sum(1).clamp(min=1).double().numpy()
+    things = ((scenes.v > 0) & ~structure).sum(1).clamp(min=1).double().numpy()
     unknown = np.array([len(scene.unknown) for scene in scenes.scenes])
-    return Ratio(mrr.numerators, mrr.denominators * (1 + unknown / known))
+    return Ratio(mrr.numerators, mrr.denominators * (1 + unknown / things))
 
 
 def removed_places(
-    scenes: SceneTensors, structure: Tensor, seed: int = 0
-) -> tuple[Tensor, Tensor, Places]:
-    """Return the indices of the scenes (N,), the removed classes (N,), and the places."""
+    scenes: SceneTensors, structure: Structure, seed: int = 0
+) -> tuple[Int[Tensor, " N"], Int[Tensor, " N"], Places]:
+    """Return the indices of the scenes, the removed classes, and their places."""
     removals: list[tuple[int, int, int, int, bool]] = []
     for k, scene in enumerate(scenes.scenes):
         evidence = scene.evidence
@@ -118,9 +119,9 @@ def removed_places(
 
 
 def leave_one_out_at(
-    scenes: SceneTensors, structure: Tensor, score: PlacedScore, *, seed: int = 0
-) -> tuple[Ranking, Ints]:
-    """Return the rank of every removed class among the absent classes, and its relation (N,).
+    scenes: SceneTensors, structure: Structure, score: PlacedScore, *, seed: int = 0
+) -> tuple[Ranking, Int[NDArray, " N"]]:
+    """Return the rank of every removed class among the absent classes, and its relation.
 
     Classes of one family with a listed class are neither ranked nor candidates.
     """
@@ -135,7 +136,7 @@ def leave_one_out_at(
 
 
 def placed_task(score: PlacedScore, setting: Setting) -> Outcome | None:
-    """Measure T2-at."""
+    """Measure T2-at: the MRR of removed classes at their places, also by relation."""
     scenes, structure = setting.some(related=True, share=3), setting.structure
     ranking, relation = leave_one_out_at(scenes, structure, score, seed=setting.seed)
     if not len(relation):

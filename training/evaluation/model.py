@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from app.registry import Artifact, Sensitivity
@@ -14,13 +15,14 @@ from app.scene import Scene
 from training.datasets.batches import Batch
 from training.evaluation.setting import Setting
 
-# Function that takes presence (scenes, classes) and returns log-odds (scenes, classes).
-ObjectScore = Callable[[Tensor], Tensor]
+ObjectScore: TypeAlias = Callable[[Float[Tensor, "B V"]], Float[Tensor, "B V"]]
+"""Function from lists of classes to the log-odds of all classes."""
 
-# Function from lists (B, V) and the name of a profile, or "", to log p (B, room types).
-RoomScore = Callable[[Tensor, str], Tensor]
-# Function that takes lists (B, V) and a sensitivity, and returns the reported outliers (B, V) bool.
-Flagged = Callable[[Tensor, Sensitivity], Tensor]
+RoomScore: TypeAlias = Callable[[Float[Tensor, "B V"], str], Float[Tensor, "B C"]]
+"""Function from lists and the name of a profile, or "", to log p of the room types."""
+
+Flagged: TypeAlias = Callable[[Float[Tensor, "B V"], Sensitivity], Bool[Tensor, "B V"]]
+"""Function from lists and a sensitivity to the reported outliers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,44 +30,46 @@ class Places:
     """B scenes with a removed class, and the place of the removed class.
 
     Attributes:
-        v, counts: (B, V) presence and instances of the remaining classes.
-        relation, anchor: (B,) int64 canonical relation, and class at its other end.
-        outgoing: (B,) bool, the removed class is the subject of the relation.
+        v, counts: presence and instances of the remaining classes.
+        relation, anchor: canonical relation, and class at its other end.
+        outgoing: True if the removed class is the subject of the relation.
     """
 
-    v: Tensor
-    counts: Tensor
-    relation: Tensor
-    anchor: Tensor
-    outgoing: Tensor
+    v: Float[Tensor, "B V"]
+    counts: Float[Tensor, "B V"]
+    relation: Int[Tensor, " B"]
+    anchor: Int[Tensor, " B"]
+    outgoing: Bool[Tensor, " B"]
 
     def rows(self, index: Tensor) -> Places:
         """Select the scenes at the given indices."""
         return Places(*(column[index] for column in vars(self).values()))
 
 
-# Function that returns scores (B, V): higher means more likely missing from the place.
-PlacedScore = Callable[[Places], Tensor]
-# Function that returns scores (B, A, n, n) of the relations between the classes of a batch.
-RelationScore = Callable[[Batch], Tensor]
-# Function from a scene, as a request states it, to the entries of `misplaced` of `/outliers`. The
-# first entry has the highest probability.
-MisplacedScore = Callable[[Scene], Sequence[Mapping[str, Any]]]
+PlacedScore: TypeAlias = Callable[[Places], Float[Tensor, "B V"]]
+"""Function that returns higher scores for classes that are likelier missing from the place."""
+
+RelationScore: TypeAlias = Callable[[Batch], Float[Tensor, "B A n n"]]
+"""Function that returns scores of the relations between the classes of a batch."""
+
+MisplacedScore: TypeAlias = Callable[[Scene], Sequence[Mapping[str, Any]]]
+"""Function from a scene of a request to the entries of `misplaced` of `/outliers`, likeliest first.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """Generated scenes, (scenes, V), and `count_contradictions` of their relations."""
+    """Generated scenes, and `count_contradictions` of their relations."""
 
-    v: Tensor
-    contradictions: Tensor
+    v: Float[Tensor, "B V"]
+    contradictions: Int[Tensor, "B 4"]
 
 
-# Function that generates scenes from the classes that each scene must contain, (scenes, classes)
-# bool, the room type of each scene, (scenes,) int64 or -1 for any, and a seed.
-Sampler = Callable[[Tensor, Tensor, int], Drawn]
-# Function of the setting; None if its scenes allow no answer.
-SamplerOf = Callable[[Setting], Sampler | None]
+Sampler: TypeAlias = Callable[[Bool[Tensor, "B V"], Int[Tensor, "B"], int], Drawn]
+"""Function that generates scenes from their required classes, room types (-1: any) and a seed."""
+
+SamplerOf: TypeAlias = Callable[[Setting], Sampler | None]
+"""Function of the setting; None if its scenes allow no answer."""
 
 Parameters: TypeAlias = Mapping[str, float | int | str]
 
@@ -78,8 +82,8 @@ class Model:
 
     Attributes:
         missing, at_place: scores of T2 and T2-at, missing objects in a scene and at a place.
-        suspicion: score of T3, intruders: it takes lists (B, V) and returns the suspicion of each
-            listed class (B, V), -inf for other classes. By default `suspicion_of(missing)`.
+        suspicion: score of T3, the suspicion of each listed class; -inf for other classes. By
+            default `suspicion_of(missing)`.
         flags: outliers that a published model reports.
         relations, completion, false_relations: scores of T1a, T1b and T3b. The batch observes no
             relation, the given triples, or all triples with one false triple.
@@ -111,15 +115,16 @@ class Model:
 
 
 def suspicion_of(
-    score: ObjectScore, log_popularity: Tensor | None = None, weight: float = 0.0
+    score: ObjectScore, log_popularity: Float[Tensor, " V"] | None = None, weight: float = 0.0
 ) -> ObjectScore:
     """Return the suspicion of each listed class: its negated score given the other classes.
 
     An intruder is often a common class in the wrong room. So the suspicion adds `weight` times the
-    log popularity of the class, (V,), as `/outliers` does.
+    log popularity of the class, as `/outliers` does.
     """
 
-    def suspicion(v: Tensor) -> Tensor:
+    def suspicion(v: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
+        """Score each listed class given the other classes of its list."""
         row, listed = (v > 0).nonzero(as_tuple=True)
         values = torch.full(v.shape, -torch.inf)
         if len(row):

@@ -22,17 +22,17 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-from torch import Tensor
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 
 from app.scene import Scene
-from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import scene_rng, some_scenes
 from training.datasets.moved import moved_scene, untouched_scene
 from training.evaluation.asking import ask_every
 from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.model import MisplacedScore
-from training.evaluation.setting import Outcome, Setting
+from training.evaluation.setting import Outcome, Setting, Structure
 
 ALARMS: Final = 0.05
 """Share of untouched scenes with an alarm at the threshold."""
@@ -46,37 +46,37 @@ _SCENES: Final = 300  # maximum number of scenes of a source
 class MovedCase:
     """A scene with the moved object `object`, and the same scene without the move.
 
-    `place` is the index of the scene in its set.
+    `scene_index` is the index of the scene in its set.
     """
 
-    place: int
+    scene_index: int
     moved: Scene
     object: str
     untouched: Scene
 
 
-def moved_cases(scenes: SceneTensors, structure: Tensor, seed: int = 0) -> list[MovedCase]:
+def moved_cases(scenes: SceneTensors, structure: Structure, seed: int = 0) -> list[MovedCase]:
     """Return a case for each scene in which an object can move."""
-    is_structure: Flags = structure.numpy()
+    is_structure = structure.numpy()
     cases = []
-    for place, encoded in enumerate(scenes.scenes):
+    for scene_index, encoded in enumerate(scenes.scenes):
         case = moved_scene(encoded, is_structure, scene_rng(encoded, seed))
         untouched = untouched_scene(encoded, is_structure, scene_rng(encoded, seed))
         if case is not None and untouched is not None:
             scene, index = case
             scene, untouched = (replace(entry, room_type=None) for entry in (scene, untouched))
-            cases.append(MovedCase(place, scene, scene.objects[index].id, untouched))
+            cases.append(MovedCase(scene_index, scene, scene.objects[index].id, untouched))
     return cases
 
 
-def ask_moved(score: MisplacedScore, cases: Sequence[MovedCase]) -> Floats:
-    """Return the answers to N cases, (N, 3).
+def ask_moved(score: MisplacedScore, cases: Sequence[MovedCase]) -> Float[NDArray, "N 3"]:
+    """Return the answers to N cases.
 
     The columns are 1 if the moved object is named first, the highest probability about the moved
     object, and the highest probability in the untouched scene. Without an entry, the value is 0.
     """
 
-    def ask(case: MovedCase) -> Floats:
+    def ask(case: MovedCase) -> Float[NDArray, " 3"]:
         entries, untouched = score(case.moved), score(case.untouched)
         is_first = bool(entries) and entries[0].get("moved") == case.object
         return np.array([is_first, _highest(entries, case.object), _highest(untouched)])
@@ -94,8 +94,10 @@ def _highest(entries: Sequence[Mapping[str, Any]], object_: str | None = None) -
     return max(values, default=0.0)
 
 
-def flagged(suspicion: Floats, untouched: Floats, source: Ints) -> Flags:
-    """Return whether each suspicion exceeds the threshold of its source, all (N,).
+def flagged(
+    suspicion: Float[NDArray, " N"], untouched: Float[NDArray, " N"], source: Int[NDArray, " N"]
+) -> Bool[NDArray, " N"]:
+    """Return whether each suspicion exceeds the threshold of its source.
 
     `suspicion` is the highest probability about the moved object, `untouched` that in the untouched
     scene.
@@ -110,17 +112,16 @@ def flagged(suspicion: Floats, untouched: Floats, source: Ints) -> Flags:
 
 
 def moved_task(score: MisplacedScore, setting: Setting) -> Outcome | None:
-    """Measure T3c."""
+    """Measure T3c: the shares of moved objects that are named first, and flagged."""
     scenes = some_scenes(setting.some(related=True), _SCENES, setting.seed)
     cases = moved_cases(scenes, setting.structure, setting.seed)
     if not cases:
         return None
     first, suspicion, untouched = ask_moved(score, cases).T
-    place = np.array([case.place for case in cases])
-    is_flagged = flagged(suspicion, untouched, scenes.source.numpy()[place])
-    values = first, is_flagged.astype(np.float64)
+    index = np.array([case.scene_index for case in cases])
+    values = first, flagged(suspicion, untouched, scenes.source.numpy()[index])
     metrics: dict[str, Metric] = {
-        name: Ratio.of_items(place, value, len(scenes))
+        name: Ratio.of_items(index, value, len(scenes))
         for name, value in zip(METRICS, values, strict=True)
     }
     return Outcome.over(scenes, metrics, len(scenes) - len(cases))

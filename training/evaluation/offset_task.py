@@ -37,7 +37,7 @@ METRICS: Final = (
 def offsets_task(artifact: Artifact, setting: Setting) -> Outcome | None:
     """Measure the share of covered offsets for each relation, and the distances for all relations.
 
-    Return None if the model has no offsets, or if no scene has related objects with poses.
+    The result is None if the model has no offsets, or no scene has related objects with poses.
     """
     if (offsets := artifact.offsets) is None:
         return None

@@ -11,12 +11,13 @@ The alarms are measured in random parts of scenes without an intruder, where eac
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import torch
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
-from training.datasets.array_types import Floats
 from training.datasets.batches import SceneTensors
 from training.evaluation.asking import SENSITIVITIES, ask_rows
 from training.evaluation.intruders import draw_intruders, intruder_weights
@@ -24,41 +25,45 @@ from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.missing_tasks import SEEDS
 from training.evaluation.model import Flagged, Model, ObjectScore
 from training.evaluation.parts import draw_parts, exactly
-from training.evaluation.setting import Outcome, Setting
+from training.evaluation.setting import Outcome, Setting, Structure
 
 LENGTHS: Final = (1, 2, 3, 5, 8)
 """Numbers of listed classes in which alarms are measured."""
 
 
+class Cases(NamedTuple):
+    """N lists of the classes of a scene and one intruder."""
+
+    scene: Int[Tensor, " N"]
+    v: Float[Tensor, "N V"]
+    intruder: Int[Tensor, " N"]
+
+
 def with_intruders(
-    scenes: SceneTensors, structure: Tensor, weights: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return N cases: the scene (N,), the listed classes (N, V) and the intruder (N,)."""
+    scenes: SceneTensors, structure: Structure, weights: Float[Tensor, "scenes V"] | None
+) -> Cases:
+    """Add the intruders of the sampling weights to the scenes, for each of `SEEDS`."""
     drawn = torch.stack([draw_intruders(scenes, structure, weights, seed) for seed in SEEDS])
     _, scene = (drawn >= 0).nonzero(as_tuple=True)
     intruder = drawn[drawn >= 0]
     v = (scenes.v[scene] * ~structure).scatter(1, intruder.unsqueeze(1), 1.0)
-    return scene, v, intruder
+    return Cases(scene, v, intruder)
 
 
-def first_shares(values: Tensor, target: Tensor) -> Floats:
-    """Return 1 where the target (N,) has the highest of the values (N, V); 1/m for m of them."""
+def expected_hit_at_1(
+    values: Float[Tensor, "N V"], target: Int[Tensor, " N"]
+) -> Float[NDArray, " N"]:
+    """Return 1 where the target has the highest value of its row; 1/m for m highest values."""
     is_highest = values == values.max(1, keepdim=True).values
     hit = is_highest.gather(1, target.unsqueeze(1)).squeeze(1)
-    share: Floats = (hit / is_highest.sum(1)).double().numpy()
-    return share
+    return (hit / is_highest.sum(1)).double().numpy()
 
 
-def hit_at_1(
-    scenes: SceneTensors, structure: Tensor, suspicion: ObjectScore, weights: Tensor | None
-) -> Ratio | None:
-    """Return the share of scenes whose intruder ranks first, or None without intruders."""
-    scene, v, intruder = with_intruders(scenes, structure, weights)
-    if not len(scene):
-        return None
-    values = ask_rows(suspicion, v, block=32).masked_fill(v == 0, -torch.inf)
-    hits = first_shares(values, intruder)
-    return Ratio.of_items(scene.numpy(), hits, len(scenes))
+def hit_at_1(scenes: SceneTensors, cases: Cases, suspicion: ObjectScore) -> Ratio:
+    """Return the share of cases whose intruder ranks first."""
+    values = ask_rows(suspicion, cases.v, block=32).masked_fill(cases.v == 0, -torch.inf)
+    hits = expected_hit_at_1(values, cases.intruder)
+    return Ratio.of_items(cases.scene.numpy(), hits, len(scenes))
 
 
 def outliers_task(model: Model, setting: Setting) -> Outcome | None:
@@ -74,25 +79,17 @@ def outliers_task(model: Model, setting: Setting) -> Outcome | None:
     # Number of scenes without an intruder, under the distribution with the fewest such scenes.
     skipped = len(scenes)
     for distribution, weights in intruder_weights(scenes, setting.train).items():
-        hits = hit_at_1(scenes, structure, model.suspicion, weights)
-        if hits is None:
+        cases = with_intruders(scenes, structure, weights)
+        if not len(cases.scene):
             continue
-        metrics[f"hit@1, {distribution}"] = hits
+        hits = metrics[f"hit@1, {distribution}"] = hit_at_1(scenes, cases, model.suspicion)
         skipped = min(skipped, hits.skipped)
-        if model.flags is not None:
-            flagged = _flagged_share(scenes, structure, model.flags, weights)
-            metrics[f"flagged, {distribution}"] = flagged
+        if (flags := model.flags) is not None:
+            flagged = ask_rows(lambda v: flags(v, "medium").float(), cases.v)
+            is_flagged = flagged.gather(1, cases.intruder.unsqueeze(1)).squeeze(1).numpy()
+            share = Ratio.of_items(cases.scene.numpy(), is_flagged, len(scenes))
+            metrics[f"flagged, {distribution}"] = share
     return Outcome.over(scenes, metrics, skipped)
-
-
-def _flagged_share(
-    scenes: SceneTensors, structure: Tensor, flags: Flagged, weights: Tensor | None
-) -> Ratio:
-    """Return the share of intruders that a model flags at medium sensitivity."""
-    scene, v, intruder = with_intruders(scenes, structure, weights)
-    flagged = ask_rows(lambda rows: flags(rows, "medium").float(), v)
-    is_intruder_flagged = flagged.gather(1, intruder.unsqueeze(1)).squeeze(1).numpy()
-    return Ratio.of_items(scene.numpy(), is_intruder_flagged, len(scenes))
 
 
 def alarms_task(flags: Flagged, setting: Setting) -> Outcome | None:

@@ -18,24 +18,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int, Shaped
 from numpy.typing import NDArray
 from scipy.special import expit
-from torch import Tensor
 
 from app.registry import Artifact
 from app.scene.relations import INSIDE, LATERAL, VERTICAL
 from training.datasets import EncodedScene
-from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.batches import SceneTensors, seen_triples
 from training.evaluation.asking import ask_every, labels_alone, relation_probabilities
 from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.model import Model, RelationScore
-from training.evaluation.relation_tasks import telling
-from training.evaluation.setting import Outcome, Setting
+from training.evaluation.relation_tasks import with_observed
+from training.evaluation.setting import Outcome, Setting, Structure
 
 RARE = 10
 """A class is rare if training relates it to at most this many classes."""
@@ -52,63 +51,58 @@ class ScenePairs:
     """The questions about one scene.
 
     Attributes:
-        place: index of the scene in its set.
-        ends: (P, 2) indices into the scene's classes, the smaller index first.
-        listed: (P, 2 A) bool, canonical relations of the first class to the second, then of the
-            second to the first.
+        scene_index: index of the scene in its set.
+        pairs: indices into the scene's classes, the smaller index first.
+        listed: True for listed relations: the canonical relations of the first class to the second,
+            then of the second to the first.
     """
 
-    place: int
+    scene_index: int
     scene: EncodedScene
-    ends: Ints
-    listed: Flags
-
-    @property
-    def classes(self) -> Ints:
-        """Class indices of each pair, (P, 2)."""
-        return self.scene.evidence.classes[self.ends]
+    pairs: Int[NDArray, "P 2"]
+    listed: Bool[NDArray, "P 2*A"]
 
 
-# Function that returns probabilities (P, 2 A) for the pairs of a scene.
-PairScore = Callable[[ScenePairs], Floats]
+PairScore: TypeAlias = Callable[[ScenePairs], Float[NDArray, "P 2*A"]]
+"""Function that returns the probabilities of the relations of the pairs of a scene."""
 
 
 def listed_pairs(
-    scenes: SceneTensors, structure: Tensor, relations: Sequence[int] = VERTICAL
+    scenes: SceneTensors, structure: Structure, relations: Sequence[int] = VERTICAL
 ) -> list[ScenePairs]:
     """Return the pairs with one of these listed relations, for every scene that has such pairs."""
-    not_structure = ~structure.numpy()
-    pairs = []
+    questions = []
     for index, scene in enumerate(scenes.scenes):
         holds = scene.evidence.holds
         related = holds[[a for a in relations if a < len(holds)]].any(0)
-        is_thing = not_structure[scene.evidence.classes]
-        pair = np.triu(related | related.T, 1) & is_thing[:, None] & is_thing
-        if len(ends := np.argwhere(pair)):
-            pairs.append(ScenePairs(index, scene, ends, both_ways(holds, ends)))
-    return pairs
+        is_thing = ~structure.numpy()[scene.evidence.classes]
+        is_pair = np.triu(related | related.T, 1) & is_thing[:, None] & is_thing
+        if len(pairs := np.argwhere(is_pair)):
+            questions.append(ScenePairs(index, scene, pairs, both_ways(holds, pairs)))
+    return questions
 
 
 def service_score(artifact: Artifact) -> PairScore:
     """Return a score: probabilities of `/relations` between the first instances of both classes."""
 
-    def score(question: ScenePairs) -> Floats:
+    def score(question: ScenePairs) -> Float[NDArray, "P 2*A"]:
+        """Ask the service about the first instances of the classes of each pair."""
         scene, classes = question.scene, question.scene.evidence.classes
         first = np.array([np.flatnonzero(scene.instance_classes == c)[0] for c in classes])
-        ends = first[question.ends]
-        pairs = [tuple(pair) for pair in np.concatenate([ends, ends[:, ::-1]]).tolist()]
-        return both_ways(relation_probabilities(artifact, labels_alone(scene), pairs), ends)
+        pairs = first[question.pairs]
+        both = [tuple(pair) for pair in np.concatenate([pairs, pairs[:, ::-1]]).tolist()]
+        return both_ways(relation_probabilities(artifact, labels_alone(scene), both), pairs)
 
     return score
 
 
 def baseline_log_odds(scenes: SceneTensors, relations: RelationScore) -> PairScore:
-    """Return the log-odds of a score of relations between classes, in place of probabilities."""
+    """Return a score: the log-odds of a relation score between the two classes of a pair."""
 
     @torch.no_grad()
-    def score(question: ScenePairs) -> Floats:
-        batch = scenes.batch(torch.tensor([question.place]))
-        return both_ways(relations(telling(batch))[0].double().numpy(), question.ends)
+    def score(question: ScenePairs) -> Float[NDArray, "P 2*A"]:
+        batch = scenes.batch(torch.tensor([question.scene_index]))
+        return both_ways(relations(with_observed(batch))[0].double().numpy(), question.pairs)
 
     return score
 
@@ -126,7 +120,7 @@ def lateral_shift(log_odds: PairScore, questions: Sequence[ScenePairs]) -> float
     over the data sources. Without questions, it is 0. The service and its rivals use the same
     rule: geometry finds left and front for most pairs, and annotators list them for few.
     """
-    hits: dict[str, list[Floats]] = {}
+    hits: dict[str, list[Float[NDArray, "P shifts"]]] = {}
     for question in questions:
         values = log_odds(question)
         rows = [accuracy(_shifted(values, shift), question.listed) for shift in SHIFTS]
@@ -137,45 +131,43 @@ def lateral_shift(log_odds: PairScore, questions: Sequence[ScenePairs]) -> float
     return SHIFTS[int(np.mean(means, axis=0).argmax())]
 
 
-def _shifted(log_odds: Floats, shift: float) -> Floats:
-    """Add a shift to the columns of left and front, (P, 2 A)."""
+def _shifted(log_odds: Float[NDArray, "P 2*A"], shift: float) -> Float[NDArray, "P 2*A"]:
+    """Add a shift to the columns of left and front."""
     relation = np.arange(log_odds.shape[1]) % (log_odds.shape[1] // 2)
     return log_odds + shift * np.isin(relation, LATERAL)
 
 
-def both_ways(table: NDArray[Any], ends: NDArray[Any]) -> NDArray[Any]:
-    """Return the entries of a table (A, n, n) for pairs (P, 2) in both directions, (P, 2 A)."""
-    x, y = ends.T
+def both_ways(
+    table: Shaped[NDArray, "A n n"], pairs: Int[NDArray, "P 2"]
+) -> Shaped[NDArray, "P 2*A"]:
+    """Return the entries of a table for pairs in both directions."""
+    x, y = pairs.T
     return np.concatenate([table[:, x, y], table[:, y, x]]).T
 
 
-def accuracy(p: Floats, listed: Flags) -> Floats:
-    """Return 1 for each pair whose most probable relation is listed, else 0, (N,).
+def accuracy(p: Float[NDArray, "N k"], listed: Bool[NDArray, "N k"]) -> Float[NDArray, " N"]:
+    """Return 1 for each pair whose most probable relation is listed, else 0.
 
     For ties, the result is the share of listed relations among the most probable ones.
-
-    Args:
-        p: probabilities of k relations of each pair, (N, k).
-        listed: True for relations that the scene lists, (N, k).
     """
     is_best = p == p.max(1, keepdims=True)
-    return np.asarray((is_best & listed).sum(1) / is_best.sum(1))
+    return (is_best & listed).sum(1) / is_best.sum(1)
 
 
-def log_loss(p: Floats, listed: Flags) -> Floats:
-    """Return the log-loss of each pair in nats, (N,).
+def log_loss(p: Float[NDArray, "N k"], listed: Bool[NDArray, "N k"]) -> Float[NDArray, " N"]:
+    """Return the log-loss of each pair in nats.
 
     The log-loss is -log(L / T). L is the sum of the probabilities of the listed relations, and T is
     the sum of the probabilities of all k relations. If T is 0, all relations count as equally
-    probable. `accuracy` describes the arguments.
+    probable.
     """
     total = p.sum(1)
     share = np.divide((p * listed).sum(1), total, where=total > 0, out=listed.mean(1))
-    return np.asarray(-np.log(np.maximum(share, _LEAST)))
+    return -np.log(np.maximum(share, _LEAST))
 
 
-def without_inside(columns: NDArray[Any]) -> NDArray[Any]:
-    """Return the columns of the eight relations without inside and contains, (P, 2 A) → (P, 8)."""
+def without_inside(columns: Shaped[NDArray, "P 2*A"]) -> Shaped[NDArray, "P 8"]:
+    """Return the columns of the eight relations without inside and contains."""
     relation = np.arange(columns.shape[1]) % (columns.shape[1] // 2)
     return columns[:, relation != INSIDE]
 
@@ -202,16 +194,16 @@ def pairs_task(model: Model, setting: Setting) -> Outcome | None:
 
 @dataclass(frozen=True, eq=False)
 class _Answers:
-    """The answers about N pairs: scene (N,), classes (N, 2), p and listed relations (N, 2 A)."""
+    """The answers about N pairs: scene, classes, probabilities and listed relations."""
 
     scenes: SceneTensors
-    scene: Ints
-    classes: Ints
-    p: Floats
-    listed: Flags
+    scene: Int[NDArray, " N"]
+    classes: Int[NDArray, "N 2"]
+    p: Float[NDArray, "N 2*A"]
+    listed: Bool[NDArray, "N 2*A"]
 
-    def mean(self, values: Floats, mask: Flags | None = None) -> Ratio:
-        """Return the mean of values (N,) of the pairs in `mask`, with one value for each group."""
+    def mean(self, values: Float[NDArray, " N"], mask: Bool[NDArray, " N"] | None = None) -> Ratio:
+        """Return the mean of the values of pairs in `mask`, with one value for each group."""
         chosen = np.ones(len(values), dtype=np.bool_) if mask is None else mask
         ratio = Ratio.of_items(self.scene[chosen], values[chosen], len(self.scenes))
         return ratio.by(self.scenes.group_ids)
@@ -219,10 +211,10 @@ class _Answers:
 
 def _ask(model: Model, setting: Setting, relations: Sequence[int]) -> _Answers | None:
     """Ask about the pairs with one of these listed relations, or return None without pairs."""
-    related = {q.place for q in listed_pairs(setting.scenes, setting.structure, relations)}
-    if not related:
+    pairs = listed_pairs(setting.scenes, setting.structure, relations)
+    if not pairs:
         return None
-    scenes = setting.at(torch.tensor(sorted(related), dtype=torch.int64)).some()
+    scenes = setting.at(torch.tensor([question.scene_index for question in pairs])).some()
     questions = listed_pairs(scenes, setting.structure, relations)
     if model.artifact is not None:
         score = service_score(model.artifact)
@@ -232,27 +224,25 @@ def _ask(model: Model, setting: Setting, relations: Sequence[int]) -> _Answers |
         return None
     return _Answers(
         scenes,
-        np.repeat([q.place for q in questions], [len(q.ends) for q in questions]),
-        np.concatenate([q.classes for q in questions]),
+        np.repeat([q.scene_index for q in questions], [len(q.pairs) for q in questions]),
+        np.concatenate([q.scene.evidence.classes[q.pairs] for q in questions]),
         np.concatenate(ask_every(score, questions)),
         np.concatenate([q.listed for q in questions]),
     )
 
 
-def _hard_pairs(classes: Ints, setting: Setting) -> dict[str, Flags]:
-    """Return masks (N,) of unseen pairs and of rare classes; empty without training scenes.
+def _hard_pairs(classes: Int[NDArray, "N 2"], setting: Setting) -> dict[str, Bool[NDArray, " N"]]:
+    """Return masks of unseen pairs and of rare classes; empty without training scenes.
 
     "unseen pairs": training lists no relation of the two classes. "rare classes": training relates
     one of the two classes to at most `RARE` classes, in any source.
     """
-    V = setting.scenes.v.shape[1]
-    triples = setting.seen
+    V, triples = setting.scenes.v.shape[1], setting.seen
     if triples is None:
         if setting.train is None:
             return {}
         triples = seen_triples(setting.train.scenes, V)
     related = np.unique(np.sort(triples.numpy()[:, 1:].astype(np.int64), axis=1), axis=0)
     partners = np.bincount(related.ravel(), minlength=V)
-    is_rare: Flags = np.any(partners[classes] <= RARE, axis=1)
     is_unseen = ~np.isin(classes @ np.array([V, 1]), related @ np.array([V, 1]))
-    return {"unseen pairs": is_unseen, "rare classes": is_rare}
+    return {"unseen pairs": is_unseen, "rare classes": np.any(partners[classes] <= RARE, axis=1)}

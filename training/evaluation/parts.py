@@ -15,13 +15,16 @@ from typing import Final, TypeAlias
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
 from app.inference.weights import SHARES
-from training.datasets.array_types import Floats, Ints, Rng
+from training.datasets.array_types import Rng
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.cases import scene_rng, some_scenes
 from training.evaluation.metrics import Metric, Ratio
+from training.evaluation.setting import Structure
 
 REAL_SOURCES: Final = ("sunrgbd", "3dssg", "sunrgbd_bedrooms_3d", "matterport_rooms")
 """Data sources of real rooms with nearly complete object lists."""
@@ -38,8 +41,8 @@ _BLOCK = 256
 Size: TypeAlias = Callable[[int, Rng], int]
 """Function of the number of classes of a scene. It returns the number to list, 0 for no part."""
 
-ListScore: TypeAlias = Callable[[Tensor, Tensor], Tensor]
-"""Function of lists (B, V) and their share bins (B,) int64. It returns scores (B, V)."""
+ListScore: TypeAlias = Callable[[Float[Tensor, "B V"], Int[Tensor, " B"]], Float[Tensor, "B V"]]
+"""Function from lists and their share bins to scores."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,16 +50,16 @@ class Parts:
     """N parts of scenes.
 
     Attributes:
-        scene: (N,) int64, index of the scene.
-        v, hidden: (N, V) 1 for listed classes; True for hidden classes.
-        related: (N, V) True for unlisted classes of one family with a listed class.
+        scene: index of the scene.
+        v, hidden: 1 for listed classes; True for hidden classes.
+        related: True for unlisted classes of one family with a listed class.
         scenes: number of scenes of the set, with the scenes without a part.
     """
 
-    scene: Tensor
-    v: Tensor
-    hidden: Tensor
-    related: Tensor
+    scene: Int[Tensor, " N"]
+    v: Float[Tensor, "N V"]
+    hidden: Bool[Tensor, "N V"]
+    related: Bool[Tensor, "N V"]
     scenes: int
 
     @property
@@ -67,8 +70,8 @@ class Parts:
     def of_listed_families(self) -> Ratio:
         """Return the share of hidden classes of one family with a listed class."""
         row, target = self.hidden.nonzero(as_tuple=True)
-        shares = self.related[row, target].double().numpy()
-        return Ratio.of_items(self.scene[row].numpy(), shares, self.scenes)
+        is_related = self.related[row, target].numpy()
+        return Ratio.of_items(self.scene[row].numpy(), is_related, self.scenes)
 
 
 def all_but_one(classes: int, _: Rng) -> int:
@@ -98,12 +101,12 @@ def up_to_longest(classes: int, rng: Rng) -> int:
 
 
 def draw_parts(
-    scenes: SceneTensors, structure: Tensor, size: Size, seeds: Sequence[int] = (0,)
+    scenes: SceneTensors, structure: Structure, size: Size, seeds: Sequence[int] = (0,)
 ) -> Parts:
     """Draw a part of each scene for each seed."""
     is_thing = ~structure.numpy()
     rows: list[int] = []
-    hidden: list[Ints] = []
+    hidden: list[Int[NDArray, " hidden"]] = []
     for seed in seeds:
         for k, scene in enumerate(scenes.scenes):
             rng = scene_rng(scene, seed)
@@ -120,8 +123,8 @@ def draw_parts(
     return Parts(index, v, mask, related, len(scenes))
 
 
-def share_bin(listed: Tensor, classes: Tensor) -> Tensor:
-    """Return the bin of the listed share of scenes of so many classes, (B,) int64.
+def share_bin(listed: Float[Tensor, " B"], classes: Float[Tensor, " B"]) -> Int[Tensor, " B"]:
+    """Return the bin of the listed share of scenes of so many classes.
 
     `app.inference.weights.SHARES` has the limits of the bins. `ALL_BUT_ONE` is the last bin.
     """
@@ -134,23 +137,28 @@ class Ranking:
     """Ranks of all hidden classes of a set of scenes.
 
     Attributes:
-        scene, target: (N,) index of the scene in the set, and the hidden class.
-        above, ties: (N,) number of candidates with a higher score, and of others with the same.
+        scene, target: index of the scene in the set, and the hidden class.
+        above, ties: number of candidates with a higher score, and of others with the same.
         skipped: number of scenes with too few classes.
     """
 
-    scene: Ints
-    target: Ints
-    above: Ints
-    ties: Ints
+    scene: Int[NDArray, " N"]
+    target: Int[NDArray, " N"]
+    above: Int[NDArray, " N"]
+    ties: Int[NDArray, " N"]
     scenes: int
     skipped: int
 
     @classmethod
     def of(
-        cls, scene: Tensor, target: Tensor, values: Tensor, scenes: int, skipped: int
+        cls,
+        scene: Int[Tensor, " N"],
+        target: Int[Tensor, " N"],
+        values: Float[Tensor, "N V"],
+        scenes: int,
+        skipped: int,
     ) -> Ranking:
-        """Compute ranks from scores (N, V); classes that are not candidates have score -inf.
+        """Compute ranks from scores; classes that are not candidates have score -inf.
 
         Raises:
             FloatingPointError: a score is NaN.
@@ -161,27 +169,26 @@ class Ranking:
         above, ties = (values > target_score).sum(1), (values == target_score).sum(1) - 1
         return cls(scene.numpy(), target.numpy(), above.numpy(), ties.numpy(), scenes, skipped)
 
-    def reciprocal_rank(self) -> Floats:
-        """Return the expectation of 1 / rank under random order of ties, (N,)."""
+    def reciprocal_rank(self) -> Float[NDArray, " N"]:
+        """Return the expectation of 1 / rank under random order of ties."""
         # Mean of 1/r over r = above + 1 .. above + ties + 1, by harmonic numbers.
         last = self.above + self.ties + 1
         ranks = np.arange(1, int(last.max(initial=1)) + 1)
         harmonic = np.concatenate([[0.0], np.cumsum(1.0 / ranks)])
-        mean: Floats = (harmonic[last] - harmonic[self.above]) / (self.ties + 1)
-        return mean
+        return (harmonic[last] - harmonic[self.above]) / (self.ties + 1)
 
     def top(self, k: int) -> Metric:
         """Return the share of targets among the first k candidates."""
         share = np.clip((k - self.above) / (self.ties + 1), 0.0, 1.0)
         return Ratio.of_items(self.scene, share, self.scenes)
 
-    def mrr(self, selection: Ints | slice = slice(None)) -> Ratio:
+    def mrr(self, selection: Bool[NDArray, " N"] | slice = slice(None)) -> Ratio:
         """Return the mean reciprocal rank of the selected targets."""
         return Ratio.of_items(self.scene[selection], self.reciprocal_rank()[selection], self.scenes)
 
 
-def rank_hidden(parts: Parts, structure: Tensor, values: Tensor) -> Ranking:
-    """Rank each hidden class among the unlisted classes, by scores (N, V).
+def rank_hidden(parts: Parts, structure: Structure, values: Float[Tensor, "N V"]) -> Ranking:
+    """Rank each hidden class among the unlisted classes, by scores.
 
     Classes of one family with a listed class are neither ranked nor candidates.
     """
@@ -203,7 +210,9 @@ def real_sources(scenes: SceneTensors) -> Iterator[tuple[str, SceneTensors]]:
 
 
 @torch.no_grad()
-def validation_score(score_function: ListScore, scenes: SceneTensors, structure: Tensor) -> float:
+def validation_score(
+    score_function: ListScore, scenes: SceneTensors, structure: Structure
+) -> float:
     """Return the mean over real sources of the MRR of hidden classes; NaN without hidden classes.
 
     The MRR of a source is the mean of two MRRs: of random parts of 1 to `LONGEST` classes, and of

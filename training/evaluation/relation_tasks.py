@@ -21,20 +21,22 @@ because the other triples would contradict these directly.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
 from app.scene import CANONICAL
-from training.datasets.array_types import Flags, Floats, Ints, Rng
+from training.datasets.array_types import Rng
 from training.datasets.batches import Batch, SceneTensors
 from training.datasets.cases import Triple, scene_rng
 from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.model import RelationScore
-from training.evaluation.setting import Outcome, Setting
+from training.evaluation.setting import Outcome, Setting, Structure
 from training.machines.edges import triple_keys
 
 FIRST = (20, 50, 100)
@@ -44,41 +46,41 @@ _TRIES = 50
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """The k ranked triples of one scene.
+    """The ranked triples of one scene.
 
     Attributes:
         scene: index of the scene among the scored scenes.
-        relation: (k,) int64, index of the canonical relation.
-        key: (k,) int64, number of the triple, see `triple_keys`.
-        score: (k,) score of each triple. A higher score means more likely true.
-        truth: (k,) bool, the triple is annotated.
+        relation: index of the canonical relation.
+        key: number of the triple, see `triple_keys`.
+        score: score of each triple. A higher score means more likely true.
+        truth: True if the triple is annotated.
     """
 
     scene: int
-    relation: Ints
-    key: Ints
-    score: Floats
-    truth: Flags
+    relation: Int[NDArray, " k"]
+    key: Int[NDArray, " k"]
+    score: Float[NDArray, " k"]
+    truth: Bool[NDArray, " k"]
 
-    def where(self, mask: Flags) -> Candidates:
-        """Select the triples with a True value in `mask` (k,)."""
+    def where(self, mask: Bool[NDArray, " k"]) -> Candidates:
+        """Select the triples with a True value in the mask."""
         scene, *columns = vars(self).values()
         return Candidates(scene, *(column[mask] for column in columns))
 
 
-def scorable(batch: Batch, structure: Tensor) -> Tensor:
-    """Return a mask (B, A, n, n) of triples between two different classes without structure."""
+def scorable(batch: Batch, structure: Structure) -> Bool[Tensor, "B A n n"]:
+    """Return a mask of the triples between two different classes without structure."""
     n = batch.classes.shape[1]
     is_thing = (batch.classes >= 0) & ~structure[batch.classes.clamp(min=0)]
     pair = is_thing[:, :, None] & is_thing[:, None, :] & ~torch.eye(n, dtype=torch.bool)
     return pair[:, None].expand_as(batch.holds)
 
 
-def telling(batch: Batch, given: Tensor | None = None) -> Batch:
-    """Return the batch with only the given relations (B, A, n, n) observed."""
-    if given is None:
-        given = torch.zeros_like(batch.observed)
-    return replace(batch, holds=given.to(batch.holds.dtype), observed=given)
+def with_observed(batch: Batch, observed: Bool[Tensor, "B A n n"] | None = None) -> Batch:
+    """Return the batch with only these relations observed, which hold; None means no relation."""
+    if observed is None:
+        observed = torch.zeros_like(batch.observed)
+    return replace(batch, holds=observed.to(batch.holds.dtype), observed=observed)
 
 
 def _batches(scenes: SceneTensors, triples: int) -> Iterator[tuple[list[int], Batch]]:
@@ -88,10 +90,17 @@ def _batches(scenes: SceneTensors, triples: int) -> Iterator[tuple[list[int], Ba
         yield index.tolist(), scenes.batch(index)
 
 
-def _candidates(batches: Iterable[tuple[Batch, Tensor, Tensor]]) -> list[Candidates]:
-    """Return the candidates of every scene, numbered in order."""
+@torch.no_grad()
+def _scored(
+    scenes: SceneTensors, triples: int, ask: Callable[[Batch, list[int]], tuple[Tensor, Tensor]]
+) -> list[Candidates]:
+    """Return the candidates of the scenes with at least `triples` annotated triples, in order.
+
+    `ask` returns the scores and the mask of the candidates of a batch with these scene indices.
+    """
     candidates: list[Candidates] = []
-    for batch, values, mask in batches:
+    for index, batch in _batches(scenes, triples):
+        values, mask = ask(batch, index)
         for row, classes in enumerate(batch.classes):
             relation, x, y = mask[row].nonzero(as_tuple=True)
             score = values[row, relation, x, y].double().numpy()
@@ -103,47 +112,45 @@ def _candidates(batches: Iterable[tuple[Batch, Tensor, Tensor]]) -> list[Candida
     return candidates
 
 
-@torch.no_grad()
 def score_scenes(
-    scenes: SceneTensors, structure: Tensor, score: RelationScore, *, counts: bool = True
+    scenes: SceneTensors, structure: Structure, score: RelationScore, *, counts: bool = True
 ) -> list[Candidates]:
     """Score the T1a candidates of annotated scenes. Without `counts`, all counts are 0, unknown."""
 
-    def scored() -> Iterator[tuple[Batch, Tensor, Tensor]]:
-        for _, batch in _batches(scenes, 1):
-            question = telling(batch)
-            if not counts:
-                question = replace(question, counts=torch.zeros_like(batch.counts))
-            yield batch, score(question), scorable(batch, structure)
+    def ask(batch: Batch, _: list[int]) -> tuple[Tensor, Tensor]:
+        question = with_observed(batch)
+        if not counts:
+            question = replace(question, counts=torch.zeros_like(batch.counts))
+        return score(question), scorable(batch, structure)
 
-    return _candidates(scored())
+    return _scored(scenes, 1, ask)
 
 
-@torch.no_grad()
 def complete_scenes(
-    scenes: SceneTensors, structure: Tensor, score: RelationScore, *, seed: int = 0
+    scenes: SceneTensors, structure: Structure, score: RelationScore, *, seed: int = 0
 ) -> list[Candidates]:
     """Score the T1b candidates of scenes with at least two triples, given half of the triples."""
 
-    def scored() -> Iterator[tuple[Batch, Tensor, Tensor]]:
-        for index, batch in _batches(scenes, 2):
-            mask = scorable(batch, structure)
-            given = random_half((batch.holds > 0) & mask, scenes, index, seed)
-            # With a single triple the observed half is empty: the scene is left out.
-            has_evidence = given.flatten(1).any(1)[:, None, None, None]
-            yield batch, score(telling(batch, given)), mask & ~given & ~given.mT & has_evidence
+    def ask(batch: Batch, index: list[int]) -> tuple[Tensor, Tensor]:
+        """Score the triples that neither the given half nor its mirror image contains."""
+        mask = scorable(batch, structure)
+        given = random_half((batch.holds > 0) & mask, scenes, index, seed)
+        # With a single triple the observed half is empty: the scene is left out.
+        has_evidence = given.flatten(1).any(1)[:, None, None, None]
+        return score(with_observed(batch, given)), mask & ~given & ~given.mT & has_evidence
 
-    return _candidates(scored())
+    return _scored(scenes, 2, ask)
 
 
-def random_half(truth: Tensor, scenes: SceneTensors, index: Sequence[int], seed: int) -> Tensor:
-    """Return half of each scene's triples (rounded down), (B, A, n, n) bool."""
+def random_half(
+    truth: Bool[Tensor, "B A n n"], scenes: SceneTensors, index: Sequence[int], seed: int
+) -> Bool[Tensor, "B A n n"]:
+    """Return half of each scene's triples, rounded down."""
     half = torch.zeros_like(truth)
     for row, k in enumerate(index):
         triples = truth[row].nonzero()
         order = scene_rng(scenes.scenes[k], seed).permutation(len(triples))
-        chosen = triples[torch.from_numpy(order[: len(triples) // 2])]
-        half[row][tuple(chosen.T)] = True
+        half[row][tuple(triples[torch.from_numpy(order[: len(triples) // 2])].T)] = True
     return half
 
 
@@ -163,14 +170,16 @@ def r_precision(
     return Ratio(hits, annotated) if annotated.any() else None
 
 
-def unseen(scored: Sequence[Candidates], seen: Tensor, classes: int) -> list[Candidates]:
-    """Select the candidates that are not among the training triples `seen`, (T, 3) (zero-shot)."""
+def unseen(
+    scored: Sequence[Candidates], seen: Int[Tensor, "triples 3"], classes: int
+) -> list[Candidates]:
+    """Select the candidates that are not among the training triples `seen` (zero-shot)."""
     relation, subject, object_ = seen.long().unbind(1)
     keys = triple_keys(relation, subject, object_, classes).numpy()
     return [scene.where(~np.isin(scene.key, keys)) for scene in scored]
 
 
-def expected_hits(score: Floats, truth: Flags, count: int) -> float:
+def expected_hits(score: Float[NDArray, " k"], truth: Bool[NDArray, " k"], count: int) -> float:
     """Return the expected number of true items among the first `count`; ties in random order."""
     if count >= len(score):
         return float(truth.sum())
@@ -180,22 +189,17 @@ def expected_hits(score: Floats, truth: Flags, count: int) -> float:
     return float(truth[is_above].sum() + share * truth[is_tied].sum())
 
 
-def alter(holds: Flags, allowed: Flags, rng: Rng) -> tuple[Triple, Triple] | None:
+def draw_false_triple(
+    holds: Bool[NDArray, "A n n"], usable: Bool[NDArray, "A n n"], rng: Rng
+) -> tuple[Triple, Triple] | None:
     """Draw a true triple (relation, subject, object) of a scene and a false replacement.
 
     The replacement changes the relation with probability 1/2, the subject with probability 1/4 and
-    the object with probability 1/4. It is false if the scene lists neither it nor its mirror
-    image.
-
-    Args:
-        holds: True for triples that hold, (A, n, n) for n classes.
-        allowed: True for triples that the task may use, (A, n, n).
-
-    Returns:
-        The true triple and the false triple. The result is None if the scene has fewer than two
-        true triples, or if `_TRIES` draws give no false triple.
+    the object with probability 1/4. It is usable, and false if the scene lists neither it nor its
+    mirror image. The result is None if the scene has fewer than two usable true triples, or if
+    `_TRIES` draws give no false triple.
     """
-    true_triples = np.argwhere(holds & allowed)
+    true_triples = np.argwhere(holds & usable)
     if len(true_triples) < 2:
         return None
     A, n, _ = holds.shape
@@ -208,14 +212,14 @@ def alter(holds: Flags, allowed: Flags, rng: Rng) -> tuple[Triple, Triple] | Non
             a, i, j = relation, subject, new_class
         else:
             a, i, j = relation, new_class, object_
-        if allowed[a, i, j] and not holds[a, i, j] and not holds[a, j, i]:
+        if usable[a, i, j] and not holds[a, i, j] and not holds[a, j, i]:
             return (relation, subject, object_), (a, i, j)
     return None
 
 
 @torch.no_grad()
 def false_hits(
-    scenes: SceneTensors, structure: Tensor, score: RelationScore, *, seed: int = 0
+    scenes: SceneTensors, structure: Structure, score: RelationScore, *, seed: int = 0
 ) -> Ratio | None:
     """Return the share of false triples that rank first in their scene; None without any.
 
@@ -228,12 +232,12 @@ def false_hits(
         observed, is_false = torch.zeros_like(truth), torch.zeros_like(truth)
         for row, k in enumerate(index):
             rng = scene_rng(scenes.scenes[k], seed)
-            if case := alter(batch.holds[row].numpy() > 0, mask[row].numpy(), rng):
+            if case := draw_false_triple(batch.holds[row].numpy() > 0, mask[row].numpy(), rng):
                 true_triple, false_triple = case
                 observed[row] = truth[row]
                 observed[row][true_triple] = False
                 observed[row][false_triple] = is_false[row][false_triple] = True
-        log_odds = score(telling(batch, observed)).double()
+        log_odds = score(with_observed(batch, observed)).double()
         for row, k in enumerate(index):
             stated = observed[row]
             if stated.any():
@@ -246,7 +250,7 @@ def false_hits(
 
 
 def relations_task(score: RelationScore, setting: Setting) -> Outcome | None:
-    """Measure T1a."""
+    """Measure T1a: R-precision of the relations of a scene, given its classes."""
     scenes, structure = setting.scenes, setting.structure
     with_counts = score_scenes(scenes, structure, score)
     uncounted = score_scenes(scenes, structure, score, counts=False)
@@ -263,7 +267,7 @@ def relations_task(score: RelationScore, setting: Setting) -> Outcome | None:
 
 
 def completion_task(score: RelationScore, setting: Setting) -> Outcome | None:
-    """Measure T1b."""
+    """Measure T1b: R-precision of half of the relations, given the other half."""
     scenes = setting.scenes
     candidates = complete_scenes(scenes, setting.structure, score, seed=setting.seed)
     ranking = r_precision(candidates, len(scenes))
@@ -293,7 +297,7 @@ def _details(scored: list[Candidates], setting: Setting) -> dict[str, Metric]:
 
 
 def placement_task(score: RelationScore, setting: Setting) -> Outcome | None:
-    """Measure T3b."""
+    """Measure T3b: the share of scenes whose false triple is the least likely one."""
     scenes = setting.some(related=True)
     hits = false_hits(scenes, setting.structure, score, seed=setting.seed)
     return None if hits is None else Outcome.over(scenes, {"hit@1": hits}, hits.skipped)

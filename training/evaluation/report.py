@@ -8,7 +8,7 @@ compared by paired resampling, without the models.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from hashlib import sha256
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from app.registry import Artifact
@@ -26,7 +27,7 @@ from training.evaluation.artifact_model import artifact_model
 from training.evaluation.everyday_task import SOURCE, facts_file
 from training.evaluation.metrics import Metric, Ratio, Resampled, Scored
 from training.evaluation.model import Model
-from training.evaluation.setting import Outcome, Setting
+from training.evaluation.setting import Outcome, Setting, Structure
 from training.evaluation.tasks import EVERY_TASK, ONCE, TASKS, WHOLE_SET
 
 _LIMIT = 200  # maximum number of scenes per data source in slow tasks
@@ -86,9 +87,9 @@ def by_source(scenes: SceneTensors) -> Iterator[tuple[str, SceneTensors]]:
 
 def settings_by_source(
     scenes: SceneTensors,
-    structure: Tensor,
+    structure: Structure,
     train: SceneTensors,
-    seen: Tensor | None,
+    seen: Int[Tensor, "triples 3"] | None,
     *,
     limit: int | None = 600,
 ) -> Iterator[tuple[str, Setting]]:
@@ -143,7 +144,7 @@ def pooled(reports: Sequence[SourceReport], source: str = "pooled") -> SourceRep
 def evaluate(
     artifact: Artifact,
     scenes: SceneTensors,
-    structure: Tensor,
+    structure: Structure,
     train: SceneTensors,
     *,
     limit: int = _LIMIT,
@@ -164,39 +165,32 @@ def evaluate(
     selected = [
         name for name, task in EVERY_TASK.items() if task.card and (tasks is None or name in tasks)
     ]
-    settings = dict(settings_by_source(scenes, structure, train, None, limit=limit))
-    together = next(iter(settings)) if len(settings) == 1 else "pooled"
-    questions = [
-        (setting, source, [task for task in selected if task not in WHOLE_SET])
-        for source, setting in settings.items()
-    ]
-    whole = [task for task in selected if task in WHOLE_SET and task not in ONCE]
-    questions.append((Setting(scenes, structure, train, limit=limit), together, whole))
+    of_source = [task for task in selected if task not in WHOLE_SET]
     once = [task for task in selected if task in ONCE]
-    questions.append((Setting(scenes, structure, limit=limit, everyday=everyday), SOURCE, once))
+    whole = [task for task in selected if task in WHOLE_SET and task not in ONCE]
+    by_name = dict(settings_by_source(scenes, structure, train, None, limit=limit))
+    together = next(iter(by_name)) if len(by_name) == 1 else "pooled"
+    everyday_setting = Setting(scenes, structure, limit=limit, everyday=everyday)
+    questions = [
+        *((source, setting, of_source) for source, setting in by_name.items()),
+        (together, Setting(scenes, structure, train, limit=limit), whole),
+        (SOURCE, everyday_setting, once),
+    ]
     return [
         row
-        for setting, source, names in questions
+        for source, setting, names in questions
         for row in card_figures(measure(model, setting, source, tasks=names, progress=progress))
     ]
 
 
 def card_figures(report: SourceReport) -> list[CardMetric]:
-    """Return the figures of a model card. A data source may lack data for some of them."""
-    rows: list[CardMetric] = []
-    for task, outcome in report.outcomes.items():
-        metrics = outcome.metrics if outcome else {}
-        shown = {name: metrics[name] for name in EVERY_TASK[task].card if name in metrics}
-        rows += card_rows(task, report.source, shown)
-    return rows
-
-
-def card_rows(task: str, source: str, metrics: Mapping[str, Metric]) -> list[CardMetric]:
-    """Return the metrics of a task with an interval, which needs two groups."""
+    """Return the figures of a model card that have an interval, which needs two groups."""
     return [
-        CardMetric(task=task, source=source, metric=name, **asdict(metric.figure()))
-        for name, metric in metrics.items()
-        if len(metric.groups) > 1
+        CardMetric(task=task, source=report.source, metric=name, **asdict(metric.figure()))
+        for task, outcome in report.outcomes.items()
+        if outcome is not None
+        for name in EVERY_TASK[task].card
+        if (metric := outcome.metrics.get(name)) and len(metric.groups) > 1
     ]
 
 
@@ -237,6 +231,7 @@ def metric_from_dict(values: dict[str, Any]) -> Metric:
 
 
 def _plain(value: Any) -> Any:
+    """Return an array as a list for JSON, with null for values that are not finite."""
     if isinstance(value, np.ndarray) and value.dtype == np.float64:
         return [float(f"{x:.9g}") if np.isfinite(x) else None for x in value.tolist()]
     if isinstance(value, np.ndarray):

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from training.datasets.array_types import Floats
 from training.datasets.files import write_whole
 from training.evaluation.metrics import Figure, Metric, Resampled, paired_difference
 from training.evaluation.report import SourceReport
+from training.evaluation.setting import Outcome
 from training.evaluation.tasks import TASKS
 
 Reports = Mapping[tuple[str, int], Mapping[str, SourceReport]]
@@ -118,6 +118,7 @@ class Results:
         return "\n\n".join(parts) + "\n"
 
     def _table(self, task: str, metric: str) -> str:
+        """Return the Markdown table of a metric by row and data source, or "" without values."""
         worse = {
             (difference.row, difference.source)
             for difference in self.differences
@@ -183,11 +184,11 @@ def summarise(reports: Reports, ours: str) -> Results:
             for task, outcome in report.outcomes.items():
                 if outcome is None:
                     continue
-                place = {"row": row, "seed": seed, "task": task, "source": source}
+                entry = {"row": row, "seed": seed, "task": task, "source": source}
                 numbers = {name: getattr(outcome, name) for name in ("scenes", "skipped", "notes")}
-                asked.append(place | numbers)
+                asked.append(entry | numbers)
                 for name, metric in outcome.metrics.items():
-                    members.setdefault((row, source, task, name), []).append(metric)
+                    members.setdefault((row, task, source, name), []).append(metric)
     rows = [row for row, _ in reports]
     # A pooled metric is left out if its data sources differ between seeds. For example, the Brier
     # skill of a seed is undefined on a source where all queried relations hold.
@@ -196,18 +197,18 @@ def summarise(reports: Reports, ours: str) -> Results:
         for key, metrics in sorted(members.items(), key=lambda item: rows.index(item[0][0]))
         if len(metrics[0].groups) > 1 and all(_same_groups(m, metrics[0]) for m in metrics)
     }
-    if not any(key[0] == ours for key in means):
+    if not any(row == ours for row, *_ in means):
         raise ValueError(f"the reports contain no metric of the reference row {ours}")
     cells = tuple(
-        Cell(row, task, source, name, mean.figure(), tuple(m.value for m in members[key]))
-        for key, mean in means.items()
-        for row, source, task, name in [key]
+        Cell(row, task, source, name, mean.figure(), tuple(m.value for m in seeds))
+        for (row, task, source, name), mean in means.items()
+        for seeds in [members[row, task, source, name]]
     )
     differences = tuple(
-        Difference(*(row, task, source, name), paired_difference(mine, mean))
-        for (row, source, task, name), mean in means.items()
+        Difference(row, task, source, name, paired_difference(mine, mean))
+        for (row, task, source, name), mean in means.items()
         if row != ours
-        and (mine := means.get((ours, source, task, name))) is not None
+        and (mine := means.get((ours, task, source, name))) is not None
         # A row may lack a pooled metric on some data sources. Its scenes then cannot be paired.
         and _same_groups(mine, mean)
     )
@@ -217,7 +218,7 @@ def summarise(reports: Reports, ours: str) -> Results:
 def mean_over_seeds(members: Sequence[Metric]) -> Resampled:
     """Return the mean of a metric over training seeds; all seeds use the same resamples."""
     shortest = min(len(member.draws) for member in members)
-    drawn: Floats = np.mean([member.draws[:shortest] for member in members], axis=0)
+    drawn = np.mean([member.draws[:shortest] for member in members], axis=0)
     value = float(np.mean([member.value for member in members]))
     return Resampled(value, drawn, members[0].groups, members[0].n)
 
@@ -228,14 +229,11 @@ def _same_groups(a: Metric, b: Metric) -> bool:
 
 def only(report: SourceReport, wanted: Mapping[str, Sequence[str]]) -> SourceReport:
     """Return the report with only the wanted metrics, because resampling all metrics is slow."""
-    outcomes = {
-        task: outcome
-        and replace(
-            outcome,
-            metrics={name: outcome.metrics[name] for name in names if name in outcome.metrics},
-        )
-        for task, names in wanted.items()
-        if task in report.outcomes
-        for outcome in [report.outcomes[task]]
-    }
+    outcomes: dict[str, Outcome | None] = {}
+    for task, names in wanted.items():
+        if task in report.outcomes:
+            outcome = outcomes[task] = report.outcomes[task]
+            if outcome is not None:
+                metrics = {x: outcome.metrics[x] for x in names if x in outcome.metrics}
+                outcomes[task] = replace(outcome, metrics=metrics)
     return replace(report, outcomes=outcomes)

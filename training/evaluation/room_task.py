@@ -21,7 +21,6 @@ from typing import Final
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from training.datasets.batches import SceneTensors, subset
 from training.evaluation.asking import ask_rows
@@ -37,7 +36,7 @@ from training.evaluation.parts import (
     exactly,
     real_sources,
 )
-from training.evaluation.setting import Outcome, Setting
+from training.evaluation.setting import Outcome, Setting, Structure
 
 LEAST: Final = 1e-4
 """Least probability of a room type in the log-loss."""
@@ -99,7 +98,7 @@ def rooms_task(score: RoomScore, setting: Setting) -> Outcome | None:
     return Outcome.over(scenes, metrics, 0)
 
 
-def mean_log_p(scenes: SceneTensors, structure: Tensor, score: RoomScore) -> float:
+def mean_log_p(scenes: SceneTensors, structure: Structure, score: RoomScore) -> float:
     """Return the mean over real sources and lists of log p of the room type.
 
     Each list counts without and with the named profile. If the scenes contain no source of

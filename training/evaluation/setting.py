@@ -1,4 +1,4 @@
-"""Inputs and results of an evaluation task: model, setting and outcome."""
+"""Inputs and results of an evaluation task: setting and outcome."""
 
 from __future__ import annotations
 
@@ -6,13 +6,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TypeAlias
 
 import torch
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.cases import some_scenes
 from training.evaluation.metrics import Metric
+
+Structure: TypeAlias = Bool[Tensor, " V"]
+"""Mask of structure classes, such as walls. They are evidence, but never questions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,9 +26,8 @@ class Setting:
 
     Attributes:
         scenes: held-out scenes.
-        structure: (V,) bool, True for structure classes.
         train: training scenes of the same sources. If None, tasks that need them are left out.
-        seen: (T, 3) triples that the model may have learnt from.
+        seen: triples that the model may have learnt from.
         limit: maximum number of scenes for slow tasks, which are all but T1a and T1b. The slowest
             tasks, T2-at and Calibration, use a third of the limit.
         seed: random seed of the questions.
@@ -31,9 +35,9 @@ class Setting:
     """
 
     scenes: SceneTensors
-    structure: Tensor
+    structure: Structure
     train: SceneTensors | None = None
-    seen: Tensor | None = None
+    seen: Int[Tensor, "triples 3"] | None = None
     limit: int | None = 600
     seed: int = 0
     everyday: Path | None = None
@@ -42,12 +46,11 @@ class Setting:
         """Return at most `limit` / `share` scenes; with `related`, only scenes with relations."""
         scenes = self.scenes
         if related:
-            has_relation = [bool(scene.evidence.holds.any()) for scene in scenes.scenes]
-            scenes = subset(scenes, torch.tensor(has_relation).nonzero().squeeze(1))
+            scenes = with_relations(scenes)
         limit = None if self.limit is None else max(1, self.limit // share)
         return some_scenes(scenes, limit, self.seed)
 
-    def at(self, index: Tensor) -> Setting:
+    def at(self, index: Int[Tensor, " N"]) -> Setting:
         """Return the setting with only the scenes at the given indices."""
         return replace(self, scenes=subset(self.scenes, index))
 
@@ -56,6 +59,12 @@ class Setting:
         """The scenes with complete object lists; in other scenes unlisted objects may exist."""
         train = None if self.train is None else _complete(self.train)
         return replace(self, scenes=_complete(self.scenes), train=train if train else None)
+
+
+def with_relations(scenes: SceneTensors) -> SceneTensors:
+    """Return the scenes with a relation that holds."""
+    related = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.holds.any()]
+    return subset(scenes, torch.tensor(related, dtype=torch.int64))
 
 
 def _complete(scenes: SceneTensors) -> SceneTensors:

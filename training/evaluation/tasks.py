@@ -9,11 +9,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from training.evaluation import count_task as counts
 from training.evaluation import evidence_tasks as evidence
-from training.evaluation import offset_task as offsets
 from training.evaluation.asking import SENSITIVITIES
 from training.evaluation.calibration_task import NAMES, calibration_task
+from training.evaluation.count_task import METRICS as COUNTS
+from training.evaluation.count_task import counts_task
 from training.evaluation.everyday_task import LINES, everyday_task
 from training.evaluation.generated_rooms_task import (
     FREE,
@@ -27,6 +27,8 @@ from training.evaluation.intruders import LAWS
 from training.evaluation.missing_tasks import SIZES, missing_task, placed_task
 from training.evaluation.model import Model
 from training.evaluation.moved_task import METRICS, moved_task
+from training.evaluation.offset_task import METRICS as OFFSETS
+from training.evaluation.offset_task import offsets_task
 from training.evaluation.outlier_tasks import LENGTHS, alarms_task, outliers_task
 from training.evaluation.pair_task import pairs_task
 from training.evaluation.relation_tasks import completion_task, placement_task, relations_task
@@ -40,20 +42,25 @@ class Task:
 
     Attributes:
         words: name of the task in the tables of the command line.
+        ask: function of the answers of the model and the questions that returns the metrics.
         field: attribute of `Model` that answers the questions. "" means the whole model.
-        ask: function that takes this attribute and the questions (`Setting`), and returns the
-            metrics.
-        shown: names of the metrics in Markdown tables. JSON files contain all metrics.
         card: names of the metrics in a model card.
+        tables: names of the metrics in Markdown tables; None means those of a card. JSON files
+            contain all metrics.
         of_objects: True if the task uses only scenes with complete object lists.
     """
 
     words: str
-    field: str
     ask: Callable[[Any, Setting], Outcome | None]
-    shown: tuple[str, ...]
+    field: str
     card: tuple[str, ...]
-    of_objects: bool
+    tables: tuple[str, ...] | None = None
+    of_objects: bool = True
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """Names of the metrics in Markdown tables."""
+        return self.card if self.tables is None else self.tables
 
     def __call__(self, model: Model, setting: Setting) -> Outcome | None:
         """Return the metrics, or None if the task cannot be measured."""
@@ -64,84 +71,70 @@ class Task:
         return self.ask(answers, setting)
 
 
-def _task(
-    words: str,
-    field: str,
-    ask: Callable[[Any, Setting], Outcome | None],
-    shown: tuple[str, ...],
-    card: tuple[str, ...] | None = None,
-    *,
-    of_objects: bool = True,
-) -> Task:
-    """Return a task. By default, tables and model cards have the same metrics."""
-    return Task(words, field, ask, shown, shown if card is None else card, of_objects)
-
-
 def _each(names: Iterable[str], kinds: Iterable[str]) -> tuple[str, ...]:
     """Return the metric names "name, kind" for all pairs of a name and a kind."""
     kinds = tuple(kinds)
     return tuple(f"{name}, {kind}" for name in names for kind in kinds)
 
 
-_MRR = _each(("MRR",), SIZES)
+_R_PRECISION = _each(["R-precision"], ["distinct classes", "instance counts"])
+_PAIRS = ("accuracy", "log-loss", "accuracy of ten, inside pairs")
+_PAIRS_SHOWN = (*_PAIRS[:2], *_each(["accuracy"], ["unseen pairs", "rare classes"]), _PAIRS[2])
+_MRR = _each(["MRR"], SIZES)
 _ROOMS = tuple(f"{figure}, {lists}" for lists in LISTS for figure in FIGURES)
+_ROOMS_SHOWN = (
+    *_ROOMS,
+    *_each(_each(["top-1"], LISTS), ["profile named"]),
+    *_each(_ROOMS, ["real rooms"]),
+)
+_ALARMS = tuple(f"alarms, {name}, {n} classes" for n in LENGTHS for name in SENSITIVITIES)
 
 TASKS: dict[str, Task] = {
-    "T1a relations": _task(
-        *("relations of a scene", "relations", relations_task),
-        _each(("R-precision",), ("distinct classes", "instance counts")),
+    "T1a relations": Task(
+        "relations of a scene", relations_task, "relations", _R_PRECISION, of_objects=False
+    ),
+    "T1 pairs": Task(
+        "relation of two objects", pairs_task, "", _PAIRS, _PAIRS_SHOWN, of_objects=False
+    ),
+    "T1 with evidence": Task(
+        "relations, with more evidence",
+        evidence.relations_evidence_task,
+        "artifact",
+        card=_each(["change of R-precision"], evidence.OF_RELATIONS),
         of_objects=False,
     ),
-    "T1 pairs": _task(
-        *("relation of two objects", "", pairs_task),
-        (
-            *("accuracy", "log-loss", "accuracy, unseen pairs", "accuracy, rare classes"),
-            "accuracy of ten, inside pairs",
-        ),
-        ("accuracy", "log-loss", "accuracy of ten, inside pairs"),
-        of_objects=False,
+    "T1b completion": Task(
+        "remaining relations", completion_task, "completion", ("R-precision",), of_objects=False
     ),
-    "T1 with evidence": _task(
-        *("relations, with more evidence", "artifact", evidence.relations_evidence_task),
-        _each(("change of R-precision",), evidence.OF_RELATIONS),
-        of_objects=False,
+    "T2 missing": Task(
+        "missing objects",
+        missing_task,
+        "missing",
+        card=(*_MRR, "top-1", "top-10"),
+        tables=(*_MRR, *_each(_MRR, ["structure listed"])),
     ),
-    "T1b completion": _task(
-        *("remaining relations", "completion", completion_task), ("R-precision",), of_objects=False
+    "T2 with evidence": Task(
+        "missing object, with the room type",
+        evidence.missing_evidence_task,
+        "artifact",
+        card=_each(["change of MRR"], evidence.OF_OBJECTS),
     ),
-    "T2 missing": _task(
-        *("missing objects", "missing", missing_task),
-        (*_MRR, *_each(_MRR, ("structure listed",))),
-        (*_MRR, "top-1", "top-10"),
+    "T2-at missing at a place": Task(
+        "missing object at a place", placed_task, "at_place", ("MRR",), ("MRR", "MRR, on-top")
     ),
-    "T2 with evidence": _task(
-        *("missing object, with the room type", "artifact", evidence.missing_evidence_task),
-        _each(("change of MRR",), evidence.OF_OBJECTS),
+    "Rooms": Task("room type", rooms_task, "rooms", card=_ROOMS, tables=_ROOMS_SHOWN),
+    "T3 outliers": Task("intruder", outliers_task, "", _each(["hit@1", "flagged"], LAWS)),
+    "T3 alarms": Task("alarms in untouched parts", alarms_task, "flags", card=_ALARMS),
+    "T3b placement": Task(
+        "false relation", placement_task, "false_relations", ("hit@1",), of_objects=False
     ),
-    "T2-at missing at a place": _task(
-        *("missing object at a place", "at_place", placed_task), ("MRR", "MRR, on-top"), ("MRR",)
-    ),
-    "Rooms": _task(
-        *("room type", "rooms", rooms_task),
-        (
-            *_ROOMS,
-            *(f"top-1, {lists}, profile named" for lists in LISTS),
-            *_each(_ROOMS, ("real rooms",)),
-        ),
-        _ROOMS,
-    ),
-    "T3 outliers": _task("intruder", "", outliers_task, _each(("hit@1", "flagged"), LAWS)),
-    "T3 alarms": _task(
-        *("alarms in untouched parts", "flags", alarms_task),
-        tuple(f"alarms, {name}, {n} classes" for n in LENGTHS for name in SENSITIVITIES),
-    ),
-    "T3b placement": _task(
-        "false relation", "false_relations", placement_task, ("hit@1",), of_objects=False
-    ),
-    "T3c moved": _task("moved object", "misplaced", moved_task, METRICS, of_objects=False),
-    "T4 generate": _task(
-        *("generated scenes", "generate", generation_task),
-        (
+    "T3c moved": Task("moved object", moved_task, "misplaced", METRICS, of_objects=False),
+    "T4 generate": Task(
+        "generated scenes",
+        generation_task,
+        "generate",
+        card=("MMD², free", "pair correlation, free"),
+        tables=(
             "MMD², free",
             "MMD², given room types",
             "pair correlation, free",
@@ -150,33 +143,33 @@ TASKS: dict[str, Task] = {
             "mirrored relations, free",
             "on-top cycles, free",
         ),
-        ("MMD², free", "pair correlation, free"),
     ),
-    "T4 rooms": _task(
-        *("generated rooms", "artifact", generated_rooms_task),
-        (REFUSED, *_each((REFUSED,), ROOMS), *_each((SIZE,), (FREE, *ROOMS))),
-        (REFUSED, *_each((SIZE,), (FREE,))),
+    "T4 rooms": Task(
+        "generated rooms",
+        generated_rooms_task,
+        "artifact",
+        card=(REFUSED, *_each([SIZE], [FREE])),
+        tables=(REFUSED, *_each([REFUSED], ROOMS), *_each([SIZE], [FREE, *ROOMS])),
     ),
-    "Calibration": _task(
-        *("calibration", "artifact", calibration_task),
-        _each(("ECE", "Brier skill"), NAMES),
-        tuple(f"{figure}, {name}" for name in NAMES for figure in ("ECE", "Brier skill")),
+    "Calibration": Task(
+        "calibration",
+        calibration_task,
+        "artifact",
+        card=tuple(f"{figure}, {name}" for name in NAMES for figure in ("ECE", "Brier skill")),
+        tables=_each(["ECE", "Brier skill"], NAMES),
         of_objects=False,
     ),
-    "Everyday": _task("everyday facts", "artifact", everyday_task, LINES, of_objects=False),
+    "Everyday": Task("everyday facts", everyday_task, "artifact", LINES, of_objects=False),
 }
 
 
 # The statistics depend only on the training scenes, not on the machine. They appear in model cards,
 # but not in tables that compare machines.
 STATISTICS: dict[str, Task] = {
-    "Offsets": _task(
-        *("offsets of placements", "artifact", offsets.offsets_task),
-        (),
-        offsets.METRICS,
-        of_objects=False,
+    "Offsets": Task(
+        "offsets of placements", offsets_task, "artifact", OFFSETS, tables=(), of_objects=False
     ),
-    "Counts": _task("numbers of instances", "artifact", counts.counts_task, (), counts.METRICS),
+    "Counts": Task("numbers of instances", counts_task, "artifact", COUNTS, tables=()),
 }
 
 EVERY_TASK = TASKS | STATISTICS

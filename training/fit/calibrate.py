@@ -127,7 +127,7 @@ def with_lower_lateral(
         log_odds = posterior.relation_log_odds().astype(np.float64)
         logs = np.log(scene.evidence.counts)
         logits = table[:, 0] + table[:, 1] * log_odds + table[:, 2] * (logs[:, None] + logs)
-        return both_ways(logits, question.ends)
+        return both_ways(logits, question.pairs)
 
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
     shift = lateral_shift(score, listed_pairs(scenes, structure, STACKED))

@@ -66,9 +66,9 @@ def _configs(reference: str, path: Path | None, names: Sequence[str] | None) -> 
     """Return the configurations of the full model and of the selected ablations."""
     full = load_config(reference)
     rows = load_rows(own_or_shipped(path, full, "ablations", "--rows"), full)
-    known = [row.name for row in rows]
-    if unknown := sorted(set(names or ()) - set(known)):
-        raise ConfigError(f"unknown rows {unknown}: choose from {', '.join(known)}")
+    all_names = [row.name for row in rows]
+    if unknown := sorted(set(names or ()) - set(all_names)):
+        raise ConfigError(f"unknown rows {unknown}: choose from {', '.join(all_names)}")
     return [full, *(row for row in rows if not names or row.name in names)]
 
 
@@ -105,6 +105,7 @@ def load_rows(path: Path, full: Config) -> list[Config]:
 
 
 def _config(row: _Change, full: Config, file: str) -> Config:
+    """Return the configuration of one ablation; see `load_rows` for the errors."""
     try:
         start = load_config(row.start) if row.start else full
         changed = with_settings(start, row.changes).model_copy(update={"data": full.data})

@@ -165,6 +165,7 @@ def compare_machines(
 
 
 def _plan(folder: Path, scenes: SplitScenes, limit: int, tasks: tuple[str, ...]) -> Plan:
+    """Return the questions about the test scenes of each data source, and of all together."""
     data = scenes.complete_data()
     common = data.structure, data.train, seen_triples(data.train.scenes, data.train.v.shape[1])
     settings = dict(settings_by_source(data.test, *common, limit=limit))

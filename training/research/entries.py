@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from app.scene.relations import STACKED
 from training.datasets.batches import SceneTensors, TrainingData, subset
@@ -22,9 +21,10 @@ from training.evaluation.baselines.classes import frequency
 from training.evaluation.baselines.fitting import TRIALS, Baseline
 from training.evaluation.intruders import intruder_weights
 from training.evaluation.model import Model, ObjectScore, suspicion_of
-from training.evaluation.outlier_tasks import first_shares, with_intruders
+from training.evaluation.outlier_tasks import expected_hit_at_1, with_intruders
 from training.evaluation.pair_task import SHIFTS, baseline_log_odds, lateral_shift, listed_pairs
 from training.evaluation.report import Progress, silent
+from training.evaluation.setting import Structure
 from training.fit.calibrate import calibrate
 from training.fit.configuration import Config, ObjectsConfig
 from training.fit.draft import placed_draft
@@ -78,7 +78,7 @@ def baseline_entries(
     config = learning or ObjectsConfig()
     decisive = config.model_dump(include={"source_weights", "open_sources"})
     for name, baseline in BASELINES.items():
-        is_usable = related or not baseline.learns_relations
+        is_usable = related or not baseline.answer.of_relations
         is_selected = names is None or name in names
         if is_usable and is_selected and (baseline.stochastic or seed == 0):
             make = partial(_baseline_model, baseline, seed, config)
@@ -120,7 +120,7 @@ def _baseline_model(
         parts = data.train, data.validation, data.structure
         return baseline.fit(*parts, seed=seed, progress=say)
 
-    if baseline.scores not in (("missing",), ("rooms",)):
+    if baseline.answer.of_relations:
         return with_lateral_shift(fit(baseline, data), data)
     objects = replace(data, train=object_scenes(data.train, data.structure, learning))
     model = fit(baseline, objects)
@@ -143,7 +143,7 @@ def with_lateral_shift(model: Model, data: TrainingData) -> Model:
     return replace(model, lateral=shift)
 
 
-def object_scenes(train: SceneTensors, structure: Tensor, config: ObjectsConfig) -> SceneTensors:
+def object_scenes(train: SceneTensors, structure: Structure, config: ObjectsConfig) -> SceneTensors:
     """Return the scenes from which a machine learns objects, with its weights and masks."""
     learnt = ObjectScenes.of(train, structure, config)
     shows = torch.zeros_like(train.annotated_classes)
@@ -166,16 +166,17 @@ def tuned_suspicion(score: ObjectScore, data: TrainingData, seed: int) -> Object
     log_popularity = frequency(data.train.v, data.train.weight).logit()
     hits = dict.fromkeys(_WEIGHTS, 0.0)
     for weights in intruder_weights(scenes, data.train).values():
-        _, v, intruder = with_intruders(scenes, data.structure, weights)
-        if len(v):
-            plain = ask_rows(suspicion_of(score), v, block=32)
+        cases = with_intruders(scenes, data.structure, weights)
+        if len(cases.v):
+            plain = ask_rows(suspicion_of(score), cases.v, block=32)
             for weight in _WEIGHTS:
                 values = plain + weight * log_popularity
-                hits[weight] += float(first_shares(values, intruder).mean())
+                hits[weight] += float(expected_hit_at_1(values, cases.intruder).mean())
     return suspicion_of(score, log_popularity, max(hits, key=lambda weight: hits[weight]))
 
 
 def _machine_model(config: Config, data: TrainingData, folder: Path, say: Progress) -> Model:
+    """Train or load a machine, and calibrate it. Its weights that are held at 0 do not count."""
     run, seed = folder / "run", config.training.seed
     machine = train_once(config, data, run, say)
     draft = placed_draft(machine, data)

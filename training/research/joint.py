@@ -24,6 +24,7 @@ from typing import Annotated
 import numpy as np
 import torch
 import typer
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from app.registry import DEFAULT_STORE, Store
@@ -32,6 +33,7 @@ from training.datasets.cases import some_scenes
 from training.domain.init_command import StorePath
 from training.evaluation.outside import read_test
 from training.evaluation.parts import draw_parts, exactly, rank_hidden
+from training.evaluation.setting import Structure, with_relations
 from training.machines import BoltzmannMachine
 from training.machines.arrays import machine_of
 from training.machines.edges import Edges
@@ -42,10 +44,10 @@ _FIRST = 10  # likeliest unlisted classes, which an answer lists
 _DRAWS = 4000
 
 
-def joint_log_odds(machine: BoltzmannMachine, v: Tensor) -> Tensor:
-    """Return log p(v_i = 1 | v) - log p(v_i = 0 | v) in the joint with a source unit, (B, V).
+def joint_log_odds(machine: BoltzmannMachine, v: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
+    """Return log p(v_i = 1 | v) - log p(v_i = 0 | v) in the joint with a source unit.
 
-    v are lists, (B, V) 0 or 1. The entry of a listed class has no meaning.
+    The entry of a listed class has no meaning.
     """
     if not machine.spec.profiles:
         return machine.object_log_odds(v)
@@ -54,10 +56,10 @@ def joint_log_odds(machine: BoltzmannMachine, v: Tensor) -> Tensor:
     return machine.object_log_odds(v) - p @ machine.a + of_source
 
 
-def joint_room_log_p(machine: BoltzmannMachine, v: Tensor) -> Tensor:
-    """Return log p(t | v) of each room type in the joint with a source unit, (B, C).
+def joint_room_log_p(machine: BoltzmannMachine, v: Float[Tensor, "B V"]) -> Float[Tensor, "B C"]:
+    """Return log p(t | v) of each room type in the joint with a source unit.
 
-    The room type is known to be one of the C types.
+    The room type is one of the C types.
     """
     logits = machine.e + machine.gain(machine.context(v), machine.Q)
     if machine.spec.coupled:
@@ -70,22 +72,18 @@ def joint_room_log_p(machine: BoltzmannMachine, v: Tensor) -> Tensor:
 
 def change_by_relations(
     machine: BoltzmannMachine,
-    v: Tensor,
+    v: Float[Tensor, "1 V"],
     edges: Edges,
-    r: Tensor,
-    observed: Tensor,
+    r: Float[Tensor, "1 units"],
+    observed: Bool[Tensor, "1 units"],
     generator: torch.Generator,
     draws: int = _DRAWS,
-) -> Tensor:
-    """Estimate the change of the log-odds of each unlisted class by observed relations, (V,).
+) -> Float[Tensor, " V"]:
+    """Estimate the change of the log-odds of each unlisted class by observed relations.
 
     The change is log E[exp(W_i h1) | v, r] - log E[exp(W_i h1) | v]. States of h1 are drawn from
-    p(h1 | v), and weighted by p(r | v, h1).
-
-    Args:
-        v: one list, (1, V).
-        edges, r, observed: relation units between the listed classes, their values and True where
-            they are observed, (1, units).
+    p(h1 | v), and weighted by p(r | v, h1). `r` are the values of the relation units `edges`
+    between the listed classes.
     """
     x = machine.by_unit(machine.context(v))[0]
     states = torch.cat([torch.zeros_like(x[:, :1]), x], 1).softmax(1)
@@ -93,8 +91,8 @@ def change_by_relations(
     one = torch.nn.functional.one_hot(drawn, machine.spec.states)[..., 1:]
     h1 = one.flatten(1).to(v.dtype)
     logits = machine.relation_logits(edges, v, h1.unsqueeze(1)).squeeze(1)
-    known = observed[0] & (machine.gate(edges, v)[0] > 0)
-    log_weight = (r[0] * logits - torch.nn.functional.softplus(logits))[:, known].sum(1)
+    is_unit = observed[0] & (machine.gate(edges, v)[0] > 0)
+    log_weight = (r[0] * logits - torch.nn.functional.softplus(logits))[:, is_unit].sum(1)
     weight = log_weight.softmax(0)
     raised = (h1 @ machine.W.T).exp()
     return (weight @ raised).log() - raised.mean(0).log()
@@ -102,7 +100,7 @@ def change_by_relations(
 
 @torch.no_grad()
 def compare_sources(
-    machine: BoltzmannMachine, scenes: SceneTensors, structure: Tensor, length: int
+    machine: BoltzmannMachine, scenes: SceneTensors, structure: Structure, length: int
 ) -> dict[str, float]:
     """Return the mean differences of log-odds by the source unit in lists of some length."""
     parts = draw_parts(some_scenes(scenes, _LISTS, 0), structure, exactly(length))
@@ -130,16 +128,15 @@ def compare_sources(
 
 @torch.no_grad()
 def compare_relations(
-    machine: BoltzmannMachine, scenes: SceneTensors, structure: Tensor
+    machine: BoltzmannMachine, scenes: SceneTensors, structure: Structure
 ) -> dict[str, float]:
     """Return the mean differences of log-odds by the observed relations of whole scenes."""
-    has_relation = [bool(scene.evidence.holds.any()) for scene in scenes.scenes]
-    index = torch.tensor(has_relation).nonzero().squeeze(1)
-    chosen = torch.randperm(len(index), generator=torch.Generator().manual_seed(0))[:_LISTS]
+    related = with_relations(scenes)
+    order = torch.randperm(len(related), generator=torch.Generator().manual_seed(0))
     generator = torch.Generator().manual_seed(0)
     every, first = [], []
-    for k in index[chosen].tolist():
-        batch = scenes.batch(torch.tensor([k]))
+    for k in order[:_LISTS]:
+        batch = related.batch(k.unsqueeze(0))
         edges, r, observed = machine.lay_out(
             batch.classes, batch.counts, batch.holds.double(), batch.observed
         )

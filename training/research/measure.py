@@ -193,6 +193,7 @@ _plan: Plan
 
 
 def _start_worker(plan: bytes) -> None:
+    """Unpickle the plan in a new process, which uses one thread."""
     global _plan  # set once in each process
     torch.set_num_threads(1)
     # Ctrl-C reaches every process of the terminal; only the main process handles it.

@@ -147,6 +147,7 @@ def load_space(path: Path, config: Config) -> dict[str, BaseDistribution]:
 
 
 def _distribution(entry: Any) -> BaseDistribution:
+    """Return the distribution of a list of choices or of an interval."""
     from optuna import distributions
 
     if isinstance(entry, list):
@@ -197,6 +198,7 @@ class Search:
         scores: dict[str, float] = {}
 
         def report(point: CurvePoint) -> None:
+            """Report the sum of the latest scores, and stop a trial below the median."""
             scores[SCORES[point.phase]] = point.score
             step = round(100 * point.done) + 100 * (point.phase == "relations")
             trial.report(float(np.nansum(list(scores.values()))), step)
@@ -242,6 +244,7 @@ class Search:
         }
 
     def _measure(self, machine: BoltzmannMachine, folder: Path) -> None:
+        """Write the reports of a machine on the validation scenes of each data source."""
         data, artifact = self.data, draft_artifact(machine, self.data.vocabulary)
         relations = partial(score_relations, artifact, given=False)
         model = Model(missing=partial(score_missing, artifact), relations=relations)

@@ -120,6 +120,11 @@ def knowing(scenes: SceneTensors):
     return score
 
 
+def values_of(outcome):
+    """The values of the metrics of an outcome, by name."""
+    return {name: metric.value for name, metric in outcome.metrics.items()}
+
+
 def in_order(v):
     """A score of objects: class 0 before 1 before 2, ..."""
     return torch.tensor([5.0, 4, 3, 2, 1]).expand_as(v)

@@ -1,4 +1,4 @@
-"""Everyday facts: asked as a client of the service asks them, by one module, for acceptance."""
+"""Everyday facts: the same answers as a client of the service gets; only one module reads them."""
 
 import json
 import re

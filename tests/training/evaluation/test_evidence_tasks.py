@@ -1,4 +1,4 @@
-"""With and without evidence: what is told, what is asked, and that these never meet."""
+"""Metrics with and without evidence; evidence and queried relations are disjoint."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, roo
 from tests.training.evaluation.scenes import scene, tensors
 from training.evaluation import evidence_tasks as evidence
 from training.evaluation.evidence_tasks import (
-    halves,
+    evidence_cases,
     missing_evidence_task,
     relations_evidence_task,
 )
@@ -20,8 +20,8 @@ TASKS = {"MRR": missing_evidence_task, "R-precision": relations_evidence_task}
 
 
 @pytest.mark.parametrize("kind", ["relations", "poses"])
-def test_no_asked_pair_is_told(kind):
-    cases = list(halves(DATA, PLAIN, kind))
+def test_evidence_contains_no_queried_relation(kind):
+    cases = list(evidence_cases(DATA, PLAIN, kind))
     assert cases
     for case in cases:
         for a, i, j in case.scene.relations:

@@ -8,7 +8,7 @@ import torch
 
 from tests.questions.answers import generate
 from tests.questions.artifacts import LABELS, larger_artifact, scene_of
-from tests.training.evaluation.scenes import scene, tensors
+from tests.training.evaluation.scenes import scene, tensors, values_of
 from training.evaluation import generated_rooms_task as task
 from training.evaluation.generated_rooms_task import generated_rooms_task
 from training.evaluation.setting import Setting
@@ -19,7 +19,7 @@ STRUCTURE = torch.arange(V) == V - 1
 
 def metrics_of(artifact, scenes):
     outcome = generated_rooms_task(artifact, Setting(tensors(scenes, V), STRUCTURE))
-    return {name: metric.value for name, metric in outcome.metrics.items()}, outcome
+    return values_of(outcome), outcome
 
 
 def test_refused_rooms_are_those_below_the_limits():

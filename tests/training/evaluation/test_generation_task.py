@@ -7,9 +7,10 @@ import torch
 from tests.enumeration.small_machines import small_machine
 from tests.questions.artifacts import artifact_of
 from tests.training.evaluation.scenes import WIDE, random_scenes, scene, tensors
-from training.evaluation.contradictions import contradiction_metrics, count_contradictions
 from training.evaluation.generation_task import (
+    contradiction_metrics,
     copies,
+    count_contradictions,
     discrepancy,
     generation_metrics,
     hamming,

@@ -8,7 +8,7 @@ import torch
 
 from app.scene.relations import LEFT, ON_TOP
 from tests.questions.artifacts import LARGER, larger_artifact
-from tests.training.evaluation.scenes import scene, tensors
+from tests.training.evaluation.scenes import scene, tensors, values_of
 from tests.training.fit.test_offset_statistics import MEAN, STD, apart, draws
 from training.evaluation.offset_task import offsets_task
 from training.evaluation.report import evaluate
@@ -27,26 +27,22 @@ def outcome(train, test):
     return offsets_task(artifact_of(train), Setting(tensors(test, V), NO_STRUCTURE))
 
 
-def values(found):
-    return {name: metric.value for name, metric in found.metrics.items()}
-
-
-def test_draws_of_a_known_normal_are_covered_as_promised():
+def test_the_regions_cover_80_percent_of_normal_draws():
     """2,000 scenes: .8 within .05 is 5.6 standard errors of .009, and 400 draws are learnt from,
     which moves the share by less than .02; the seeds are fixed, and others would fail with
     probability below 1e-3."""
     test = draws(MEAN, STD, 2000, 1)
     found = outcome(draws(MEAN, STD, 400, 0), test)
-    share = values(found)
+    share = values_of(found)
     assert share["in the ellipse, left"] == pytest.approx(0.8, abs=0.05)
     assert share["in the ellipsoid, left"] == pytest.approx(0.8, abs=0.05)
     assert found.metrics["in the ellipse, left"].n == 2000
 
 
-def test_distances_are_from_the_mean_and_from_what_the_relation_says():
+def test_distances_from_the_mean_of_the_pair_and_of_the_relation():
     """Two kinds of pairs, 1 and 3 m away: the relation alone says 2."""
     train = draws((0, 1, 0), 0.01, 40, 0) + draws((0, 3, 0), 0.01, 40, 1, i=2, j=3)
-    found = values(outcome(train, [apart((0, 1, 0)), apart((0, 3, 0), 2, 3)]))
+    found = values_of(outcome(train, [apart((0, 1, 0)), apart((0, 3, 0), 2, 3)]))
     assert found["distance (m)"] == pytest.approx(0.0, abs=0.1)
     assert found["distance (m), relation alone"] == pytest.approx(1.0, abs=0.1)
 
@@ -57,7 +53,7 @@ def test_relations_never_seen_in_training_are_not_judged():
     both = outcome(train, draws(MEAN, STD, 5, 1, relation=ON_TOP) + draws(MEAN, STD, 5, 2))
     assert both.skipped == 5
     regions = {"in the ellipse, left", "in the ellipsoid, left"}
-    assert set(values(both)) == {*regions, "distance (m)", "distance (m), relation alone"}
+    assert set(values_of(both)) == {*regions, "distance (m)", "distance (m), relation alone"}
 
 
 def test_models_and_sources_without_poses_have_no_figures():

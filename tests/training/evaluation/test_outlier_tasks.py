@@ -1,11 +1,11 @@
-"""T3: who is added, by which law, who is first, and the alarms in untouched parts."""
+"""T3: the intruders and their distributions, hit@1, and the alarms in untouched parts."""
 
 import numpy as np
 import pytest
 import torch
 
 from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
-from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
+from tests.training.evaluation.scenes import FLOOR, NO_STRUCTURE, scene, tensors, values_of
 from training.evaluation.artifact_model import artifact_model
 from training.evaluation.asking import SENSITIVITIES, judge, of_classes
 from training.evaluation.intruders import (
@@ -28,14 +28,16 @@ def only_intruders(v):
     return suspicion.masked_fill(v == 0, -torch.inf)
 
 
-def test_suspicions_that_know_everything_or_nothing():
+def test_hit_at_1_of_a_perfect_a_wrong_and_an_ignorant_suspicion():
     data = tensors([scene([0, 1, 2]) for _ in range(5)])
-    hits = hit_at_1(data, NO_STRUCTURE, only_intruders, None)
-    assert (hits.value, hits.n) == (1.0, 5 * len(SEEDS))
+    cases = with_intruders(data, NO_STRUCTURE, None)
     wrong = lambda v: (-only_intruders(v)).masked_fill(v == 0, -torch.inf)  # noqa: E731
-    assert hit_at_1(data, NO_STRUCTURE, wrong, None).value == 0.0
-    assert hit_at_1(data, NO_STRUCTURE, suspicion_of(torch.zeros_like), None).value == 1 / 4
-    assert hit_at_1(tensors([scene([0, 1])]), NO_STRUCTURE, wrong, None) is None
+    scores = (only_intruders, 1.0), (wrong, 0.0), (suspicion_of(torch.zeros_like), 1 / 4)
+    for suspicion, value in scores:
+        hits = hit_at_1(data, cases, suspicion)
+        assert (hits.value, hits.n) == (value, 5 * len(SEEDS))
+    small = Setting(tensors([scene([0, 1])]), NO_STRUCTURE)
+    assert outliers_task(Model(suspicion=wrong), small) is None
 
 
 def test_an_object_is_judged_by_the_rest_without_itself():
@@ -53,21 +55,16 @@ def test_an_object_is_judged_by_the_rest_without_itself():
     assert values.tolist() == [[3, -2, -3, -inf, -inf], [-inf, -inf, -inf, -4, -5]]
 
 
-def test_a_request_lists_the_scene_and_its_intruder_without_structure():
-    structure = torch.tensor([True, False, False, False, False])
-    data = tensors([scene([0, 1, 2, 3]), scene([0, 1, 2])])
-    index, v, intruder = with_intruders(data, structure, None)
+def test_a_request_lists_the_things_of_a_scene_and_an_absent_one():
+    """Scenes of fewer than three things have no intruder."""
+    data = tensors([scene([0, 1, 2, 3]), scene([0, 2]), scene([0, 1, 2])])
+    index, v, intruder = with_intruders(data, FLOOR, None)
     assert index.tolist() == [0] * len(SEEDS)
     assert intruder.tolist() == [4] * len(SEEDS)
-    assert v.tolist() == [[0, 1, 1, 1, 1]] * len(SEEDS)
-
-
-def test_intruders_are_absent_and_no_structure():
-    structure = torch.arange(len(NO_STRUCTURE)) == 4
-    data = tensors([scene([0, 1, 2]) for _ in range(20)])
-    assert set(draw_intruders(data, structure).tolist()) == {3}
-    small = tensors([scene([0, 1]), scene([0, 1, 4])])
-    assert draw_intruders(small, structure).tolist() == [-1, -1]
+    assert v.tolist() == [[1, 0, 1, 1, 1]] * len(SEEDS)
+    absent = torch.arange(len(FLOOR)) == 4
+    drawn = draw_intruders(tensors([scene([0, 1, 2]) for _ in range(20)]), absent)
+    assert set(drawn.tolist()) == {3}
 
 
 def test_popular_intruders_follow_training():
@@ -92,7 +89,7 @@ TOY = tensors(
 )
 
 
-def test_the_signature_of_a_room_is_what_is_often_there_and_seldom_elsewhere():
+def test_signature_classes_are_frequent_in_their_room_type_and_rare_elsewhere():
     """Lift of its own class 180 / 30 = 6; of class 4 in rooms 0 and 1 3; of class 3 1."""
     typical, share = signatures(TOY)
     assert [np.flatnonzero(row).tolist() for row in typical] == [[0], [1], [2], [], [], []]
@@ -147,14 +144,13 @@ def test_alarms_by_hand():
         return (v > 0) & (torch.arange(5) == 0) & (sensitivity == "high")
 
     outcome = alarms_task(flags, Setting(data, NO_STRUCTURE))
-    values = {name: metric.value for name, metric in outcome.metrics.items()}
     expected = dict.fromkeys(
         (f"alarms, {s}, {n} classes" for s in SENSITIVITIES for n in (1, 2, 3)), 0.0
     )
     for n in (1, 2, 3):
         share = float(draw_parts(data, NO_STRUCTURE, exactly(n)).v[:, 0].mean())
         expected[f"alarms, high, {n} classes"] = pytest.approx(share)
-    assert values == expected
+    assert values_of(outcome) == expected
     assert outcome.skipped == 1
 
 

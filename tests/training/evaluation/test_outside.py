@@ -1,4 +1,4 @@
-"""Files of a user as tests: read, asked and marked as learnt."""
+"""Files of a user as tests: reading, metrics and marks of training data."""
 
 import json
 from dataclasses import asdict, replace
@@ -31,7 +31,7 @@ def learnt(*sources):
     return replace(room_model(), manifest=SimpleNamespace(data=entries))
 
 
-def test_rooms_are_asked_every_task_that_needs_no_training_scenes(tmp_path):
+def test_files_have_the_metrics_of_all_tasks_without_training_scenes(tmp_path):
     """The figures are those of the tasks; intervals resample the groups of the file."""
     pairs = [replace(s, group=f"home {k // 2}") for k, s in enumerate(generate_rooms(12, 3))]
     test = read_test(room_file(tmp_path, pairs))

@@ -1,4 +1,4 @@
-"""T1 pairs by hand: what is asked, what is right, and what is new."""
+"""T1 pairs by hand: questions, accuracy and log-loss, unseen pairs and rare classes."""
 
 from dataclasses import replace
 
@@ -18,6 +18,7 @@ from tests.training.evaluation.scenes import (
     random_scenes,
     scene,
     tensors,
+    values_of,
 )
 from training.datasets.batches import seen_triples
 from training.evaluation.asking import labels_alone, relation_probabilities
@@ -51,7 +52,7 @@ def log_odds(p):
     return score
 
 
-def test_only_vertical_relations_between_two_things_are_asked():
+def test_questions_are_pairs_of_things_with_a_vertical_relation():
     structure = torch.arange(len(NO_STRUCTURE)) == 3
     data = tensors(
         [
@@ -60,7 +61,7 @@ def test_only_vertical_relations_between_two_things_are_asked():
         ]
     )
     (asked,) = listed_pairs(data, structure)
-    assert asked.scene.evidence.classes[asked.ends].tolist() == [[0, 1]]
+    assert asked.scene.evidence.classes[asked.pairs].tolist() == [[0, 1]]
     # left(0, 1) and on-top(1, 0): the first to the second, then back.
     assert np.flatnonzero(asked.listed[0]).tolist() == [LEFT, A + ON]
 
@@ -122,8 +123,7 @@ def test_inside_pairs_have_ten_candidates():
         ({(INSIDE, True): 0.5, (ON, True): 0.6}, 0),
     ):
         outcome = pairs_task(Model(relations=log_odds(p)), setting)
-        values = {name: metric.value for name, metric in outcome.metrics.items()}
-        assert values == {"accuracy of ten, inside pairs": accuracy}
+        assert values_of(outcome) == {"accuracy of ten, inside pairs": accuracy}
         assert outcome.scenes == 2
     ignorant = pairs_task(Model(relations=flat), setting).metrics
     assert ignorant["accuracy of ten, inside pairs"].value == pytest.approx(1 / 10)
@@ -156,12 +156,12 @@ def test_rare_classes_are_those_that_training_relates_to_few():
     assert "accuracy, rare classes" not in metrics
 
 
-def test_the_service_is_asked_about_its_first_instances():
-    asked = next(one for one in listed_pairs(rooms(20, 2), STRUCTURE) if len(one.ends) > 2)
+def test_the_service_score_is_that_of_the_first_instances():
+    asked = next(one for one in listed_pairs(rooms(20, 2), STRUCTURE) if len(one.pairs) > 2)
     p = service_score(room_model())(asked)
     every = relation_probabilities(room_model(), labels_alone(asked.scene))
     own = asked.scene.instance_classes
-    classes = asked.scene.evidence.classes[asked.ends]
+    classes = asked.scene.evidence.classes[asked.pairs]
     for (i, j), row in zip(classes.tolist(), p, strict=True):
         x, y = (int(np.flatnonzero(own == c)[0]) for c in (i, j))
         assert row == pytest.approx([*every[:, x, y], *every[:, y, x]])

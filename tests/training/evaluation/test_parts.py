@@ -1,4 +1,4 @@
-"""Random parts of scenes by hand, and the validation score of a score that knows the answer."""
+"""Random parts of scenes, ranks of hidden classes, and the validation score, by hand."""
 
 from dataclasses import replace
 
@@ -21,24 +21,22 @@ from training.evaluation.parts import (
 
 
 @pytest.mark.parametrize(
-    ("size", "listed"), [(one_quarter, 1), (all_but_one, 3), (exactly(2), 2), (exactly(4), 0)]
+    ("classes", "size", "listed"),
+    [
+        *((4, size, k) for size, k in ((one_quarter, 1), (all_but_one, 3), (exactly(2), 2))),
+        *((2, size, 1) for size in (one_quarter, all_but_one, up_to_longest)),
+        (4, exactly(4), 0),
+        *((classes, up_to_longest, 0) for classes in (0, 1)),
+    ],
 )
-def test_the_size_of_a_part(size, listed):
-    """Of four classes; listed and hidden classes are the scene."""
-    data = tensors([scene([0, 1, 2, 4])])
+def test_the_size_of_a_part(classes, size, listed):
+    """Listed and hidden classes are the scene; small scenes are skipped."""
+    data = tensors([scene(range(classes))])
     parts = draw_parts(data, NO_STRUCTURE, size)
-    assert len(parts.scene) == (listed > 0)
-    assert parts.skipped == (listed == 0)
+    assert (len(parts.scene), parts.skipped) == (listed > 0, listed == 0)
     for v, hidden in zip(parts.v, parts.hidden, strict=True):
         assert int(v.sum()) == listed
         assert torch.equal(v + hidden, data.v[0])
-
-
-@pytest.mark.parametrize("size", [one_quarter, all_but_one, up_to_longest])
-def test_small_scenes_list_and_hide_one_class_or_are_skipped(size):
-    parts = draw_parts(tensors([scene([0, 3]), scene([1]), scene([])]), NO_STRUCTURE, size)
-    assert parts.scene.tolist() == [0]
-    assert (int(parts.v.sum()), int(parts.hidden.sum())) == (1, 1)
 
 
 def test_structure_is_neither_listed_nor_hidden_nor_a_candidate():

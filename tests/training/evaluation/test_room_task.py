@@ -68,7 +68,7 @@ def test_real_rooms_have_their_own_rows():
     assert not [name for name in both.metrics if "real" in name or "named" in name]
 
 
-def test_the_service_is_asked_as_a_robot_asks():
+def test_room_scores_are_those_of_the_service():
     scenes = rooms(6, 3)
     score = partial(score_rooms, room_model(), ())
     v = scenes.v * ~STRUCTURE

@@ -1,4 +1,4 @@
-"""The rows of an ablation: what is read from TOML, and what is refused."""
+"""The rows of an ablation: valid and invalid TOML files."""
 
 import pytest
 
@@ -31,27 +31,13 @@ def changed(before, after):
     return {name for name in ours | theirs if ours.get(name) != theirs.get(name)}
 
 
-def test_a_row_differs_from_the_full_model_in_one_setting():
-    rows = load_rows(shipped_files("ablations")["places-triway"], FULL)
-    several = {
-        row.name: names
-        for row in rows
-        if row.name not in ("rbm", "gbm") and len(names := changed(FULL, row)) > 1
-    }
-    assert several == {
-        "binary-units": {"machine.units", "machine.states"},
-        "no-hidden-units": {"machine.without", "objects.word_weight"},
-        "no-factors": {"machine.without", "relations.word_weight"},
-    }
-
-
 def rows(tmp_path, text):
     path = tmp_path / "rows.toml"
     path.write_text(text)
     return load_rows(path, FULL)
 
 
-def test_a_row_changes_what_it_names_and_nothing_else(tmp_path):
+def test_a_row_changes_only_its_settings(tmp_path):
     text = (
         '[[row]]\nname = "wide"\nwhat = "50 units"\nchanges = { "machine.units" = 50 }\n'
         '[[row]]\nname = "open"\nwhat = "knowledge-triway"\nfrom = "knowledge-triway"\n'
@@ -87,6 +73,6 @@ ONE = '[[row]]\nname = "{name}"\nwhat = ""\n{rest}\n'
         (ONE.format(name="x", rest='from = "places-rbm"') * 2, "the name x occurs twice"),
     ],
 )
-def test_bad_rows_say_what_is_wrong(tmp_path, text, message):
+def test_invalid_rows_are_refused_with_the_reason(tmp_path, text, message):
     with pytest.raises(ConfigError, match=message):
         rows(tmp_path, text)

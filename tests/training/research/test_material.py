@@ -1,4 +1,4 @@
-"""What rows learn from decides whether they are gone on with, and which rows there are."""
+"""Training data of a run: its digest, its parts, and the need for relations."""
 
 import gzip
 import json
@@ -35,7 +35,7 @@ def material(folder, **settings):
     return split_and_encode(data, read_sources(data, folder), folder)
 
 
-def test_all_that_decides_what_is_learnt_is_in_the_digest(tmp_path):
+def test_the_digest_covers_all_settings_and_scenes_of_a_training(tmp_path):
     for source in ("flats", "sheds"):
         write_scenes(tmp_path, source)
     scenes = material(tmp_path)

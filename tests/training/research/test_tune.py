@@ -8,7 +8,6 @@ from optuna.distributions import FloatDistribution
 
 from tests.training.commands import invoke, small_config, write_config
 from training.fit.configuration import ConfigError
-from training.fit.relations import RelationFit
 from training.fit.trainer import Trainer
 from training.research.tune import Search, load_space
 from training.runs.config_files import load_config, shipped_files
@@ -38,23 +37,6 @@ def test_the_same_command_repeats_its_trials_and_writes_the_best(tmp_path, monke
     assert path.read_text().startswith("# rooms-triway, ")
     monkeypatch.setattr(Trainer, "run", None)
     assert invoke(*arguments(tmp_path), "--trials", "2") == output
-
-
-def test_an_interrupted_search_keeps_its_finished_trials(tmp_path, monkeypatch):
-    epoch, epochs = RelationFit.epoch, []
-
-    def interrupted(self, progress):
-        if len(epochs) == 1:  # the relations of the first trial
-            epochs.append(None)
-            raise KeyboardInterrupt
-        epochs.append(self.machine.spec.units)
-        return epoch(self, progress)
-
-    monkeypatch.setattr(RelationFit, "epoch", interrupted)
-    search = (*arguments(tmp_path, space='"machine.units" = [4]\n'), "--trials", "1")
-    assert "to continue" in invoke(*search, code=130)
-    invoke(*search)
-    assert epochs == [3, None, 4]  # the unchanged machine is trained once
 
 
 def test_bad_requests_are_refused_before_anything_runs(tmp_path):
@@ -119,6 +101,6 @@ def test_choices_and_intervals_are_read(tmp_path):
         ("", "contains no settings"),
     ],
 )
-def test_bad_spaces_say_what_is_wrong(tmp_path, text, message):
+def test_invalid_spaces_are_refused_with_the_reason(tmp_path, text, message):
     with pytest.raises(ConfigError, match=message):
         read_space(tmp_path, text)

@@ -6,30 +6,32 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from training.datasets.batches import SceneTensors
 from training.evaluation.baselines.fitting import Proposals
 from training.evaluation.model import ObjectScore
+from training.evaluation.setting import Structure
 
 
 @dataclass(frozen=True, eq=False)
 class LinearScore:
-    """The linear score bias + v · weights of each class, with bias (V,) and weights (V, V).
+    """The linear score bias + v · weights of each class.
 
     Rows of the weights are present classes, columns are scored classes. The diagonal is zero.
     """
 
-    bias: Tensor
-    weights: Tensor
+    bias: Float[Tensor, " V"]
+    weights: Float[Tensor, "V V"]
 
     @property
     def parameter_count(self) -> int:
         """Number of biases and of weights that are not zero."""
         return len(self.bias) + int(self.weights.count_nonzero())
 
-    def __call__(self, v: Tensor) -> Tensor:
-        """Return the score of each class for presence v, both (scenes, classes)."""
+    def __call__(self, v: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
+        """Return the score of each class for the presence of classes."""
         return self.bias + v @ self.weights
 
 
@@ -38,26 +40,26 @@ class Lists:
     """Training scenes as the object part of a machine learns from them.
 
     Attributes:
-        v: (scenes, classes) presence, without structure classes.
-        labelled: (scenes, classes) bool, False for classes that the data source cannot show.
-        weight, index: (scenes,) weight of each scene, 1 in the mean; its index in training.
+        v: presence, without structure classes.
+        labelled: False for classes that the data source cannot show.
+        weight, index: weight of each scene, 1 in the mean; its index in training.
     """
 
-    v: Tensor
-    labelled: Tensor
-    weight: Tensor
-    index: Tensor
+    v: Float[Tensor, "scenes V"]
+    labelled: Bool[Tensor, "scenes V"]
+    weight: Float[Tensor, " scenes"]
+    index: Int[Tensor, " scenes"]
 
-    def frequency(self) -> Tensor:
-        """Return the share of scenes with each class, (classes,), among the labelled scenes."""
+    def frequency(self) -> Float[Tensor, " V"]:
+        """Return the share of scenes with each class among the labelled scenes."""
         return frequency(self.v, self.weight, self.labelled)
 
-    def filled(self) -> Tensor:
+    def filled(self) -> Float[Tensor, "scenes V"]:
         """Return the presence with unlabelled entries replaced by the frequency of the class."""
         return torch.where(self.labelled, self.v, self.frequency())
 
 
-def training_lists(train: SceneTensors, structure: Tensor) -> Iterator[tuple[str, Lists]]:
+def training_lists(train: SceneTensors, structure: Structure) -> Iterator[tuple[str, Lists]]:
     """Yield sets of training scenes with their names. A baseline chooses between the sets.
 
     A set has all scenes, or only those with complete object lists. A class that a data source
@@ -74,17 +76,21 @@ def training_lists(train: SceneTensors, structure: Tensor) -> Iterator[tuple[str
                 yield name + absent, Lists(v[mask], labelled[mask], share, index)
 
 
-def frequency(v: Tensor, weight: Tensor | None = None, labelled: Tensor | None = None) -> Tensor:
-    """Return the share of scenes with each class, (classes,), smoothed by 1/2 in both counts."""
+def frequency(
+    v: Float[Tensor, "scenes V"],
+    weight: Float[Tensor, " scenes"] | None = None,
+    labelled: Bool[Tensor, "scenes V"] | None = None,
+) -> Float[Tensor, " V"]:
+    """Return the share of scenes with each class, smoothed by 1/2 in both counts."""
     weight = torch.ones(len(v)) if weight is None else weight
     total = weight.sum().expand(v.shape[1])
     if labelled is not None:
-        known = weight @ labelled.to(v.dtype)
-        total = torch.where(known > 0, known, total)
+        of_labelled = weight @ labelled.to(v.dtype)
+        total = torch.where(of_labelled > 0, of_labelled, total)
     return (weight @ v + 0.5) / (total + 1.0)
 
 
-def popularity(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
+def popularity(train: SceneTensors, structure: Structure, _seed: int) -> Proposals[ObjectScore]:
     """Yield the log-odds of the class frequencies."""
     V = train.v.shape[1]
     for name, lists in training_lists(train, structure):
@@ -94,12 +100,14 @@ def popularity(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[
 _EASE_L2 = (3.0, 10.0, 30.0, 50.0, 100.0, 300.0)
 
 
-def fit_ease(v: Tensor, l2: float, weight: Tensor | None = None) -> LinearScore:
+def fit_ease(
+    v: Float[Tensor, "scenes V"], l2: float, weight: Float[Tensor, " scenes"] | None = None
+) -> LinearScore:
     """Fit EASE, a ridge regression of every class on all other classes with a free intercept.
 
     Source: Steck, "Embarrassingly Shallow Autoencoders for Sparse Data", WWW 2019, equation 8. With
     the centred presence X and P = (X'X + λI)⁻¹, the least-squares weights with zero diagonal are
-    -P[j,i] / P[i,i]. `weight` (scenes,) weighs the squared errors of each scene.
+    -P[j,i] / P[i,i]. `weight` weighs the squared errors of each scene.
     """
     w = torch.ones(len(v)) if weight is None else weight
     x, w = v.double(), w.double()
@@ -112,7 +120,7 @@ def fit_ease(v: Tensor, l2: float, weight: Tensor | None = None) -> LinearScore:
     return LinearScore((mean - mean @ weights).float(), weights.float())
 
 
-def ease(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
+def ease(train: SceneTensors, structure: Structure, _seed: int) -> Proposals[ObjectScore]:
     """Yield a score for each ridge penalty. Unlabelled classes have their mean."""
     for name, lists in training_lists(train, structure):
         v = lists.filled()

@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, Final, TypeAlias, TypeVar
+from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from torch import Tensor
@@ -37,6 +37,8 @@ from training.evaluation.relation_tasks import (
     r_precision,
     score_scenes,
 )
+from training.evaluation.room_task import mean_log_p
+from training.evaluation.setting import Structure
 
 _SCENES = 1000
 
@@ -79,25 +81,25 @@ def halving(
         settings = [settings[k] for k in np.argsort(best)[::-1]]
 
 
-def missing_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> float:
-    """Return the `validation_score` of missing objects. Without such, raise a ValueError."""
+def missing_mrr(scenes: SceneTensors, structure: Structure, score: ObjectScore) -> float:
+    """Return the `validation_score` of missing objects; a ValueError if none can be hidden."""
     value = validation_score(lambda v, _: score(v), scenes, structure)
     if math.isnan(value):
         raise ValueError("no scene has two classes, so no class can be hidden")
     return value
 
 
-def placed_mrr(scenes: SceneTensors, structure: Tensor, score: PlacedScore) -> float:
+def placed_mrr(scenes: SceneTensors, structure: Structure, score: PlacedScore) -> float:
     """Return the mean reciprocal rank (MRR) of T2-at in at most `_SCENES` scenes."""
     return leave_one_out_at(some_scenes(scenes, _SCENES), structure, score)[0].mrr().value
 
 
-def relation_precision(scenes: SceneTensors, structure: Tensor, score: RelationScore) -> float:
+def relation_precision(scenes: SceneTensors, structure: Structure, score: RelationScore) -> float:
     """Return the R-precision of relations, given the instance counts of classes (task T1a)."""
     return _precision(score_scenes(scenes, structure, score), scenes)
 
 
-def completion_precision(scenes: SceneTensors, structure: Tensor, score: RelationScore) -> float:
+def completion_precision(scenes: SceneTensors, structure: Structure, score: RelationScore) -> float:
     """Return the R-precision of half of the relations, given the other half (task T1b)."""
     return _precision(complete_scenes(scenes, structure, score), scenes)
 
@@ -109,7 +111,7 @@ def _precision(scored: list[Candidates], scenes: SceneTensors) -> float:
     return ratio.value
 
 
-def named_moved(scenes: SceneTensors, structure: Tensor, score: MisplacedScore) -> float:
+def named_moved(scenes: SceneTensors, structure: Structure, score: MisplacedScore) -> float:
     """Return the share of moved objects that are named first (T3c); 0 if no object can move.
 
     At most `_SCENES` scenes take part.
@@ -123,33 +125,47 @@ def named_moved(scenes: SceneTensors, structure: Tensor, score: MisplacedScore) 
     return float(ask_moved(score, cases)[:, 0].mean()) if cases else 0.0
 
 
+class Answer(NamedTuple):
+    """What a score answers.
+
+    Attributes:
+        fields: fields of `Model` that the score fills.
+        judge: function of validation scenes, structure classes and score; higher is better.
+        of_relations: True if the score learns from scenes with annotated relations.
+    """
+
+    fields: tuple[str, ...]
+    judge: Callable[[SceneTensors, Tensor, Any], float]
+    of_relations: bool = True
+
+
+OBJECTS: Final = Answer(("missing",), missing_mrr, of_relations=False)
+ROOMS: Final = Answer(("rooms",), mean_log_p, of_relations=False)
+RELATIONS: Final = Answer(("relations", "false_relations"), relation_precision)
+COMPLETION: Final = Answer(("completion",), completion_precision)
+AT_PLACE: Final = Answer(("at_place",), placed_mrr)
+MISPLACED: Final = Answer(("misplaced",), named_moved)
+
+
 @dataclass(frozen=True)
 class Baseline:
     """One baseline, shown as one row of a result table.
 
     Attributes:
         propose: function of training scenes, structure classes and seed, see the module.
-        judge: function of validation scenes, structure classes and score; higher is better.
-        scores: fields of `Model` that the score answers.
         stochastic: True if the fit depends on the seed.
     """
 
     name: str
     propose: Callable[[SceneTensors, Tensor, int], Proposals[Any]]
-    judge: Callable[[SceneTensors, Tensor, Any], float] = missing_mrr
-    scores: tuple[str, ...] = ("missing",)
+    answer: Answer = OBJECTS
     stochastic: bool = False
-
-    @property
-    def learns_relations(self) -> bool:
-        """True if the baseline needs scenes with annotated relations."""
-        return self.scores not in (("missing",), ("rooms",))
 
     def fit(
         self,
         train: SceneTensors,
         validation: SceneTensors,
-        structure: Tensor,
+        structure: Structure,
         *,
         seed: int = 0,
         progress: Callable[[str], None] = lambda _: None,
@@ -171,7 +187,7 @@ class Baseline:
         proposal = next(proposals, None)
         while proposal is not None:
             parameters, score = proposal
-            metric = self.judge(validation, structure, score)
+            metric = self.answer.judge(validation, structure, score)
             if math.isnan(metric):
                 raise FloatingPointError(
                     f"{self.name}: the validation metric with {dict(parameters)} is NaN; leave "
@@ -185,6 +201,6 @@ class Baseline:
                 proposal = proposals.send(metric)
             except StopIteration:
                 proposal = None
-        answers: dict[str, Any] = dict.fromkeys(self.scores, best)
-        count = getattr(best, "parameter_count", None) if "missing" in answers else None
-        return Model(**answers, parameters=count)
+        scores: dict[str, Any] = dict.fromkeys(self.answer.fields, best)
+        count = getattr(best, "parameter_count", None) if "missing" in scores else None
+        return Model(**scores, parameters=count)

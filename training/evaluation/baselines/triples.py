@@ -8,12 +8,14 @@ from itertools import product
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from training.datasets.batches import Batch, SceneTensors
 from training.evaluation.baselines.classes import frequency
 from training.evaluation.baselines.fitting import Proposals
 from training.evaluation.model import ObjectScore, PlacedScore, Places, RelationScore
+from training.evaluation.setting import Structure
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,19 +23,19 @@ class TripleCounts:
     """Numbers of scenes with annotated relations; 0 for structure, and for equal classes.
 
     Attributes:
-        held: number of scenes in which a relation holds, (relations, subjects, objects).
-        together: number of scenes that contain both classes, (classes, classes).
+        holds: number of scenes in which a relation holds, by relation, subject and object.
+        together: number of scenes that contain both classes.
     """
 
-    held: Tensor
-    together: Tensor
+    holds: Float[Tensor, "A V V"]
+    together: Float[Tensor, "V V"]
 
-    def overall(self) -> Tensor:
-        """Return the add-one smoothed probability of each relation over all pairs, (relations,)."""
-        return (self.held.sum((1, 2)) + 1.0) / (self.together.sum() + 2.0)
+    def overall(self) -> Float[Tensor, " A"]:
+        """Return the add-one smoothed probability of each relation over all pairs."""
+        return (self.holds.sum((1, 2)) + 1.0) / (self.together.sum() + 2.0)
 
 
-def count_triples(scenes: SceneTensors, structure: Tensor) -> TripleCounts:
+def count_triples(scenes: SceneTensors, structure: Structure) -> TripleCounts:
     """Count triples over the scenes with annotated relations.
 
     An unlisted relation counts as false, as in task T1, even if the pair is unobserved. Some data
@@ -62,14 +64,15 @@ def count_triples(scenes: SceneTensors, structure: Tensor) -> TripleCounts:
     return TripleCounts(torch.from_numpy(holds * pair), torch.from_numpy(together * pair))
 
 
-def table_score(log_odds: Tensor, multiplicity: float = 0.0) -> RelationScore:
-    """Return the relation score log_odds[a, i, j] + g · log(n_i n_j), from a table (A, V, V).
+def table_score(log_odds: Float[Tensor, "A V V"], multiplicity: float = 0.0) -> RelationScore:
+    """Return the relation score log_odds[a, i, j] + g · log(n_i n_j).
 
     n_i and n_j are the instance counts of the classes, and g is `multiplicity`. The score ignores
     observed relations. It is arbitrary for padding.
     """
 
-    def score(batch: Batch) -> Tensor:
+    def score(batch: Batch) -> Float[Tensor, "B A n n"]:
+        """Look up the log-odds of the classes of a batch, and add the weighted counts."""
         index = batch.classes.clamp(min=0)
         values = log_odds[:, index[:, :, None], index[:, None, :]].movedim(0, 1)
         if multiplicity:
@@ -81,36 +84,41 @@ def table_score(log_odds: Tensor, multiplicity: float = 0.0) -> RelationScore:
 
 
 _PAIR = (1.0, 3.0, 10.0, 30.0, 100.0)
-_END = (3.0, 30.0)
+_CLASS = (3.0, 30.0)
 _MULTIPLICITY = (0.0, 0.5, 1.0)
 
 
-def smoothed_log_odds(counts: TripleCounts, pair: float, end: float) -> Tensor:
-    """Return logit p(r | i, j), (relations, classes, classes).
+def smoothed_log_odds(
+    counts: TripleCounts, *, of_pair: float, of_class: float
+) -> Float[Tensor, "A V V"]:
+    """Return logit p(r | i, j).
 
     The estimate for a rare pair depends mainly on its two classes, as labels predict most relations
     (Zellers et al., "Neural Motifs: Scene Graph Parsing with Global Context", CVPR 2018). That for
     a rare class depends mainly on p(r):
 
-        p(r | i, j) = (held + s · [p(r | i as subject) + p(r | j as object)] / 2) / (together + s)
-        p(r | i)    = (held with i + m · p(r)) / (pairs with i + m), likewise p(r | j)
+        p(r | i, j) = (holds + s · [p(r | i as subject) + p(r | j as object)] / 2) / (together + s)
+        p(r | i)    = (holds with i + m · p(r)) / (pairs with i + m), likewise p(r | j)
 
-    s (`pair`) and m (`end`) are numbers of added cases, above 0.
+    s (`of_pair`) and m (`of_class`) are numbers of added cases, above 0.
     """
-    overall = counts.overall()[:, None]
-    subject = (counts.held.sum(2) + end * overall) / (counts.together.sum(1) + end)
-    object_ = (counts.held.sum(1) + end * overall) / (counts.together.sum(0) + end)
+    added = of_class * counts.overall()[:, None]
+    subject = (counts.holds.sum(2) + added) / (counts.together.sum(1) + of_class)
+    object_ = (counts.holds.sum(1) + added) / (counts.together.sum(0) + of_class)
     back_off = (subject[:, :, None] + object_[:, None, :]) / 2
-    return ((counts.held + pair * back_off) / (counts.together + pair)).logit(eps=1e-7)
+    return ((counts.holds + of_pair * back_off) / (counts.together + of_pair)).logit(eps=1e-7)
 
 
-def frequency_table(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[RelationScore]:
+def frequency_table(
+    train: SceneTensors, structure: Structure, _seed: int
+) -> Proposals[RelationScore]:
     """Yield a score for each smoothing of pairs and of classes, and each weight of the counts."""
     counts = count_triples(train, structure)
-    for pair, end in product(_PAIR, _END):
-        table = smoothed_log_odds(counts, pair, end)
+    for of_pair, of_class in product(_PAIR, _CLASS):
+        table = smoothed_log_odds(counts, of_pair=of_pair, of_class=of_class)
         for weight in _MULTIPLICITY:
-            yield {"pair": pair, "end": end, "multiplicity": weight}, table_score(table, weight)
+            parameters = {"pair": of_pair, "class": of_class, "multiplicity": weight}
+            yield parameters, table_score(table, weight)
 
 
 _PLACE = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
@@ -119,27 +127,27 @@ _WEIGHTS = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5)
 _CORRECTIONS = (0.0, 0.25, 0.5, 1.0)
 
 
-def place_score(log_p: Tensor) -> PlacedScore:
+def place_score(log_p: Float[Tensor, "2 A V V"]) -> PlacedScore:
     """Return the score log p(i | a, j) of class i at the place (a, j).
 
-    `log_p` is a table over `Places.outgoing`, relation a, class j and class i, (2, A, V, V).
+    `log_p` is a table over `Places.outgoing`, relation a, class j and class i.
     """
     return lambda places: log_p[places.outgoing.long(), places.relation, places.anchor]
 
 
 def smoothed_log_p(
-    counts: TripleCounts, popularity: Tensor, place: float, relation: float
-) -> Tensor:
+    counts: TripleCounts, popularity: Float[Tensor, " V"], place: float, relation: float
+) -> Float[Tensor, "2 A V V"]:
     """Return log p(i | a, j) in the layout of `place_score`.
 
         p(i | a, j) = (scenes with a(i, j) + s · p(i | a)) / (scenes with a of any class to j + s)
 
     p(i | a) is smoothed in the same way towards p(i), with m in place of s. p(i) is proportional to
-    the popularity, (classes,). s (`place`) and m (`relation`) are numbers of added cases.
+    the popularity. s (`place`) and m (`relation`) are numbers of added cases.
     """
     # In the second table, the removed class is the subject of the relation. The transpose puts the
     # class j of the place first.
-    holds = torch.stack([counts.held, counts.held.mT])
+    holds = torch.stack([counts.holds, counts.holds.mT])
     share = popularity / popularity.sum()
     any_anchor = holds.sum(2)
     back_off = any_anchor + relation * share
@@ -148,7 +156,7 @@ def smoothed_log_p(
     return (table / (holds.sum(-1, keepdim=True) + place)).log()
 
 
-def placed_table(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[PlacedScore]:
+def placed_table(train: SceneTensors, structure: Structure, _seed: int) -> Proposals[PlacedScore]:
     """Yield a score for each smoothing s of places and each smoothing m of relations."""
     counts = count_triples(train, structure)
     for place, relation in product(_PLACE, _RELATION):
@@ -156,7 +164,7 @@ def placed_table(train: SceneTensors, structure: Tensor, _seed: int) -> Proposal
         yield {"place": place, "relation": relation}, place_score(log_p)
 
 
-def times(
+def propose_products(
     objects: ObjectScore | None, table: PlacedScore | None
 ) -> Callable[[SceneTensors, Tensor, int], Proposals[PlacedScore]]:
     """Return a generator function for objects(v) + weight · table - correction · log popularity.
@@ -167,15 +175,21 @@ def times(
     if objects is None or table is None:
         raise ValueError("the product needs an object score and a table of places")
 
-    def product_score(weight: float, correction: float, log_popularity: Tensor) -> PlacedScore:
-        # Both factors depend on the class frequency. The last term corrects for this.
-        def score(places: Places) -> Tensor:
+    def product_score(
+        weight: float, correction: float, log_popularity: Float[Tensor, " V"]
+    ) -> PlacedScore:
+        """Return the score of one weight and one correction for the class frequency.
+
+        Both factors depend on the class frequency.
+        """
+
+        def score(places: Places) -> Float[Tensor, "B V"]:
             added = weight * table(places) - correction * log_popularity
             return objects(places.v) + added
 
         return score
 
-    def propose(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[PlacedScore]:
+    def propose(train: SceneTensors, _structure: Structure, _seed: int) -> Proposals[PlacedScore]:
         log_popularity = frequency(train.v, train.weight).log()
         for weight, correction in product(_WEIGHTS, _CORRECTIONS):
             score = product_score(weight, correction, log_popularity)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 from torch.optim.lr_scheduler import OneCycleLR
@@ -17,6 +18,7 @@ from training.datasets.batches import SceneTensors
 from training.evaluation.baselines.classes import Lists, training_lists
 from training.evaluation.baselines.fitting import TRIALS, Proposals, drawn_settings, halving
 from training.evaluation.model import ObjectScore, Parameters
+from training.evaluation.setting import Structure
 
 # The network learns to predict the hidden classes of random parts of scenes, as a machine does.
 #
@@ -46,7 +48,7 @@ class NetworkScore:
     """The score of each unlisted class: its logit, or log p under a softmax over these classes."""
 
     network: nn.Module
-    structure: Tensor
+    structure: Structure
     softmax: bool
 
     @property
@@ -55,8 +57,8 @@ class NetworkScore:
         return sum(parameter.numel() for parameter in self.network.parameters())
 
     @torch.no_grad()
-    def __call__(self, v: Tensor) -> Tensor:
-        """Return the score of each class, (B, V); -inf for present and structure classes."""
+    def __call__(self, v: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
+        """Return the score of each class; -inf for present and structure classes."""
         listed = v * ~self.structure
         values: Tensor = self.network(listed)
         values = values.masked_fill((v > 0) | self.structure, -torch.inf)
@@ -66,7 +68,7 @@ class NetworkScore:
 def train_network(
     network: nn.Module,
     lists: Lists,
-    structure: Tensor,
+    structure: Structure,
     seed: int,
     *,
     learning_rate: float,
@@ -105,8 +107,8 @@ def train_network(
             yield step, NetworkScore(trained, structure, loss == "softmax")
 
 
-def draw_lists(v: Tensor) -> Tensor:
-    """Return random parts of scenes (scenes, classes) with at least two classes."""
+def draw_lists(v: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
+    """Return random parts of scenes with at least two classes."""
     classes = v.sum(1)
     share = _LEAST_SHARE + (1 - _LEAST_SHARE) * torch.rand(len(v))
     listed = torch.where(torch.rand(len(v)) < _ONE_HIDDEN, classes - 1, (share * classes).round())
@@ -115,7 +117,9 @@ def draw_lists(v: Tensor) -> Tensor:
     return v * (rank < listed.unsqueeze(1))
 
 
-def hidden_loss(network: nn.Module, v: Tensor, labelled: Tensor, loss: str) -> Tensor:
+def hidden_loss(
+    network: nn.Module, v: Float[Tensor, "B V"], labelled: Bool[Tensor, "B V"], loss: str
+) -> Float[Tensor, ""]:
     """Return the mean loss of the hidden classes of random parts of the scenes."""
     listed = draw_lists(v)
     candidate, hidden = (listed == 0) & labelled, v - listed
@@ -141,8 +145,8 @@ _AUTOENCODER: Final[dict[str, Sequence[Any]]] = {
 }
 
 
-def build_autoencoder(popularity: Tensor, width: int, dropout: float) -> nn.Sequential:
-    """Return an untrained autoencoder; the class frequencies (V,) initialise its output bias."""
+def build_autoencoder(popularity: Float[Tensor, " V"], width: int, dropout: float) -> nn.Sequential:
+    """Return an untrained autoencoder; the class frequencies initialise its output bias."""
     V = len(popularity)
     output = nn.Linear(width, V)
     with torch.no_grad():
@@ -154,11 +158,12 @@ def build_autoencoder(popularity: Tensor, width: int, dropout: float) -> nn.Sequ
     )  # fmt: skip
 
 
-def autoencoder(train: SceneTensors, structure: Tensor, seed: int) -> Proposals[ObjectScore]:
+def autoencoder(train: SceneTensors, structure: Structure, seed: int) -> Proposals[ObjectScore]:
     """Yield the score of an autoencoder for `TRIALS` settings, losses and sets of scenes."""
     lists = dict(training_lists(train, structure))
 
     def fit(setting: dict[str, Any], share: float) -> Iterator[tuple[Parameters, ObjectScore]]:
+        """Train one setting for a share of the steps."""
         chosen, options = lists[setting["scenes"]], setting.copy()
         options.pop("scenes")
         sizes = {name: options.pop(name) for name in ("width", "dropout")}

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, embedding_bag, normalize, softplus
 
@@ -16,6 +17,7 @@ from training.datasets.batches import SceneTensors
 from training.evaluation.baselines.classes import LinearScore, Lists, frequency, training_lists
 from training.evaluation.baselines.fitting import TRIALS, Proposals, drawn_settings, halving
 from training.evaluation.model import ObjectScore, Parameters
+from training.evaluation.setting import Structure
 
 # Co-occurrence: Bernoulli naive Bayes, with the present classes as evidence.
 #
@@ -28,7 +30,9 @@ _SMOOTHING = (30.0, 300.0)
 _EXPONENTS = (0.2, 0.3, 0.5)
 
 
-def evidence(v: Tensor, smoothing: float, weight: Tensor | None = None) -> Tensor:
+def evidence(
+    v: Float[Tensor, "scenes V"], smoothing: float, weight: Float[Tensor, " scenes"] | None = None
+) -> Float[Tensor, "V V"]:
     """Return log p(j | i) / p(j | not i) for present class j (row) and scored class i (column).
 
     The diagonal is zero. `smoothing` average scenes are added to the scenes with, and without, i.
@@ -41,7 +45,7 @@ def evidence(v: Tensor, smoothing: float, weight: Tensor | None = None) -> Tenso
     return (with_class / without_class).log().fill_diagonal_(0.0)
 
 
-def naive_bayes(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
+def naive_bayes(train: SceneTensors, structure: Structure, _seed: int) -> Proposals[ObjectScore]:
     """Yield a score for each set of scenes, smoothing and factor t."""
     for name, lists in training_lists(train, structure):
         for smoothing, t in product(_SMOOTHING, _EXPONENTS):
@@ -63,11 +67,12 @@ _SHARPNESS = (4.0, 8.0, 12.0)
 
 
 def nearest_score(lists: Lists, *, neighbours: int, sharpness: float) -> ObjectScore:
-    """Return a score function from presence to log-odds, both (scenes, classes)."""
+    """Return a score function from presence to log-odds."""
     popularity, v = lists.frequency(), lists.filled()
     index = normalize(lists.v, dim=1).T.contiguous()
 
-    def score(query: Tensor) -> Tensor:
+    def score(query: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
+        """Let the nearest scenes of each list vote for their classes."""
         cosine = normalize(query, dim=1) @ index
         similarity, neighbour = cosine.topk(min(neighbours, len(v)), dim=1)
         # The vote of a training scene without a class of the query is 0.
@@ -79,7 +84,7 @@ def nearest_score(lists: Lists, *, neighbours: int, sharpness: float) -> ObjectS
     return score
 
 
-def nearest(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
+def nearest(train: SceneTensors, structure: Structure, _seed: int) -> Proposals[ObjectScore]:
     """Yield a score for each set of scenes, number of neighbours and sharpness."""
     for name, lists in training_lists(train, structure):
         for k, power in product(_NEIGHBOURS, _SHARPNESS):
@@ -122,10 +127,11 @@ def fit_pairwise(
         [bias, half], max_iter=iterations, history_size=10, line_search_fn="strong_wolfe"
     )
 
-    def symmetric() -> Tensor:
+    def symmetric() -> Float[Tensor, "V V"]:
         return (half + half.T) * (1.0 - torch.eye(V))
 
-    def loss() -> Tensor:
+    def loss() -> Float[Tensor, ""]:
+        """Compute the penalised loss and its gradients."""
         optimiser.zero_grad()
         W = symmetric()
         logits = bias + torch.sparse.mm(sparse, W) + (unlabelled @ W)[pattern]
@@ -139,7 +145,7 @@ def fit_pairwise(
         return LinearScore(bias.detach(), symmetric().detach())
 
 
-def pairwise(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[LinearScore]:
+def pairwise(train: SceneTensors, structure: Structure, _seed: int) -> Proposals[LinearScore]:
     """Yield a score for each L2 penalty, largest first. A fit starts at the last solution."""
     for name, lists in training_lists(train, structure):
         score = None
@@ -167,22 +173,23 @@ _BLOCK = 8
 
 @dataclass(frozen=True, eq=False)
 class RbmScore:
-    """Log-odds of each class of an RBM with biases b (V,), c (H,) and weights W (H, V)."""
+    """Log-odds of each class of an RBM with biases b and c and weights W."""
 
-    b: Tensor
-    c: Tensor
-    W: Tensor
+    b: Float[Tensor, " V"]
+    c: Float[Tensor, " H1"]
+    W: Float[Tensor, "H1 V"]
 
     @property
     def parameter_count(self) -> int:
         """Number of trained weights."""
         return self.b.numel() + self.c.numel() + self.W.numel()
 
-    def __call__(self, v: Tensor) -> Tensor:
-        """Return the log-odds of each unlisted class, (scenes, classes)."""
-        return torch.cat([self._gain(self.c + x @ self.W.T) for x in v.split(_BLOCK)]) + self.b
+    def __call__(self, v: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
+        """Return the log-odds of each unlisted class."""
+        blocks = [self._hidden_log_odds(self.c + x @ self.W.T) for x in v.split(_BLOCK)]
+        return torch.cat(blocks) + self.b
 
-    def _gain(self, x: Tensor) -> Tensor:
+    def _hidden_log_odds(self, x: Float[Tensor, "B H1"]) -> Float[Tensor, "B V"]:
         with_class = softplus(x.unsqueeze(2) + self.W)
         return (with_class - softplus(x).unsqueeze(2)).sum(1)
 
@@ -210,7 +217,7 @@ def fit_annealed(
     return RbmScore(*(torch.as_tensor(w, dtype=torch.float32) for w in weights))
 
 
-def bernoulli_rbm(train: SceneTensors, structure: Tensor, seed: int) -> Proposals[ObjectScore]:
+def bernoulli_rbm(train: SceneTensors, structure: Structure, seed: int) -> Proposals[ObjectScore]:
     """Yield the score of a trained RBM for each setting and number of epochs."""
     lists = dict(training_lists(train, structure))
 

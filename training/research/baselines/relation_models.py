@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import product
 
 import torch
+from jaxtyping import Complex, Float
 from torch import Tensor
 from torch.nn.functional import softplus
 
@@ -16,17 +17,18 @@ from training.evaluation.baselines.triples import (
     smoothed_log_odds,
     table_score,
 )
-from training.evaluation.contradictions import transitive_closure
+from training.evaluation.generation_task import transitive_closure
 from training.evaluation.model import RelationScore
+from training.evaluation.setting import Structure
 
 
 def relation_popularity(
-    train: SceneTensors, structure: Tensor, _seed: int
+    train: SceneTensors, structure: Structure, _seed: int
 ) -> Proposals[RelationScore]:
     """Yield a single score: the log-odds of each relation over all pairs of classes."""
     counts = count_triples(train, structure)
     overall = counts.overall().logit()[:, None, None]
-    yield {}, table_score(overall.expand_as(counts.held))
+    yield {}, table_score(overall.expand_as(counts.holds))
 
 
 # ComplEx: complex embeddings of classes. Complex numbers allow different scores for left(i, j) and
@@ -34,7 +36,7 @@ def relation_popularity(
 #
 # Source: T. Trouillon et al., "Complex Embeddings for Simple Link Prediction", ICML 2016, equation
 # 11: logit p(a, i, j) = d_a + Re sum_k S[i,k] R[a,k] conj(S[j,k]). The fit uses all pairs of
-# classes that occur in the same scene. The likelihood of a triple is binomial, with `held`
+# classes that occur in the same scene. The likelihood of a triple is binomial, with `holds`
 # successes in `together` trials. The penalty is the nuclear 3-norm of T. Lacroix et al., ICML 2018.
 
 _RANKS = (16, 64)
@@ -44,23 +46,25 @@ _STEPS = 200
 _LEARNING_RATE = 0.05
 
 
-def fit_complex(counts: TripleCounts, *, rank: int, penalty: float, seed: int) -> Tensor:
-    """Fit ComplEx of `rank` complex dimensions; return the logits of all triples, (A, V, V).
+def fit_complex(
+    counts: TripleCounts, *, rank: int, penalty: float, seed: int
+) -> Float[Tensor, "A V V"]:
+    """Fit ComplEx of `rank` complex dimensions; return the logits of all triples.
 
     The penalty weighs, for each pair of classes, the mean over the relations of the sum of cubed
     moduli of its factors.
     """
     generator = torch.Generator().manual_seed(seed)
-    A, V, _ = counts.held.shape
+    A, V, _ = counts.holds.shape
 
-    def factors(rows: int, scale: float) -> Tensor:
+    def factors(rows: int, scale: float) -> Complex[Tensor, "rows rank"]:
         values = torch.randn(rows, rank, dtype=torch.cfloat, generator=generator)
         return (scale * values).requires_grad_()
 
     classes, relations = factors(V, 0.1), factors(A, 1.0)
     bias = counts.overall().logit().requires_grad_()
     i, j = counts.together.nonzero(as_tuple=True)
-    trials, successes = counts.together[i, j], counts.held[:, i, j]
+    trials, successes = counts.together[i, j], counts.holds[:, i, j]
     optimiser = torch.optim.Adam([classes, relations, bias], lr=_LEARNING_RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, _STEPS)
     for _ in range(_STEPS):
@@ -76,8 +80,12 @@ def fit_complex(counts: TripleCounts, *, rank: int, penalty: float, seed: int) -
         return complex_logits(bias, relations, classes)
 
 
-def complex_logits(bias: Tensor, relations: Tensor, classes: Tensor) -> Tensor:
-    """Return the logits d_a + Re <S_i, R_a, conj S_j>, (relations, classes, classes)."""
+def complex_logits(
+    bias: Float[Tensor, " A"],
+    relations: Complex[Tensor, "A rank"],
+    classes: Complex[Tensor, "V rank"],
+) -> Float[Tensor, "A V V"]:
+    """Return the logits d_a + Re <S_i, R_a, conj S_j>."""
     turned = classes * relations[:, None]
     # Re(x conj(y)) = Re x Re y + Im x Im y. Two real products are faster than a complex product.
     real = turned.real @ classes.real.T + turned.imag @ classes.imag.T
@@ -85,7 +93,7 @@ def complex_logits(bias: Tensor, relations: Tensor, classes: Tensor) -> Tensor:
 
 
 def complex_embedding(
-    train: SceneTensors, structure: Tensor, seed: int
+    train: SceneTensors, structure: Structure, seed: int
 ) -> Proposals[RelationScore]:
     """Yield a ComplEx score for each rank, penalty and weight of the instance counts."""
     counts = count_triples(train, structure)
@@ -105,7 +113,7 @@ def complex_embedding(
 # The score needs batches in which only the given relations are observed, as in task T1b.
 
 _CLOSURE_PAIR = (3.0, 10.0, 30.0)
-_CLOSURE_END = 30.0
+_CLOSURE_CLASS = 30.0
 _CLOSURE_MULTIPLICITY = (0.5, 1.0)
 _BONUS = (0.0, 1.0, 2.0, 4.0)
 _PENALTY = (0.0, 1.0, 3.0)
@@ -118,22 +126,22 @@ def closure_score(table: RelationScore, bonus: float, penalty: float) -> Relatio
     relations lose the penalty.
     """
 
-    def score(batch: Batch) -> Tensor:
+    def score(batch: Batch) -> Float[Tensor, "B A n n"]:
         observed = (batch.holds > 0) & batch.observed
         closed = transitive_closure(observed)
-        follows, mirror = closed & ~observed, closed.mT & ~closed
-        return table(batch) + bonus * follows - penalty * mirror
+        implied, mirror = closed & ~observed, closed.mT & ~closed
+        return table(batch) + bonus * implied - penalty * mirror
 
     return score
 
 
 def frequency_table_with_closure(
-    train: SceneTensors, structure: Tensor, _seed: int
+    train: SceneTensors, structure: Structure, _seed: int
 ) -> Proposals[RelationScore]:
     """Yield a score for each smoothing, weight of the instance counts, bonus and penalty."""
     counts = count_triples(train, structure)
     for pair in _CLOSURE_PAIR:
-        log_odds = smoothed_log_odds(counts, pair, _CLOSURE_END)
+        log_odds = smoothed_log_odds(counts, of_pair=pair, of_class=_CLOSURE_CLASS)
         for weight, bonus, penalty in product(_CLOSURE_MULTIPLICITY, _BONUS, _PENALTY):
             parameters = {"pair": pair, "multiplicity": weight, "bonus": bonus, "penalty": penalty}
             yield parameters, closure_score(table_score(log_odds, weight), bonus, penalty)

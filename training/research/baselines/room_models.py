@@ -7,6 +7,7 @@ from itertools import product
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import one_hot
 
@@ -15,6 +16,7 @@ from training.evaluation.baselines.classes import Lists, training_lists
 from training.evaluation.baselines.fitting import Proposals
 from training.evaluation.model import Parameters, RoomScore
 from training.evaluation.room_task import with_room_type
+from training.evaluation.setting import Structure
 
 # Naive Bayes over room types:
 #
@@ -31,20 +33,22 @@ _EXPONENTS = (0.5, 0.75)
 
 
 class _Counts(NamedTuple):
-    """Weighted counts of the scenes of each room type: all (C,), with and labelled (C, V)."""
+    """Weighted counts of the scenes of each room type: all, with a class, and labelled."""
 
-    scenes: Tensor
-    present: Tensor
-    labelled: Tensor
+    scenes: Float[Tensor, " C"]
+    present: Float[Tensor, "C V"]
+    labelled: Float[Tensor, "C V"]
 
     @classmethod
-    def of(cls, lists: Lists, room: Tensor, types: int) -> _Counts:
-        """Count lists whose scenes have these room types, (scenes,)."""
+    def of(cls, lists: Lists, room: Int[Tensor, " scenes"], types: int) -> _Counts:
+        """Count lists whose scenes have these room types."""
         member = one_hot(room, types).float().T * lists.weight
         return cls(member.sum(1), member @ lists.v, member @ lists.labelled.float())
 
-    def table(self, alpha: float, exponent: float, absent: bool) -> tuple[Tensor, Tensor]:
-        """Return the bias of each room type (C,) and the weights of the classes (C, V)."""
+    def table(
+        self, alpha: float, exponent: float, absent: bool
+    ) -> tuple[Float[Tensor, " C"], Float[Tensor, "C V"]]:
+        """Return the bias of each room type and the weights of the classes."""
         average = (self.present.sum(0) + 0.5) / (self.labelled.sum(0) + 1.0)
         p = (self.present + alpha * average) / (self.labelled + alpha)
         prior = ((self.scenes + 0.5) / (self.scenes + 0.5).sum()).log()
@@ -55,14 +59,14 @@ class _Counts(NamedTuple):
 def room_table(tables: Mapping[str, tuple[Tensor, Tensor]]) -> RoomScore:
     """Return the log p of linear scores for each data source; "" stands for all data sources."""
 
-    def score(v: Tensor, profile: str) -> Tensor:
+    def score(v: Float[Tensor, "B V"], profile: str) -> Float[Tensor, "B C"]:
         bias, weights = tables.get(profile, tables[""])
         return (bias + v @ weights.T).log_softmax(1)
 
     return score
 
 
-def _counts(train: SceneTensors, structure: Tensor) -> Iterator[tuple[str, dict[str, _Counts]]]:
+def _counts(train: SceneTensors, structure: Structure) -> Iterator[tuple[str, dict[str, _Counts]]]:
     """Yield each set of scenes with its counts for all data sources, and for each data source."""
     scenes = with_room_type(train)
     if not len(scenes):
@@ -77,7 +81,7 @@ def _counts(train: SceneTensors, structure: Tensor) -> Iterator[tuple[str, dict[
         yield name, counts
 
 
-def naive_bayes(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[RoomScore]:
+def naive_bayes(train: SceneTensors, structure: Structure, _seed: int) -> Proposals[RoomScore]:
     """Yield a score for each set of scenes, smoothing, kind of evidence and exponent."""
     grid = tuple(product(_ALPHA, _SOURCE_ALPHA, (False, True), _EXPONENTS))
     for name, counts in _counts(train, structure):
@@ -90,7 +94,7 @@ def naive_bayes(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals
             yield {**kind, "alpha": alpha, "source_alpha": source_alpha}, room_table(tables)
 
 
-def most_common(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[RoomScore]:
+def most_common(train: SceneTensors, structure: Structure, _seed: int) -> Proposals[RoomScore]:
     """Yield the frequencies of the room types for each set of scenes."""
     for name, counts in _counts(train, structure):
         yield {"scenes": name}, room_table({q: c.table(1.0, 0.0, False) for q, c in counts.items()})

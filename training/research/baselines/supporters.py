@@ -16,32 +16,34 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from scipy.special import expit
-from torch import Tensor
 
 from app.scene import Scene, observe
 from app.scene.relations import SUPPORTS
 from training.datasets import EncodedScene
-from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import scene_of
 from training.datasets.moved import has_boxes, posed_scene
 from training.evaluation.baselines.fitting import Proposals
 from training.evaluation.model import MisplacedScore
+from training.evaluation.setting import Structure
 
 _ALPHA: Final = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 _GAMMA: Final = (0.0, 0.25, 0.5, 1.0)
 
 
-def supporter_score(suspicion: Floats, structure: Flags) -> MisplacedScore:
-    """Return a score with an entry for each object with a known supporter, likeliest first.
+def supporter_score(
+    suspicion: Float[NDArray, "V V+1"], structure: Bool[NDArray, " V"]
+) -> MisplacedScore:
+    """Return a score with an entry for each object whose supporter is observed, likeliest first.
 
-    Args:
-        suspicion: (V, V + 1) suspicion of class i with supporter s; the last s is "nothing".
-        structure: (V,) structure classes, which are neither object nor supporter.
+    `suspicion` is that of class i with supporter s; the last s is "nothing".
     """
 
     def score(scene: Scene) -> list[dict[str, Any]]:
+        """Return an entry for each object with its least suspicious supporter."""
         entries = [
             {"subject": name, "moved": name, "probability": float(expit(values.min()))}
             for index, object_class, supporters in _supporters(scene, structure)
@@ -52,8 +54,13 @@ def supporter_score(suspicion: Floats, structure: Flags) -> MisplacedScore:
     return score
 
 
-def _supporters(scene: Scene, structure: Flags) -> Iterator[tuple[int, int, Ints]]:
-    """Yield the objects with a known supporter, their class, and the classes of the supporters."""
+def _supporters(
+    scene: Scene, structure: Bool[NDArray, " V"]
+) -> Iterator[tuple[int, int, Int[NDArray, " supporters"]]]:
+    """Yield each object whose supporter is observed, its class, and those of its supporters.
+
+    Structure classes are neither object nor supporter.
+    """
     observed = observe(scene)
     classes = np.array([-1 if x.class_index is None else x.class_index for x in scene.objects])
     is_thing = (classes >= 0) & ~structure[classes]
@@ -77,12 +84,12 @@ def _annotated(encoded: EncodedScene) -> Scene:
 
 
 def supporter_table(
-    train: SceneTensors, structure: Tensor, _seed: int
+    train: SceneTensors, structure: Structure, _seed: int
 ) -> Proposals[MisplacedScore]:
     """Yield a score for each smoothing α and weight γ. Relations are needed, else ValueError."""
     if not any(encoded.evidence.observed.any() for encoded in train.scenes):
         raise ValueError(f"the {len(train)} training scenes contain no observed relation")
-    is_structure: Flags = structure.numpy()
+    is_structure = structure.numpy()
     V = len(is_structure)
     count = np.zeros((V, V + 1))
     for encoded in train.scenes:

@@ -25,10 +25,10 @@ from training.evaluation.baselines.triples import (
     smoothed_log_p,
     table_score,
 )
-from training.evaluation.contradictions import transitive_closure
+from training.evaluation.generation_task import transitive_closure
 from training.evaluation.model import Places
-from training.evaluation.relation_tasks import telling
-from training.research.baselines.networks import draw_lists, hidden_loss
+from training.evaluation.relation_tasks import with_observed
+from training.research.baselines.networks import hidden_loss
 from training.research.baselines.object_models import (
     bernoulli_rbm,
     evidence,
@@ -132,20 +132,6 @@ def test_the_loss_of_a_flat_network(loss, expected):
     assert float(value) == pytest.approx(expected, abs=1e-5)
 
 
-def test_networks_learn_from_short_lists():
-    """At least one class is listed and one hidden, every number of them and every class alike."""
-    torch.manual_seed(0)
-    v = torch.tensor([[1.0] * 8 + [0.0] * 3]).expand(4000, -1)
-    listed = draw_lists(v)
-    counts = listed.sum(1).int()
-    assert not (listed > v).any()
-    assert set(counts.tolist()) == set(range(1, 8))
-    # All but one: .3 of the draws, and shares above 6.5/8 of the others.
-    assert (counts == 7).float().mean() == pytest.approx(0.3 + 0.7 * 1.5 / 8 / 0.95, abs=0.04)
-    assert listed[:, :8].mean(0) == pytest.approx(float(listed[:, :8].mean()), abs=0.04)
-    assert draw_lists(torch.tensor([[1.0, 1, 0]]).expand(50, -1)).sum(1).tolist() == [1.0] * 50
-
-
 def test_scenes_have_their_weights_and_partial_labels():
     """Class 1 is unlabelled in the second source; the third scene is incomplete and weighs 3."""
     some = [scene([0, 1, 9]), scene([0], source="b"), scene([2], source="b")]
@@ -195,8 +181,8 @@ def related():
 
 def test_triples_by_hand(related):
     counts = count_triples(related, STRUCTURE)
-    assert counts.held.nonzero().tolist() == [[LEFT, 0, 2], [ON_TOP, 0, 1]]
-    assert counts.held[ON_TOP, 0, 1] == 2
+    assert counts.holds.nonzero().tolist() == [[LEFT, 0, 2], [ON_TOP, 0, 1]]
+    assert counts.holds[ON_TOP, 0, 1] == 2
     assert counts.together[0, 1] == counts.together[1, 0] == 3
     assert counts.together[0, 2] == 1
     assert counts.together[0, 9] == 0, "structure is no end"
@@ -205,7 +191,7 @@ def test_triples_by_hand(related):
 
 def test_the_frequency_table_by_hand(related):
     counts = count_triples(related, STRUCTURE)
-    p = smoothed_log_odds(counts, pair=4.0, end=2.0).sigmoid()
+    p = smoothed_log_odds(counts, of_pair=4.0, of_class=2.0).sigmoid()
     # Ordered pairs together: 3 + 3 of (0, 1), 1 + 1 each of (0, 2) and (1, 2).
     overall = (2 + 1) / (10 + 2)
     subject = (2 + 2 * overall) / (4 + 2)
@@ -237,9 +223,9 @@ def test_closure_is_warshalls():
     assert torch.equal(transitive_closure(given), expected)
 
 
-def test_closure_moves_what_follows_and_its_mirror_image_alone():
+def test_closure_changes_implied_relations_and_mirror_images_alone():
     batch = tensors([scene([0, 1, 2, 3], [(LEFT, 0, 1), (LEFT, 1, 2)])]).batch(torch.tensor([0]))
-    given = telling(batch, batch.holds > 0)
+    given = with_observed(batch, batch.holds > 0)
     moved = closure_score(table_score(torch.zeros(A, V, V)), bonus=2.0, penalty=3.0)(given)
     expected = torch.zeros(1, A, 4, 4)
     expected[0, LEFT, 0, 2] = 2.0

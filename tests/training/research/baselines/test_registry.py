@@ -18,19 +18,20 @@ from tests.training.research.baselines.furnished import (
     scene,
     tensors,
 )
-from training.evaluation.baselines import PLACED, RELATIONS, placed_product
+from training.evaluation.baselines import PLACED, fitting, placed_product
 from training.evaluation.baselines.fitting import TRIALS, Baseline, drawn_settings, halving
 from training.evaluation.missing_tasks import removed_places
 from training.evaluation.moved_task import moved_cases
-from training.evaluation.relation_tasks import telling
+from training.evaluation.relation_tasks import with_observed
 from training.research.baselines import BASELINES
 
 EVERY = tuple(BASELINES.values())
-OBJECTS = [one for one in EVERY if one.scores == ("missing",)]
-OF_RELATIONS = [one for one in EVERY if one.scores == RELATIONS]
-COMPLETIONS = [one for one in EVERY if one.scores == ("completion",)]
-OF_ROOMS = [one for one in EVERY if one.scores == ("rooms",)]
-(SUPPORTERS,) = (one for one in EVERY if one.scores == ("misplaced",))
+OBJECTS, OF_ROOMS, OF_RELATIONS, COMPLETIONS, (SUPPORTERS,) = (
+    [one for one in EVERY if one.answer is answer]
+    for answer in (
+        fitting.OBJECTS, fitting.ROOMS, fitting.RELATIONS, fitting.COMPLETION, fitting.MISPLACED,
+    )
+)  # fmt: skip
 
 
 PROGRESS = defaultdict(list)
@@ -50,8 +51,8 @@ def fitted(baseline: Baseline):
 @cache
 def value(baseline: Baseline) -> float:
     """The validation metric of `fitted`."""
-    score = getattr(fitted(baseline), baseline.scores[0])
-    return baseline.judge(furnished(60, seed=2), STRUCTURE, score)
+    score = getattr(fitted(baseline), baseline.answer.fields[0])
+    return baseline.answer.judge(furnished(60, seed=2), STRUCTURE, score)
 
 
 def answers(baseline: Baseline, score, scenes):
@@ -159,13 +160,13 @@ def test_relations_beat_popularity(baseline):
 def test_relation_scores_ignore_the_true_relations(baseline, validation):
     """The truth in a batch changes nothing."""
     batch = validation.batch(torch.arange(10))
-    blank = telling(batch)
+    blank = with_observed(batch)
     score = fitted(baseline).relations
     assert score(batch).shape == batch.holds.shape
     assert torch.equal(score(batch), score(blank))
 
 
-def test_closure_completes_what_the_table_cannot():
+def test_closure_completes_chains_that_the_table_cannot():
     """Where left is drawn at random, only what is given tells how the chain goes on."""
     generator = torch.Generator().manual_seed(0)
 
@@ -179,7 +180,7 @@ def test_closure_completes_what_the_table_cannot():
 
     train, held_out = shuffled(60), shuffled(60)
     table, closure = (
-        b.judge(held_out, STRUCTURE, b.fit(train, held_out, STRUCTURE).completion)
+        b.answer.judge(held_out, STRUCTURE, b.fit(train, held_out, STRUCTURE).completion)
         for b in COMPLETIONS
     )
     # Half of the ordered pairs hold, so the table is right by chance alone.
@@ -194,7 +195,7 @@ def test_the_placed_table_finds_the_missing_class(train, validation):
     product = placed_product("EASE", ease, table)
     assert "× EASE" in product.name
     score = product.fit(train, validation, STRUCTURE).at_place
-    assert product.judge(validation, STRUCTURE, score) >= value(PLACED) - 0.02
+    assert product.answer.judge(validation, STRUCTURE, score) >= value(PLACED) - 0.02
 
 
 @named(EVERY)
@@ -204,7 +205,7 @@ def test_nothing_to_learn_from_is_an_error(baseline, validation):
         baseline.fit(empty, validation, STRUCTURE)
 
 
-@named([one for one in EVERY if one.learns_relations])
+@named([one for one in EVERY if one.answer.of_relations])
 def test_no_relation_to_learn_from_is_an_error(baseline, validation):
     bare = tensors([scene([0, 1], annotated=False)])
     with pytest.raises(ValueError, match="the 1 training scenes contain no observed relation"):
@@ -212,6 +213,7 @@ def test_no_relation_to_learn_from_is_an_error(baseline, validation):
 
 
 def test_a_score_that_is_no_number_is_an_error(train, validation):
-    broken = Baseline("broken", lambda *_: iter([({}, None)]), lambda *_: float("nan"))
+    answer = fitting.Answer((), lambda *_: float("nan"))
+    broken = Baseline("broken", lambda *_: iter([({}, None)]), answer)
     with pytest.raises(FloatingPointError, match="broken"):
         broken.fit(train, validation, STRUCTURE)

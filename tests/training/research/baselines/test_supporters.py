@@ -1,4 +1,4 @@
-"""The table of supporters by hand: what is counted, and who is suspicious."""
+"""The table of supporters by hand: counts and suspicion."""
 
 import numpy as np
 import torch
