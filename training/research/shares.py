@@ -1,0 +1,121 @@
+"""How much of an answer comes from the machine, and how much from counts.
+
+    python -m training.research.shares places-triway@4.1.0 scenes.jsonl
+
+The command asks the questions of the evaluation about the scenes of a file, with the whole model
+and with variants in which a part of the scores is left out. No variant is calibrated again, so the
+metrics are ranks.
+
+    hidden context   the relations see the hidden units of an empty scene
+    relation score   log p(relation) of a missing object at a place, or the relation scores z and d
+                     of misplaced entries
+    counts           counts of classes at places, shares of stands and of supporters
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import typer
+
+from app.inference.weights import Weights
+from app.registry import DEFAULT_STORE, Artifact, Store
+from app.registry.description import KINDS
+from training.domain.init_command import StorePath
+from training.evaluation.artifact_model import artifact_model
+from training.evaluation.outside import read_test
+from training.evaluation.setting import Setting
+from training.evaluation.tasks import TASKS
+
+_LIMIT = 600
+_SHOWN = {
+    "T1a relations": ("R-precision, distinct classes",),
+    "T1 pairs": ("accuracy",),
+    "T2-at missing at a place": ("MRR",),
+    "T3c moved": ("named first",),
+}
+
+
+def without_context(artifact: Artifact) -> Artifact:
+    """Return the model whose hidden units do not see the objects."""
+    arrays = artifact.weights.arrays
+    nothing = np.zeros_like(arrays["W"])
+    return replace(artifact, weights=Weights(artifact.spec, {**arrays, "W": nothing}))
+
+
+def at_a_place(**entries: float) -> Callable[[Artifact], Artifact]:
+    """Return a function that changes the weights of the scores at a place."""
+
+    def change(artifact: Artifact) -> Artifact:
+        fits = tuple(fit.model_copy(update=entries) for fit in artifact.calibration.at)
+        return _recalibrated(artifact, at=fits)
+
+    return change
+
+
+def misplaced(**entries: float) -> Callable[[Artifact], Artifact]:
+    """Return a function that changes the weights of the scores of misplaced entries."""
+
+    def change(artifact: Artifact) -> Artifact:
+        judged = artifact.calibration.misplaced
+        kinds = {kind: getattr(judged, kind) for kind in KINDS}
+        update = {kind: one and one.model_copy(update=entries) for kind, one in kinds.items()}
+        return _recalibrated(artifact, misplaced=judged.model_copy(update=update))
+
+    return change
+
+
+def _recalibrated(artifact: Artifact, **update: Any) -> Artifact:
+    return replace(artifact, calibration=artifact.calibration.model_copy(update=update))
+
+
+def whole(artifact: Artifact) -> Artifact:
+    """Return the model itself."""
+    return artifact
+
+
+VARIANTS: dict[str, dict[str, Callable[[Artifact], Artifact]]] = {
+    "T1a relations": {"whole": whole, "without hidden context": without_context},
+    "T1 pairs": {"whole": whole, "without hidden context": without_context},
+    "T2-at missing at a place": {
+        "whole": whole,
+        "without relation score": at_a_place(relation=0.0),
+        "without counts": at_a_place(counts=0.0),
+        "without both": at_a_place(relation=0.0, counts=0.0),
+    },
+    "T3c moved": {
+        "whole": whole,
+        "without relation score": misplaced(relation=0.0, change=0.0),
+        "without counts": misplaced(stand=0.0, supporter=0.0),
+    },
+}
+
+
+def main(
+    model: Annotated[str, typer.Argument(help="stored model, NAME@VERSION")],
+    file: Annotated[Path, typer.Argument(help="scenes in any format that training reads")],
+    store: StorePath = DEFAULT_STORE,
+) -> None:
+    """Print the metrics of a model and of its variants on the scenes of a file."""
+    models = Store(store)
+    artifact = models.load(*models.resolve(model))
+    scenes = read_test(file).tensors(artifact.vocabulary)
+    structure = torch.from_numpy(artifact.vocabulary.structure.copy())
+    setting = Setting(scenes, structure, train=scenes, limit=_LIMIT)
+    for task, variants in VARIANTS.items():
+        for name, change in variants.items():
+            outcome = TASKS[task](artifact_model(change(artifact)), setting)
+            metrics = outcome.metrics if outcome else {}
+            for metric in filter(metrics.__contains__, _SHOWN[task]):
+                figure = metrics[metric].figure()
+                bounds = f"[{figure.low:.3f}, {figure.high:.3f}]"
+                typer.echo(f"{task}, {metric}: {name} {figure.value:.3f} {bounds}")
+
+
+if __name__ == "__main__":
+    typer.run(main)
