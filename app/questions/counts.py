@@ -24,10 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference.kernels import best, count_distributions
+from app.model.count_statistics import Counts
+from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, named, significant
 from app.questions.posterior import Present
-from app.registry.artifact import Artifact
-from app.registry.counts import Counts
 from app.scene.scene import Scene
 
 Floats = NDArray[np.float64]
@@ -42,7 +42,7 @@ _FIELDS: Final = ("listed_count", "expected_count", "low", "high", "probability"
 
 
 def more(
-    artifact: Artifact,
+    model: SceneModel,
     scene: Scene,
     listing: Present,
     *,
@@ -69,16 +69,16 @@ def more(
         The fields of `scene_client.schemas.MoreInstances`. `low` and `high` are limits of the
         number of instances, which is between them with a probability of at least 0.8.
     """
-    if artifact.counts is None:
+    if model.counts is None:
         return []
     # Words without a class have no statistics; their classes follow those of the statistics.
-    size = artifact.vocabulary.known
-    plain = ~artifact.vocabulary.structure[listing.classes] & (listing.classes < size)
+    size = model.vocabulary.known
+    plain = ~model.vocabulary.structure[listing.classes] & (listing.classes < size)
     classes, listed = listing.classes[plain], listing.counts[plain]
-    usual, unlisted = artifact.calibration.coverage, 1.0
+    usual, unlisted = model.calibration.coverage, 1.0
     if coverage is not None and coverage > usual:
         unlisted = (1 - coverage) / (1 - usual)
-    rows, p = distribution(artifact.counts, size, classes, listed, scene.room_type, unlisted)
+    rows, p = distribution(model.counts, size, classes, listed, scene.room_type, unlisted)
     classes, listed = classes[rows], listed[rows]
     numbers, cumulative = np.arange(1, p.shape[1] + 1), p.cumsum(axis=1)
     p_more = 1 - cumulative[np.arange(len(p)), listed - 1]
@@ -86,7 +86,7 @@ def more(
     order = best(p_more, usable, top_k)
     if not len(order):
         return []
-    labels, first = artifact.vocabulary.labels, listing.first[plain][rows][order]
+    labels, first = model.vocabulary.labels, listing.first[plain][rows][order]
     names = [
         named(labels[index], scene.objects[number].label)
         for index, number in zip(classes[order].tolist(), first.tolist(), strict=True)

@@ -42,11 +42,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference.elementary import sigmoid
+from app.model.calibration import KINDS, Judgement, Sensitivity
+from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, significant
 from app.questions.posterior import Posterior
 from app.questions.reading import Triple
-from app.registry.artifact import Artifact
-from app.registry.description import KINDS, Judgement, Sensitivity
 from app.scene.relations import ABOVE, CANONICAL, INSIDE, LATERAL, ON_TOP, SUPPORTS, opposite
 from app.scene.scene import Scene, boxes_of
 from app.scene.stands import (
@@ -100,7 +100,7 @@ _NO_ENTRIES: Final = Entries(
 
 
 def entries_of(
-    artifact: Artifact, posterior: Posterior, scene: Scene, flipped: Collection[Triple] = ()
+    model: SceneModel, posterior: Posterior, scene: Scene, flipped: Collection[Triple] = ()
 ) -> Entries:
     """Return the entries of a scene that the model can judge.
 
@@ -109,15 +109,15 @@ def entries_of(
     Args:
         flipped: relations of the scene that the request states by their opposite.
     """
-    row, A, places = posterior.present.row, artifact.spec.A, artifact.places
-    classes = artifact.vocabulary.stand_in[posterior.present.classes][row]
-    is_thing = (~artifact.vocabulary.structure[classes]).tolist()
+    row, A, places = posterior.present.row, model.spec.A, model.places
+    classes = model.vocabulary.stand_in[posterior.present.classes][row]
+    is_thing = (~model.vocabulary.structure[classes]).tolist()
     stated = [t for t in scene.relations or () if t[0] < A and is_thing[t[1]] and is_thing[t[2]]]
     if not stated and scene.poses is None:
         return _NO_ENTRIES
     heights, around = None, None
     if scene.poses is not None:
-        heights = _heights(artifact, scene, classes)
+        heights = _heights(model, scene, classes)
         around = heights.around
     unders = {
         (a, i, j)
@@ -126,15 +126,15 @@ def entries_of(
     }
     supports = [(i, j) for a, i, j in stated if a in SUPPORTS and (a, i, j) not in unders]
     stands, log_p, log_q = (
-        values.tolist() for values in _stands(artifact, posterior, scene, supports, heights)
+        values.tolist() for values in _stands(model, posterior, scene, supports, heights)
     )
-    moves = (~artifact.vocabulary.anywhere[classes]).tolist()
+    moves = (~model.vocabulary.anywhere[classes]).tolist()
     relation, subject, object_ = np.fromiter(chain(*stated), np.int64).reshape(-1, 3).T
     alone, pairs = posterior.alone_log_odds(), (row[subject], row[object_])
     of_relation, changes = (
         values[relation, *pairs].tolist() for values in (alone, posterior.relation_change())
     )
-    usual = {*artifact.calibration.misplaced.usual}
+    usual = {*model.calibration.misplaced.usual}
     entries: list[tuple[float, ...]] = []  # relation, subject, object, kind, terms, mover
     for (a, i, j), z, d in zip(stated, of_relation, changes, strict=True):
         mover = j if (a, i, j) in flipped and a != INSIDE else i
@@ -172,7 +172,7 @@ def entries_of(
 
 
 def _stands(
-    artifact: Artifact,
+    model: SceneModel,
     posterior: Posterior,
     scene: Scene,
     supports: Sequence[tuple[int, int]],
@@ -186,11 +186,11 @@ def _stands(
         supports: pairs of objects (i, j) with i on or in j.
         heights: heights of the boxes, or None for a scene without poses.
     """
-    present, places = posterior.present, artifact.places
+    present, places = posterior.present, model.places
     stands, zeros = np.full(len(present.row), UNKNOWN), np.zeros(len(present.row))
     if places is None:
         return stands, zeros, zeros
-    listed = artifact.vocabulary.stand_in[present.classes]
+    listed = model.vocabulary.stand_in[present.classes]
     classes = listed[present.row]
     shares = places.stands[classes].astype(np.float64)
     if heights is not None and scene.poses is not None:
@@ -201,7 +201,7 @@ def _stands(
     if (stands == UNKNOWN).all():
         return stands, zeros, zeros
     by_class = places.supporters(classes, listed)
-    by_class[:, artifact.vocabulary.structure[present.classes]] = 0.0
+    by_class[:, model.vocabulary.structure[present.classes]] = 0.0
     is_supported = stands == SUPPORTED
     q = np.where(is_supported, 0.0, 1.0)
     for i, j in supports:
@@ -215,13 +215,13 @@ def _stands(
     return stands, np.log(np.maximum(p, _LEAST_P)), log_q
 
 
-def _heights(artifact: Artifact, scene: Scene, classes: Indices) -> Heights:
+def _heights(model: SceneModel, scene: Scene, classes: Indices) -> Heights:
     """Return the heights of the objects. Furniture whose box is only its top reaches down."""
-    centres, extents = boxes_of(scene.objects, artifact.vocabulary.sizes)
-    heights, places = Heights.of(centres, extents), artifact.places
+    centres, extents = boxes_of(scene.objects, model.vocabulary.sizes)
+    heights, places = Heights.of(centres, extents), model.places
     if places is None:
         return heights
-    usual, tops = artifact.vocabulary.sizes[classes, 2], heights.tops
+    usual, tops = model.vocabulary.sizes[classes, 2], heights.tops
     is_top = (places.stands[classes, FLOOR] >= USUAL) & (extents[:, 2] < usual / 2)
     bottoms = np.where(is_top, np.fmin(heights.bottoms, tops - usual), heights.bottoms)
     return Heights(bottoms, tops, heights.areas)
@@ -233,28 +233,28 @@ def wrong_log_odds(judgement: Judgement, terms: Floats) -> Floats:
     return judgement.intercept + terms @ weights
 
 
-def wrong_relations(artifact: Artifact, scene: Scene) -> dict[Triple, float]:
+def wrong_relations(model: SceneModel, scene: Scene) -> dict[Triple, float]:
     """Return the log-odds that each judged relation of a scene is wrong."""
-    entries = entries_of(artifact, Posterior(artifact, scene), scene)
+    entries = entries_of(model, Posterior(model, scene), scene)
     return {
         (a, i, j): z
-        for _, rows, values in _judged(artifact, entries)
+        for _, rows, values in _judged(model, entries)
         for (a, i, j), z in zip(entries.triple[rows].tolist(), values.tolist(), strict=True)
         if j >= 0
     }
 
 
-def _judged(artifact: Artifact, entries: Entries) -> Iterator[tuple[Judgement, Indices, Floats]]:
+def _judged(model: SceneModel, entries: Entries) -> Iterator[tuple[Judgement, Indices, Floats]]:
     """Yield the judgement of each kind, its entries, and their log-odds to be wrong."""
     for kind in sorted({*entries.kind.tolist()}):
-        judgement: Judgement | None = getattr(artifact.calibration.misplaced, KINDS[kind])
+        judgement: Judgement | None = getattr(model.calibration.misplaced, KINDS[kind])
         if judgement is not None:
             rows = (entries.kind == kind).nonzero()[0]
             yield judgement, rows, wrong_log_odds(judgement, entries.terms[rows])
 
 
 def misplaced_fields(
-    artifact: Artifact,
+    model: SceneModel,
     posterior: Posterior,
     scene: Scene,
     sensitivity: Sensitivity,
@@ -271,12 +271,12 @@ def misplaced_fields(
     Returns:
         The fields of `scene_client.schemas.MisplacedRelation`.
     """
-    entries = entries_of(artifact, posterior, scene, flipped)
+    entries = entries_of(model, posterior, scene, flipped)
     n = len(entries.kind)
     if not n:
         return []
     log_odds, line, lowest = np.full(n, -np.inf), np.full(n, np.inf), np.full(n, np.inf)
-    for judgement, rows, values in _judged(artifact, entries):
+    for judgement, rows, values in _judged(model, entries):
         log_odds[rows] = values
         line[rows] = getattr(judgement.lines, sensitivity).threshold(len(rows))
         lowest[rows] = judgement.lines.high.threshold(len(rows))

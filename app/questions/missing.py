@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from app.errors import InvalidRequestError
 from app.inference.elementary import sigmoid
 from app.inference.kernels import best
+from app.model.scene_model import SceneModel
 from app.questions.answer import EXPLAINED, Fields, named, reasons, significant
 from app.questions.counts import more
 from app.questions.names import ErrorList
@@ -22,8 +23,7 @@ from app.questions.placements import Place, place_log_p, placements
 from app.questions.posterior import LEAST_CHANGE, Posterior, calibrated_missing, log_odds_of
 from app.questions.question import LABELS, REFUSED, SCENES, Example, Options, Question
 from app.questions.reading import Reading
-from app.registry.artifact import Artifact
-from app.scene.relations import opposite
+from app.scene.relations import CANONICAL, opposite
 from app.scene.scene import Scene
 from scene_client.frames import Axes, viewer_axes
 from scene_client.schemas import Anchor, MissingAnswer, MissingRequest
@@ -35,7 +35,7 @@ _BLOCK: Final = 32
 
 
 def missing(
-    artifact: Artifact,
+    model: SceneModel,
     scene: Scene,
     *,
     top_k: int = 10,
@@ -75,10 +75,10 @@ def missing(
         The fields `coverage`, `missing` and `more` of `scene_client.schemas.MissingAnswer`.
     """
     place = None if at is None else Place.of(*at)
-    posterior = Posterior(artifact, scene)
-    calibration = artifact.calibration
-    classes, log_odds, placed = _ranked(artifact, posterior, top_k, candidates, place, coverage)
-    labels = artifact.vocabulary.labels
+    posterior = Posterior(model, scene)
+    calibration = model.calibration
+    classes, log_odds, placed = _ranked(model, posterior, top_k, candidates, place, coverage)
+    labels = model.vocabulary.labels
     columns = classes.tolist(), significant(sigmoid(log_odds)), significant(log_odds)
     entries: list[Fields] = []
     for index, probability, value in zip(*columns, strict=True):
@@ -86,7 +86,7 @@ def missing(
         entry["probability"], entry["log_odds"] = probability, value
         entries.append(entry)
     if details and entries:
-        places = placements(artifact, posterior, scene, classes, axes, place)
+        places = placements(model, posterior, scene, classes, axes, place)
         for entry, class_places in zip(entries, places, strict=True):
             entry["placements"], entry["because"] = class_places, []
         if place is not None:
@@ -103,7 +103,7 @@ def missing(
     further: list[Fields] = []
     if at is None:
         further = more(
-            artifact,
+            model,
             scene,
             posterior.present,
             top_k=top_k,
@@ -115,7 +115,7 @@ def missing(
 
 
 def _ranked(
-    artifact: Artifact,
+    model: SceneModel,
     posterior: Posterior,
     top_k: int,
     candidates: Sequence[int] | None,
@@ -128,7 +128,7 @@ def _ranked(
         The class indices, the log-odds that they are present (and at the place), and the
         probabilities of the place if they are present (1 without a place), each (k,).
     """
-    vocabulary, listed = artifact.vocabulary, posterior.present.classes
+    vocabulary, listed = model.vocabulary, posterior.present.classes
     usable = ~vocabulary.structure
     usable[listed] = False
     if candidates is None:
@@ -139,7 +139,7 @@ def _ranked(
         usable &= named & ~vocabulary.broader[listed].any(0)
     if not usable.any():
         return np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
-    calibration = artifact.calibration
+    calibration = model.calibration
     used_coverage = calibration.coverage if coverage is None else coverage
     raw = posterior.absent_log_odds(np.arange(len(usable)), used_coverage).astype(np.float64)
     log_odds = calibrated_missing(calibration, raw, posterior.listed, coverage)
@@ -148,7 +148,7 @@ def _ranked(
     while True:
         score = log_odds
         if place is not None:
-            score = _log_p_at(artifact, posterior, place, usable, log_odds, count)
+            score = _log_p_at(model, posterior, place, usable, log_odds, count)
         first = best(score, usable, count)
         chosen = np.arange(len(first))
         if candidates is None:
@@ -180,7 +180,7 @@ def _one_of_a_family(related: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def _log_p_at(
-    artifact: Artifact,
+    model: SceneModel,
     posterior: Posterior,
     place: Place,
     usable: NDArray[np.bool_],
@@ -197,12 +197,12 @@ def _log_p_at(
     Args:
         log_odds: (V,) log-odds that each class is present.
     """
-    entry, log_p = artifact.calibration.at[place.relation], -np.logaddexp(0.0, -log_odds)
+    entry, log_p = model.calibration.at[place.relation], -np.logaddexp(0.0, -log_odds)
     at_most = np.full_like(log_p, entry.intercept)
-    if artifact.places is not None and entry.counts:
-        stand_in = artifact.vocabulary.stand_in
+    if model.places is not None and entry.counts:
+        stand_in = model.vocabulary.stand_in
         anchor = int(stand_in[posterior.present.classes[posterior.present.row[place.anchor]]])
-        ratio = artifact.places.log_ratio(place.relation, anchor, outgoing=place.outgoing)
+        ratio = model.places.log_ratio(place.relation, anchor, outgoing=place.outgoing)
         at_most += entry.counts * ratio[stand_in]
     bound = log_p - np.logaddexp(0.0, -at_most)
     joint = np.full_like(log_p, -np.inf)
@@ -218,8 +218,8 @@ def _log_p_at(
     return joint
 
 
-def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Options:
-    errors, size = ErrorList(), len(artifact.vocabulary)
+def _read(request: MissingRequest, model: SceneModel, reading: Reading) -> Options:
+    errors, size = ErrorList(), len(model.vocabulary)
     # Only the default of `top_k` may exceed the size of the vocabulary.
     if request.top_k > size and "top_k" in request.model_fields_set:
         message = f"`top_k` must be at most {size}, the size of the vocabulary"
@@ -230,7 +230,7 @@ def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Opti
         candidates = list(labels_of)
         listed_as = {index: labels[0] for index, labels in labels_of.items()}
     if request.at is not None:
-        at = _at(request.at, artifact, reading, errors)
+        at = _at(request.at, model, reading, errors)
     errors.raise_any()
     return {
         "top_k": request.top_k,
@@ -244,10 +244,10 @@ def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Opti
 
 
 def _at(
-    at: Anchor, artifact: Artifact, reading: Reading, errors: ErrorList
+    at: Anchor, model: SceneModel, reading: Reading, errors: ErrorList
 ) -> tuple[str, int] | None:
     """Return relation and anchor index of the request's field `at`, or None after an error."""
-    canonical = artifact.manifest.vocabulary.relations
+    canonical = CANONICAL[: model.spec.A]
     if at.relation not in {*canonical, *map(opposite, canonical)}:
         errors.add(InvalidRequestError, ("at", "relation"), "the model does not know this relation")
     anchor = reading.names.find(at.object, ("at", "object"), errors)
@@ -259,13 +259,13 @@ def _at(
     return None if anchor is None else (at.relation, anchor)
 
 
-def _ask_all(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
+def _ask_all(model: SceneModel, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
     related, bare, _ = scenes
     for scene in scenes:
-        yield missing(artifact, scene)
+        yield missing(model, scene)
     if len(bare.objects) > 1:
-        yield missing(artifact, bare, at=("on-top", 0))
-        yield missing(artifact, related, at=("under", 0))
+        yield missing(model, bare, at=("on-top", 0))
+        yield missing(model, related, at=("under", 0))
 
 
 _EXAMPLES: Final = {

@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 
 from app.inference.elementary import sigmoid
 from app.inference.kernels import best
+from app.model.calibration import CountSlope, Sensitivity
+from app.model.scene_model import SceneModel
 from app.questions.answer import EXPLAINED, Fields, reasons, rounded_number, significant
 from app.questions.misplaced import misplaced_fields
 from app.questions.posterior import Posterior, calibrated
 from app.questions.question import REFUSED, SCENES, WITH_TOILET, Example, Options, Question
 from app.questions.reading import Reading, Triple
-from app.registry.artifact import Artifact
-from app.registry.description import CountSlope, Sensitivity
 from app.scene.scene import Scene, SceneObject
 from scene_client.schemas import OutliersAnswer, OutliersRequest, SceneWarning
 
@@ -36,7 +36,7 @@ _LEAST_SHARE: Final = 0.5  # smallest increase of a companion, as a share of the
 
 
 def outliers(
-    artifact: Artifact,
+    model: SceneModel,
     scene: Scene,
     *,
     sensitivity: Sensitivity = "medium",
@@ -59,8 +59,8 @@ def outliers(
     scene with few objects gives little evidence, so its threshold is higher. A single class without
     structure is never an outlier, because no other object says whether it belongs.
 
-    The model knows little about a class that few training scenes show (`Artifact.rarely_shown`). At
-    a sensitivity, an object of such a class is never an outlier. If its probability reaches the
+    The model knows little about a class that few training scenes show (`rarely_shown`). At a
+    sensitivity, an object of such a class is never an outlier. If its probability reaches the
     threshold, a warning names the object. A stated threshold applies to all classes, but a word
     that is read by its meaning never is an outlier.
 
@@ -78,25 +78,25 @@ def outliers(
         class, and the objects of rare classes that reach the threshold.
         `threshold` is left out if the model judges no object and the caller states no threshold.
     """
-    entry = artifact.calibration.outlier
-    can_alarm = ~artifact.rarely_shown
+    entry = model.calibration.outlier
+    can_alarm = ~model.rarely_shown
     if threshold is not None:
         can_alarm = np.ones_like(can_alarm)
-    can_alarm[artifact.vocabulary.known :] = False
+    can_alarm[model.vocabulary.known :] = False
     judged: list[Fields] = []
     wrong: list[Fields] = []
-    warnings = _unjudged(artifact, scene)
-    posterior = Posterior(artifact, scene) if scene.objects else None
+    warnings = _unjudged(model, scene)
+    posterior = Posterior(model, scene) if scene.objects else None
     if threshold is None:
         n, in_room = posterior.listed if posterior else 0, scene.room_type is not None
-        threshold = artifact.calibration.outlier_threshold(sensitivity, n, in_room=in_room)
+        threshold = model.calibration.outlier_threshold(sensitivity, n, in_room=in_room)
     if posterior is not None:
-        wrong = misplaced_fields(artifact, posterior, scene, sensitivity, flipped)
+        wrong = misplaced_fields(model, posterior, scene, sensitivity, flipped)
         if entry is not None and threshold is not None:
             judged, unsure = _judged(
-                artifact, entry, posterior, scene, threshold, can_alarm, details=details
+                model, entry, posterior, scene, threshold, can_alarm, details=details
             )
-            warnings += _too_rare(artifact, unsure) + _alone(artifact, posterior, scene)
+            warnings += _too_rare(model, unsure) + _alone(model, posterior, scene)
     fields: Fields = {"warnings": warnings}
     if threshold is not None:
         fields["threshold"] = rounded_number(threshold)
@@ -104,7 +104,7 @@ def outliers(
 
 
 def _judged(
-    artifact: Artifact,
+    model: SceneModel,
     entry: CountSlope,
     posterior: Posterior,
     scene: Scene,
@@ -121,10 +121,10 @@ def _judged(
     `because` lists up to three other objects, in order of their effect on `log_odds`. For an
     outlier, these objects raise its log-odds. For other objects, they lower the log-odds.
     """
-    present, vocabulary = posterior.present, artifact.vocabulary
+    present, vocabulary = posterior.present, model.vocabulary
     labels, broader = vocabulary.labels, vocabulary.broader_labels
     log_odds, change = posterior.given_rest(explained=details)
-    logits, p = _intruder_odds(artifact, entry, posterior, log_odds)
+    logits, p = _intruder_odds(model, entry, posterior, log_odds)
     reaches = (p >= threshold) & (posterior.listed > 1)
     is_outlier = reaches & can_alarm[present.classes]
     # The order follows the logits, because probabilities near 0 or 1 may round to the same number.
@@ -141,7 +141,7 @@ def _judged(
     classes, probabilities, values = present.classes.tolist(), significant(p), significant(logits)
     for row in explained if details else ():
         if flags[row]:
-            usual[row] = _companions(artifact, present.classes, classes[row])
+            usual[row] = _companions(model, present.classes, classes[row])
     for number, row in zip(order.tolist(), rows, strict=True):
         thing = scene.objects[number]
         fields: Fields = {"object": thing.id, "label": labels[classes[row]]}
@@ -162,27 +162,27 @@ def _judged(
 
 
 def misplaced(
-    artifact: Artifact, scene: Scene, *, sensitivity: Sensitivity = "medium"
+    model: SceneModel, scene: Scene, *, sensitivity: Sensitivity = "medium"
 ) -> list[Fields]:
     """Judge every stated relation like `outliers`, but do not judge objects."""
     if not scene.objects:
         return []
-    return misplaced_fields(artifact, Posterior(artifact, scene), scene, sensitivity, ())
+    return misplaced_fields(model, Posterior(model, scene), scene, sensitivity, ())
 
 
-def intruders(artifact: Artifact, scene: Scene) -> NDArray[np.int64]:
+def intruders(model: SceneModel, scene: Scene) -> NDArray[np.int64]:
     """Return the classes that reach the threshold of medium sensitivity, rare classes included."""
-    calibration, posterior = artifact.calibration, Posterior(artifact, scene)
+    calibration, posterior = model.calibration, Posterior(model, scene)
     classes, in_room = posterior.present.classes, scene.room_type is not None
     threshold = calibration.outlier_threshold("medium", posterior.listed, in_room=in_room)
     if calibration.outlier is None or threshold is None:
         return classes[:0]
-    _, p = _intruder_odds(artifact, calibration.outlier, posterior, posterior.given_rest()[0])
+    _, p = _intruder_odds(model, calibration.outlier, posterior, posterior.given_rest()[0])
     return classes[(p >= threshold) & (posterior.listed > 1)]
 
 
 def _intruder_odds(
-    artifact: Artifact,
+    model: SceneModel,
     entry: CountSlope,
     posterior: Posterior,
     log_odds: NDArray[np.floating[Any]],
@@ -192,32 +192,32 @@ def _intruder_odds(
     They are -inf and 0 for a class that is not judged. `entry` is `Calibration.outlier`.
     """
     classes = posterior.present.classes
-    adjusted = log_odds - artifact.intruder_prior[classes]
+    adjusted = log_odds - model.intruder_prior[classes]
     logits = calibrated(entry, adjusted, max(1, posterior.listed))
-    p, is_excused = sigmoid(logits), ~artifact.vocabulary.judged[classes]
+    p, is_excused = sigmoid(logits), ~model.vocabulary.judged[classes]
     logits[is_excused], p[is_excused] = -np.inf, 0.0
     return logits, p
 
 
-def _companions(artifact: Artifact, present: NDArray[np.int64], flagged: int) -> list[str]:
+def _companions(model: SceneModel, present: NDArray[np.int64], flagged: int) -> list[str]:
     """Return the labels of the companions of an outlier, best first; see the module.
 
     The classes in ``present``, those of the scene, and structural classes are never companions.
     """
-    usable = ~artifact.vocabulary.structure
+    usable = ~model.vocabulary.structure
     usable[present] = False
-    increase, rank = artifact.objects.increases(flagged)
+    increase, rank = model.objects.increases(flagged)
     least = max(_LEAST_SHARE * float(increase[usable].max(initial=0)), 1e-6)
     chosen = best(rank, usable & (increase >= least) & (rank > 0), COMPANIONS)
-    return [artifact.vocabulary.labels[index] for index in chosen.tolist()]
+    return [model.vocabulary.labels[index] for index in chosen.tolist()]
 
 
-def _too_rare(artifact: Artifact, objects: list[SceneObject]) -> list[SceneWarning]:
+def _too_rare(model: SceneModel, objects: list[SceneObject]) -> list[SceneWarning]:
     """Return a warning for objects that reach the threshold, but whose class is rarely shown."""
     if not objects:
         return []
     classes = {thing.class_index for thing in objects}
-    labels = sorted(artifact.vocabulary.labels[index] for index in classes if index is not None)
+    labels = sorted(model.vocabulary.labels[index] for index in classes if index is not None)
     message = (
         f"too few or no training scenes show {', '.join(labels)}, so the service raises no alarm"
     )
@@ -225,9 +225,9 @@ def _too_rare(artifact: Artifact, objects: list[SceneObject]) -> list[SceneWarni
     return [SceneWarning(code="not-judged", message=message, objects=ids)]
 
 
-def _alone(artifact: Artifact, posterior: Posterior, scene: Scene) -> list[SceneWarning]:
+def _alone(model: SceneModel, posterior: Posterior, scene: Scene) -> list[SceneWarning]:
     """Return a warning if the scene lists a single class without structure, and it is judged."""
-    present, vocabulary = posterior.present, artifact.vocabulary
+    present, vocabulary = posterior.present, model.vocabulary
     if posterior.listed != 1 or not vocabulary.judged[present.classes].any():
         return []
     rows = ~vocabulary.structure[present.classes][present.row]
@@ -236,9 +236,9 @@ def _alone(artifact: Artifact, posterior: Posterior, scene: Scene) -> list[Scene
     return [SceneWarning(code="not-judged", message=message, objects=ids)]
 
 
-def _unjudged(artifact: Artifact, scene: Scene) -> list[SceneWarning]:
+def _unjudged(model: SceneModel, scene: Scene) -> list[SceneWarning]:
     """Return a warning for objects, and one for relations, if the model gives no judgement."""
-    calibration = artifact.calibration
+    calibration = model.calibration
     parts = ["objects"] if scene.objects and calibration.outlier is None else []
     if scene.relations and not calibration.misplaced.judges_relations:
         parts.append("relations")
@@ -248,7 +248,7 @@ def _unjudged(artifact: Artifact, scene: Scene) -> list[SceneWarning]:
     ]
 
 
-def _read(request: OutliersRequest, _: Artifact, reading: Reading) -> Options:
+def _read(request: OutliersRequest, _: SceneModel, reading: Reading) -> Options:
     return {
         "sensitivity": request.sensitivity,
         "threshold": request.threshold,
@@ -257,11 +257,11 @@ def _read(request: OutliersRequest, _: Artifact, reading: Reading) -> Options:
     }
 
 
-def _ask_all(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
+def _ask_all(model: SceneModel, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
     # With threshold 0, every object is an outlier. So the function also computes `usually_with`.
-    yield outliers(artifact, scenes[0], threshold=0.0)
+    yield outliers(model, scenes[0], threshold=0.0)
     for scene in scenes[1:]:
-        yield outliers(artifact, scene)
+        yield outliers(model, scene)
 
 
 _EXAMPLES: Final = {

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference.kernels import NO_UNIT, UNOBSERVED, add_unseen, likeliest_places, rotated_offsets
+from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, significant
 from app.questions.posterior import Posterior
-from app.registry.artifact import Artifact
 from app.scene.relations import (
     INSIDE,
     ON_TOP,
@@ -69,7 +69,7 @@ def place_log_p(
 
 
 def placements(
-    artifact: Artifact,
+    model: SceneModel,
     posterior: Posterior,
     scene: Scene,
     candidates: NDArray[np.int64],
@@ -94,15 +94,15 @@ def placements(
         For each candidate, the fields of `scene_client.schemas.Placement`.
     """
     present = posterior.present
-    anchors = (~artifact.vocabulary.structure[present.classes]).nonzero()[0]
+    anchors = (~model.vocabulary.structure[present.classes]).nonzero()[0]
     if not len(anchors):
         return [[] for _ in candidates]
     forward, backward = posterior.placement_log_odds(candidates, anchors)
-    A, objects, stand_in = forward.shape[1], present.first[anchors], artifact.vocabulary.stand_in
+    A, objects, stand_in = forward.shape[1], present.first[anchors], model.vocabulary.stand_in
     classes, candidates = stand_in[present.classes[anchors]], stand_in[candidates]
     first = -1  # number of the requested place in `likeliest_places`; -1 without a request
     if A > ON_TOP and scene.relations:
-        held = held_objects(artifact, posterior, scene)
+        held = held_objects(model, posterior, scene)
         columns = [k for k, number in enumerate(objects.tolist()) if number in held]
         for a in SUPPORTS:
             if a < A:
@@ -113,22 +113,22 @@ def placements(
             first = ((0 if at.outgoing else A) + at.relation) * len(anchors) + column
             objects[column] = at.anchor
     things = [scene.objects[number] for number in objects.tolist()]
-    if A > ON_TOP and artifact.places is not None:
-        add_unseen(*artifact.places.unseen, candidates, classes, forward, backward)
+    if A > ON_TOP and model.places is not None:
+        add_unseen(*model.places.unseen, candidates, classes, forward, backward)
     if A > INSIDE:
-        candidates_too_large, things_too_large = _too_large(artifact, things, candidates, classes)
+        candidates_too_large, things_too_large = _too_large(model, things, candidates, classes)
         forward[:, INSIDE][candidates_too_large] = NO_UNIT
         backward[:, INSIDE][things_too_large] = NO_UNIT
-    slopes, log_counts = artifact.relation_slopes.placement, present.log_counts[anchors]
+    slopes, log_counts = model.relation_slopes.placement, present.log_counts[anchors]
     limits = PLACES, first, LEAST_SHARE, LEAST_LIKELY
     rows, relations, outgoing, columns, p = likeliest_places(
         slopes, forward, backward, log_counts, *limits
     )
     offsets: Iterator[Fields | None] = repeat(None)
-    if artifact.offsets is not None and any(thing.position is not None for thing in things):
+    if model.offsets is not None and any(thing.position is not None for thing in things):
         ends = relations, candidates[rows], classes[columns], outgoing
         rotation = _UNTURNED if axes is None else np.array(axes)
-        tables = artifact.offsets.tables
+        tables = model.offsets.tables
         offsets = _offset_fields(*rotated_offsets(tables, *ends, rotation, axes is not None))
     entries: list[list[Fields]] = [[] for _ in candidates]
     arrays = rows.tolist(), relations.tolist(), outgoing.tolist(), columns.tolist()
@@ -144,14 +144,14 @@ def placements(
     return entries
 
 
-def held_objects(artifact: Artifact, posterior: Posterior, scene: Scene) -> list[int]:
+def held_objects(model: SceneModel, posterior: Posterior, scene: Scene) -> list[int]:
     """Return the indices of the objects that stand on or in an object, by the scene's relations.
 
     The list does not contain a desk with a bin under it, although its relation is on-top as well.
     """
-    places = artifact.places
+    places = model.places
     present = posterior.present
-    classes = artifact.vocabulary.stand_in[present.classes][present.row].tolist()
+    classes = model.vocabulary.stand_in[present.classes][present.row].tolist()
     return [
         i
         for a, i, j in scene.relations or ()
@@ -161,7 +161,7 @@ def held_objects(artifact: Artifact, posterior: Posterior, scene: Scene) -> list
 
 
 def _too_large(
-    artifact: Artifact,
+    model: SceneModel,
     things: Sequence[SceneObject],
     candidates: NDArray[np.int64],
     classes: NDArray[np.int64],
@@ -170,7 +170,7 @@ def _too_large(
 
     Both arrays are (N candidates, m objects). Candidates have the typical size of their class.
     """
-    rows, vocabulary = candidates[:, None], artifact.vocabulary
+    rows, vocabulary = candidates[:, None], model.vocabulary
     if all(thing.size is None for thing in things):
         return vocabulary.too_large[rows, classes], vocabulary.too_large[classes, rows]
     inner, (_, outer) = vocabulary.sizes[candidates], boxes_of(things, vocabulary.sizes)

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from app.inference import MachineSpec
 from app.inference.kernels import pool_classes, pool_relations
 from app.inference.relations import Between, ObservedRelations, context_of, to_log_odds
-from app.registry.artifact import Artifact
-from app.registry.description import LEAST_COVERAGE, Calibration, CountSlope, CoverageFit
+from app.model.calibration import LEAST_COVERAGE, Calibration, CountSlope, CoverageFit
+from app.model.scene_model import SceneModel
 from app.scene.scene import Scene, instance_evidence
 
 Floats = NDArray[np.floating[Any]]
@@ -121,16 +121,16 @@ class Posterior:
         ValueError: the machine does not know the class of an object, the room type or the profile.
     """
 
-    def __init__(self, artifact: Artifact, scene: Scene) -> None:
-        self.present = listing = present(scene, artifact.spec)
-        is_structure = artifact.vocabulary.structure[listing.classes]
+    def __init__(self, model: SceneModel, scene: Scene) -> None:
+        self.present = listing = present(scene, model.spec)
+        is_structure = model.vocabulary.structure[listing.classes]
         self.listed = len(listing.classes) - int(np.count_nonzero(is_structure))
-        observed = given_relations(scene, listing, artifact.spec.A)
+        observed = given_relations(scene, listing, model.spec.A)
         self.context = context_of(
-            artifact.weights,
+            model.weights,
             *(listing.classes, listing.presence, listing.log_counts, scene.room_type, observed),
         )
-        self._objects, self._units = artifact.objects, artifact.relation_units
+        self._objects, self._units = model.objects, model.relation_units
         self._profile, self._room = scene.profile, scene.room_type
 
     def absent_log_odds(self, absent: Indices, coverage: float) -> Floats:

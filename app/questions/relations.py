@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 
 from app.errors import InvalidRequestError, Location
 from app.inference.kernels import EXCLUDED, disagreeing, likeliest_relations, observed_pairs
+from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, significant
 from app.questions.names import ErrorList
 from app.questions.placements import held_objects
 from app.questions.posterior import Posterior, Present, relations_given
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
 from app.questions.reading import Reading, Triple
-from app.registry.artifact import Artifact
 from app.scene.relations import ON_TOP, SUPPORTS, canonicalise, opposite, relation_names
 from app.scene.scene import Scene, instance_evidence
 from scene_client.schemas import RelationsAnswer, RelationsRequest, SceneWarning
@@ -39,7 +39,7 @@ If all relations of a pair are unlikely, the likeliest relation is not a meaning
 
 
 def relations(
-    artifact: Artifact,
+    model: SceneModel,
     scene: Scene,
     *,
     top_k: int = 20,
@@ -77,25 +77,25 @@ def relations(
     """
     if not scene.objects:
         return {"relations": [], "disagreements": []}
-    posterior, A = Posterior(artifact, scene), artifact.spec.A
-    present, slopes = posterior.present, artifact.relation_slopes
-    judged = _judged(artifact, present, pairs)
+    posterior, A = Posterior(model, scene), model.spec.A
+    present, slopes = posterior.present, model.relation_slopes
+    judged = _judged(model, present, pairs)
     # This limit is slightly lower than the requested minimum, because the final comparison uses
     # rounded probabilities.
     least = min_probability * (1 - 1e-5)
     table = slopes.relation_given if relations_given(scene) else slopes.relation
     log_odds, log_counts, row = posterior.relation_log_odds(), present.log_counts, present.row
-    evidence = _evidence(artifact, posterior, scene)
+    evidence = _evidence(model, posterior, scene)
     subjects, objects, kinds, p, of_model = likeliest_relations(
         table, log_odds, log_counts, row, judged, evidence, least, include_opposites, top_k
     )
     columns = subjects.tolist(), objects.tolist(), kinds.tolist(), significant(p)
     expected = significant(of_model)
     disagreements = _disagreements(
-        artifact, scene, posterior, judged, flipped, top_k=top_k, least=least
+        model, scene, posterior, judged, flipped, top_k=top_k, least=least
     )
     names, observed, things = relation_names(A), set(scene.relations or ()), scene.objects
-    judges = artifact.spec.judges_relations
+    judges = model.spec.judges_relations
     entries: list[Fields] = []
     for subject, object_, kind, probability, own in zip(*columns, expected, strict=True):
         ends = (subject, object_) if kind < A else (object_, subject)
@@ -116,13 +116,13 @@ def relations(
     return {"relations": entries, "disagreements": disagreements, "warnings": warnings}
 
 
-def _evidence(artifact: Artifact, posterior: Posterior, scene: Scene) -> NDArray[np.float32]:
+def _evidence(model: SceneModel, posterior: Posterior, scene: Scene) -> NDArray[np.float32]:
     """Return the evidence about the relations of a scene; see `likeliest_relations`.
 
     The probability of an observed relation is the product of the confidences of its objects. An
     object on or in one object is not on or in another object.
     """
-    A = artifact.spec.A
+    A = model.spec.A
     if scene.excluded is None and not relations_given(scene):
         return np.zeros((0, 0, 0), np.float32)
     holds, observed = instance_evidence(scene)
@@ -131,7 +131,7 @@ def _evidence(artifact: Artifact, posterior: Posterior, scene: Scene) -> NDArray
     lateral, stacked = holds[:ON_TOP].any(0), holds[ON_TOP:].any(0)
     excluded = observed | stacked | stacked.T
     excluded[ON_TOP:] |= lateral | lateral.T
-    held = held_objects(artifact, posterior, scene)
+    held = held_objects(model, posterior, scene)
     for a in SUPPORTS:
         excluded[a, held] = True
     if scene.excluded is not None:
@@ -144,12 +144,12 @@ def _evidence(artifact: Artifact, posterior: Posterior, scene: Scene) -> NDArray
 
 
 def _judged(
-    artifact: Artifact, present: Present, pairs: Sequence[tuple[int, int]] | None
+    model: SceneModel, present: Present, pairs: Sequence[tuple[int, int]] | None
 ) -> NDArray[np.bool_]:
     """Return a bool mask (N subjects, N objects) of the ordered pairs to judge."""
     size = len(present.row)
     if pairs is None:
-        things = ~artifact.vocabulary.structure[present.classes][present.row]
+        things = ~model.vocabulary.structure[present.classes][present.row]
         return things[:, None] & things & ~np.eye(size, dtype=np.bool_)
     judged = np.zeros((size, size), dtype=np.bool_)
     for subject, object_ in pairs:
@@ -158,7 +158,7 @@ def _judged(
 
 
 def _disagreements(
-    artifact: Artifact,
+    model: SceneModel,
     scene: Scene,
     posterior: Posterior,
     judged: NDArray[np.bool_],
@@ -174,7 +174,7 @@ def _disagreements(
     disagreement. A relation is never expected if the machine has no unit for it. ``judged`` is
     (N, N) bool. The function judges a pair of objects if one of its two orders is True.
     """
-    A = artifact.spec.A
+    A = model.spec.A
     stated = [triple for triple in scene.relations or () if triple[0] < A]
     if not stated:
         return []
@@ -184,7 +184,7 @@ def _disagreements(
     if not len(subjects):
         return []
     i, j = present.row[subjects], present.row[objects]
-    table, least = artifact.relation_slopes.relation_given, max(least, EXPECTED)
+    table, least = model.relation_slopes.relation_given, max(least, EXPECTED)
     log_odds, log_counts = posterior.log_odds_apart(i, j), present.log_counts
     chosen, expected, p, observed_p = disagreeing(
         table, *log_odds, log_counts[i] + log_counts[j], holds, of_classes, least, top_k
@@ -235,7 +235,7 @@ def _names(
     }
 
 
-def _read(request: RelationsRequest, _: Artifact, reading: Reading) -> Options:
+def _read(request: RelationsRequest, _: SceneModel, reading: Reading) -> Options:
     return {
         "top_k": request.top_k,
         "min_probability": request.min_probability,

@@ -38,7 +38,7 @@ class ServedModels:
 
     @property
     def served(self) -> Mapping[Key, Artifact]:
-        """Maps the (name, version) of each usable model to the model."""
+        """Maps the (name, version) of each usable model to its artifact."""
         return self.store.artifacts
 
     def resolve(self, reference: str) -> Artifact:
@@ -182,12 +182,13 @@ def warm_up(artifact: Artifact) -> None:
     Raises:
         ArtifactError: `warm_up_failed` if the model could not answer a question.
     """
-    related = _scene(artifact.vocabulary)
+    model = artifact.model
+    related = _scene(model.vocabulary)
     bare = replace(related, relations=None)
-    posed = observe(bare, typical_sizes=artifact.vocabulary.sizes)
+    posed = observe(bare, typical_sizes=model.vocabulary.sizes)
     try:
         for question in QUESTIONS:
-            for answer in question.warm_up(artifact, (related, bare, posed)):
+            for answer in question.warm_up(model, (related, bare, posed)):
                 written(answer)
     except Exception:
         # A broken model may raise any exception. The service must still serve other models.

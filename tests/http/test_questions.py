@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from app import questions
+from app.model import Counts
 from app.questions import QUESTIONS
-from app.registry import Counts, Store
+from app.registry import Store
 from app.scene import Scene, SceneObject
 from scene_client.frames import viewer_axes
 from tests.http.stores import PROFILES, VOCABULARY, C, V, publish
@@ -230,7 +231,7 @@ def computed(
     store: Path, labels: tuple[str, ...], position: Any, *scene: Any, **options: Any
 ) -> Any:
     """The answer of the question itself."""
-    artifact = Store(store).load("measured", "1.0.0")
+    artifact = Store(store).load("measured", "1.0.0").model
     things = (
         SceneObject(str(k), label, VOCABULARY.index(label), position=position)
         for k, label in enumerate(labels)

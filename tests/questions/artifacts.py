@@ -1,12 +1,9 @@
 """Small artifacts for tests of the questions. Every test uses each machine of this module."""
 
-from pathlib import Path
-
 import numpy as np
 import torch
 
-from app.registry.artifact import Artifact
-from app.registry.description import (
+from app.model.calibration import (
     KINDS,
     AlarmLine,
     AlarmLines,
@@ -15,7 +12,8 @@ from app.registry.description import (
     Judgement,
     Misplaced,
 )
-from app.registry.places import Places
+from app.model.place_statistics import Places
+from app.model.scene_model import SceneModel
 from app.scene import ObjectClass, Scene, SceneObject, Vocabulary
 from tests.enumeration.small_machines import SMALL, random_weights
 from training.machines import BoltzmannMachine, MachineSpec, build
@@ -90,26 +88,18 @@ PLACES = places_of(
 
 def artifact_of(
     machine: BoltzmannMachine, places: Places | None = None, **changes: object
-) -> Artifact:
+) -> SceneModel:
     """An artifact with a neutral calibration, except for the changed fields."""
     spec = machine.spec
     vocabulary = Vocabulary(
         [ObjectClass(label, structure=label in STRUCTURE) for label in LABELS[: spec.V]],
         ROOMS[: spec.C],
     )
-    return Artifact(
-        manifest=None,
-        weights=weights_of(machine),
-        vocabulary=vocabulary,
-        calibration=calibration(spec.A, **changes),
-        digest="",
-        card="",
-        path=Path(),
-        places=places,
-    )
+    fitted = calibration(spec.A, **changes)
+    return SceneModel(weights_of(machine), vocabulary, fitted, places=places)
 
 
-def larger_artifact(name: str, scale: float = 0.7, **changes: object) -> Artifact:
+def larger_artifact(name: str, scale: float = 0.7, **changes: object) -> SceneModel:
     """An artifact with many states. All weights are random numbers from N(0, scale²).
 
     Structure has no object weights, as in a trained machine.

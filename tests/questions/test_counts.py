@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from app.model import Counts
 from app.questions.counts import LIKELY, distribution
-from app.registry import Counts
 from tests.questions.answers import more
 from tests.questions.artifacts import LARGER, larger_artifact, scene_of
 

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from app.model.calibration import Judgement
 from app.questions.misplaced import (
     BELOW,
     BESIDE,
@@ -21,7 +22,6 @@ from app.questions.misplaced import (
     wrong_relations,
 )
 from app.questions.posterior import present
-from app.registry.description import Judgement
 from app.scene import ObjectClass, Scene, SceneObject, Vocabulary, observe
 from app.scene.relations import ABOVE, INSIDE, LEFT, ON_TOP
 from tests.questions.answers import misplaced

@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from app.registry import Artifact
+from app.model import SceneModel
 from app.scene import PoseRelations, Scene
 from training.datasets.array_types import Flags, Floats
 from training.datasets.batches import SceneTensors
@@ -55,7 +55,7 @@ class Case(NamedTuple):
     truth: Flags
 
 
-def missing_evidence_task(artifact: Artifact, setting: Setting) -> Outcome | None:
+def missing_evidence_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
     """Measure T2 (missing objects) with labels only and with the room type."""
     scenes, structure = with_room_type(setting.some()), setting.structure
     # With one question per scene, the random choice of the class changes the result of a small data
@@ -95,7 +95,7 @@ def halves(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -> 
         yield Case(index, scene, queried, truth)
 
 
-def relations_evidence_task(artifact: Artifact, setting: Setting) -> Outcome | None:
+def relations_evidence_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
     """Measure T1 (relations) with labels only, and with relations or poses."""
     scenes, structure = setting.some(related=True), setting.structure.numpy()
     metrics: dict[str, Metric] = {}

@@ -22,6 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logit
 
+from app.model import AlarmLine, AlarmLines, Judgement, Misplaced, SceneModel
+from app.model.calibration import KINDS, LEAST_ALARM
 from app.questions.misplaced import (
     BELOW,
     BESIDE,
@@ -35,8 +37,6 @@ from app.questions.misplaced import (
     wrong_log_odds,
 )
 from app.questions.posterior import Posterior
-from app.registry import AlarmLine, AlarmLines, Artifact, Judgement, Misplaced
-from app.registry.description import KINDS, LEAST_ALARM
 from app.scene import Scene
 from app.scene.relations import ON_TOP
 from app.scene.scene import observe
@@ -89,7 +89,7 @@ class _Cases(NamedTuple):
         return _Cases(*columns)
 
 
-def fit_misplaced(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0) -> Misplaced:
+def fit_misplaced(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int = 0) -> Misplaced:
     """Return the judgement of each kind of entry. A kind with too few scenes gets None."""
     cases = _cases(artifact, _some(scenes, seed), seed)
     if cases is None:
@@ -111,7 +111,7 @@ def _some(scenes: Sequence[EncodedScene], seed: int) -> list[EncodedScene]:
     return chosen
 
 
-def _cases(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int) -> _Cases | None:
+def _cases(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int) -> _Cases | None:
     """Return the cases of the scenes, or None without any."""
     of_scene: list[tuple[int, str, bool, bool, float]] = []
     of_entries: list[tuple[Ints, Floats, Flags]] = []
@@ -142,7 +142,7 @@ def _cases(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int) -> _Ca
 
 
 def _questions(
-    artifact: Artifact, encoded: EncodedScene, seed: int
+    artifact: SceneModel, encoded: EncodedScene, seed: int
 ) -> Iterator[tuple[Scene, Collection[Triple], Triple | int | None]]:
     """Yield scenes, triples stated as "under", and the wrong triple, moved object or None."""
     structure, places = artifact.vocabulary.structure, artifact.places

@@ -21,8 +21,8 @@ from scipy import sparse
 from scipy.optimize import minimize
 
 from app.inference.kernels import INTERCEPT, ROOM, SEVERAL, SINGLE
+from app.model.count_statistics import EXPONENTS, Counts
 from app.questions.counts import distribution, functions
-from app.registry.counts import EXPONENTS, Counts
 from app.scene import Vocabulary
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Ints

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from app import questions
-from app.registry import Artifact, Store
+from app.model import SceneModel
+from app.registry import Store
 from app.scene import Scene, SceneObject
 from app.scene.relations import ON_TOP
 from tests.registry.small_artifacts import rewrite_manifest
@@ -41,19 +42,19 @@ def adapt(store: Store, *arguments: object, code: int = 0) -> str:
     return invoke("adapt", "default", *arguments, "--store", store.root, code=code)
 
 
-def alarms(artifact: Artifact, labels: list[str], room: str | None = None) -> list[str]:
+def alarms(artifact: SceneModel, labels: list[str], room: str | None = None) -> list[str]:
     words = artifact.vocabulary
     objects = tuple(SceneObject(x, x, words.index(x)) for x in dict.fromkeys(labels))
     scene = Scene(objects, room_type=None if room is None else words.room_index(room))
     return [words.labels[c] for c in alarms_of(artifact, scene)]
 
 
-def home(store: Store, version: str = "1.0.0") -> Artifact:
-    return store.load("home", version)
+def home(store: Store, version: str = "1.0.0") -> SceneModel:
+    return store.load("home", version).model
 
 
-def default(store: Store) -> Artifact:
-    return store.load(*store.resolve("default"))
+def default(store: Store) -> SceneModel:
+    return store.load(*store.resolve("default")).model
 
 
 def test_a_confirmed_object_is_never_reported_again(store, tmp_path):
@@ -111,7 +112,7 @@ def test_a_relation_of_boxes_that_stands_right_is_not_reported_again(
             objects.append(SceneObject(label, label, words.index(label), 1.0, at, size))
         return Scene(tuple(objects))
 
-    def reported(artifact: Artifact, asked: Scene) -> list[tuple[str, str]]:
+    def reported(artifact: SceneModel, asked: Scene) -> list[tuple[str, str]]:
         found = score_misplaced(artifact, asked)
         return [(one["subject"], one["object"]) for one in found if one["is_misplaced"]]
 
@@ -172,7 +173,7 @@ def test_a_written_room_is_one_confirmed_scene(store, tmp_path):
     assert "never reported from now on: toilet (1)" in said
     assert alarms(home(store), INTRUDER, "bedroom") == []
     assert home(store).vocabulary.index("stairlift") is not None
-    source = home(store).manifest.data[-1]
+    source = store.load("home", "1.0.0").manifest.data[-1]
     assert (source.source, source.scenes, source.written) == ("home, written", 2, True)
 
     bedroom = Home.of(default(store), [], read_inventory(path).places).scenes[0]
@@ -220,7 +221,7 @@ def test_words_that_the_model_cannot_read_become_classes(store, tmp_path):
 
 def test_errors_name_the_reason(store, tmp_path):
     scenes = write([{"objects": ["bed"]}], tmp_path / "scenes.jsonl")
-    name = default(store).manifest.name
+    name, _ = store.resolve("default")
     assert "choose another name" in adapt(store, scenes, "--name", name, code=1)
     assert "--alias belongs to --promote" in adapt(store, scenes, "--alias", "x", code=1)
     assert "alias" in adapt(store, scenes, "--name", "default", code=1)
@@ -236,7 +237,8 @@ def test_errors_name_the_reason(store, tmp_path):
 def test_five_habits_are_learnt_from_a_hundred_scenes(store, tmp_path):
     scenes = write(home_scenes(100, 7), tmp_path / "scenes.jsonl")
     said = adapt(store, scenes, "--promote")
-    before, after = store.load(*store.resolve("places-triway")), home(store)
+    key = store.resolve("places-triway")
+    before, after = store.load(*key).model, home(store)
     new = home_scenes(50, 8)
     reported = [
         [scene for scene in new if alarms(side, scene["objects"], scene["room_type"])]
@@ -250,14 +252,14 @@ def test_five_habits_are_learnt_from_a_hundred_scenes(store, tmp_path):
     p = [tv_is_missing(side, living_room) for side in (before, after)]
     assert p[1] < 0.5 * p[0]
     assert str(store.aliases()["default"]) == "home@1.0.0"
-    assert f"to roll back: python -m app.registry alias default {'@'.join(before.key)}" in said
+    assert f"to roll back: python -m app.registry alias default {'@'.join(key)}" in said
     # `default` is now the home, whose parent is adapted again.
     few = write(reported[0][:15], tmp_path / "few.jsonl")  # the weights stay
     assert "is itself adapted" in adapt(store, few)
-    assert store.load("home", "1.1.0").manifest.training["parent"]["name"] == before.key[0]
+    assert store.load("home", "1.1.0").manifest.training["parent"]["name"] == key[0]
 
 
-def tv_is_missing(artifact: Artifact, labels: list[str]) -> float:
+def tv_is_missing(artifact: SceneModel, labels: list[str]) -> float:
     words = artifact.vocabulary
     scene = Scene(tuple(SceneObject(x, x, words.index(x)) for x in labels))
     answer = questions.missing(artifact, scene, candidates=[words.index("tv")], coverage=0.8)

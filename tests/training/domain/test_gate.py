@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from app.registry import Artifact, Store
+from app.model import SceneModel
+from app.registry import Store
 from tests.http.stores import corrupt, make_store
 from tests.training.commands import small_config
 from training.datasets import EncodedScene
@@ -99,7 +100,7 @@ def rooms() -> SplitScenes:
     return prepare(small(), Path())
 
 
-def trained(scenes: SplitScenes, **objects: float) -> Artifact:
+def trained(scenes: SplitScenes, **objects: float) -> SceneModel:
     machine = Trainer(small(**objects), scenes.training_data()).run().machine
     return draft_artifact(as_stored(machine), scenes.vocabulary)
 
@@ -118,7 +119,7 @@ def with_random_classes(scenes: SplitScenes) -> SplitScenes:
     return replace(scenes, parts=scenes.parts | {"train": [drawn(scene) for scene in train]})
 
 
-def usefulness(artifact: Artifact, data: TrainingData) -> Usefulness:
+def usefulness(artifact: SceneModel, data: TrainingData) -> Usefulness:
     return measure_usefulness(artifact, data, say=lambda _: None)
 
 

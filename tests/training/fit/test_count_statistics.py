@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from app.model import Counts
 from app.questions.counts import distribution
-from app.registry import Counts
 from app.scene import ObjectClass, Vocabulary
 from tests.training.evaluation.furnished_rooms import VOCABULARY, room_model, rooms
 from tests.training.evaluation.scenes import scene

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, invgamma, norm
 
-from app.registry import Offsets
+from app.model import Offsets
 from app.scene import CANONICAL
 from app.scene.relations import LEFT, ON_TOP
 from tests.training.evaluation.scenes import scene

@@ -5,16 +5,15 @@ viewer's axes (x away from the viewer, y left, z up). The tables contain only ca
 The opposite relation, with both classes exchanged, has the negative offset.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.inference.kernels import look_up_offsets
-from app.registry.fields import TensorGroup
+from app.model.fields import TensorGroup
 
 Table = NDArray[np.float32]
 Ints = NDArray[np.integer[Any]]
@@ -47,22 +46,15 @@ class Offsets(TensorGroup):
     pair_offset: Annotated[Table, "P", 6]
     pair_scenes: Annotated[Ints, "P"]
 
-    @classmethod
-    def from_tensors(cls, tensors: Mapping[str, NDArray[Any]], A: int, V: int) -> Self:
-        """Build the offsets of a machine with A relations and V classes from stored tensors.
-
-        Raises:
-            ArtifactError: `wrong_shape` or `invalid_tensor`; see `TensorGroup.read`.
-        """
-        offsets = cls.read(tensors, A=A, V=V)
-        offsets.require_keys("pair", A * V * V)
-        is_right = (offsets.relation_scenes >= 0).all() and (offsets.pair_scenes >= 1).all()
-        offsets.require(is_right, "relation_scenes must be at least 0 and pair_scenes at least 1")
-        least = offsets.relation + offsets.subject.min(axis=1) + offsets.object.min(axis=1)
-        variances = least[offsets.relation_scenes > 0, 3:]
-        is_right = (variances > 0).all() and (offsets.pair_offset[:, 3:] > 0).all()
-        offsets.require(is_right, "variances and standard deviations must be positive")
-        return offsets
+    def check(self, A: int, V: int, C: int) -> None:
+        """Check the values for a machine with A relations and V classes."""
+        self.require_keys("pair", A * V * V)
+        is_right = (self.relation_scenes >= 0).all() and (self.pair_scenes >= 1).all()
+        self.require(is_right, "relation_scenes must be at least 0 and pair_scenes at least 1")
+        least = self.relation + self.subject.min(axis=1) + self.object.min(axis=1)
+        variances = least[self.relation_scenes > 0, 3:]
+        is_right = (variances > 0).all() and (self.pair_offset[:, 3:] > 0).all()
+        self.require(is_right, "variances and standard deviations must be positive")
 
     def find(
         self, relation: Ints, subject: Ints, other: Ints

@@ -10,16 +10,15 @@ held is the number of scenes with a relation a from class i to class j, or in th
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Final, Self
+from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.inference.kernels import IN, ON, UNDER, triple_counts
-from app.registry.fields import TensorGroup
+from app.model.fields import TensorGroup
 from app.scene.relations import CANONICAL, STACKED, SUPPORTS
 from app.scene.roles import RoleCounts, role_counts
 from app.scene.stands import HANGS, SUPPORTED, USUAL
@@ -60,21 +59,14 @@ class Places(TensorGroup):
     role_anchor: Annotated[NDArray[np.float32], "V", 3]
     stands: Annotated[NDArray[np.float32], "V", 3]
 
-    @classmethod
-    def from_tensors(cls, tensors: Mapping[str, NDArray[Any]], A: int, V: int) -> Self:
-        """Build the counts of a machine with A relations and V classes from stored tensors.
-
-        Raises:
-            ArtifactError: `wrong_shape` or `invalid_tensor`; see `TensorGroup.read`.
-        """
-        places = cls.read(tensors, V=V)
-        places.require(len(places.triple), "there must be at least one triple")
-        places.require_keys("triple", A * V * V)
-        places.require_keys("role_pair", V * V)
-        counts = places.held, places.role_counts, places.role_anchor, places.stands
-        is_right = all((array >= 0).all() for array in counts) and (places.frequency > 0).all()
-        places.require(is_right, "counts must be at least 0, and frequencies must be above 0")
-        return places
+    def check(self, A: int, V: int, C: int) -> None:
+        """Check the values for a machine with A relations and V classes."""
+        self.require(len(self.triple), "there must be at least one triple")
+        self.require_keys("triple", A * V * V)
+        self.require_keys("role_pair", V * V)
+        counts = self.held, self.role_counts, self.role_anchor, self.stands
+        is_right = all((array >= 0).all() for array in counts) and (self.frequency > 0).all()
+        self.require(is_right, "counts must be at least 0, and frequencies must be above 0")
 
     @cached_property
     def roles(self) -> RoleCounts:
