@@ -236,7 +236,7 @@ class Calibration(Frozen):
     misplaced: Misplaced = Misplaced()
 
     @model_validator(mode="after")
-    def _has_fit_with_lines(self) -> Self:
+    def _check_outlier_lines(self) -> Self:
         if (self.outlier is None) != (self.outlier_lines is None):
             raise ValueError("outlier and outlier_lines must both have a value, or neither")
         return self

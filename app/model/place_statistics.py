@@ -84,9 +84,9 @@ class Places(TensorGroup):
         start, classes, counts, back_off = self._by_anchor[int(outgoing)]
         V = len(self.frequency)
         begin, end = start[relation * V + anchor], start[relation * V + anchor + 1]
-        held = _PLACE * back_off[relation]
-        held[classes[begin:end]] += counts[begin:end]
-        return np.log(held / ((counts[begin:end].sum() + _PLACE) * self.frequency))
+        smoothed = _PLACE * back_off[relation]
+        smoothed[classes[begin:end]] += counts[begin:end]
+        return np.log(smoothed / ((counts[begin:end].sum() + _PLACE) * self.frequency))
 
     def shows(self, relation: int, subject: Indices, other: Indices) -> NDArray[np.bool_]:
         """Return whether training shows the relation from each subject to each other class, (N, M).

@@ -72,12 +72,12 @@ def more(
     if model.counts is None:
         return []
     # Words without a class have no statistics; their classes follow those of the statistics.
-    size = model.vocabulary.known
+    size = model.vocabulary.trained
     plain = ~model.vocabulary.structure[listing.classes] & (listing.classes < size)
     classes, listed = listing.classes[plain], listing.counts[plain]
-    usual, unlisted = model.calibration.coverage, 1.0
-    if coverage is not None and coverage > usual:
-        unlisted = (1 - coverage) / (1 - usual)
+    own, unlisted = model.calibration.coverage, 1.0
+    if coverage is not None and coverage > own:
+        unlisted = (1 - coverage) / (1 - own)
     rows, p = distribution(model.counts, size, classes, listed, scene.room_type, unlisted)
     classes, listed = classes[rows], listed[rows]
     numbers, cumulative = np.arange(1, p.shape[1] + 1), p.cumsum(axis=1)

@@ -31,7 +31,8 @@ from app.questions.names import ErrorList
 from app.questions.outliers import intruders
 from app.questions.posterior import Present, given_relations, present
 from app.questions.question import BEDROOM, POSES, REFUSED, Example, Options, Question
-from app.questions.reading import Reading, Triple
+from app.questions.reading import Reading
+from app.scene.relation_table import Triple
 from app.scene.relations import CANONICAL
 from app.scene.scene import Scene, SceneObject
 from scene_client.schemas import GenerateAnswer, GenerateRequest
@@ -91,7 +92,7 @@ def generate(
     shown = ~model.vocabulary.structure
     shown[conditions.classes] = True
     class_of = [thing.class_index or 0 for thing in scene.objects]
-    evidence = {(a, class_of[i], class_of[j]) for a, i, j in scene.relations or ()}
+    evidence = {(a, class_of[i], class_of[j]) for a, i, j in scene.triples}
     scenes: list[Fields] = []
     while len(scenes) < count and not stop():
         stream = random_stream(seed, len(scenes))
@@ -192,9 +193,9 @@ def staying(
     possible = (units[:, 1] != units[:, 2]) & ~structure[units[:, 1:]].any(axis=1)
     triples = np.concatenate([fixed, units])
     relation = np.ascontiguousarray(triples[:, 0])
-    classes, ends = np.unique(triples[:, 1:], return_inverse=True)
+    classes, pairs = np.unique(triples[:, 1:], return_inverse=True)
     stay: NDArray[np.bool_] = select_consistent(
-        relation, ends.reshape(-1, 2), order[possible[order]], len(fixed), len(classes)
+        relation, pairs.reshape(-1, 2), order[possible[order]], len(fixed), len(classes)
     )
     # A drawn relation that is part of the evidence always stays.
     if evidence:

@@ -11,7 +11,7 @@ multiplied by the probability of the companion in a scene with the outlier. Clas
 is below half of the largest increase are ignored.
 """
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from typing import Any, Final
 
 import numpy as np
@@ -25,7 +25,7 @@ from app.questions.answer import EXPLAINED, Fields, reasons, rounded_number, sig
 from app.questions.misplaced import misplaced_fields
 from app.questions.posterior import Posterior, calibrated
 from app.questions.question import REFUSED, SCENES, WITH_TOILET, Example, Options, Question
-from app.questions.reading import Reading, Triple
+from app.questions.reading import Reading
 from app.scene.scene import Scene, SceneObject
 from scene_client.schemas import OutliersAnswer, OutliersRequest, SceneWarning
 
@@ -42,7 +42,6 @@ def outliers(
     sensitivity: Sensitivity = "medium",
     threshold: float | None = None,
     details: bool = True,
-    flipped: Collection[Triple] = (),
 ) -> Fields:
     """Judge every object and every stated relation of a scene.
 
@@ -69,8 +68,6 @@ def outliers(
         sensitivity: name of one of the model's thresholds.
         threshold: minimum probability of an outlier. None means the threshold of `sensitivity`.
         details: whether the answer contains `because` and `usually_with`.
-        flipped: relations of the scene that the request states by their opposite. The answer uses
-            the words of the request.
 
     Returns:
         The fields `threshold`, `outliers` and `misplaced` of `scene_client.schemas.OutliersAnswer`.
@@ -82,7 +79,7 @@ def outliers(
     can_alarm = ~model.rarely_shown
     if threshold is not None:
         can_alarm = np.ones_like(can_alarm)
-    can_alarm[model.vocabulary.known :] = False
+    can_alarm[model.vocabulary.trained :] = False
     judged: list[Fields] = []
     wrong: list[Fields] = []
     warnings = _unjudged(model, scene)
@@ -91,7 +88,7 @@ def outliers(
         n, in_room = posterior.listed if posterior else 0, scene.room_type is not None
         threshold = model.calibration.outlier_threshold(sensitivity, n, in_room=in_room)
     if posterior is not None:
-        wrong = misplaced_fields(model, posterior, scene, sensitivity, flipped)
+        wrong = misplaced_fields(model, posterior, scene, sensitivity)
         if entry is not None and threshold is not None:
             judged, unsure = _judged(
                 model, entry, posterior, scene, threshold, can_alarm, details=details
@@ -136,12 +133,12 @@ def _judged(
         lowered, raised = np.minimum(change, 0), np.maximum(change, 0)
         change = np.where(is_outlier[:, None], lowered, raised)
         causes = reasons(scene, present, change, np.arange(n), scale=entry.slope)
-    usual: list[list[str]] = [[] for _ in flags]
+    companions: list[list[str]] = [[] for _ in flags]
     judged: list[Fields] = []
     classes, probabilities, values = present.classes.tolist(), significant(p), significant(logits)
     for row in explained if details else ():
         if flags[row]:
-            usual[row] = _companions(model, present.classes, classes[row])
+            companions[row] = _companions(model, present.classes, classes[row])
     for number, row in zip(order.tolist(), rows, strict=True):
         thing = scene.objects[number]
         fields: Fields = {"object": thing.id, "label": labels[classes[row]]}
@@ -155,7 +152,7 @@ def _judged(
         fields["is_outlier"] = flags[row]
         if details:
             fields["because"] = causes[row] if row in explained else []
-            fields["usually_with"] = usual[row]
+            fields["usually_with"] = companions[row]
         judged.append(fields)
     unsure = np.flatnonzero((reaches & ~is_outlier)[present.row])
     return judged, [scene.objects[number] for number in unsure.tolist()]
@@ -167,7 +164,7 @@ def misplaced(
     """Judge every stated relation like `outliers`, but do not judge objects."""
     if not scene.objects:
         return []
-    return misplaced_fields(model, Posterior(model, scene), scene, sensitivity, ())
+    return misplaced_fields(model, Posterior(model, scene), scene, sensitivity)
 
 
 def intruders(model: SceneModel, scene: Scene) -> NDArray[np.int64]:
@@ -240,7 +237,7 @@ def _unjudged(model: SceneModel, scene: Scene) -> list[SceneWarning]:
     """Return a warning for objects, and one for relations, if the model gives no judgement."""
     calibration = model.calibration
     parts = ["objects"] if scene.objects and calibration.outlier is None else []
-    if scene.relations and not calibration.misplaced.judges_relations:
+    if scene.triples and not calibration.misplaced.judges_relations:
         parts.append("relations")
     message = "the model does not judge {}, because its calibration had too few scenes"
     return [
@@ -248,12 +245,11 @@ def _unjudged(model: SceneModel, scene: Scene) -> list[SceneWarning]:
     ]
 
 
-def _read(request: OutliersRequest, _: SceneModel, reading: Reading) -> Options:
+def _read(request: OutliersRequest, _: SceneModel, __: Reading) -> Options:
     return {
         "sensitivity": request.sensitivity,
         "threshold": request.threshold,
         "details": request.detail == "full",
-        "flipped": reading.flipped,
     }
 
 

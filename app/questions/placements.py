@@ -101,9 +101,9 @@ def placements(
     A, objects, stand_in = forward.shape[1], present.first[anchors], model.vocabulary.stand_in
     classes, candidates = stand_in[present.classes[anchors]], stand_in[candidates]
     first = -1  # number of the requested place in `likeliest_places`; -1 without a request
-    if A > ON_TOP and scene.relations:
-        held = held_objects(model, posterior, scene)
-        columns = [k for k, number in enumerate(objects.tolist()) if number in held]
+    if A > ON_TOP and scene.triples:
+        supported = supported_objects(model, posterior, scene)
+        columns = [k for k, number in enumerate(objects.tolist()) if number in supported]
         for a in SUPPORTS:
             if a < A:
                 backward[:, a, columns] = NO_UNIT
@@ -144,7 +144,7 @@ def placements(
     return entries
 
 
-def held_objects(model: SceneModel, posterior: Posterior, scene: Scene) -> list[int]:
+def supported_objects(model: SceneModel, posterior: Posterior, scene: Scene) -> list[int]:
     """Return the indices of the objects that stand on or in an object, by the scene's relations.
 
     The list does not contain a desk with a bin under it, although its relation is on-top as well.
@@ -154,7 +154,7 @@ def held_objects(model: SceneModel, posterior: Posterior, scene: Scene) -> list[
     classes = model.vocabulary.stand_in[present.classes][present.row].tolist()
     return [
         i
-        for a, i, j in scene.relations or ()
+        for a, i, j in scene.triples
         if a == INSIDE
         or (a == ON_TOP and not (places and places.means_under(classes[i], classes[j])))
     ]

@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference import MachineSpec
-from app.inference.kernels import pool_classes, pool_relations
+from app.inference.kernels import pool_classes
 from app.inference.relations import Between, ObservedRelations, context_of, to_log_odds
 from app.model.calibration import LEAST_COVERAGE, Calibration, CountSlope, CoverageFit
 from app.model.scene_model import SceneModel
-from app.scene.scene import Scene, instance_evidence
+from app.scene.scene import Scene
 
 Floats = NDArray[np.floating[Any]]
 Doubles = NDArray[np.float64]
@@ -81,26 +81,15 @@ def present(scene: Scene, spec: MachineSpec) -> Present:
 
 
 def given_relations(scene: Scene, present: Present, relations: int) -> ObservedRelations | None:
-    """Return the observed relations between the classes of a scene.
-
-    The result is None if the scene has neither relations nor poses.
+    """Return the observed relations between the classes of a scene, or None without observations.
 
     Args:
         relations: number of canonical relations that the machine knows.
     """
-    if not relations_given(scene):
+    if scene.relations is None or not scene.has_observations:
         return None
-    n = len(present.classes)
-    holds, observed = pool_relations(present.row, n, *instance_evidence(scene))
-    # The arrays are contiguous. For another layout, numba would compile the loops again.
-    units = observed[:relations].reshape(-1).nonzero()[0]
-    a, pair = np.divmod(units, n * n)
-    return ObservedRelations(a, *np.divmod(pair, n), holds.reshape(-1)[units].astype(np.float32))
-
-
-def relations_given(scene: Scene) -> bool:
-    """Return whether the scene has observed relations, either stated or derived from poses."""
-    return bool(scene.relations or scene.relations_complete or scene.poses)
+    columns = scene.relations.of_classes(present.row, len(present.classes), relations)
+    return ObservedRelations(*columns)
 
 
 class Posterior:

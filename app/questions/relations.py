@@ -12,10 +12,11 @@ instance counts as observed for all instances. Example: one chair is to the left
 another chair is to the right. Then left and right both count as observed for each chair.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import NDArray
 
 from app.errors import InvalidRequestError, Location
@@ -23,12 +24,12 @@ from app.inference.kernels import EXCLUDED, disagreeing, likeliest_relations, ob
 from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, significant
 from app.questions.names import ErrorList
-from app.questions.placements import held_objects
-from app.questions.posterior import Posterior, Present, relations_given
+from app.questions.placements import supported_objects
+from app.questions.posterior import Posterior, Present
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
-from app.questions.reading import Reading, Triple
-from app.scene.relations import ON_TOP, SUPPORTS, canonicalise, opposite, relation_names
-from app.scene.scene import Scene, instance_evidence
+from app.questions.reading import Reading
+from app.scene.relations import CANONICAL, ON_TOP, SUPPORTS, canonicalise, opposite, relation_names
+from app.scene.scene import Scene
 from scene_client.schemas import RelationsAnswer, RelationsRequest, SceneWarning
 
 EXPECTED = 0.5
@@ -46,7 +47,6 @@ def relations(
     min_probability: float = 0.0,
     pairs: Sequence[tuple[int, int]] | None = None,
     include_opposites: bool = False,
-    flipped: Collection[Triple] = (),
 ) -> Fields:
     """Return the likeliest relations between the objects of a scene, and the disagreements.
 
@@ -65,8 +65,6 @@ def relations(
             all pairs.
         include_opposites: whether the answer also lists opposite relations, such as right(y, x) for
             left(x, y).
-        flipped: relations of the scene that the request states by their opposite. Disagreements
-            use the words of the request.
 
     Returns:
         The fields `relations` and `disagreements` of `scene_client.schemas.RelationsAnswer`. The
@@ -83,7 +81,7 @@ def relations(
     # This limit is slightly lower than the requested minimum, because the final comparison uses
     # rounded probabilities.
     least = min_probability * (1 - 1e-5)
-    table = slopes.relation_given if relations_given(scene) else slopes.relation
+    table = slopes.relation_given if scene.has_observations else slopes.relation
     log_odds, log_counts, row = posterior.relation_log_odds(), present.log_counts, present.row
     evidence = _evidence(model, posterior, scene)
     subjects, objects, kinds, p, of_model = likeliest_relations(
@@ -91,15 +89,13 @@ def relations(
     )
     columns = subjects.tolist(), objects.tolist(), kinds.tolist(), significant(p)
     expected = significant(of_model)
-    disagreements = _disagreements(
-        model, scene, posterior, judged, flipped, top_k=top_k, least=least
-    )
-    names, observed, things = relation_names(A), set(scene.relations or ()), scene.objects
+    disagreements = _disagreements(model, scene, posterior, judged, top_k=top_k, least=least)
+    names, observed, things = relation_names(A), set(scene.triples), scene.objects
     judges = model.spec.judges_relations
     entries: list[Fields] = []
     for subject, object_, kind, probability, own in zip(*columns, expected, strict=True):
-        ends = (subject, object_) if kind < A else (object_, subject)
-        is_observed = (kind % A, *ends) in observed
+        pair = (subject, object_) if kind < A else (object_, subject)
+        is_observed = (kind % A, *pair) in observed
         if probability < min_probability or not (judges or is_observed):
             continue
         entry: Fields = {
@@ -116,30 +112,35 @@ def relations(
     return {"relations": entries, "disagreements": disagreements, "warnings": warnings}
 
 
-def _evidence(model: SceneModel, posterior: Posterior, scene: Scene) -> NDArray[np.float32]:
+def _evidence(
+    model: SceneModel, posterior: Posterior, scene: Scene
+) -> Float[NDArray[np.float32], "A N N"]:
     """Return the evidence about the relations of a scene; see `likeliest_relations`.
 
-    The probability of an observed relation is the product of the confidences of its objects. An
+    The probability of an observed relation is multiplied by the confidences of its objects. An
     object on or in one object is not on or in another object.
     """
-    A = model.spec.A
-    if scene.excluded is None and not relations_given(scene):
+    A, N, table = model.spec.A, len(scene.objects), scene.relations
+    if table is None or not len(table):
         return np.zeros((0, 0, 0), np.float32)
-    holds, observed = instance_evidence(scene)
+    excluded = np.zeros((len(CANONICAL), N, N), np.bool_)
+    excluded[table.relation, table.subject, table.object] = True
     # A stacked relation excludes all other relations of its two objects. Left and front exclude
     # stacked relations.
-    lateral, stacked = holds[:ON_TOP].any(0), holds[ON_TOP:].any(0)
-    excluded = observed | stacked | stacked.T
-    excluded[ON_TOP:] |= lateral | lateral.T
-    held = held_objects(model, posterior, scene)
+    holds, (beside, stacked) = table.holding, np.zeros((2, N, N), np.bool_)
+    is_stacked = holds.relation >= ON_TOP
+    for pairs, rows in ((beside, ~is_stacked), (stacked, is_stacked)):
+        pairs[holds.subject[rows], holds.object[rows]] = True
+    excluded |= stacked | stacked.T
+    excluded[ON_TOP:] |= beside | beside.T
+    supported = supported_objects(model, posterior, scene)
     for a in SUPPORTS:
-        excluded[a, held] = True
-    if scene.excluded is not None:
-        excluded |= scene.excluded
+        excluded[a, supported] = True
     evidence = np.where(excluded[:A], EXCLUDED, np.float32(np.nan))
     confidence = np.array([thing.confidence for thing in scene.objects], np.float32)
-    units = holds[:A].nonzero()
-    evidence[units] = confidence[units[1]] * confidence[units[2]]
+    observed = holds.rows(holds.relation < A)
+    p = observed.probability * confidence[observed.subject] * confidence[observed.object]
+    evidence[observed.relation, observed.subject, observed.object] = p
     return evidence
 
 
@@ -162,7 +163,6 @@ def _disagreements(
     scene: Scene,
     posterior: Posterior,
     judged: NDArray[np.bool_],
-    flipped: Collection[Triple],
     *,
     top_k: int,
     least: float,
@@ -174,11 +174,10 @@ def _disagreements(
     disagreement. A relation is never expected if the machine has no unit for it. ``judged`` is
     (N, N) bool. The function judges a pair of objects if one of its two orders is True.
     """
-    A = model.spec.A
-    stated = [triple for triple in scene.relations or () if triple[0] < A]
+    A, present = model.spec.A, posterior.present
+    stated = [triple for triple in scene.triples if triple[0] < A]
     if not stated:
         return []
-    present = posterior.present
     pairs = observed_pairs(np.array(stated), present.row, judged, len(present.classes), A)
     subjects, objects, holds, of_classes = pairs
     if not len(subjects):
@@ -192,7 +191,7 @@ def _disagreements(
     columns = *(part[chosen].tolist() for part in (subjects, objects, holds)), expected.tolist()
     return [
         {
-            **_names(scene, A, flipped, subject, object_, bits, kind),
+            **_names(scene, A, subject, object_, bits, kind),
             "probability": probability,
             "observed_probability": observed_probability,
         }
@@ -205,7 +204,6 @@ def _disagreements(
 def _names(
     scene: Scene,
     A: int,
-    flipped: Collection[Triple],
     subject: int,
     object_: int,
     holds: int,
@@ -215,7 +213,6 @@ def _names(
 
     Args:
         A: number of canonical relations that the machine knows.
-        flipped: relations that the request states by their opposite.
         holds: bit set of the observed relations; see `observed_pairs`.
         expected: number of the expected relation.
     """
@@ -224,7 +221,7 @@ def _names(
     triples = {canonicalise(subject, relation, object_) for relation in observed}
     # A relation comes from this subject if the request states it with this subject, or if the
     # request states its opposite with the other object as subject.
-    if all((triple[1] == subject) == (triple in flipped) for triple in triples):
+    if all((triple[1] == subject) == (triple in scene.opposites) for triple in triples):
         subject, object_ = object_, subject
         names, observed = tuple(map(opposite, names)), list(map(opposite, observed))
     return {
@@ -241,7 +238,6 @@ def _read(request: RelationsRequest, _: SceneModel, reading: Reading) -> Options
         "min_probability": request.min_probability,
         "pairs": None if request.pairs is None else _pairs(request, reading),
         "include_opposites": request.include_opposites,
-        "flipped": reading.flipped,
     }
 
 

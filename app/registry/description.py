@@ -36,7 +36,7 @@ class VocabularyEntry(Frozen):
     _words: Vocabulary = PrivateAttr()
 
     @model_validator(mode="after")
-    def _is_a_vocabulary(self) -> Self:
+    def _check_vocabulary(self) -> Self:
         if self.relations != CANONICAL[: len(self.relations)]:
             raise ValueError(f"relations must be the first of {CANONICAL}, in the same order")
         self._words = Vocabulary(self.objects, self.room_types, self.room_aliases)
@@ -115,7 +115,7 @@ class Example(Frozen):
 
     @field_validator("scene")
     @classmethod
-    def _has_no_other_field(cls, scene: SceneRequest) -> SceneRequest:
+    def _check_fields_of_scene(cls, scene: SceneRequest) -> SceneRequest:
         if extra := sorted(scene.model_fields_set - _FIELDS):
             raise ValueError(f"an example must not have the field {extra[0]!r}")
         return scene
@@ -129,14 +129,14 @@ class Example(Frozen):
         return self._without_defaults(self.scene)
 
 
-def _are_small(examples: tuple[Example, ...]) -> tuple[Example, ...]:
+def _check_size(examples: tuple[Example, ...]) -> tuple[Example, ...]:
     size = len(to_json([example.model_dump(mode="json") for example in examples]).encode())
     if size > MAX_EXAMPLES_BYTES:
         raise ValueError(f"the examples have {size} bytes, more than {MAX_EXAMPLES_BYTES}")
     return examples
 
 
-Examples = Annotated[Many[Example], Field(max_length=MAX_EXAMPLES), AfterValidator(_are_small)]
+Examples = Annotated[Many[Example], Field(max_length=MAX_EXAMPLES), AfterValidator(_check_size)]
 """The examples of a model: at most `MAX_EXAMPLES`, of at most `MAX_EXAMPLES_BYTES` together."""
 
 
@@ -172,13 +172,13 @@ class Description(Frozen):
 
     @field_validator("spec", "training", "libraries", "terms")
     @classmethod
-    def _can_be_written(cls, value: JsonValue) -> JsonValue:
+    def _check_json(cls, value: JsonValue) -> JsonValue:
         # pydantic accepts NaN and lone surrogates in JSON without a schema. Neither can be written.
         to_json(value).encode()
         return value
 
     @model_validator(mode="after")
-    def _fits_spec(self) -> Self:
+    def _check_spec(self) -> Self:
         words = self.vocabulary
         for name, what, length in (
             ("V", "vocabulary objects", len(words.objects)),

@@ -59,7 +59,7 @@ class Manifest(Description):
 
     @field_validator("files")
     @classmethod
-    def _names_every_file(cls, files: dict[str, FileEntry]) -> dict[str, FileEntry]:
+    def _check_files(cls, files: dict[str, FileEntry]) -> dict[str, FileEntry]:
         if set(files) != {WEIGHTS, CARD}:
             raise ValueError(f"the files must be exactly {WEIGHTS} and {CARD}")
         return files

@@ -47,14 +47,14 @@ def _remembered(search: SearchT) -> SearchT:
     @wraps(search)
     def recall(self: "Vocabulary", label: str, *, is_room: bool = False) -> Any:
         memory, key = self._memory, (search.__name__, label, is_room)
-        found = memory.get(key, memory)  # a result may be None
-        if found is memory:
-            found = search(self, label, is_room=is_room)
+        result = memory.get(key, memory)  # a result may be None
+        if result is memory:
+            result = search(self, label, is_room=is_room)
             if len(memory) >= _MOST_REMEMBERED:
                 memory.clear()  # in one step, because other threads read the memory
             if len(label) <= _LONGEST:
-                memory[key] = found
-        return found
+                memory[key] = result
+        return result
 
     return cast("SearchT", recall)
 
@@ -102,7 +102,7 @@ class Vocabulary:
         room_types: canonical names of the room types. Their order defines the room indices.
         room_aliases: maps room types to their synonyms.
         parents: (V,) index of the parent of each class, -1 without a parent.
-        known: number of classes without those of words (`with_words`), which come last.
+        trained: number of classes without those of words (`with_words`), which come last.
         stand_in: (V,) class whose counts and relations each class has: itself, or the nearest class
             for a word of `with_words`.
 
@@ -129,8 +129,8 @@ class Vocabulary:
         self._by_spelling, self._by_key = _tables(names, "an object class", clash)
         self._bare = {name: SceneObject(name, name, k) for name, k in self._by_spelling.items()}
         self.parents = self._parent_indices()
-        self.known = len(self.objects)
-        self.stand_in = _read_only(np.arange(self.known))
+        self.trained = len(self.objects)
+        self.stand_in = _read_only(np.arange(self.trained))
         names = [(room, *self.room_aliases.get(room, ())) for room in self.room_types]
         clash = "room types {first!r} and {second!r} have the same name"
         self._room_by_spelling, self._room_by_key = _tables(names, "a room type", clash)
@@ -192,9 +192,9 @@ class Vocabulary:
         """(V, V) True if class j is the parent of class i, or a parent of its parent."""
         is_broader = np.zeros((len(self), len(self)), np.bool_)
         rows, ancestors = np.arange(len(self)), self.parents
-        while (known := ancestors >= 0).any():
-            is_broader[rows[known], ancestors[known]] = True
-            ancestors = np.where(known, self.parents[ancestors], -1)
+        while (has_parent := ancestors >= 0).any():
+            is_broader[rows[has_parent], ancestors[has_parent]] = True
+            ancestors = np.where(has_parent, self.parents[ancestors], -1)
         return _read_only(is_broader)
 
     @cached_property
@@ -304,10 +304,10 @@ class Vocabulary:
         alternatives = [name for rule, name in pairs if rule == "alternative"]
         for text in alternatives[:_MOST_GUESSED] or [name for _, name in pairs][-1:] or [label]:
             name = " ".join(split_words(text))
-            vector, (vectors, known) = word_vectors().of(name), self.vectors
+            vector, (vectors, has_vector) = word_vectors().of(name), self.vectors
             # Structure has no weights, so it cannot predict those of a word.
-            if vector is not None and (known & ~self.structure).any():
-                cosines = np.where(known, vectors @ vector, -1.0)
+            if vector is not None and (has_vector & ~self.structure).any():
+                cosines = np.where(has_vector, vectors @ vector, -1.0)
                 nearest = int(cosines.argmax())
                 similarity = round(min(max(float(cosines[nearest]), 0.0), 1.0), 3)
                 return Word(name, vector, nearest, similarity)
@@ -353,24 +353,24 @@ class _WithWords(Vocabulary):
     Its arrays extend those of the known classes, because a new vocabulary would take 0.1 s.
     """
 
-    def __init__(self, known: Vocabulary, words: Sequence[Word]) -> None:
-        vars(self).update({name: vars(known)[name] for name in _SHARED})
-        self._base, self._nearest = known, [word.nearest for word in words]
-        self.known = len(known)
-        nearest = [known.objects[index] for index in self._nearest]
+    def __init__(self, base: Vocabulary, words: Sequence[Word]) -> None:
+        vars(self).update({name: vars(base)[name] for name in _SHARED})
+        self._base, self._nearest = base, [word.nearest for word in words]
+        self.trained = len(base)
+        nearest = [base.objects[index] for index in self._nearest]
         self.objects = (
-            *known.objects,
+            *base.objects,
             *(
                 replace(entry, label=word.name, aliases=(), size=None, parent=None)
                 for word, entry in zip(words, nearest, strict=True)
             ),
         )
-        self.parents = _read_only([*known.parents, *(-1 for _ in words)])
-        self.stand_in = _read_only([*known.stand_in, *self._nearest])
+        self.parents = _read_only([*base.parents, *(-1 for _ in words)])
+        self.stand_in = _read_only([*base.stand_in, *self._nearest])
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
-        new = self.objects[self.known :]
+        new = self.objects[self.trained :]
         return (*self._base.labels, *(entry.label for entry in new))
 
     @cached_property

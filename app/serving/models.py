@@ -19,6 +19,8 @@ from app.questions.answer import written
 from app.registry import Artifact, ArtifactError, ModelSet, StoreError
 from app.registry.model_set import EMPTY
 from app.scene.nearest import spelt_alike
+from app.scene.relation_table import RelationTable
+from app.scene.relations import ON_TOP
 from app.scene.scene import Scene, SceneObject, observe
 from app.scene.vocabulary import Vocabulary
 from scene_client.schemas import Failure
@@ -198,10 +200,11 @@ def warm_up(artifact: Artifact) -> None:
 
 
 def _scene(vocabulary: Vocabulary) -> Scene:
-    """Return a scene of up to three objects in a row. The third object is on top of the second."""
+    """Return a scene of up to three objects in a row. The second object is on top of the first."""
     proposable = [i for i, entry in enumerate(vocabulary.objects) if not entry.structure]
     objects = tuple(
         SceneObject(str(k), vocabulary.labels[index], index, position=(1.0, 0.5 * k, 0.5))
         for k, index in enumerate((proposable or [0])[:3])
     )
-    return Scene(objects, ((2, 1, 0),) if len(objects) > 1 else None)
+    relations = RelationTable.stated([(ON_TOP, 1, 0)]) if len(objects) > 1 else None
+    return Scene(objects, relations)

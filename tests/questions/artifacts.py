@@ -14,7 +14,7 @@ from app.model.calibration import (
 )
 from app.model.place_statistics import Places
 from app.model.scene_model import SceneModel
-from app.scene import ObjectClass, Scene, SceneObject, Vocabulary
+from app.scene import ObjectClass, RelationTable, Scene, SceneObject, Vocabulary
 from tests.enumeration.small_machines import SMALL, random_weights
 from training.machines import BoltzmannMachine, MachineSpec, build
 from training.machines.arrays import weights_of
@@ -140,5 +140,8 @@ def scene_of(
 ) -> Scene:
     """A scene. The relations are canonical triples of a relation and two indices of objects."""
     objects = tuple(SceneObject(f"{LABELS[c]}_{k}", LABELS[c], c) for k, c in enumerate(classes))
-    triples = None if relations is None else tuple(relations)
-    return Scene(objects, triples, complete, room, profile=profile)
+    table = None
+    if relations is not None or complete:
+        complete_for = len(objects) if complete else None
+        table = RelationTable.stated(relations or (), complete_for=complete_for)
+    return Scene(objects, table, room, profile)

@@ -9,7 +9,7 @@ from app.questions.outliers import outliers
 from app.questions.posterior import Posterior
 from app.questions.relations import relations
 from app.questions.rooms import rooms
-from app.scene import Scene, SceneObject
+from app.scene import RelationTable, Scene, SceneObject
 from tests.questions.artifacts import LARGER, larger_artifact, lines
 
 ALARM = lines(-1e3, -1e3, -1e3)
@@ -78,7 +78,7 @@ def test_relations_and_places_are_those_of_the_nearest_class(variant) -> None:
         )
         for a, b in zip(of_word, of_sofa, strict=True):
             assert a == pytest.approx(b, abs=1e-4)
-    scene = Scene(objects(artifact, "couch", "rug"), ((3, 0, 1),))
+    scene = Scene(objects(artifact, "couch", "rug"), RelationTable.stated([(3, 0, 1)]))
     answer = relations(artifact, scene, top_k=50)
     assert {one["subject"] for one in answer["relations"]} >= {"couch_0"}
 

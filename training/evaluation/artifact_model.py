@@ -11,8 +11,8 @@ from torch import Tensor
 from app.model import SceneModel
 from app.questions.misplaced import wrong_relations
 from app.questions.posterior import Posterior
-from app.questions.reading import Triple
-from app.scene import CANONICAL, OPPOSITES, Scene
+from app.scene import CANONICAL, OPPOSITES, RelationTable, Scene
+from app.scene.relation_table import Triple
 from training.datasets.batches import Batch
 from training.evaluation.asking import (
     flag_outliers,
@@ -100,7 +100,8 @@ def _scenes(batch: Batch, given: bool = True) -> Iterator[tuple[Scene, dict[Trip
         for a, x, y in sorted(observed):
             index = last if (a, y, x) in observed and x > y else first
             triples[a, x, y] = (a, int(index[x]), int(index[y]))
-        yield Scene(scene.objects, tuple(triples.values()) or None), triples
+        table = RelationTable.stated(triples.values()) if triples else None
+        yield Scene(scene.objects, table), triples
 
 
 def score_placed(artifact: SceneModel, places: Places) -> Tensor:

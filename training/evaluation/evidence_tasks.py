@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from app.model import SceneModel
-from app.scene import PoseRelations, Scene
+from app.scene import RelationTable, Scene
 from training.datasets.array_types import Flags, Floats
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import scene_of, scene_rng
@@ -91,7 +91,9 @@ def halves(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -> 
         triples = [(int(a), int(i), int(j)) for a, i, j in np.argwhere(given)]
         scene = replace(scene_of(encoded, range(len(instances)), triples), room_type=None)
         if kind == "poses":
-            scene = replace(scene, poses=PoseRelations(given, encoded.instance_observed & between))
+            observed = encoded.instance_observed & between
+            table = RelationTable.shown_by_boxes(given, observed, np.zeros_like(observed))
+            scene = replace(scene, relations=table)
         yield Case(index, scene, queried, truth)
 
 
@@ -103,7 +105,7 @@ def relations_evidence_task(artifact: SceneModel, setting: Setting) -> Outcome |
 
     def ask(case: Case) -> Floats:
         count, truth = int(case.truth.sum()), case.truth[case.queried]
-        bare = replace(case.scene, relations=None, poses=None)
+        bare = replace(case.scene, relations=None)
         p = (relation_probabilities(artifact, scene) for scene in (bare, case.scene))
         return np.array([expected_hits(x[case.queried], truth, count) for x in p])
 

@@ -11,7 +11,7 @@ import pytest
 from app import questions
 from app.model import SceneModel
 from app.registry import Store
-from app.scene import Scene, SceneObject
+from app.scene import RelationTable, Scene, SceneObject
 from app.scene.relations import ON_TOP
 from tests.registry.small_artifacts import rewrite_manifest
 from tests.training.commands import invoke
@@ -119,7 +119,7 @@ def test_a_relation_of_boxes_that_stands_right_is_not_reported_again(
     right = scene(support)
     assert (top, support) in reported(default(store), right)
     bare = [replace(thing, position=None, size=None) for thing in right.objects]
-    stated = Scene(tuple(bare), relations=((ON_TOP, 1, 0),))
+    stated = Scene(tuple(bare), RelationTable.stated([(ON_TOP, 1, 0)]))
     assert ((top, support) in reported(default(store), stated)) == is_stated_reported
     objects = [
         {"id": thing.id, "label": thing.label, "position": thing.position, "size": thing.size}

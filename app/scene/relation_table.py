@@ -1,0 +1,177 @@
+"""The relations of a scene in one table: stated by a request, shown by boxes, or excluded by boxes.
+
+A request is read into this table once, and all questions read the table. A row is a relation of one
+object to another object. Its probability is 1 if the relation holds, and 0 if it does not hold.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int
+from numpy.typing import NDArray
+
+from app.scene.relations import CANONICAL
+
+Array: TypeAlias = NDArray[Any]
+Triple: TypeAlias = tuple[int, int, int]
+"""A canonical relation, its subject and its object, as indices."""
+
+STATED, BOXES, EXCLUDED = range(3)
+"""Origins of a row. The first two are observations: the request states the relation or that it does
+not hold, or the boxes show this. A row of origin `EXCLUDED` observes nothing about other relations:
+its relation alone cannot hold between these boxes."""
+
+_A: Final = len(CANONICAL)
+
+
+@dataclass(frozen=True, eq=False)
+class RelationTable:
+    """R relations between different objects of a scene.
+
+    Attributes:
+        relation: indices of the canonical relations.
+        subject, object: indices of the objects.
+        probability: probabilities that the relations hold.
+        origin: `STATED`, `BOXES` or `EXCLUDED`.
+        is_opposite: True for relations that the request states by their opposite, for example right
+            instead of left.
+        of_boxes: whether the observations come from boxes.
+    """
+
+    relation: Int[Array, "R"]
+    subject: Int[Array, "R"]
+    object: Int[Array, "R"]
+    probability: Float32[Array, "R"]
+    origin: Int[Array, "R"]
+    is_opposite: Bool[Array, "R"]
+    of_boxes: bool = False
+
+    @classmethod
+    def stated(
+        cls,
+        triples: Iterable[Triple],
+        is_opposite: Sequence[bool] | None = None,
+        *,
+        complete_for: int | None = None,
+    ) -> "RelationTable":
+        """Return the table of the relations that a request states.
+
+        Args:
+            triples: the relations, which hold.
+            is_opposite: whether the request states each relation by its opposite; by default, none.
+            complete_for: number of objects, if no other relations between them hold.
+        """
+        columns = np.array(list(triples), dtype=np.int64).reshape(-1, 3).T
+        n, unlisted = columns.shape[1], np.zeros((3, 0), np.int64)
+        if complete_for is not None:
+            grid = np.ones((_A, complete_for, complete_for), np.bool_)
+            grid[tuple(columns)] = False
+            unlisted = np.array(_between_two(grid))
+        more = unlisted.shape[1]
+        flags = np.zeros(n + more, np.bool_)
+        flags[:n] = False if is_opposite is None else is_opposite
+        p = np.repeat(np.float32([1, 0]), [n, more])
+        return cls(*np.hstack([columns, unlisted]), p, np.full(n + more, STATED), flags)
+
+    @classmethod
+    def shown_by_boxes(
+        cls,
+        holds: Bool[Array, "A N N"],
+        observed: Bool[Array, "A N N"],
+        excluded: Bool[Array, "A N N"],
+    ) -> "RelationTable":
+        """Return the table of the relations between N boxes.
+
+        Args:
+            holds: relations that hold.
+            observed: relations that hold or do not hold.
+            excluded: relations that cannot hold, observed or not.
+        """
+        columns = _between_two(observed | excluded)
+        origin = np.where(observed[columns], BOXES, EXCLUDED)
+        p = holds[columns].astype(np.float32)
+        return cls(*columns, p, origin, np.zeros(len(p), np.bool_), of_boxes=True)
+
+    def with_excluded(self, excluded: Bool[Array, "A N N"]) -> "RelationTable":
+        """Return the table with the relations that boxes exclude, without those that hold."""
+        grid, stated = excluded.copy(), self.holding
+        grid[stated.relation, stated.subject, stated.object] = False
+        columns = _between_two(grid)
+        n = len(columns[0])
+        new = *columns, np.zeros(n, np.float32), np.full(n, EXCLUDED), np.zeros(n, np.bool_)
+        return RelationTable(*map(np.concatenate, zip(self._columns, new, strict=True)))
+
+    @property
+    def _columns(self) -> tuple[Array, ...]:
+        ends = self.subject, self.object
+        return self.relation, *ends, self.probability, self.origin, self.is_opposite
+
+    def __len__(self) -> int:
+        return len(self.relation)
+
+    def rows(self, chosen: Bool[Array, "R"]) -> "RelationTable":
+        """Return the chosen rows."""
+        return RelationTable(*(column[chosen] for column in self._columns), of_boxes=self.of_boxes)
+
+    @cached_property
+    def holding(self) -> "RelationTable":
+        """The relations that hold, in the order of the request or of their indices."""
+        return self.rows(self.probability > 0)
+
+    @cached_property
+    def triples(self) -> tuple[Triple, ...]:
+        """The relations that hold."""
+        columns = self.holding.relation, self.holding.subject, self.holding.object
+        return tuple(zip(*(column.tolist() for column in columns), strict=True))
+
+    @cached_property
+    def opposites(self) -> frozenset[Triple]:
+        """The relations that hold and that the request states by their opposite."""
+        flags = self.holding.is_opposite.tolist()
+        return frozenset(triple for triple, flag in zip(self.triples, flags, strict=True) if flag)
+
+    @cached_property
+    def has_observations(self) -> bool:
+        """Whether the request or the boxes say something about relations."""
+        return self.of_boxes or bool((self.origin != EXCLUDED).any())
+
+    def grids(self, N: int) -> tuple[Bool[Array, "A N N"], Bool[Array, "A N N"]]:
+        """Return which relations between N objects hold, and which are observed."""
+        holds, observed = np.zeros((2, _A, N, N), np.bool_)
+        seen = self.rows(self.origin != EXCLUDED)
+        cells = seen.relation, seen.subject, seen.object
+        observed[cells], holds[cells] = True, seen.probability > 0
+        return holds, observed
+
+    def of_classes(
+        self, row: Int[Array, "N"], n: int, A: int
+    ) -> tuple[Int[Array, "E"], Int[Array, "E"], Int[Array, "E"], Float32[Array, "E"]]:
+        """Return the observed relations between n classes, in the order of their indices.
+
+        A relation of classes has the largest probability of the relations between their objects.
+        Unobserved relations have no influence.
+
+        Args:
+            row: index of the class of each object, from 0 to n - 1.
+            A: number of relations that the machine knows.
+
+        Returns:
+            Relation, subject class, object class and probability of each observation.
+        """
+        used = (self.origin != EXCLUDED) & (self.relation < A)
+        i, j = row[self.subject[used]], row[self.object[used]]
+        grid = np.full(A * n * n, -1, np.float32)
+        np.maximum.at(grid, (self.relation[used] * n + i) * n + j, self.probability[used])
+        units = np.flatnonzero(grid >= 0)
+        relation, pair = np.divmod(units, n * n)
+        return relation, *np.divmod(pair, n), grid[units]
+
+
+def _between_two(grid: Bool[Array, "A N N"]) -> tuple[Array, ...]:
+    """Return the indices of the relations that are True, without those of an object to itself."""
+    a, i, j = grid.nonzero()
+    other = i != j
+    return a[other], i[other], j[other]
