@@ -24,8 +24,8 @@ from app import questions
 from app.inference.weights import pack_scenes
 from app.registry.artifact import Artifact, load_artifact, write_artifact
 from app.registry.description import Calibration, Description, VocabularyEntry
-from app.scene.relations import CANONICAL
 from app.scene.scene import Scene, SceneObject
+from app.scene.spatial_relations import CANONICAL
 from app.scene.vocabulary import ObjectClass, Vocabulary
 from benchmarks.report import Fact, Result
 from benchmarks.timing import interleave

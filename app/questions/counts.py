@@ -23,11 +23,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.kernels import best, count_distributions
 from app.questions.answer import Fields, named, significant
 from app.questions.posterior import Present
+from app.questions.ranking import best
 from app.registry.artifact import Artifact
-from app.registry.counts import Counts
+from app.registry.counts import Counts, count_distributions
 from app.scene.scene import Scene
 
 Floats = NDArray[np.float64]

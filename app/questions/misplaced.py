@@ -47,8 +47,16 @@ from app.questions.posterior import Posterior
 from app.questions.reading import Triple
 from app.registry.artifact import Artifact
 from app.registry.description import KINDS, Judgement, Sensitivity
-from app.scene.relations import ABOVE, CANONICAL, INSIDE, LATERAL, ON_TOP, SUPPORTS, opposite
 from app.scene.scene import Scene, boxes_of
+from app.scene.spatial_relations import (
+    ABOVE,
+    CANONICAL,
+    INSIDE,
+    LATERAL,
+    ON_TOP,
+    SUPPORTS,
+    opposite,
+)
 from app.scene.stands import (
     FLOOR,
     HANGS,

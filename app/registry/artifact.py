@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from app.inference import MachineSpec, Weights
 from app.inference.chains import SceneChains
 from app.inference.objects import LARGEST_WEIGHT, ObjectScorer
-from app.inference.relations import RelationUnits, StandIns, relation_units
+from app.inference.relation_units import RelationUnits, StandIns, relation_units
 from app.inference.weights import layout
 from app.registry.card import render_card
 from app.registry.counts import Counts

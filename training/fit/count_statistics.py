@@ -20,9 +20,8 @@ import numpy as np
 from scipy import sparse
 from scipy.optimize import minimize
 
-from app.inference.kernels import INTERCEPT, ROOM, SEVERAL, SINGLE
 from app.questions.counts import distribution, functions
-from app.registry.counts import EXPONENTS, Counts
+from app.registry.counts import EXPONENTS, INTERCEPT, ROOM, SEVERAL, SINGLE, Counts
 from app.scene import Vocabulary
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Ints

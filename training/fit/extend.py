@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference import Weights
-from app.inference.kernels import ROOM
 from app.registry import Artifact, Calibration, Counts, Offsets, Places
+from app.registry.counts import ROOM
 from app.registry.description import NO_LIMIT
 from app.scene import CANONICAL, ObjectClass, Vocabulary
 

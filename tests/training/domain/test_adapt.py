@@ -11,7 +11,7 @@ import pytest
 from app import questions
 from app.registry import Artifact, Store
 from app.scene import Scene, SceneObject
-from app.scene.relations import ON_TOP
+from app.scene.spatial_relations import ON_TOP
 from tests.registry.small_artifacts import rewrite_manifest
 from tests.training.commands import invoke
 from tests.training.domain.homes import home_scenes, write
