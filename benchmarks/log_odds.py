@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from app.inference.objects import ObjectScorer
-from app.inference.relations import context_of
+from app.inference.relation_units import context_of
 from benchmarks.report import Result
 from benchmarks.timing import interleave
 from benchmarks.yardsticks import object_machine, presence, random_scenes, scikit_learn

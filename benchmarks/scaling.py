@@ -26,8 +26,8 @@ from app.model import SceneModel
 from app.model.calibration import Calibration
 from app.registry.artifact import load_artifact, write_artifact
 from app.registry.description import Description, VocabularyEntry
-from app.scene.relations import CANONICAL
 from app.scene.scene import Scene, SceneObject
+from app.scene.spatial_relations import CANONICAL
 from app.scene.vocabulary import ObjectClass, Vocabulary
 from benchmarks.report import Fact, Result
 from benchmarks.timing import interleave

@@ -14,7 +14,7 @@ from app.api.openapi import error_responses
 from app.errors import InvalidRequestError
 from app.registry import Artifact
 from app.registry.manifest import of_machine
-from app.scene.relations import relation_names
+from app.scene.spatial_relations import relation_names
 from app.scene.vocabulary import ObjectClass
 from app.serving.models import ServedModels
 from app.serving.runtime import Runtime

@@ -25,13 +25,15 @@ estimation" (1993), for resampling and moving.
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference import kernels
-from app.inference.elementary import sigmoid, softplus
-from app.inference.relations import (
+from app.compiling import compiled
+from app.inference.elementary import exp, logistic, sigmoid, softplus
+from app.inference.implications import draw_in_groups
+from app.inference.relation_units import (
     NEVER,
     ObservedRelations,
     RelationUnits,
@@ -94,6 +96,21 @@ class ChainState:
     r: Mask
 
 
+class ChainArrays(NamedTuple):
+    """Weights for the compiled kernel. `weights.layout` explains the attributes not listed here.
+
+    Attributes:
+        WT: (H1, V), transpose of W.
+        L: (V, V) couplings, or (0, V) for a machine without couplings.
+        b: (V,) biases of the classes.
+    """
+
+    W: Floats
+    WT: Floats
+    L: Floats
+    b: Floats
+
+
 class SceneChains:
     """Gibbs chains of a machine.
 
@@ -111,7 +128,7 @@ class SceneChains:
         self.machine, self._excluded = weights, list(excluded)
         self.units = units or relation_units(weights)
         W, spec = weights["W"], weights.spec
-        self.arrays = kernels.ChainArrays(
+        self.arrays = ChainArrays(
             W=W,
             WT=np.ascontiguousarray(W.T),
             L=weights["L"] if spec.coupled else np.zeros((0, spec.V), np.float32),
@@ -237,7 +254,7 @@ class ConditionedChains:
         h1 = np.zeros(self._machine.spec.units, np.int64)
         while steps > 0:
             uniform = stream.random((min(steps, _AT_ONCE), len(h1) + len(on)), np.float32)
-            kernels.sweeps(self._w, self._bias, self._required_classes, self._beta, uniform, on, h1)
+            sweeps(self._w, self._bias, self._required_classes, self._beta, uniform, on, h1)
             steps -= _AT_ONCE
         return h1
 
@@ -274,7 +291,7 @@ class ConditionedChains:
         if self._machine.spec.G:
             x = self._context(classes)
             weight = self._chains.units.implication_weights(x, float(self._beta))
-            kernels.draw_in_groups(weight, self._beta * logits, free, uniform, group_numbers, r)
+            draw_in_groups(weight, self._beta * logits, free, uniform, group_numbers, r)
         else:
             r |= free & (uniform < sigmoid(self._beta * logits))
         return r
@@ -307,3 +324,78 @@ class ConditionedChains:
         if machine.spec.coupled:
             score += 0.5 * machine["L"][np.ix_(listed, listed)].sum()
         return float(score + (on * logits - softplus(logits)).sum())
+
+
+@compiled
+def sweeps(w, bias, always, beta, uniform, on, h1):
+    """Run Gibbs sweeps that change the arrays on and h1 in place.
+
+    A sweep draws h1 given the classes, and then the classes. Coupled classes are drawn one after
+    another, each given all others.
+
+    Args:
+        w: `ChainArrays`.
+        bias: (H1,) bias of h1.
+        always: (V,) uint8, 1 for classes that stay present.
+        beta: 1 / temperature.
+        uniform: (sweeps, units + V) random numbers.
+        on: (V,) uint8, presence of the classes.
+        h1: (units,) state of each unit of h1.
+    """
+    V, H1 = w.W.shape
+    units = len(h1)
+    states = H1 // units
+    x, coupled = np.empty(H1, np.float32), len(w.L) > 0
+    field, from_classes = np.empty(V, np.float32), np.zeros(V, np.float32)
+    if coupled:
+        _add_rows(w.L, on, from_classes)
+    for t in range(len(uniform)):
+        row = uniform[t]
+        x[:] = bias
+        _add_rows(w.W, on, x)
+        for m in range(units):
+            h1[m] = _draw_state(x[m * states : (m + 1) * states], beta, row[m])
+        field[:] = w.b
+        for m in range(units):
+            if h1[m]:
+                from_h1 = w.WT[m * states + h1[m] - 1]
+                for i in range(V):
+                    field[i] += from_h1[i]
+        for i in range(V):
+            logit = beta * (field[i] + from_classes[i])
+            drawn = max(always[i], np.uint8(row[units + i] < logistic(logit)))
+            if coupled and drawn != on[i]:
+                sign, changed = np.float32(1.0 if drawn else -1.0), w.L[i]
+                for j in range(V):
+                    from_classes[j] += sign * changed[j]
+            on[i] = drawn
+
+
+@compiled
+def _draw_state(logits, beta, uniform):
+    """Draw the state of a hidden unit: 0 for the first state, whose logit is 0."""
+    top = np.float32(0.0)
+    for z in range(len(logits)):
+        top = max(top, beta * logits[z])
+    total = exp(-top)
+    for z in range(len(logits)):
+        total += exp(beta * logits[z] - top)
+    threshold = uniform * total
+    cumulative = exp(-top)
+    if threshold < cumulative:
+        return 0
+    for z in range(len(logits)):
+        cumulative += exp(beta * logits[z] - top)
+        if threshold < cumulative:
+            return z + 1
+    return len(logits)  # rounding
+
+
+@compiled
+def _add_rows(rows, on, total):
+    """Add each row with on[row] = 1 to total. on has the shape (n,)."""
+    for i in range(len(on)):
+        if on[i]:
+            row = rows[i]
+            for k in range(len(total)):
+                total[k] += row[k]

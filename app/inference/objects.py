@@ -26,10 +26,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference import kernels
-from app.inference.elementary import log_softmax, sigmoid
-from app.inference.relations import Context
-from app.inference.weights import SHARES, Weights
+from app.compiling import compiled, compiled_in_any_order
+from app.inference.elementary import LN2, exp, exponent, log, log_softmax, mantissa, sigmoid
+from app.inference.relation_units import Context
+from app.inference.weights import SHARES, Weights, all_states, odds
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -85,8 +85,8 @@ class Gains:
 
     def __call__(self, x: Floats) -> Floats:
         """Return the gain of each row of weights, (B, rows), at the logits x of h1, (B, H1)."""
-        p = kernels.all_states(x, self._states)
-        return kernels.gains(p, self._factors, self._group, self._rows)
+        p = all_states(x, self._states)
+        return _gains(p, self._factors, self._group, self._rows)
 
 
 class ObjectScorer:
@@ -135,9 +135,7 @@ class ObjectScorer:
             if len(self._biases) < _KEPT_BIASES:
                 self._biases[coverage, room] = bias
         p = weights.source_weights(classes, presence[None], profile)[0]
-        return kernels.class_log_odds(
-            gain, bias, p, weights["a"], self._couplings, classes, presence
-        )
+        return _class_log_odds(gain, bias, p, weights["a"], self._couplings, classes, presence)
 
     def kappa(self, coverage: float) -> Floats:
         """Return the bias of each class for a listed share, interpolated between the bins, (V,)."""
@@ -189,10 +187,10 @@ class ObjectScorer:
         *,
         explained: bool,
     ) -> tuple[Floats, Floats]:
-        """See `kernels.explained_log_odds`."""
+        """See `_explained_log_odds`."""
         weights = self._weights
         possible = slice(None) if profile is None else slice(profile, profile + 1)
-        return kernels.explained_log_odds(
+        return _explained_log_odds(
             *(scene.x, scene.shares, weights["W"], bias, self._couplings),
             *(weights["f"][possible], weights["a"][possible], self._states),
             *(scene.classes, scene.presence, rows, targets, explained),
@@ -253,3 +251,206 @@ class ObjectScorer:
         by_source = np.exp(log_softmax(logits[:, None] + weights["y"]))
         p = weights.source_weights(classes, presence, profile)[:, None] @ by_source
         return np.log(np.maximum(p[:, 0], _SMALLEST))
+
+
+@compiled
+def _gains(p, factors, group, rows):
+    """Return the gain of each row of weights, (B, rows); see `Gains`.
+
+    After each group of sums, the function splits the product into mantissa and exponent, and adds
+    the exponent to an integer. So one log at the end is enough.
+
+    Args:
+        p: (B, units, states) probabilities of the states of h1.
+        factors: (tiles, units, states - 1, rows per tile) exponentials of the weights.
+        group: maximum number of sums in a product.
+        rows: number of rows of weights.
+    """
+    tiles, units, states, width = factors.shape
+    gain = np.empty((len(p), rows), np.float32)
+    product, exponents = np.empty(width, np.float32), np.empty(width, np.int32)
+    total = np.empty(width, np.float32)
+    for t in range(tiles):
+        for b in range(len(p)):
+            product[:], exponents[:] = np.float32(1.0), np.int32(0)
+            for m in range(units):
+                total[:] = p[b, m, 0]
+                for z in range(0, states - 1, 2):
+                    # The loop takes two states at a time. This halves the reads and writes.
+                    p1, row1 = p[b, m, z + 1], factors[t, m, z]
+                    p2, row2 = p[b, m, z + 2], factors[t, m, z + 1]
+                    for i in range(width):
+                        total[i] += p1 * row1[i] + p2 * row2[i]
+                if states % 2:
+                    p1, row1 = p[b, m, states], factors[t, m, states - 1]
+                    for i in range(width):
+                        total[i] += p1 * row1[i]
+                for i in range(width):
+                    product[i] *= total[i]
+                if (m + 1) % group == 0 or m + 1 == units:
+                    for i in range(width):
+                        exponents[i] += exponent(product[i])
+                        product[i] = mantissa(product[i])
+            gain_b = gain[b, t * width :]
+            for i in range(min(width, rows - t * width)):
+                gain_b[i] = log(product[i]) + LN2 * np.float32(exponents[i])
+    return gain
+
+
+@compiled_in_any_order
+def _gain_factors(p, raised, removed):
+    """Return the factors of e^gain, (N, units), and of e^-change, (N, n, units).
+
+    A factor is the effect of one hidden unit; see `explained_log_odds`.
+
+    Args:
+        p: (N or 1, units, states) probabilities of the states of h1.
+        raised: (N, units, states) exponentials of the weights of the classes c.
+        removed: (n, units, states) exponentials of the contributions of classes j, negated.
+    """
+    (N, units, states), n = raised.shape, len(removed)
+    gain, ratio = np.empty((N, units), np.float32), np.empty((N, n, units), np.float32)
+    for c in range(N):
+        for m in range(units):
+            row, factors = p[min(c, len(p) - 1), m], raised[c, m]
+            with_class = np.float32(0.0)
+            for z in range(states):
+                with_class += row[z] * factors[z]
+            gain[c, m] = with_class
+            for j in range(n):
+                without, before, after = removed[j, m], np.float32(0.0), np.float32(0.0)
+                for z in range(states):
+                    product = row[z] * without[z]
+                    before += product
+                    after += product * factors[z]
+                ratio[c, j, m] = after / (before * with_class)
+    return gain, ratio
+
+
+@compiled
+def _class_log_odds(gain, bias, p, a, L, classes, presence):
+    """Return gain + bias + sum_q p_q a_q + sum_j presence_j L_j, (V,).
+
+    Args:
+        gain, bias: (V,) terms of the classes.
+        p, a: (profiles,) probabilities of the data sources, and (profiles, V) their base rates.
+        L: (V, V) couplings, or (0, V) without couplings.
+        classes, presence: (n,) listed classes j, and the probabilities that they are present.
+    """
+    log_odds = np.empty(len(gain), np.float32)
+    for i in range(len(gain)):
+        log_odds[i] = gain[i] + bias[i]
+    for q in range(len(p)):
+        weight, row = np.float32(p[q]), a[q]
+        for i in range(len(gain)):
+            log_odds[i] += weight * row[i]
+    for j in range(len(classes) if len(L) else 0):
+        weight, row = presence[j], L[classes[j]]
+        for i in range(len(gain)):
+            log_odds[i] += weight * row[i]
+    return log_odds
+
+
+@compiled
+def _log_sums(x):
+    """Return the sum of ln x over the last axis, (N,), for positive x (N, units)."""
+    total = np.zeros(len(x), np.float32)
+    for i in range(len(x)):
+        row = x[i]
+        for m in range(len(row)):
+            total[i] += log(row[m])
+    return total
+
+
+@compiled
+def _explained_log_odds(
+    x, shares, W, bias, L, f, a, states, classes, presence, rows, targets, explained
+):
+    """Return the log-odds of N target classes i given the listed classes, and their changes.
+
+    The log-odds are bias_i + gain_i + sum_q p_q a_qi + sum_j presence_j L_ij; see `objects`. The
+    change by class j is their value minus their value without class j.
+
+    Args:
+        x: (H1,) logits of h1 given the n listed classes.
+        shares: (n, H1) contribution of each listed class to x.
+        W, bias, L: (V, H1) weights of h1, (V,) biases, and (V, V) couplings, or (0, V) without
+            couplings.
+        f, a: (Q,) and (Q, V) weights of the Q possible data sources; see `weights.layout`.
+        states: number of states of a hidden unit.
+        classes, presence: (n,) the listed classes; see `ObjectScorer.absent`.
+        rows: (N,) index of each target among the listed classes. A class is not evidence for
+            itself. `rows` is empty if the targets are not listed.
+        targets: (N,) the target classes.
+        explained: whether to compute the changes.
+
+    Returns:
+        The log-odds, (N,), and the changes, (N, n). The changes are (N, 0) if not `explained`.
+    """
+    N, n, coupled = len(targets), len(classes) if explained else 0, len(L) > 0
+    base = np.empty((max(len(rows), 1), len(x)), np.float32)
+    base[0] = x
+    for i in range(len(rows)):
+        base[i] = x - shares[rows[i]]
+    p, raised = all_states(base, states), odds(W[targets], states)
+    factors, ratios = _gain_factors(p, raised, odds(-shares[:n], states))
+    log_odds, change = _log_sums(factors), np.empty((N, n), np.float32)
+    mean, of_source = _source_effects(f, a, classes, presence, rows, targets, n)
+    for i in range(N):
+        total, change[i] = np.float32(0.0), -_log_sums(ratios[i])
+        for j in range(len(classes) if coupled else 0):
+            total += presence[j] * L[classes[j], targets[i]]
+        log_odds[i] = bias[targets[i]] + log_odds[i] + mean[i] + total
+        for j in range(n):
+            if coupled:
+                change[i, j] += L[targets[i], classes[j]] * presence[j]
+            change[i, j] += of_source[i, j]
+        if n and len(rows):
+            change[i, rows[i]] = np.float32(0.0)
+    return log_odds, change
+
+
+@compiled
+def _source_effects(f, a, classes, presence, rows, targets, n):
+    """Return the effect of the unknown data source on N target classes, and its changes.
+
+    The effect on a class i is the mean base rate sum_q p_q a_qi over the Q data sources. p_q is the
+    probability of source q given the listed classes.
+
+    Args:
+        n: number of listed classes whose changes are computed. For the others, see
+            `explained_log_odds`.
+
+    Returns:
+        The effects, (N,), and the change of each effect due to each listed class, (N, n).
+    """
+    Q = len(f)
+    # Part of each listed class in the logit of each source, and e^-part.
+    parts, without = np.empty((len(classes), Q), np.float32), np.empty((n, Q), np.float32)
+    logits, p = f.copy(), np.empty(Q, np.float32)
+    for j in range(len(classes)):
+        for q in range(Q):
+            parts[j, q] = a[q, classes[j]] * presence[j]
+            logits[q] += parts[j, q]
+    for j in range(n):
+        for q in range(Q):
+            without[j, q] = exp(-parts[j, q])
+    mean, change = np.zeros(len(targets), np.float32), np.zeros((len(targets), n), np.float32)
+    for i in range(len(targets) if Q else 0):
+        top, total, weighted = np.float32(-np.inf), np.float32(0.0), np.float32(0.0)
+        for q in range(Q):
+            p[q] = logits[q] - parts[rows[i], q] if len(rows) else logits[q]
+            top = max(top, p[q])
+        for q in range(Q):
+            p[q] = exp(p[q] - top)
+            total += p[q]
+            weighted += p[q] * a[q, targets[i]]
+        mean[i] = weighted / total
+        for j in range(n):
+            total, weighted = np.float32(0.0), np.float32(0.0)
+            for q in range(Q):
+                weight = p[q] * without[j, q]
+                total += weight
+                weighted += weight * a[q, targets[i]]
+            change[i, j] = mean[i] - weighted / total
+    return mean, change

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from app.model.fields import Count, Frozen, Many
-from app.scene.relations import CANONICAL
+from app.scene.spatial_relations import CANONICAL
 from scene_client.schemas import Sensitivity as Sensitivity
 
 Floats = NDArray[np.floating[Any]]

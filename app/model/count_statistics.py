@@ -1,13 +1,15 @@
 """Statistics of the number of instances of a class in a scene, such as the chairs of a kitchen."""
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.kernels import ROOM as ROOM
+from app.compiling import compiled
 from app.model.fields import TensorGroup
+from app.scene.roles import find_row
 
 Table = NDArray[np.float32]
 Ints = NDArray[np.integer[Any]]
@@ -16,6 +18,10 @@ Ints = NDArray[np.integer[Any]]
 EXPONENTS: Final = 2
 """Exponents of the formula: the first raises large numbers, and the second numbers between 1 and M.
 """
+
+INTERCEPT, SINGLE, SEVERAL, ROOM = 0, 1, 2, 3
+"""Columns of `Counts.weights`: intercept, 1 if one object is listed, 1 if another class is listed
+several times, and the first of C room types. The last V columns are those of the other classes."""
 
 _LARGEST: Final = 64.0
 _MOST: Final = 256
@@ -57,3 +63,53 @@ class Counts(TensorGroup):
         self.require(is_right, f"weights must be between -{_LARGEST:g} and {_LARGEST:g}")
         on_itself = self.weights[np.arange(K), :, ROOM + C + self.classes]
         self.require(not on_itself.any(), "the weight of a class on itself must be 0")
+
+
+@compiled
+def count_distributions(
+    known, most, log_share, weights, classes, listed, room, first, log_unlisted
+):
+    """Return the classes and distributions of `app.questions.counts.distribution`, (k,) and (k, M).
+
+    Args:
+        known, most, log_share, weights: see `Counts`. Column `first` of the weights is class 0.
+        classes, listed: (n,) listed classes, and numbers of listed objects.
+        room: index of the room type, or -1.
+        log_unlisted: log ρ of the formula.
+    """
+    n, M = len(classes), log_share.shape[1]
+    p, rows, k = np.empty((n, M), np.float64), np.empty(n, np.int64), 0
+    exponents, several, entry = np.empty(2), 0, np.empty(n, np.int64)
+    for i in range(n):
+        several += listed[i] > 1
+        entry[i] = find_row(known, classes[i])
+        if entry[i] >= 0 and listed[i] <= most[entry[i]]:
+            rows[k] = i
+            k += 1
+    for row in range(k):
+        e, number = entry[rows[row]], listed[rows[row]]
+        for x in range(2):
+            exponents[x] = 0.0
+            # The effect of a class on itself is 0, so the sum over all listed classes is correct.
+            for j in range(n):
+                exponents[x] += weights[e, x, first + classes[j]]
+            exponents[x] /= math.sqrt(max(n - 1, 1))
+            exponents[x] += weights[e, x, INTERCEPT]
+            if number == 1:
+                exponents[x] += weights[e, x, SINGLE]
+            if several > (number > 1):
+                exponents[x] += weights[e, x, SEVERAL]
+            if room >= 0:
+                exponents[x] += weights[e, x, ROOM + room]
+        largest, total = -np.inf, 0.0
+        for m in range(number, M + 1):
+            log = math.log(m)
+            value = log_share[e, m - 1] + exponents[0] * log + (m - number) * log_unlisted
+            p[row, m - 1] = value + exponents[1] * log * (math.log(M) - log)
+            largest = max(largest, p[row, m - 1])
+        for m in range(number, M + 1):
+            p[row, m - 1] = math.exp(p[row, m - 1] - largest)
+            total += p[row, m - 1]
+        for m in range(M):
+            p[row, m] = p[row, m] / total if m + 1 >= number else 0.0
+    return rows[:k], p[:k]

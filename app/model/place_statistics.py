@@ -17,10 +17,10 @@ from typing import Annotated, Any, ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.kernels import IN, ON, UNDER, triple_counts
+from app.compiling import compiled
 from app.model.fields import TensorGroup
-from app.scene.relations import CANONICAL, STACKED, SUPPORTS
-from app.scene.roles import RoleCounts, role_counts
+from app.scene.roles import IN, ON, UNDER, RoleCounts, find_row, role_counts
+from app.scene.spatial_relations import CANONICAL, ON_TOP, STACKED, SUPPORTS
 from app.scene.stands import HANGS, SUPPORTED, USUAL
 
 _PLACE: Final = 10.0  # smoothing s, in scenes
@@ -94,7 +94,7 @@ class Places(TensorGroup):
         The class indices are (N,) and (M,). A single scene may be an error.
         """
         V = len(self.frequency)
-        return triple_counts(self.triple, self.held, V, relation, subject, other) >= _SHOWN
+        return _triple_counts(self.triple, self.held, V, relation, subject, other) >= _SHOWN
 
     def supporters(self, subject: Indices, other: Indices) -> Floats:
         """Return the share of each other class among the supporters of each subject, (N, M).
@@ -104,7 +104,7 @@ class Places(TensorGroup):
         total, share = self._supporters
         V, of_pairs = len(self.frequency), _SUPPORTER * share[other]
         for a in SUPPORTS:
-            of_pairs = of_pairs + triple_counts(self.triple, self.held, V, a, subject, other)
+            of_pairs = of_pairs + _triple_counts(self.triple, self.held, V, a, subject, other)
         return of_pairs / (total[subject, None] + _SUPPORTER)
 
     @cached_property
@@ -126,7 +126,7 @@ class Places(TensorGroup):
 
         Returns:
             Relations of `STACKED` that training shows, (V, V): bit a is relation a. Then the change
-            for each subject class, (3, V); see `kernels.add_unseen`.
+            for each subject class, (3, V); see `add_unseen`.
         """
         shares = np.log(np.minimum(np.maximum(self.stands, _LEAST_STAND) / USUAL, 1.0))
         every = np.arange(len(shares))
@@ -175,3 +175,36 @@ class Places(TensorGroup):
             start = np.searchsorted(key[order], np.arange(A * V + 1))
             tables.append((start, other[order], self.held[order].astype(np.float64), back_off))
         return tuple(tables)
+
+
+@compiled
+def add_unseen(shown, change, candidates, classes, forward, backward):
+    """Add the changes of stacked relations that training never shows to log-odds, in place.
+
+    Args:
+        shown: (V, V) stacked relations of two classes that training shows. Bit a is relation a.
+        change: (3, V) change for each subject class.
+        candidates, classes: (N,) and (m,) classes.
+        forward, backward: (N, A, m) log-odds with the candidate and with the other class as
+            subject. The last A - 2 relations are the stacked ones.
+    """
+    for c in range(len(candidates)):
+        for a in range(forward.shape[1] - ON_TOP):
+            for k in range(len(classes)):
+                i, j = candidates[c], classes[k]
+                if not shown[i, j] >> a & 1:
+                    forward[c, ON_TOP + a, k] += change[a, i]
+                if not shown[j, i] >> a & 1:
+                    backward[c, ON_TOP + a, k] += change[a, j]
+
+
+@compiled
+def _triple_counts(triple, held, V, relation, subject, other):
+    """Return the counts of the triples (relation, subject, other), (N, M); 0 without an entry."""
+    counts = np.zeros((len(subject), len(other)))
+    for i in range(len(subject)):
+        for j in range(len(other)):
+            row = find_row(triple, (relation * V + subject[i]) * V + other[j])
+            if row >= 0:
+                counts[i, j] = held[row]
+    return counts

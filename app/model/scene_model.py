@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from app.inference import MachineSpec, Weights
 from app.inference.chains import SceneChains
 from app.inference.objects import ObjectScorer
-from app.inference.relations import RelationUnits, StandIns, relation_units
+from app.inference.relation_units import RelationUnits, StandIns, relation_units
 from app.model.calibration import Calibration, RelationSlopes
 from app.model.count_statistics import Counts
 from app.model.offset_statistics import Offsets

@@ -12,14 +12,21 @@ import orjson
 from numpy.typing import NDArray
 from pydantic_core import from_json, to_json, to_jsonable_python
 
-from app.inference.kernels import DIGITS, round_to_digits, strongest
+from app.compiling import compiled
 from app.questions.posterior import Present
+from app.questions.ranking import best
 from app.questions.reading import Reading
 from app.scene.scene import Scene
 from scene_client.schemas import ModelReference, SceneRequest
 
 Fields: TypeAlias = dict[str, Any]
 """Fields of an answer, or of a part of an answer."""
+
+DIGITS: Final = 6
+"""Significant digits of probabilities, log-odds and metres."""
+# Doubles represent these powers of ten exactly. So an integer divided by such a power is the double
+# that is nearest to the decimal number.
+_POWERS: Final = np.array([10.0**power for power in range(23)])
 
 REASONS: Final = 3
 """Maximum number of reasons for one entry of an answer."""
@@ -86,7 +93,7 @@ def reasons(
         For each explained class, a list of reasons with the fields of
         `scene_client.schemas.Because`.
     """
-    columns, values = strongest(change, np.zeros(0, np.int64) if rows is None else rows, REASONS)
+    columns, values = _strongest(change, np.zeros(0, np.int64) if rows is None else rows, REASONS)
     values = scale * values
     strong = np.abs(values) >= max(least, _ROUNDING)
     entries: list[list[Fields]] = [[] for _ in change]
@@ -99,7 +106,7 @@ def reasons(
 def significant(numbers: NDArray[np.floating[Any]]) -> list[float]:
     """Round numbers (n,) to `DIGITS` significant digits."""
     values = numbers.astype(np.float64)
-    exact = round_to_digits(values)
+    exact = _round_to_digits(values)
     rounded: list[float] = values.tolist()
     return rounded if exact else [rounded_number(value) for value in rounded]
 
@@ -143,3 +150,52 @@ def written(answer: Any) -> bytes:
     except ValueError:
         raise ValueError("an answer contains a number that is not finite") from None
     return body
+
+
+@compiled
+def _strongest(change, rows, count):
+    """Return the indices and values of the k <= `count` largest absolute changes, each (N, k).
+
+    The result leaves out the change of a class by itself.
+
+    Args:
+        change: (N, n) change of each explained class's log-odds by each of the n classes of the
+            scene.
+        rows: (N,) index of each explained class among the n classes. It is empty if the explained
+            classes are absent.
+        count: maximum of k.
+    """
+    N, n = change.shape
+    kept = min(count, n - (len(rows) > 0))
+    places, values = np.empty((N, kept), np.int64), np.empty((N, kept), np.float64)
+    usable = np.ones(n, np.bool_)
+    for c in range(N):
+        if len(rows):
+            usable[rows[c]] = False
+        indices = best(np.abs(change[c]), usable, kept)
+        if len(rows):
+            usable[rows[c]] = True
+        for k in range(kept):
+            places[c, k], values[c, k] = indices[k], change[c, indices[k]]
+    return places, values
+
+
+@compiled
+def _round_to_digits(values):
+    """Round float64 numbers (n,) to `DIGITS` significant digits in place.
+
+    Returns:
+        False if a number is too small or too large for exact powers of ten. Such numbers stay
+        unchanged.
+    """
+    exact = True
+    for k in range(len(values)):
+        size = np.abs(values[k])
+        if 1e-16 < size < 1e5:
+            # A number with d digits before the point keeps DIGITS - d decimal places.
+            places = DIGITS - 1 - np.int64(np.floor(np.log10(size)))
+            scale = _POWERS[places]
+            values[k] = np.rint(values[k] * scale) / scale
+        elif size != 0.0:
+            exact = False
+    return exact

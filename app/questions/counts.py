@@ -23,11 +23,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.kernels import best, count_distributions
-from app.model.count_statistics import Counts
+from app.model.count_statistics import Counts, count_distributions
 from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, named, significant
 from app.questions.posterior import Present
+from app.questions.ranking import best
 from app.scene.scene import Scene
 
 Floats = NDArray[np.float64]

@@ -21,10 +21,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from app.compiling import compiled
 from app.errors import LocatedError, RareRoomTypeError
 from app.inference.chains import ChainState, ConditionedChains, Conditions, random_stream
-from app.inference.kernels import select_consistent
-from app.inference.relations import context_of
+from app.inference.relation_units import context_of
 from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, rounded_number
 from app.questions.names import ErrorList
@@ -33,8 +33,8 @@ from app.questions.posterior import Present, given_relations, present
 from app.questions.question import BEDROOM, POSES, REFUSED, Example, Options, Question
 from app.questions.reading import Reading
 from app.scene.relation_table import Triple
-from app.scene.relations import CANONICAL
 from app.scene.scene import Scene, SceneObject
+from app.scene.spatial_relations import CANONICAL, ON_TOP
 from scene_client.schemas import GenerateAnswer, GenerateRequest
 
 STEPS: Final = 50
@@ -194,13 +194,52 @@ def staying(
     triples = np.concatenate([fixed, units])
     relation = np.ascontiguousarray(triples[:, 0])
     classes, pairs = np.unique(triples[:, 1:], return_inverse=True)
-    stay: NDArray[np.bool_] = select_consistent(
+    stay: NDArray[np.bool_] = _select_consistent(
         relation, pairs.reshape(-1, 2), order[possible[order]], len(fixed), len(classes)
     )
     # A drawn relation that is part of the evidence always stays.
     if evidence:
         shape = len(CANONICAL), len(structure), len(structure)
         stay |= np.isin(np.ravel_multi_index(units.T, shape), np.ravel_multi_index(fixed.T, shape))
+    return stay
+
+
+# Direction of each relation: 1 for left, 2 for front, and 0 (up) for on-top, above and inside.
+# Their subjects are higher than their objects, or in their objects.
+_DIRECTION: Final = np.array([1, 2, 0, 0, 0])
+
+
+@compiled
+def _select_consistent(relation, ends, order, fixed, count):
+    """Select relations that contradict neither the evidence nor each other, as a bool mask (m,).
+
+    Args:
+        relation: (fixed + m,) canonical relations. The relations of the evidence come first.
+        ends: (fixed + m, 2) indices of the subject and object classes, from 0 to count - 1.
+        order: indices from 0 to m - 1 of the drawn relations to try, likeliest first.
+        fixed: number of relations in the evidence.
+        count: number of classes.
+    """
+    # reaches[d, x, y] is True if relations of direction d lead from x to y, directly or through
+    # other classes.
+    reaches = np.zeros((3, count, count), np.bool_)
+    related, supported = np.zeros((count, count), np.bool_), np.zeros(count, np.bool_)
+    stay = np.zeros(len(relation) - fixed, np.bool_)
+    for turn in range(fixed + len(order)):
+        e = turn if turn < fixed else fixed + order[turn - fixed]
+        x, y, reached = ends[e, 0], ends[e, 1], reaches[_DIRECTION[relation[e]]]
+        on_top = relation[e] == ON_TOP
+        if turn >= fixed:
+            if reached[y, x] or related[x, y] or (on_top and supported[x]):
+                continue
+            stay[e - fixed] = True
+        related[x, y] = related[y, x] = True
+        supported[x] |= on_top
+        # Each class that leads to x now also leads to y and to all classes after y.
+        for k in range(count):
+            if k == x or reached[k, x]:
+                reached[k] |= reached[y]
+                reached[k, y] = True
     return stay
 
 

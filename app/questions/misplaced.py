@@ -47,8 +47,16 @@ from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, significant
 from app.questions.posterior import Posterior
 from app.scene.relation_table import Triple
-from app.scene.relations import ABOVE, CANONICAL, INSIDE, LATERAL, ON_TOP, SUPPORTS, opposite
 from app.scene.scene import Scene, boxes_of
+from app.scene.spatial_relations import (
+    ABOVE,
+    CANONICAL,
+    INSIDE,
+    LATERAL,
+    ON_TOP,
+    SUPPORTS,
+    opposite,
+)
 from app.scene.stands import (
     FLOOR,
     HANGS,

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from app.errors import InvalidRequestError
 from app.inference.elementary import sigmoid
-from app.inference.kernels import best
 from app.model.scene_model import SceneModel
 from app.questions.answer import EXPLAINED, Fields, named, reasons, significant
 from app.questions.counts import more
@@ -22,9 +21,10 @@ from app.questions.names import ErrorList
 from app.questions.placements import Place, place_log_p, placements
 from app.questions.posterior import LEAST_CHANGE, Posterior, calibrated_missing, log_odds_of
 from app.questions.question import LABELS, REFUSED, SCENES, Example, Options, Question
+from app.questions.ranking import best
 from app.questions.reading import Reading
-from app.scene.relations import CANONICAL, opposite
 from app.scene.scene import Scene
+from app.scene.spatial_relations import CANONICAL, opposite
 from scene_client.frames import Axes, viewer_axes
 from scene_client.schemas import Anchor, MissingAnswer, MissingRequest
 

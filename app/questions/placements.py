@@ -11,11 +11,16 @@ from typing import Any, Final, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.kernels import NO_UNIT, UNOBSERVED, add_unseen, likeliest_places, rotated_offsets
+from app.compiling import compiled
+from app.inference.quadrature import NO_UNIT
+from app.model.offset_statistics import UNOBSERVED, rotated_offsets
+from app.model.place_statistics import add_unseen
 from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, significant
-from app.questions.posterior import Posterior
-from app.scene.relations import (
+from app.questions.posterior import Posterior, exclusive, relation_probability
+from app.questions.ranking import best
+from app.scene.scene import Scene, SceneObject, boxes_of
+from app.scene.spatial_relations import (
     INSIDE,
     ON_TOP,
     RELATIONS,
@@ -23,7 +28,6 @@ from app.scene.relations import (
     canonicalise,
     opposite,
 )
-from app.scene.scene import Scene, SceneObject, boxes_of
 from app.scene.vocabulary import do_not_fit
 from scene_client.frames import Axes
 
@@ -100,7 +104,7 @@ def placements(
     forward, backward = posterior.placement_log_odds(candidates, anchors)
     A, objects, stand_in = forward.shape[1], present.first[anchors], model.vocabulary.stand_in
     classes, candidates = stand_in[present.classes[anchors]], stand_in[candidates]
-    first = -1  # number of the requested place in `likeliest_places`; -1 without a request
+    first = -1  # number of the requested place in `_likeliest_places`; -1 without a request
     if A > ON_TOP and scene.triples:
         supported = supported_objects(model, posterior, scene)
         columns = [k for k, number in enumerate(objects.tolist()) if number in supported]
@@ -121,7 +125,7 @@ def placements(
         backward[:, INSIDE][things_too_large] = NO_UNIT
     slopes, log_counts = model.relation_slopes.placement, present.log_counts[anchors]
     limits = PLACES, first, LEAST_SHARE, LEAST_LIKELY
-    rows, relations, outgoing, columns, p = likeliest_places(
+    rows, relations, outgoing, columns, p = _likeliest_places(
         slopes, forward, backward, log_counts, *limits
     )
     offsets: Iterator[Fields | None] = repeat(None)
@@ -190,3 +194,55 @@ def _offset_fields(
             "scenes": count,
         }
         yield None if count == UNOBSERVED else offset
+
+
+@compiled
+def _likeliest_places(slopes, forward, backward, log_counts, count, first, share, least):
+    """Return the likeliest places of each of N candidate classes, likeliest first.
+
+    A place is a relation a to an anchor j, which is a class of the scene. The number of the place
+    is (d A + a) m + j. The candidate is the relation's subject if d = 0, and the anchor is the
+    subject if d = 1.
+
+    Args:
+        slopes: (A, 3) table of `RelationSlopes`.
+        forward: (N, A, m) log-odds of relations with a candidate as subject and an anchor as
+            object.
+        backward: (N, A, m) log-odds of relations with an anchor as subject and a candidate as
+            object.
+        log_counts: (m,) log of the number of instances of each anchor's class.
+        count: maximum number of places of a candidate.
+        first: number of a place that comes first even if other places are likelier, or if it is
+            unlikely. -1 means that the order depends only on the probabilities.
+        share, least: minimum probability of a place, as a share of the candidate's first place, and
+            as a number.
+
+    Returns:
+        Five arrays (k,) with the places of candidate 0, then of candidate 1 and so on: index of the
+        candidate, relation, True if the candidate is the subject, index of the anchor, and
+        probability.
+    """
+    N, A, m = forward.shape
+    size = A * m
+    to = relation_probability(slopes, forward, log_counts)
+    back = relation_probability(slopes, backward, log_counts)
+    p, usable = np.empty(2 * size, forward.dtype), np.ones(2 * size, np.bool_)
+    kept, begin, at = min(count, 2 * size), 0, 0
+    if first >= 0:
+        usable[first], begin = False, 1
+    candidate, relation = np.empty(N * kept, np.int64), np.empty(N * kept, np.int64)
+    outgoing, anchor = np.empty(N * kept, np.bool_), np.empty(N * kept, np.int64)
+    probabilities = np.empty(N * kept, np.float64)
+    for c in range(N):
+        p_to, p_back = to[c].reshape(-1), back[c].reshape(-1)
+        for e in range(size):
+            p[e], p[size + e] = exclusive(p_to[e], p_back[e])
+        indices = best(p, usable, kept - begin)
+        enough = max(share * p[first if begin else indices[0]], least)
+        for k in range(kept):
+            place = first if k < begin else indices[k - begin]
+            if k < begin or p[place] >= enough:
+                candidate[at], relation[at], anchor[at] = c, place // m % A, place % m
+                outgoing[at], probabilities[at] = place < size, p[place]
+                at += 1
+    return candidate[:at], relation[:at], outgoing[:at], anchor[:at], probabilities[:at]

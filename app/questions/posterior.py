@@ -4,7 +4,7 @@ v are the object units, and h1 are the hidden units. Given v, the units of h1 ar
 the logits x (`app.inference.weights`). The answers are in closed form:
 
     object     log-odds_i = b_i + ..., see `app.inference.objects`
-    relation   p(r_e = 1) = E[sigmoid(ℓ_e(h1))], see `app.inference.relations`
+    relation   p(r_e = 1) = E[sigmoid(ℓ_e(h1))], see `app.inference.relation_units`
 
 The log-odds of a listed class are computed at x without its contribution, which is its row of W.
 Observed relations do not change the logits of h1: their effect on objects and on other relations
@@ -19,12 +19,14 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from app.compiling import compiled, inlined
 from app.inference import MachineSpec
-from app.inference.kernels import pool_classes
-from app.inference.relations import Between, ObservedRelations, context_of, to_log_odds
+from app.inference.elementary import logistic
+from app.inference.quadrature import to_log_odds
+from app.inference.relation_units import Between, ObservedRelations, context_of
 from app.model.calibration import LEAST_COVERAGE, Calibration, CountSlope, CoverageFit
 from app.model.scene_model import SceneModel
-from app.scene.scene import Scene
+from app.scene.scene import Scene, pool_classes
 
 Floats = NDArray[np.floating[Any]]
 Doubles = NDArray[np.float64]
@@ -249,3 +251,38 @@ def calibrated_at_coverage(
     change = entry.log_share * log_s + entry.both * log_n * log_s
     last = entry.last * (np.asarray(coverage) == 1)
     return entry.intercept + entry.slope * z + entry.log_count * log_n + change + last
+
+
+@compiled
+def relation_probability(slopes, log_odds, log_count):
+    """Return the probability that each relation holds between two objects, (B, A, N).
+
+    The shape is (B candidate classes, A relations, N pairs of classes). B is 1 without candidates.
+
+    Args:
+        slopes: (A, 3) table of `RelationSlopes`.
+        log_odds: (B, A, N) log-odds of the relation between classes.
+        log_count: (N,) log of the number of object pairs with these two classes.
+    """
+    p = np.empty_like(log_odds)
+    for a in range(p.shape[1]):
+        intercept, slope, weight = slopes[a, 0], slopes[a, 1], slopes[a, 2]
+        for b in range(len(p)):
+            row, logits = log_odds[b, a], p[b, a]
+            for j in range(len(row)):
+                logits[j] = intercept + slope * row[j] + weight * log_count[j]
+    # One loop over all rows is faster than one loop per row, because a row may be short.
+    flat = p.reshape(-1)
+    for e in range(len(flat)):
+        flat[e] = logistic(np.float32(flat[e]))
+    return p
+
+
+@inlined
+def exclusive(forward, backward):
+    """Scale p(a(x,y)) and p(a(y,x)) so that their sum is at most 1.
+
+    The reason is that a relation a cannot hold in both directions between the same two objects.
+    """
+    total = np.maximum(forward + backward, np.float32(1.0))
+    return forward / total, backward / total

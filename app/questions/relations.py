@@ -19,17 +19,31 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
+from app.compiling import compiled, inlined
 from app.errors import InvalidRequestError, Location
-from app.inference.kernels import EXCLUDED, disagreeing, likeliest_relations, observed_pairs
+from app.inference.quadrature import NO_UNIT
 from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, significant
 from app.questions.names import ErrorList
 from app.questions.placements import supported_objects
-from app.questions.posterior import Posterior, Present
+from app.questions.posterior import (
+    Posterior,
+    Present,
+    exclusive,
+    relation_probability,
+)
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
+from app.questions.ranking import best
 from app.questions.reading import Reading
-from app.scene.relations import CANONICAL, ON_TOP, SUPPORTS, canonicalise, opposite, relation_names
 from app.scene.scene import Scene
+from app.scene.spatial_relations import (
+    CANONICAL,
+    ON_TOP,
+    SUPPORTS,
+    canonicalise,
+    opposite,
+    relation_names,
+)
 from scene_client.schemas import RelationsAnswer, RelationsRequest, SceneWarning
 
 EXPECTED = 0.5
@@ -37,6 +51,11 @@ EXPECTED = 0.5
 
 If all relations of a pair are unlikely, the likeliest relation is not a meaningful expectation.
 """
+
+_EXCLUDED = np.float32(-1.0)
+"""Evidence that a relation cannot hold."""
+_MOST_EXCLUDED = np.float32(0.01)
+"""Maximum probability of a relation that cannot hold."""
 
 
 def relations(
@@ -84,7 +103,7 @@ def relations(
     table = slopes.relation_given if scene.has_observations else slopes.relation
     log_odds, log_counts, row = posterior.relation_log_odds(), present.log_counts, present.row
     evidence = _evidence(model, posterior, scene)
-    subjects, objects, kinds, p, of_model = likeliest_relations(
+    subjects, objects, kinds, p, of_model = _likeliest_relations(
         table, log_odds, log_counts, row, judged, evidence, least, include_opposites, top_k
     )
     columns = subjects.tolist(), objects.tolist(), kinds.tolist(), significant(p)
@@ -115,7 +134,7 @@ def relations(
 def _evidence(
     model: SceneModel, posterior: Posterior, scene: Scene
 ) -> Float[NDArray[np.float32], "A N N"]:
-    """Return the evidence about the relations of a scene; see `likeliest_relations`.
+    """Return the evidence about the relations of a scene; see `_likeliest_relations`.
 
     The probability of an observed relation is multiplied by the confidences of its objects. An
     object on or in one object is not on or in another object.
@@ -136,7 +155,7 @@ def _evidence(
     supported = supported_objects(model, posterior, scene)
     for a in SUPPORTS:
         excluded[a, supported] = True
-    evidence = np.where(excluded[:A], EXCLUDED, np.float32(np.nan))
+    evidence = np.where(excluded[:A], _EXCLUDED, np.float32(np.nan))
     confidence = np.array([thing.confidence for thing in scene.objects], np.float32)
     observed = holds.rows(holds.relation < A)
     p = observed.probability * confidence[observed.subject] * confidence[observed.object]
@@ -178,14 +197,14 @@ def _disagreements(
     stated = [triple for triple in scene.triples if triple[0] < A]
     if not stated:
         return []
-    pairs = observed_pairs(np.array(stated), present.row, judged, len(present.classes), A)
+    pairs = _observed_pairs(np.array(stated), present.row, judged, len(present.classes), A)
     subjects, objects, holds, of_classes = pairs
     if not len(subjects):
         return []
     i, j = present.row[subjects], present.row[objects]
     table, least = model.relation_slopes.relation_given, max(least, EXPECTED)
     log_odds, log_counts = posterior.log_odds_apart(i, j), present.log_counts
-    chosen, expected, p, observed_p = disagreeing(
+    chosen, expected, p, observed_p = _disagreeing(
         table, *log_odds, log_counts[i] + log_counts[j], holds, of_classes, least, top_k
     )
     columns = *(part[chosen].tolist() for part in (subjects, objects, holds)), expected.tolist()
@@ -213,7 +232,7 @@ def _names(
 
     Args:
         A: number of canonical relations that the machine knows.
-        holds: bit set of the observed relations; see `observed_pairs`.
+        holds: bit set of the observed relations; see `_observed_pairs`.
         expected: number of the expected relation.
     """
     names = relation_names(A)
@@ -261,6 +280,168 @@ def _pairs(request: RelationsRequest, reading: Reading) -> list[tuple[int, int]]
         pairs[subject, other] = None
     errors.raise_any()
     return list(pairs)
+
+
+@compiled
+def _likeliest_relations(
+    slopes, log_odds, log_counts, row, judged, evidence, least, opposites, count
+):
+    """Return the `count` likeliest relations between N objects, likeliest first.
+
+    Args:
+        slopes: (A, 3) table of `RelationSlopes`.
+        log_odds: (A, n, n) log-odds of the A relations between the n classes of the scene.
+        log_counts: (n,) log of the number of instances of each class.
+        row: (N,) index of each object's class among the n classes.
+        judged: (N, N) bool, True for the ordered pairs of objects to judge.
+        evidence: (A, N, N) probability of each observed relation, `_EXCLUDED` for a relation that
+            cannot hold, and NaN for other relations. It is empty if the scene shows no relations.
+        least: minimum probability of a relation in the result.
+        opposites: whether the result also contains opposite relations. The opposite of relation a
+            has the number A + a.
+        count: maximum number k of relations.
+
+    Returns:
+        Five arrays (k,): subjects, objects, relations, probabilities, and the probabilities without
+        the evidence.
+    """
+    (A, n), size = log_odds.shape[:2], len(row)
+    counts = np.empty((n, n), log_counts.dtype)
+    for i in range(n):
+        for j in range(n):
+            counts[i, j] = log_counts[i] + log_counts[j]
+    log_odds = log_odds.reshape(1, A, n * n)
+    p = relation_probability(slopes, log_odds, counts.reshape(-1)).reshape(A, n, n)
+    names = 2 * A if opposites else A
+    grid, usable = np.zeros((size, size, names), p.dtype), np.zeros((size, size, names), np.bool_)
+    expected = np.zeros((size, size, names), p.dtype)
+    for x in range(size):
+        for y in range(size):
+            if judged[x, y]:
+                i, j = row[x], row[y]
+                for a in range(A):
+                    to, back = exclusive(p[a, i, j], p[a, j, i])
+                    expected[x, y, a] = to
+                    if opposites:
+                        expected[x, y, A + a] = back
+                    if len(evidence):
+                        shown, opposite = evidence[a, x, y], evidence[a, y, x]
+                        to = with_evidence(to, shown, opposite)
+                        back = with_evidence(back, opposite, shown)
+                    grid[x, y, a], usable[x, y, a] = to, to >= least
+                    if opposites:
+                        grid[x, y, A + a], usable[x, y, A + a] = back, back >= least
+    values = grid.reshape(-1)
+    indices = best(values, usable.reshape(-1), count)
+    pair = indices // names
+    of_model = expected.reshape(-1)[indices].astype(np.float64)
+    probabilities = values[indices].astype(np.float64)
+    return pair // size, pair % size, indices % names, probabilities, of_model
+
+
+@inlined
+def with_evidence(p, evidence, opposite):
+    """Return the probability of a relation a(x, y), given the evidence about it and about a(y, x).
+
+    A relation cannot hold in both directions.
+    """
+    if evidence > _EXCLUDED:
+        return evidence
+    if opposite > _EXCLUDED:
+        return min(p, _MOST_EXCLUDED, max(np.float32(1.0) - opposite, np.float32(0.0)))
+    return min(p, _MOST_EXCLUDED) if evidence == _EXCLUDED else p
+
+
+@compiled
+def _observed_pairs(triples, row, judged, classes, relations):
+    """Return the pairs of objects with at least one observed relation, and their relations.
+
+    A bit set contains the relations of a pair. Bit a stands for relation a from subject to object.
+    Bit A + a stands for relation a from object to subject.
+
+    Args:
+        triples: (T, 3) observed relations, each as (relation, subject, object).
+        row: (N,) index of each object's class among the n classes.
+        judged: (N, N) bool, True for the ordered pairs of objects to judge. The result contains a
+            pair if one of its two orders is True.
+        classes: number n of classes in the scene.
+        relations: number A of canonical relations.
+
+    Returns:
+        Four arrays (P,): subject, object, bit set of the relations between these two objects, and
+        bit set of the relations between any two objects of their classes.
+    """
+    size = len(row)
+    holds, of_classes = np.zeros((size, size), np.int64), np.zeros((classes, classes), np.int64)
+    for t in range(len(triples)):
+        a, x, y = triples[t, 0], triples[t, 1], triples[t, 2]
+        holds[x, y] |= 1 << a
+        holds[y, x] |= 1 << (relations + a)
+        of_classes[row[x], row[y]] |= 1 << a
+        of_classes[row[y], row[x]] |= 1 << (relations + a)
+    columns = np.empty((4, min(len(triples), size * size)), np.int64)
+    pairs, forward = 0, (1 << relations) - 1
+    for x in range(size):
+        for y in range(x + 1, size):
+            if holds[x, y] and (judged[x, y] or judged[y, x]):
+                # The subject of the pair is the subject of its observed relation with the lowest
+                # number. n & -n is the lowest bit of n.
+                from_x, from_y = holds[x, y] & forward, holds[y, x] & forward
+                y_is_lower = from_y != 0 and (from_y & -from_y) < (from_x & -from_x)
+                swapped = from_x == 0 or y_is_lower
+                subject, object_ = (y, x) if swapped else (x, y)
+                columns[0, pairs], columns[1, pairs] = subject, object_
+                columns[2, pairs] = holds[subject, object_]
+                columns[3, pairs] = of_classes[row[subject], row[object_]]
+                pairs += 1
+    return columns[0, :pairs], columns[1, :pairs], columns[2, :pairs], columns[3, :pairs]
+
+
+@compiled
+def _disagreeing(slopes, forward, backward, log_counts, holds, of_classes, least, count):
+    """Return the `count` pairs whose observed relations differ most from the expected relation.
+
+    The expected relation of a pair is its likeliest relation. The observed probability is the
+    probability of the likeliest observed relation. Pairs are ranked by the probability of the
+    expected relation divided by the observed probability. The result contains a pair only if its
+    expected relation is not observed between any two objects of its classes.
+
+    Args:
+        slopes: (A, 3) table of `RelationSlopes`.
+        forward: (A, P) log-odds of the relations from subject to object.
+        backward: (A, P) log-odds of the relations from object to subject.
+        log_counts: (P,) log of the number of object pairs with these two classes.
+        holds, of_classes: (P,) bit sets of the relations of the pair and of its classes; see
+            `_observed_pairs`.
+        least: minimum probability of an expected relation.
+        count: maximum number k of pairs.
+
+    Returns:
+        Four arrays (k,): index of the pair, number of the expected relation, probability of the
+        expected relation, and observed probability.
+    """
+    A, P = forward.shape
+    to = relation_probability(slopes, forward.reshape(1, A, P), log_counts)[0]
+    back = relation_probability(slopes, backward.reshape(1, A, P), log_counts)[0]
+    expected, ratio = np.empty(P, np.int64), np.empty(P, np.float64)
+    likely, usable = np.empty((2, P), np.float64), np.zeros(P, np.bool_)
+    p = np.empty(2 * A, forward.dtype)
+    for k in range(P):
+        for a in range(A):
+            p[a], p[A + a] = exclusive(to[a, k], back[a, k])
+        top, observed = -1, np.float64(0.0)
+        for name in range(2 * A):
+            log_odds = forward[name, k] if name < A else backward[name - A, k]
+            if log_odds > NO_UNIT and (top < 0 or p[name] > p[top]):
+                top = name
+            if holds[k] >> name & 1:
+                observed = max(observed, np.float64(p[name]))
+        if top >= 0 and not of_classes[k] >> top & 1 and p[top] > observed and p[top] >= least:
+            usable[k], expected[k] = True, top
+            likely[0, k], likely[1, k] = p[top], observed
+            ratio[k] = likely[0, k] / observed
+    indices = best(ratio, usable, count)
+    return indices, expected[indices], likely[0][indices], likely[1][indices]
 
 
 _NO_RELATIONS: Final = SceneWarning(

@@ -17,7 +17,7 @@ from pydantic import (
 from app.model.calibration import PAIR_CALIBRATIONS, Calibration
 from app.model.fields import Count, Frozen, Many, Sha256, Text, Timestamp, to_json
 from app.registry.references import ModelName, Version
-from app.scene.relations import CANONICAL
+from app.scene.spatial_relations import CANONICAL
 from app.scene.vocabulary import ObjectClass, Vocabulary
 from scene_client.schemas import Label, SceneRequest
 

@@ -55,11 +55,18 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from app.inference import kernels
-from app.inference.kernels import MIN_OFFSET
-from app.scene.relations import CANONICAL, FRONT, LEFT, ON_TOP
-from app.scene.roles import RoleCounts
+from app.compiling import compiled
+from app.scene.footprints import measure
+from app.scene.roles import IN, ON, UNDER, RoleCounts, is_smaller, likely_role, possible_roles
+from app.scene.spatial_relations import ABOVE, CANONICAL, FRONT, INSIDE, LEFT, ON_TOP
 
+_NONE: Final = -1  # index for "no relation"
+
+MIN_OVERLAP: Final = 0.30  # minimum overlap as a share of the smaller footprint
+CONTACT: Final = 0.05  # maximum distance in metres between bottom and top for *on-top*
+NEIGHBOUR_GAP: Final = 1.0  # maximum distance in metres between the footprints of neighbours
+NEIGHBOUR_DISTANCE: Final = 1.5  # maximum distance in metres between centres if a size is unknown
+MIN_OFFSET: Final = 0.10  # minimum |dx| or |dy| in metres for *front* or *left*
 UNKNOWN_REACH: Final = 1.5  # maximum reach in metres of a footprint of unknown size
 MOST_DISTANT: Final = 100.0  # longest plausible distance from the viewer in metres; detects mm
 SMALLEST: Final = 1e-3  # shortest plausible longest side of a box in metres
@@ -149,33 +156,13 @@ def derive_relations(
         raise ValueError(f"classes must be {n} indices below {len(roles.anchor)}")
     holds = np.zeros((len(CANONICAL), n, n), dtype=np.bool_)
     observed = np.zeros_like(holds)
-    kernels.relate_all(points, extents, turns, horizontal, classes, roles, holds, observed)
+    _relate_all(points, extents, turns, horizontal, classes, roles, holds, observed)
     return PoseRelations(holds, observed)
 
 
 _NO_ROLES: Final = RoleCounts(
     np.empty(0, np.int64), np.empty((0, 3), np.float32), np.empty((0, 3), np.float32)
 )
-
-
-def overlap_and_gap(
-    centre_a: Array, size_a: Array, yaw_a: Array, centre_b: Array, size_b: Array, yaw_b: Array
-) -> tuple[Array, Array]:
-    """Compute overlap and gap of P pairs of rectangles a and b, the footprints of boxes.
-
-    Centres (P, 2) and sizes (P, 2) along the rectangle's own axes are in metres, yaws (P,) in
-    radians.
-
-    Returns:
-        Overlap of each pair, (P,): area of the intersection divided by the smaller area.
-        Gap of each pair, (P,): distance between the rectangles in metres, or 0 if they touch.
-    """
-    share, gap = np.empty(len(yaw_a)), np.empty(len(yaw_a))
-    rectangles = (centre_a, size_a, yaw_a, centre_b, size_b, yaw_b)
-    kernels.measure_pairs(
-        *(np.asarray(part, np.float64, order="C") for part in rectangles), share, gap
-    )
-    return share, gap
 
 
 def excluded_by_centres(points: Array, sizes: Array, *, horizontal: bool) -> NDArray[np.bool_]:
@@ -206,3 +193,127 @@ def _array(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
     if array.shape != shape:
         raise ValueError(f"{name} must have the shape {shape}, not {array.shape}")
     return array
+
+
+@compiled
+def _relate_all(points, extents, turns, horizontal, classes, roles, holds, observed):
+    """Write the relations of all pairs of boxes to ``holds`` and ``observed``."""
+    n = len(points)
+    has_position, has_size = np.empty(n, np.bool_), np.empty(n, np.bool_)
+    radius = np.empty(n)
+    for i in range(n):
+        has_position[i], has_size[i] = _is_known(points[i]), _is_known(extents[i])
+        radius[i] = math.hypot(extents[i, 0], extents[i, 1]) / 2
+    for i in range(n):
+        for j in range(i + 1, n):
+            if not (has_position[i] and has_position[j]):
+                continue
+            distance = math.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1])
+            have_sizes, overlap = has_size[i] and has_size[j], False
+            if not have_sizes:
+                neighbours = distance <= NEIGHBOUR_DISTANCE
+            # The distance between the circles around the footprints is a fast first check, because
+            # `measure` is slower.
+            elif distance - radius[i] - radius[j] <= NEIGHBOUR_GAP:
+                share, gap = measure(
+                    points[i], extents[i], turns[i], points[j], extents[j], turns[j]
+                )
+                neighbours, overlap = gap <= NEIGHBOUR_GAP, share >= MIN_OVERLAP
+            else:
+                neighbours = False
+            # The order of relation indices is left, front, on-top, above, inside.
+            first = LEFT if neighbours and horizontal else ON_TOP
+            last = INSIDE if have_sizes else FRONT
+            for relation in range(first, last + 1):
+                observed[relation, i, j] = observed[relation, j, i] = True
+            if overlap and _stack(points, extents, i, j, classes, roles, holds, observed):
+                continue
+            if neighbours and horizontal:
+                for subject, anchor in ((i, j), (j, i)):
+                    relation = _horizontal(points, subject, anchor)
+                    if relation != _NONE:
+                        holds[relation, subject, anchor] = True
+
+
+@compiled
+def _is_known(row):
+    return not (math.isnan(row[0]) or math.isnan(row[1]) or math.isnan(row[2]))
+
+
+@compiled
+def _stack(points, extents, i, j, classes, roles, holds, observed):
+    """Set the stacked relations of two boxes by rules 1 to 3. Return whether a rule applies.
+
+    The footprints must overlap.
+    """
+    for subject, anchor in ((i, j), (j, i)):
+        relation = _vertical(points, extents, subject, anchor)
+        if relation != _NONE:
+            holds[relation, subject, anchor] = True
+            return True
+    nested = _surrounds(points, extents, i, j) or _surrounds(points, extents, j, i)
+    lowest = max(_lift(points, extents, i, j), _lift(points, extents, j, i))
+    if lowest >= -CONTACT and not nested:
+        return False  # two thin boxes at the same height
+    for smaller, larger in ((i, j), (j, i)):
+        if is_smaller(extents[smaller], extents[larger]):
+            _choose_role(points, extents, smaller, larger, classes, roles, holds, observed)
+            return True
+    for relation in (ON_TOP, INSIDE):
+        observed[relation, i, j] = observed[relation, j, i] = False
+    return True
+
+
+@compiled
+def _choose_role(points, extents, smaller, larger, classes, roles, holds, observed):
+    """Set the relation of a role by rule 3, or leave the relations of possible roles unobserved."""
+    height, larger_height = extents[smaller, 2], extents[larger, 2]
+    rise = points[smaller, 2] - height / 2 - (points[larger, 2] - larger_height / 2)
+    possible = possible_roles(rise, height, larger_height)
+    role = likely_role(roles, classes[smaller], classes[larger], possible)
+    if role == ON:
+        holds[ON_TOP, smaller, larger] = True
+    elif role == UNDER:
+        holds[ON_TOP, larger, smaller] = True
+    elif role == IN:
+        holds[INSIDE, smaller, larger] = True
+    else:
+        observed[ON_TOP, smaller, larger] = not possible[ON]
+        observed[ON_TOP, larger, smaller] = not possible[UNDER]
+        observed[INSIDE, smaller, larger] = not possible[IN]
+
+
+@compiled
+def _vertical(points, extents, i, j):
+    """Return the vertical relation of box i to box j. Their footprints must overlap."""
+    lift = _lift(points, extents, i, j)
+    if lift > CONTACT:
+        return ABOVE
+    if abs(lift) <= CONTACT and points[i, 2] > points[j, 2]:
+        return _NONE if _surrounds(points, extents, i, j) else ON_TOP
+    return _NONE
+
+
+@compiled
+def _surrounds(points, extents, i, j):
+    """Return whether box i surrounds box j; see rule 1. Their footprints must overlap."""
+    half, half_j = extents[i, 2] / 2, extents[j, 2] / 2
+    is_lower = points[i, 2] - half < points[j, 2] - half_j
+    is_higher = points[i, 2] + half > points[j, 2] + half_j
+    is_high = extents[i, 2] > 2 * CONTACT
+    return is_lower and is_higher and is_high and is_smaller(extents[j], extents[i])
+
+
+@compiled
+def _lift(points, extents, i, j):
+    """Return the height in metres of the bottom of box i above the top of box j."""
+    return (points[i, 2] - extents[i, 2] / 2) - (points[j, 2] + extents[j, 2] / 2)
+
+
+@compiled
+def _horizontal(points, i, j):
+    """Return the horizontal relation of box i to its neighbour j."""
+    to_front, to_left = points[j, 0] - points[i, 0], points[i, 1] - points[j, 1]
+    if abs(to_left) >= abs(to_front):
+        return LEFT if to_left >= MIN_OFFSET else _NONE
+    return FRONT if to_front >= MIN_OFFSET else _NONE

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int
 from numpy.typing import NDArray
 
-from app.scene.relations import CANONICAL
+from app.scene.spatial_relations import CANONICAL
 
 Array: TypeAlias = NDArray[Any]
 Triple: TypeAlias = tuple[int, int, int]

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from app.compiling import compiled
 from app.scene.geometry import (
     SMALLEST,
     Viewpoint,
@@ -170,3 +171,35 @@ def boxes_of(
         elif thing.class_index is None:
             extents[row] = math.nan
     return centres, extents
+
+
+@compiled
+def pool_classes(classes, confidence):
+    """Return the n distinct classes of N instances; classes (N,) int64, confidence (N,) float64.
+
+    Returns:
+        Class indices in ascending order, (n,).
+        Index of the first instance of each class, (n,).
+        For each instance, index of its class in the first array, (N,).
+        Number of instances of each class, (n,).
+        Probability that at least one instance of each class exists, (n,).
+    """
+    distinct, row = np.empty(len(classes), np.int64), np.empty(len(classes), np.int64)
+    counts, first = np.zeros(len(classes), np.int64), np.empty(len(classes), np.int64)
+    absent, n = np.ones(len(classes), np.float64), 0
+    order = np.empty(len(classes), np.int64)
+    for k in range(len(classes)):  # insertion sort
+        place = k
+        while place and classes[order[place - 1]] > classes[k]:
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = k
+    for k in range(len(classes)):
+        instance = order[k]
+        if n == 0 or distinct[n - 1] != classes[instance]:
+            distinct[n], first[n] = classes[instance], instance
+            n += 1
+        row[instance] = n - 1
+        counts[n - 1] += 1
+        absent[n - 1] *= 1.0 - confidence[instance]
+    return distinct[:n], first[:n], row, counts[:n], 1.0 - absent[:n]

@@ -8,8 +8,8 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.kernels import CONTACT
-from app.scene.relations import ABOVE, INSIDE, ON_TOP
+from app.scene.geometry import CONTACT
+from app.scene.spatial_relations import ABOVE, INSIDE, ON_TOP
 
 UNKNOWN, FLOOR, HANGS, SUPPORTED = -1, 0, 1, 2
 """An object stands on the floor, hangs on a wall or from the ceiling, or is on or in an object."""

@@ -20,8 +20,8 @@ from app.registry import Artifact, ArtifactError, ModelSet, StoreError
 from app.registry.model_set import EMPTY
 from app.scene.nearest import spelt_alike
 from app.scene.relation_table import RelationTable
-from app.scene.relations import ON_TOP
 from app.scene.scene import Scene, SceneObject, observe
+from app.scene.spatial_relations import ON_TOP
 from app.scene.vocabulary import Vocabulary
 from scene_client.schemas import Failure
 

@@ -10,7 +10,6 @@ from contextlib import suppress
 
 from app import errors
 from app.compiling import check_cache, progress
-from app.inference.kernels import KERNELS
 from app.questions.reading import Limits
 from app.registry import DEFAULT_STORE, Store, StoreState, load_model_set
 from app.registry.model_set import with_default
@@ -131,7 +130,7 @@ class Runtime:
     def _load(self) -> ServedModels:
         # Read the state first. So the next check finds changes that are made during the load.
         self._loaded_state = self._store.state()
-        with progress(KERNELS):
+        with progress():
             previous = self.models.store
             models = load_model_set(self._store, previous, warm_up, self._release)
             return ServedModels(with_default(models, self._release, previous, warm_up))

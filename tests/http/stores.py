@@ -7,7 +7,7 @@ import torch
 
 from app.model import Calibration, Counts, Offsets
 from app.registry import AliasTarget, Store, VocabularyEntry
-from app.scene.relations import CANONICAL
+from app.scene.spatial_relations import CANONICAL
 from app.scene.vocabulary import ObjectClass, Vocabulary
 from tests.enumeration.small_machines import with_symmetric_couplings
 from tests.registry.small_artifacts import JUDGING, description

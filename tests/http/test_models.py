@@ -14,7 +14,7 @@ import httpx
 import pytest
 
 from app.registry import Store
-from app.scene.relations import CANONICAL, opposite
+from app.scene.spatial_relations import CANONICAL, opposite
 from tests.http.stores import PROFILES, VOCABULARY, corrupt, publish
 from tests.http.test_problems import problem
 from tests.services import PATIENCE, Hold, Replace, defect, load_changes, serve

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app.inference.objects import LARGEST_WEIGHT, Gains, ObjectScorer
-from app.inference.relations import context_of
+from app.inference.relation_units import context_of
 from tests.enumeration.small_machines import random_weights
 from training.machines import MachineSpec, build
 from training.machines.arrays import weights_of

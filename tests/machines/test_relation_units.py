@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import expit
 
-from app.inference.relations import (
+from app.inference.relation_units import (
     NEVER,
     ObservedRelations,
     context_of,

@@ -6,7 +6,7 @@ import pytest
 
 from app import questions
 from app.scene import RelationTable, Scene, SceneObject, observe
-from app.scene.relations import ABOVE, CANONICAL, INSIDE, LEFT, ON_TOP
+from app.scene.spatial_relations import ABOVE, CANONICAL, INSIDE, LEFT, ON_TOP
 from tests.questions.answers import relations
 from tests.questions.artifacts import (
     LABELS,

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from app.inference.weights import pack_scenes
 from app.questions.generate import staying
 from app.scene import CANONICAL
-from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP
+from app.scene.spatial_relations import ABOVE, FRONT, LEFT, ON_TOP
 from tests.enumeration.small_machines import enumerate_joint, with_mean_rates
 from tests.questions.answers import generate, outliers
 from tests.questions.artifacts import (

@@ -23,7 +23,7 @@ from app.questions.misplaced import (
 )
 from app.questions.posterior import present
 from app.scene import ObjectClass, RelationTable, Scene, SceneObject, Vocabulary, observe
-from app.scene.relations import ABOVE, INSIDE, LEFT, ON_TOP
+from app.scene.spatial_relations import ABOVE, INSIDE, LEFT, ON_TOP
 from tests.questions.answers import misplaced
 from tests.questions.artifacts import judging, larger_artifact, lines, places_of, scene_of
 

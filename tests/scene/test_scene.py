@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from app.inference.kernels import pool_classes
 from app.scene import RelationTable, Scene, SceneObject, observe
 from app.scene.geometry import Viewpoint, derive_relations, to_viewer_frame
-from app.scene.relations import (
+from app.scene.scene import pool_classes
+from app.scene.spatial_relations import (
     ABOVE,
     CANONICAL,
     FRONT,

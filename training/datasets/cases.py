@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from app.scene import CANONICAL, RelationTable, Scene, SceneObject, Vocabulary
-from app.scene.relations import ABOVE, LATERAL, STACKED
+from app.scene.spatial_relations import ABOVE, LATERAL, STACKED
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Ints, Rng
 from training.datasets.batches import SceneTensors, subset

@@ -20,7 +20,7 @@ import numpy as np
 from app.model import SceneModel
 from app.questions.misplaced import THE_FLOOR
 from app.scene import Vocabulary
-from app.scene.relations import STACKED
+from app.scene.spatial_relations import STACKED
 from training.datasets import AnnotatedScene, encode
 from training.datasets.cases import scene_of
 from training.datasets.moved import has_boxes, posed_scene

@@ -27,7 +27,7 @@ from scipy.special import expit
 from torch import Tensor
 
 from app.model import SceneModel
-from app.scene.relations import INSIDE, LATERAL, VERTICAL
+from app.scene.spatial_relations import INSIDE, LATERAL, VERTICAL
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.batches import SceneTensors, seen_triples

@@ -23,11 +23,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from app.inference.kernels import NO_UNIT
+from app.inference.quadrature import NO_UNIT
 from app.model import Calibration, CountSlope, SceneModel
 from app.questions.placements import PLACES
 from app.questions.posterior import Posterior
-from app.scene.relations import CANONICAL, LATERAL, ON_TOP, STACKED
+from app.scene.spatial_relations import CANONICAL, LATERAL, ON_TOP, STACKED
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Rng
 from training.datasets.batches import SceneTensors, TrainingData, subset

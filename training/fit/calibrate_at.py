@@ -20,7 +20,7 @@ from scipy.optimize import minimize
 from app.model import PlaceFit, SceneModel
 from app.questions.placements import place_log_p
 from app.questions.posterior import Posterior, calibrated_missing
-from app.scene.relations import LATERAL, STACKED
+from app.scene.spatial_relations import LATERAL, STACKED
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats
 from training.evaluation.calibration_task import PlaceQuestion, place_question

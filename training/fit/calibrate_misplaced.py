@@ -38,8 +38,8 @@ from app.questions.misplaced import (
 )
 from app.questions.posterior import Posterior
 from app.scene import RelationTable, Scene
-from app.scene.relations import ON_TOP
 from app.scene.scene import observe
+from app.scene.spatial_relations import ON_TOP
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Ints, Rng
 from training.datasets.cases import (

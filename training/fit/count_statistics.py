@@ -20,8 +20,7 @@ import numpy as np
 from scipy import sparse
 from scipy.optimize import minimize
 
-from app.inference.kernels import INTERCEPT, ROOM, SEVERAL, SINGLE
-from app.model.count_statistics import EXPONENTS, Counts
+from app.model.count_statistics import EXPONENTS, INTERCEPT, ROOM, SEVERAL, SINGLE, Counts
 from app.questions.counts import distribution, functions
 from app.scene import Vocabulary
 from training.datasets import EncodedScene

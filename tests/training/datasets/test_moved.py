@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from app.scene import ObjectClass, Vocabulary
-from app.scene.geometry import overlap_and_gap
-from app.scene.relations import FRONT, INSIDE, LEFT, ON_TOP
+from app.scene.footprints import overlap_and_gap
+from app.scene.spatial_relations import FRONT, INSIDE, LEFT, ON_TOP
 from tests.training.scenes import encode_objects, things
 from training.datasets import AnnotatedObject
 from training.datasets.moved import (

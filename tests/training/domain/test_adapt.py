@@ -12,7 +12,7 @@ from app import questions
 from app.model import SceneModel
 from app.registry import Store
 from app.scene import RelationTable, Scene, SceneObject
-from app.scene.relations import ON_TOP
+from app.scene.spatial_relations import ON_TOP
 from tests.registry.small_artifacts import rewrite_manifest
 from tests.training.commands import invoke
 from tests.training.domain.homes import home_scenes, write

@@ -8,7 +8,7 @@ from scipy.stats import chi2, invgamma, norm
 
 from app.model import Offsets
 from app.scene import CANONICAL
-from app.scene.relations import LEFT, ON_TOP
+from app.scene.spatial_relations import LEFT, ON_TOP
 from tests.training.evaluation.scenes import scene
 from training.datasets import encode, generate_rooms, rooms_vocabulary
 from training.datasets.cases import observed_offsets

@@ -20,7 +20,7 @@ from scipy.special import expit
 from torch import Tensor
 
 from app.scene import Scene, observe
-from app.scene.relations import SUPPORTS
+from app.scene.spatial_relations import SUPPORTS
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.batches import SceneTensors

@@ -9,11 +9,13 @@ from collections.abc import Hashable, Iterable
 from graphlib import CycleError, TopologicalSorter
 from typing import Final, TypeVar
 
-from app.inference.kernels import ABOVE as ABOVE
-from app.inference.kernels import FRONT as FRONT
-from app.inference.kernels import INSIDE as INSIDE
-from app.inference.kernels import LEFT as LEFT
-from app.inference.kernels import ON_TOP as ON_TOP
+import numpy as np
+
+from app.compiling import compiled
+
+LEFT, FRONT, ON_TOP, ABOVE, INSIDE = 0, 1, 2, 3, 4
+"""Indices of the canonical relations."""
+
 
 CANONICAL: Final[tuple[str, ...]] = ("left", "front", "on-top", "above", "inside")
 OPPOSITES: Final[dict[str, str]] = {
@@ -93,3 +95,21 @@ def support_cycle(triples: Iterable[tuple[int, End, End]]) -> list[End] | None:
         circle: list[End] = error.args[1]
         return circle[::-1]
     return None
+
+
+@compiled
+def pool_relations(row, n, holds, observed):
+    """Pool the relations of instances (A, N, N) into relations of classes (A, n, n), all bool.
+
+    ``row`` (N,) is the index of each instance's class, from 0 to n - 1. The results are the pooled
+    ``holds`` and ``observed``.
+    """
+    A, size, _ = holds.shape
+    class_holds, class_observed = np.zeros((A, n, n), np.bool_), np.zeros((A, n, n), np.bool_)
+    for a in range(A):
+        for i in range(size):
+            for j in range(size):
+                if i != j and (holds[a, i, j] or observed[a, i, j]):
+                    class_observed[a, row[i], row[j]] = True
+                    class_holds[a, row[i], row[j]] |= holds[a, i, j]
+    return class_holds, class_observed

@@ -20,8 +20,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference import kernels
-from app.inference.kernels import NO_UNIT, Ends, SharedArrays
+from app.compiling import compiled, compiled_in_any_order
+from app.inference.implications import implication_shifts
+from app.inference.quadrature import to_log_odds
 from app.inference.weights import Weights, state_means
 
 Floats = NDArray[np.float32]
@@ -35,29 +36,16 @@ Table = tuple[NDArray[np.int32], NDArray[np.int32]]
 
 NO_VALUES: Final[Floats] = np.zeros((0, 0, 0), dtype=np.float32)
 
+# Constants of a hash table: bucket of a pair = (key * _SPREAD) >> _SHIFT, modulo the table size.
+_SPREAD, _SHIFT = 2654435761, 16
+
+# Number of float32 in a vector register. Rows of whole registers are faster.
+_VECTOR: Final = 8
+
 # Maximum variance of a logit, averaged over units, that `_directions` may neglect. Neglecting a
 # variance changes a probability by about 1/20 of this variance. The model `places-triway` keeps 6
 # of 33 directions.
 _LEFT_OUT: Final = 1.6e-2
-
-
-def to_log_odds(mean: Floats, spread: Floats) -> Floats:
-    """Return the log-odds of the mean of sigmoid(ℓ) for normal logits ℓ.
-
-    The smallest result is `NO_UNIT`. σ is the standard deviation of ℓ. For σ < 0.75, the quadrature
-    has three nodes, 0 and ±√3 σ, with weights 4 : 1 : 1. The error in the probability is at most
-    0.0004. With u = e^-|mean| and q = e^spread, the sigmoids at the nodes are u/(1 + u),
-    uq/(1 + uq) and u/(q + u). These forms cannot overflow. For σ of at least 0.75, the function
-    uses the trapezoidal rule.
-
-    Args:
-        mean: means of the logits, an array of any shape.
-        spread: √3 σ of the logits. The array has the same shape.
-    """
-    log_odds = mean.ravel().astype(np.float32)
-    # ravel() makes the arrays contiguous. For another layout, numba would compile the kernel again.
-    kernels.log_odds(log_odds, spread.ravel(), NO_UNIT)
-    return log_odds.reshape(mean.shape)
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +83,45 @@ class Context:
     x: Floats
     shares: Floats
     observed: ObservedRelations | None
+
+
+class SharedArrays(NamedTuple):
+    """Weights of a Triway's units for the compiled kernels.
+
+    Attributes:
+        S, O: (V, K + 1) factors of each class as subject and as object. The last column is 1.
+        s, o: (V, A) weights of each class as subject and as object of each relation.
+        n: (A, 2) weights of the log number of instances of subject and object class.
+        start, key: look-up table of `_pair_rows`.
+        residual: (pairs + 1, A) residual weight w' of each pair of classes and each relation. The
+            last row is 0.
+    """
+
+    S: Floats
+    O: Floats  # noqa: E741
+    s: Floats
+    o: Floats
+    n: Floats
+    start: NDArray[np.int32]
+    key: NDArray[np.int32]
+    residual: Floats
+
+
+class Ends(NamedTuple):
+    """Subject and object classes of some pairs. All arrays have the same shape.
+
+    Attributes:
+        i, j: class indices of the subjects and of the objects.
+        log_i, log_j: log of the number of instances of each class in i and in j.
+        p_i, p_j: probability that each class in i and in j is present.
+    """
+
+    i: Indices
+    j: Indices
+    log_i: Floats
+    log_j: Floats
+    p_i: Floats
+    p_j: Floats
 
 
 def context_of(
@@ -178,7 +205,7 @@ class RelationUnits(ABC):
         if observed is not None and len(weight):
             on = (observed.r > 0) & (observed.i != observed.j)
             units = observed.a[on], observed.i[on], observed.j[on]
-            shifts = kernels.implication_shifts(weight, n, *units)
+            shifts = implication_shifts(weight, n, *units)
             shift, apart = (np.ascontiguousarray(change.transpose(2, 0, 1)) for change in shifts)
         shape = self._A, n, n
         return Between(mean.reshape(shape), spread.reshape(shape), shift, apart)
@@ -219,7 +246,7 @@ class RelationUnits(ABC):
             anchor as subject.
         """
         m, scene = len(anchors), (context.classes, context.log_counts, context.presence)
-        ends = kernels.placement_ends(candidates, *(part[anchors] for part in scene))
+        ends = _placement_ends(candidates, *(part[anchors] for part in scene))
         means = state_means(context.x + self._W[candidates], self._states)
         log_odds = to_log_odds(*self.normal(means, ends, only))
         return log_odds[:, :, :m], log_odds[:, :, m:]
@@ -249,7 +276,7 @@ class FreeUnits(RelationUnits):
         shape = len(means), chosen.stop - chosen.start, ends.i.shape[1]
         # Row b of the means, relation a and pair p of each entry of the result.
         b, a, p = (indices.reshape(-1) for indices in np.indices(shape))
-        rows = kernels.pair_rows(*self._table, ends.i[b, p] * self._V + ends.j[b, p])
+        rows = _pair_rows(*self._table, ends.i[b, p] * self._V + ends.j[b, p])
         units = self._index[rows, chosen.start + a].astype(np.int64)
         kept = np.flatnonzero(units >= 0)
         units, b, p = units[kept], b[kept], p[kept]
@@ -327,7 +354,7 @@ class SharedUnits(RelationUnits):
         by_unit = means.reshape(len(means), -1, self._states - 1).transpose(1, 0, 2)
         f = by_unit @ self._F[:, :, chosen.start * r : chosen.stop * r]
         f = f.reshape(len(f), len(means), R, r)
-        return kernels.normal_logits(self._w, chosen.start, ends, U, Y, C, f)
+        return _normal_logits(self._w, chosen.start, ends, U, Y, C, f)
 
     def _products(self, chosen: slice, rows: Floats, columns: Floats) -> Floats:
         """Return the product of the rows (B, H1) with n columns of each chosen relation, (B, R, n).
@@ -404,7 +431,7 @@ def _chosen_relations(relations: int, only: int | None) -> slice:
 
 
 def _pair_table(weights: Weights) -> tuple[Table, tuple[Indices, Indices]]:
-    """Build the hash table of `kernels.pair_rows`.
+    """Build the hash table of `_pair_rows`.
 
     Its keys are the pairs of classes of the T stored triples. The keys are sorted by bucket. Bucket
     k consists of the rows from start[k] to start[k + 1].
@@ -417,7 +444,7 @@ def _pair_table(weights: Weights) -> tuple[Table, tuple[Indices, Indices]]:
     relation, pair_of_triple = np.divmod(weights.triple_keys, weights.spec.V**2)
     pairs, pair_index = np.unique(pair_of_triple, return_inverse=True)
     buckets = 1 << (2 * len(pairs)).bit_length()
-    bucket = (pairs * kernels.SPREAD >> kernels.SHIFT) & (buckets - 1)
+    bucket = (pairs * _SPREAD >> _SHIFT) & (buckets - 1)
     order = np.argsort(bucket, kind="stable")
     row_of_pair = np.empty_like(order)
     row_of_pair[order] = np.arange(len(order))
@@ -466,3 +493,132 @@ def _mean_covariance(means: NDArray[np.float64], states: int) -> NDArray[np.floa
     same_unit = np.kron(np.eye(units), np.ones((states - 1, states - 1)))
     covariance: NDArray[np.float64] = np.diag(means.mean(0)) - means.T @ means / len(means)
     return covariance * same_unit
+
+
+@compiled
+def _pair_rows(start, keys, pairs):
+    """Return the row of each pair of classes in the table of residual weights, (E,).
+
+    Args:
+        start: first row of each bucket of the hash table.
+        keys: keys of the pairs in the table. A pair (i, j) of V classes has the key i V + j.
+        pairs: (E,) keys to look up. A key outside the table gets the last row, which is zero.
+    """
+    # Buckets are faster than binary search, because the processor cannot predict its branches.
+    rows = np.empty(len(pairs), np.int64)
+    for e in range(len(pairs)):
+        pair = pairs[e]
+        bucket = (pair * _SPREAD >> _SHIFT) & (len(start) - 2)
+        rows[e] = len(keys)
+        for row in range(start[bucket], start[bucket + 1]):
+            if keys[row] == pair:
+                rows[e] = row
+    return rows
+
+
+@compiled
+def _placement_ends(candidates, classes, log_counts, presence):
+    """Return the `Ends` of N candidate classes and m anchor classes, (N, 2 m) each.
+
+    In the first m columns, the candidate is the subject. In the others, the anchor is. Candidates
+    are present, with one instance.
+    """
+    N, m = len(candidates), len(classes)
+    i, j = np.empty((N, 2 * m), np.int64), np.empty((N, 2 * m), np.int64)
+    log_i, log_j = np.empty((N, 2 * m), np.float32), np.empty((N, 2 * m), np.float32)
+    p_i, p_j = np.empty((N, 2 * m), np.float32), np.empty((N, 2 * m), np.float32)
+    for c in range(N):
+        for k in range(m):
+            i[c, k] = j[c, m + k] = candidates[c]
+            j[c, k] = i[c, m + k] = classes[k]
+            log_i[c, k] = log_j[c, m + k] = np.float32(0.0)
+            log_j[c, k] = log_i[c, m + k] = log_counts[k]
+            p_i[c, k] = p_j[c, m + k] = np.float32(1.0)
+            p_j[c, k] = p_i[c, m + k] = presence[k]
+    return Ends(i, j, log_i, log_j, p_i, p_j)
+
+
+@compiled_in_any_order
+def _normal_logits(w, first, ends, U, Y, C, f):
+    """Return the means and √3 σ of the logits of R relations for P pairs in B batches, (B, R, P).
+
+    The mean of a logit is base + U z, and its variance σ² is q'C q - sum_u (f_u'q)² with q = Y z.
+    z are the factors of the pair, and base are the terms that do not depend on the hidden units;
+    see `SharedUnits`.
+
+    Args:
+        w: weights of the units; see `SharedArrays`.
+        first: index of the first of the R consecutive relations.
+        ends: subject and object classes of the pairs, (B, P); see `Ends`.
+        U: (B, R, K) weights of the factors.
+        Y: (R, r, K) matrix Y of each relation. σ is 0 if r is 0.
+        C: (B, R, r (r + 1) / 2) lower half of each symmetric r x r matrix C. Entries off the
+            diagonal are doubled. The function subtracts the products of f from C, in place.
+        f: (units u, B, R, r) vectors f_u.
+    """
+    # Local names are faster: each access through the tuple would change a reference count.
+    S, O, s, o, n, residual = w.S, w.O, w.s, w.o, w.n, w.residual  # noqa: E741
+    (B, P), (R, r, K) = ends.i.shape, Y.shape
+    width = -(-P // _VECTOR) * _VECTOR
+    z, q = np.zeros((K, B * width), np.float32), np.empty((r, B * width), np.float32)
+    mean, spread = np.empty((B, R, P), np.float32), np.empty((B, R, P), np.float32)
+    row, variance = np.empty(width, np.float32), np.empty(width, np.float32)
+    for b in range(B):
+        subjects, objects, log_i, log_j = ends.i[b], ends.j[b], ends.log_i[b], ends.log_j[b]
+        pairs = _pair_rows(w.start, w.key, subjects * len(S) + objects)
+        for p in range(P):
+            i, j = subjects[p], objects[p]
+            for k in range(K):
+                z[k, b * width + p] = S[i, k] * O[j, k]
+            for c in range(R):
+                a = first + c
+                of_counts = n[a, 0] * log_i[p] + n[a, 1] * log_j[p]
+                mean[b, c, p] = s[i, a] + o[j, a] + of_counts + residual[pairs[p], a]
+    for c in range(R):
+        for d in range(r):
+            _weighted_sum(Y[c, d], z, 0, q[d])
+        for b in range(B):
+            _weighted_sum(U[b, c], z, b * width, row)
+            for p in range(P):
+                mean[b, c, p] += row[p]
+            lower, t = C[b, c], 0
+            for u in range(len(f)):
+                _subtract_product(f[u, b, c], lower)
+            variance[:] = np.float32(0.0)
+            for d in range(r):
+                _weighted_sum(lower[t : t + d + 1], q, b * width, row)
+                t, q_d = t + d + 1, q[d, b * width : (b + 1) * width]
+                for p in range(width):
+                    variance[p] += row[p] * q_d[p]
+            for p in range(P):
+                spread[b, c, p] = np.sqrt(np.float32(3.0) * max(variance[p], np.float32(0.0)))
+    return mean, spread
+
+
+@compiled_in_any_order
+def _weighted_sum(weights, rows, start, total):
+    """Write sum_k weights_k rows_k (P,) to total. P columns of the rows begin at column start."""
+    K, P = len(weights), len(total)
+    total[:] = np.float32(0.0)
+    # Two rows at a time halve the reads and writes of the sum.
+    for k in range(0, K - 1, 2):
+        weight, row = weights[k], rows[k, start : start + P]
+        next_weight, next_row = weights[k + 1], rows[k + 1, start : start + P]
+        for p in range(P):
+            total[p] += weight * row[p] + next_weight * next_row[p]
+    if K % 2:
+        weight, row = weights[K - 1], rows[K - 1, start : start + P]
+        for p in range(P):
+            total[p] += weight * row[p]
+
+
+@compiled_in_any_order
+def _subtract_product(f, lower):
+    """Subtract f f' from a symmetric matrix, in place; see `_normal_logits` for its lower half."""
+    t = 0
+    for d in range(len(f)):
+        double = f[d] + f[d]
+        for e in range(d):
+            lower[t + e] -= double * f[e]
+        lower[t + d] -= f[d] * f[d]
+        t += d + 1
