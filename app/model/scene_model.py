@@ -69,7 +69,7 @@ class SceneModel:
         return RelationSlopes.of(self.calibration)
 
     @cached_property
-    def intruder_prior(self) -> Float[NDArray, "V"]:
+    def intruder_prior(self) -> Float[NDArray[np.float64], "V"]:
         """Log prior that an intruder has each class, up to a constant: alpha · popularity.
 
         A class that no training scene shows counts as the rarest other class.
@@ -84,7 +84,7 @@ class SceneModel:
         return np.where(np.isnan(popularity), alone - (1 - alpha) * rarest, alpha * popularity)
 
     @cached_property
-    def rarely_shown(self) -> Bool[NDArray, "V"]:
+    def rarely_shown(self) -> Bool[NDArray[np.bool_], "V"]:
         """True for classes that fewer than `RARELY` of the training scenes show."""
         if not self.calibration.popularity:
             return np.zeros(self.spec.V, np.bool_)

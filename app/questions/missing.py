@@ -2,10 +2,11 @@
 
 The answers are object classes that the scene does not list (candidates), and their placements
 (`app.questions.placements`). Structural classes (floor, wall) are neither candidates nor anchors of
-placements.
+placements. `more` adds listed classes with probably more instances than listed, by the statistics
+of counts (`app.model.count_statistics`).
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -15,13 +16,17 @@ from numpy.typing import NDArray
 from app.errors import InvalidRequestError
 from app.inference.elementary import sigmoid
 from app.model.scene_model import SceneModel
-from app.questions.answer import EXPLAINED, Fields, named, reasons, significant
-from app.questions.counts import more
+from app.questions.answer import EXPLAINED, Fields, best, named, reasons, significant
 from app.questions.names import ErrorList
 from app.questions.placements import Place, place_log_p, placements
-from app.questions.posterior import LEAST_CHANGE, Posterior, calibrated_missing, log_odds_of
+from app.questions.posterior import (
+    LEAST_CHANGE,
+    Posterior,
+    Present,
+    calibrated_missing,
+    log_odds_of,
+)
 from app.questions.question import LABELS, REFUSED, SCENES, Example, Options, Question
-from app.questions.ranking import best
 from app.questions.reading import Reading
 from app.scene.scene import Scene
 from app.scene.spatial_relations import CANONICAL, opposite
@@ -31,7 +36,12 @@ from scene_client.schemas import Anchor, MissingAnswer, MissingRequest
 VIEWER = viewer_axes()
 """Axes of a viewer who looks along the x axis of the frame."""
 
+LIKELY: Final = 0.5
+"""Minimum probability of further instances at which an answer contains a class."""
+
 _BLOCK: Final = 32
+_OUTSIDE: Final = 0.1  # probability of a count below `low`, and of a count above `high`
+_FIELDS: Final = ("listed_count", "expected_count", "low", "high", "probability")
 
 
 def missing(
@@ -95,7 +105,7 @@ def missing(
                     requested["probability"] = p
         if len(posterior.present.classes):
             explained = classes[:EXPLAINED]
-            change = posterior.reasons_for_absent(explained)
+            change = model.objects.reasons_for_absent(posterior.context, scene.profile, explained)
             slope = (calibration.missing if coverage is None else calibration.covered).slope
             causes = reasons(scene, posterior.present, change, least=LEAST_CHANGE, scale=slope)
             for entry, because in zip(entries, causes, strict=False):
@@ -112,6 +122,71 @@ def missing(
         )
     used_coverage = calibration.coverage if coverage is None else coverage
     return {"coverage": used_coverage, "missing": entries, "more": further}
+
+
+def more(
+    model: SceneModel,
+    scene: Scene,
+    listing: Present,
+    *,
+    top_k: int = 10,
+    candidates: Collection[int] | None = None,
+    coverage: float | None = None,
+) -> list[Fields]:
+    """Return the listed classes with probably more instances than listed, likeliest first.
+
+    Listed objects count as present, whatever their confidence. The answer never contains structural
+    classes, classes without statistics, or classes with more listed objects than these cover.
+
+    Args:
+        scene: the listed objects and the room type. The first object of a class is its name in
+            the request.
+        listing: the classes of the listed objects.
+        top_k: maximum number of classes in the answer.
+        candidates: indices of classes. The answer then contains these classes at any probability,
+            and no others. None means all classes with a probability of at least `LIKELY`.
+        coverage: probability that the request lists an object of the scene. Only values above the
+            model's coverage change the answer. At 1, the scene has no further instances.
+
+    Returns:
+        The fields of `scene_client.schemas.MoreInstances`. `low` and `high` are limits of the
+        number of instances, which is between them with a probability of at least 0.8.
+    """
+    if model.counts is None:
+        return []
+    # Words without a class have no statistics; their classes follow those of the statistics.
+    size = model.vocabulary.trained
+    plain = ~model.vocabulary.structure[listing.classes] & (listing.classes < size)
+    classes, listed = listing.classes[plain], listing.counts[plain]
+    own, unlisted = model.calibration.coverage, 1.0
+    if coverage is not None and coverage > own:
+        unlisted = (1 - coverage) / (1 - own)
+    rows, p = model.counts.distribution(size, classes, listed, scene.room_type, unlisted)
+    classes, listed = classes[rows], listed[rows]
+    numbers, cumulative = np.arange(1, p.shape[1] + 1), p.cumsum(axis=1)
+    p_more = 1 - cumulative[np.arange(len(p)), listed - 1]
+    usable = p_more >= LIKELY if candidates is None else np.isin(classes, list(candidates))
+    order = best(p_more, usable, top_k)
+    if not len(order):
+        return []
+    labels, first = model.vocabulary.labels, listing.first[plain][rows][order]
+    names = [
+        named(labels[index], scene.objects[number].label)
+        for index, number in zip(classes[order].tolist(), first.tolist(), strict=True)
+    ]
+    columns = (
+        listed[order].tolist(),
+        significant(p[order] @ numbers),
+        *(
+            ((cumulative[order] < share).sum(axis=1) + 1).tolist()
+            for share in (_OUTSIDE, 1 - _OUTSIDE)
+        ),
+        significant(p_more[order]),
+    )
+    return [
+        name | dict(zip(_FIELDS, values, strict=True))
+        for name, *values in zip(names, *columns, strict=True)
+    ]
 
 
 def _ranked(

@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 from app.inference.elementary import sigmoid
 from app.model.calibration import CountSlope, Sensitivity
 from app.model.scene_model import SceneModel
-from app.questions.answer import EXPLAINED, Fields, reasons, rounded_number, significant
+from app.questions.answer import EXPLAINED, Fields, best, reasons, rounded_number, significant
 from app.questions.misplaced import misplaced_fields
 from app.questions.posterior import Posterior, calibrated
 from app.questions.question import REFUSED, SCENES, WITH_TOILET, Example, Options, Question
-from app.questions.ranking import best
 from app.questions.reading import Reading
 from app.scene.scene import Scene, SceneObject
 from scene_client.schemas import OutliersAnswer, OutliersRequest, SceneWarning

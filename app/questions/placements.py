@@ -16,9 +16,8 @@ from app.inference.quadrature import NO_UNIT
 from app.model.offset_statistics import UNOBSERVED, rotated_offsets
 from app.model.place_statistics import add_unseen
 from app.model.scene_model import SceneModel
-from app.questions.answer import Fields, significant
+from app.questions.answer import Fields, best, significant
 from app.questions.posterior import Posterior, exclusive, relation_probability
-from app.questions.ranking import best
 from app.scene.scene import Scene, SceneObject, boxes_of
 from app.scene.spatial_relations import (
     INSIDE,

@@ -88,10 +88,10 @@ def given_relations(scene: Scene, present: Present, relations: int) -> ObservedR
     Args:
         relations: number of canonical relations that the machine knows.
     """
-    if scene.relations is None or not scene.has_observations:
+    if scene.relations is None:
         return None
     columns = scene.relations.of_classes(present.row, len(present.classes), relations)
-    return ObservedRelations(*columns)
+    return None if columns is None else ObservedRelations(*columns)
 
 
 class Posterior:
@@ -136,14 +136,13 @@ class Posterior:
         return self._objects.absent(*arguments)[absent]
 
     def given_rest(self, *, explained: bool = False) -> tuple[Floats, Floats]:
-        """See `ObjectScorer.given_rest`."""
+        """Return the log-odds of each listed class given the others, and their changes by each.
+
+        `ObjectScorer.given_rest` describes the results.
+        """
         return self._objects.given_rest(
             self.context, self._profile, self._room, explained=explained
         )
-
-    def reasons_for_absent(self, candidates: Indices) -> Floats:
-        """See `ObjectScorer.reasons_for_absent`."""
-        return self._objects.reasons_for_absent(self.context, self._profile, candidates)
 
     def room_log_p(self) -> Doubles:
         """Return log p(t | objects) of each room type t, (C,), in a scene of unknown room type."""
@@ -195,7 +194,10 @@ class Posterior:
     def placement_log_odds(
         self, candidates: Indices, anchors: Indices, only: int | None = None
     ) -> tuple[Floats, Floats]:
-        """See `RelationUnits.placement_log_odds`."""
+        """Return the log-odds of R relations from N candidates to m anchors, and back, (N, R, m).
+
+        `RelationUnits.placement_log_odds` describes the arguments.
+        """
         return self._units.placement_log_odds(self.context, candidates, anchors, only)
 
     @cached_property

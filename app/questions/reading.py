@@ -63,7 +63,8 @@ class Reading:
     @property
     def vocabulary(self) -> Vocabulary:
         """The classes of the model, and those of the words that are read by their meaning."""
-        return self.unknown.vocabulary.with_words(list(self.unknown.words.values()))
+        words = list(self.unknown.words.values())
+        return self.unknown.vocabulary.with_words(words) if words else self.unknown.vocabulary
 
     @cached_property
     def names(self) -> Names:

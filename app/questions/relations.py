@@ -16,14 +16,14 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled, inlined
 from app.errors import InvalidRequestError, Location
 from app.inference.quadrature import NO_UNIT
 from app.model.scene_model import SceneModel
-from app.questions.answer import Fields, significant
+from app.questions.answer import Fields, best, significant
 from app.questions.names import ErrorList
 from app.questions.placements import supported_objects
 from app.questions.posterior import (
@@ -33,8 +33,8 @@ from app.questions.posterior import (
     relation_probability,
 )
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
-from app.questions.ranking import best
 from app.questions.reading import Reading
+from app.scene.relation_table import RelationTable
 from app.scene.scene import Scene
 from app.scene.spatial_relations import (
     CANONICAL,
@@ -45,6 +45,9 @@ from app.scene.spatial_relations import (
     relation_names,
 )
 from scene_client.schemas import RelationsAnswer, RelationsRequest, SceneWarning
+
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 EXPECTED = 0.5
 """Minimum probability of the expected relation of a disagreement.
@@ -100,7 +103,7 @@ def relations(
     # This limit is slightly lower than the requested minimum, because the final comparison uses
     # rounded probabilities.
     least = min_probability * (1 - 1e-5)
-    table = slopes.relation_given if scene.has_observations else slopes.relation
+    table = slopes.relation if posterior.context.observed is None else slopes.relation_given
     log_odds, log_counts, row = posterior.relation_log_odds(), present.log_counts, present.row
     evidence = _evidence(model, posterior, scene)
     subjects, objects, kinds, p, of_model = _likeliest_relations(
@@ -165,8 +168,8 @@ def _evidence(
 
 def _judged(
     model: SceneModel, present: Present, pairs: Sequence[tuple[int, int]] | None
-) -> NDArray[np.bool_]:
-    """Return a bool mask (N subjects, N objects) of the ordered pairs to judge."""
+) -> Bool[Mask, "N N"]:
+    """Return whether to judge each ordered pair of objects."""
     size = len(present.row)
     if pairs is None:
         things = ~model.vocabulary.structure[present.classes][present.row]
@@ -181,62 +184,100 @@ def _disagreements(
     model: SceneModel,
     scene: Scene,
     posterior: Posterior,
-    judged: NDArray[np.bool_],
+    judged: Bool[Mask, "N N"],
     *,
     top_k: int,
     least: float,
 ) -> list[Fields]:
     """Return the fields of `scene_client.schemas.Disagreement` for each disagreement.
 
-    Disagreements with the largest ratio of `probability` to `observed_probability` come first. If a
-    pair has several observed relations, the first of them in `CANONICAL` defines the subject of the
-    disagreement. A relation is never expected if the machine has no unit for it. ``judged`` is
-    (N, N) bool. The function judges a pair of objects if one of its two orders is True.
+    Disagreements with the largest ratio of `probability` to `observed_probability` come first. The
+    observed probability is that of the likeliest observed relation. A relation is never expected if
+    the machine has no unit for it, or if two objects of the same classes have it. The function
+    judges a pair of objects if one of its two orders is True in ``judged``.
     """
-    A, present = model.spec.A, posterior.present
-    stated = [triple for triple in scene.triples if triple[0] < A]
-    if not stated:
+    A, (row, n) = model.spec.A, (posterior.present.row, len(posterior.present.classes))
+    if scene.relations is None or not scene.triples:
         return []
-    pairs = _observed_pairs(np.array(stated), present.row, judged, len(present.classes), A)
-    subjects, objects, holds, of_classes = pairs
+    stated = scene.relations.holding
+    stated = stated.rows(stated.relation < A)
+    holds, of_classes = _named_relations(stated, row, n, A)
+    subjects, objects = _observed_pairs(holds, judged, A)
     if not len(subjects):
         return []
-    i, j = present.row[subjects], present.row[objects]
-    table, least = model.relation_slopes.relation_given, max(least, EXPECTED)
-    log_odds, log_counts = posterior.log_odds_apart(i, j), present.log_counts
-    chosen, expected, p, observed_p = _disagreeing(
-        table, *log_odds, log_counts[i] + log_counts[j], holds, of_classes, least, top_k
-    )
-    columns = *(part[chosen].tolist() for part in (subjects, objects, holds)), expected.tolist()
+    i, j = row[subjects], row[objects]
+    log_odds, log_counts = posterior.log_odds_apart(i, j), posterior.present.log_counts
+    slopes, counts = model.relation_slopes.relation_given, log_counts[i] + log_counts[j]
+    to, back = (relation_probability(slopes, part[None], counts)[0] for part in log_odds)
+    # A relation cannot hold in both directions; see `exclusive`.
+    total = np.maximum(to + back, np.float32(1.0))
+    p = np.concatenate([to / total, back / total]).T.astype(np.float64)
+    has_unit = np.concatenate(log_odds).T > NO_UNIT
+    expected, every = np.where(has_unit, p, -1.0).argmax(1), np.arange(len(p))
+    observed = np.where(holds[subjects, objects], p, 0.0).max(1)
+    likeliest = p[every, expected]
+    usable = has_unit.any(1) & ~of_classes[i, j, expected] & (likeliest > observed)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = likeliest / observed
+    chosen = best(ratio, usable & (likeliest >= max(least, EXPECTED)), top_k)
+    columns = subjects[chosen].tolist(), objects[chosen].tolist(), expected[chosen].tolist()
+    names = holds[subjects, objects][chosen]
     return [
         {
-            **_names(scene, A, subject, object_, bits, kind),
+            **_names(scene, A, subject, object_, flags.nonzero()[0].tolist(), kind),
             "probability": probability,
             "observed_probability": observed_probability,
         }
-        for subject, object_, bits, kind, probability, observed_probability in zip(
-            *columns, significant(p), significant(observed_p), strict=True
+        for subject, object_, kind, flags, probability, observed_probability in zip(
+            *columns,
+            names,
+            significant(likeliest[chosen]),
+            significant(observed[chosen]),
+            strict=True,
         )
     ]
 
 
+def _named_relations(
+    stated: RelationTable, row: Int[Indices, "N"], n: int, A: int
+) -> tuple[Bool[Mask, "N N B"], Bool[Mask, "n n B"]]:
+    """Return which of the B = 2A relations hold from each object, and class, to each other one.
+
+    Relation A + a is the opposite of relation a.
+    """
+    N, a = len(row), stated.relation
+    holds, of_classes = np.zeros((N, N, 2 * A), np.bool_), np.zeros((n, n, 2 * A), np.bool_)
+    for grid, i, j in (
+        (holds, stated.subject, stated.object),
+        (of_classes, row[stated.subject], row[stated.object]),
+    ):
+        grid[i, j, a] = grid[j, i, A + a] = True
+    return holds, of_classes
+
+
+def _observed_pairs(
+    holds: Bool[Mask, "N N B"], judged: Bool[Mask, "N N"], A: int
+) -> tuple[Int[Indices, "P"], Int[Indices, "P"]]:
+    """Return the subjects and objects of the pairs with an observed relation, in either order.
+
+    The subject is that of the first of the pair's relations in `CANONICAL`.
+    """
+    forward = holds[..., :A]
+    first = np.where(forward.any(-1), forward.argmax(-1), A)
+    x, y = np.triu(holds.any(-1) & (judged | judged.T), 1).nonzero()
+    swapped = first[y, x] < first[x, y]
+    return np.where(swapped, y, x), np.where(swapped, x, y)
+
+
 def _names(
-    scene: Scene,
-    A: int,
-    subject: int,
-    object_: int,
-    holds: int,
-    expected: int,
+    scene: Scene, A: int, subject: int, object_: int, observed_kinds: list[int], expected: int
 ) -> Fields:
     """Return the names of a disagreement, from the subject of the relation in the request.
 
-    Args:
-        A: number of canonical relations that the machine knows.
-        holds: bit set of the observed relations; see `_observed_pairs`.
-        expected: number of the expected relation.
+    `observed_kinds` and `expected` are indices in `relation_names(A)`.
     """
     names = relation_names(A)
-    observed = [name for bit, name in enumerate(names) if holds >> bit & 1]
+    observed = [names[kind] for kind in observed_kinds]
     triples = {canonicalise(subject, relation, object_) for relation in observed}
     # A relation comes from this subject if the request states it with this subject, or if the
     # request states its opposite with the other object as subject.
@@ -350,98 +391,6 @@ def with_evidence(p, evidence, opposite):
     if opposite > _EXCLUDED:
         return min(p, _MOST_EXCLUDED, max(np.float32(1.0) - opposite, np.float32(0.0)))
     return min(p, _MOST_EXCLUDED) if evidence == _EXCLUDED else p
-
-
-@compiled
-def _observed_pairs(triples, row, judged, classes, relations):
-    """Return the pairs of objects with at least one observed relation, and their relations.
-
-    A bit set contains the relations of a pair. Bit a stands for relation a from subject to object.
-    Bit A + a stands for relation a from object to subject.
-
-    Args:
-        triples: (T, 3) observed relations, each as (relation, subject, object).
-        row: (N,) index of each object's class among the n classes.
-        judged: (N, N) bool, True for the ordered pairs of objects to judge. The result contains a
-            pair if one of its two orders is True.
-        classes: number n of classes in the scene.
-        relations: number A of canonical relations.
-
-    Returns:
-        Four arrays (P,): subject, object, bit set of the relations between these two objects, and
-        bit set of the relations between any two objects of their classes.
-    """
-    size = len(row)
-    holds, of_classes = np.zeros((size, size), np.int64), np.zeros((classes, classes), np.int64)
-    for t in range(len(triples)):
-        a, x, y = triples[t, 0], triples[t, 1], triples[t, 2]
-        holds[x, y] |= 1 << a
-        holds[y, x] |= 1 << (relations + a)
-        of_classes[row[x], row[y]] |= 1 << a
-        of_classes[row[y], row[x]] |= 1 << (relations + a)
-    columns = np.empty((4, min(len(triples), size * size)), np.int64)
-    pairs, forward = 0, (1 << relations) - 1
-    for x in range(size):
-        for y in range(x + 1, size):
-            if holds[x, y] and (judged[x, y] or judged[y, x]):
-                # The subject of the pair is the subject of its observed relation with the lowest
-                # number. n & -n is the lowest bit of n.
-                from_x, from_y = holds[x, y] & forward, holds[y, x] & forward
-                y_is_lower = from_y != 0 and (from_y & -from_y) < (from_x & -from_x)
-                swapped = from_x == 0 or y_is_lower
-                subject, object_ = (y, x) if swapped else (x, y)
-                columns[0, pairs], columns[1, pairs] = subject, object_
-                columns[2, pairs] = holds[subject, object_]
-                columns[3, pairs] = of_classes[row[subject], row[object_]]
-                pairs += 1
-    return columns[0, :pairs], columns[1, :pairs], columns[2, :pairs], columns[3, :pairs]
-
-
-@compiled
-def _disagreeing(slopes, forward, backward, log_counts, holds, of_classes, least, count):
-    """Return the `count` pairs whose observed relations differ most from the expected relation.
-
-    The expected relation of a pair is its likeliest relation. The observed probability is the
-    probability of the likeliest observed relation. Pairs are ranked by the probability of the
-    expected relation divided by the observed probability. The result contains a pair only if its
-    expected relation is not observed between any two objects of its classes.
-
-    Args:
-        slopes: (A, 3) table of `RelationSlopes`.
-        forward: (A, P) log-odds of the relations from subject to object.
-        backward: (A, P) log-odds of the relations from object to subject.
-        log_counts: (P,) log of the number of object pairs with these two classes.
-        holds, of_classes: (P,) bit sets of the relations of the pair and of its classes; see
-            `_observed_pairs`.
-        least: minimum probability of an expected relation.
-        count: maximum number k of pairs.
-
-    Returns:
-        Four arrays (k,): index of the pair, number of the expected relation, probability of the
-        expected relation, and observed probability.
-    """
-    A, P = forward.shape
-    to = relation_probability(slopes, forward.reshape(1, A, P), log_counts)[0]
-    back = relation_probability(slopes, backward.reshape(1, A, P), log_counts)[0]
-    expected, ratio = np.empty(P, np.int64), np.empty(P, np.float64)
-    likely, usable = np.empty((2, P), np.float64), np.zeros(P, np.bool_)
-    p = np.empty(2 * A, forward.dtype)
-    for k in range(P):
-        for a in range(A):
-            p[a], p[A + a] = exclusive(to[a, k], back[a, k])
-        top, observed = -1, np.float64(0.0)
-        for name in range(2 * A):
-            log_odds = forward[name, k] if name < A else backward[name - A, k]
-            if log_odds > NO_UNIT and (top < 0 or p[name] > p[top]):
-                top = name
-            if holds[k] >> name & 1:
-                observed = max(observed, np.float64(p[name]))
-        if top >= 0 and not of_classes[k] >> top & 1 and p[top] > observed and p[top] >= least:
-            usable[k], expected[k] = True, top
-            likely[0, k], likely[1, k] = p[top], observed
-            ratio[k] = likely[0, k] / observed
-    indices = best(ratio, usable, count)
-    return indices, expected[indices], likely[0][indices], likely[1][indices]
 
 
 _NO_RELATIONS: Final = SceneWarning(

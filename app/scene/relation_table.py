@@ -5,7 +5,7 @@ object to another object. Its probability is 1 if the relation holds, and 0 if i
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
 from typing import Any, Final, TypeAlias
 
@@ -25,6 +25,7 @@ not hold, or the boxes show this. A row of origin `EXCLUDED` observes nothing ab
 its relation alone cannot hold between these boxes."""
 
 _A: Final = len(CANONICAL)
+_COLUMNS: Final = ("relation", "subject", "object", "probability", "origin", "is_opposite")
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +48,7 @@ class RelationTable:
     probability: Float32[Array, "R"]
     origin: Int[Array, "R"]
     is_opposite: Bool[Array, "R"]
+    _: KW_ONLY
     of_boxes: bool = False
 
     @classmethod
@@ -64,17 +66,14 @@ class RelationTable:
             is_opposite: whether the request states each relation by its opposite; by default, none.
             complete_for: number of objects, if no other relations between them hold.
         """
-        columns = np.array(list(triples), dtype=np.int64).reshape(-1, 3).T
-        n, unlisted = columns.shape[1], np.zeros((3, 0), np.int64)
-        if complete_for is not None:
-            grid = np.ones((_A, complete_for, complete_for), np.bool_)
-            grid[tuple(columns)] = False
-            unlisted = np.array(_between_two(grid))
-        more = unlisted.shape[1]
-        flags = np.zeros(n + more, np.bool_)
-        flags[:n] = False if is_opposite is None else is_opposite
-        p = np.repeat(np.float32([1, 0]), [n, more])
-        return cls(*np.hstack([columns, unlisted]), p, np.full(n + more, STATED), flags)
+        relation, subject, object_ = np.array(list(triples), np.int64).reshape(-1, 3).T
+        n = len(relation)
+        flags = np.zeros(n, np.bool_) if is_opposite is None else np.array(is_opposite, np.bool_)
+        p = np.ones(n, np.float32)
+        table = cls(relation, subject, object_, p, np.full(n, STATED), flags)
+        if complete_for is None:
+            return table
+        return table.excluding(np.ones((_A, complete_for, complete_for), np.bool_), STATED)
 
     @classmethod
     def shown_by_boxes(
@@ -90,31 +89,28 @@ class RelationTable:
             observed: relations that hold or do not hold.
             excluded: relations that cannot hold, observed or not.
         """
-        columns = _between_two(observed | excluded)
-        origin = np.where(observed[columns], BOXES, EXCLUDED)
-        p = holds[columns].astype(np.float32)
-        return cls(*columns, p, origin, np.zeros(len(p), np.bool_), of_boxes=True)
+        a, i, j = _between_two(observed | excluded)
+        origin = np.where(observed[a, i, j], BOXES, EXCLUDED)
+        p = holds[a, i, j].astype(np.float32)
+        return cls(a, i, j, p, origin, np.zeros(len(p), np.bool_), of_boxes=True)
 
-    def with_excluded(self, excluded: Bool[Array, "A N N"]) -> "RelationTable":
-        """Return the table with the relations that boxes exclude, without those that hold."""
-        grid, stated = excluded.copy(), self.holding
-        grid[stated.relation, stated.subject, stated.object] = False
-        columns = _between_two(grid)
-        n = len(columns[0])
-        new = *columns, np.zeros(n, np.float32), np.full(n, EXCLUDED), np.zeros(n, np.bool_)
-        return RelationTable(*map(np.concatenate, zip(self._columns, new, strict=True)))
-
-    @property
-    def _columns(self) -> tuple[Array, ...]:
-        ends = self.subject, self.object
-        return self.relation, *ends, self.probability, self.origin, self.is_opposite
+    def excluding(self, grid: Bool[Array, "A N N"], origin: int) -> "RelationTable":
+        """Return the table with relations that do not hold: those of a grid, unless they hold."""
+        others, holding = grid.copy(), self.holding
+        others[holding.relation, holding.subject, holding.object] = False
+        a, i, j = _between_two(others)
+        off = np.zeros(len(a), np.float32)
+        new = a, i, j, off, np.full(len(a), origin), off.astype(np.bool_)
+        columns = zip(_COLUMNS, new, strict=True)
+        joined = {name: np.concatenate([getattr(self, name), more]) for name, more in columns}
+        return replace(self, **joined)
 
     def __len__(self) -> int:
         return len(self.relation)
 
     def rows(self, chosen: Bool[Array, "R"]) -> "RelationTable":
         """Return the chosen rows."""
-        return RelationTable(*(column[chosen] for column in self._columns), of_boxes=self.of_boxes)
+        return replace(self, **{name: getattr(self, name)[chosen] for name in _COLUMNS})
 
     @cached_property
     def holding(self) -> "RelationTable":
@@ -124,19 +120,15 @@ class RelationTable:
     @cached_property
     def triples(self) -> tuple[Triple, ...]:
         """The relations that hold."""
-        columns = self.holding.relation, self.holding.subject, self.holding.object
-        return tuple(zip(*(column.tolist() for column in columns), strict=True))
+        holds = self.probability > 0
+        columns = self.relation, self.subject, self.object
+        return tuple(zip(*(column[holds].tolist() for column in columns), strict=True))
 
     @cached_property
     def opposites(self) -> frozenset[Triple]:
         """The relations that hold and that the request states by their opposite."""
         flags = self.holding.is_opposite.tolist()
         return frozenset(triple for triple, flag in zip(self.triples, flags, strict=True) if flag)
-
-    @cached_property
-    def has_observations(self) -> bool:
-        """Whether the request or the boxes say something about relations."""
-        return self.of_boxes or bool((self.origin != EXCLUDED).any())
 
     def grids(self, N: int) -> tuple[Bool[Array, "A N N"], Bool[Array, "A N N"]]:
         """Return which relations between N objects hold, and which are observed."""
@@ -148,7 +140,7 @@ class RelationTable:
 
     def of_classes(
         self, row: Int[Array, "N"], n: int, A: int
-    ) -> tuple[Int[Array, "E"], Int[Array, "E"], Int[Array, "E"], Float32[Array, "E"]]:
+    ) -> tuple[Int[Array, "E"], Int[Array, "E"], Int[Array, "E"], Float32[Array, "E"]] | None:
         """Return the observed relations between n classes, in the order of their indices.
 
         A relation of classes has the largest probability of the relations between their objects.
@@ -159,9 +151,13 @@ class RelationTable:
             A: number of relations that the machine knows.
 
         Returns:
-            Relation, subject class, object class and probability of each observation.
+            Relation, subject class, object class and probability of each observation; None without
+            observations. Boxes observe something even if they show no relation.
         """
-        used = (self.origin != EXCLUDED) & (self.relation < A)
+        is_observed = self.origin != EXCLUDED
+        if not (self.of_boxes or is_observed.any()):
+            return None
+        used = is_observed & (self.relation < A)
         i, j = row[self.subject[used]], row[self.object[used]]
         grid = np.full(A * n * n, -1, np.float32)
         np.maximum.at(grid, (self.relation[used] * n + i) * n + j, self.probability[used])
@@ -170,7 +166,7 @@ class RelationTable:
         return relation, *np.divmod(pair, n), grid[units]
 
 
-def _between_two(grid: Bool[Array, "A N N"]) -> tuple[Array, ...]:
+def _between_two(grid: Bool[Array, "A N N"]) -> tuple[Array, Array, Array]:
     """Return the indices of the relations that are True, without those of an object to itself."""
     a, i, j = grid.nonzero()
     other = i != j

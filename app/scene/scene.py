@@ -19,7 +19,7 @@ from app.scene.geometry import (
     excluded_by_centres,
     to_viewer_frame,
 )
-from app.scene.relation_table import RelationTable, Triple
+from app.scene.relation_table import EXCLUDED, RelationTable, Triple
 from app.scene.roles import RoleCounts
 
 Point = tuple[float, float, float]
@@ -82,11 +82,6 @@ class Scene:
         """Whether the observed relations come from boxes."""
         return self.relations is not None and self.relations.of_boxes
 
-    @property
-    def has_observations(self) -> bool:
-        """Whether something states or shows which relations hold."""
-        return self.relations is not None and self.relations.has_observations
-
 
 # ------------------------------------------------------------------------- relations from poses
 
@@ -135,7 +130,7 @@ def observe(
     far = excluded_by_centres(points, sizes, horizontal=has_viewer)
     if scene.relations is not None:
         excluded = far | (poses.observed & ~poses.holds)
-        return replace(scene, relations=scene.relations.with_excluded(excluded))
+        return replace(scene, relations=scene.relations.excluding(excluded, EXCLUDED))
     table = RelationTable.shown_by_boxes(poses.holds, poses.observed, far)
     return replace(scene, objects=objects, relations=table)
 

@@ -108,8 +108,9 @@ class Request:
                 may_be_empty=question.samples,
             )
             options = question.read(scene, model, reading)
-            with_words = model.with_words(list(reading.unknown.words.values()))
-            return reading, partial(question.answer, with_words, reading.scene, **options)
+            words = list(reading.unknown.words.values())
+            asked = model.with_words(words) if words else model
+            return reading, partial(question.answer, asked, reading.scene, **options)
 
         def finish(reading: Reading, ask: Callable[[], Fields], began: float) -> _Computed:
             fields = ask()

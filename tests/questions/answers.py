@@ -11,7 +11,7 @@ import pytest
 
 from app import questions
 from app.model import SceneModel
-from app.questions import counts
+from app.questions.missing import more as more_instances
 from app.questions.posterior import present
 from app.scene import Scene
 
@@ -41,7 +41,7 @@ def _question(function: Callable[..., Any], *path: str) -> Callable[..., Any]:
 
 
 def _more(artifact: SceneModel, scene: Scene, **options: Any) -> Any:
-    return counts.more(artifact, scene, present(scene, artifact.spec), **options)
+    return more_instances(artifact, scene, present(scene, artifact.spec), **options)
 
 
 # The answer to `outliers` has all its fields. The other functions return one list of an answer.

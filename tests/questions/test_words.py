@@ -40,7 +40,7 @@ def test_a_word_that_is_listed_is_evidence(variant) -> None:
     without = Posterior(artifact, Scene(objects(artifact, "bed")))
     absent = np.array([1, 2])
     change = posterior.absent_log_odds(absent, 0.5) - without.absent_log_odds(absent, 0.5)
-    reason = posterior.reasons_for_absent(absent)[:, 1]
+    reason = artifact.objects.reasons_for_absent(posterior.context, None, absent)[:, 1]
     assert change == pytest.approx(reason, abs=1e-4)
     assert np.abs(change).min() > 1e-4
 

@@ -173,7 +173,7 @@ def test_a_relation_of_classes_has_the_largest_probability_of_their_objects(
     evidence = pool_instances(classes, holds & observed, observed)
     table = RelationTable.shown_by_boxes(holds & observed, observed, ~observed)
     row = np.searchsorted(evidence.classes, classes)
-    a, i, j, p = table.of_classes(row, len(evidence.classes), A - 1)
+    a, i, j, p = table.of_classes(row, len(evidence.classes), A - 1) or ()
     expected = np.argwhere(evidence.observed[: A - 1])
     assert np.stack([a, i, j], 1).tolist() == expected.tolist()
     assert p.tolist() == evidence.holds[tuple(expected.T)].tolist()

@@ -22,7 +22,7 @@ import torch
 
 from app.model import SceneModel
 from app.model.count_statistics import Counts
-from app.questions.counts import LIKELY, more
+from app.questions.missing import LIKELY, more
 from app.questions.posterior import present
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Ints

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from app.model import Counts
-from app.questions.counts import distribution
 from app.scene import ObjectClass, Vocabulary
 from tests.training.evaluation.furnished_rooms import VOCABULARY, room_model, rooms
 from tests.training.evaluation.scenes import scene
@@ -37,7 +36,7 @@ def furnished(number: int, seed: int, source: str = "toy"):
 
 
 def expected(counts: Counts, anchor: int, listed: int) -> float:
-    _, p = distribution(counts, len(WORDS), np.array([CHAIR, anchor]), np.array([listed, 1]))
+    _, p = counts.distribution(len(WORDS), np.array([CHAIR, anchor]), np.array([listed, 1]))
     return float(p[0] @ np.arange(1, MOST + 1))
 
 
