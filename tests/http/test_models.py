@@ -221,7 +221,8 @@ async def test_requests_are_answered_while_the_store_is_read(
 async def test_a_request_keeps_the_models_it_started_with(
     own: httpx.AsyncClient, store: Path, hold: Hold
 ) -> None:
-    held = hold("missing", lambda manifest: manifest.version == "1.0.0")
+    served = own.app.state.runtime.models.served  # type: ignore[attr-defined]
+    held = hold("missing", lambda model: model is served["home", "1.0.0"].model)
     batch = {"scenes": [{"objects": ["bed"] * 33}] * 3}  # so many are not for the event loop
     asking = asyncio.create_task(own.post("/missing/batch", json=batch))
     assert await asyncio.to_thread(held.started.wait, PATIENCE)
