@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled
@@ -64,14 +65,14 @@ class Offsets(TensorGroup):
         self.require(is_right, "variances and standard deviations must be positive")
 
     def find(
-        self, relation: Ints, subject: Ints, other: Ints
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return the offsets of n pairs (relation, subject class, object class) of indices (n,).
+        self, relation: Int[Ints, "n"], subject: Int[Ints, "n"], other: Int[Ints, "n"]
+    ) -> tuple[Float[NDArray[np.float64], "n 6"], Int[NDArray[np.int64], "n"]]:
+        """Return the offsets of pairs: relation, subject class and object class.
 
         Returns:
-            Offsets (n, 6): mean (3) and standard deviation (3). Then the number of training scenes
-            that contain each pair, (n,). If it is 0, the offset is the sum of a term of the
-            relation and one term of each class. `UNOBSERVED`: training lacks the relation.
+            Offsets: mean (3) and standard deviation (3). Then the number of training scenes that
+            contain each pair. If it is 0, the offset is the sum of a term of the relation and one
+            term of each class. `UNOBSERVED`: training lacks the relation.
         """
         return _look_up_offsets(self.tables, relation, subject, other)
 
@@ -134,7 +135,7 @@ def rotated_offsets(tables, relation, missing, anchor, outgoing, axes, has_axes)
 
 @compiled
 def _look_up_offsets(tables, relation, subject, other):
-    """See `Offsets.find`."""
+    """Return the offsets and the numbers of scenes of `Offsets.find`."""
     relation_offset, relation_scenes, subjects, objects, pair, pair_offset, pair_scenes = tables
     n, V = len(relation), subjects.shape[1]
     offset, scenes = np.empty((n, 6)), np.empty(n, np.int64)

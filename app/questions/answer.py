@@ -9,6 +9,7 @@ from typing import Any, Final, TypeAlias
 
 import numpy as np
 import orjson
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from pydantic_core import from_json, to_json, to_jsonable_python
 
@@ -69,8 +70,8 @@ def named(label: str, word: str | None) -> Fields:
 def reasons(
     scene: Scene,
     present: Present,
-    change: NDArray[np.floating[Any]],
-    rows: NDArray[np.int64] | None = None,
+    change: Float[NDArray[np.floating[Any]], "N n"],
+    rows: Int[NDArray[np.int64], "N"] | None = None,
     *,
     least: float = 0.0,
     scale: float = 1.0,
@@ -81,10 +82,8 @@ def reasons(
     absolute changes come first. The answer names the first object of the class.
 
     Args:
-        change: (N, n) change of each explained class's log-odds by each of the n classes of the
-            scene.
-        rows: (N,) index of each explained class among the n classes. None means that the explained
-            classes are absent.
+        change: change of each explained class's log-odds by each class of the scene.
+        rows: index of each explained class among the classes of the scene; None: they are absent.
         least: minimum absolute value of a change. Rounding errors of a change of 0 are left out.
         scale: slope of the calibration, so that an answer's changes are those of its `log_odds`.
 
@@ -102,8 +101,8 @@ def reasons(
     return entries
 
 
-def significant(numbers: NDArray[np.floating[Any]]) -> list[float]:
-    """Round numbers (n,) to `DIGITS` significant digits."""
+def significant(numbers: Float[NDArray[np.floating[Any]], "n"]) -> list[float]:
+    """Round numbers to `DIGITS` significant digits."""
     values = numbers.astype(np.float64)
     exact = _round_to_digits(values)
     rounded: list[float] = values.tolist()

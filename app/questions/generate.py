@@ -19,6 +19,7 @@ from collections.abc import Callable, Collection, Iterator
 from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled
@@ -84,6 +85,11 @@ def generate(
         The fields of `scene_client.schemas.GenerateAnswer`. For `log_score`, see
         `ConditionedChains.log_score`. Only scores of the same model, for the same listed classes
         and profile, can be compared.
+
+    Example:
+        >>> scene = Scene(model.vocabulary.bare_objects(["desk"]))
+        >>> "desk" in generate(model, scene, seed=1)["scenes"][0]["objects"]
+        True
     """
     listing = present(scene, model.spec)
     observed = given_relations(scene, listing, model.spec.A)
@@ -136,12 +142,12 @@ def _scene(
     model: SceneModel,
     chains: ConditionedChains,
     state: ChainState,
-    shown: NDArray[np.bool_],
+    shown: Bool[NDArray[np.bool_], "n"],
     evidence: set[Triple],
 ) -> Fields:
     """Return the fields of `scene_client.schemas.GeneratedScene` for a drawn scene.
 
-    ``shown`` (n,) is True for the classes of ``state`` that the answer lists.
+    ``shown`` is True for the classes of ``state`` that the answer lists.
     """
     labels, room_types = model.vocabulary.labels, model.vocabulary.room_types
     units = np.nonzero(state.r & shown[:, None] & shown)
@@ -163,12 +169,12 @@ def _scene(
 
 
 def staying(
-    units: NDArray[np.int64],
-    logits: NDArray[np.floating[Any]],
+    units: Int[NDArray[np.int64], "m 3"],
+    logits: Float[NDArray[np.floating[Any]], "m"],
     evidence: Collection[Triple],
-    structure: NDArray[np.bool_],
-) -> NDArray[np.bool_]:
-    """Select drawn relations that do not contradict each other. Return them as a bool mask (m,).
+    structure: Bool[NDArray[np.bool_], "V"],
+) -> Bool[NDArray[np.bool_], "m"]:
+    """Select drawn relations that do not contradict each other.
 
     Relations of the evidence always stay. The function then tries the other relations one by one,
     likeliest first. A tried relation stays if all of these conditions are met:
@@ -182,11 +188,11 @@ def staying(
       a drawn relation of such a class has no meaning.
 
     Args:
-        units: (m, 3) distinct triples (relation a, subject class i, object class j).
-        logits: (m,) logit of each triple. Of triples with equal logits, the smallest (a, i, j) is
-            tried first.
+        units: distinct triples (relation a, subject class i, object class j).
+        logits: logit of each triple. Of triples with equal logits, the smallest (a, i, j) is tried
+            first.
         evidence: triples (a, i, j) of the evidence.
-        structure: (V,) bool, True for structural classes.
+        structure: True for structural classes.
     """
     fixed = np.array(sorted(evidence), dtype=np.int64).reshape(-1, 3)
     order = np.lexsort((*units.T[::-1], -logits))
@@ -244,12 +250,12 @@ def _select_consistent(relation, ends, order, fixed, count):
 
 
 def is_plausible(
-    model: SceneModel, evidence: Scene, present: NDArray[np.int64], room: int | None
+    model: SceneModel, evidence: Scene, present: Int[NDArray[np.int64], "n"], room: int | None
 ) -> bool:
     """Return whether a drawn scene meets none of the three conditions of the module.
 
     Args:
-        present: (n,) indices of the classes of the drawn scene. Structural classes count only if
+        present: indices of the classes of the drawn scene. Structural classes count only if
             the evidence lists them.
         room: index of the room type of the drawn scene, or None if unknown.
     """

@@ -39,6 +39,7 @@ from itertools import chain
 from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from app.inference.elementary import sigmoid
@@ -90,16 +91,16 @@ class Entries(NamedTuple):
     """The n judged entries of a scene of N objects.
 
     Attributes:
-        triple: (n, 3) relation, subject and object. The object is -1 for the floor.
-        kind: (n,) index of the kind in `KINDS`.
-        terms: (n, 4) terms z, d, s and q; see the module.
-        mover: (n,) object that would have moved if the entry is wrong.
+        triple: relation, subject and object. The object is -1 for the floor.
+        kind: index of the kind in `KINDS`.
+        terms: terms z, d, s and q; see the module.
+        mover: object that would have moved if the entry is wrong.
     """
 
-    triple: Indices
-    kind: Indices
-    terms: Floats
-    mover: Indices
+    triple: Int[Indices, "n 3"]
+    kind: Int[Indices, "n"]
+    terms: Float[Floats, "n 4"]
+    mover: Int[Indices, "n"]
 
 
 _NO_ENTRIES: Final = Entries(
@@ -180,8 +181,8 @@ def _stands(
     scene: Scene,
     supports: Sequence[tuple[int, int]],
     heights: Heights | None,
-) -> tuple[Indices, Floats, Floats]:
-    """Return the stand of each of N objects, its log p, and log q of its supporter, (N,) each.
+) -> tuple[Int[Indices, "N"], Float[Floats, "N"], Float[Floats, "N"]]:
+    """Return the stand of each object, its log p, and log q of its supporter.
 
     The values are 0 for an unknown stand, and log p without poses.
 
@@ -230,8 +231,8 @@ def _heights(model: SceneModel, scene: Scene, classes: Indices) -> Heights:
     return Heights(bottoms, tops, heights.areas)
 
 
-def wrong_log_odds(judgement: Judgement, terms: Floats) -> Floats:
-    """Return the log-odds that entries of one kind are wrong, (n,). `terms` is (n, 4)."""
+def wrong_log_odds(judgement: Judgement, terms: Float[Floats, "n 4"]) -> Float[Floats, "n"]:
+    """Return the log-odds that entries of one kind are wrong."""
     weights = np.array([judgement.relation, judgement.change, judgement.stand, judgement.supporter])
     return judgement.intercept + terms @ weights
 

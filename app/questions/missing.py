@@ -8,9 +8,10 @@ of counts (`app.model.count_statistics`).
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from app.errors import InvalidRequestError
@@ -35,6 +36,10 @@ from scene_client.schemas import Anchor, MissingAnswer, MissingRequest
 
 VIEWER = viewer_axes()
 """Axes of a viewer who looks along the x axis of the frame."""
+
+Indices = NDArray[np.int64]
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 LIKELY: Final = 0.5
 """Minimum probability of further instances at which an answer contains a class."""
@@ -83,6 +88,11 @@ def missing(
 
     Returns:
         The fields `coverage`, `missing` and `more` of `scene_client.schemas.MissingAnswer`.
+
+    Example:
+        >>> scene = Scene(model.vocabulary.bare_objects(["desk", "chair"]))
+        >>> missing(model, scene, at=("on-top", 0))["missing"][0]["label"]
+        'laptop'
     """
     place = None if at is None else Place.of(*at)
     posterior = Posterior(model, scene)
@@ -196,12 +206,12 @@ def _ranked(
     candidates: Sequence[int] | None,
     place: Place | None,
     coverage: float | None,
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Int[Indices, "k"], Float[Floats, "k"], Float[Floats, "k"]]:
     """Return the likeliest candidates, likeliest first.
 
     Returns:
         The class indices, the log-odds that they are present (and at the place), and the
-        probabilities of the place if they are present (1 without a place), each (k,).
+        probabilities of the place if they are present (1 without a place).
     """
     vocabulary, listed = model.vocabulary, posterior.present.classes
     usable = ~vocabulary.structure
@@ -241,11 +251,10 @@ def _ranked(
     )
 
 
-def _one_of_a_family(related: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the indices of N ranked classes without those related to a class that is kept before.
+def _one_of_a_family(related: Bool[Mask, "N N"]) -> Int[Indices, "k"]:
+    """Return the indices of ranked classes without relatives of a better class.
 
-    Args:
-        related: (N, N) True for classes of one family.
+    ``related`` is True for classes of one family.
     """
     left_out = np.zeros(len(related), np.bool_)
     for k in np.flatnonzero(related.any(1)):
@@ -258,19 +267,16 @@ def _log_p_at(
     model: SceneModel,
     posterior: Posterior,
     place: Place,
-    usable: NDArray[np.bool_],
-    log_odds: NDArray[np.floating[Any]],
+    usable: Bool[Mask, "V"],
+    log_odds: Float[Floats, "V"],
     top_k: int,
-) -> NDArray[np.float64]:
-    """Return log p(present and at the place), (V,): log p(present) + log p(place | present).
+) -> Float[Floats, "V"]:
+    """Return log p(present and at the place): log p(present) + log p(place | present).
 
     The log probability of the relation is at most 0. So the other terms of `PlaceFit` give an upper
     bound. The function scores candidates in blocks, in descending order of this bound. It stops
     when the bound of the next candidate is below the `top_k` largest values. The remaining
-    candidates get the value -inf.
-
-    Args:
-        log_odds: (V,) log-odds that each class is present.
+    candidates get the value -inf. ``log_odds`` are those that each class is present.
     """
     entry, log_p = model.calibration.at[place.relation], -np.logaddexp(0.0, -log_odds)
     at_most = np.full_like(log_p, entry.intercept)

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from app.inference.elementary import sigmoid
@@ -27,6 +28,8 @@ from app.questions.question import REFUSED, SCENES, WITH_TOILET, Example, Option
 from app.questions.reading import Reading
 from app.scene.scene import Scene, SceneObject
 from scene_client.schemas import OutliersAnswer, OutliersRequest, SceneWarning
+
+Floats = NDArray[np.floating[Any]]
 
 COMPANIONS: Final = 3
 """Maximum number of companions in the answer for one outlier."""
@@ -73,6 +76,12 @@ def outliers(
         A list is empty if the model gives no such judgement. `warnings` names this case, a single
         class, and the objects of rare classes that reach the threshold.
         `threshold` is left out if the model judges no object and the caller states no threshold.
+
+    Example:
+        >>> labels = ["bed", "nightstand", "pillow", "toilet"]
+        >>> scene = Scene(model.vocabulary.bare_objects(labels))
+        >>> outliers(model, scene)["outliers"][0]["object"]
+        'toilet'
     """
     entry = model.calibration.outlier
     can_alarm = ~model.rarely_shown
@@ -105,14 +114,14 @@ def _judged(
     posterior: Posterior,
     scene: Scene,
     threshold: float,
-    can_alarm: NDArray[np.bool_],
+    can_alarm: Bool[NDArray[np.bool_], "V"],
     *,
     details: bool,
 ) -> tuple[list[Fields], list[SceneObject]]:
     """Return the fields of `scene_client.schemas.Outlier` for every object of a scene.
 
     The second result lists the objects that reach the threshold, but whose class raises no alarm.
-    `can_alarm` is True for the classes that raise an alarm, (V,).
+    `can_alarm` is True for the classes that raise an alarm.
 
     `because` lists up to three other objects, in order of their effect on `log_odds`. For an
     outlier, these objects raise its log-odds. For other objects, they lower the log-odds.
@@ -160,7 +169,14 @@ def _judged(
 def misplaced(
     model: SceneModel, scene: Scene, *, sensitivity: Sensitivity = "medium"
 ) -> list[Fields]:
-    """Judge every stated relation like `outliers`, but do not judge objects."""
+    """Judge every stated relation like `outliers`, but do not judge objects.
+
+    Example:
+        >>> bed_on_nightstand = RelationTable.stated([(ON_TOP, 0, 1)])
+        >>> scene = Scene(model.vocabulary.bare_objects(["bed", "nightstand"]), bed_on_nightstand)
+        >>> misplaced(model, scene)[0]["is_misplaced"]
+        True
+    """
     if not scene.objects:
         return []
     return misplaced_fields(model, Posterior(model, scene), scene, sensitivity)
@@ -181,9 +197,9 @@ def _intruder_odds(
     model: SceneModel,
     entry: CountSlope,
     posterior: Posterior,
-    log_odds: NDArray[np.floating[Any]],
-) -> tuple[NDArray[np.floating[Any]], NDArray[np.floating[Any]]]:
-    """Return logit and probability that each class is an intruder, (n,) each.
+    log_odds: Float[Floats, "n"],
+) -> tuple[Float[Floats, "n"], Float[Floats, "n"]]:
+    """Return logit and probability that each class is an intruder.
 
     They are -inf and 0 for a class that is not judged. `entry` is `Calibration.outlier`.
     """
@@ -195,7 +211,7 @@ def _intruder_odds(
     return logits, p
 
 
-def _companions(model: SceneModel, present: NDArray[np.int64], flagged: int) -> list[str]:
+def _companions(model: SceneModel, present: Int[NDArray[np.int64], "n"], flagged: int) -> list[str]:
     """Return the labels of the companions of an outlier, best first; see the module.
 
     The classes in ``present``, those of the scene, and structural classes are never companions.

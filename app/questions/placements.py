@@ -9,6 +9,7 @@ from itertools import repeat
 from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled
@@ -30,6 +31,7 @@ from app.scene.spatial_relations import (
 from app.scene.vocabulary import do_not_fit
 from scene_client.frames import Axes
 
+Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 PLACES: Final = 3
@@ -62,9 +64,9 @@ class Place(NamedTuple):
 
 
 def place_log_p(
-    posterior: Posterior, candidates: NDArray[np.int64], place: Place
-) -> NDArray[np.floating[Any]]:
-    """Return log p(relation to the anchor | candidate is present), not calibrated, (N,)."""
+    posterior: Posterior, candidates: Int[Indices, "N"], place: Place
+) -> Float[NDArray[np.floating[Any]], "N"]:
+    """Return log p(relation to the anchor | candidate is present), not calibrated."""
     anchor = posterior.present.row[[place.anchor]]
     forward, backward = posterior.placement_log_odds(candidates, anchor, place.relation)
     log_odds = (forward if place.outgoing else backward)[:, 0, 0]
@@ -75,7 +77,7 @@ def placements(
     model: SceneModel,
     posterior: Posterior,
     scene: Scene,
-    candidates: NDArray[np.int64],
+    candidates: Int[Indices, "N"],
     axes: Axes | None,
     at: Place | None = None,
 ) -> list[list[Fields]]:
@@ -88,7 +90,7 @@ def placements(
     empty. An offset needs an anchor with a position.
 
     Args:
-        candidates: (N,) indices of absent classes.
+        candidates: indices of absent classes.
         axes: viewer's axes, or None if the viewing direction is unknown; see `rotated_offsets`.
         at: the place in the request, or None. It comes first in each result, even if other places
             are likelier.
@@ -123,16 +125,21 @@ def placements(
         forward[:, INSIDE][candidates_too_large] = NO_UNIT
         backward[:, INSIDE][things_too_large] = NO_UNIT
     slopes, log_counts = model.relation_slopes.placement, present.log_counts[anchors]
-    limits = PLACES, first, LEAST_SHARE, LEAST_LIKELY
     rows, relations, outgoing, columns, p = _likeliest_places(
-        slopes, forward, backward, log_counts, *limits
+        slopes, forward, backward, log_counts, PLACES, first, LEAST_SHARE, LEAST_LIKELY
     )
     offsets: Iterator[Fields | None] = repeat(None)
     if model.offsets is not None and any(thing.position is not None for thing in things):
-        ends = relations, candidates[rows], classes[columns], outgoing
-        rotation = _UNTURNED if axes is None else np.array(axes)
-        tables = model.offsets.tables
-        offsets = _offset_fields(*rotated_offsets(tables, *ends, rotation, axes is not None))
+        mean, std, scenes = rotated_offsets(
+            model.offsets.tables,
+            relations,
+            candidates[rows],
+            classes[columns],
+            outgoing,
+            _UNTURNED if axes is None else np.array(axes),
+            axes is not None,
+        )
+        offsets = _offset_fields(mean, std, scenes)
     entries: list[list[Fields]] = [[] for _ in candidates]
     arrays = rows.tolist(), relations.tolist(), outgoing.tolist(), columns.tolist()
     for row, relation, is_subject, column, probability, offset in zip(
@@ -166,12 +173,12 @@ def supported_objects(model: SceneModel, posterior: Posterior, scene: Scene) -> 
 def _too_large(
     model: SceneModel,
     things: Sequence[SceneObject],
-    candidates: NDArray[np.int64],
-    classes: NDArray[np.int64],
-) -> tuple[Mask, Mask]:
+    candidates: Int[Indices, "N"],
+    classes: Int[Indices, "m"],
+) -> tuple[Bool[Mask, "N m"], Bool[Mask, "N m"]]:
     """Return which candidates do not fit into each object, and which objects not into candidates.
 
-    Both arrays are (N candidates, m objects). Candidates have the typical size of their class.
+    Candidates have the typical size of their class.
     """
     rows, vocabulary = candidates[:, None], model.vocabulary
     if all(thing.size is None for thing in things):
@@ -181,7 +188,9 @@ def _too_large(
 
 
 def _offset_fields(
-    mean: NDArray[np.float64], std: NDArray[np.float64], scenes: NDArray[np.int64]
+    mean: Float[NDArray[np.float64], "n 3"],
+    std: Float[NDArray[np.float64], "n 3"],
+    scenes: Int[Indices, "n"],
 ) -> Iterator[Fields | None]:
     """Yield the fields of `scene_client.schemas.Offset`, or None for an unknown offset."""
     numbers = significant(np.concatenate([mean, std], axis=1).reshape(-1))

@@ -94,6 +94,12 @@ def relations(
         `observed_probability` comes first. Entries with equal values are ordered by their indices.
         If the training scenes of the model have no relations, the answer lists observed relations
         only. Then the field `warnings` says so.
+
+    Example:
+        >>> scene = Scene(model.vocabulary.bare_objects(["lamp", "nightstand"]))
+        >>> likeliest = relations(model, scene)["relations"][0]
+        >>> likeliest["subject"], likeliest["relation"], likeliest["object"]
+        ('lamp', 'on-top', 'nightstand')
     """
     if not scene.objects:
         return {"relations": [], "disagreements": []}
@@ -196,17 +202,17 @@ def _disagreements(
     the machine has no unit for it, or if two objects of the same classes have it. The function
     judges a pair of objects if one of its two orders is True in ``judged``.
     """
-    A, (row, n) = model.spec.A, (posterior.present.row, len(posterior.present.classes))
+    A, row = model.spec.A, posterior.present.row
     if scene.relations is None or not scene.triples:
         return []
-    stated = scene.relations.holding
-    stated = stated.rows(stated.relation < A)
-    holds, of_classes = _named_relations(stated, row, n, A)
+    observed = scene.relations.holding
+    of_model = observed.rows(observed.relation < A)
+    holds, of_classes = _named_relations(of_model, row, len(posterior.present.classes), A)
     subjects, objects = _observed_pairs(holds, judged, A)
     if not len(subjects):
         return []
     i, j = row[subjects], row[objects]
-    log_odds, log_counts = posterior.log_odds_apart(i, j), posterior.present.log_counts
+    log_odds, log_counts = posterior.log_odds_of_pairs(i, j), posterior.present.log_counts
     slopes, counts = model.relation_slopes.relation_given, log_counts[i] + log_counts[j]
     to, back = (relation_probability(slopes, part[None], counts)[0] for part in log_odds)
     # A relation cannot hold in both directions; see `exclusive`.
@@ -214,11 +220,11 @@ def _disagreements(
     p = np.concatenate([to / total, back / total]).T.astype(np.float64)
     has_unit = np.concatenate(log_odds).T > NO_UNIT
     expected, every = np.where(has_unit, p, -1.0).argmax(1), np.arange(len(p))
-    observed = np.where(holds[subjects, objects], p, 0.0).max(1)
+    p_observed = np.where(holds[subjects, objects], p, 0.0).max(1)
     likeliest = p[every, expected]
-    usable = has_unit.any(1) & ~of_classes[i, j, expected] & (likeliest > observed)
+    usable = has_unit.any(1) & ~of_classes[i, j, expected] & (likeliest > p_observed)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = likeliest / observed
+        ratio = likeliest / p_observed
     chosen = best(ratio, usable & (likeliest >= max(least, EXPECTED)), top_k)
     columns = subjects[chosen].tolist(), objects[chosen].tolist(), expected[chosen].tolist()
     names = holds[subjects, objects][chosen]
@@ -232,7 +238,7 @@ def _disagreements(
             *columns,
             names,
             significant(likeliest[chosen]),
-            significant(observed[chosen]),
+            significant(p_observed[chosen]),
             strict=True,
         )
     ]

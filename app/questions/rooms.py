@@ -43,6 +43,11 @@ def rooms(
     Returns:
         The field `room_types` of `scene_client.schemas.RoomsAnswer`. The list is empty if the model
         has no room types. Then the field `warnings` says so.
+
+    Example:
+        >>> scene = Scene(model.vocabulary.bare_objects(["bed", "nightstand"]))
+        >>> rooms(model, scene)["room_types"][0]["room_type"]
+        'bedroom'
     """
     C = model.spec.C
     among = np.arange(C) if candidates is None else np.array([*candidates], dtype=np.int64)

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled
@@ -93,8 +94,8 @@ def observe(
     *,
     viewpoint: Viewpoint | None = None,
     has_viewer: bool = True,
-    typical_sizes: NDArray[np.float64] | None = None,
-    stand_in: NDArray[np.int64] | None = None,
+    typical_sizes: Float[NDArray[np.float64], "V 3"] | None = None,
+    stand_in: Int[NDArray[np.int64], "V"] | None = None,
     roles: RoleCounts | None = None,
 ) -> Scene:
     """Derive the relations of a scene from the poses of its objects.
@@ -107,9 +108,9 @@ def observe(
         viewpoint: position and heading of the viewer in this frame. By default, the viewer is at
             the origin and looks along x.
         has_viewer: whether the viewer's pose is known. Otherwise, left and front are undefined.
-        typical_sizes: (V, 3) typical extents of each class in metres (`Vocabulary.sizes`). They
+        typical_sizes: typical extents of each class in metres (`Vocabulary.sizes`). They
             replace missing sizes of objects, and sizes below `SMALLEST`. NaN means an unknown size.
-        stand_in: (V,) class whose roles each class has (`Vocabulary.stand_in`); None means itself.
+        stand_in: class whose roles each class has (`Vocabulary.stand_in`); None means itself.
         roles: counts that decide between on-top, under and inside; see `derive_relations`.
     """
     if all(thing.position is None for thing in scene.objects):
@@ -149,9 +150,9 @@ def _in_viewer_frame(
 
 
 def boxes_of(
-    objects: Sequence[SceneObject], typical_sizes: NDArray[np.float64] | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the centres and the extents of n objects, (n, 3) each, NaN where unknown.
+    objects: Sequence[SceneObject], typical_sizes: Float[NDArray[np.float64], "V 3"] | None
+) -> tuple[Float[NDArray[np.float64], "n 3"], Float[NDArray[np.float64], "n 3"]]:
+    """Return the centres and the extents of objects, NaN where unknown.
 
     An object without a plausible size has the typical extents of its class (`Vocabulary.sizes`).
     """

@@ -7,6 +7,7 @@ from functools import cached_property, wraps
 from typing import Any, ClassVar, Final, NamedTuple, TypeVar, cast
 
 import numpy as np
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike, NDArray
 
 from app.scene.labels import LookUp, Rule, head_of, label_key, readings, split_words
@@ -163,33 +164,33 @@ class Vocabulary:
     # The arrays are read-only.
 
     @cached_property
-    def structure(self) -> NDArray[np.bool_]:
-        """(V,) True for structural classes, which a model never proposes."""
+    def structure(self) -> Bool[NDArray[np.bool_], "V"]:
+        """True for structural classes, which a model never proposes."""
         return _read_only([entry.structure for entry in self.objects])
 
     @cached_property
-    def anywhere(self) -> NDArray[np.bool_]:
-        """(V,) True for classes whose objects belong in every room."""
+    def anywhere(self) -> Bool[NDArray[np.bool_], "V"]:
+        """True for classes whose objects belong in every room."""
         return _read_only([entry.anywhere for entry in self.objects])
 
     @cached_property
-    def judged(self) -> NDArray[np.bool_]:
-        """(V,) True for classes that can be intruders: neither structure nor `anywhere`."""
+    def judged(self) -> Bool[NDArray[np.bool_], "V"]:
+        """True for classes that can be intruders: neither structure nor `anywhere`."""
         return _read_only(~(self.structure | self.anywhere))
 
     @cached_property
-    def sizes(self) -> NDArray[np.float64]:
-        """(V, 3) typical extents in metres, or NaN for classes of unknown size."""
+    def sizes(self) -> Float[NDArray[np.float64], "V 3"]:
+        """Typical extents in metres, or NaN for classes of unknown size."""
         return _read_only([entry.size or (math.nan,) * 3 for entry in self.objects])
 
     @cached_property
-    def too_large(self) -> NDArray[np.bool_]:
-        """(V, V) True if a box of the size of class i does not fit into one of class j."""
+    def too_large(self) -> Bool[NDArray[np.bool_], "V V"]:
+        """True if a box of the size of class i does not fit into one of class j."""
         return _read_only(do_not_fit(self.sizes, self.sizes))
 
     @cached_property
-    def broader(self) -> NDArray[np.bool_]:
-        """(V, V) True if class j is the parent of class i, or a parent of its parent."""
+    def broader(self) -> Bool[NDArray[np.bool_], "V V"]:
+        """True if class j is the parent of class i, or a parent of its parent."""
         is_broader = np.zeros((len(self), len(self)), np.bool_)
         rows, ancestors = np.arange(len(self)), self.parents
         while (has_parent := ancestors >= 0).any():
@@ -210,8 +211,8 @@ class Vocabulary:
         return tuple(chains)
 
     @cached_property
-    def related(self) -> NDArray[np.bool_]:
-        """(V, V) True if one of the classes i and j is broader than the other: one family."""
+    def related(self) -> Bool[NDArray[np.bool_], "V V"]:
+        """True if one of the classes i and j is broader than the other: one family."""
         return _read_only(self.broader | self.broader.T)
 
     def bare_objects(self, labels: Sequence[str]) -> tuple[SceneObject, ...] | None:
@@ -409,8 +410,10 @@ _SHARED: Final = (
 )
 
 
-def do_not_fit(inner: NDArray[np.float64], outer: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which boxes (N, 3) do not fit into which boxes (m, 3), (N, m).
+def do_not_fit(
+    inner: Float[NDArray[np.float64], "N 3"], outer: Float[NDArray[np.float64], "m 3"]
+) -> Bool[NDArray[np.bool_], "N m"]:
+    """Return which boxes do not fit into which other boxes.
 
     A box fits into another box if each of its extents, in order of size, is at most `_TIGHT` times
     that of the other. A box of unknown size (NaN) fits everywhere.
