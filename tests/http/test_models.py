@@ -177,9 +177,11 @@ async def test_a_version_that_cannot_answer_is_refused(
     caplog: pytest.LogCaptureFixture,
     log_odds: float | None,
 ) -> None:
-    def fails(missing: Any, artifact: Any, *args: Any, **parameters: Any) -> Any:
-        answer = missing(artifact, *args, **parameters)
-        if artifact.manifest.version != "2.0.0":
+    served = own.app.state.runtime.models.served.values()  # type: ignore[attr-defined]
+
+    def fails(missing: Any, model: Any, *args: Any, **parameters: Any) -> Any:
+        answer = missing(model, *args, **parameters)
+        if any(model is artifact.model for artifact in served):
             return answer
         if log_odds is None:
             return defect()
@@ -239,9 +241,9 @@ async def test_replaced_models_are_freed(
 ) -> None:
     asked: list[weakref.ref[Any]] = []
 
-    def note(missing: Any, artifact: Any, *args: Any, **parameters: Any) -> Any:
-        asked.append(weakref.ref(artifact.weights))
-        return missing(artifact, *args, **parameters)
+    def note(missing: Any, model: Any, *args: Any, **parameters: Any) -> Any:
+        asked.append(weakref.ref(model.weights))
+        return missing(model, *args, **parameters)
 
     replace("missing", note)
     for model in ("general", "home"):

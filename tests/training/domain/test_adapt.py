@@ -10,7 +10,7 @@ import pytest
 
 from app import questions
 from app.model import SceneModel
-from app.registry import Store
+from app.registry import Artifact, Store
 from app.scene import RelationTable, Scene, SceneObject
 from app.scene.spatial_relations import ON_TOP
 from tests.registry.small_artifacts import rewrite_manifest
@@ -49,12 +49,16 @@ def alarms(artifact: SceneModel, labels: list[str], room: str | None = None) -> 
     return [words.labels[c] for c in alarms_of(artifact, scene)]
 
 
+def stored(store: Store, reference: str) -> Artifact:
+    return store.load(*store.resolve(reference))
+
+
 def home(store: Store, version: str = "1.0.0") -> SceneModel:
-    return store.load("home", version).model
+    return stored(store, f"home@{version}").model
 
 
 def default(store: Store) -> SceneModel:
-    return store.load(*store.resolve("default")).model
+    return stored(store, "default").model
 
 
 def test_a_confirmed_object_is_never_reported_again(store, tmp_path):
@@ -63,9 +67,10 @@ def test_a_confirmed_object_is_never_reported_again(store, tmp_path):
     said = adapt(store, write([scene], tmp_path / "scenes.jsonl"))
     assert "never reported from now on: toilet (1)" in said
     assert alarms(home(store), INTRUDER, "bedroom") == []
-    assert home(store).manifest.training["parent"]["digest"] == default(store).digest
-    parent = "@".join(default(store).key)
-    assert f"adapted to one home from {parent}" in " ".join(home(store).card.split())
+    parent, adapted_one = stored(store, "default"), stored(store, "home")
+    assert adapted_one.manifest.training["parent"]["digest"] == parent.digest
+    text = f"adapted to one home from {'@'.join(parent.key)}"
+    assert text in " ".join(adapted_one.card.split())
     for command in (["evaluate", "home"], ["publish", "home@1.0.0", "1.0.1"]):
         said = invoke(*command, "--store", store.root, code=1)
         assert "home@1.0.0 was adapted to a home" in said
@@ -78,14 +83,14 @@ def test_a_home_keeps_the_terms_of_its_parent(store, tmp_path):
         members["terms"] = terms
         members["data"][0]["research_only"] = True
 
-    rewrite_manifest(default(store).path, restrict)
+    rewrite_manifest(stored(store, "default").path, restrict)
     scene = {"objects": INTRUDER, "room_type": "bedroom", "confirmed": True}
     adapt(store, write([scene], tmp_path / "scenes.jsonl"))
-    manifest = home(store).manifest
+    manifest = stored(store, "home").manifest
     assert manifest.terms == terms
     assert manifest.data[0].research_only
     assert not manifest.data[-1].research_only, "the scenes of the home"
-    card = home(store).card
+    card = stored(store, "home").card
     assert f"Terms of the weights: {terms}" in card
     assert "**Research use.** These weights were trained on" in card
 

@@ -1,6 +1,5 @@
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -77,8 +76,7 @@ def test_a_refusal_names_every_metric_that_is_worse() -> None:
 def test_a_model_without_relation_metrics_replaces_no_model_with_them(
     measured, task, expected
 ) -> None:
-    manifest = SimpleNamespace(metrics=[SimpleNamespace(task=name) for name in measured])
-    holder = Candidate("old", None, {}, SimpleNamespace(manifest=manifest))  # type: ignore[arg-type]
+    holder = Candidate("old", None, {}, None, tasks=frozenset(measured))
     names = unmeasured([difference(task, "MRR", -0.1, 0.1)], holder)
     assert len(names) == expected
     assert set(names) < set(RELATIONAL)
