@@ -268,7 +268,7 @@ def _log_p_at(
     posterior: Posterior,
     place: Place,
     usable: Bool[Mask, "V"],
-    log_odds: Float[Floats, "V"],
+    log_odds: Float[NDArray[np.floating[Any]], "V"],
     top_k: int,
 ) -> Float[Floats, "V"]:
     """Return log p(present and at the place): log p(present) + log p(place | present).

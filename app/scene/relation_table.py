@@ -102,7 +102,9 @@ class RelationTable:
         off = np.zeros(len(a), np.float32)
         new = a, i, j, off, np.full(len(a), origin), off.astype(np.bool_)
         columns = zip(_COLUMNS, new, strict=True)
-        joined = {name: np.concatenate([getattr(self, name), more]) for name, more in columns}
+        joined: dict[str, Any] = {
+            name: np.concatenate([getattr(self, name), more]) for name, more in columns
+        }
         return replace(self, **joined)
 
     def __len__(self) -> int:
