@@ -23,7 +23,7 @@ from app.compiling import compiled, inlined
 from app.inference import MachineSpec
 from app.inference.elementary import logistic
 from app.inference.quadrature import to_log_odds
-from app.inference.relation_units import Between, ObservedRelations, context_of
+from app.inference.relation_units import ObservedRelations, RelationLogits, encode
 from app.registry.artifact import Artifact
 from app.registry.description import LEAST_COVERAGE, Calibration, CountSlope, CoverageFit
 from app.scene.scene import Scene, instance_evidence, pool_classes
@@ -129,7 +129,7 @@ class Posterior:
         is_structure = artifact.vocabulary.structure[listing.classes]
         self.listed = len(listing.classes) - int(np.count_nonzero(is_structure))
         observed = given_relations(scene, listing, artifact.spec.A)
-        self.context = context_of(
+        self.context = encode(
             artifact.weights,
             *(listing.classes, listing.presence, listing.log_counts, scene.room_type, observed),
         )
@@ -171,7 +171,7 @@ class Posterior:
         scene without the class.
         """
         # Row k has the logits of h1 and the presence of the classes in the scene without class k.
-        x, presence = self.context.x - self.context.shares, self.present.presence
+        x, presence = self.context.x - self.context.contributions, self.present.presence
         without = self._room_log_p(x, presence * (1 - np.eye(len(presence), dtype=np.float32)))
         return (log_odds_of(self.room_log_p()) - log_odds_of(without)).T
 
@@ -188,8 +188,7 @@ class Posterior:
 
     def relation_change(self) -> Floats:
         """Return the change of every logit by observed relations of other pairs, (A, n, n)."""
-        change = self._between.apart
-        return change if len(change) else np.zeros_like(self._between.mean)
+        return self._between.shift_by_others
 
     def log_odds_apart(self, i: Indices, j: Indices) -> tuple[Floats, Floats]:
         """Return the log-odds (A, P) of all relations from classes i to j, and (A, P) from j to i.
@@ -199,7 +198,7 @@ class Posterior:
         Args:
             i, j: (P,) indices of the two classes of each pair in the scene.
         """
-        log_odds = self._units.log_odds(self._between, apart=True)
+        log_odds = self._units.log_odds(self._between, leave_out_pair=True)
         # The compiled functions of the questions need contiguous arrays.
         forward, backward = np.ascontiguousarray(log_odds[:, [i, j], [j, i]].swapaxes(0, 1))
         return forward, backward
@@ -211,8 +210,8 @@ class Posterior:
         return self._units.placement_log_odds(self.context, candidates, anchors, only)
 
     @cached_property
-    def _between(self) -> Between:
-        return self._units.between(self.context)
+    def _between(self) -> RelationLogits:
+        return self._units.logits(self.context)
 
 
 def log_odds_of(log_p: Doubles) -> Doubles:
