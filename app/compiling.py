@@ -111,15 +111,14 @@ def compiled(function: Callable[..., Any]) -> Any:
 def compiled_in_any_order(function: Callable[..., Any]) -> Any:
     """Compile a function, and let the compiler reorder sums to use vector instructions.
 
-    The compiler chooses the order of the terms once, so results are reproducible. The function must
-    not call `exp` and `log` of `app.inference.elementary`, which depend on the order of operations.
+    The compiler chooses the order of the terms once, so results are reproducible.
     """
     return _kernel(function, fastmath={"reassoc", "contract"})
 
 
 def inlined(function: Callable[..., Any]) -> Any:
-    """Inline a function into each compiled function that calls it, with its compiler options."""
-    return njit(inline="always", error_model="numpy")(function)
+    """Inline a function into each compiled function that calls it. Its sums keep their order."""
+    return njit(forceinline=True, error_model="numpy")(function)
 
 
 def check_cache() -> None:

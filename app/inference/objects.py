@@ -20,16 +20,19 @@ multiplies the sums of several units and takes one log of the product. The group
 keep the product within float32.
 """
 
+from __future__ import annotations
+
 from bisect import bisect
 from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import NDArray
 
 from app.compiling import compiled, compiled_in_any_order
 from app.inference.elementary import LN2, exp, exponent, log, log_softmax, mantissa, sigmoid
-from app.inference.relation_units import Context
-from app.inference.weights import SHARES, Weights, all_states, odds
+from app.inference.relation_units import EncodedScene
+from app.inference.weights import SHARES, Weights, all_states
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -50,7 +53,6 @@ _LANES: Final = 16
 _SMALLEST: Final = 1e-300  # least probability of a room type
 # Maximum number of biases that a scorer keeps, of 4 bytes for each class.
 _KEPT_BIASES: Final = 64
-_NO_COUPLINGS: Final[Floats] = np.zeros((0, 0), np.float32)
 # Listed share in the middle of each bin of kappa. The last bin lists all classes but one.
 _MIDDLES: Final = (0.15, 0.45, 0.8, 1.0)
 
@@ -103,7 +105,6 @@ class ObjectScorer:
         self._weights, self._states = weights, weights.spec.states
         self._biases: dict[tuple[float, int | None], Floats] = {}  # by coverage and room type
         self._increases: dict[int, tuple[Floats, Floats]] = {}
-        self._couplings = weights["L"] if weights.spec.coupled else _NO_COUPLINGS
         self.gains = Gains(weights["W"], self._states)
         self.room_gains = Gains(weights["Q"], self._states)
 
@@ -134,8 +135,13 @@ class ObjectScorer:
             bias = weights["b"] + weights.room_couplings(room) + self.kappa(coverage)
             if len(self._biases) < _KEPT_BIASES:
                 self._biases[coverage, room] = bias
-        p = weights.source_weights(classes, presence[None], profile)[0]
-        return _class_log_odds(gain, bias, p, weights["a"], self._couplings, classes, presence)
+        gain += bias
+        if weights.spec.profiles:
+            p = weights.source_weights(classes, presence[None], profile)[0]
+            gain += p.astype(np.float32) @ weights["a"]
+        if weights.spec.coupled:
+            gain += presence @ weights["L"][classes]
+        return gain
 
     def kappa(self, coverage: float) -> Floats:
         """Return the bias of each class for a listed share, interpolated between the bins, (V,)."""
@@ -147,7 +153,7 @@ class ObjectScorer:
 
     def given_rest(
         self,
-        scene: Context,
+        scene: EncodedScene,
         profile: int | None,
         room: int | None = None,
         *,
@@ -167,7 +173,7 @@ class ObjectScorer:
         return self._explained(bias, scene, profile, rows, scene.classes, explained=explained)
 
     def reasons_for_absent(
-        self, scene: Context, profile: int | None, candidates: Indices
+        self, scene: EncodedScene, profile: int | None, candidates: Indices
     ) -> Floats:
         """Return how much each listed class changes the log-odds of unlisted classes, (N, n).
 
@@ -180,21 +186,45 @@ class ObjectScorer:
     def _explained(
         self,
         bias: Floats,
-        scene: Context,
+        scene: EncodedScene,
         profile: int | None,
         rows: Indices,
         targets: Indices,
         *,
         explained: bool,
-    ) -> tuple[Floats, Floats]:
-        """See `_explained_log_odds`."""
-        weights = self._weights
-        possible = slice(None) if profile is None else slice(profile, profile + 1)
-        return _explained_log_odds(
-            *(scene.x, scene.shares, weights["W"], bias, self._couplings),
-            *(weights["f"][possible], weights["a"][possible], self._states),
-            *(scene.classes, scene.presence, rows, targets, explained),
+    ) -> tuple[Float[NDArray, " N"], Float[NDArray, "N n"]]:
+        """Return the log-odds of N target classes given the listed classes, and their changes.
+
+        The change by class j is the log-odds minus their value without class j. It is (N, 0) if not
+        `explained`.
+
+        Args:
+            bias: biases of all classes.
+            rows: index of each target among the listed classes. A class is not evidence for itself.
+                `rows` is empty if the targets are not listed.
+        """
+        weights, classes, presence = self._weights, scene.classes, scene.presence
+        n, others = len(classes) if explained else 0, self._states - 1
+        x = scene.x - scene.contributions[rows] if len(rows) else scene.x[None]
+        raised, removed = np.exp(weights["W"][targets]), np.exp(-scene.contributions[:n])
+        factors, ratios = _hidden_factors(
+            all_states(x, self._states),
+            raised.reshape(len(targets), weights.spec.units, others),
+            removed.reshape(n, weights.spec.units, others),
         )
+        possible = slice(None) if profile is None else slice(profile, profile + 1)
+        mean, change = _source_effects(
+            weights["f"][possible], weights["a"][possible], classes, presence, rows, targets, n
+        )
+        log_odds = bias[targets] + np.log(factors).sum(1) + mean
+        change -= np.log(ratios).sum(2)
+        if weights.spec.coupled:
+            couplings = weights["L"][targets[:, None], classes] * presence
+            log_odds += couplings.sum(1)
+            change += couplings[:, :n]
+        if n and len(rows):
+            change[np.arange(len(rows)), rows] = 0
+        return log_odds, change
 
     def increases(self, i: int) -> tuple[Floats, Floats]:
         """Return how much the presence of class i increases the log-odds of each class, (V,).
@@ -298,116 +328,35 @@ def _gains(p, factors, group, rows):
 
 
 @compiled_in_any_order
-def _gain_factors(p, raised, removed):
-    """Return the factors of e^gain, (N, units), and of e^-change, (N, n, units).
-
-    A factor is the effect of one hidden unit; see `explained_log_odds`.
+def _hidden_factors(
+    p: Float[NDArray, "N|1 units states"],
+    raised: Float[NDArray, "N units states-1"],
+    removed: Float[NDArray, "n units states-1"],
+) -> tuple[Float[NDArray, "N units"], Float[NDArray, "N n units"]]:
+    """Return the factors of each hidden unit in e^gain of N classes, and in e^-change by n classes.
 
     Args:
-        p: (N or 1, units, states) probabilities of the states of h1.
-        raised: (N, units, states) exponentials of the weights of the classes c.
-        removed: (n, units, states) exponentials of the contributions of classes j, negated.
+        p: probabilities of the states of h1.
+        raised: exponentials of the weights of the N classes.
+        removed: exponentials of the contributions of the n classes, negated.
     """
-    (N, units, states), n = raised.shape, len(removed)
+    (N, units, others), n = raised.shape, len(removed)
     gain, ratio = np.empty((N, units), np.float32), np.empty((N, n, units), np.float32)
     for c in range(N):
         for m in range(units):
             row, factors = p[min(c, len(p) - 1), m], raised[c, m]
-            with_class = np.float32(0.0)
-            for z in range(states):
-                with_class += row[z] * factors[z]
+            with_class = row[0]
+            for z in range(others):
+                with_class += row[z + 1] * factors[z]
             gain[c, m] = with_class
             for j in range(n):
-                without, before, after = removed[j, m], np.float32(0.0), np.float32(0.0)
-                for z in range(states):
-                    product = row[z] * without[z]
+                without, before, after = removed[j, m], row[0], row[0]
+                for z in range(others):
+                    product = row[z + 1] * without[z]
                     before += product
                     after += product * factors[z]
                 ratio[c, j, m] = after / (before * with_class)
     return gain, ratio
-
-
-@compiled
-def _class_log_odds(gain, bias, p, a, L, classes, presence):
-    """Return gain + bias + sum_q p_q a_q + sum_j presence_j L_j, (V,).
-
-    Args:
-        gain, bias: (V,) terms of the classes.
-        p, a: (profiles,) probabilities of the data sources, and (profiles, V) their base rates.
-        L: (V, V) couplings, or (0, V) without couplings.
-        classes, presence: (n,) listed classes j, and the probabilities that they are present.
-    """
-    log_odds = np.empty(len(gain), np.float32)
-    for i in range(len(gain)):
-        log_odds[i] = gain[i] + bias[i]
-    for q in range(len(p)):
-        weight, row = np.float32(p[q]), a[q]
-        for i in range(len(gain)):
-            log_odds[i] += weight * row[i]
-    for j in range(len(classes) if len(L) else 0):
-        weight, row = presence[j], L[classes[j]]
-        for i in range(len(gain)):
-            log_odds[i] += weight * row[i]
-    return log_odds
-
-
-@compiled
-def _log_sums(x):
-    """Return the sum of ln x over the last axis, (N,), for positive x (N, units)."""
-    total = np.zeros(len(x), np.float32)
-    for i in range(len(x)):
-        row = x[i]
-        for m in range(len(row)):
-            total[i] += log(row[m])
-    return total
-
-
-@compiled
-def _explained_log_odds(
-    x, shares, W, bias, L, f, a, states, classes, presence, rows, targets, explained
-):
-    """Return the log-odds of N target classes i given the listed classes, and their changes.
-
-    The log-odds are bias_i + gain_i + sum_q p_q a_qi + sum_j presence_j L_ij; see `objects`. The
-    change by class j is their value minus their value without class j.
-
-    Args:
-        x: (H1,) logits of h1 given the n listed classes.
-        shares: (n, H1) contribution of each listed class to x.
-        W, bias, L: (V, H1) weights of h1, (V,) biases, and (V, V) couplings, or (0, V) without
-            couplings.
-        f, a: (Q,) and (Q, V) weights of the Q possible data sources; see `weights.layout`.
-        states: number of states of a hidden unit.
-        classes, presence: (n,) the listed classes; see `ObjectScorer.absent`.
-        rows: (N,) index of each target among the listed classes. A class is not evidence for
-            itself. `rows` is empty if the targets are not listed.
-        targets: (N,) the target classes.
-        explained: whether to compute the changes.
-
-    Returns:
-        The log-odds, (N,), and the changes, (N, n). The changes are (N, 0) if not `explained`.
-    """
-    N, n, coupled = len(targets), len(classes) if explained else 0, len(L) > 0
-    base = np.empty((max(len(rows), 1), len(x)), np.float32)
-    base[0] = x
-    for i in range(len(rows)):
-        base[i] = x - shares[rows[i]]
-    p, raised = all_states(base, states), odds(W[targets], states)
-    factors, ratios = _gain_factors(p, raised, odds(-shares[:n], states))
-    log_odds, change = _log_sums(factors), np.empty((N, n), np.float32)
-    mean, of_source = _source_effects(f, a, classes, presence, rows, targets, n)
-    for i in range(N):
-        total, change[i] = np.float32(0.0), -_log_sums(ratios[i])
-        for j in range(len(classes) if coupled else 0):
-            total += presence[j] * L[classes[j], targets[i]]
-        log_odds[i] = bias[targets[i]] + log_odds[i] + mean[i] + total
-        for j in range(n):
-            if coupled:
-                change[i, j] += L[targets[i], classes[j]] * presence[j]
-            change[i, j] += of_source[i, j]
-        if n and len(rows):
-            change[i, rows[i]] = np.float32(0.0)
-    return log_odds, change
 
 
 @compiled

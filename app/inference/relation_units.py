@@ -1,16 +1,18 @@
-"""Probabilities of relations: p(r_e = 1) = E[sigmoid(ℓ_e(h1))] with ℓ_e(h1) = base_e + U_e·h1.
+"""Relation units: the logits of relations given the hidden units, and their log-odds.
 
 A relation e is a triple (relation a, subject class i, object class j). r_e is 1 if the relation
-holds, else 0. The logit ℓ_e is a sum of many small independent terms, one for each hidden unit k of
-h1. This module treats the logit as a normal variable with
+holds, else 0. Its probability is p(r_e = 1) = E[sigmoid(ℓ_e(h1))] with ℓ_e(h1) = base_e + U_e·h1.
+The logit ℓ_e is a sum of many small independent terms, one for each hidden unit k of h1. This
+module treats the logit as a normal variable with
 
     mean base_e + U_e·m   and variance   σ_e² = sum_u [sum_z U_euz² m_uz - (sum_z U_euz m_uz)²]
 
 where m_uz is the probability of state z of hidden unit u (its first state has the weight 0).
-Quadrature gives the mean of sigmoid(ℓ_e). For the quadrature errors, see
-docs/decisions/inference.md. The variant of the machine defines base and U. Each unit of `FreeUnits`
-has its own row of U. `SharedUnits` computes U from factors. All variants share the other code.
+`app.inference.quadrature` computes the mean of sigmoid(ℓ_e). The variant of the machine defines
+base and U. Each unit of `FreeUnits` has its own row of U. `SharedUnits` computes U from factors.
 """
+
+from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -18,6 +20,7 @@ from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled, compiled_in_any_order
@@ -25,18 +28,10 @@ from app.inference.implications import implication_shifts
 from app.inference.quadrature import to_log_odds
 from app.inference.weights import Weights, state_means
 
-Floats = NDArray[np.float32]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-
 NEVER: Final = np.float32(-1e4)
 """Logit of a relation for which the machine has no unit. Such a relation never holds."""
 
-Table = tuple[NDArray[np.int32], NDArray[np.int32]]
-
-NO_VALUES: Final[Floats] = np.zeros((0, 0, 0), dtype=np.float32)
-
-# Constants of a hash table: bucket of a pair = (key * _SPREAD) >> _SHIFT, modulo the table size.
+# Bucket of a pair in a hash table: (key * _SPREAD) >> _SHIFT, modulo the number of buckets.
 _SPREAD, _SHIFT = 2654435761, 16
 
 # Number of float32 in a vector register. Rows of whole registers are faster.
@@ -53,122 +48,94 @@ class ObservedRelations:
     """E observed relations between the n classes of a scene. Each relation holds or does not hold.
 
     Attributes:
-        a: (E,) number of the relation (left, on top, ...) of each unit.
-        i, j: (E,) indices of the subject classes and of the object classes, from 0 to n - 1.
-        r: (E,) 1 if the relation holds, else 0.
+        a: number of the relation (left, on top, ...) of each unit.
+        i, j: indices of the subject classes and of the object classes, from 0 to n - 1.
+        r: 1 if the relation holds, else 0.
     """
 
-    a: Indices
-    i: Indices
-    j: Indices
-    r: Floats
+    a: Int[NDArray, " E"]
+    i: Int[NDArray, " E"]
+    j: Int[NDArray, " E"]
+    r: Float[NDArray, " E"]
 
 
 @dataclass(frozen=True, slots=True)
-class Context:
-    """The hidden units of a scene, given its objects, and the observed relations of the scene.
+class EncodedScene:
+    """The n distinct classes of a scene, their effect on the hidden units, and observed relations.
 
     Attributes:
-        classes: (n,) int64, distinct indices of the classes in the scene.
-        presence: (n,) probability that each class is present.
-        log_counts: (n,) log of the number of instances of each class.
-        x: (H1,) logits of h1 given the objects.
-        shares: (n, H1) contribution of each class to x.
+        classes: indices of the classes.
+        presence: probability that each class is present.
+        log_counts: log of the number of instances of each class.
+        x: logits of h1 given the classes and the room type.
+        contributions: contribution of each class to x.
         observed: observed relations, or None if the scene has no observed relations.
     """
 
-    classes: Indices
-    presence: Floats
-    log_counts: Floats
-    x: Floats
-    shares: Floats
+    classes: Int[NDArray, " n"]
+    presence: Float[NDArray, " n"]
+    log_counts: Float[NDArray, " n"]
+    x: Float[NDArray, " H1"]
+    contributions: Float[NDArray, "n H1"]
     observed: ObservedRelations | None
 
 
-class SharedArrays(NamedTuple):
-    """Weights of a Triway's units for the compiled kernels.
-
-    Attributes:
-        S, O: (V, K + 1) factors of each class as subject and as object. The last column is 1.
-        s, o: (V, A) weights of each class as subject and as object of each relation.
-        n: (A, 2) weights of the log number of instances of subject and object class.
-        start, key: look-up table of `_pair_rows`.
-        residual: (pairs + 1, A) residual weight w' of each pair of classes and each relation. The
-            last row is 0.
-    """
-
-    S: Floats
-    O: Floats  # noqa: E741
-    s: Floats
-    o: Floats
-    n: Floats
-    start: NDArray[np.int32]
-    key: NDArray[np.int32]
-    residual: Floats
-
-
-class Ends(NamedTuple):
-    """Subject and object classes of some pairs. All arrays have the same shape.
-
-    Attributes:
-        i, j: class indices of the subjects and of the objects.
-        log_i, log_j: log of the number of instances of each class in i and in j.
-        p_i, p_j: probability that each class in i and in j is present.
-    """
-
-    i: Indices
-    j: Indices
-    log_i: Floats
-    log_j: Floats
-    p_i: Floats
-    p_j: Floats
-
-
-def context_of(
+def encode(
     weights: Weights,
-    classes: Indices,
-    presence: Floats,
-    log_counts: Floats,
+    classes: Int[NDArray, " n"],
+    presence: Float[NDArray, " n"],
+    log_counts: Float[NDArray, " n"],
     room: int | None = None,
     observed: ObservedRelations | None = None,
-) -> Context:
-    """Compute the logits of h1 given the objects and the room type.
+) -> EncodedScene:
+    """Compute the logits of h1 given the classes of a scene and its room type; see `EncodedScene`.
 
     Args:
-        classes: (n,) indices of the distinct classes of the scene.
-        presence: (n,) probability that each class is present.
-        log_counts: (n,) log of the number of instances of each class.
         room: index of the room type, or None if the room type is unknown.
-        observed: observed relations, or None if the scene has no observed relations.
     """
-    shares = presence[:, None] * weights["W"][classes]
-    x = weights.room_bias(room) + shares.sum(0)
-    return Context(classes, presence, log_counts, x, shares, observed)
+    contributions = presence[:, None] * weights["W"][classes]
+    x = weights.room_bias(room) + contributions.sum(0)
+    return EncodedScene(classes, presence, log_counts, x, contributions, observed)
 
 
-def ends_of(classes: Indices, presence: Floats, log_counts: Floats, i: Indices, j: Indices) -> Ends:
-    """Return the `Ends` of pairs (i, j). i and j are indices into the other arrays."""
-    n, p = log_counts, presence
-    return Ends(classes[i], classes[j], n[i], n[j], p[i], p[j])
-
-
-class Between(NamedTuple):
-    """The logits of all A relations between n classes, and the effects of observed relations.
-
-    If the scene has no observed relations, `shift` and `apart` are empty.
+class Pairs(NamedTuple):
+    """Ordered pairs of classes.
 
     Attributes:
-        mean: (A, n, n) means of the logits.
-        spread: (A, n, n) √3 σ, where σ is the standard deviation of each logit.
-        shift: (A, n, n) change of each logit by the observed relations that hold.
-        apart: (A, n, n) the same change without the observed relations between the two classes of
-            the logit.
+        classes: indices of the classes.
+        log_counts: log of the number of instances of each class.
+        presence: probability that each class is present.
+        i, j: positions of the subject and object class of each pair in `classes`.
     """
 
-    mean: Floats
-    spread: Floats
-    shift: Floats
-    apart: Floats
+    classes: Int[NDArray, " n"]
+    log_counts: Float[NDArray, " n"]
+    presence: Float[NDArray, " n"]
+    i: Int[NDArray, "B P"]
+    j: Int[NDArray, "B P"]
+
+
+@lru_cache(maxsize=128)
+def all_pairs(n: int) -> tuple[Int[NDArray, "1 P"], Int[NDArray, "1 P"]]:
+    """Return the first and the second positions of all P = n² ordered pairs of n classes."""
+    positions = np.arange(n)
+    return np.repeat(positions, n)[None], np.tile(positions, n)[None]
+
+
+class RelationLogits(NamedTuple):
+    """The logits of all relations between the n classes of a scene.
+
+    Attributes:
+        mean: means of the logits given the classes alone.
+        spread: √3 σ, where σ is the standard deviation of each logit.
+        shift: change of each logit by the observed relations that hold.
+        shift_by_others: the same change without the observed relations of the same two classes.
+    """
+
+    mean: Float[NDArray, "A n n"]
+    spread: Float[NDArray, "A n n"]
+    shift: Float[NDArray, "A n n"]
+    shift_by_others: Float[NDArray, "A n n"]
 
 
 class RelationUnits(ABC):
@@ -179,76 +146,100 @@ class RelationUnits(ABC):
         self._states = weights.spec.states
 
     @abstractmethod
-    def normal(
-        self, means: Floats, ends: Ends, only: int | None = None, *, certain: bool = False
-    ) -> tuple[Floats, Floats]:
-        """Return the means and √3 σ of the logits of R relations for P pairs, both (B, R, P).
+    def moments(
+        self,
+        means: Float[NDArray, "B H1"],
+        pairs: Pairs,
+        only: int | None = None,
+        *,
+        sampled: bool = False,
+    ) -> tuple[Float[NDArray, "B R P"], Float[NDArray, "B R P"]]:
+        """Return the means and √3 σ of the logits of R relations for P pairs.
 
-        σ is the standard deviation of a logit. B is the number of different means of h1. A relation
-        without a unit has the mean `NEVER`.
+        σ is the standard deviation of a logit. A relation without a unit has the mean `NEVER`.
 
         Args:
-            means: (B, H1) means of h1.
-            ends: subject and object class of each pair, (B, P).
+            means: B different means of h1.
             only: index of one relation (R = 1), or None for all relations (R = A).
-            certain: True if all means of h1 are 0 or 1. The variance of the logits is then 0.
+            sampled: True if h1 is a sample: its means are 0 or 1, so all variances are 0.
         """
 
-    def between(self, context: Context) -> Between:
+    def logits(self, scene: EncodedScene) -> RelationLogits:
         """Return the logits of all relations between the classes of a scene."""
-        n, observed = len(context.classes), context.observed
-        listed = context.classes, context.presence, context.log_counts
-        means = state_means(context.x[None], self._states)
-        mean, spread = self.normal(means, ends_of(*listed, *all_pairs(n)))
-        weight = NO_VALUES if observed is None else self.implication_weights(context.x)
-        shift = apart = NO_VALUES
-        if observed is not None and len(weight):
-            on = (observed.r > 0) & (observed.i != observed.j)
-            units = observed.a[on], observed.i[on], observed.j[on]
-            shifts = implication_shifts(weight, n, *units)
-            shift, apart = (np.ascontiguousarray(change.transpose(2, 0, 1)) for change in shifts)
-        shape = self._A, n, n
-        return Between(mean.reshape(shape), spread.reshape(shape), shift, apart)
+        n, observed = len(scene.classes), scene.observed
+        pairs = Pairs(scene.classes, scene.log_counts, scene.presence, *all_pairs(n))
+        mean, spread = (
+            part.reshape(self._A, n, n)
+            for part in self.moments(state_means(scene.x[None], self._states), pairs)
+        )
+        weight = None if observed is None else self.implication_weights(scene.x)
+        if observed is None or weight is None:
+            shift = np.zeros_like(mean)
+            return RelationLogits(mean, spread, shift, shift)
+        r = np.zeros(mean.shape, np.bool_)
+        r[observed.a, observed.i, observed.j] = (observed.r > 0) & (observed.i != observed.j)
+        shift = np.ascontiguousarray(implication_shifts(weight, r).transpose(2, 0, 1))
+        # The first 2A features are the relations of the same two classes, in both directions.
+        steps = np.concatenate([r, r.swapaxes(1, 2)]).reshape(2 * self._A, n * n)
+        of_pair = weight[: 2 * self._A].T @ steps
+        return RelationLogits(mean, spread, shift, shift - of_pair.reshape(shift.shape))
 
-    def implication_weights(self, x: Floats, beta: float = 1.0) -> Floats:
-        """Return how much each of F features of the observed relations changes a logit, (F, A).
+    def implication_weights(
+        self, x: Float[NDArray, " H1"], beta: float = 1.0
+    ) -> Float[NDArray, "F A"] | None:
+        """Return how much each of F features of the relations that hold changes a logit.
 
-        `training/machines/triway.py` defines the features. The result is empty for machines in
-        which relations do not change each other's logits directly. x (H1,) are the logits of h1
-        given the objects, and beta is 1 / temperature.
+        `training/machines/triway.py` defines the features. The result is None for machines in which
+        relations do not change each other's logits directly.
+
+        Args:
+            x: logits of h1 given the classes.
+            beta: 1 / temperature.
         """
-        return NO_VALUES.reshape(0, 0)
+        return None
 
-    def log_odds(self, between: Between, *, apart: bool = False) -> Floats:
-        """Return the log-odds of all relations between the n classes of a scene, (A, n, n).
+    def log_odds(
+        self, logits: RelationLogits, *, leave_out_pair: bool = False
+    ) -> Float[NDArray, "A n n"]:
+        """Return the log-odds of all relations between the n classes of a scene.
 
-        With `apart`, the observed relations of a pair are not evidence for its other relations.
+        With `leave_out_pair`, the observed relations of a pair are not evidence for its other
+        relations.
         """
-        change = between.apart if apart else between.shift
-        mean = between.mean + change if len(change) else between.mean
-        return to_log_odds(mean, between.spread)
+        shift = logits.shift_by_others if leave_out_pair else logits.shift
+        return to_log_odds(logits.mean + shift, logits.spread)
 
     def placement_log_odds(
-        self, context: Context, candidates: Indices, anchors: Indices, only: int | None = None
-    ) -> tuple[Floats, Floats]:
+        self,
+        scene: EncodedScene,
+        candidates: Int[NDArray, " N"],
+        anchors: Int[NDArray, " m"],
+        only: int | None = None,
+    ) -> tuple[Float[NDArray, "N R m"], Float[NDArray, "N R m"]]:
         """Return the log-odds of relations between absent candidate classes and anchor classes.
 
         The method computes the log-odds of each candidate as if the candidate were present.
 
         Args:
-            context: hidden units of the scene.
-            candidates: (N,) indices of the candidate classes.
-            anchors: (m,) indices of the anchor classes in the scene.
+            candidates: indices of the candidate classes.
+            anchors: positions of the anchor classes among the classes of the scene.
             only: index of one relation (R = 1), or None for all relations (R = A).
 
         Returns:
-            Log-odds (N, R, m) with the candidate as subject, and log-odds (N, R, m) with the
-            anchor as subject.
+            Log-odds with the candidate as subject, and log-odds with the anchor as subject.
         """
-        m, scene = len(anchors), (context.classes, context.log_counts, context.presence)
-        ends = _placement_ends(candidates, *(part[anchors] for part in scene))
-        means = state_means(context.x + self._W[candidates], self._states)
-        log_odds = to_log_odds(*self.normal(means, ends, only))
+        N, m = len(candidates), len(anchors)
+        i, j = np.empty((N, 2 * m), np.int64), np.empty((N, 2 * m), np.int64)
+        i[:, :m] = j[:, m:] = np.arange(N)[:, None]
+        j[:, :m] = i[:, m:] = np.arange(N, N + m)
+        pairs = Pairs(
+            np.concatenate([candidates, scene.classes[anchors]]),
+            np.concatenate([np.zeros(N, np.float32), scene.log_counts[anchors]]),
+            np.concatenate([np.ones(N, np.float32), scene.presence[anchors]]),
+            *(i, j),
+        )
+        means = state_means(scene.x + self._W[candidates], self._states)
+        log_odds = to_log_odds(*self.moments(means, pairs, only))
         return log_odds[:, :, :m], log_odds[:, :, m:]
 
 
@@ -265,25 +256,31 @@ class FreeUnits(RelationUnits):
         self._U, self._d, self._g = weights["U"], weights["d"], weights.arrays.get("g")
         self._table, index = _pair_table(weights)
         # The unit of each pair and relation, or -1. The last row is for pairs outside the table.
-        self._index = np.full((len(self._table[1]) + 1, self._A), -1, np.int32)
+        self._index = np.full((len(self._table.keys) + 1, self._A), -1, np.int32)
         self._index[index] = np.arange(len(self._U))
 
-    def normal(
-        self, means: Floats, ends: Ends, only: int | None = None, *, certain: bool = False
-    ) -> tuple[Floats, Floats]:
-        """See `RelationUnits`. The formula gives variance 0 for means of 0 and 1."""
+    def moments(
+        self,
+        means: Float[NDArray, "B H1"],
+        pairs: Pairs,
+        only: int | None = None,
+        *,
+        sampled: bool = False,
+    ) -> tuple[Float[NDArray, "B R P"], Float[NDArray, "B R P"]]:
+        """Return means and √3 σ of logits by the formula, which gives samples the variance 0."""
         chosen = _chosen_relations(self._A, only)
-        shape = len(means), chosen.stop - chosen.start, ends.i.shape[1]
+        shape = len(means), chosen.stop - chosen.start, pairs.i.shape[1]
         # Row b of the means, relation a and pair p of each entry of the result.
         b, a, p = (indices.reshape(-1) for indices in np.indices(shape))
-        rows = _pair_rows(*self._table, ends.i[b, p] * self._V + ends.j[b, p])
+        i, j = pairs.i[b, p], pairs.j[b, p]
+        rows = _pair_rows(self._table, pairs.classes[i] * self._V + pairs.classes[j])
         units = self._index[rows, chosen.start + a].astype(np.int64)
         kept = np.flatnonzero(units >= 0)
-        units, b, p = units[kept], b[kept], p[kept]
+        units, b = units[kept], b[kept]
         base = self._d[units]
         if self._g is not None:
-            g = self._g[units]
-            base = base + g[:, 0] * ends.p_i[b, p] + g[:, 1] * ends.p_j[b, p]
+            v_i, v_j = pairs.presence[i[kept]], pairs.presence[j[kept]]
+            base = base + self._g[units, 0] * v_i + self._g[units, 1] * v_j
         terms = self._by_unit(self._U[units])
         m = self._by_unit(means)[b if len(means) > 1 else np.zeros(1, np.int64)]
         weighted = terms * m
@@ -294,7 +291,7 @@ class FreeUnits(RelationUnits):
         spread.reshape(-1)[kept] = np.sqrt(3 * np.maximum(variance, 0))
         return mean, spread
 
-    def _by_unit(self, rows: Floats) -> Floats:
+    def _by_unit(self, rows: Float[NDArray, "N H1"]) -> Float[NDArray, "N units states-1"]:
         others = self._states - 1
         return rows.reshape(len(rows), rows.shape[1] // others, others)
 
@@ -311,19 +308,18 @@ class SharedUnits(RelationUnits):
 
     def __init__(self, weights: Weights) -> None:
         super().__init__(weights)
-        A = self._A
-        ones = np.ones((self._V, 1), np.float32)
+        A, ones = self._A, np.ones((self._V, 1), np.float32)
         table, index = _pair_table(weights)
-        residual = np.zeros((len(table[1]) + 1, A), np.float32)
+        residual = np.zeros((len(table.keys) + 1, A), np.float32)
         residual[index] = weights["residual"]
-        self._w = SharedArrays(
-            np.concatenate([weights["S"], ones], 1),
-            np.concatenate([weights["O"], ones], 1),
-            np.ascontiguousarray(weights["s"].T),
-            np.ascontiguousarray(weights["o"].T),
-            weights["n"],
-            *table,
-            residual,
+        self._w = _SharedArrays(
+            S=np.concatenate([weights["S"], ones], 1),
+            O=np.concatenate([weights["O"], ones], 1),
+            s=np.ascontiguousarray(weights["s"].T),
+            o=np.ascontiguousarray(weights["o"].T),
+            n=weights["n"],
+            table=table,
+            residual=residual,
         )
         self._G = np.concatenate([weights["M"], weights["P"][:, None]], 1)
         self._g = np.concatenate([weights["R"], weights["d"][:, None]], 1)
@@ -342,63 +338,74 @@ class SharedUnits(RelationUnits):
             gamma[:, range(A), range(A)] = 0
             self._gamma = gamma.reshape(len(gamma), -1)
 
-    def normal(
-        self, means: Floats, ends: Ends, only: int | None = None, *, certain: bool = False
-    ) -> tuple[Floats, Floats]:
-        """See `RelationUnits`."""
+    def moments(
+        self,
+        means: Float[NDArray, "B H1"],
+        pairs: Pairs,
+        only: int | None = None,
+        *,
+        sampled: bool = False,
+    ) -> tuple[Float[NDArray, "B R P"], Float[NDArray, "B R P"]]:
+        """Return means and √3 σ of logits from the factors of the classes."""
         chosen = _chosen_relations(self._A, only)
-        Y = self._Y[chosen, :0] if certain else self._Y[chosen]
+        Y = self._Y[chosen, :0] if sampled else self._Y[chosen]
         U = self._products(chosen, means, self._GT) + self._g[chosen]
         # The covariance of h1 is diag(m) - m m' within each hidden unit, and 0 between units.
         C, (R, r, _) = self._products(chosen, means, self._FF), Y.shape
         by_unit = means.reshape(len(means), -1, self._states - 1).transpose(1, 0, 2)
         f = by_unit @ self._F[:, :, chosen.start * r : chosen.stop * r]
         f = f.reshape(len(f), len(means), R, r)
-        return _normal_logits(self._w, chosen.start, ends, U, Y, C, f)
+        return _shared_moments(self._w, chosen.start, pairs, U, Y, C, f)
 
-    def _products(self, chosen: slice, rows: Floats, columns: Floats) -> Floats:
-        """Return the product of the rows (B, H1) with n columns of each chosen relation, (B, R, n).
-
-        `_columns` returns the columns (H1, A n) of all relations.
-        """
+    def _products(
+        self, chosen: slice, rows: Float[NDArray, "B H1"], columns: Float[NDArray, "H1 A*n"]
+    ) -> Float[NDArray, "B R n"]:
+        """Return the product of the rows with n columns of each chosen relation; see `_columns`."""
         n = columns.shape[1] // self._A
-        products: Floats = rows @ columns[:, chosen.start * n : chosen.stop * n]
+        products = rows @ columns[:, chosen.start * n : chosen.stop * n]
         return products.reshape(len(rows), -1, n)
 
-    def implication_weights(self, x: Floats, beta: float = 1.0) -> Floats:
-        """See `RelationUnits`.
-
-        The weights are beta (gamma_0 + sum_q z_q gamma_q) with z = B m(beta x).
-        """
+    def implication_weights(
+        self, x: Float[NDArray, " H1"], beta: float = 1.0
+    ) -> Float[NDArray, "F A"] | None:
+        """Return beta (gamma_0 + sum_q z_q gamma_q) with z = B m(beta x)."""
         if self._B is None:
-            return super().implication_weights(x, beta)
+            return None
         scale = np.append(np.float32(1), self._B @ state_means(beta * x, self._states))
-        weight: Floats = (np.float32(beta) * scale) @ self._gamma
-        return weight.reshape(-1, self._A)
+        return ((np.float32(beta) * scale) @ self._gamma).reshape(-1, self._A)
 
 
 class StandIns(RelationUnits):
-    """The relation units of a model with further classes, in which known classes stand in for them.
+    """The relation units of a model with further classes, in which other classes stand in for them.
 
     Args:
         weights: weights with the further classes.
-        units: relation units of the known classes.
-        stand_in: (V,) known class that stands in for each class.
+        units: relation units of the other classes.
+        stand_in: class that stands in for each class.
     """
 
-    def __init__(self, weights: Weights, units: RelationUnits, stand_in: Indices) -> None:
+    def __init__(
+        self, weights: Weights, units: RelationUnits, stand_in: Int[NDArray, " V"]
+    ) -> None:
         super().__init__(weights)
         self._units, self._stand_in = units, stand_in
 
-    def normal(
-        self, means: Floats, ends: Ends, only: int | None = None, *, certain: bool = False
-    ) -> tuple[Floats, Floats]:
-        """See `RelationUnits`."""
-        i, j = self._stand_in[ends.i], self._stand_in[ends.j]
-        return self._units.normal(means, ends._replace(i=i, j=j), only, certain=certain)
+    def moments(
+        self,
+        means: Float[NDArray, "B H1"],
+        pairs: Pairs,
+        only: int | None = None,
+        *,
+        sampled: bool = False,
+    ) -> tuple[Float[NDArray, "B R P"], Float[NDArray, "B R P"]]:
+        """Return means and √3 σ of the logits of the stand-ins."""
+        pairs = pairs._replace(classes=self._stand_in[pairs.classes])
+        return self._units.moments(means, pairs, only, sampled=sampled)
 
-    def implication_weights(self, x: Floats, beta: float = 1.0) -> Floats:
-        """See `RelationUnits`."""
+    def implication_weights(
+        self, x: Float[NDArray, " H1"], beta: float = 1.0
+    ) -> Float[NDArray, "F A"] | None:
+        """Return the weights of the other classes' relation units."""
         return self._units.implication_weights(x, beta)
 
 
@@ -407,54 +414,20 @@ def relation_units(weights: Weights) -> RelationUnits:
     return SharedUnits(weights) if weights.spec.kind.factorised else FreeUnits(weights)
 
 
-@lru_cache(maxsize=128)
-def all_pairs(n: int) -> tuple[Indices, Indices]:
-    """Return all n² pairs of n classes: the indices of first and second classes, each (1, n²)."""
-    indices = np.arange(n)
-    return np.repeat(indices, n)[None], np.tile(indices, n)[None]
-
-
-def _columns(matrices: Floats) -> Floats:
-    """Convert the n rows of each relation (A, n, H1) to columns (H1, A n).
-
-    Matrix products with the columns are faster.
-    """
+def _columns(matrices: Float[NDArray, "A n H1"]) -> Float[NDArray, "H1 A*n"]:
+    """Convert the n rows of each relation to columns. Matrix products with columns are faster."""
     return np.ascontiguousarray(matrices.reshape(-1, matrices.shape[2]).T)
 
 
 def _chosen_relations(relations: int, only: int | None) -> slice:
-    """Return a slice that selects the relation `only`, or all relations if `only` is None.
-
-    Indexing with a slice does not copy the array.
-    """
+    """Return a slice of the relation `only`, or of all relations. A slice copies no array."""
     return slice(0, relations) if only is None else slice(only, only + 1)
 
 
-def _pair_table(weights: Weights) -> tuple[Table, tuple[Indices, Indices]]:
-    """Build the hash table of `_pair_rows`.
-
-    Its keys are the pairs of classes of the T stored triples. The keys are sorted by bucket. Bucket
-    k consists of the rows from start[k] to start[k + 1].
-
-    Returns:
-        The hash table (start, keys), and two indices of the T triples: the row of the triple's pair
-        in the table, (T,), and the relation, (T,).
-    """
-    # A triple (a, i, j) has the key (a V + i) V + j. The key of its pair is i V + j.
-    relation, pair_of_triple = np.divmod(weights.triple_keys, weights.spec.V**2)
-    pairs, pair_index = np.unique(pair_of_triple, return_inverse=True)
-    buckets = 1 << (2 * len(pairs)).bit_length()
-    bucket = (pairs * _SPREAD >> _SHIFT) & (buckets - 1)
-    order = np.argsort(bucket, kind="stable")
-    row_of_pair = np.empty_like(order)
-    row_of_pair[order] = np.arange(len(order))
-    start = np.searchsorted(bucket[order], np.arange(buckets + 1))
-    table = start.astype(np.int32), pairs[order].astype(np.int32)
-    return table, (row_of_pair[pair_index], relation)
-
-
-def _directions(weights: Weights) -> tuple[Floats, Floats]:
-    """Return F (A, r, H1) and Y (A, r, K + 1); see `SharedUnits`.
+def _directions(
+    weights: Weights,
+) -> tuple[Float[NDArray, "A r H1"], Float[NDArray, "A r K+1"]]:
+    """Return F and Y; see `SharedUnits`.
 
     The rows of F[a] are the r directions in which U_e·h1 has the largest variance. Y[a] converts
     the factors z = (S_i * O_j, 1) of a unit to its coordinates q = Y[a] z in these directions. The
@@ -487,93 +460,125 @@ def _directions(weights: Weights) -> tuple[Floats, Floats]:
     return F.astype(np.float32), Y
 
 
-def _mean_covariance(means: NDArray[np.float64], states: int) -> NDArray[np.float64]:
-    """Return the mean over N scenes of cov(h1), (H1, H1), given the means of h1, (N, H1)."""
+def _mean_covariance(means: Float[NDArray, "N H1"], states: int) -> Float[NDArray, "H1 H1"]:
+    """Return the mean of cov(h1) over N scenes, given the means of h1."""
     units = means.shape[1] // (states - 1)
     same_unit = np.kron(np.eye(units), np.ones((states - 1, states - 1)))
-    covariance: NDArray[np.float64] = np.diag(means.mean(0)) - means.T @ means / len(means)
+    covariance = np.diag(means.mean(0)) - means.T @ means / len(means)
     return covariance * same_unit
 
 
-@compiled
-def _pair_rows(start, keys, pairs):
-    """Return the row of each pair of classes in the table of residual weights, (E,).
+class _PairTable(NamedTuple):
+    """Hash table of pairs of classes, whose rows are sorted by bucket.
 
-    Args:
-        start: first row of each bucket of the hash table.
-        keys: keys of the pairs in the table. A pair (i, j) of V classes has the key i V + j.
-        pairs: (E,) keys to look up. A key outside the table gets the last row, which is zero.
+    Attributes:
+        start: first row of each bucket, and the end of the last bucket.
+        keys: key i V + j of the pair (i, j) of each row.
     """
+
+    start: Int[NDArray, " buckets+1"]
+    keys: Int[NDArray, " pairs"]
+
+
+def _pair_table(
+    weights: Weights,
+) -> tuple[_PairTable, tuple[Int[NDArray, " T"], Int[NDArray, " T"]]]:
+    """Return the table of the pairs of the T stored triples; row and relation of each triple."""
+    # A triple (a, i, j) has the key (a V + i) V + j. The key of its pair is i V + j.
+    relation, pair_of_triple = np.divmod(weights.triple_keys, weights.spec.V**2)
+    pairs, pair_index = np.unique(pair_of_triple, return_inverse=True)
+    buckets = 1 << (2 * len(pairs)).bit_length()
+    bucket = (pairs * _SPREAD >> _SHIFT) & (buckets - 1)
+    order = np.argsort(bucket, kind="stable")
+    row_of_pair = np.empty_like(order)
+    row_of_pair[order] = np.arange(len(order))
+    start = np.searchsorted(bucket[order], np.arange(buckets + 1))
+    table = _PairTable(start.astype(np.int32), pairs[order].astype(np.int32))
+    return table, (row_of_pair[pair_index], relation)
+
+
+@compiled
+def _pair_rows(table: _PairTable, pairs: Int[NDArray, " P"]) -> Int[NDArray, " P"]:
+    """Return the row of each key in the table, or the number of rows without such a key."""
     # Buckets are faster than binary search, because the processor cannot predict its branches.
+    start, keys = table
     rows = np.empty(len(pairs), np.int64)
-    for e in range(len(pairs)):
-        pair = pairs[e]
+    for p in range(len(pairs)):
+        pair = pairs[p]
         bucket = (pair * _SPREAD >> _SHIFT) & (len(start) - 2)
-        rows[e] = len(keys)
+        rows[p] = len(keys)
         for row in range(start[bucket], start[bucket + 1]):
             if keys[row] == pair:
-                rows[e] = row
+                rows[p] = row
     return rows
 
 
-@compiled
-def _placement_ends(candidates, classes, log_counts, presence):
-    """Return the `Ends` of N candidate classes and m anchor classes, (N, 2 m) each.
+class _SharedArrays(NamedTuple):
+    """Weights of `SharedUnits`.
 
-    In the first m columns, the candidate is the subject. In the others, the anchor is. Candidates
-    are present, with one instance.
+    Attributes:
+        S, O: factors of each class as subject and as object. The last column is 1.
+        s, o: weights of each class as subject and as object of each relation.
+        n: weights of the log number of instances of subject and object class.
+        table: pairs of classes with a residual.
+        residual: residual weight w' of each pair of classes and each relation. The last row is 0.
     """
-    N, m = len(candidates), len(classes)
-    i, j = np.empty((N, 2 * m), np.int64), np.empty((N, 2 * m), np.int64)
-    log_i, log_j = np.empty((N, 2 * m), np.float32), np.empty((N, 2 * m), np.float32)
-    p_i, p_j = np.empty((N, 2 * m), np.float32), np.empty((N, 2 * m), np.float32)
-    for c in range(N):
-        for k in range(m):
-            i[c, k] = j[c, m + k] = candidates[c]
-            j[c, k] = i[c, m + k] = classes[k]
-            log_i[c, k] = log_j[c, m + k] = np.float32(0.0)
-            log_j[c, k] = log_i[c, m + k] = log_counts[k]
-            p_i[c, k] = p_j[c, m + k] = np.float32(1.0)
-            p_j[c, k] = p_i[c, m + k] = presence[k]
-    return Ends(i, j, log_i, log_j, p_i, p_j)
+
+    S: Float[NDArray, "V K+1"]
+    O: Float[NDArray, "V K+1"]  # noqa: E741
+    s: Float[NDArray, "V A"]
+    o: Float[NDArray, "V A"]
+    n: Float[NDArray, "A 2"]
+    table: _PairTable
+    residual: Float[NDArray, "pairs+1 A"]
 
 
 @compiled_in_any_order
-def _normal_logits(w, first, ends, U, Y, C, f):
-    """Return the means and √3 σ of the logits of R relations for P pairs in B batches, (B, R, P).
+def _shared_moments(
+    w: _SharedArrays,
+    first: int,
+    pairs: Pairs,
+    U: Float[NDArray, "B R K+1"],
+    Y: Float[NDArray, "R r K+1"],
+    C: Float[NDArray, "B R r*(r+1)/2"],
+    f: Float[NDArray, "units B R r"],
+) -> tuple[Float[NDArray, "B R P"], Float[NDArray, "B R P"]]:
+    """Return the means and √3 σ of the logits of R relations for P pairs.
 
     The mean of a logit is base + U z, and its variance σ² is q'C q - sum_u (f_u'q)² with q = Y z.
-    z are the factors of the pair, and base are the terms that do not depend on the hidden units;
-    see `SharedUnits`.
+    base are the terms that do not depend on the hidden units; see `SharedUnits`. σ is 0 if r is 0.
 
     Args:
-        w: weights of the units; see `SharedArrays`.
         first: index of the first of the R consecutive relations.
-        ends: subject and object classes of the pairs, (B, P); see `Ends`.
-        U: (B, R, K) weights of the factors.
-        Y: (R, r, K) matrix Y of each relation. σ is 0 if r is 0.
-        C: (B, R, r (r + 1) / 2) lower half of each symmetric r x r matrix C. Entries off the
-            diagonal are doubled. The function subtracts the products of f from C, in place.
-        f: (units u, B, R, r) vectors f_u.
+        C: lower half of each symmetric r x r matrix C. Entries off the diagonal are doubled. The
+            function subtracts the products of f from C, in place.
     """
     # Local names are faster: each access through the tuple would change a reference count.
     S, O, s, o, n, residual = w.S, w.O, w.s, w.o, w.n, w.residual  # noqa: E741
-    (B, P), (R, r, K) = ends.i.shape, Y.shape
+    classes, log_counts = pairs.classes, pairs.log_counts
+    (B, P), (R, r, K) = pairs.i.shape, Y.shape
     width = -(-P // _VECTOR) * _VECTOR
     z, q = np.zeros((K, B * width), np.float32), np.empty((r, B * width), np.float32)
     mean, spread = np.empty((B, R, P), np.float32), np.empty((B, R, P), np.float32)
-    row, variance = np.empty(width, np.float32), np.empty(width, np.float32)
+    row, variance, keys = (
+        np.empty(width, np.float32),
+        np.empty(width, np.float32),
+        np.empty(P, np.int64),
+    )
     for b in range(B):
-        subjects, objects, log_i, log_j = ends.i[b], ends.j[b], ends.log_i[b], ends.log_j[b]
-        pairs = _pair_rows(w.start, w.key, subjects * len(S) + objects)
+        subjects, objects = pairs.i[b], pairs.j[b]
         for p in range(P):
-            i, j = subjects[p], objects[p]
+            keys[p] = classes[subjects[p]] * len(S) + classes[objects[p]]
+        rows = _pair_rows(w.table, keys)
+        for p in range(P):
+            i, j = classes[subjects[p]], classes[objects[p]]
+            log_i, log_j = log_counts[subjects[p]], log_counts[objects[p]]
             for k in range(K):
                 z[k, b * width + p] = S[i, k] * O[j, k]
             for c in range(R):
                 a = first + c
-                of_counts = n[a, 0] * log_i[p] + n[a, 1] * log_j[p]
-                mean[b, c, p] = s[i, a] + o[j, a] + of_counts + residual[pairs[p], a]
+                of_counts = n[a, 0] * log_i + n[a, 1] * log_j
+                mean[b, c, p] = s[i, a] + o[j, a] + of_counts + residual[rows[p], a]
     for c in range(R):
         for d in range(r):
             _weighted_sum(Y[c, d], z, 0, q[d])
@@ -581,11 +586,14 @@ def _normal_logits(w, first, ends, U, Y, C, f):
             _weighted_sum(U[b, c], z, b * width, row)
             for p in range(P):
                 mean[b, c, p] += row[p]
-            lower, t = C[b, c], 0
-            for u in range(len(f)):
-                _subtract_product(f[u, b, c], lower)
             variance[:] = np.float32(0.0)
+            lower, t = C[b, c], 0
             for d in range(r):
+                for u in range(len(f)):
+                    f_d = f[u, b, c, d]
+                    for e in range(d):
+                        lower[t + e] -= (f_d + f_d) * f[u, b, c, e]
+                    lower[t + d] -= f_d * f_d
                 _weighted_sum(lower[t : t + d + 1], q, b * width, row)
                 t, q_d = t + d + 1, q[d, b * width : (b + 1) * width]
                 for p in range(width):
@@ -596,8 +604,13 @@ def _normal_logits(w, first, ends, U, Y, C, f):
 
 
 @compiled_in_any_order
-def _weighted_sum(weights, rows, start, total):
-    """Write sum_k weights_k rows_k (P,) to total. P columns of the rows begin at column start."""
+def _weighted_sum(
+    weights: Float[NDArray, " K"],
+    rows: Float[NDArray, "K columns"],
+    start: int,
+    total: Float[NDArray, " P"],
+) -> None:
+    """Write sum_k weights_k rows_k to total, for the P columns from the column start."""
     K, P = len(weights), len(total)
     total[:] = np.float32(0.0)
     # Two rows at a time halve the reads and writes of the sum.
@@ -610,15 +623,3 @@ def _weighted_sum(weights, rows, start, total):
         weight, row = weights[K - 1], rows[K - 1, start : start + P]
         for p in range(P):
             total[p] += weight * row[p]
-
-
-@compiled_in_any_order
-def _subtract_product(f, lower):
-    """Subtract f f' from a symmetric matrix, in place; see `_normal_logits` for its lower half."""
-    t = 0
-    for d in range(len(f)):
-        double = f[d] + f[d]
-        for e in range(d):
-            lower[t + e] -= double * f[e]
-        lower[t + d] -= f[d] * f[d]
-        t += d + 1

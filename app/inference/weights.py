@@ -9,15 +9,18 @@ v is the presence of the classes, t is the room type, and z' runs over the state
 For Z = 2, p is sigmoid(x).
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import NDArray
 
-from app.compiling import compiled, compiled_in_any_order
+from app.compiling import compiled
 from app.inference.elementary import exp
 from app.inference.variants import MachineSpec
 
@@ -220,63 +223,25 @@ def pack_scenes(presence: NDArray[Any]) -> NDArray[np.int32]:
 
 
 @compiled
-def all_states(x, states):
-    """Return the probabilities of all states of the hidden units, (B, units, states).
-
-    Args:
-        x: (B, H1) logits of all states but the first of each unit.
-        states: number of states of a unit.
-    """
-    p = _with_first(x, states)
+def all_states(x: Float[NDArray, "B H1"], states: int) -> Float[NDArray, "B units states"]:
+    """Return the probabilities of all states of the hidden units, the first state included."""
+    others, half, one = states - 1, np.float32(0.5), np.float32(1.0)
+    p = np.zeros((len(x), x.shape[1] // others, states), np.float32)
     for b in range(len(p)):
         for m in range(p.shape[1]):
-            row = p[b, m]
-            top = _largest(row)
+            row, top, total = p[b, m], np.float32(0.0), np.float32(0.0)
+            for z in range(others):
+                row[z + 1] = x[b, m * others + z]
+                top = max(top, row[z + 1])
             # The square of e^(x/2) covers subnormal numbers.
             for z in range(states):
-                row[z] = exp((row[z] - top) * np.float32(0.5))
+                row[z] = exp((row[z] - top) * half)
                 row[z] *= row[z]
-            scale = np.float32(1.0) / _total(row)
             for z in range(states):
-                row[z] *= scale
+                total += row[z]
+            for z in range(states):
+                row[z] *= one / total
     return p
-
-
-@compiled
-def odds(x, states):
-    """Return e^x of all states of the hidden units, (B, units, states). See `all_states`."""
-    p = _with_first(x, states)
-    flat = p.reshape(-1)
-    for k in range(len(flat)):
-        flat[k] = exp(flat[k])
-    return p
-
-
-@compiled
-def _with_first(x, states):
-    """Return x (B, H1) with a 0 for the first state of each unit, (B, units, states)."""
-    p = np.zeros((len(x), x.shape[1] // (states - 1), states), np.float32)
-    for b in range(len(p)):
-        for m in range(p.shape[1]):
-            for z in range(1, states):
-                p[b, m, z] = x[b, m * (states - 1) + z - 1]
-    return p
-
-
-@compiled_in_any_order
-def _largest(row):
-    largest = row[0]
-    for z in range(1, len(row)):
-        largest = max(largest, row[z])
-    return largest
-
-
-@compiled_in_any_order
-def _total(row):
-    total = np.float32(0.0)
-    for z in range(len(row)):
-        total += row[z]
-    return total
 
 
 @compiled

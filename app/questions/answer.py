@@ -9,7 +9,7 @@ from typing import Any, Final, TypeAlias
 
 import numpy as np
 import orjson
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from pydantic_core import from_json, to_json, to_jsonable_python
 
@@ -200,59 +200,49 @@ def _round_to_digits(values):
 
 
 @compiled
-def best(values, usable, count):
-    """Return the indices of the `count` largest usable values, largest first.
+def best(
+    values: Float[NDArray, " N"], usable: Bool[NDArray, " N"], count: int
+) -> Int[NDArray, " k"]:
+    """Return the indices of the k <= `count` largest usable values, largest first.
 
     Of equal values, the value with the lower index comes first. The time is O(N log count).
-
-    Args:
-        values: (N,) values to compare.
-        usable: (N,) bool, True for values that the result may contain.
-        count: maximum number of indices.
-
-    Returns:
-        At most `count` indices.
     """
-    size, kept = 0, min(count, len(values))
+    size, rest, kept = 0, 0, min(count, len(values))
     # The heap contains the best indices so far. Its root is the worst of these indices: the index
     # with the smallest value, and of several equal values the largest index.
     heap = np.empty(kept, np.int64)
-    for position in range(len(values)):
-        if not usable[position]:
-            continue
-        if size < kept:
-            node = size
+    while size < kept and rest < len(values):
+        if usable[rest]:
+            heap[size] = rest
             size += 1
-            while node and not _worse(values, heap[(node - 1) // 2], position):
-                heap[node] = heap[(node - 1) // 2]
-                node = (node - 1) // 2
-            heap[node] = position
-        elif values[position] > values[heap[0]]:
-            _sink(values, heap, size, position)
-    ranked = heap[:size]
+        rest += 1
+    for node in range(size // 2 - 1, -1, -1):
+        _sink(values, heap, size, node, heap[node])
+    for index in range(rest, len(values)):
+        if size and usable[index] and values[index] > values[heap[0]]:
+            _sink(values, heap, size, 0, index)
     for last in range(size - 1, 0, -1):
         worst, moved = heap[0], heap[last]
-        _sink(values, heap, last, moved)
-        ranked[last] = worst
-    return ranked
+        _sink(values, heap, last, 0, moved)
+        heap[last] = worst
+    return heap[:size]
 
 
 @compiled
-def _worse(values, one, other):
-    """Return whether the value at index `one` ranks after the value at index `other`."""
-    return values[one] < values[other] or (values[one] == values[other] and one > other)
-
-
-@compiled
-def _sink(values, heap, size, position):
-    """Replace the root of the heap by the index `position`, and restore the heap order."""
-    node = 0
+def _sink(
+    values: Float[NDArray, " N"], heap: Int[NDArray, " k"], size: int, node: int, index: int
+) -> None:
+    """Replace a node of the heap by an index, and restore the heap order below the node."""
+    value = values[index]
     while 2 * node + 1 < size:
         child = 2 * node + 1
-        if child + 1 < size and _worse(values, heap[child + 1], heap[child]):
-            child += 1
-        if not _worse(values, heap[child], position):
+        if child + 1 < size:
+            one, other = heap[child], heap[child + 1]
+            if values[other] < values[one] or (values[other] == values[one] and other > one):
+                child += 1
+        worse = heap[child]
+        if not (values[worse] < value or (values[worse] == value and worse > index)):
             break
-        heap[node] = heap[child]
+        heap[node] = worse
         node = child
-    heap[node] = position
+    heap[node] = index

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from app.compiling import compiled
 from app.errors import LocatedError, RareRoomTypeError
 from app.inference.chains import ChainState, ConditionedChains, Conditions, random_stream
-from app.inference.relation_units import context_of
+from app.inference.relation_units import encode
 from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, rounded_number
 from app.questions.names import ErrorList
@@ -293,7 +293,7 @@ def room_fit(model: SceneModel, classes: list[int], room: int) -> float:
     """
     presence = np.ones(len(classes), np.float32)
     index = np.array(classes, dtype=np.int64)
-    context = context_of(model.weights, index, presence, np.zeros_like(presence))
+    context = encode(model.weights, index, presence, np.zeros_like(presence))
     return float(model.objects.room_evidence(context.x[None], index, presence[None])[0, room])
 
 

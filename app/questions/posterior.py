@@ -24,7 +24,7 @@ from app.compiling import compiled, inlined
 from app.inference import MachineSpec
 from app.inference.elementary import logistic
 from app.inference.quadrature import to_log_odds
-from app.inference.relation_units import Between, ObservedRelations, context_of
+from app.inference.relation_units import ObservedRelations, RelationLogits, encode
 from app.model.calibration import LEAST_COVERAGE, Calibration, CountSlope, CoverageFit
 from app.model.scene_model import SceneModel
 from app.scene.scene import Scene, pool_classes
@@ -117,7 +117,7 @@ class Posterior:
         self.present = listing = present(scene, model.spec)
         is_structure = model.vocabulary.structure[listing.classes]
         self.listed = len(listing.classes) - int(np.count_nonzero(is_structure))
-        self.context = context_of(
+        self.context = encode(
             model.weights,
             listing.classes,
             listing.presence,
@@ -167,7 +167,7 @@ class Posterior:
         scene without the class.
         """
         # Row k has the logits of h1 and the presence of the classes in the scene without class k.
-        x, presence = self.context.x - self.context.shares, self.present.presence
+        x, presence = self.context.x - self.context.contributions, self.present.presence
         without = self._room_log_p(x, presence * (1 - np.eye(len(presence), dtype=np.float32)))
         return (log_odds_of(self.room_log_p()) - log_odds_of(without)).T
 
@@ -184,8 +184,7 @@ class Posterior:
 
     def relation_change(self) -> Float[Floats, "A n n"]:
         """Return the change of every logit by observed relations of other pairs."""
-        change = self._between.apart
-        return change if len(change) else np.zeros_like(self._between.mean)
+        return self._between.shift_by_others
 
     def log_odds_of_pairs(
         self, i: Int[Indices, "P"], j: Int[Indices, "P"]
@@ -194,7 +193,7 @@ class Posterior:
 
         The observed relations of a pair are not evidence for the relations of the same pair.
         """
-        log_odds = self._units.log_odds(self._between, apart=True)
+        log_odds = self._units.log_odds(self._between, leave_out_pair=True)
         # The compiled functions of the questions need contiguous arrays.
         forward, backward = np.ascontiguousarray(log_odds[:, [i, j], [j, i]].swapaxes(0, 1))
         return forward, backward
@@ -209,8 +208,8 @@ class Posterior:
         return self._units.placement_log_odds(self.context, candidates, anchors, only)
 
     @cached_property
-    def _between(self) -> Between:
-        return self._units.between(self.context)
+    def _between(self) -> RelationLogits:
+        return self._units.logits(self.context)
 
 
 def log_odds_of(log_p: Float[Doubles, "..."]) -> Float[Doubles, "..."]:

@@ -5,9 +5,12 @@ pillow on a bed with a headboard, and of milk in a fridge look alike. Their heig
 roles. The roles that such pairs of classes have in words and support links decide.
 """
 
+from __future__ import annotations
+
 from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled
@@ -29,34 +32,28 @@ class RoleCounts(NamedTuple):
     """How often classes have each role, as sources state it in words or by support links.
 
     Attributes:
-        pair: (P,) int64 keys i V + j of pairs of smaller class i and larger class j, ascending.
-        counts: (P, 3) float32 number of scenes in which i has each role at j.
-        anchor: (V, 3) float32 number of scenes in which any class has each role at class j.
+        pair: keys i V + j of pairs of smaller class i and larger class j, in ascending order.
+        counts: number of scenes in which i has each role at j.
+        anchor: number of scenes in which any class has each role at class j.
     """
 
-    pair: NDArray[np.int64]
-    counts: NDArray[np.float32]
-    anchor: NDArray[np.float32]
+    pair: Int[NDArray, " P"]
+    counts: Float[NDArray, "P 3"]
+    anchor: Float[NDArray, "V 3"]
 
 
-def role_counts(roles: RoleCounts, i: int, j: int) -> NDArray[np.float32]:
-    """Return the counts of the roles of a smaller class i at a larger class j, (3,)."""
-    key = i * len(roles.anchor) + j
-    row = int(roles.pair.searchsorted(key))
-    if row < len(roles.pair) and roles.pair[row] == key:
-        return roles.counts[row]
-    return np.zeros(3, np.float32)
+def role_counts(roles: RoleCounts, i: int, j: int) -> Float[NDArray, " 3"]:
+    """Return the counts of the roles of a smaller class i at a larger class j."""
+    row = find_row(roles.pair, i * len(roles.anchor) + j)
+    return np.zeros(3, np.float32) if row < 0 else roles.counts[row]
 
 
 @compiled
-def is_smaller(size_i, size_j):
+def is_smaller(size_i: Float[NDArray, " 3"], size_j: Float[NDArray, " 3"]) -> bool:
     """Return whether box i is smaller than box j.
 
     The function compares the areas of the footprints. If these are equal up to the share `SAME`, it
     compares the volumes. If the volumes are also equal, no box is smaller than the other.
-
-    Args:
-        size_i, size_j: extents of the boxes in x, y and z, in metres, (3,).
     """
     extent_i, extent_j = size_i[0] * size_i[1], size_j[0] * size_j[1]  # areas in m²
     if abs(extent_i - extent_j) <= SAME * max(extent_i, extent_j):
@@ -65,13 +62,11 @@ def is_smaller(size_i, size_j):
 
 
 @compiled
-def possible_roles(rise, height, larger_height):
-    """Return which roles the heights of two boxes allow, (3,) bool.
+def possible_roles(rise: float, height: float, larger_height: float) -> Bool[NDArray, " 3"]:
+    """Return which roles the heights of two boxes in metres allow.
 
     Args:
-        rise: bottom of the smaller box above the bottom of the larger box, in metres.
-        height: height of the smaller box in metres.
-        larger_height: height of the larger box in metres.
+        rise: bottom of the smaller box above the bottom of the larger box.
     """
     possible = np.empty(3, np.bool_)
     possible[ON] = rise >= LEAST_RISE * larger_height
@@ -81,16 +76,15 @@ def possible_roles(rise, height, larger_height):
 
 
 @compiled
-def likely_role(roles, i, j, possible):
+def likely_role(roles: RoleCounts, i: int, j: int, possible: Bool[NDArray, " 3"]) -> int:
     """Return the role of a smaller object of class i at a larger object of class j, or -1.
 
     The result is -1 if no role has `LEAST_SHARE` of the smoothed counts, and at least
     `LEAST_WEIGHT`.
 
     Args:
-        roles: see `RoleCounts`.
         i, j: class indices. -1 means an unknown class.
-        possible: (3,) bool, True for the roles that the boxes allow.
+        possible: the roles that the boxes allow.
     """
     pair, counts, anchor = roles
     if i < 0 or j < 0:
@@ -111,8 +105,8 @@ def likely_role(roles, i, j, possible):
 
 
 @compiled
-def find_row(keys, key):
-    """Return the row of a key in ascending keys (N,), or -1 without such a key."""
+def find_row(keys: Int[NDArray, " P"], key: int) -> int:
+    """Return the row of a key in ascending keys, or -1 without such a key."""
     low, high = 0, len(keys)
     while low < high:
         middle = (low + high) // 2

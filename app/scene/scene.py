@@ -4,6 +4,8 @@
 (objects), but models only know classes: `app.questions.posterior` pools the instances of a class.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -170,32 +172,38 @@ def boxes_of(
 
 
 @compiled
-def pool_classes(classes, confidence):
-    """Return the n distinct classes of N instances; classes (N,) int64, confidence (N,) float64.
+def pool_classes(
+    classes: Int[NDArray, " N"], confidence: Float[NDArray, " N"]
+) -> tuple[
+    Int[NDArray, " n"], Int[NDArray, " n"], Int[NDArray, " N"], Int[NDArray, " n"],
+    Float[NDArray, " n"],
+]:  # fmt: skip
+    """Return the n distinct classes of N instances.
 
     Returns:
-        Class indices in ascending order, (n,).
-        Index of the first instance of each class, (n,).
-        For each instance, index of its class in the first array, (N,).
-        Number of instances of each class, (n,).
-        Probability that at least one instance of each class exists, (n,).
+        Class indices in ascending order.
+        Index of the first instance of each class.
+        For each instance, index of its class in the first array.
+        Number of instances of each class.
+        Probability that at least one instance of each class exists.
     """
-    distinct, row = np.empty(len(classes), np.int64), np.empty(len(classes), np.int64)
-    counts, first = np.zeros(len(classes), np.int64), np.empty(len(classes), np.int64)
-    absent, n = np.ones(len(classes), np.float64), 0
-    order = np.empty(len(classes), np.int64)
-    for k in range(len(classes)):  # insertion sort
-        place = k
-        while place and classes[order[place - 1]] > classes[k]:
-            order[place] = order[place - 1]
-            place -= 1
-        order[place] = k
-    for k in range(len(classes)):
+    N = len(classes)
+    distinct, first, counts = np.empty(N, np.int64), np.empty(N, np.int64), np.zeros(N, np.int64)
+    order, row, presence, n = np.empty(N, np.int64), np.empty(N, np.int64), np.empty(N), 0
+    for k in range(N):  # insertion sort
+        rank = k
+        while rank and classes[order[rank - 1]] > classes[k]:
+            order[rank] = order[rank - 1]
+            rank -= 1
+        order[rank] = k
+    absent = 1.0
+    for k in range(N):
         instance = order[k]
         if n == 0 or distinct[n - 1] != classes[instance]:
-            distinct[n], first[n] = classes[instance], instance
+            distinct[n], first[n], absent = classes[instance], instance, 1.0
             n += 1
         row[instance] = n - 1
         counts[n - 1] += 1
-        absent[n - 1] *= 1.0 - confidence[instance]
-    return distinct[:n], first[:n], row, counts[:n], 1.0 - absent[:n]
+        absent *= 1.0 - confidence[instance]
+        presence[n - 1] = 1.0 - absent
+    return distinct[:n], first[:n], row, counts[:n], presence[:n]

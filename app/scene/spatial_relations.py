@@ -5,11 +5,15 @@ A relation and its opposite are the same statement with exchanged objects: ``rig
 into `CANONICAL`. The first argument of a relation is its subject, and the second is its anchor.
 """
 
+from __future__ import annotations
+
 from collections.abc import Hashable, Iterable
 from graphlib import CycleError, TopologicalSorter
 from typing import Final, TypeVar
 
 import numpy as np
+from jaxtyping import Bool, Int
+from numpy.typing import NDArray
 
 from app.compiling import compiled
 
@@ -26,7 +30,6 @@ OPPOSITES: Final[dict[str, str]] = {
     "inside": "contains",
 }
 RELATIONS: Final[tuple[str, ...]] = CANONICAL + tuple(OPPOSITES[name] for name in CANONICAL)
-
 
 LATERAL: Final = (LEFT, FRONT)
 """Indices of the relations of neighbours that stand beside each other."""
@@ -98,11 +101,16 @@ def support_cycle(triples: Iterable[tuple[int, End, End]]) -> list[End] | None:
 
 
 @compiled
-def pool_relations(row, n, holds, observed):
-    """Pool the relations of instances (A, N, N) into relations of classes (A, n, n), all bool.
+def pool_relations(
+    row: Int[NDArray, " N"], n: int, holds: Bool[NDArray, "A N N"], observed: Bool[NDArray, "A N N"]
+) -> tuple[Bool[NDArray, "A n n"], Bool[NDArray, "A n n"]]:
+    """Pool the relations of N instances into relations of n classes; see `app.scene.scene`.
 
-    ``row`` (N,) is the index of each instance's class, from 0 to n - 1. The results are the pooled
-    ``holds`` and ``observed``.
+    Args:
+        row: number of each instance's class, from 0 to n - 1.
+
+    Returns:
+        The pooled `holds` and `observed`.
     """
     A, size, _ = holds.shape
     class_holds, class_observed = np.zeros((A, n, n), np.bool_), np.zeros((A, n, n), np.bool_)
