@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from app.inference.objects import ObjectScorer
-from app.inference.relations import context_of
+from app.inference.relation_units import encode
 from benchmarks.report import Result
 from benchmarks.timing import interleave
 from benchmarks.yardsticks import object_machine, presence, random_scenes, scikit_learn
@@ -37,7 +37,7 @@ def log_odds(*, V: int = 417, H: int = 200, objects: int = 12, rounds: int = 31)
     ones, zeros = np.ones(objects, np.float32), np.zeros(objects, np.float32)
 
     def prepared() -> Any:
-        x = context_of(weights, classes, ones, zeros).x
+        x = encode(weights, classes, ones, zeros).x
         return scorer.absent(x, classes, ones, None, coverage=1.0)
 
     def unprepared() -> Tensor:

@@ -22,21 +22,26 @@ Source: Gordon, Salmond and Smith, "Novel approach to nonlinear/non-Gaussian Bay
 estimation" (1993), for resampling and moving.
 """
 
+from __future__ import annotations
+
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int, UInt8
 from numpy.typing import NDArray
 
-from app.inference import kernels
-from app.inference.elementary import sigmoid, softplus
-from app.inference.relations import (
+from app.compiling import compiled
+from app.inference.elementary import exp, logistic, sigmoid, softplus
+from app.inference.implications import draw_in_groups
+from app.inference.relation_units import (
     NEVER,
     ObservedRelations,
+    Pairs,
     RelationUnits,
     all_pairs,
-    ends_of,
     relation_units,
 )
 from app.inference.weights import Weights, unpack_scenes
@@ -94,6 +99,21 @@ class ChainState:
     r: Mask
 
 
+class ChainArrays(NamedTuple):
+    """Weights for the compiled kernel. `weights.layout` explains the attributes not listed here.
+
+    Attributes:
+        WT: (H1, V), transpose of W.
+        L: (V, V) couplings, or (0, V) for a machine without couplings.
+        b: (V,) biases of the classes.
+    """
+
+    W: Floats
+    WT: Floats
+    L: Floats
+    b: Floats
+
+
 class SceneChains:
     """Gibbs chains of a machine.
 
@@ -111,7 +131,7 @@ class SceneChains:
         self.machine, self._excluded = weights, list(excluded)
         self.units = units or relation_units(weights)
         W, spec = weights["W"], weights.spec
-        self.arrays = kernels.ChainArrays(
+        self.arrays = ChainArrays(
             W=W,
             WT=np.ascontiguousarray(W.T),
             L=weights["L"] if spec.coupled else np.zeros((0, spec.V), np.float32),
@@ -237,11 +257,11 @@ class ConditionedChains:
         h1 = np.zeros(self._machine.spec.units, np.int64)
         while steps > 0:
             uniform = stream.random((min(steps, _AT_ONCE), len(h1) + len(on)), np.float32)
-            kernels.sweeps(self._w, self._bias, self._required_classes, self._beta, uniform, on, h1)
+            sweeps(self._w, self._bias, self._required_classes, self._beta, uniform, on, h1)
             steps -= _AT_ONCE
         return h1
 
-    def _context(self, classes: Indices) -> Floats:
+    def _hidden_logits(self, classes: Indices) -> Floats:
         """Return the logits x of h1 given present classes, (H1,)."""
         x: Floats = self._bias + self._machine["W"][classes].sum(0)
         return x
@@ -249,9 +269,9 @@ class ConditionedChains:
     def _logits(self, classes: Indices, h1: Indices) -> Floats:
         """Return the logits of the relations between classes with one instance each, (A, n, n)."""
         n, spec = len(classes), self._machine.spec
-        ends = ends_of(classes, np.ones(n, np.float32), np.zeros(n, np.float32), *all_pairs(n))
+        pairs = Pairs(classes, np.zeros(n, np.float32), np.ones(n, np.float32), *all_pairs(n))
         entries = (h1[:, None] == np.arange(1, spec.states)).astype(np.float32).reshape(1, -1)
-        mean, _ = self._chains.units.normal(entries, ends, certain=True)
+        mean, _ = self._chains.units.moments(entries, pairs, sampled=True)
         return mean.reshape(spec.A, n, n)
 
     def _relations(self, classes: Indices, logits: Floats, stream: np.random.Generator) -> Mask:
@@ -271,10 +291,10 @@ class ConditionedChains:
             units = a[has_unit], i[has_unit], j[has_unit]
             r[units], free[units] = observed.r[has_unit] > 0, False
         uniform, group_numbers = stream.random((2, *r.shape), np.float32)
-        if self._machine.spec.G:
-            x = self._context(classes)
-            weight = self._chains.units.implication_weights(x, float(self._beta))
-            kernels.draw_in_groups(weight, self._beta * logits, free, uniform, group_numbers, r)
+        x = self._hidden_logits(classes)
+        weight = self._chains.units.implication_weights(x, float(self._beta))
+        if weight is not None:
+            draw_in_groups(weight, self._beta * logits, free, uniform, group_numbers, r)
         else:
             r |= free & (uniform < sigmoid(self._beta * logits))
         return r
@@ -298,7 +318,9 @@ class ConditionedChains:
         if state.room != self._room:
             return self._in_room(state.room).log_score(state, shown, kept)
         listed, machine = state.classes[shown], self._machine
-        by_unit = self._context(listed).astype(np.float64).reshape(-1, machine.spec.states - 1)
+        by_unit = (
+            self._hidden_logits(listed).astype(np.float64).reshape(-1, machine.spec.states - 1)
+        )
         # The first state of each unit has the logit 0.
         log_sums = np.logaddexp.reduce(by_unit, axis=1, initial=0.0)
         logits = state.logits[:, shown][:, :, shown].astype(np.float64)
@@ -307,3 +329,70 @@ class ConditionedChains:
         if machine.spec.coupled:
             score += 0.5 * machine["L"][np.ix_(listed, listed)].sum()
         return float(score + (on * logits - softplus(logits)).sum())
+
+
+@compiled
+def sweeps(
+    w: ChainArrays,
+    bias: Float[NDArray, " H1"],
+    required: UInt8[NDArray, " V"],
+    beta: float,
+    uniform: Float[NDArray, "sweeps units+V"],
+    on: UInt8[NDArray, " V"],
+    h1: Int[NDArray, " units"],
+) -> None:
+    """Run Gibbs sweeps that change the presence `on` of the classes and the states `h1` in place.
+
+    A sweep draws h1 given the classes, and then the classes. Coupled classes are drawn one after
+    another, each given all others.
+
+    Args:
+        bias: bias of h1.
+        required: 1 for classes that stay present.
+        beta: 1 / temperature.
+        uniform: random numbers in [0, 1).
+    """
+    (V, H1), units, coupled = w.W.shape, len(h1), len(w.L) > 0
+    others = H1 // units  # states of a unit but the first, whose logit is 0
+    x, field = np.empty(H1, np.float32), np.empty(V, np.float32)
+    from_classes = np.zeros(V, np.float32)
+    for i in range(V if coupled else 0):
+        if on[i]:
+            changed = w.L[i]
+            for j in range(V):
+                from_classes[j] += changed[j]
+    for t in range(len(uniform)):
+        row = uniform[t]
+        # Loops compile faster than assignments of arrays.
+        for k in range(H1):
+            x[k] = bias[k]
+        for i in range(V):
+            field[i] = w.b[i]
+            if on[i]:
+                weights = w.W[i]
+                for k in range(H1):
+                    x[k] += weights[k]
+        for m in range(units):
+            logits, top = x[m * others : (m + 1) * others], np.float32(0.0)
+            for z in range(others):
+                top = max(top, beta * logits[z])
+            total = exp(-top)
+            for z in range(others):
+                total += exp(beta * logits[z] - top)
+            threshold, cumulative, state = row[m] * total, exp(-top), 0
+            while state < others and threshold >= cumulative:
+                cumulative += exp(beta * logits[state] - top)
+                state += 1
+            h1[m] = state
+            if state:
+                from_h1 = w.WT[m * others + state - 1]
+                for i in range(V):
+                    field[i] += from_h1[i]
+        for i in range(V):
+            logit = beta * (field[i] + from_classes[i])
+            drawn = max(required[i], np.uint8(row[units + i] < logistic(logit)))
+            if coupled and drawn != on[i]:
+                sign, changed = np.float32(1.0 if drawn else -1.0), w.L[i]
+                for j in range(V):
+                    from_classes[j] += sign * changed[j]
+            on[i] = drawn

@@ -20,16 +20,19 @@ multiplies the sums of several units and takes one log of the product. The group
 keep the product within float32.
 """
 
+from __future__ import annotations
+
 from bisect import bisect
 from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import NDArray
 
-from app.inference import kernels
-from app.inference.elementary import log_softmax, sigmoid
-from app.inference.relations import Context
-from app.inference.weights import SHARES, Weights
+from app.compiling import compiled, compiled_in_any_order
+from app.inference.elementary import LN2, exp, exponent, log, log_softmax, mantissa, sigmoid
+from app.inference.relation_units import EncodedScene
+from app.inference.weights import SHARES, Weights, all_states
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -50,7 +53,6 @@ _LANES: Final = 16
 _SMALLEST: Final = 1e-300  # least probability of a room type
 # Maximum number of biases that a scorer keeps, of 4 bytes for each class.
 _KEPT_BIASES: Final = 64
-_NO_COUPLINGS: Final[Floats] = np.zeros((0, 0), np.float32)
 # Listed share in the middle of each bin of kappa. The last bin lists all classes but one.
 _MIDDLES: Final = (0.15, 0.45, 0.8, 1.0)
 
@@ -85,8 +87,8 @@ class Gains:
 
     def __call__(self, x: Floats) -> Floats:
         """Return the gain of each row of weights, (B, rows), at the logits x of h1, (B, H1)."""
-        p = kernels.all_states(x, self._states)
-        return kernels.gains(p, self._factors, self._group, self._rows)
+        p = all_states(x, self._states)
+        return _gains(p, self._factors, self._group, self._rows)
 
 
 class ObjectScorer:
@@ -103,7 +105,6 @@ class ObjectScorer:
         self._weights, self._states = weights, weights.spec.states
         self._biases: dict[tuple[float, int | None], Floats] = {}  # by coverage and room type
         self._increases: dict[int, tuple[Floats, Floats]] = {}
-        self._couplings = weights["L"] if weights.spec.coupled else _NO_COUPLINGS
         self.gains = Gains(weights["W"], self._states)
         self.room_gains = Gains(weights["Q"], self._states)
 
@@ -134,10 +135,13 @@ class ObjectScorer:
             bias = weights["b"] + weights.room_couplings(room) + self.kappa(coverage)
             if len(self._biases) < _KEPT_BIASES:
                 self._biases[coverage, room] = bias
-        p = weights.source_weights(classes, presence[None], profile)[0]
-        return kernels.class_log_odds(
-            gain, bias, p, weights["a"], self._couplings, classes, presence
-        )
+        gain += bias
+        if weights.spec.profiles:
+            p = weights.source_weights(classes, presence[None], profile)[0]
+            gain += p.astype(np.float32) @ weights["a"]
+        if weights.spec.coupled:
+            gain += presence @ weights["L"][classes]
+        return gain
 
     def kappa(self, coverage: float) -> Floats:
         """Return the bias of each class for a listed share, interpolated between the bins, (V,)."""
@@ -149,7 +153,7 @@ class ObjectScorer:
 
     def given_rest(
         self,
-        scene: Context,
+        scene: EncodedScene,
         profile: int | None,
         room: int | None = None,
         *,
@@ -169,7 +173,7 @@ class ObjectScorer:
         return self._explained(bias, scene, profile, rows, scene.classes, explained=explained)
 
     def reasons_for_absent(
-        self, scene: Context, profile: int | None, candidates: Indices
+        self, scene: EncodedScene, profile: int | None, candidates: Indices
     ) -> Floats:
         """Return how much each listed class changes the log-odds of unlisted classes, (N, n).
 
@@ -182,21 +186,45 @@ class ObjectScorer:
     def _explained(
         self,
         bias: Floats,
-        scene: Context,
+        scene: EncodedScene,
         profile: int | None,
         rows: Indices,
         targets: Indices,
         *,
         explained: bool,
-    ) -> tuple[Floats, Floats]:
-        """See `kernels.explained_log_odds`."""
-        weights = self._weights
-        possible = slice(None) if profile is None else slice(profile, profile + 1)
-        return kernels.explained_log_odds(
-            *(scene.x, scene.shares, weights["W"], bias, self._couplings),
-            *(weights["f"][possible], weights["a"][possible], self._states),
-            *(scene.classes, scene.presence, rows, targets, explained),
+    ) -> tuple[Float[NDArray, " N"], Float[NDArray, "N n"]]:
+        """Return the log-odds of N target classes given the listed classes, and their changes.
+
+        The change by class j is the log-odds minus their value without class j. It is (N, 0) if not
+        `explained`.
+
+        Args:
+            bias: biases of all classes.
+            rows: index of each target among the listed classes. A class is not evidence for itself.
+                `rows` is empty if the targets are not listed.
+        """
+        weights, classes, presence = self._weights, scene.classes, scene.presence
+        n, others = len(classes) if explained else 0, self._states - 1
+        x = scene.x - scene.contributions[rows] if len(rows) else scene.x[None]
+        raised, removed = np.exp(weights["W"][targets]), np.exp(-scene.contributions[:n])
+        factors, ratios = _hidden_factors(
+            all_states(x, self._states),
+            raised.reshape(len(targets), weights.spec.units, others),
+            removed.reshape(n, weights.spec.units, others),
         )
+        possible = slice(None) if profile is None else slice(profile, profile + 1)
+        mean, change = _source_effects(
+            weights["f"][possible], weights["a"][possible], classes, presence, rows, targets, n
+        )
+        log_odds = bias[targets] + np.log(factors).sum(1) + mean
+        change -= np.log(ratios).sum(2)
+        if weights.spec.coupled:
+            couplings = weights["L"][targets[:, None], classes] * presence
+            log_odds += couplings.sum(1)
+            change += couplings[:, :n]
+        if n and len(rows):
+            change[np.arange(len(rows)), rows] = 0
+        return log_odds, change
 
     def increases(self, i: int) -> tuple[Floats, Floats]:
         """Return how much the presence of class i increases the log-odds of each class, (V,).
@@ -253,3 +281,125 @@ class ObjectScorer:
         by_source = np.exp(log_softmax(logits[:, None] + weights["y"]))
         p = weights.source_weights(classes, presence, profile)[:, None] @ by_source
         return np.log(np.maximum(p[:, 0], _SMALLEST))
+
+
+@compiled
+def _gains(p, factors, group, rows):
+    """Return the gain of each row of weights, (B, rows); see `Gains`.
+
+    After each group of sums, the function splits the product into mantissa and exponent, and adds
+    the exponent to an integer. So one log at the end is enough.
+
+    Args:
+        p: (B, units, states) probabilities of the states of h1.
+        factors: (tiles, units, states - 1, rows per tile) exponentials of the weights.
+        group: maximum number of sums in a product.
+        rows: number of rows of weights.
+    """
+    tiles, units, states, width = factors.shape
+    gain = np.empty((len(p), rows), np.float32)
+    product, exponents = np.empty(width, np.float32), np.empty(width, np.int32)
+    total = np.empty(width, np.float32)
+    for t in range(tiles):
+        for b in range(len(p)):
+            product[:], exponents[:] = np.float32(1.0), np.int32(0)
+            for m in range(units):
+                total[:] = p[b, m, 0]
+                for z in range(0, states - 1, 2):
+                    # The loop takes two states at a time. This halves the reads and writes.
+                    p1, row1 = p[b, m, z + 1], factors[t, m, z]
+                    p2, row2 = p[b, m, z + 2], factors[t, m, z + 1]
+                    for i in range(width):
+                        total[i] += p1 * row1[i] + p2 * row2[i]
+                if states % 2:
+                    p1, row1 = p[b, m, states], factors[t, m, states - 1]
+                    for i in range(width):
+                        total[i] += p1 * row1[i]
+                for i in range(width):
+                    product[i] *= total[i]
+                if (m + 1) % group == 0 or m + 1 == units:
+                    for i in range(width):
+                        exponents[i] += exponent(product[i])
+                        product[i] = mantissa(product[i])
+            gain_b = gain[b, t * width :]
+            for i in range(min(width, rows - t * width)):
+                gain_b[i] = log(product[i]) + LN2 * np.float32(exponents[i])
+    return gain
+
+
+@compiled_in_any_order
+def _hidden_factors(
+    p: Float[NDArray, "N|1 units states"],
+    raised: Float[NDArray, "N units states-1"],
+    removed: Float[NDArray, "n units states-1"],
+) -> tuple[Float[NDArray, "N units"], Float[NDArray, "N n units"]]:
+    """Return the factors of each hidden unit in e^gain of N classes, and in e^-change by n classes.
+
+    Args:
+        p: probabilities of the states of h1.
+        raised: exponentials of the weights of the N classes.
+        removed: exponentials of the contributions of the n classes, negated.
+    """
+    (N, units, others), n = raised.shape, len(removed)
+    gain, ratio = np.empty((N, units), np.float32), np.empty((N, n, units), np.float32)
+    for c in range(N):
+        for m in range(units):
+            row, factors = p[min(c, len(p) - 1), m], raised[c, m]
+            with_class = row[0]
+            for z in range(others):
+                with_class += row[z + 1] * factors[z]
+            gain[c, m] = with_class
+            for j in range(n):
+                without, before, after = removed[j, m], row[0], row[0]
+                for z in range(others):
+                    product = row[z + 1] * without[z]
+                    before += product
+                    after += product * factors[z]
+                ratio[c, j, m] = after / (before * with_class)
+    return gain, ratio
+
+
+@compiled
+def _source_effects(f, a, classes, presence, rows, targets, n):
+    """Return the effect of the unknown data source on N target classes, and its changes.
+
+    The effect on a class i is the mean base rate sum_q p_q a_qi over the Q data sources. p_q is the
+    probability of source q given the listed classes.
+
+    Args:
+        n: number of listed classes whose changes are computed. For the others, see
+            `explained_log_odds`.
+
+    Returns:
+        The effects, (N,), and the change of each effect due to each listed class, (N, n).
+    """
+    Q = len(f)
+    # Part of each listed class in the logit of each source, and e^-part.
+    parts, without = np.empty((len(classes), Q), np.float32), np.empty((n, Q), np.float32)
+    logits, p = f.copy(), np.empty(Q, np.float32)
+    for j in range(len(classes)):
+        for q in range(Q):
+            parts[j, q] = a[q, classes[j]] * presence[j]
+            logits[q] += parts[j, q]
+    for j in range(n):
+        for q in range(Q):
+            without[j, q] = exp(-parts[j, q])
+    mean, change = np.zeros(len(targets), np.float32), np.zeros((len(targets), n), np.float32)
+    for i in range(len(targets) if Q else 0):
+        top, total, weighted = np.float32(-np.inf), np.float32(0.0), np.float32(0.0)
+        for q in range(Q):
+            p[q] = logits[q] - parts[rows[i], q] if len(rows) else logits[q]
+            top = max(top, p[q])
+        for q in range(Q):
+            p[q] = exp(p[q] - top)
+            total += p[q]
+            weighted += p[q] * a[q, targets[i]]
+        mean[i] = weighted / total
+        for j in range(n):
+            total, weighted = np.float32(0.0), np.float32(0.0)
+            for q in range(Q):
+                weight = p[q] * without[j, q]
+                total += weight
+                weighted += weight * a[q, targets[i]]
+            change[i, j] = mean[i] - weighted / total
+    return mean, change

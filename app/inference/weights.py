@@ -9,14 +9,19 @@ v is the presence of the classes, t is the room type, and z' runs over the state
 For Z = 2, p is sigmoid(x).
 """
 
+from __future__ import annotations
+
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import NDArray
 
-from app.inference import kernels
+from app.compiling import compiled
+from app.inference.elementary import exp
 from app.inference.variants import MachineSpec
 
 WORD: Final = 32
@@ -160,7 +165,7 @@ class Weights:
             one = np.zeros((len(presence), self.spec.profiles))
             one[:, profile] = 1.0
             return one
-        return kernels.source_weights(self["f"], self["a"], classes, presence)
+        return _source_weights(self["f"], self["a"], classes, presence)
 
     def scene_bias(
         self, classes: NDArray[Any], profile: int | None, room: int | None
@@ -199,7 +204,7 @@ def state_means(x: NDArray[Any], states: int) -> NDArray[Any]:
 
     Each unit has `states` states. Its first state has the logit 0 and no entry in x.
     """
-    p: NDArray[Any] = kernels.all_states(x.reshape(-1, x.shape[-1]), states)
+    p: NDArray[Any] = all_states(x.reshape(-1, x.shape[-1]), states)
     return p[:, :, 1:].reshape(x.shape)
 
 
@@ -215,3 +220,48 @@ def pack_scenes(presence: NDArray[Any]) -> NDArray[np.int32]:
     bits = np.zeros((len(presence), -(-presence.shape[1] // WORD) * WORD), np.uint8)
     bits[:, : presence.shape[1]] = presence > 0
     return np.packbits(bits, axis=1, bitorder="little").view("<i4").astype(np.int32)
+
+
+@compiled
+def all_states(x: Float[NDArray, "B H1"], states: int) -> Float[NDArray, "B units states"]:
+    """Return the probabilities of all states of the hidden units, the first state included."""
+    others, half, one = states - 1, np.float32(0.5), np.float32(1.0)
+    p = np.zeros((len(x), x.shape[1] // others, states), np.float32)
+    for b in range(len(p)):
+        for m in range(p.shape[1]):
+            row, top, total = p[b, m], np.float32(0.0), np.float32(0.0)
+            for z in range(others):
+                row[z + 1] = x[b, m * others + z]
+                top = max(top, row[z + 1])
+            # The square of e^(x/2) covers subnormal numbers.
+            for z in range(states):
+                row[z] = exp((row[z] - top) * half)
+                row[z] *= row[z]
+            for z in range(states):
+                total += row[z]
+            for z in range(states):
+                row[z] *= one / total
+    return p
+
+
+@compiled
+def _source_weights(f, a, classes, presence):
+    """Return softmax(f + a v) of the data sources in N scenes, (N, profiles).
+
+    The sums have float64 digits, so that listed structure, whose terms are 0, changes none. See
+    `weights.Weights.source_weights` for the arguments.
+    """
+    p = np.empty((len(presence), len(f)), np.float64)
+    for s in range(len(presence)):
+        top, total = -np.inf, 0.0
+        for q in range(len(f)):
+            p[s, q] = f[q]
+            for j in range(len(classes)):
+                p[s, q] += np.float64(a[q, classes[j]]) * presence[s, j]
+            top = max(top, p[s, q])
+        for q in range(len(f)):
+            p[s, q] = math.exp(p[s, q] - top)
+            total += p[s, q]
+        for q in range(len(f)):
+            p[s, q] /= total
+    return p

@@ -1,4 +1,4 @@
-"""Parts of all answers: common fields, rounded numbers, reasons, and JSON.
+"""Parts of all answers: common fields, rounded numbers, reasons, ranking, and JSON.
 
 The schemas of `scene_client.schemas` describe the answers. An answer contains its fields in the
 order of the schema, without null fields. Answers are dictionaries, because pydantic objects would
@@ -9,10 +9,11 @@ from typing import Any, Final, TypeAlias
 
 import numpy as np
 import orjson
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from pydantic_core import from_json, to_json, to_jsonable_python
 
-from app.inference.kernels import DIGITS, round_to_digits, strongest
+from app.compiling import compiled
 from app.questions.posterior import Present
 from app.questions.reading import Reading
 from app.scene.scene import Scene
@@ -20,6 +21,12 @@ from scene_client.schemas import ModelReference, SceneRequest
 
 Fields: TypeAlias = dict[str, Any]
 """Fields of an answer, or of a part of an answer."""
+
+DIGITS: Final = 6
+"""Significant digits of probabilities, log-odds and metres."""
+# Doubles represent these powers of ten exactly. So an integer divided by such a power is the double
+# that is nearest to the decimal number.
+_POWERS: Final = np.array([10.0**power for power in range(23)])
 
 REASONS: Final = 3
 """Maximum number of reasons for one entry of an answer."""
@@ -63,8 +70,8 @@ def named(label: str, word: str | None) -> Fields:
 def reasons(
     scene: Scene,
     present: Present,
-    change: NDArray[np.floating[Any]],
-    rows: NDArray[np.int64] | None = None,
+    change: Float[NDArray[np.floating[Any]], "N n"],
+    rows: Int[NDArray[np.int64], "N"] | None = None,
     *,
     least: float = 0.0,
     scale: float = 1.0,
@@ -75,10 +82,8 @@ def reasons(
     absolute changes come first. The answer names the first object of the class.
 
     Args:
-        change: (N, n) change of each explained class's log-odds by each of the n classes of the
-            scene.
-        rows: (N,) index of each explained class among the n classes. None means that the explained
-            classes are absent.
+        change: change of each explained class's log-odds by each class of the scene.
+        rows: index of each explained class among the classes of the scene; None: they are absent.
         least: minimum absolute value of a change. Rounding errors of a change of 0 are left out.
         scale: slope of the calibration, so that an answer's changes are those of its `log_odds`.
 
@@ -86,7 +91,7 @@ def reasons(
         For each explained class, a list of reasons with the fields of
         `scene_client.schemas.Because`.
     """
-    columns, values = strongest(change, np.zeros(0, np.int64) if rows is None else rows, REASONS)
+    columns, values = _strongest(change, np.zeros(0, np.int64) if rows is None else rows, REASONS)
     values = scale * values
     strong = np.abs(values) >= max(least, _ROUNDING)
     entries: list[list[Fields]] = [[] for _ in change]
@@ -96,10 +101,10 @@ def reasons(
     return entries
 
 
-def significant(numbers: NDArray[np.floating[Any]]) -> list[float]:
-    """Round numbers (n,) to `DIGITS` significant digits."""
+def significant(numbers: Float[NDArray[np.floating[Any]], "n"]) -> list[float]:
+    """Round numbers to `DIGITS` significant digits."""
     values = numbers.astype(np.float64)
-    exact = round_to_digits(values)
+    exact = _round_to_digits(values)
     rounded: list[float] = values.tolist()
     return rounded if exact else [rounded_number(value) for value in rounded]
 
@@ -143,3 +148,101 @@ def written(answer: Any) -> bytes:
     except ValueError:
         raise ValueError("an answer contains a number that is not finite") from None
     return body
+
+
+@compiled
+def _strongest(change, rows, count):
+    """Return the indices and values of the k <= `count` largest absolute changes, each (N, k).
+
+    The result leaves out the change of a class by itself.
+
+    Args:
+        change: (N, n) change of each explained class's log-odds by each of the n classes of the
+            scene.
+        rows: (N,) index of each explained class among the n classes. It is empty if the explained
+            classes are absent.
+        count: maximum of k.
+    """
+    N, n = change.shape
+    kept = min(count, n - (len(rows) > 0))
+    places, values = np.empty((N, kept), np.int64), np.empty((N, kept), np.float64)
+    usable = np.ones(n, np.bool_)
+    for c in range(N):
+        if len(rows):
+            usable[rows[c]] = False
+        indices = best(np.abs(change[c]), usable, kept)
+        if len(rows):
+            usable[rows[c]] = True
+        for k in range(kept):
+            places[c, k], values[c, k] = indices[k], change[c, indices[k]]
+    return places, values
+
+
+@compiled
+def _round_to_digits(values):
+    """Round float64 numbers (n,) to `DIGITS` significant digits in place.
+
+    Returns:
+        False if a number is too small or too large for exact powers of ten. Such numbers stay
+        unchanged.
+    """
+    exact = True
+    for k in range(len(values)):
+        size = np.abs(values[k])
+        if 1e-16 < size < 1e5:
+            # A number with d digits before the point keeps DIGITS - d decimal places.
+            places = DIGITS - 1 - np.int64(np.floor(np.log10(size)))
+            scale = _POWERS[places]
+            values[k] = np.rint(values[k] * scale) / scale
+        elif size != 0.0:
+            exact = False
+    return exact
+
+
+@compiled
+def best(
+    values: Float[NDArray, " N"], usable: Bool[NDArray, " N"], count: int
+) -> Int[NDArray, " k"]:
+    """Return the indices of the k <= `count` largest usable values, largest first.
+
+    Of equal values, the value with the lower index comes first. The time is O(N log count).
+    """
+    size, rest, kept = 0, 0, min(count, len(values))
+    # The heap contains the best indices so far. Its root is the worst of these indices: the index
+    # with the smallest value, and of several equal values the largest index.
+    heap = np.empty(kept, np.int64)
+    while size < kept and rest < len(values):
+        if usable[rest]:
+            heap[size] = rest
+            size += 1
+        rest += 1
+    for node in range(size // 2 - 1, -1, -1):
+        _sink(values, heap, size, node, heap[node])
+    for index in range(rest, len(values)):
+        if size and usable[index] and values[index] > values[heap[0]]:
+            _sink(values, heap, size, 0, index)
+    for last in range(size - 1, 0, -1):
+        worst, moved = heap[0], heap[last]
+        _sink(values, heap, last, 0, moved)
+        heap[last] = worst
+    return heap[:size]
+
+
+@compiled
+def _sink(
+    values: Float[NDArray, " N"], heap: Int[NDArray, " k"], size: int, node: int, index: int
+) -> None:
+    """Replace a node of the heap by an index, and restore the heap order below the node."""
+    value = values[index]
+    while 2 * node + 1 < size:
+        child = 2 * node + 1
+        if child + 1 < size:
+            one, other = heap[child], heap[child + 1]
+            if values[other] < values[one] or (values[other] == values[one] and other > one):
+                child += 1
+        worse = heap[child]
+        if not (values[worse] < value or (values[worse] == value and worse > index)):
+            break
+        heap[node] = worse
+        node = child
+    heap[node] = index

@@ -4,7 +4,7 @@ v are the object units, and h1 are the hidden units. Given v, the units of h1 ar
 the logits x (`app.inference.weights`). The answers are in closed form:
 
     object     log-odds_i = b_i + ..., see `app.inference.objects`
-    relation   p(r_e = 1) = E[sigmoid(ℓ_e(h1))], see `app.inference.relations`
+    relation   p(r_e = 1) = E[sigmoid(ℓ_e(h1))], see `app.inference.relation_units`
 
 The log-odds of a listed class are computed at x without its contribution, which is its row of W.
 Observed relations do not change the logits of h1: their effect on objects and on other relations
@@ -17,16 +17,20 @@ from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
+from app.compiling import compiled, inlined
 from app.inference import MachineSpec
-from app.inference.kernels import pool_classes, pool_relations
-from app.inference.relations import Between, ObservedRelations, context_of, to_log_odds
-from app.registry.artifact import Artifact
-from app.registry.description import LEAST_COVERAGE, Calibration, CountSlope, CoverageFit
-from app.scene.scene import Scene, instance_evidence
+from app.inference.elementary import logistic
+from app.inference.quadrature import to_log_odds
+from app.inference.relation_units import ObservedRelations, RelationLogits, encode
+from app.model.calibration import LEAST_COVERAGE, Calibration, CountSlope, CoverageFit
+from app.model.scene_model import SceneModel
+from app.scene.scene import Scene, pool_classes
 
 Floats = NDArray[np.floating[Any]]
+Singles = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
@@ -40,20 +44,20 @@ class Present(NamedTuple):
     Models compute log-odds for classes, but answers list objects.
 
     Attributes:
-        classes: (n,) int64, class indices in ascending order.
-        counts: (n,) int64, number of objects of each class.
-        row: (N,) int64, index into `classes` of each object's class.
-        first: (n,) int64, index of the first object of each class in `Scene.objects`.
-        presence: (n,) float32, probability that at least one instance of the class is present.
-        log_counts: (n,) float32, log of `counts`.
+        classes: class indices in ascending order.
+        counts: number of objects of each class.
+        row: index into `classes` of each object's class.
+        first: index of the first object of each class in `Scene.objects`.
+        presence: probability that at least one instance of the class is present.
+        log_counts: log of `counts`.
     """
 
-    classes: Indices
-    counts: Indices
-    row: Indices
-    first: Indices
-    presence: NDArray[np.float32]
-    log_counts: NDArray[np.float32]
+    classes: Int[Indices, "n"]
+    counts: Int[Indices, "n"]
+    row: Int[Indices, "N"]
+    first: Int[Indices, "n"]
+    presence: Float[Singles, "n"]
+    log_counts: Float[Singles, "n"]
 
 
 def present(scene: Scene, spec: MachineSpec) -> Present:
@@ -80,27 +84,15 @@ def present(scene: Scene, spec: MachineSpec) -> Present:
     return Present(classes, counts, row, first, presence.astype(np.float32), log_counts)
 
 
-def given_relations(scene: Scene, present: Present, relations: int) -> ObservedRelations | None:
-    """Return the observed relations between the classes of a scene.
+def given_relations(scene: Scene, present: Present, A: int) -> ObservedRelations | None:
+    """Return the observed relations between the classes of a scene, or None without observations.
 
-    The result is None if the scene has neither relations nor poses.
-
-    Args:
-        relations: number of canonical relations that the machine knows.
+    The machine knows the first A canonical relations.
     """
-    if not relations_given(scene):
+    if scene.relations is None:
         return None
-    n = len(present.classes)
-    holds, observed = pool_relations(present.row, n, *instance_evidence(scene))
-    # The arrays are contiguous. For another layout, numba would compile the loops again.
-    units = observed[:relations].reshape(-1).nonzero()[0]
-    a, pair = np.divmod(units, n * n)
-    return ObservedRelations(a, *np.divmod(pair, n), holds.reshape(-1)[units].astype(np.float32))
-
-
-def relations_given(scene: Scene) -> bool:
-    """Return whether the scene has observed relations, either stated or derived from poses."""
-    return bool(scene.relations or scene.relations_complete or scene.poses)
+    columns = scene.relations.of_classes(present.row, len(present.classes), A)
+    return None if columns is None else ObservedRelations(*columns)
 
 
 class Posterior:
@@ -121,98 +113,106 @@ class Posterior:
         ValueError: the machine does not know the class of an object, the room type or the profile.
     """
 
-    def __init__(self, artifact: Artifact, scene: Scene) -> None:
-        self.present = listing = present(scene, artifact.spec)
-        is_structure = artifact.vocabulary.structure[listing.classes]
+    def __init__(self, model: SceneModel, scene: Scene) -> None:
+        self.present = listing = present(scene, model.spec)
+        is_structure = model.vocabulary.structure[listing.classes]
         self.listed = len(listing.classes) - int(np.count_nonzero(is_structure))
-        observed = given_relations(scene, listing, artifact.spec.A)
-        self.context = context_of(
-            artifact.weights,
-            *(listing.classes, listing.presence, listing.log_counts, scene.room_type, observed),
+        self.context = encode(
+            model.weights,
+            listing.classes,
+            listing.presence,
+            listing.log_counts,
+            room=scene.room_type,
+            observed=given_relations(scene, listing, model.spec.A),
         )
-        self._objects, self._units = artifact.objects, artifact.relation_units
+        self._objects, self._units = model.objects, model.relation_units
         self._profile, self._room = scene.profile, scene.room_type
 
-    def absent_log_odds(self, absent: Indices, coverage: float) -> Floats:
-        """Return the log-odds that each of N unlisted classes is present, (N,).
+    def absent_log_odds(self, absent: Int[Indices, "N"], coverage: float) -> Float[Floats, "N"]:
+        """Return the log-odds of unlisted classes, if the list has this share of the classes."""
+        log_odds = self._objects.absent(
+            self.context.x,
+            self.present.classes,
+            self.present.presence,
+            profile=self._profile,
+            coverage=coverage,
+            room=self._room,
+        )
+        return log_odds[absent]
 
-        Args:
-            absent: (N,) indices of the unlisted classes.
-            coverage: listed share of the classes of the scene.
+    def given_rest(
+        self, *, explained: bool = False
+    ) -> tuple[Float[Floats, "n"], Float[Floats, "n n"]]:
+        """Return the log-odds of each listed class given the others, and their changes by each.
+
+        `ObjectScorer.given_rest` describes the results.
         """
-        listed = self.present.classes, self.present.presence
-        arguments = self.context.x, *listed, self._profile, coverage, self._room
-        return self._objects.absent(*arguments)[absent]
-
-    def given_rest(self, *, explained: bool = False) -> tuple[Floats, Floats]:
-        """See `ObjectScorer.given_rest`."""
         return self._objects.given_rest(
             self.context, self._profile, self._room, explained=explained
         )
 
-    def reasons_for_absent(self, candidates: Indices) -> Floats:
-        """See `ObjectScorer.reasons_for_absent`."""
-        return self._objects.reasons_for_absent(self.context, self._profile, candidates)
-
-    def room_log_p(self) -> Doubles:
-        """Return log p(t | objects) of each room type t, (C,), in a scene of unknown room type."""
+    def room_log_p(self) -> Float[Doubles, "C"]:
+        """Return log p(t | objects) of each room type t in a scene of unknown room type."""
         return self._room_log_p(self.context.x[None], self.present.presence[None])[0]
 
-    def _room_log_p(self, x: Floats, presence: Floats) -> Doubles:
+    def _room_log_p(
+        self, x: Float[Floats, "B H1"], presence: Float[Floats, "B n"]
+    ) -> Float[Doubles, "B C"]:
         return self._objects.room_log_p(x, self.present.classes, presence, self._profile)
 
-    def room_reasons(self) -> Doubles:
-        """Return how much each class changes the log-odds of each room type, (C, n).
+    def room_reasons(self) -> Float[Doubles, "C n"]:
+        """Return how much each class changes the log-odds of each room type.
 
         An entry is the log-odds of the room type given all n classes, minus its log-odds given the
         scene without the class.
         """
         # Row k has the logits of h1 and the presence of the classes in the scene without class k.
-        x, presence = self.context.x - self.context.shares, self.present.presence
+        x, presence = self.context.x - self.context.contributions, self.present.presence
         without = self._room_log_p(x, presence * (1 - np.eye(len(presence), dtype=np.float32)))
         return (log_odds_of(self.room_log_p()) - log_odds_of(without)).T
 
-    def relation_log_odds(self) -> Floats:
-        """Return the log-odds of every relation between the classes of the scene, (A, n, n).
+    def relation_log_odds(self) -> Float[Floats, "A n n"]:
+        """Return the log-odds of every relation between the classes of the scene.
 
         The observation of a relation is not evidence for the same relation.
         """
         return self._units.log_odds(self._between)
 
-    def alone_log_odds(self) -> Floats:
-        """Return the log-odds of every relation given the objects alone, (A, n, n)."""
+    def alone_log_odds(self) -> Float[Floats, "A n n"]:
+        """Return the log-odds of every relation given the objects alone."""
         return to_log_odds(self._between.mean, self._between.spread)
 
-    def relation_change(self) -> Floats:
-        """Return the change of every logit by observed relations of other pairs, (A, n, n)."""
-        change = self._between.apart
-        return change if len(change) else np.zeros_like(self._between.mean)
+    def relation_change(self) -> Float[Floats, "A n n"]:
+        """Return the change of every logit by observed relations of other pairs."""
+        return self._between.shift_by_others
 
-    def log_odds_apart(self, i: Indices, j: Indices) -> tuple[Floats, Floats]:
-        """Return the log-odds (A, P) of all relations from classes i to j, and (A, P) from j to i.
+    def log_odds_of_pairs(
+        self, i: Int[Indices, "P"], j: Int[Indices, "P"]
+    ) -> tuple[Float[Floats, "A P"], Float[Floats, "A P"]]:
+        """Return the log-odds of all relations from classes i to j of the scene, and from j to i.
 
         The observed relations of a pair are not evidence for the relations of the same pair.
-
-        Args:
-            i, j: (P,) indices of the two classes of each pair in the scene.
         """
-        log_odds = self._units.log_odds(self._between, apart=True)
+        log_odds = self._units.log_odds(self._between, leave_out_pair=True)
         # The compiled functions of the questions need contiguous arrays.
         forward, backward = np.ascontiguousarray(log_odds[:, [i, j], [j, i]].swapaxes(0, 1))
         return forward, backward
 
     def placement_log_odds(
-        self, candidates: Indices, anchors: Indices, only: int | None = None
-    ) -> tuple[Floats, Floats]:
-        """See `RelationUnits.placement_log_odds`."""
+        self, candidates: Int[Indices, "N"], anchors: Int[Indices, "m"], only: int | None = None
+    ) -> tuple[Float[Floats, "N R m"], Float[Floats, "N R m"]]:
+        """Return the log-odds of R relations from the candidates to the anchors, and back.
+
+        `RelationUnits.placement_log_odds` describes the arguments.
+        """
         return self._units.placement_log_odds(self.context, candidates, anchors, only)
 
     @cached_property
-    def _between(self) -> Between:
-        return self._units.between(self.context)
+    def _between(self) -> RelationLogits:
+        return self._units.logits(self.context)
 
 
-def log_odds_of(log_p: Doubles) -> Doubles:
+def log_odds_of(log_p: Float[Doubles, "..."]) -> Float[Doubles, "..."]:
     """Return log p - log(1 - p). A p of nearly 1 counts as 1 - 1e-12."""
     return log_p - np.log(-np.expm1(np.minimum(log_p, -1e-12)))
 
@@ -222,24 +222,20 @@ def log_odds_of(log_p: Doubles) -> Doubles:
 # Validation scenes determine the coefficients, which are fields of `Calibration`.
 
 
-def calibrated(entry: CountSlope, z: Floats, n: int | NDArray[np.integer[Any]]) -> Floats:
-    """Return the calibrated log-odds of N logits, (N,); see `CountSlope` for the formula.
-
-    Args:
-        entry: calibration of a question.
-        z: (N,) logits.
-        n: number n of the formula, or an array (N,) with a number for each logit.
-    """
+def calibrated(
+    entry: CountSlope, z: Float[Floats, "N"], n: int | Int[NDArray[np.integer[Any]], "N"]
+) -> Float[Floats, "N"]:
+    """Return the calibrated log-odds of logits z by the formula of `CountSlope`."""
     return entry.intercept + entry.log_count * np.log(n) + entry.slope * z
 
 
 def calibrated_missing(
-    calibration: Calibration, z: Floats, n: int, coverage: float | None
-) -> Floats:
-    """Return the calibrated log-odds that N unlisted classes are present, (N,).
+    calibration: Calibration, z: Float[Floats, "N"], n: int, coverage: float | None
+) -> Float[Floats, "N"]:
+    """Return the calibrated log-odds that unlisted classes are present.
 
     Args:
-        z: (N,) log-odds of the classes at the coverage.
+        z: log-odds of the classes at the coverage.
         n: number of listed classes without structure.
         coverage: share of the scene that the request states; None if it states none.
     """
@@ -251,12 +247,47 @@ def calibrated_missing(
 
 def calibrated_at_coverage(
     entry: CoverageFit,
-    z: Floats,
-    n: int | NDArray[np.integer[Any]],
-    coverage: float | NDArray[np.floating[Any]],
-) -> Floats:
-    """Return the calibrated log-odds of N logits, (N,); see `CoverageFit` for the formula."""
+    z: Float[Floats, "N"],
+    n: int | Int[NDArray[np.integer[Any]], "N"],
+    coverage: float | Float[Floats, "N"],
+) -> Float[Floats, "N"]:
+    """Return the calibrated log-odds of logits z by the formula of `CoverageFit`."""
     log_n, log_s = np.log(n), np.log(np.maximum(coverage, LEAST_COVERAGE))
     change = entry.log_share * log_s + entry.both * log_n * log_s
     last = entry.last * (np.asarray(coverage) == 1)
     return entry.intercept + entry.slope * z + entry.log_count * log_n + change + last
+
+
+@compiled
+def relation_probability(slopes, log_odds, log_count):
+    """Return the probability that each relation holds between two objects, (B, A, N).
+
+    The shape is (B candidate classes, A relations, N pairs of classes). B is 1 without candidates.
+
+    Args:
+        slopes: (A, 3) table of `RelationSlopes`.
+        log_odds: (B, A, N) log-odds of the relation between classes.
+        log_count: (N,) log of the number of object pairs with these two classes.
+    """
+    p = np.empty_like(log_odds)
+    for a in range(p.shape[1]):
+        intercept, slope, weight = slopes[a, 0], slopes[a, 1], slopes[a, 2]
+        for b in range(len(p)):
+            row, logits = log_odds[b, a], p[b, a]
+            for j in range(len(row)):
+                logits[j] = intercept + slope * row[j] + weight * log_count[j]
+    # One loop over all rows is faster than one loop per row, because a row may be short.
+    flat = p.reshape(-1)
+    for e in range(len(flat)):
+        flat[e] = logistic(np.float32(flat[e]))
+    return p
+
+
+@inlined
+def exclusive(forward, backward):
+    """Scale p(a(x,y)) and p(a(y,x)) so that their sum is at most 1.
+
+    The reason is that a relation a cannot hold in both directions between the same two objects.
+    """
+    total = np.maximum(forward + backward, np.float32(1.0))
+    return forward / total, backward / total

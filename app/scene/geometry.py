@@ -47,26 +47,33 @@ rotated by the yaw.
 4 does not allow, and stacked relations of boxes too far apart to overlap.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
-from app.inference import kernels
-from app.inference.kernels import MIN_OFFSET
-from app.scene.relations import CANONICAL, FRONT, LEFT, ON_TOP
-from app.scene.roles import RoleCounts
+from app.compiling import compiled
+from app.scene.footprints import measure
+from app.scene.roles import IN, ON, UNDER, RoleCounts, is_smaller, likely_role, possible_roles
+from app.scene.spatial_relations import ABOVE, CANONICAL, FRONT, INSIDE, LEFT, ON_TOP
 
+MIN_OVERLAP: Final = 0.30  # minimum overlap as a share of the smaller footprint
+CONTACT: Final = 0.05  # maximum distance in metres between bottom and top for *on-top*
+NEIGHBOUR_GAP: Final = 1.0  # maximum distance in metres between the footprints of neighbours
+NEIGHBOUR_DISTANCE: Final = 1.5  # maximum distance in metres between centres if a size is unknown
+MIN_OFFSET: Final = 0.10  # minimum |dx| or |dy| in metres for *front* or *left*
 UNKNOWN_REACH: Final = 1.5  # maximum reach in metres of a footprint of unknown size
 MOST_DISTANT: Final = 100.0  # longest plausible distance from the viewer in metres; detects mm
 SMALLEST: Final = 1e-3  # shortest plausible longest side of a box in metres
 LARGEST: Final = 20.0  # longest plausible side of a box in metres
 
-Array = NDArray[np.float64]
-Rows = Array | Sequence[Sequence[float]]
+Rows = Float[NDArray, "n 3"] | Sequence[Sequence[float]]
 
 
 class Viewpoint(NamedTuple):
@@ -82,24 +89,23 @@ class PoseRelations:
     """Relations between n objects, derived from poses.
 
     Attributes:
-        holds: (A, n, n) bool. ``holds[a, i, j]`` means that object i has relation a to object j.
-        observed: (A, n, n) bool. ``observed[a, i, j]`` means that relation a between objects i and
-            j was observed, whether it holds or not. The array is symmetric in i and j, except for
-            undecided roles.
+        holds: ``holds[a, i, j]`` means that object i has relation a to object j.
+        observed: ``observed[a, i, j]`` means that relation a between objects i and j was observed,
+            whether it holds or not. The array is symmetric in i and j, except for undecided roles.
     """
 
-    holds: NDArray[np.bool_]
-    observed: NDArray[np.bool_]
+    holds: Bool[NDArray, "A n n"]
+    observed: Bool[NDArray, "A n n"]
 
 
 def to_viewer_frame(
     positions: Rows, viewpoint: Viewpoint, yaws: ArrayLike | None = None
-) -> tuple[Array, Array]:
+) -> tuple[Float[NDArray, "n 3"], Float[NDArray, " n"]]:
     """Convert positions and yaws of n boxes from a frame to the axes of a viewer.
 
     Args:
-        positions: (n, 3) centres in the frame, in metres. The heights do not change.
-        yaws: (n,) rotations about z in radians; all 0 by default.
+        positions: centres in the frame, in metres. The heights do not change.
+        yaws: rotations about z in radians; all 0 by default.
 
     Raises:
         ValueError: a shape is wrong.
@@ -118,17 +124,17 @@ def derive_relations(
     yaws: ArrayLike | None = None,
     *,
     horizontal: bool = True,
-    classes: NDArray[np.int64] | None = None,
+    classes: Int[NDArray, " n"] | None = None,
     roles: RoleCounts | None = None,
 ) -> PoseRelations:
     """Derive the relations between n boxes by the rules of this module.
 
     Args:
-        positions: (n, 3) centres in viewer axes, in metres; a row with NaN where unknown.
-        sizes: (n, 3) extents before the rotation, in metres; 0 for flat boxes, NaN where unknown.
-        yaws: (n,) rotation of each box about z in radians; all 0 by default.
+        positions: centres in viewer axes, in metres; a row with NaN where unknown.
+        sizes: extents before the rotation, in metres; 0 for flat boxes, NaN where unknown.
+        yaws: rotation of each box about z in radians; all 0 by default.
         horizontal: whether the viewer is known. Otherwise, left and front stay unobserved.
-        classes: (n,) index of the class of each box, -1 where unknown.
+        classes: index of the class of each box, -1 where unknown.
         roles: counts that decide between the roles of rule 3. None leaves all roles undecided.
 
     Raises:
@@ -149,7 +155,7 @@ def derive_relations(
         raise ValueError(f"classes must be {n} indices below {len(roles.anchor)}")
     holds = np.zeros((len(CANONICAL), n, n), dtype=np.bool_)
     observed = np.zeros_like(holds)
-    kernels.relate_all(points, extents, turns, horizontal, classes, roles, holds, observed)
+    _relate_all(points, extents, turns, horizontal, classes, roles, holds, observed)
     return PoseRelations(holds, observed)
 
 
@@ -158,31 +164,13 @@ _NO_ROLES: Final = RoleCounts(
 )
 
 
-def overlap_and_gap(
-    centre_a: Array, size_a: Array, yaw_a: Array, centre_b: Array, size_b: Array, yaw_b: Array
-) -> tuple[Array, Array]:
-    """Compute overlap and gap of P pairs of rectangles a and b, the footprints of boxes.
+def excluded_by_centres(
+    points: Float[NDArray, "n 3"], sizes: Float[NDArray, "n 3"], *, horizontal: bool
+) -> Bool[NDArray, "A n n"]:
+    """Return the relations that the centres of n boxes exclude.
 
-    Centres (P, 2) and sizes (P, 2) along the rectangle's own axes are in metres, yaws (P,) in
-    radians.
-
-    Returns:
-        Overlap of each pair, (P,): area of the intersection divided by the smaller area.
-        Gap of each pair, (P,): distance between the rectangles in metres, or 0 if they touch.
-    """
-    share, gap = np.empty(len(yaw_a)), np.empty(len(yaw_a))
-    rectangles = (centre_a, size_a, yaw_a, centre_b, size_b, yaw_b)
-    kernels.measure_pairs(
-        *(np.asarray(part, np.float64, order="C") for part in rectangles), share, gap
-    )
-    return share, gap
-
-
-def excluded_by_centres(points: Array, sizes: Array, *, horizontal: bool) -> NDArray[np.bool_]:
-    """Return the relations that the centres of n boxes exclude, (A, n, n).
-
-    Points and sizes (n, 3) are those of `derive_relations`. Unknown centres exclude no relation. A
-    footprint of unknown size has a radius of `UNKNOWN_REACH`.
+    `derive_relations` explains the arguments. Unknown centres exclude no relation. A footprint of
+    unknown size has a radius of `UNKNOWN_REACH`.
     """
     x, y = points[:, 0], points[:, 1]
     dx, dy = x[:, None] - x, y[:, None] - y
@@ -198,7 +186,7 @@ def excluded_by_centres(points: Array, sizes: Array, *, horizontal: bool) -> NDA
     return excluded
 
 
-def _array(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
+def _array(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Float[NDArray, "..."]:
     """Return the values as an array of this shape, or raise ValueError with the argument's name."""
     array = np.asarray(values, dtype=np.float64, order="C")
     if array.size == 0 and 0 in shape:
@@ -206,3 +194,112 @@ def _array(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
     if array.shape != shape:
         raise ValueError(f"{name} must have the shape {shape}, not {array.shape}")
     return array
+
+
+@compiled
+def _relate_all(
+    points: Float[NDArray, "n 3"],
+    extents: Float[NDArray, "n 3"],
+    turns: Float[NDArray, " n"],
+    horizontal: bool,
+    classes: Int[NDArray, " n"],
+    roles: RoleCounts,
+    holds: Bool[NDArray, "A n n"],
+    observed: Bool[NDArray, "A n n"],
+) -> None:
+    """Write the relations of all pairs of boxes to `holds` and `observed`."""
+    n = len(points)
+    has_position, has_size = np.empty(n, np.bool_), np.empty(n, np.bool_)
+    radius = np.empty(n)
+    for i in range(n):
+        radius[i] = math.hypot(extents[i, 0], extents[i, 1]) / 2
+        has_size[i] = not math.isnan(radius[i] + extents[i, 2])
+        has_position[i] = not math.isnan(points[i, 0] + points[i, 1] + points[i, 2])
+    for i in range(n):
+        for j in range(i + 1, n):
+            if not (has_position[i] and has_position[j]):
+                continue
+            distance = math.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1])
+            have_sizes, overlap = has_size[i] and has_size[j], False
+            if not have_sizes:
+                neighbours = distance <= NEIGHBOUR_DISTANCE
+            # The distance between the circles around the footprints is a fast first check, because
+            # `measure` is slower.
+            elif distance - radius[i] - radius[j] <= NEIGHBOUR_GAP:
+                share, gap = measure(
+                    points[i], extents[i], turns[i], points[j], extents[j], turns[j]
+                )
+                neighbours, overlap = gap <= NEIGHBOUR_GAP, share >= MIN_OVERLAP
+            else:
+                neighbours = False
+            # The order of relation indices is left, front, on-top, above, inside.
+            first = LEFT if neighbours and horizontal else ON_TOP
+            last = INSIDE if have_sizes else FRONT
+            for relation in range(first, last + 1):
+                observed[relation, i, j] = observed[relation, j, i] = True
+            if overlap and _stack(points, extents, i, j, classes, roles, holds, observed):
+                continue
+            if neighbours and horizontal:
+                for subject, anchor in ((i, j), (j, i)):
+                    to_front = points[anchor, 0] - points[subject, 0]
+                    to_left = points[subject, 1] - points[anchor, 1]
+                    if abs(to_left) >= abs(to_front):
+                        holds[LEFT, subject, anchor] = to_left >= MIN_OFFSET
+                    else:
+                        holds[FRONT, subject, anchor] = to_front >= MIN_OFFSET
+
+
+@compiled
+def _stack(
+    points: Float[NDArray, "n 3"],
+    extents: Float[NDArray, "n 3"],
+    i: int,
+    j: int,
+    classes: Int[NDArray, " n"],
+    roles: RoleCounts,
+    holds: Bool[NDArray, "A n n"],
+    observed: Bool[NDArray, "A n n"],
+) -> bool:
+    """Write the stacked relations of two boxes by rules 1 to 3. Return whether a rule applies.
+
+    The footprints must overlap.
+    """
+    smaller, larger, is_nested, is_deep = -1, -1, False, True
+    for one, other in ((i, j), (j, i)):
+        if is_smaller(extents[one], extents[other]):
+            smaller, larger = one, other
+    height, larger_height = extents[smaller, 2], extents[larger, 2]
+    rise = points[smaller, 2] - height / 2 - (points[larger, 2] - larger_height / 2)
+    if smaller >= 0:  # the larger box may surround the smaller box; see rule 1
+        tops = points[smaller, 2] + height / 2, points[larger, 2] + larger_height / 2
+        is_nested = rise > 0 and tops[1] > tops[0] and larger_height > 2 * CONTACT
+    for subject, anchor in ((i, j), (j, i)):
+        bottom = points[subject, 2] - extents[subject, 2] / 2
+        lift = bottom - (points[anchor, 2] + extents[anchor, 2] / 2)
+        is_deep = is_deep and lift < -CONTACT
+        is_higher = points[subject, 2] > points[anchor, 2]
+        if lift > CONTACT:
+            holds[ABOVE, subject, anchor] = True
+            return True
+        if lift >= -CONTACT and is_higher and not (is_nested and subject == larger):
+            holds[ON_TOP, subject, anchor] = True
+            return True
+    if not is_deep and not is_nested:
+        return False  # two thin boxes at the same height
+    if smaller < 0:
+        for relation in (ON_TOP, INSIDE):
+            observed[relation, i, j] = observed[relation, j, i] = False
+        return True
+    possible = possible_roles(rise, height, larger_height)
+    role = likely_role(roles, classes[smaller], classes[larger], possible)
+    if role == ON:
+        holds[ON_TOP, smaller, larger] = True
+    elif role == UNDER:
+        holds[ON_TOP, larger, smaller] = True
+    elif role == IN:
+        holds[INSIDE, smaller, larger] = True
+    else:  # the relations of the possible roles are unobserved
+        observed[ON_TOP, smaller, larger] = not possible[ON]
+        observed[ON_TOP, larger, smaller] = not possible[UNDER]
+        observed[INSIDE, smaller, larger] = not possible[IN]
+    return True

@@ -1,15 +1,18 @@
 """What holds an object: the floor, a wall or the ceiling, or another object."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, Self
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from app.inference.kernels import CONTACT
-from app.scene.relations import ABOVE, INSIDE, ON_TOP
+from app.scene.geometry import CONTACT
+from app.scene.spatial_relations import ABOVE, INSIDE, ON_TOP
 
 UNKNOWN, FLOOR, HANGS, SUPPORTED = -1, 0, 1, 2
 """An object stands on the floor, hangs on a wall or from the ceiling, or is on or in an object."""
@@ -17,18 +20,14 @@ UNKNOWN, FLOOR, HANGS, SUPPORTED = -1, 0, 1, 2
 CLEARANCE: Final = 0.10  # maximum height in metres of the bottom of an object on the floor
 CLOSE: Final = 0.15  # maximum gap in metres to an object that may support an object above it
 
-Flags = NDArray[np.bool_]
-Floats = NDArray[np.float64]
-
-
 USUAL: Final = 0.5  # share of a stand that is usual for a class
 
 
-def floor_level(bottoms: Floats, weights: Floats) -> float:
-    """Return the height of the floor: the lower weighted tertile of bottoms (n,), in metres.
+def floor_level(bottoms: Float[NDArray, " n"], weights: Float[NDArray, " n"]) -> float:
+    """Return the height of the floor in metres: the lower weighted tertile of bottoms of boxes.
 
-    Only objects that usually stand on the floor count: the weights (n,) are the shares of the
-    objects of each class that do. Without them, the height is NaN.
+    The weights are the shares of the objects of each class that stand on the floor. Boxes with a
+    weight below `USUAL` do not count. If all boxes have such a weight, the height is NaN.
     """
     usable = np.isfinite(bottoms) & (weights >= USUAL)
     bottoms, weights = bottoms[usable], weights[usable]
@@ -43,19 +42,19 @@ def floor_level(bottoms: Floats, weights: Floats) -> float:
 class Heights:
     """Bottoms, tops and footprint areas of n boxes, in metres and square metres; NaN: unknown."""
 
-    bottoms: Floats
-    tops: Floats
-    areas: Floats
+    bottoms: Float[NDArray, " n"]
+    tops: Float[NDArray, " n"]
+    areas: Float[NDArray, " n"]
 
     @classmethod
-    def of(cls, centres: Floats, sizes: Floats) -> Self:
-        """Return the heights of boxes with these centres and extents, (n, 3) each."""
+    def of(cls, centres: Float[NDArray, "n 3"], sizes: Float[NDArray, "n 3"]) -> Self:
+        """Return the heights of boxes with these centres and extents."""
         half = sizes[:, 2] / 2
         return cls(centres[:, 2] - half, centres[:, 2] + half, sizes[:, 0] * sizes[:, 1])
 
     @cached_property
-    def around(self) -> Flags:
-        """Whether box i reaches below a smaller box j, or far below its top, (n, n).
+    def around(self) -> Bool[NDArray, "n n"]:
+        """Whether box i reaches below a smaller box j, or far below its top.
 
         "i is on top of j" then means that j is under i, as a bin is under a desk.
         """
@@ -63,15 +62,17 @@ class Heights:
         return is_deep & (self.areas[:, None] >= self.areas)
 
 
-def stands_of(holds: Flags, observed: Flags, heights: Heights, floor: float) -> NDArray[np.int64]:
-    """Return the stand of each of n boxes, (n,).
+def stands_of(
+    holds: Bool[NDArray, "A n n"], observed: Bool[NDArray, "A n n"], heights: Heights, floor: float
+) -> Int[NDArray, " n"]:
+    """Return the stand of each of n boxes.
 
     A low object stands on the floor, also if it is on a rug. The value is `UNKNOWN` if a bottom or
     the floor is unknown, if a box reaches into another box and its relation to this box is open, or
     if a box is closely above another box.
 
     Args:
-        holds, observed: (A, n, n) relations between the boxes; see `PoseRelations`.
+        holds, observed: relations between the boxes; see `PoseRelations`.
         floor: height of the floor in metres, or NaN.
     """
     bottoms, tops, has_floor = heights.bottoms, heights.tops, not math.isnan(floor)

@@ -10,7 +10,6 @@ from contextlib import suppress
 
 from app import errors
 from app.compiling import check_cache, progress
-from app.inference.kernels import KERNELS
 from app.questions.reading import Limits
 from app.registry import DEFAULT_STORE, Store, StoreState, load_model_set
 from app.registry.model_set import with_default
@@ -116,8 +115,8 @@ class Runtime:
     def _serve(self, models: ServedModels) -> None:
         previous, self.models = self.models, models
         is_first = previous is NO_MODELS
-        known = {} if is_first else previous.failures
-        new = [one for name, one in models.failures.items() if known.get(name) != one]
+        old = {} if is_first else previous.failures
+        new = [one for name, one in models.failures.items() if old.get(name) != one]
         _log_failures("", new)
         if not is_first:
             _logger.info("the service has loaded the store: %d usable versions", len(models.served))
@@ -131,7 +130,7 @@ class Runtime:
     def _load(self) -> ServedModels:
         # Read the state first. So the next check finds changes that are made during the load.
         self._loaded_state = self._store.state()
-        with progress(KERNELS):
+        with progress():
             previous = self.models.store
             models = load_model_set(self._store, previous, warm_up, self._release)
             return ServedModels(with_default(models, self._release, previous, warm_up))

@@ -1,5 +1,7 @@
 """Compiled loops on disk: stored once, in a directory that only this user can change."""
 
+import ast
+import inspect
 import json
 import os
 import sys
@@ -8,16 +10,17 @@ from typing import Any
 
 import pytest
 
+from app.compiling import KERNELS
 from tests.conftest import run_program
 
 PROGRAM = """
 import json, logging
 import numpy as np
 from app import compiling
-from app.inference.kernels import KERNELS, is_smaller
+from app.scene.roles import is_smaller
 logging.basicConfig(format="%(message)s", level="INFO")
 compiling.check_cache()
-with compiling.progress(KERNELS):
+with compiling.progress():
     is_smaller(np.ones(3), 2 * np.ones(3))
 print(json.dumps([sum(is_smaller.stats.cache_misses.values()), is_smaller.stats.cache_path]))
 """
@@ -25,8 +28,8 @@ print(json.dumps([sum(is_smaller.stats.cache_misses.values()), is_smaller.stats.
 
 @pytest.fixture
 def package(tmp_path: Path, repository: Path) -> Path:
-    """A copy of the package `app` with the loops alone."""
-    for name in ("__init__", "compiling", "inference/__init__", "inference/kernels"):
+    """A copy of the package `app` with the loops of two modules."""
+    for name in ("__init__", "compiling", "scene/__init__", "scene/roles", "scene/footprints"):
         copy = tmp_path / "service" / "app" / f"{name}.py"
         copy.parent.mkdir(parents=True, exist_ok=True)
         text = "" if name.endswith("__init__") else (repository / f"app/{name}.py").read_text()
@@ -54,10 +57,14 @@ def test_a_second_start_compiles_nothing(package: Path) -> None:
     assert folder.stat().st_mode & 0o777 == 0o700
     assert "compiling loop 1 of" in log
     assert start(package)[::2] == (0, "")
-    # A change of the file compiles again.
-    kernels = package / "inference" / "kernels.py"
-    kernels.write_text(kernels.read_text() + "\n")
-    assert start(package)[0] == 1
+    # A change of another file with loops gives another folder, and compiles again.
+    other = package / "scene" / "footprints.py"
+    other.write_text(other.read_text() + "\n")
+    compilations, changed, _ = start(package)
+    assert compilations == 1
+    assert changed is not None
+    assert Path(changed).parent.parent == folder
+    assert changed != stored
 
 
 def test_a_folder_that_others_can_change_is_refused(package: Path, tmp_path: Path) -> None:
@@ -84,10 +91,17 @@ def test_a_folder_of_another_user_is_refused(package: Path, tmp_path: Path) -> N
     assert f"{folder} or its parent belongs to another user" in log
 
 
-def test_every_loop_is_in_one_file_that_depends_on_no_other(repository: Path) -> None:
-    """numba notices no change of another file."""
-    app = repository / "app"
-    with_loops = [path for path in app.rglob("*.py") if "njit" in path.read_text()]
-    assert with_loops == [app / "inference" / "kernels.py"]
-    imports = [line for line in with_loops[0].read_text().splitlines() if " app" in line]
-    assert [line for line in imports if "import" in line] == ["from app.compiling import FOLDER"]
+def test_loops_depend_on_files_with_loops_only() -> None:
+    """The hash in the folder's name covers only these files, and numba notices no other change."""
+    import app.main  # noqa: F401 - imports every loop
+
+    with_loops = {kernel.py_func.__module__ for kernel in KERNELS}
+    with_loops |= {"app.inference.elementary"}
+    for kernel in KERNELS:
+        function = kernel.py_func
+        tree = ast.parse(inspect.getsource(sys.modules[function.__module__]))
+        used = set(function.__code__.co_names)
+        for statement in tree.body:
+            if isinstance(statement, ast.ImportFrom) and str(statement.module).startswith("app."):
+                names = {name.asname or name.name for name in statement.names}
+                assert not names & used or statement.module in with_loops, function

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from app.inference.chains import OTHER_ROOM, ChainState, Conditions, SceneChains, random_stream
-from app.inference.relations import ObservedRelations
+from app.inference.relation_units import ObservedRelations
 from app.inference.weights import pack_scenes
 from tests.enumeration.small_machines import (
     SMALL,

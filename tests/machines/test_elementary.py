@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from numba import njit
 
-from app.inference import kernels
+from app.inference import elementary
 from tests.conftest import run_program
 
 
 def compiled(name):
-    function = getattr(kernels, name)
+    function = getattr(elementary, name)
 
     @njit
     def apply(x, out):
@@ -84,5 +84,5 @@ def test_loops_for_a_generic_processor_give_equal_numbers(tmp_path, monkeypatch)
         path = tmp_path / f"{cpu}.npy"
         run_program(sys.executable, "-c", _GAINS, path)
         gains.append(np.load(path))
-    assert len(list(tmp_path.glob("loops/*/kernels.gains*.nbc"))) == 2
+    assert len(list(tmp_path.glob("loops/*/*/objects._gains*.nbc"))) == 2
     np.testing.assert_allclose(*gains, rtol=1e-5, atol=1e-5)

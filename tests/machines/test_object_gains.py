@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app.inference.objects import LARGEST_WEIGHT, Gains, ObjectScorer
-from app.inference.relations import context_of
+from app.inference.relation_units import encode
 from tests.enumeration.small_machines import random_weights
 from training.machines import MachineSpec, build
 from training.machines.arrays import weights_of
@@ -98,7 +98,7 @@ class Case:
         self.scorer = ObjectScorer(weights)
         room = None if self.room < 0 else self.room
         scene = self.classes, self.presence, self.presence
-        self.context = context_of(weights, *scene, room)
+        self.context = encode(weights, *scene, room)
         self.x = self.context.x
 
     def listed(self, *without):

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from app.inference.weights import pack_scenes
 from app.questions.generate import staying
 from app.scene import CANONICAL
-from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP
+from app.scene.spatial_relations import ABOVE, FRONT, LEFT, ON_TOP
 from tests.enumeration.small_machines import enumerate_joint, with_mean_rates
 from tests.questions.answers import generate, outliers
 from tests.questions.artifacts import (
@@ -42,8 +42,7 @@ every_model = pytest.mark.parametrize("artifact", ARTIFACTS.values(), ids=NAMES)
 def test_scenes_contain_the_evidence_and_no_contradiction(name, scene, seed):
     evidence = {thing.label for thing in scene.objects}
     stated = {
-        (scene.objects[i].label, CANONICAL[a], scene.objects[j].label)
-        for a, i, j in scene.relations or ()
+        (scene.objects[i].label, CANONICAL[a], scene.objects[j].label) for a, i, j in scene.triples
     }
     pairs = [{subject, object_} for subject, _, object_ in stated]
     for drawn in generate(ARTIFACTS[name], scene, count=9, seed=seed, steps=4):

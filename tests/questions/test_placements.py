@@ -13,13 +13,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import logit
 
-from app.inference.kernels import UNOBSERVED, rotated_offsets
+from app.model import CountSlope, Offsets
+from app.model.calibration import PlaceFit
+from app.model.offset_statistics import UNOBSERVED, rotated_offsets
 from app.questions.placements import Place, place_log_p, placements
 from app.questions.posterior import Posterior
-from app.registry import CountSlope, Offsets
-from app.registry.description import PlaceFit
 from app.scene import RELATIONS, ObjectClass, Scene, SceneObject, Vocabulary
-from app.scene.relations import (
+from app.scene.spatial_relations import (
     ABOVE,
     CANONICAL,
     FRONT,

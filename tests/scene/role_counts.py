@@ -4,8 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from app.inference.kernels import IN, ON, UNDER
-from app.scene.roles import RoleCounts
+from app.scene.roles import IN, ON, UNDER, RoleCounts
 
 ROLES = {ON: "on", UNDER: "under", IN: "in"}
 LABELS = (

@@ -13,7 +13,6 @@ from typing import Final
 
 import numpy as np
 
-from app.inference.kernels import CONTACT, IN, ON, likely_role, pool_classes, pool_relations
 from app.scene import (
     CANONICAL,
     PoseRelations,
@@ -25,7 +24,10 @@ from app.scene import (
     label_key,
     to_viewer_frame,
 )
-from app.scene.relations import INSIDE, ON_TOP, STACKED, SUPPORTS
+from app.scene.geometry import CONTACT
+from app.scene.roles import IN, ON, likely_role
+from app.scene.scene import pool_classes
+from app.scene.spatial_relations import INSIDE, ON_TOP, STACKED, SUPPORTS, pool_relations
 from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN, Heights, stands_of
 from scene_client.image_plane import are_neighbours, relation_between
 from training.datasets.array_types import Flags, Floats, Ints
@@ -79,7 +81,7 @@ def pool_instances(
 
     Args:
         classes: (N,) index of the class of each instance.
-        holds, observed: (A, N, N), see `app.scene.instance_evidence`.
+        holds, observed: (A, N, N) relations between the instances.
     """
     distinct, _, row, counts, _ = pool_classes(classes, np.ones(len(classes)))
     on, known = pool_relations(row, len(distinct), holds, observed)

@@ -13,10 +13,10 @@ from typing import Final
 
 import numpy as np
 
-from app.inference.kernels import CONTACT
 from app.scene import Scene
-from app.scene.geometry import overlap_and_gap
-from app.scene.relations import ON_TOP, SUPPORTS
+from app.scene.footprints import overlap_and_gap
+from app.scene.geometry import CONTACT
+from app.scene.spatial_relations import ON_TOP, SUPPORTS
 from training.datasets.array_types import Flags, Floats, Rng
 from training.datasets.cases import draw_true_relations, scene_of
 from training.datasets.encoding import EncodedScene

@@ -17,8 +17,8 @@ from typing import Final
 
 import numpy as np
 
-from app.inference.kernels import IN, ON, UNDER
 from app.scene import RoleCounts, Vocabulary
+from app.scene.roles import IN, ON, UNDER
 from training.datasets.records import AnnotatedObject, AnnotatedScene
 
 _OF_KIN: Final = 0.5  # weight of a pair in which a class is replaced by its parent or its kind

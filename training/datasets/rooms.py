@@ -19,7 +19,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from app.scene import Vocabulary, to_viewer_frame
-from app.scene.geometry import overlap_and_gap
+from app.scene.footprints import overlap_and_gap
 from training.datasets.array_types import Floats, Rng
 from training.datasets.encoding import side_viewpoints
 from training.datasets.records import AnnotatedObject, AnnotatedScene

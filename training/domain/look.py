@@ -13,7 +13,7 @@ from rapidfuzz.distance import OSA
 
 from app.scene import CANONICAL, canonicalise, label_key
 from app.scene.geometry import LARGEST, MOST_DISTANT
-from app.scene.relations import ABOVE, ON_TOP
+from app.scene.spatial_relations import ABOVE, ON_TOP
 from training.datasets import AnnotatedScene, EncodedScene
 from training.datasets.sources import source_of
 from training.datasets.vocabulary import curated_names, most_frequent

@@ -19,8 +19,8 @@ from torch import Tensor
 
 from app import questions
 from app.inference.elementary import log_softmax
+from app.model import SceneModel, Sensitivity
 from app.questions.posterior import Posterior, calibrated_missing
-from app.registry import Artifact, Sensitivity
 from app.scene import CANONICAL, Scene, SceneObject, canonicalise, observe
 from training.datasets import EncodedScene
 from training.datasets.cases import scene_of
@@ -103,7 +103,7 @@ def instances_of(
     return of_classes(classes.repeat_interleave(copies).tolist()), copies.cumsum(0) - copies
 
 
-def with_intruder(artifact: Artifact, scene: Scene, intruder: int) -> Scene:
+def with_intruder(artifact: SceneModel, scene: Scene, intruder: int) -> Scene:
     """Return the scene with one more object, of the class `intruder`."""
     thing = SceneObject("intruder", artifact.vocabulary.labels[intruder], intruder)
     return replace(scene, objects=(*scene.objects, thing))
@@ -122,7 +122,7 @@ def canonical_triple(index: Mapping[str, int], entry: Mapping[str, Any]) -> tupl
     return canonicalise(index[entry["subject"]], entry["relation"], index[entry["object"]])
 
 
-def missing_log_p(artifact: Artifact, scene: Scene) -> Float[NDArray, " V"]:
+def missing_log_p(artifact: SceneModel, scene: Scene) -> Float[NDArray, " V"]:
     """Return the log-probability of `/missing` that each class is missing; else -inf.
 
     All classes are candidates, so a class has a value beside a likelier one of its family.
@@ -138,7 +138,7 @@ def missing_log_p(artifact: Artifact, scene: Scene) -> Float[NDArray, " V"]:
 
 
 def missing_log_p_at(
-    artifact: Artifact, scene: Scene, relation: str, anchor: int
+    artifact: SceneModel, scene: Scene, relation: str, anchor: int
 ) -> Float[NDArray, " V"]:
     """Return the log-probability of `/missing` that each class is missing at a place; else -inf.
 
@@ -156,7 +156,7 @@ def missing_log_p_at(
 
 
 def judge(
-    artifact: Artifact, scene: Scene, sensitivity: Sensitivity = "medium"
+    artifact: SceneModel, scene: Scene, sensitivity: Sensitivity = "medium"
 ) -> Float[NDArray, "objects 2"]:
     """Return the answers of `/outliers` about the objects of a scene.
 
@@ -172,7 +172,7 @@ def judge(
 
 
 def score_missing(
-    artifact: Artifact, v: Float[Tensor, "B V"], room: Int[Tensor, " B"] | None = None
+    artifact: SceneModel, v: Float[Tensor, "B V"], room: Int[Tensor, " B"] | None = None
 ) -> Float[Tensor, "B V"]:
     """Return the log-probabilities of `/missing` for lists, with the room types or without any."""
     types = [None] * len(v) if room is None else room.tolist()
@@ -181,7 +181,7 @@ def score_missing(
 
 
 def score_rooms(
-    artifact: Artifact, profiles: Sequence[str], v: Float[Tensor, "B V"], profile: str
+    artifact: SceneModel, profiles: Sequence[str], v: Float[Tensor, "B V"], profile: str
 ) -> Float[Tensor, "B C"]:
     """Return the log-probabilities of `/rooms` for lists.
 
@@ -196,7 +196,7 @@ def score_rooms(
     return torch.from_numpy(log_p)
 
 
-def score_suspicion(artifact: Artifact, v: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
+def score_suspicion(artifact: SceneModel, v: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
     """Return the probabilities of `/outliers` for lists; -inf for unlisted classes."""
     values = torch.full(v.shape, -torch.inf, dtype=torch.float64)
     for row, scene in enumerate(_scenes(v)):
@@ -205,7 +205,7 @@ def score_suspicion(artifact: Artifact, v: Float[Tensor, "B V"]) -> Float[Tensor
 
 
 def flag_outliers(
-    artifact: Artifact, v: Float[Tensor, "B V"], sensitivity: Sensitivity
+    artifact: SceneModel, v: Float[Tensor, "B V"], sensitivity: Sensitivity
 ) -> Bool[Tensor, "B V"]:
     """Return the listed classes that `/outliers` reports as outliers."""
     flags = torch.zeros(v.shape, dtype=torch.bool)
@@ -218,7 +218,7 @@ def _scenes(v: Float[Tensor, "B V"]) -> Iterator[Scene]:
     return (of_classes(row.nonzero().squeeze(1).tolist()) for row in v)
 
 
-def score_misplaced(artifact: Artifact, scene: Scene) -> list[dict[str, Any]]:
+def score_misplaced(artifact: SceneModel, scene: Scene) -> list[dict[str, Any]]:
     """Return the misplaced relations of a scene.
 
     Relations of scenes with poses follow from the poses, as in a request in viewer axes.
@@ -229,7 +229,7 @@ def score_misplaced(artifact: Artifact, scene: Scene) -> list[dict[str, Any]]:
 
 
 def relation_probabilities(
-    artifact: Artifact, scene: Scene, pairs: Sequence[tuple[int, int]] | None = None
+    artifact: SceneModel, scene: Scene, pairs: Sequence[tuple[int, int]] | None = None
 ) -> Float[NDArray, "A objects objects"]:
     """Return the probability of each canonical relation.
 

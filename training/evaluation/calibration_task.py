@@ -31,17 +31,17 @@ import torch
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from app.questions import misplaced, missing, outliers, relations
-from app.questions.placements import Place
-from app.registry import (
+from app.model import (
     AlarmLine,
     AlarmLines,
-    Artifact,
     Calibration,
     CountSlope,
     Judgement,
     Misplaced,
+    SceneModel,
 )
+from app.questions import misplaced, missing, outliers, relations
+from app.questions.placements import Place
 from app.scene import CANONICAL, Scene, Vocabulary, canonicalise
 from training.datasets import EncodedScene
 from training.datasets.array_types import Rng
@@ -81,7 +81,7 @@ _REMOVALS = 4
 _NO_ALARM = AlarmLine(intercept=1e3)
 Answers = list[tuple[float, bool]]
 """Probability and truth value of each answer about one scene."""
-Ask = Callable[[Artifact, EncodedScene, Rng], Answers | None]
+Ask = Callable[[SceneModel, EncodedScene, Rng], Answers | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +108,7 @@ class Items:
         return Scored(statistic, self.scene, self.score, self.truth, np.arange(self.scenes))
 
 
-def uncalibrated(artifact: Artifact) -> Artifact:
+def uncalibrated(artifact: SceneModel) -> SceneModel:
     """Return the artifact with raw log-odds in place of calibrated log-odds.
 
     The slope -1 turns the log-odds of an object or relation into those that it is wrong.
@@ -127,7 +127,7 @@ def uncalibrated(artifact: Artifact) -> Artifact:
     return replace(artifact, calibration=neutral)
 
 
-def collect(artifact: Artifact, scenes: SceneTensors, ask: Ask, seed: int = 0) -> Items:
+def collect(artifact: SceneModel, scenes: SceneTensors, ask: Ask, seed: int = 0) -> Items:
     """Ask one of `QUESTIONS` about every scene, and collect the answers with their truth."""
     answers = [ask(artifact, scene, scene_rng(scene, seed)) for scene in scenes.scenes]
     items = [(k, *answer) for k, of_scene in enumerate(answers) for answer in of_scene or ()]
@@ -135,7 +135,7 @@ def collect(artifact: Artifact, scenes: SceneTensors, ask: Ask, seed: int = 0) -
 
 
 def ask_relations(
-    artifact: Artifact,
+    artifact: SceneModel,
     encoded: EncodedScene,
     rng: Rng,  # noqa: ARG001
 ) -> Answers | None:
@@ -144,7 +144,7 @@ def ask_relations(
     return _answers_on(artifact, encoded, labels_alone(encoded), mask) or None
 
 
-def ask_given(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answers | None:
+def ask_given(artifact: SceneModel, encoded: EncodedScene, rng: Rng) -> Answers | None:
     """Ask for the relations of half of the pairs. The relations of the other half are evidence."""
     is_queried, evidence = observed_pairs(encoded, artifact.vocabulary.structure, rng)
     if not evidence:
@@ -155,7 +155,7 @@ def ask_given(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answers | 
 
 
 def _answers_on(
-    artifact: Artifact,
+    artifact: SceneModel,
     encoded: EncodedScene,
     scene: Scene,
     mask: Bool[NDArray, "A objects objects"],
@@ -169,7 +169,7 @@ def _answers_on(
     return [(p, bool(encoded.instance_holds[triple])) for p, triple in answers if mask[triple]]
 
 
-def ask_placements(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answers | None:
+def ask_placements(artifact: SceneModel, encoded: EncodedScene, rng: Rng) -> Answers | None:
     """Ask where an instance of a removed class belongs, for up to `_REMOVALS` removals."""
     is_annotated = annotated_relations(encoded)
     answers: Answers = []
@@ -190,7 +190,7 @@ def ask_placements(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answe
 
 
 def collect_missing(
-    artifact: Artifact, scenes: SceneTensors, size: Size, seed: int = 0, *, stated: bool = False
+    artifact: SceneModel, scenes: SceneTensors, size: Size, seed: int = 0, *, stated: bool = False
 ) -> Items:
     """Ask for the missing classes of random parts of this size, and collect the answers.
 
@@ -253,7 +253,7 @@ def place_question(
     return PlaceQuestion(labels_alone(encoded, kept), at, placed, usable)
 
 
-def ask_placed(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answers | None:
+def ask_placed(artifact: SceneModel, encoded: EncodedScene, rng: Rng) -> Answers | None:
     """Ask for the hidden classes at one place, without those of an unknown relation."""
     question = place_question(artifact.vocabulary, encoded, rng, range(artifact.spec.A))
     if question is None:
@@ -266,7 +266,7 @@ def ask_placed(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answers |
 
 
 def ask_outliers(
-    artifact: Artifact,
+    artifact: SceneModel,
     encoded: EncodedScene,
     rng: Rng,
     intruders: Mapping[tuple[str, str], Int[NDArray, " choices"]] | None = None,
@@ -298,7 +298,7 @@ def ask_outliers(
     ] or None
 
 
-def ask_misplaced(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answers | None:
+def ask_misplaced(artifact: SceneModel, encoded: EncodedScene, rng: Rng) -> Answers | None:
     """Ask for misplaced relations. One relation is altered in half of the scenes."""
     case = altered_case(encoded, artifact.vocabulary.structure, rng)
     if case is None:
@@ -331,7 +331,7 @@ NAMES = (*QUESTIONS, *LISTED)
 """Names of all questions in the metrics of the task."""
 
 
-def calibration_task(artifact: Artifact, setting: Setting) -> Outcome | None:
+def calibration_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
     """Measure the calibration of the answers to all questions, published and uncalibrated."""
     related = setting.some(related=True, share=3)
     complete, complete_related = (

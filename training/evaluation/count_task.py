@@ -22,10 +22,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from app.questions.counts import LIKELY, more
+from app.model import SceneModel
+from app.model.count_statistics import Counts
+from app.questions.missing import LIKELY, more
 from app.questions.posterior import present
-from app.registry import Artifact
-from app.registry.counts import Counts
 from training.datasets import EncodedScene
 from training.datasets.cases import MOST, counted_classes, listed_cases
 from training.evaluation.asking import of_classes
@@ -42,7 +42,7 @@ METRICS: Final = (
 )
 
 
-def counts_task(artifact: Artifact, setting: Setting) -> Outcome | None:
+def counts_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
     """Measure the errors, the share of counts in the interval and the precision of proposals."""
     train = setting.train
     if artifact.counts is None or train is None:
@@ -83,7 +83,7 @@ def counts_task(artifact: Artifact, setting: Setting) -> Outcome | None:
 
 
 def _ask_counts(
-    artifact: Artifact, scene: EncodedScene, counted: Bool[NDArray, " V"], seed: int
+    artifact: SceneModel, scene: EncodedScene, counted: Bool[NDArray, " V"], seed: int
 ) -> list[tuple[float, ...]]:
     """Return (class, number, listed, expected, low, high, probability) of each listed class."""
     part, is_candidate = listed_cases(scene, counted, artifact.vocabulary.structure, seed)
@@ -99,7 +99,7 @@ def _ask_counts(
     return [(*number_of[entry["label"]], *(entry[name] for name in fields)) for entry in entries]
 
 
-def _mean_counts(scenes: Sequence[EncodedScene], artifact: Artifact) -> Float[NDArray, " V"]:
+def _mean_counts(scenes: Sequence[EncodedScene], artifact: SceneModel) -> Float[NDArray, " V"]:
     """Return the mean number of instances of each class in the scenes with the class."""
     times, total = np.zeros((2, len(artifact.vocabulary)))
     for scene in scenes:

@@ -24,8 +24,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from app.registry import Artifact
-from app.scene import PoseRelations, Scene
+from app.model import SceneModel
+from app.scene import RelationTable, Scene
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import scene_of, scene_rng
 from training.evaluation.asking import ask_every, ask_rows, relation_probabilities, score_missing
@@ -55,7 +55,7 @@ class Case(NamedTuple):
     truth: Bool[NDArray, "A objects objects"]
 
 
-def missing_evidence_task(artifact: Artifact, setting: Setting) -> Outcome | None:
+def missing_evidence_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
     """Measure T2 (missing objects) with labels only and with the room type."""
     scenes, structure = with_room_type(setting.some()), setting.structure
     # With one question per scene, the random choice of the class changes the result of a small data
@@ -93,11 +93,13 @@ def evidence_cases(
         triples = [(int(a), int(i), int(j)) for a, i, j in np.argwhere(given)]
         scene = replace(scene_of(encoded, range(len(instances)), triples), room_type=None)
         if kind == "poses":
-            scene = replace(scene, poses=PoseRelations(given, encoded.instance_observed & between))
+            observed = encoded.instance_observed & between
+            table = RelationTable.shown_by_boxes(given, observed, np.zeros_like(observed))
+            scene = replace(scene, relations=table)
         yield Case(index, scene, queried, truth)
 
 
-def relations_evidence_task(artifact: Artifact, setting: Setting) -> Outcome | None:
+def relations_evidence_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
     """Measure T1 (relations) with labels only, and with relations or poses."""
     scenes, structure = setting.some(related=True), setting.structure.numpy()
     metrics: dict[str, Metric] = {}
@@ -105,7 +107,7 @@ def relations_evidence_task(artifact: Artifact, setting: Setting) -> Outcome | N
 
     def ask(case: Case) -> Float[NDArray, " 2"]:
         count, truth = int(case.truth.sum()), case.truth[case.queried]
-        bare = replace(case.scene, relations=None, poses=None)
+        bare = replace(case.scene, relations=None)
         p = (relation_probabilities(artifact, scene) for scene in (bare, case.scene))
         return np.array([expected_hits(x[case.queried], truth, count) for x in p])
 

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from app.inference.chains import Conditions, random_stream
+from app.model import SceneModel
 from app.questions.generate import STEPS, draw_plausible, is_within_limits
-from app.registry import Artifact
 from app.scene import Scene
 from training.datasets.sources import source_of
 from training.evaluation.metrics import Metric, Ratio, Resampled
@@ -39,7 +39,7 @@ _DRAWS = 200  # generated scenes of each condition
 _RESAMPLES = 200
 
 
-def generated_rooms_task(artifact: Artifact, setting: Setting) -> Outcome | None:
+def generated_rooms_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
     """Measure the task on held-out scenes. The figures of a room type need 10 scenes."""
     names = artifact.vocabulary.room_types
     types = {name: names.index(name) for name in ROOMS if artifact.spec.C and name in names}
@@ -66,7 +66,7 @@ def generated_rooms_task(artifact: Artifact, setting: Setting) -> Outcome | None
 
 
 def _drawn_size(
-    artifact: Artifact, room: int | None, things: Bool[Tensor, " V"], seed: int
+    artifact: SceneModel, room: int | None, things: Bool[Tensor, " V"], seed: int
 ) -> float:
     """Return the mean number of classes of generated scenes, without structure."""
     chains = artifact.scene_chains.under(Conditions(np.zeros(0, np.int64), None, room))

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from app.registry import Artifact, Sensitivity
+from app.model import SceneModel, Sensitivity
 from app.scene import Scene
 from training.datasets.batches import Batch
 from training.evaluation.setting import Setting
@@ -91,7 +91,7 @@ class Model:
         lateral: change of the log-odds of left and front in T1 pairs, see `lateral_shift`.
         rooms: log-probabilities of the room types.
         generate: sampler of T4 for a setting.
-        artifact: model for Calibration and for all questions to the service.
+        scene_model: model for Calibration and for all questions to the service.
         parameters: number of trained weights, or None if this number is not meaningful.
     """
 
@@ -106,7 +106,7 @@ class Model:
     lateral: float = 0.0
     rooms: RoomScore | None = None
     generate: SamplerOf | None = None
-    artifact: Artifact | None = None
+    scene_model: SceneModel | None = None
     parameters: int | None = None
 
     def __post_init__(self) -> None:

@@ -26,8 +26,8 @@ from jaxtyping import Bool, Float, Int, Shaped
 from numpy.typing import NDArray
 from scipy.special import expit
 
-from app.registry import Artifact
-from app.scene.relations import INSIDE, LATERAL, VERTICAL
+from app.model import SceneModel
+from app.scene.spatial_relations import INSIDE, LATERAL, VERTICAL
 from training.datasets import EncodedScene
 from training.datasets.batches import SceneTensors, seen_triples
 from training.evaluation.asking import ask_every, labels_alone, relation_probabilities
@@ -82,7 +82,7 @@ def listed_pairs(
     return questions
 
 
-def service_score(artifact: Artifact) -> PairScore:
+def service_score(artifact: SceneModel) -> PairScore:
     """Return a score: probabilities of `/relations` between the first instances of both classes."""
 
     def score(question: ScenePairs) -> Float[NDArray, "P 2*A"]:
@@ -216,8 +216,8 @@ def _ask(model: Model, setting: Setting, relations: Sequence[int]) -> _Answers |
         return None
     scenes = setting.at(torch.tensor([question.scene_index for question in pairs])).some()
     questions = listed_pairs(scenes, setting.structure, relations)
-    if model.artifact is not None:
-        score = service_score(model.artifact)
+    if model.scene_model is not None:
+        score = service_score(model.scene_model)
     elif model.relations is not None:
         score = baseline_score(scenes, model.relations, model.lateral)
     else:

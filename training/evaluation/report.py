@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from app.registry import Artifact
+from app.model import SceneModel
 from app.registry import Metric as CardMetric
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.files import write_whole
@@ -142,7 +142,7 @@ def pooled(reports: Sequence[SourceReport], source: str = "pooled") -> SourceRep
 
 
 def evaluate(
-    artifact: Artifact,
+    artifact: SceneModel,
     scenes: SceneTensors,
     structure: Structure,
     train: SceneTensors,

@@ -99,7 +99,7 @@ TASKS: dict[str, Task] = {
     "T1 with evidence": Task(
         "relations, with more evidence",
         evidence.relations_evidence_task,
-        "artifact",
+        "scene_model",
         card=_each(["change of R-precision"], evidence.OF_RELATIONS),
         of_objects=False,
     ),
@@ -116,7 +116,7 @@ TASKS: dict[str, Task] = {
     "T2 with evidence": Task(
         "missing object, with the room type",
         evidence.missing_evidence_task,
-        "artifact",
+        "scene_model",
         card=_each(["change of MRR"], evidence.OF_OBJECTS),
     ),
     "T2-at missing at a place": Task(
@@ -147,19 +147,19 @@ TASKS: dict[str, Task] = {
     "T4 rooms": Task(
         "generated rooms",
         generated_rooms_task,
-        "artifact",
+        "scene_model",
         card=(REFUSED, *_each([SIZE], [FREE])),
         tables=(REFUSED, *_each([REFUSED], ROOMS), *_each([SIZE], [FREE, *ROOMS])),
     ),
     "Calibration": Task(
         "calibration",
         calibration_task,
-        "artifact",
+        "scene_model",
         card=tuple(f"{figure}, {name}" for name in NAMES for figure in ("ECE", "Brier skill")),
         tables=_each(["ECE", "Brier skill"], NAMES),
         of_objects=False,
     ),
-    "Everyday": Task("everyday facts", everyday_task, "artifact", LINES, of_objects=False),
+    "Everyday": Task("everyday facts", everyday_task, "scene_model", LINES, of_objects=False),
 }
 
 
@@ -167,9 +167,9 @@ TASKS: dict[str, Task] = {
 # but not in tables that compare machines.
 STATISTICS: dict[str, Task] = {
     "Offsets": Task(
-        "offsets of placements", offsets_task, "artifact", OFFSETS, tables=(), of_objects=False
+        "offsets of placements", offsets_task, "scene_model", OFFSETS, tables=(), of_objects=False
     ),
-    "Counts": Task("numbers of instances", counts_task, "artifact", COUNTS, tables=()),
+    "Counts": Task("numbers of instances", counts_task, "scene_model", COUNTS, tables=()),
 }
 
 EVERY_TASK = TASKS | STATISTICS

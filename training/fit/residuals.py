@@ -9,7 +9,7 @@ import torch
 from scipy.special import expit
 from torch import Tensor
 
-from app.scene.relations import STACKED
+from app.scene.spatial_relations import STACKED
 from training.datasets.batches import Batch, SceneTensors, relation_units
 from training.machines import BoltzmannMachine, build
 from training.machines.edges import triple_keys

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from app.scene.relations import STACKED
+from app.scene.spatial_relations import STACKED
 from training.datasets.batches import SceneTensors, TrainingData, subset
 from training.datasets.cases import some_scenes
 from training.evaluation.artifact_model import artifact_model, floor_model, independent_model

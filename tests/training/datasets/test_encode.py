@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from app.scene import CANONICAL, ObjectClass, Vocabulary, to_viewer_frame
-from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP
+from app.scene.spatial_relations import ABOVE, FRONT, LEFT, ON_TOP
 from tests.training.scenes import encode_objects, things
 from training.datasets import AnnotatedObject, annotated_classes, encode
 from training.datasets.encoding import derive_from_boxes, room_viewpoint

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from app.inference.kernels import IN, ON, UNDER
 from app.scene import ObjectClass, RoleCounts, Vocabulary
-from app.scene.roles import role_counts
+from app.scene.roles import IN, ON, UNDER, role_counts
 from tests.training.scenes import things
 from training.datasets import AnnotatedObject, AnnotatedScene
 from training.datasets.roles import count_roles, lift_of

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from app.scene import CANONICAL
-from app.scene.geometry import overlap_and_gap
+from app.scene.footprints import overlap_and_gap
 from training.datasets import AnnotatedScene, encode, generate_rooms, rooms_vocabulary
 from training.datasets.rooms import DOMAINS, ROOMS, Piece
 

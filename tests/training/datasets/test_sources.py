@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from app.scene import ObjectClass, RoleCounts, Vocabulary
-from app.scene.relations import ABOVE, FRONT, INSIDE, LEFT, ON_TOP, SUPPORTS
+from app.scene.spatial_relations import ABOVE, FRONT, INSIDE, LEFT, ON_TOP, SUPPORTS
 from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN
 from tests.training.scenes import encode_objects, things
 from training.datasets import (

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from app.registry import CountSlope
+from app.model import CountSlope
 from app.scene import CANONICAL
-from app.scene.relations import LEFT, ON_TOP
+from app.scene.spatial_relations import LEFT, ON_TOP
 from tests.questions.answers import missing, relations
 from tests.questions.artifacts import LARGER, calibration, larger_artifact
 from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms

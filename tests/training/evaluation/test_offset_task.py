@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from app.scene.relations import LEFT, ON_TOP
+from app.scene.spatial_relations import LEFT, ON_TOP
 from tests.questions.artifacts import LARGER, larger_artifact
 from tests.training.evaluation.scenes import scene, tensors, values_of
 from tests.training.fit.test_offset_statistics import MEAN, STD, apart, draws

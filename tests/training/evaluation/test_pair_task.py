@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from app.scene import CANONICAL
-from app.scene.relations import INSIDE, STACKED
+from app.scene.spatial_relations import INSIDE, STACKED
 from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
 from tests.training.evaluation.scenes import (
     NO_STRUCTURE,

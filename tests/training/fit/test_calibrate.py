@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
+from app.model import Calibration, CountSlope, CoverageFit
 from app.questions.posterior import calibrated
-from app.registry import Calibration, CountSlope, CoverageFit
 from app.scene import Vocabulary
-from app.scene.relations import ABOVE, INSIDE, LATERAL, LEFT, ON_TOP, STACKED
+from app.scene.spatial_relations import ABOVE, INSIDE, LATERAL, LEFT, ON_TOP, STACKED
 from tests.questions.artifacts import artifact_of, random_machine
 from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, A, rooms
 from tests.training.evaluation.scenes import WIDE, random_scenes, scene, tensors

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.special import expit as sigmoid
 
-from app.registry import Calibration, PlaceFit
-from app.scene.relations import LATERAL, STACKED
+from app.model import Calibration, PlaceFit
+from app.scene.spatial_relations import LATERAL, STACKED
 from tests.questions.artifacts import larger_artifact
 from tests.training.evaluation.scenes import scene, tensors
 from training.fit.calibrate_at import PlaceTerms, fit_at, fit_place

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from app.scene import ObjectClass, Vocabulary
-from app.scene.relations import INSIDE, LEFT, ON_TOP
+from app.scene.spatial_relations import INSIDE, LEFT, ON_TOP
 from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN
 from tests.training.evaluation.scenes import scene
 from training.datasets.roles import count_roles

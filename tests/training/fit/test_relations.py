@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.scene.relations import ABOVE, CANONICAL, INSIDE, LEFT, ON_TOP, STACKED
+from app.scene.spatial_relations import ABOVE, CANONICAL, INSIDE, LEFT, ON_TOP, STACKED
 from tests.enumeration.small_machines import random_weights
 from tests.training.evaluation.scenes import V, scene, tensors, toy
 from training.datasets.batches import relation_units

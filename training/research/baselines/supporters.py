@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from app.scene import Scene, observe
-from app.scene.relations import SUPPORTS
+from app.scene.spatial_relations import SUPPORTS
 from training.datasets import EncodedScene
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import scene_of
@@ -65,13 +65,13 @@ def _supporters(
     classes = np.array([-1 if x.class_index is None else x.class_index for x in scene.objects])
     is_thing = (classes >= 0) & ~structure[classes]
     supports = np.zeros((len(classes), len(classes)), dtype=np.bool_)
-    for a, i, j in observed.relations or ():
+    for a, i, j in observed.triples:
         supports[i, j] |= a in SUPPORTS
     for i in np.flatnonzero(is_thing).tolist():
         of_object = np.unique(classes[supports[i] & is_thing])
         if len(of_object):
             yield i, int(classes[i]), of_object
-        elif observed.poses is not None or supports[i].any():
+        elif observed.has_boxes or supports[i].any():
             yield i, int(classes[i]), np.array([len(structure)])
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from app.scene import ObjectClass, Vocabulary
-from app.scene.relations import INSIDE, LEFT, ON_TOP
+from app.scene.spatial_relations import INSIDE, LEFT, ON_TOP
 from training.datasets import AnnotatedObject, AnnotatedScene, annotated_classes, encode
 from training.datasets.batches import scene_tensors
 from training.datasets.cases import scene_of

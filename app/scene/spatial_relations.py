@@ -5,15 +5,21 @@ A relation and its opposite are the same statement with exchanged objects: ``rig
 into `CANONICAL`. The first argument of a relation is its subject, and the second is its anchor.
 """
 
+from __future__ import annotations
+
 from collections.abc import Hashable, Iterable
 from graphlib import CycleError, TopologicalSorter
 from typing import Final, TypeVar
 
-from app.inference.kernels import ABOVE as ABOVE
-from app.inference.kernels import FRONT as FRONT
-from app.inference.kernels import INSIDE as INSIDE
-from app.inference.kernels import LEFT as LEFT
-from app.inference.kernels import ON_TOP as ON_TOP
+import numpy as np
+from jaxtyping import Bool, Int
+from numpy.typing import NDArray
+
+from app.compiling import compiled
+
+LEFT, FRONT, ON_TOP, ABOVE, INSIDE = 0, 1, 2, 3, 4
+"""Indices of the canonical relations."""
+
 
 CANONICAL: Final[tuple[str, ...]] = ("left", "front", "on-top", "above", "inside")
 OPPOSITES: Final[dict[str, str]] = {
@@ -24,7 +30,6 @@ OPPOSITES: Final[dict[str, str]] = {
     "inside": "contains",
 }
 RELATIONS: Final[tuple[str, ...]] = CANONICAL + tuple(OPPOSITES[name] for name in CANONICAL)
-
 
 LATERAL: Final = (LEFT, FRONT)
 """Indices of the relations of neighbours that stand beside each other."""
@@ -93,3 +98,26 @@ def support_cycle(triples: Iterable[tuple[int, End, End]]) -> list[End] | None:
         circle: list[End] = error.args[1]
         return circle[::-1]
     return None
+
+
+@compiled
+def pool_relations(
+    row: Int[NDArray, " N"], n: int, holds: Bool[NDArray, "A N N"], observed: Bool[NDArray, "A N N"]
+) -> tuple[Bool[NDArray, "A n n"], Bool[NDArray, "A n n"]]:
+    """Pool the relations of N instances into relations of n classes; see `app.scene.scene`.
+
+    Args:
+        row: number of each instance's class, from 0 to n - 1.
+
+    Returns:
+        The pooled `holds` and `observed`.
+    """
+    A, size, _ = holds.shape
+    class_holds, class_observed = np.zeros((A, n, n), np.bool_), np.zeros((A, n, n), np.bool_)
+    for a in range(A):
+        for i in range(size):
+            for j in range(size):
+                if i != j and (holds[a, i, j] or observed[a, i, j]):
+                    class_observed[a, row[i], row[j]] = True
+                    class_holds[a, row[i], row[j]] |= holds[a, i, j]
+    return class_holds, class_observed
