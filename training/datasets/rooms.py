@@ -186,10 +186,11 @@ class _Layout:
         return x, y, z
 
     def _furnish(self, piece: Piece) -> None:
+        """Add a piece at a random free place, if `_ATTEMPTS` attempts find one."""
         size = self._random_size(piece.size)
         for _ in range(_ATTEMPTS):
             if (box := self._propose(piece, size)) is not None and self._free(box):
-                self._place(piece, box)
+                self._add(piece, box)
                 return
 
     def _propose(self, piece: Piece, size: Size) -> _Box | None:
@@ -220,7 +221,8 @@ class _Layout:
             z = min(self.rng.uniform(1.5, 1.8), _HEIGHT - 0.05 - size[2] / 2)
         return _Box(piece.label, x, y, z, size, side * math.pi / 2)
 
-    def _place(self, piece: Piece, box: _Box) -> None:
+    def _add(self, piece: Piece, box: _Box) -> None:
+        """Add a box, the small objects on it, and the pieces beside it."""
         support = len(self.boxes)
         self.boxes.append(box)
         for small in piece.carries:
@@ -231,6 +233,7 @@ class _Layout:
             self._put_beside(beside, side, box)
 
     def _put_on(self, small: Piece, support: int) -> None:
+        """Add a small object at a random free spot on top of a box."""
         base = self.boxes[support]
         size = self._random_size(small.size)
         if size[0] > base.size[0] or size[1] > base.size[1]:
@@ -245,6 +248,7 @@ class _Layout:
                 return
 
     def _put_beside(self, piece: Piece, where: Side, anchor: _Box) -> None:
+        """Add a piece at the named sides of a box, where the room has space."""
         for side in ("left", "right", "front", "back") if where == "around" else (where,):
             if self.rng.random() >= piece.chance:
                 continue
@@ -260,9 +264,10 @@ class _Layout:
                 x, y = _point_on(anchor, 0.0, v if side == "front" else -v)
             box = _Box(piece.label, x, y, size[2] / 2, size, anchor.yaw)
             if self._inside(box) and self._free(box):
-                self._place(piece, box)
+                self._add(piece, box)
 
     def _inside(self, box: _Box) -> bool:
+        """Return True if a box lies between the walls."""
         cos, sin = abs(math.cos(box.yaw)), abs(math.sin(box.yaw))
         half_x, half_y = box.size[0] / 2, box.size[1] / 2
         # Half the side lengths of the axis-aligned rectangle around the rotated box.

@@ -63,8 +63,7 @@ class Candidate:
 def run_candidate(folder: Path, data: Path | None, say: Progress) -> Candidate:
     """Load a finished run as a candidate, and calibrate its model as for publication.
 
-    Args:
-        data: folder with the scene files. None means the folder that the run records.
+    `data` is the folder with the scene files. None means the folder that the run records.
 
     Raises:
         RunError: the folder holds no finished run, or the scene files have changed since training.
@@ -150,8 +149,7 @@ HeldOut = tuple[list[AnnotatedScene], tuple[str, ...]]
 def held_out(a: Candidate, b: Candidate, sources: Sources) -> HeldOut:
     """Return the first model's test scenes without scenes that the second model learnt from.
 
-    Args:
-        sources: current scenes of the first model's configuration, by data source.
+    The sources have the current scenes of the first model's configuration, by name.
 
     Raises:
         ConfigError: the first model does not record its split, its test part is empty, or the
@@ -202,8 +200,8 @@ def _drop_learnt(candidate: Candidate, scenes: list[AnnotatedScene], sources: So
     data = None if candidate.config is None else candidate.config.data
     if data is not None and data.split == "stable":
         seed = data.split_seed
-        held = [s for s in scenes if s.source not in shared or stable_part(s, seed) == "test"]
-        return held, ()
+        test = [s for s in scenes if s.source not in shared or stable_part(s, seed) == "test"]
+        return test, ()
     names = [] if data is None else list(map(source_name, data.sources))
     if data is None or any(candidate.learnt.get(x) != digests.get(x, "") for x in names):
         note = (

@@ -80,6 +80,8 @@ def look(scenes: Sequence[AnnotatedScene], labels: Sequence[Label]) -> Facts:
 def _findings(
     scenes: Sequence[AnnotatedScene], labels: Sequence[Label], rooms: Counter[str]
 ) -> Iterator[Finding]:
+    """Generate the findings. A finding without cases has the count 0."""
+
     def finding(what: str, advice: str, cases: Iterable[str]) -> Finding:
         examples = list(cases)
         return Finding(what, advice, len(examples), examples[:SHOWN])
@@ -160,6 +162,7 @@ def _findings(
 
 
 def _beyond_metres(scene: AnnotatedScene) -> bool:
+    """Return True if a position or a side is too large to be in metres."""
     points = np.array([thing.position for thing in scene.objects if thing.position] or [(0, 0, 0)])
     middle = np.zeros(3) if scene.viewer_frame else np.median(points, 0)
     sides = [side for thing in scene.objects for side in thing.size or ()]

@@ -32,7 +32,7 @@ from training.datasets.array_types import Ints, Rng
 from training.datasets.files import DATA, write_whole
 from training.domain.adaptation import adapted
 from training.domain.home import Home, HomeScene, alarms_of, of_classes
-from training.domain.init_command import StorePath
+from training.domain.terminal import StorePath
 from training.evaluation.parts import ALL_BUT_ONE
 from training.fit.adapt import adapt
 from training.fit.configuration import ConfigError, DataConfig
@@ -171,7 +171,7 @@ def _home(
         confirmed = number < len(visits) and len(alarms) > 0
         left_out = alarms[:0] if confirmed else alarms
         scenes.append(HomeScene(classes, left_out, kind, f"visit-{number}", confirmed))
-    return Home(parent, (parent.spec.V, parent.spec.C), tuple(scenes), len(scenes))
+    return Home(parent, parent.spec.V, parent.spec.C, tuple(scenes), len(scenes))
 
 
 Sides = tuple[Artifact, Artifact]
@@ -215,7 +215,7 @@ def _intruder(home: Home, lists: Sequence[Ints], own: Ints, rng: Rng) -> tuple[f
         if before := _alarm_share(parent, seen, intruder):
             twice = [np.union1d(part, [intruder]) for part in lists[-2:]]
             recorded = _home(parent, visits, twice)
-            weights = adapt(parent.weights, recorded.tensors, known=recorded.learnt)
+            weights = adapt(parent.weights, recorded.tensors, trained_on=recorded.trained_on)
             after = _alarm_share(replace(parent, weights=weights), seen, intruder)
             shares.append((before, after))
         if len(shares) == _INTRUDERS:

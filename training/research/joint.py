@@ -29,7 +29,7 @@ from torch import Tensor
 from app.registry import DEFAULT_STORE, Store
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import some_scenes
-from training.domain.init_command import StorePath
+from training.domain.terminal import StorePath
 from training.evaluation.outside import read_test
 from training.evaluation.parts import draw_parts, exactly, rank_hidden
 from training.machines import BoltzmannMachine
@@ -59,7 +59,7 @@ def joint_room_log_p(machine: BoltzmannMachine, v: Tensor) -> Tensor:
 
     The room type is known to be one of the C types.
     """
-    logits = machine.e + machine.gain(machine.context(v), machine.Q)
+    logits = machine.e + machine.hidden_log_odds(machine.hidden_logits(v), machine.Q)
     if machine.spec.coupled:
         logits = logits + v @ machine.Y.T
     if not machine.spec.profiles:
@@ -87,7 +87,7 @@ def change_by_relations(
         edges, r, observed: relation units between the listed classes, their values and True where
             they are observed, (1, units).
     """
-    x = machine.by_unit(machine.context(v))[0]
+    x = machine.by_unit(machine.hidden_logits(v))[0]
     states = torch.cat([torch.zeros_like(x[:, :1]), x], 1).softmax(1)
     drawn = torch.multinomial(states, draws, replacement=True, generator=generator).T
     one = torch.nn.functional.one_hot(drawn, machine.spec.states)[..., 1:]

@@ -26,7 +26,7 @@ import typer
 from app.inference.weights import Weights
 from app.registry import DEFAULT_STORE, Artifact, Store
 from app.registry.description import KINDS
-from training.domain.init_command import StorePath
+from training.domain.terminal import StorePath
 from training.evaluation.artifact_model import artifact_model
 from training.evaluation.outside import read_test
 from training.evaluation.setting import Setting

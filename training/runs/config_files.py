@@ -90,6 +90,7 @@ def load_config(reference: str, *, seed: int | None = None) -> Config:
 
 
 def _with_base(path: Path) -> dict[str, Any]:
+    """Return the entries of a file, merged into those of its base."""
     values = read_toml(path)
     if (base := values.pop("base", None)) is None:
         return values
@@ -174,6 +175,7 @@ def sections_toml(values: Mapping[str, Any], reasons: Mapping[str, str] | None =
 
 
 def _entry(name: str, value: Any) -> str:
+    """Return an entry as a line of TOML."""
     if isinstance(value, Mapping):
         entries = ", ".join(_entry(json.dumps(key), entry) for key, entry in value.items())
         return f"{name} = {{ {entries} }}"

@@ -10,6 +10,8 @@ from functools import partial
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from app.registry import Example
 from app.scene import RoleCounts, Vocabulary
@@ -48,7 +50,7 @@ class SplitScenes:
     parts: dict[str, list[EncodedScene]]
     counts: dict[str, int]  # number of scenes, by source
     digests: dict[str, str]  # sha256 of the contents of the scenes, by source
-    words: torch.Tensor | None = None  # (V, D) unit word vectors of the classes
+    words: Float[Tensor, "V D"] | None = None  # unit word vectors of the classes
     examples: tuple[Example, ...] = ()  # for the artifact
 
     @property
@@ -131,6 +133,7 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
 
 
 def _path(source: str, root: Path) -> Path:
+    """Return the file of a data source."""
     if source == inventories.SOURCE:
         return KNOWLEDGE / "inventories.csv"
     if is_file(source):
@@ -197,11 +200,8 @@ def split_and_encode(
 ) -> SplitScenes:
     """Split the scenes into train, validation and test parts, and encode them.
 
-    The split includes all data sources at once, because sources can contain the same room.
-
-    Args:
-        root: folder of the vocabulary.
-        vocabulary: vocabulary of a published model. The default is that of the configuration.
+    The split includes all data sources at once, because sources can contain the same room. The
+    vocabulary is that of a published model, or by default that of the configuration in `root`.
 
     Raises:
         ConfigError: the vocabulary is invalid; see `build_vocabulary`.
@@ -210,9 +210,6 @@ def split_and_encode(
     parts = split(all_scenes, seed=data.split_seed, protocol=data.split)
     if vocabulary is None:
         vocabulary = build_vocabulary(data, parts["train"], root)
-    words = None
-    if data.words:
-        words = torch.from_numpy(vocabulary.vectors[0])
     roles = count_roles(parts["train"], vocabulary)
     return SplitScenes(
         data=data,
@@ -221,7 +218,7 @@ def split_and_encode(
         parts={name: encode(part, vocabulary, roles) for name, part in parts.items()},
         counts={name: len(source) for name, source in scenes.items()},
         digests={name: digest_of(source) for name, source in scenes.items()},
-        words=words,
+        words=torch.from_numpy(vocabulary.vectors[0]) if data.words else None,
     )
 
 

@@ -19,8 +19,8 @@ from training.datasets.inventories import (
     Item,
     Place,
     complete_scene,
+    detection_rates,
     draw_scene,
-    listed_shares,
     read_inventory,
     shipped_things,
     written_scenes,
@@ -222,7 +222,7 @@ def test_a_detector_lists_a_part_of_each_scene():
     )
     place = Place("den", "study", (Group("basics", 1, items),))
     things = shipped_things()
-    shares = listed_shares([replace(things["table"], size=(0.5, 2.0, 0.7))])
+    shares = detection_rates([replace(things["table"], size=(0.5, 2.0, 0.7))])
     assert shares["table"] == pytest.approx(1 - 0.7 * math.exp(-5))
     scenes = written_scenes([place], shares, 4000, seed=3)
     assert len({scene.scene_id for scene in scenes}) == 4000

@@ -7,7 +7,7 @@ import pytest
 from app.scene import label_key
 from training.datasets.files import KNOWLEDGE
 from training.datasets.inventories import read_inventory, shipped_things
-from training.datasets.vocabulary import indoor_vocabulary
+from training.datasets.vocabulary import INDOOR_FILE, read_vocabulary
 from training.datasets.written import LEAST_PLACES, written_vocabulary
 
 
@@ -29,14 +29,14 @@ def room_type(vocabulary, name):
 
 def test_common_things_and_indoor_classes_are_classes(vocabulary):
     assert 1_400 < len(vocabulary) < 1_700
-    assert {label_key(x) for x in indoor_vocabulary().labels} <= set(
+    assert {label_key(x) for x in read_vocabulary(INDOOR_FILE).labels} <= set(
         map(label_key, vocabulary.labels)
     )
     expected = Counter()
     for place in read_inventory(KNOWLEDGE / "inventories.csv").places:
         for group, item in place.items:
             expected[item.label] += group.share * item.share
-    indoor = set(indoor_vocabulary().labels)
+    indoor = set(read_vocabulary(INDOOR_FILE).labels)
     things = [label for label in shipped_things() if label not in indoor][::40]
     assert len(things) > 20
     for label in things:
@@ -73,7 +73,7 @@ def test_no_word_of_the_indoor_vocabulary_is_lost(vocabulary):
         for name in (thing.label, *thing.other_names)
     }
     moved = 0
-    for entry in indoor_vocabulary().objects:
+    for entry in read_vocabulary(INDOOR_FILE).objects:
         for name in entry.aliases:
             if (found := named(vocabulary, name)) != entry.label:
                 moved += 1

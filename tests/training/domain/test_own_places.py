@@ -168,8 +168,8 @@ def test_from_the_table_to_answers(ward, tmp_path) -> None:
     folder, store = tmp_path / "ward", Store(tmp_path / "store")
     init(ward, folder=folder)
     runs = ("--runs", tmp_path / "runs", "--store", store.root)
-    said = invoke("train", folder, "--publish", "1.0.0", *runs)
-    assert "published ward@1.0.0" in said
+    output = invoke("train", folder, "--publish", "1.0.0", *runs)
+    assert "published ward@1.0.0" in output
     model = store.load("ward", "1.0.0")
     assert "Scenes drawn from written places have 100.0 %" in " ".join(model.card.split())
     assert model.calibration.outlier_lines is not None

@@ -130,7 +130,7 @@ def test_a_present_class_says_nothing_about_its_family():
     data = replace(tensors([scene(row, source="house") for row in rows], 4), related=related)
     found = ObjectScenes.of(data, torch.zeros(4, dtype=torch.bool), CONFIG)
     # Present classes are known, and so are absent classes without a relative.
-    assert found.known.int().tolist() == [[0, 1, 0, 1], [0, 0, 1, 1], [1, 0, 1, 1]]
+    assert found.observed.int().tolist() == [[0, 1, 0, 1], [0, 0, 1, 1], [1, 0, 1, 1]]
     # The log-odds of an unknown class change no loss.
     machine = machine_of("coupled", scale=0.7)
     losses = []

@@ -8,7 +8,7 @@ from optuna.distributions import FloatDistribution
 
 from tests.training.commands import invoke, small_config, write_config
 from training.fit.configuration import ConfigError
-from training.fit.relations import RelationFit
+from training.fit.relation_weights import RelationFit
 from training.fit.trainer import Trainer
 from training.research.tune import Search, load_space
 from training.runs.config_files import load_config, shipped_files
