@@ -122,7 +122,9 @@ def scene_tensors(
 
 
 def subset(scenes: SceneTensors, index: Tensor) -> SceneTensors:
-    """Return the scenes at the given indices."""
+    """Return the scenes at the given indices, or the scenes where a mask is True."""
+    if index.dtype == torch.bool:
+        index = index.nonzero().squeeze(1)
     return replace(
         scenes,
         scenes=[scenes.scenes[k] for k in index.tolist()],

@@ -240,7 +240,12 @@ def _scene(place: Place, scene_id: str, things: Sequence[tuple[Item, int]]) -> A
             relations.append((index, item.relation, anchor))
     supported += [i for i, name, _ in relations if name in ("on-top", "inside")]
     return AnnotatedScene(
-        *(scene_id, SOURCE, place.name, place.room_type, tuple(objects), tuple(relations)),
+        scene_id=scene_id,
+        source=SOURCE,
+        group=place.name,
+        room_type=place.room_type,
+        objects=tuple(objects),
+        relations=tuple(relations),
         supported=tuple(sorted(supported)),
     )
 

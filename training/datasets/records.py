@@ -44,12 +44,7 @@ MAX_LISTED: Final = 32
 
 
 class InvalidLinesError(DatasetError):
-    """Lines of a file are invalid.
-
-    Attributes:
-        errors: the first `MAX_LISTED` errors, in the order of the lines.
-        count: number of all errors.
-    """
+    """Lines of a file are invalid. `count` errors; `errors` has the first `MAX_LISTED` of them."""
 
     def __init__(self, path: Path, errors: Sequence[DatasetError], count: int) -> None:
         first = errors[0]

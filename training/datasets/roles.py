@@ -53,8 +53,8 @@ def _stated_roles(scene: AnnotatedScene) -> Iterable[Role]:
     """Yield role, index of the object in this role and index of the larger object."""
     for subject, relation, anchor in scene.relations or ():
         if relation in _ROLES:
-            ends = (anchor, subject) if relation == "contains" else (subject, anchor)
-            yield _ROLES[relation], *ends
+            small, large = (anchor, subject) if relation == "contains" else (subject, anchor)
+            yield _ROLES[relation], small, large
 
 
 def lift_of(thing: AnnotatedObject, support: AnnotatedObject) -> float | None:

@@ -41,24 +41,17 @@ Side = Literal["left", "right", "front", "around"]
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A piece of furniture or a small object, added with a probability in ``most`` attempts each.
-
-    Attributes:
-        size: mean extents of the piece.
-        where: place of the piece: at a wall, in the centre, hung on a wall, or under the ceiling.
-            Small objects stand on the piece that carries them.
-        carries: small objects that can stand on the piece.
-        beside: pieces beside the piece, such as a nightstand left of a bed, with their sides. The
-            side is seen from the wall behind the main piece; ``around`` means all four sides. The
-            ``chance`` of the adjacent piece applies to each side.
-    """
+    """A piece of furniture or a small object, which a room contains at most ``most`` times."""
 
     label: str
-    size: Size
-    chance: float = 1.0
-    where: Where = "wall"
+    size: Size  # mean extents
+    chance: float = 1.0  # probability of an attempt
+    where: Where = "wall"  # not used for small objects, which stand on the piece that carries them
     most: int = 1
-    carries: tuple[Piece, ...] = ()
+    carries: tuple[Piece, ...] = ()  # small objects that can stand on the piece
+    # Pieces beside the piece, such as a nightstand left of a bed, with their sides. The side is
+    # seen from the wall behind the main piece; ``around`` means all four sides. The ``chance`` of
+    # the adjacent piece applies to each side.
     beside: tuple[tuple[Piece, Side], ...] = ()
 
 
@@ -171,7 +164,11 @@ class _Layout:
         )
         objects = tuple(
             AnnotatedObject(
-                *(str(index), box.label, tuple(position), box.size, yaw),
+                id=str(index),
+                label=box.label,
+                position=tuple(position),
+                size=box.size,
+                yaw=yaw,
                 supported_by=None if box.support is None else str(box.support),
             )
             for (index, box), position, yaw in zip(

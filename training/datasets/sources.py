@@ -1,4 +1,4 @@
-"""Known data sources: terms of use, predicates, and the meaning of relations that are not listed.
+"""The data sources: terms of use, predicates, and the meaning of relations that are not listed.
 
 A listed relation holds. An unlisted relation is false ("off"), false only between neighbours ("off
 for neighbours"), false only if the support of its subject is listed ("off for supported"), or
@@ -53,7 +53,7 @@ class Meaning:
 
 @dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid"))
 class Source:
-    """A known data source."""
+    """A data source of the project."""
 
     terms: str  # origin and licence of the data, for the model card
     research_only: bool = False  # the licence excludes commercial use
@@ -112,7 +112,7 @@ BOXES: Final = _FILE.meaning("boxes")
 """Meaning for relations derived from boxes. Without sizes, stacked objects show no relation."""
 
 SOURCES: Final = {name: _FILE.source(entry) for name, entry in _FILE.sources.items()}
-"""The known data sources by name."""
+"""The data sources of the project by name."""
 
 _UNKNOWN: Final = Source("", whole_rooms=True)
 _OWN_INVENTORY: Final = replace(SOURCES["inventories"], terms="", left_out=())
@@ -134,9 +134,7 @@ def source_of(name: str) -> Source:
 def meaning_of(source: str, *, listed: bool = True) -> Meaning:
     """Return the meaning of relations and objects that a data source does not list.
 
-    Args:
-        listed: True if the scene lists relations. Only unknown sources, and sources without a fixed
-            meaning, depend on this argument.
+    It depends on whether the scene lists relations, except for sources with a fixed meaning.
     """
     return source_of(source).meaning or (LISTS if listed else BOXES)
 

@@ -117,7 +117,7 @@ def _families(
 
 
 def _assign(
-    rooms_of: Mapping[str, Counter[str]], shares: Mapping[Part, float], seed: int
+    rooms_of: Mapping[str, Counter[str]], fractions: Mapping[Part, float], seed: int
 ) -> dict[str, Part]:
     """Assign each unit to the part that is furthest below its target share of scenes.
 
@@ -137,10 +137,10 @@ def _assign(
             # Number of additional scenes with which a part reaches its target share.
             lack = {
                 part: sum(
-                    share * (counts.total() + weight[unit]) - counts[part]
+                    fraction * (counts.total() + weight[unit]) - counts[part]
                     for counts in (in_stratum, overall)
                 )
-                for part, share in shares.items()
+                for part, fraction in fractions.items()
             }
             part_of[unit] = part = max(lack, key=lack.__getitem__)
             in_stratum[part] += weight[unit]

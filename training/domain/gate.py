@@ -94,11 +94,11 @@ def measure_usefulness(artifact: Artifact, data: TrainingData, *, say: Progress)
     The baselines learn from the training scenes of the run. Scenes with incomplete object lists are
     left out, unless all test scenes are such scenes.
     """
-    complete = data.test.complete.nonzero().squeeze(1)
-    scenes = some_scenes(subset(data.test, complete) if len(complete) else data.test, SCENES)
+    complete = data.test.complete
+    scenes = some_scenes(subset(data.test, complete) if complete.any() else data.test, SCENES)
     # A question hides one class and lists the others.
     has_two_classes = ((scenes.v > 0) & ~data.structure).sum(1) > 1
-    scenes = subset(scenes, has_two_classes.nonzero().squeeze(1))
+    scenes = subset(scenes, has_two_classes)
     usefulness = Usefulness(scenes=len(scenes), groups=len(np.unique(scenes.group_ids)))
     if usefulness.groups < FEWEST_GROUPS:
         return usefulness

@@ -149,7 +149,7 @@ def _show(proposal: Proposal, classes: str) -> None:
     facts = proposal.facts
     least, mean, most = facts.objects_per_scene
     rooms = ", ".join(f"{room} {count}" for room, count in list(facts.rooms.items())[:ROWS])
-    shares = ", ".join(f"{name} {share:.0%}" for name, share in facts.shares.items())
+    shares = ", ".join(f"{name} {share:.0%}" for name, share in facts.annotated.items())
     lines = [
         *proposal.written_lines(),
         f"{facts.scenes} scenes in {facts.groups} groups, with {least} to {most} objects each "

@@ -40,14 +40,14 @@ class Facts:
     groups: int  # of near-duplicates
     objects_per_scene: tuple[int, float, int]  # minimum, mean and maximum
     rooms: dict[str, int]  # number of scenes of each canonical room type
-    shares: dict[str, float]  # share of scenes with each kind of annotation, such as "positions"
+    annotated: dict[str, float]  # share of scenes with each kind of annotation, such as "positions"
     findings: tuple[Finding, ...]
 
     @property
     def related(self) -> bool:
         """True if a model can learn relations from the scenes."""
         sources = ("relations", "positions", "supports", "boxes in an image")
-        return any(self.shares[name] > 0 for name in sources)
+        return any(self.annotated[name] > 0 for name in sources)
 
 
 def look(scenes: Sequence[AnnotatedScene], labels: Sequence[Label]) -> Facts:
@@ -64,7 +64,7 @@ def look(scenes: Sequence[AnnotatedScene], labels: Sequence[Label]) -> Facts:
         groups=len({scene.group for scene in scenes}),
         objects_per_scene=(min(sizes), sum(sizes) / len(sizes), max(sizes)),
         rooms=dict(rooms.most_common()),
-        shares={
+        annotated={
             "room type": rooms.total() / len(scenes),
             "relations": sum(bool(scene.relations) for scene in scenes) / len(scenes),
             "positions": share("position"),

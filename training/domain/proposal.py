@@ -208,11 +208,11 @@ def use_frequent_names(vocabulary: Vocabulary, scenes: Sequence[AnnotatedScene])
 def _split(scenes: Sequence[AnnotatedScene]) -> tuple[int, dict[str, int], int]:
     """Return the first seed with parts near their shares, or the best; sizes, test groups."""
     best: tuple[int, dict[str, int], int] | None = None
-    smallest, shares = math.inf, FRACTIONS["stable"]
+    smallest, fractions = math.inf, FRACTIONS["stable"]
     for seed in range(_SPLIT_SEEDS):
         scenes_of = split(scenes, seed=seed, protocol="stable")
         sizes: dict[str, int] = {name: len(part) for name, part in scenes_of.items()}
-        deviation = max(abs(sizes[p] / (share * len(scenes)) - 1) for p, share in shares.items())
+        deviation = max(abs(sizes[p] / (x * len(scenes)) - 1) for p, x in fractions.items())
         if deviation < smallest and all(map(_is_informative, scenes_of.values())):
             smallest = deviation
             best = seed, sizes, len({scene.group for scene in scenes_of["test"]})

@@ -114,7 +114,7 @@ def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
     complete = scenes.complete.numpy()
     complete = complete if complete.any() else ~complete
     mask = complete & (rng.random(len(scenes)) < scenes.weight.numpy())
-    return subset(scenes, torch.from_numpy(np.flatnonzero(mask)))
+    return subset(scenes, torch.from_numpy(mask))
 
 
 def calibration_scenes(scenes: SceneTensors, sources: Collection[str]) -> SceneTensors:
@@ -142,7 +142,7 @@ def fit_missing(
 ) -> dict[str, Any]:
     """Fit the entries `coverage`, `missing` and `covered` of the calibration."""
     structure = structure_of(artifact)
-    seen = subset(scenes, (~of_sources(scenes, "written")).nonzero().squeeze(1))
+    seen = subset(scenes, ~of_sources(scenes, "written"))
     used = seen if len(seen) >= LEAST_SCENES else scenes
     lists = _joined(used, structure, map(exactly, LENGTHS))
     if not len(lists.v):
@@ -330,7 +330,7 @@ def score_untouched(
     With `in_room`, the request states the room type, and scenes without a type are left out.
     """
     if in_room:
-        scenes = subset(scenes, (scenes.room >= 0).nonzero().squeeze(1))
+        scenes = subset(scenes, scenes.room >= 0)
     scores: dict[int, ListScores] = {}
     for n in JUDGED_LENGTHS:
         parts = draw_parts(scenes, structure_of(artifact), exactly(n), _SEEDS)

@@ -67,7 +67,7 @@ def calibrate_rooms(
 
 def fit_rooms(artifact: Artifact, scenes: SceneTensors) -> Sharpness:
     """Fit the sharpness of room types; the default with fewer than 20 scenes with a room type."""
-    scenes = subset(scenes, (scenes.room >= 0).nonzero().squeeze(1))
+    scenes = subset(scenes, scenes.room >= 0)
     if len(scenes) < LEAST_SCENES:
         return Sharpness()
     sizes: list[Size] = [lambda n, _: n, *map(exactly, _LENGTHS)]
@@ -217,7 +217,7 @@ def _fit_limit(artifact: Artifact, lists: Sequence[_ListedRooms], room: int) -> 
 def whole_rooms(scenes: SceneTensors) -> SceneTensors:
     """Return the scenes of sources of whole rooms, or all scenes if there are none."""
     mask = of_sources(scenes, "whole_rooms")
-    return subset(scenes, mask.nonzero().squeeze(1)) if mask.any() else scenes
+    return subset(scenes, mask) if mask.any() else scenes
 
 
 def _part_of(share: float) -> Size:

@@ -161,9 +161,7 @@ def random_parts(
 class ObjectFit:
     """The fit of the object weights of a machine. It can stop after each step and continue.
 
-    Attributes:
-        steps: number of finished steps.
-        loss: loss of the last step.
+    `steps` counts the finished steps, and `loss` is that of the last step.
     """
 
     def __init__(

@@ -96,9 +96,12 @@ def test_places_are_read_in_order(tmp_path):
     ],
 )
 def test_errors_name_line_and_column(tmp_path, row, message):
-    path = write(tmp_path, DESK, row)
+    check_error(read_inventory, write(tmp_path, DESK, row), message)
+
+
+def check_error(read, path: Path, message: str) -> None:
     with pytest.raises(DatasetError) as caught:
-        read_inventory(path)
+        read(path)
     assert str(caught.value).startswith(f"{path}, {message}")
 
 
@@ -305,10 +308,7 @@ def test_things_are_read(tmp_path):
     ],
 )
 def test_errors_of_things_name_line_and_column(tmp_path, row, message):
-    path = write(tmp_path, VESSEL, row, columns=THING_COLUMNS)
-    with pytest.raises(DatasetError) as caught:
-        read_things(path)
-    assert str(caught.value).startswith(f"{path}, {message}")
+    check_error(read_things, write(tmp_path, VESSEL, row, columns=THING_COLUMNS), message)
 
 
 def test_a_long_loop_of_parents_is_found(tmp_path):
