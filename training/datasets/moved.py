@@ -40,11 +40,7 @@ def has_boxes(encoded: EncodedScene) -> bool:
 
 
 def posed_scene(encoded: EncodedScene) -> Scene:
-    """Return a scene with the poses of all instances, without relations.
-
-    Raises:
-        ValueError: the relations of the scene do not come from positions.
-    """
+    """Return a scene with the poses of all instances, without relations."""
     centre, size, yaw = _poses(encoded)
     bare = scene_of(encoded, range(len(yaw)), ())
     objects = tuple(
@@ -141,9 +137,6 @@ def moved_by_pose(
     height by at least .3 m. In one third, an object on the floor moves onto another object. This
     object is at least .3 m high, and its footprint has at least half of the area. If a place does
     not exist, another one is tried. The result is None if the scene has none.
-
-    Raises:
-        ValueError: the relations of the scene do not come from positions.
     """
     bare = posed_scene(encoded)
     boxes = _Boxes.of(encoded, structure)

@@ -105,9 +105,6 @@ def generate_rooms(count: int, seed: int, rooms: Rooms = ROOMS) -> list[Annotate
 
     Positions are in viewer axes. Objects have sizes, yaws, and the id of the furniture below them
     (``supported_by``). ``relations`` is None, because encoding derives the relations.
-
-    Raises:
-        ValueError: ``count`` is negative.
     """
     if count < 0:
         raise ValueError(f"count must not be negative, not {count}")

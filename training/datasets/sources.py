@@ -140,11 +140,7 @@ def meaning_of(source: str, *, listed: bool = True) -> Meaning:
 
 
 def relation_of(source: str, predicate: str) -> str | None:
-    """Return the relation that a predicate of a data source means, or None if no relation matches.
-
-    Raises:
-        ValueError: the predicate is unknown, and the data source has no table of predicates.
-    """
+    """Return the relation that a predicate of a data source means, or None if it means none."""
     if predicate in RELATIONS:
         return predicate
     if (predicates := source_of(source).predicates) is None:

@@ -43,11 +43,7 @@ FRACTIONS: Final[dict[Protocol, dict[Part, float]]] = {
 def split(
     scenes: Sequence[AnnotatedScene], *, seed: int, protocol: Protocol = "group"
 ) -> dict[Part, list[AnnotatedScene]]:
-    """Return the scenes of each part, in their original order.
-
-    Raises:
-        ValueError: the protocol is unknown, or two scenes of a data source have the same id.
-    """
+    """Return the scenes of each part, in their original order."""
     if protocol not in FRACTIONS:
         raise ValueError(f"protocol must be one of {', '.join(FRACTIONS)}, not {protocol!r}")
     if len({(scene.source, scene.scene_id) for scene in scenes}) < len(scenes):

@@ -64,10 +64,6 @@ def run_candidate(folder: Path, data: Path | None, say: Progress) -> Candidate:
     """Load a finished run as a candidate, and calibrate its model as for publication.
 
     `data` is the folder with the scene files. None means the folder that the run records.
-
-    Raises:
-        RunError: the folder holds no finished run, or the scene files have changed since training.
-        ConfigError, DatasetError: the scene files cannot be read.
     """
     run = load_run(folder)
     root = data or run.data_folder
@@ -79,11 +75,7 @@ def run_candidate(folder: Path, data: Path | None, say: Progress) -> Candidate:
 
 
 def stored_candidate(reference: str, store: Store) -> Candidate:
-    """Load a published model as a candidate.
-
-    Raises:
-        StoreError, ArtifactError: the model does not exist or cannot be used.
-    """
+    """Load a published model as a candidate."""
     name, version = store.resolve(reference)
     artifact = store.load(name, version)
     try:
@@ -95,12 +87,7 @@ def stored_candidate(reference: str, store: Store) -> Candidate:
 
 
 def find(reference: str, store: Store, data: Path | None, say: Progress) -> Candidate:
-    """Return the candidate that a reference names: a folder of a run, `BASELINES`, or a model.
-
-    Raises:
-        ConfigError: the reference names none of these.
-        RunError: the folder holds no finished run. See also `run_candidate` and `stored_candidate`.
-    """
+    """Return the candidate that a reference names: a folder of a run, `BASELINES`, or a model."""
     if reference == BASELINES:
         # The baselines are fitted later, on the training scenes of the other candidate.
         return Candidate(BASELINES, None, {}, None)
@@ -150,10 +137,6 @@ def held_out(a: Candidate, b: Candidate, sources: Sources) -> HeldOut:
     """Return the first model's test scenes without scenes that the second model learnt from.
 
     The sources have the current scenes of the first model's configuration, by name.
-
-    Raises:
-        ConfigError: the first model does not record its split, its test part is empty, or the
-            second model learnt from all its test scenes.
     """
     if a.config is None:
         raise ConfigError(

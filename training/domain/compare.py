@@ -160,10 +160,6 @@ def compare(a: Candidate, b: Candidate, root: Path, *, say: Progress) -> Compari
     """Measure both models on the tasks of `COMPARED`. The questions use the first model's classes.
 
     `root` is the folder with the scene files of the first model's configuration.
-
-    Raises:
-        ConfigError: the first model lacks its training configuration, its scene files are missing,
-            or too few scenes are held out from both models.
     """
     if a.config is None or a.vocabulary is None:
         raise ConfigError(
@@ -206,11 +202,7 @@ def side_by_side(
     *,
     progress: Progress = silent,
 ) -> Results:
-    """Measure every metric that both models support, and the differences, paired by group.
-
-    Raises:
-        ValueError: all scenes belong to one group, or the models share no metric.
-    """
+    """Measure every metric that both models support, and the differences, paired by group."""
     setting = Setting(scenes, structure, limit=None)
     if len(np.unique(scenes.group_ids)) < 2:
         raise ValueError("the scenes belong to one group, but intervals need at least two groups")

@@ -126,11 +126,7 @@ class ServedModel(NamedTuple):
 
 
 def served_model(store: Store, alias: str) -> ServedModel:
-    """Look up an alias in the store and load the model that it serves.
-
-    Raises:
-        StoreError: the aliases of the store cannot be read.
-    """
+    """Look up an alias in the store and load the model that it serves."""
     target = store.aliases().get(alias)
     if target is None:
         return ServedModel(None, None, f"{alias} is a new alias, so there is no older version")

@@ -75,9 +75,6 @@ def adapt(
     """Return the weights of the parent, adapted to scenes of two or more classes.
 
     Without `trained_on`, training scenes of the parent show all classes and room types.
-
-    Raises:
-        ValueError: no scene has two classes, or the parent stores no samples.
     """
     scenes = scenes.rows(scenes.v.sum(1) >= 2)
     if not len(scenes):

@@ -70,11 +70,7 @@ class ObjectScenes:
 
     @classmethod
     def of(cls, train: SceneTensors, structure: Bool[Tensor, "V"], config: ObjectsConfig) -> Self:
-        """Select the scenes.
-
-        Raises:
-            ValueError: no scene has two classes.
-        """
+        """Select the scenes."""
         names, annotated = train.source_names, train.annotated_classes
         weights = torch.tensor([config.source_weights.get(q, 1.0) for q in names])
         counts = torch.zeros(annotated.shape).index_add_(0, train.source, (train.v > 0).float())
@@ -195,11 +191,7 @@ class ObjectFit:
         return self.steps >= self.config.steps
 
     def step(self) -> None:
-        """Update the weights by one batch of random parts.
-
-        Raises:
-            FloatingPointError: the loss is infinite or NaN.
-        """
+        """Update the weights by one batch of random parts."""
         config = self.config
         with cached():
             loss = self._batch_loss()

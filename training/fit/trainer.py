@@ -91,11 +91,7 @@ def _start_relations(machine: BoltzmannMachine, data: TrainingData) -> None:
 
 
 class Trainer:
-    """Train one configuration on one set of scenes. `curve` has the points so far.
-
-    Raises:
-        ValueError: no training scene has two classes.
-    """
+    """Train one configuration on one set of scenes. `curve` has the points so far."""
 
     def __init__(self, config: Config, data: TrainingData) -> None:
         self.config, self.data = config, data
@@ -111,11 +107,7 @@ class Trainer:
     def run(
         self, progress: Progress = lambda *_: None, passed: Passed = lambda _: None
     ) -> TrainingResult:
-        """Run both phases.
-
-        Raises:
-            FloatingPointError: the training diverged.
-        """
+        """Run both phases."""
         began, seed = time.perf_counter(), self.config.training.seed
 
         def add(point: CurvePoint) -> None:

@@ -43,9 +43,6 @@ def read_examples(reference: str, root: Path) -> tuple[Example, ...]:
 
     The reference is its entry `examples`: the name of a shipped file, or a file in `root` that ends
     in .json. An empty text means no examples.
-
-    Raises:
-        ConfigError: the file is missing or invalid.
     """
     if not reference:
         return ()

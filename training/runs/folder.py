@@ -95,11 +95,7 @@ def _write(
 
 
 def load_run(folder: Path) -> FinishedRun:
-    """Read a finished run.
-
-    Raises:
-        RunError: a file is missing or cannot be read.
-    """
+    """Read a finished run."""
     for name in ("config.json", "model.safetensors", "result.json"):
         if not (folder / name).is_file():
             runs = ", ".join(str(path.parent) for path in sorted(folder.glob("*/result.json")))

@@ -67,9 +67,6 @@ class SplitScenes:
         """Return the tensors for the trainer.
 
         A data source annotates the classes that occur in its training part.
-
-        Raises:
-            ConfigError: a source has no scene in the training part.
         """
         annotated = annotated_classes(self.parts["train"], self.vocabulary)
         sources = {scene.source for scenes in self.parts.values() for scene in scenes}
@@ -90,11 +87,7 @@ class SplitScenes:
         )
 
     def complete_data(self) -> TrainingData:
-        """Return the tensors for an experiment, which needs all three parts.
-
-        Raises:
-            ConfigError: the training, validation or test part contains no scenes.
-        """
+        """Return the tensors for an experiment, which needs all three parts."""
         for part, scenes in self.parts.items():
             if not scenes:
                 raise ConfigError(
@@ -109,10 +102,6 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
     A data source is a file, or a name. A name means `<name>.jsonl.gz` in `root` or in `root/extra`
     (`<name>.tsv.gz` for the placing priors). `rooms` and `inventories` come from the repository.
     The scenes of a file have plain labels, and no placeholders (`plain_scenes`).
-
-    Raises:
-        ConfigError: a file is missing.
-        DatasetError: a file is invalid.
     """
     _require_files(data, root)
     scenes: dict[str, list[AnnotatedScene]] = {}
@@ -163,11 +152,7 @@ def _require_files(data: DataConfig, root: Path) -> None:
 
 
 def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path) -> Vocabulary:
-    """Return the vocabulary of a configuration, with typical object sizes from the scenes.
-
-    Raises:
-        ConfigError: the vocabulary name is unknown, or the file contains no vocabulary.
-    """
+    """Return the vocabulary of a configuration, with typical object sizes from the scenes."""
     name = data.vocabulary
     makers: dict[str, Callable[[], Vocabulary]] = {
         "written": written_vocabulary,
@@ -202,9 +187,6 @@ def split_and_encode(
 
     The split includes all data sources at once, because sources can contain the same room. The
     vocabulary is that of a published model, or by default that of the configuration in `root`.
-
-    Raises:
-        ConfigError: the vocabulary is invalid; see `build_vocabulary`.
     """
     all_scenes = [scene for source in scenes.values() for scene in source]
     parts = split(all_scenes, seed=data.split_seed, protocol=data.split)
@@ -226,9 +208,5 @@ def prepare(config: Config, root: Path, vocabulary: Vocabulary | None = None) ->
     """Read the scenes of a configuration from the folder `root`, split and encode them.
 
     `vocabulary` is that of a published model. The default is that of the configuration.
-
-    Raises:
-        ConfigError: a file is missing, or the vocabulary is invalid.
-        DatasetError: a file of scenes is invalid.
     """
     return split_and_encode(config.data, read_sources(config.data, root), root, vocabulary)

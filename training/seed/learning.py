@@ -88,11 +88,7 @@ def train(
     epochs: int = EPOCHS,
     rate: float = LEARNING_RATE,
 ) -> list[Epoch]:
-    """Train a machine in place, and return the errors of each epoch.
-
-    Raises:
-        FloatingPointError: training has diverged.
-    """
+    """Train a machine in place, and return the errors of each epoch."""
     history: list[Epoch] = []
     best, best_epoch, weights = math.inf, 0, machine.state_dict()
     for epoch in range(epochs):
