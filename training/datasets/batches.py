@@ -15,7 +15,7 @@ from torch import Tensor
 
 from app.scene import CANONICAL, RoleCounts, Vocabulary
 from training.datasets import EncodedScene
-from training.datasets.array_types import ClassMask
+from training.datasets.array_types import ClassMask, Table
 from training.datasets.encoding import ClassEvidence
 from training.machines import BoltzmannMachine
 from training.machines.edges import Edges
@@ -24,7 +24,7 @@ _BLOCK = 1024
 
 
 @dataclass(frozen=True)
-class Batch:
+class Batch(Table):
     """A batch of scenes as tensors. n is the largest number of classes of a scene."""
 
     v: Float[Tensor, "B V"]  # presence of each class
@@ -37,10 +37,6 @@ class Batch:
 
     def __len__(self) -> int:
         return len(self.v)
-
-    def rows(self, index: Tensor) -> Batch:
-        """Return the scenes at the given indices. A mask selects the scenes where it is True."""
-        return Batch(*(tensor[index] for tensor in vars(self).values()))
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from app.scene import CANONICAL, Scene, SceneObject, Vocabulary
 from app.scene.relations import ABOVE, LATERAL, STACKED
 from training.datasets import EncodedScene
-from training.datasets.array_types import ClassMask, Rng
+from training.datasets.array_types import ClassMask, Rng, Table
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.sources import meaning_of, source_of
 
@@ -268,7 +268,7 @@ def listed_cases(
 
 
 @dataclass(frozen=True, eq=False)
-class ObservedOffsets:
+class ObservedOffsets(Table):
     """Observed offsets between related objects, in metres and viewer axes."""
 
     offset: Float[NDArray, "N 3"]  # position of the relation's subject minus that of its object
@@ -277,10 +277,6 @@ class ObservedOffsets:
     other: Int[NDArray, "N"]  # class of the relation's object
     scene: Int[NDArray, "N"]
     source: Int[NDArray, "N"]  # data source of the scene
-
-    def rows(self, mask: Bool[NDArray, "N"]) -> ObservedOffsets:
-        """Return the offsets where the mask is True."""
-        return ObservedOffsets(*(getattr(self, name)[mask] for name in self.__dataclass_fields__))
 
 
 def observed_offsets(scenes: Sequence[EncodedScene]) -> ObservedOffsets:

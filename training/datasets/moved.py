@@ -140,7 +140,7 @@ def moved_by_pose(
     """
     bare = posed_scene(encoded)
     boxes = _Boxes.of(encoded, structure)
-    for pairs, place in _kinds(boxes, rng):
+    for pairs, place in _moves(boxes, rng):
         for i in rng.permutation(np.flatnonzero(pairs.any(1))).tolist():
             group = boxes.group(i)
             for j in rng.permutation(np.flatnonzero(pairs[i] & ~group)).tolist():
@@ -220,7 +220,7 @@ _Place = Callable[[_Boxes, int, int, Rng], NDArray[np.float64] | None]
 """Function of boxes, moved instance, other instance and generator. It returns the new centre."""
 
 
-def _kinds(boxes: _Boxes, rng: Rng) -> Iterator[tuple[Bool[NDArray, "n n"], _Place]]:
+def _moves(boxes: _Boxes, rng: Rng) -> Iterator[tuple[Bool[NDArray, "n n"], _Place]]:
     """Yield the kinds of moves in random order: pairs (moved, other instance), and the place."""
     usable, area, bottom, height = boxes.usable, boxes.area, boxes.bottom, boxes.size[:, 2]
     smaller = usable[:, None] & usable & (area[:, None] < area)

@@ -44,7 +44,7 @@ def plain_label(label: str) -> str:
     A label without a curated name stays, because its number may distinguish kinds: "screw m4".
     """
     names = curated_names()
-    if names.knows(label) or not names.knows(name := without_instance(label)):
+    if names.is_curated(label) or not names.is_curated(name := without_instance(label)):
         return label
     return name
 

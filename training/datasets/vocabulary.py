@@ -41,7 +41,7 @@ class Names:
     # Other names of each room type. The key "" lists names without a room type.
     rooms: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
-    def knows(self, label: str) -> bool:
+    def is_curated(self, label: str) -> bool:
         """Return True if a label is a curated name of a class in any spelling."""
         return label_key(label) in self._by_key
 

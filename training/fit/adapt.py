@@ -31,6 +31,7 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, one_hot
 
 from app.inference import Weights
+from training.datasets.array_types import Table
 from training.fit.objects import Parts, random_parts
 from training.machines.arrays import machine_of, weights_of
 
@@ -54,7 +55,7 @@ class TrainedOn:
 
 
 @dataclass(frozen=True)
-class HomeScenes:
+class HomeScenes(Table):
     """N recorded scenes of a home."""
 
     v: Float[Tensor, "N V"]  # presence of the classes, without structure
@@ -63,10 +64,6 @@ class HomeScenes:
 
     def __len__(self) -> int:
         return len(self.v)
-
-    def rows(self, index: Tensor) -> HomeScenes:
-        """Return the scenes at the indices, or where a mask is True."""
-        return HomeScenes(*(tensor[index] for tensor in vars(self).values()))
 
 
 def adapt(

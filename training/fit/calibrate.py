@@ -17,8 +17,7 @@ Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -31,7 +30,7 @@ from app.questions.posterior import Posterior
 from app.registry import Artifact, Calibration, CountSlope
 from app.scene.relations import CANONICAL, LATERAL, ON_TOP, STACKED
 from training.datasets import EncodedScene
-from training.datasets.array_types import ClassMask, Rng
+from training.datasets.array_types import ClassMask, Rng, Table
 from training.datasets.batches import SceneTensors, TrainingData, subset
 from training.datasets.cases import (
     Triple,
@@ -151,7 +150,8 @@ def _posterior(
     return Posterior(artifact, replace(scene_of(encoded, kept, observed), room_type=None))
 
 
-class _Examples(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _Examples(Table):
     """N candidate relations between two instances of a scene."""
 
     scene: Int[NDArray, "N"]
@@ -167,13 +167,11 @@ class _Examples(NamedTuple):
 
         A column of a block is an array, or a single value of the whole block.
         """
-        columns = zip(*(np.broadcast_arrays(*block) for block in blocks), strict=True)
+        arrays = (np.broadcast_arrays(*vars(block).values()) for block in blocks)
+        columns = zip(*arrays, strict=True)
         joined = map(np.concatenate, columns) if blocks else np.zeros((6, 0), dtype=np.int64)
         examples = cls(*joined)
         return examples.rows(examples.log_odds > NO_UNIT)
-
-    def rows(self, mask: Bool[NDArray, "N"]) -> _Examples:
-        return _Examples(*(column[mask] for column in self))
 
     @property
     def annotated(self) -> Bool[NDArray, "N"]:

@@ -14,8 +14,8 @@ Long lists have a higher line than short ones.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import replace
-from typing import Any, Final, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -41,7 +41,7 @@ from app.scene import Scene
 from app.scene.relations import ON_TOP
 from app.scene.scene import observe
 from training.datasets import EncodedScene
-from training.datasets.array_types import Rng
+from training.datasets.array_types import Rng, Table
 from training.datasets.cases import (
     Triple,
     altered_scene,
@@ -62,7 +62,8 @@ _LENGTHS: Final = (1, 2, 4, 8, 16, 32)
 _BUDGET: Final = {"lateral": 0.05, "support": 0.45, "above": 0.1, "under": 0.1, "stand": 0.3}
 
 
-class _Cases(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _Cases(Table):
     """N entries of scenes, in which one entry or no entry is wrong."""
 
     scene: Int[NDArray, "N"]  # number of the scene
@@ -74,10 +75,6 @@ class _Cases(NamedTuple):
     terms: Float[NDArray, "N terms"]
     wrong: Bool[NDArray, "N"]
     weight: Float[NDArray, "N"]
-
-    def rows(self, mask: Bool[NDArray, "N"]) -> _Cases:
-        columns: Any = (column[mask] for column in self)
-        return _Cases(*columns)
 
 
 def fit_misplaced(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0) -> Misplaced:

@@ -251,7 +251,7 @@ class ListScores:
         """Return log-odds with the prior of intruders; low values mean intruders."""
         return self.log_odds - alpha * self.popularity
 
-    def extreme(self, values: Float[NDArray, "n"]) -> Float[NDArray, "N"]:
+    def largest(self, values: Float[NDArray, "n"]) -> Float[NDArray, "N"]:
         """Return the largest value of each list."""
         worst = np.full(len(self.size), -np.inf)
         np.maximum.at(worst, self.row, values)
@@ -353,7 +353,7 @@ def choose_alpha(untouched: Collection[ListScores], altered: Collection[ListScor
     """Return the alpha with the best mean of hit@1 and detected share over the intruder kinds."""
 
     def rate(alpha: float) -> float:
-        worst = [scores.extreme(-scores.score(alpha)) for scores in untouched]
+        worst = [scores.largest(-scores.score(alpha)) for scores in untouched]
         limit = float(np.mean([np.quantile(values, 1 - ALARMS["medium"]) for values in worst]))
         return float(np.mean([_detection(scores, alpha, limit) for scores in altered]))
 
@@ -363,7 +363,7 @@ def choose_alpha(untouched: Collection[ListScores], altered: Collection[ListScor
 def _detection(scores: ListScores, alpha: float, limit: float) -> float:
     """Return the mean of hit@1 and of the share of intruders above a limit."""
     values = -scores.score(alpha)
-    first = values >= scores.extreme(values)[scores.row]
+    first = values >= scores.largest(values)[scores.row]
     caught = values > limit
     return float(first[scores.intruder].mean() + caught[scores.intruder].mean()) / 2
 
@@ -433,5 +433,5 @@ def worst_log_odds(
     worst = {}
     for n, scores in untouched.items():
         log_odds = calibrated(entry, scores.score(alpha), scores.size[scores.row])
-        worst[n] = scores.extreme(np.where(scores.can_alarm, log_odds, -np.inf))
+        worst[n] = scores.largest(np.where(scores.can_alarm, log_odds, -np.inf))
     return worst

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from typing import Final
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.optimize import minimize
@@ -26,7 +26,7 @@ from app.questions.counts import distribution, functions
 from app.registry.counts import EXPONENTS, Counts
 from app.scene import Vocabulary
 from training.datasets import EncodedScene
-from training.datasets.array_types import ClassMask
+from training.datasets.array_types import ClassMask, Table
 from training.datasets.cases import MOST, Part, counted_classes, listed_cases
 from training.datasets.sources import source_of
 from training.evaluation.count_task import class_mean
@@ -69,7 +69,7 @@ def fit_counts(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> Counts
     counted = {source: classes & (most > 0) for source, classes in counted.items()}
     cases = _Cases.of(scenes, counted, vocabulary)
     most *= _is_better_than_mean(scenes, cases, most, counted, vocabulary)
-    cases = cases.where(most[cases.index] > 0)
+    cases = cases.rows(most[cases.index] > 0)
     return _fit(cases, most, vocabulary) if (most > 1).any() else None
 
 
@@ -119,7 +119,7 @@ def _most_listed(
 
 
 @dataclass(frozen=True, eq=False)
-class _Cases:
+class _Cases(Table):
     """N cases: a class of a partly listed scene."""
 
     index: Int[NDArray, "N"]  # class
@@ -156,10 +156,6 @@ class _Cases:
         shape = (len(cases), start + len(vocabulary))
         features = sparse.csr_matrix((values, columns, bounds), shape=shape)
         return cls(index, listed, number, features, scene_rows, sources)
-
-    def where(self, mask: Bool[NDArray, "N"]) -> _Cases:
-        """Return the cases where a mask is True."""
-        return _Cases(*(getattr(self, field.name)[mask] for field in fields(self)))
 
     @cached_property
     def weight(self) -> Float[NDArray, "N"]:
@@ -250,7 +246,7 @@ def _is_better_than_mean(
     V, fold = len(vocabulary), _folds(scenes)
     improvement = np.zeros(V)
     for number in range(_FOLDS):
-        counts = _fit(cases.where(fold[cases.scene] != number), most, vocabulary)
+        counts = _fit(cases.rows(fold[cases.scene] != number), most, vocabulary)
         test = [scenes[k] for k in np.flatnonzero(fold == number).tolist()]
         for scene, seed in product(test, range(_DRAWS)):
             part, indices = listed_cases(scene, counted[scene.source], vocabulary.structure, seed)

@@ -183,12 +183,12 @@ def measure_drift(artifact: Artifact, scenes: ObjectScenes, config: ObjectsConfi
     """Run 3,000 sweeps from training scenes of the served mix, and compare chains and scenes.
 
     The states of the last 1,000 sweeps count if the filter of `/generate` accepts them
-    (`accepted`).
+    (`served_frequencies`).
     """
     *_, population = populations(scenes, config)
     long = LongChains(scene_chains(artifact.weights), scenes, population, _CHAINS, seed=1)
     long.run(_SETTLED, every=_SETTLED)
-    drawn = accepted(artifact, long, (_SWEEPS - _SETTLED) // STEPS)
+    drawn = served_frequencies(artifact, long, (_SWEEPS - _SETTLED) // STEPS)
     sizes = drawn[:, population.shows].sum(1) / population.p[population.shows].sum()
     top = np.argsort(-np.where(population.shows, population.p, 0))[:_COMMONEST]
     top = top[population.p[top] > 0]
@@ -201,7 +201,9 @@ def measure_drift(artifact: Artifact, scenes: ObjectScenes, config: ObjectsConfi
     return Drift(size, size_error, label, float(share[k]), float(error[k]))
 
 
-def accepted(artifact: Artifact, long: LongChains, states: int) -> Float[NDArray, "chains V"]:
+def served_frequencies(
+    artifact: Artifact, long: LongChains, states: int
+) -> Float[NDArray, "chains V"]:
     """Continue the chains, and return the share of each class in the served scenes of each chain.
 
     A state is recorded every `STEPS` sweeps, the length of a draw of `/generate`. A served scene is

@@ -158,7 +158,7 @@ class BoltzmannMachine(nn.Module, ABC):
         self, v: Float[Tensor, "B V"], room: Int[Tensor, "B"] | None = None
     ) -> Float[Tensor, "B H1"]:
         """Return the logits x = c1 + Q[t] + v'W of h1 given the objects v."""
-        return self.hidden_bias(room) + sums(v, self.W)
+        return self.hidden_bias(room) + sparse_product(v, self.W)
 
     def hidden_log_odds(
         self, x: Float[Tensor, "B H1"], weights: Float[Tensor, "rows H1"]
@@ -211,7 +211,7 @@ class BoltzmannMachine(nn.Module, ABC):
         log_odds = bias + self.hidden_log_odds(self.hidden_logits(v, room), self.W)
         couplings = self.couplings
         if couplings is not None:
-            log_odds = log_odds + sums(v, couplings)
+            log_odds = log_odds + sparse_product(v, couplings)
         return log_odds if share is None else log_odds + self.kappa[share]
 
     def room_bias(self, room: Int[Tensor, "B"] | None) -> Float[Tensor, "B|1 V"]:
@@ -239,7 +239,7 @@ class BoltzmannMachine(nn.Module, ABC):
         """
         logits = self.e + self.hidden_log_odds(self.hidden_logits(v), self.Q)
         if self.spec.coupled:
-            logits = logits + sums(v, self.Y.T)
+            logits = logits + sparse_product(v, self.Y.T)
         if not self.spec.profiles:
             return logits.log_softmax(-1)
         by_source = (logits.unsqueeze(-2) + self.y).log_softmax(-1)
@@ -256,7 +256,7 @@ class BoltzmannMachine(nn.Module, ABC):
         free = -(v * self.scene_bias(source)).sum(-1)
         couplings = self.couplings
         if couplings is not None:
-            free = free - 0.5 * (sums(v, couplings) * v).sum(-1)
+            free = free - 0.5 * (sparse_product(v, couplings) * v).sum(-1)
             free = free - (v * self.room_bias(room)).sum(-1)
         log_states = self._all_states(self.hidden_logits(v, room)).logsumexp(-1).sum(-1)
         return free - self.room_rate(room, source) - log_states
@@ -352,7 +352,7 @@ class BoltzmannMachine(nn.Module, ABC):
         return torch.where((r > self.gate(edges, v)).any(-1), torch.inf, energy)
 
 
-def sums(v: Float[Tensor, "B V"], weights: Float[Tensor, "V k"]) -> Float[Tensor, "B k"]:
+def sparse_product(v: Float[Tensor, "B V"], weights: Float[Tensor, "V k"]) -> Float[Tensor, "B k"]:
     """Return v @ weights by a sparse product: most classes of a scene are absent."""
     return torch.sparse.mm(v.to_sparse(), weights)
 

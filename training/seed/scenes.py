@@ -23,6 +23,7 @@ from training.datasets import (
     source_vocabulary,
     split,
 )
+from training.datasets.array_types import Table
 from training.datasets.splits import Protocol
 
 SPLITS: Final[dict[str, Protocol]] = {"scenes": "paper", "groups": "paper groups"}
@@ -33,7 +34,7 @@ RELATIONS: Final = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Scenes:
+class Scenes(Table):
     """N scenes. In an annotated scene, an unlisted relation is false."""
 
     v: Float[Tensor, "N V"]  # presence of each class
@@ -43,10 +44,6 @@ class Scenes:
 
     def __len__(self) -> int:
         return len(self.v)
-
-    def rows(self, index: Tensor) -> Scenes:
-        """Return the scenes at these indices, or the scenes where a mask is True."""
-        return Scenes(*(tensor[index] for tensor in vars(self).values()))
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,10 +18,10 @@ from training.fit import long_chains, objects
 from training.fit.configuration import ObjectsConfig
 from training.fit.long_chains import (
     LongChains,
-    accepted,
     measure_drift,
     populations,
     scene_chains,
+    served_frequencies,
 )
 from training.fit.objects import ObjectFit, ObjectScenes, random_parts, start_objects
 from training.fit.samples import fit_scene_rates, store_samples
@@ -540,7 +540,7 @@ def test_served_scenes_of_long_chains_are_the_plausible_ones():
     artifact = artifact_of(machine, smallest=(2,) * (machine.spec.C + 1))
     long = LongChains(scene_chains(weights_of(machine)), scenes, population, 512, seed=2)
     long.run(100)
-    drawn = accepted(artifact, long, 40).mean(0)
+    drawn = served_frequencies(artifact, long, 40).mean(0)
     p = log_p(machine, -1, -1).double().exp()
     is_small = EVERY.sum(1) < 2
     refused = float(p[is_small].sum())
