@@ -13,8 +13,8 @@ smallest, room_fit
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any, NamedTuple, Self
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -29,6 +29,7 @@ from app.questions.generate import STEPS, room_fit
 from app.questions.posterior import Posterior
 from app.registry import Artifact, FitLimit, Sharpness
 from app.registry.description import NO_LIMIT
+from training.datasets.array_types import Table
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.sources import source_of
 from training.evaluation.asking import of_classes
@@ -165,7 +166,7 @@ def limits(artifact: Artifact, train: SceneTensors) -> dict[str, Any]:
     least = lists[0].smallest() if len(lists[0].size) else 0
     smallest, fits = [], []
     for t in range(artifact.spec.C):
-        own = [each.of_type(t) for each in lists]
+        own = [each.rows(each.room == t) for each in lists]
         if len(np.unique(own[0].scene)) < _ROOM_SCENES:
             smallest.append(least)
             fits.append(NO_LIMIT)
@@ -175,7 +176,8 @@ def limits(artifact: Artifact, train: SceneTensors) -> dict[str, Any]:
     return {"smallest": (*smallest, least), "room_fit": tuple(fits)}
 
 
-class _ListedRooms(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _ListedRooms(Table):
     """N listed parts of rooms."""
 
     listed: Bool[NDArray, "N V"]
@@ -189,10 +191,6 @@ class _ListedRooms(NamedTuple):
         listed, scene = parts.v.numpy() > 0, parts.scene.numpy()
         source, room = scenes.source.numpy()[scene], scenes.room.numpy()[scene]
         return cls(listed, listed.sum(1), scene, source, room)
-
-    def of_type(self, room: int) -> Self:
-        """Return the parts of scenes of a room type."""
-        return type(self)(*(values[self.room == room] for values in self))
 
     def smallest(self) -> int:
         return int(_low_quantile(self.size.astype(np.float64), self.source))
