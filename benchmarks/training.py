@@ -44,7 +44,7 @@ def training_step(
     data = ObjectScenes(
         *(v, unknown, torch.zeros(scenes, dtype=torch.int64), torch.ones(scenes)),
         shows=torch.ones(1, V, dtype=torch.bool),
-        known=torch.ones(scenes, V, dtype=torch.bool),
+        observed=torch.ones(scenes, V, dtype=torch.bool),
         sources=("random",),
     )
     config = ObjectsConfig(

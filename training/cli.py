@@ -7,12 +7,12 @@ finished run.
 from __future__ import annotations
 
 import shlex
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
-from rich.console import Console
 
 from app.model import SceneModel
 from app.registry import DEFAULT_STORE, Artifact, RegistryError, Store
@@ -24,8 +24,9 @@ from training.domain.candidates import Candidate
 from training.domain.compare import compare, compare_command, show
 from training.domain.evaluate_command import evaluate_command
 from training.domain.gate import MARGIN, NEW, losses, measure_usefulness, served_model
-from training.domain.init_command import StorePath, example, fail, init
+from training.domain.init_command import example, init
 from training.domain.look import outside_vocabulary
+from training.domain.terminal import StorePath, console, fail, print_lines
 from training.evaluation.report import Progress
 from training.fit.configuration import Config, ConfigError
 from training.fit.trainer import Trainer
@@ -34,7 +35,7 @@ from training.research.benchmark import benchmark
 from training.research.tune import tune
 from training.research.words import words
 from training.runs.config_files import data_folder, load_config, with_settings
-from training.runs.example_scenes import known_examples, read_examples
+from training.runs.example_scenes import accepted_examples, read_examples
 from training.runs.folder import FinishedRun, RunError, load_run, save_run
 from training.runs.live import Display, next_steps, summarise
 from training.runs.pipeline import SplitScenes, prepare
@@ -54,7 +55,6 @@ app.command()(ablate)
 app.command()(words)
 app.command(name="evaluate")(evaluate_command)
 app.command(name="seed")(seed_command)
-console = Console()
 
 Data = Annotated[
     Path | None,
@@ -190,15 +190,10 @@ def publish(
             )
         root = data or run.data_folder
         scenes = _prepare(run.config, root)
+        accept = _print_accepted if even_if_worse else None
         if promote:
-            _promote(
-                *(run, scenes, root, models, version),
-                alias=alias or "default",
-                margin=margin,
-                even_if_worse=even_if_worse,
-            )
+            _promote(run, scenes, root, models, version, alias or "default", margin, accept=accept)
         else:
-            accept = _print_accepted if even_if_worse else None
             _print_published(_publish(run, scenes, models, version, accept=accept), store)
     except RefusedError as error:
         _exit_refused(error, "; --even-if-worse publishes the version all the same")
@@ -209,11 +204,11 @@ def publish(
 def _prepare(config: Config, data: Path) -> SplitScenes:
     with console.status("reading and encoding scenes"):
         scenes = prepare(config, data)
-    examples, reasons = known_examples(read_examples(config.examples, data), scenes.vocabulary)
+    examples, reasons = accepted_examples(read_examples(config.examples, data), scenes.vocabulary)
     sizes = ", ".join(f"{len(part)} {name}" for name, part in scenes.parts.items())
     console.print(f"{len(scenes.vocabulary)} object classes; scenes: {sizes}")
     if line := outside_vocabulary(scene for part in scenes.parts.values() for scene in part):
-        console.print(line, soft_wrap=True, markup=False, highlight=False)
+        print_lines(line)
     for reason in reasons:
         console.print(f"[yellow]note:[/yellow] an example is left out: {reason}", soft_wrap=True)
     return replace(scenes, examples=examples)
@@ -271,12 +266,15 @@ def _promote(
     root: Path,
     store: Store,
     version: str,
-    *,
     alias: str,
     margin: float,
-    even_if_worse: bool,
+    *,
+    accept: Callable[[str], None] | None,
 ) -> None:
-    """Publish the version and point the alias at it, unless the gate refuses the version."""
+    """Publish the version and point the alias at it, unless the gate refuses the version.
+
+    `accept`: see `publish_run`.
+    """
     served = served_model(store, alias)
 
     def judge(model: SceneModel, say: Progress) -> list[str]:
@@ -284,20 +282,18 @@ def _promote(
         for line in useful.lines():
             console.print(line, highlight=False)
         reasons = useful.objections()
-        if served.candidate is not None and (even_if_worse or not reasons):
+        if served.candidate is not None and (accept or not reasons):
             try:
                 new = Candidate(NEW, run.config, scenes.digests, model, root)
-                sides = (new, served.candidate, root)
-                comparison = compare(*sides, say=say)
-                show(comparison, console)
+                comparison = compare(new, served.candidate, root, say=say)
+                show(comparison)
                 reasons += losses(comparison, margin)
             except ConfigError as error:
-                if not even_if_worse:
+                if accept is None:
                     raise
                 console.print(f"the versions were not compared: {error}", soft_wrap=True)
         return reasons
 
-    accept = _print_accepted if even_if_worse else None
     artifact = _publish(run, scenes, store, version, judge=judge, accept=accept)
     if served.note:
         console.print(served.note, soft_wrap=True)
@@ -308,4 +304,4 @@ def _promote(
     change = f", before {served.target}" if served.target is not None else ""
     console.print(f"promoted: {alias} → {target}{change}", soft_wrap=True)
     command = f"SCENE_STORE={shlex.quote(str(store.root))} SCENE_PORT=8055 python -m app"
-    console.print(f"next: {command}", soft_wrap=True, markup=False, highlight=False)
+    print_lines(f"next: {command}")

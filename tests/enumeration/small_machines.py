@@ -219,7 +219,7 @@ def implied_by_hand(
     spec = machine.spec
     gamma, B = machine.get_parameter("gamma"), machine.get_parameter("B")
     phi = features_by_hand(given)
-    mean = machine.state_means(machine.context(v[None], torch.tensor([room])))[0]
+    mean = machine.state_means(machine.hidden_logits(v[None], torch.tensor([room])))[0]
     z = [sum(float(B[q, k] * mean[k]) for k in range(spec.H1)) for q in range(spec.G)]
     x = torch.zeros(given.shape, dtype=torch.float64)
     for a in range(spec.A):

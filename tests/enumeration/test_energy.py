@@ -118,7 +118,7 @@ def test_conditionals_of_relations_and_hidden_units(name):
     machine = small_machine(name)
     spec, joint = machine.spec, enumerate_joint(machine)
     logits = machine.relation_logits(joint.edges, joint.v, joint.h1)
-    means = machine.state_means(machine.context(joint.v))
+    means = machine.state_means(machine.hidden_logits(joint.v))
     gate = machine.gate(joint.edges, joint.v)
     pick = torch.randint(len(joint.v), (25,), generator=torch.Generator().manual_seed(2))
     for n in pick.tolist():

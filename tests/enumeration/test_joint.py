@@ -116,7 +116,7 @@ def test_implications_have_no_joint_distribution():
         machine.P.zero_()
         machine.M.zero_()
     edges = machine.edges(torch.arange(machine.spec.V).unsqueeze(0))
-    h1 = machine.state_means(machine.context(torch.ones(1, machine.spec.V).double()))
+    h1 = machine.state_means(machine.hidden_logits(torch.ones(1, machine.spec.V).double()))
     ends = list(zip(edges.subject[0].tolist(), edges.object[0].tolist(), strict=True))
     first, second = ends.index((0, 1)), ends.index((1, 2))
     shifts = []

@@ -49,7 +49,7 @@ def test_gain_is_exact_to_float32_rounding(
             gain = torch.from_numpy(gains(logits.numpy())).double()
             # Each factor is good to some float32 roundings, and there are as many as units.
             close = {"rtol": 1e-5, "atol": 5e-7 * units}
-            exact = machine.gain(logits.double(), weights.double())
+            exact = machine.hidden_log_odds(logits.double(), weights.double())
             torch.testing.assert_close(gain, exact, **close)
 
 

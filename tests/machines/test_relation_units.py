@@ -51,7 +51,7 @@ CLASSES, LOG_COUNTS = np.array([4, 0, 3]), np.log([1, 3, 2]).astype(np.float32)
 def exact_logits(machine, v, room):
     """ℓ of every state of h1, (states, units), and p(state | v), (states,), by the tensors."""
     h1 = unit_states(machine.spec)
-    x = machine.context(v, torch.tensor([room]))
+    x = machine.hidden_logits(v, torch.tensor([room]))
     p = (h1 @ x[0]).softmax(0)
     counts = torch.ones(V, dtype=torch.int64)
     counts[CLASSES] = torch.from_numpy(np.exp(LOG_COUNTS)).round().long()
@@ -140,7 +140,7 @@ def test_implications_equal_the_formula_by_hand(grid, room, states):
     observed = ObservedRelations(a, i, j, np.ones(len(a), np.float32))
     found = in_service(machine, observed, n, None if room < 0 else room)
     machine.double()
-    h1 = machine.state_means(machine.context(v, torch.tensor([room])))
+    h1 = machine.state_means(machine.hidden_logits(v, torch.tensor([room])))
     expected = implied_by_hand(machine, v[0], padded, room)
     edges = machine.edges(torch.arange(V).unsqueeze(0))
     ours = machine.implied(edges, padded.reshape(1, -1), h1)

@@ -70,11 +70,11 @@ def test_the_vocabulary_is_large_enough(artifact):
 
 
 def test_it_has_the_examples_of_its_configuration(artifact):
-    from training.runs.example_scenes import known_examples, read_examples
+    from training.runs.example_scenes import accepted_examples, read_examples
 
     examples = read_examples(load_config(artifact.manifest.name).examples, Path())
     assert examples
-    assert known_examples(examples, artifact.model.vocabulary) == (examples, [])
+    assert accepted_examples(examples, artifact.model.vocabulary) == (examples, [])
     assert artifact.manifest.examples == examples
 
 

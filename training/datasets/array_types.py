@@ -1,9 +1,24 @@
-"""Names for the types of arrays and of their random generator."""
+"""Names for the types of arrays and of their random generator, and the base of tables."""
+
+from dataclasses import fields
+from typing import Any, Self, cast
 
 import numpy as np
+from jaxtyping import Bool
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 Rng = np.random.Generator
+ClassMask = Bool[NDArray, "V"]
+"""True for some of the V classes."""
+
+
+class Table:
+    """Base of dataclasses whose fields are arrays or tensors of N rows."""
+
+    def rows(self, index: Any) -> Self:
+        """Return the rows at the indices, or the rows where a mask is True."""
+        names = (field.name for field in fields(cast("Any", self)))
+        return type(self)(*(getattr(self, name)[index] for name in names))

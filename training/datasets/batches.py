@@ -9,10 +9,13 @@ from zlib import crc32
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
 from app.scene import CANONICAL, RoleCounts, Vocabulary
 from training.datasets import EncodedScene
+from training.datasets.array_types import ClassMask, Table
 from training.datasets.encoding import ClassEvidence
 from training.machines import BoltzmannMachine
 from training.machines.edges import Edges
@@ -21,65 +24,59 @@ _BLOCK = 1024
 
 
 @dataclass(frozen=True)
-class Batch:
+class Batch(Table):
     """A batch of scenes as tensors. n is the largest number of classes of a scene."""
 
-    v: Tensor  # presence of each class, (scenes, classes)
-    classes: Tensor  # indices of the present classes, (scenes, n) int64; padding is -1
-    counts: Tensor  # instances of each of `classes`, (scenes, n) int64; 0: the source gives none
-    holds: Tensor  # value of each relation between two of `classes`, (scenes, relations, n, n)
-    observed: Tensor  # True where a relation is annotated, (scenes, relations, n, n)
-    room: Tensor  # index of the room type, (scenes,) int64; -1 means unknown
-    source: Tensor  # index of the source in `SceneTensors.source_names`, (scenes,) int64
+    v: Float[Tensor, "B V"]  # presence of each class
+    classes: Int[Tensor, "B n"]  # present classes; padding is -1
+    counts: Int[Tensor, "B n"]  # instances of each of `classes`; 0: the source gives none
+    holds: Float[Tensor, "B A n n"]  # value of each relation between two of `classes`
+    observed: Bool[Tensor, "B A n n"]  # True where a relation is annotated
+    room: Int[Tensor, "B"]  # room type; -1 means unknown
+    source: Int[Tensor, "B"]  # index in `SceneTensors.source_names`
 
     def __len__(self) -> int:
         return len(self.v)
 
-    def rows(self, index: Tensor) -> Batch:
-        """Return the scenes at the given indices. A mask selects the scenes where it is True."""
-        return Batch(*(tensor[index] for tensor in vars(self).values()))
-
-
-def _whole(evidence: ClassEvidence) -> ClassEvidence:
-    return evidence
-
 
 @dataclass(frozen=True)
 class SceneTensors:
-    """A set of scenes as tensors. `batch` returns some of the scenes."""
+    """A set of B scenes as tensors. `batch` returns some of the scenes."""
 
     scenes: Sequence[EncodedScene]
-    v: Tensor  # presence of each class, (scenes, classes)
-    room: Tensor  # index of the room type, (scenes,) int64; -1 means unknown
-    source: Tensor  # index in annotated_classes and source_names, (scenes,) int64
-    annotated_classes: Tensor  # classes that a data source mentions, (sources, classes) bool
-    related: Tensor  # classes of one family, (classes, classes) float; see `Vocabulary.related`
+    v: Float[Tensor, "B V"]  # presence of each class
+    room: Int[Tensor, "B"]  # room type; -1 means unknown
+    source: Int[Tensor, "B"]  # index in annotated_classes and source_names
+    annotated_classes: Bool[Tensor, "sources V"]  # classes that a data source mentions
+    related: Float[Tensor, "V V"]  # classes of one family; see `Vocabulary.related`
     source_names: tuple[str, ...] = ()  # sorted
 
-    def relatives_of(self, v: Tensor) -> Tensor:
-        """Return the classes that are in one family with a class of v, both (N, classes)."""
+    def relatives_of(self, v: Float[Tensor, "N V"]) -> Bool[Tensor, "N V"]:
+        """Return the classes that are in one family with a class of v."""
         return torch.cat([rows @ self.related > 0 for rows in v.split(_BLOCK)])
 
     @cached_property
-    def weight(self) -> Tensor:
-        """Weight of each scene in the training of objects, (scenes,)."""
+    def weight(self) -> Float[Tensor, "B"]:
+        """Weight of each scene in the training of objects."""
         return torch.tensor([scene.weight for scene in self.scenes], dtype=torch.float32)
 
     @cached_property
-    def complete(self) -> Tensor:
-        """True if the object list of the scene is nearly complete, (scenes,) bool."""
+    def complete(self) -> Bool[Tensor, "B"]:
+        """True if the object list of the scene is nearly complete."""
         return torch.tensor([scene.complete for scene in self.scenes], dtype=torch.bool)
 
     @property
-    def group_ids(self) -> np.ndarray:
-        """Id of the group of each scene, (scenes,) int64. Data sources can share a group."""
+    def group_ids(self) -> Int[NDArray, "B"]:
+        """Id of the group of each scene. Data sources can share a group."""
         return np.array([crc32(scene.group.encode()) for scene in self.scenes], dtype=np.int64)
 
     def __len__(self) -> int:
         return len(self.scenes)
 
     def batch(
-        self, index: Tensor, part: Callable[[ClassEvidence], ClassEvidence] = _whole
+        self,
+        index: Int[Tensor, "N"],
+        part: Callable[[ClassEvidence], ClassEvidence] = lambda whole: whole,
     ) -> Batch:
         """Return the scenes at the given indices as one batch.
 
@@ -100,9 +97,11 @@ class SceneTensors:
 
 
 def scene_tensors(
-    scenes: Sequence[EncodedScene], annotated: dict[str, np.ndarray], vocabulary: Vocabulary
+    scenes: Sequence[EncodedScene],
+    annotated: dict[str, ClassMask],
+    vocabulary: Vocabulary,
 ) -> SceneTensors:
-    """Return encoded scenes as tensors. `annotated` has the classes, (classes,), of each source."""
+    """Return encoded scenes as tensors. `annotated` has the classes of each source."""
     names = sorted(annotated)
     v = torch.zeros(len(scenes), len(vocabulary))
     for row, scene in enumerate(scenes):
@@ -119,7 +118,9 @@ def scene_tensors(
 
 
 def subset(scenes: SceneTensors, index: Tensor) -> SceneTensors:
-    """Return the scenes at the given indices."""
+    """Return the scenes at the given indices, or the scenes where a mask is True."""
+    if index.dtype == torch.bool:
+        index = index.nonzero().squeeze(1)
     return replace(
         scenes,
         scenes=[scenes.scenes[k] for k in index.tolist()],
@@ -129,18 +130,20 @@ def subset(scenes: SceneTensors, index: Tensor) -> SceneTensors:
     )
 
 
-def relation_units(machine: BoltzmannMachine, batch: Batch) -> tuple[Edges, Tensor, Tensor]:
+def relation_units(
+    machine: BoltzmannMachine, batch: Batch
+) -> tuple[Edges, Float[Tensor, "B E"], Bool[Tensor, "B E"]]:
     """Return the layout, values and observed flags of the relation units of a batch."""
     return machine.lay_out(batch.classes, batch.counts, batch.holds, batch.observed)
 
 
-def seen_triples(scenes: Sequence[EncodedScene], size: int, minimum: int = 1) -> Tensor:
-    """Return the sorted triples (relation, subject, object) of `minimum` or more scenes, (n, 3)."""
-    shape, keys = (len(CANONICAL), size, size), [np.zeros(0, dtype=np.int64)]
+def seen_triples(scenes: Sequence[EncodedScene], V: int, minimum: int = 1) -> Int[Tensor, "T 3"]:
+    """Return the sorted triples (relation, subject, object) of `minimum` or more scenes."""
+    shape, keys = (len(CANONICAL), V, V), [np.zeros(0, dtype=np.int64)]
     for evidence in (scene.evidence for scene in scenes):
         relation, subject, other = evidence.holds.nonzero()
-        ends = evidence.classes[subject], evidence.classes[other]
-        keys.append(np.ravel_multi_index((relation, *ends), shape))
+        triples = relation, evidence.classes[subject], evidence.classes[other]
+        keys.append(np.ravel_multi_index(triples, shape))
     values, counts = np.unique(np.concatenate(keys), return_counts=True)
     table = np.stack(np.unravel_index(values[counts >= minimum], shape), axis=1)
     return torch.from_numpy(table).to(torch.int32)
@@ -153,15 +156,15 @@ class TrainingData:
     train: SceneTensors
     validation: SceneTensors
     test: SceneTensors
-    structure: Tensor  # True for structural classes, (classes,)
+    structure: Bool[Tensor, "V"]  # True for structural classes
     vocabulary: Vocabulary
     digest: str = ""  # of the scenes, their vocabulary and split
-    words: Tensor | None = None  # (V, D) unit word vectors of the classes, 0 where unknown
+    words: Float[Tensor, "V D"] | None = None  # unit word vectors of the classes, 0 where unknown
     roles: RoleCounts | None = None  # of the classes in the training scenes
 
     @property
-    def parents(self) -> Tensor:
-        """(V,) int64 index of the parent of each class, -1 without a parent."""
+    def parents(self) -> Int[Tensor, "V"]:
+        """Index of the parent of each class, -1 without a parent."""
         return torch.from_numpy(self.vocabulary.parents.copy())
 
     @property

@@ -14,12 +14,13 @@ from zlib import crc32
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from app.scene import CANONICAL, RelationTable, Scene, SceneObject, Vocabulary
 from app.scene.spatial_relations import ABOVE, LATERAL, STACKED
 from training.datasets import EncodedScene
-from training.datasets.array_types import Flags, Floats, Ints, Rng
+from training.datasets.array_types import ClassMask, Rng, Table
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.sources import meaning_of, source_of
 
@@ -30,9 +31,6 @@ _ATTEMPTS: Final = 50  # random changes of a triple that are tried
 
 MOST: Final = 12
 """Maximum distinguished number of instances. It also stands for larger numbers."""
-
-RIDGE: Final = 1.0
-"""`C` of `logistic` for a few unweighted examples, such as those of 20 validation scenes."""
 
 _LISTED: Final = (0.25, 0.5, 0.75, 1.0)
 
@@ -64,14 +62,14 @@ def scene_of(encoded: EncodedScene, kept: Sequence[int], triples: Sequence[Tripl
     return Scene(objects, table, room_type=room if room >= 0 else None)
 
 
-def annotated_relations(encoded: EncodedScene) -> Flags:
+def annotated_relations(encoded: EncodedScene) -> Bool[NDArray, "A N N"]:
     """Return a mask of the relations whose truth is annotated without selection bias.
 
-    The mask has the shape (relations, instances, instances). It contains a relation only if the
-    data source also shows that the relation does not hold. Sentences only show this for left and
-    front between stacked objects. With positions, left and front do not hold beyond the neighbours;
-    without positions, an annotator selected the neighbours, and a camera frame shows only
-    neighbours. Boxes show too few relations above (docs/decisions/relations.md).
+    It contains a relation only if the data source also shows that the relation does not hold.
+    Sentences only show this for left and front between stacked objects. With positions, left and
+    front do not hold beyond the neighbours; without positions, an annotator selected the
+    neighbours, and a camera frame shows only neighbours. Boxes show too few relations above
+    (docs/decisions/relations.md).
     """
     positions, of_one_view = encoded.instance_positions, source_of(encoded.source).of_one_view
     annotated = encoded.instance_observed.copy()
@@ -79,7 +77,7 @@ def annotated_relations(encoded: EncodedScene) -> Flags:
     stacked |= stacked.T
     for a, unlisted in enumerate(meaning_of(encoded.source, listed=positions is None).unlisted):
         if a in LATERAL and positions is not None and unlisted != "unobserved":
-            located: Flags = np.all(np.isfinite(positions), axis=1)
+            located: Bool[NDArray, "N"] = np.all(np.isfinite(positions), axis=1)
             annotated[a] = located[:, None] & located & ~np.eye(len(located), dtype=np.bool_)
             annotated[a] &= not of_one_view
         elif unlisted not in ("off", "off for supported") or (a == ABOVE and positions is not None):
@@ -88,7 +86,7 @@ def annotated_relations(encoded: EncodedScene) -> Flags:
 
 
 def removed_class(
-    encoded: EncodedScene, structure: Flags, rng: Rng
+    encoded: EncodedScene, structure: ClassMask, rng: Rng
 ) -> tuple[int, list[int]] | None:
     """Draw a class to remove. Return its index and the indices of the remaining instances.
 
@@ -103,14 +101,13 @@ def removed_class(
     return target, np.flatnonzero(encoded.instance_classes != target).tolist()
 
 
-def observed_pairs(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[Flags, list[Triple]]:
+def observed_pairs(
+    encoded: EncodedScene, structure: ClassMask, rng: Rng
+) -> tuple[Bool[NDArray, "N N"], list[Triple]]:
     """Draw half of the object pairs of a scene as observed pairs, with or without relations.
 
     If relations were drawn, pairs without an observed relation would have fewer than other pairs.
-
-    Returns:
-        A mask of the unobserved pairs, (instances, instances) bool, and the observed triples
-        (relation, subject, object).
+    The results are a mask of the unobserved pairs, and the observed triples.
     """
     size = len(encoded.instance_classes)
     half = np.triu(rng.random((size, size)) < 0.5, 1)
@@ -118,7 +115,9 @@ def observed_pairs(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[F
     return ~observed, _triples(encoded.instance_holds & observed, encoded, structure)
 
 
-def _triples(holds: Flags, encoded: EncodedScene, structure: Flags) -> list[Triple]:
+def _triples(
+    holds: Bool[NDArray, "A N N"], encoded: EncodedScene, structure: ClassMask
+) -> list[Triple]:
     """Return the triples (relation, subject, object) of instances without structure."""
     is_thing = ~structure[encoded.instance_classes]
     triples = np.argwhere(holds & is_thing[:, None] & is_thing)
@@ -128,13 +127,13 @@ def _triples(holds: Flags, encoded: EncodedScene, structure: Flags) -> list[Trip
 class Part(NamedTuple):
     """A part of a scene that a robot could list."""
 
-    classes: Ints  # (n,) listed classes without structure, in ascending order
-    listed: Ints  # (n,) number of listed instances of each class, from 1 to `number`
-    number: Ints  # (n,) number of instances of each class in the scene, at most `MOST`
+    classes: Int[NDArray, "n"]  # listed classes without structure, in ascending order
+    listed: Int[NDArray, "n"]  # number of listed instances of each class, from 1 to `number`
+    number: Int[NDArray, "n"]  # instances of each class in the scene, at most `MOST`
     room: int  # index of the room type, -1 if unknown
 
 
-def some_instances(encoded: EncodedScene, structure: Flags, rng: Rng) -> Part:
+def some_instances(encoded: EncodedScene, structure: ClassMask, rng: Rng) -> Part:
     """Draw a part of a scene to list: 25, 50, 75 or 100 % of the classes.
 
     Half of the parts list one instance of each class. The others list from one to all instances,
@@ -152,17 +151,18 @@ def some_instances(encoded: EncodedScene, structure: Flags, rng: Rng) -> Part:
 
 
 def occupied_place(
-    encoded: EncodedScene, structure: Flags, shown: Flags, rng: Rng, relations: Collection[int]
+    encoded: EncodedScene,
+    structure: ClassMask,
+    shown: Bool[NDArray, "N"],
+    rng: Rng,
+    relations: Collection[int],
 ) -> tuple[int, int] | None:
     """Draw a place that is related to a shown object and contains another object.
 
     The object at the place may be shown or hidden: with hidden objects alone, a missing object
-    would seem more likely at every place. `shown` is True for shown objects, (instances,). The
-    place has one of these canonical `relations`.
-
-    Returns:
-        The canonical relation of the place, and the index of the shown object, which is the object
-        of the relation. None means that the scene has no such place.
+    would seem more likely at every place. The results are one of the canonical `relations`, and the
+    index of the shown object, which is the object of the relation. None means that the scene has no
+    such place.
     """
     is_thing = ~structure[encoded.instance_classes]
     holds = encoded.instance_holds & annotated_relations(encoded)
@@ -175,16 +175,13 @@ def occupied_place(
 
 
 def altered_case(
-    encoded: EncodedScene, structure: Flags, rng: Rng
+    encoded: EncodedScene, structure: ClassMask, rng: Rng
 ) -> tuple[Scene, Triple | None] | None:
     """Draw observed relations of a scene. With probability 1/2, replace one by a false triple.
 
-    `structure` is True for structural classes, (classes,).
-
-    Returns:
-        The scene with the observed relations, and the false triple (relation, subject, object).
-        The false triple is None if all observed relations are true. The whole result is None if
-        the scene has fewer than two usable relations, or if no false triple was found.
+    The results are the scene with the observed relations, and the false triple, or None if all
+    relations are true. The whole result is None if the scene has fewer than two usable relations,
+    or if `altered_scene` draws no false triple.
     """
     true_triples = draw_true_relations(encoded, structure, rng)
     if true_triples is None:
@@ -195,7 +192,9 @@ def altered_case(
     return altered_scene(encoded, structure, true_triples, rng)
 
 
-def draw_true_relations(encoded: EncodedScene, structure: Flags, rng: Rng) -> list[Triple] | None:
+def draw_true_relations(
+    encoded: EncodedScene, structure: ClassMask, rng: Rng
+) -> list[Triple] | None:
     """Draw at most 40 true triples (relation, subject, object) of instances without structure.
 
     The result is None if the scene has fewer than two: an altered triple needs other evidence.
@@ -208,16 +207,13 @@ def draw_true_relations(encoded: EncodedScene, structure: Flags, rng: Rng) -> li
 
 
 def altered_scene(
-    encoded: EncodedScene, structure: Flags, triples: Sequence[Triple], rng: Rng
+    encoded: EncodedScene, structure: ClassMask, triples: Sequence[Triple], rng: Rng
 ) -> tuple[Scene, Triple] | None:
     """Replace one random triple by a false triple with another relation or another object.
 
-    A triple is false if the scene lists neither it nor its mirror image. `structure` is True for
-    structural classes, (classes,).
-
-    Returns:
-        The scene with the altered triples, and the false triple. The result is None if
-        `_ATTEMPTS` draws give no false triple.
+    A triple is false if the scene lists neither it nor its mirror image. The results are the scene
+    with the altered triples, and the false triple. They are None if `_ATTEMPTS` draws give no false
+    triple.
     """
     is_thing = ~structure[encoded.instance_classes]
     holds = encoded.instance_holds
@@ -237,33 +233,19 @@ def altered_scene(
     return None
 
 
-def logistic(
-    features: Floats, truth: Flags, weight: Floats | None = None, C: float = 1e6
-) -> list[float]:
-    """Return the coefficients and then the intercept of a logistic regression.
-
-    C is the inverse of the ridge penalty on the coefficients. `RIDGE` keeps them finite if a few
-    examples without `weight`, (examples,), are separable.
-    """
-    from sklearn.linear_model import LogisticRegression  # slow to import
-
-    fit = LogisticRegression(C=C, max_iter=1000).fit(features, truth, weight)
-    return [float(x) for x in (*fit.coef_[0], fit.intercept_[0])]
-
-
 # Share of the classes of a scene that must occur several times. Other sources list each label once.
 _COUNTING: Final = 0.05
 
 
-def counted_classes(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> dict[str, Flags]:
-    """Return the classes whose instances a data source counts, as masks (V,) by source name.
+def counted_classes(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> dict[str, ClassMask]:
+    """Return the classes whose instances a data source counts, as masks by source name.
 
     A source counts instances if its object lists are complete and if at least 5 % of the entries
     (scene, class) have several instances.
     """
     things = ~vocabulary.structure
     entries, several = Counter[str](), Counter[str]()
-    repeated: dict[str, Flags] = {}
+    repeated: dict[str, ClassMask] = {}
     for scene in (scene for scene in scenes if scene.complete):
         evidence = scene.evidence
         is_counted = things[evidence.classes]
@@ -279,27 +261,23 @@ def counted_classes(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> d
 
 
 def listed_cases(
-    scene: EncodedScene, counted: Flags, structure: Flags, seed: int
-) -> tuple[Part, NDArray[np.intp]]:
+    scene: EncodedScene, counted: ClassMask, structure: ClassMask, seed: int
+) -> tuple[Part, Int[NDArray, "m"]]:
     """Return a listed part of a scene, and the indices of its classes that the source counts."""
     part = some_instances(scene, structure, scene_rng(scene, seed))
     return part, np.flatnonzero(counted[part.classes])
 
 
 @dataclass(frozen=True, eq=False)
-class ObservedOffsets:
+class ObservedOffsets(Table):
     """Observed offsets between related objects, in metres and viewer axes."""
 
-    offset: Floats  # position of the relation's subject minus that of its object, (offsets, 3)
-    relation: Ints  # index of the canonical relation, (offsets,)
-    subject: Ints  # class of the relation's subject, (offsets,)
-    other: Ints  # class of the relation's object, (offsets,)
-    scene: Ints  # index of the scene, (offsets,)
-    source: Ints  # index of the data source of the scene, (offsets,)
-
-    def rows(self, mask: Flags) -> ObservedOffsets:
-        """Return the offsets where the mask, (offsets,), is True."""
-        return ObservedOffsets(*(getattr(self, name)[mask] for name in self.__dataclass_fields__))
+    offset: Float[NDArray, "N 3"]  # position of the relation's subject minus that of its object
+    relation: Int[NDArray, "N"]  # canonical relation
+    subject: Int[NDArray, "N"]  # class of the relation's subject
+    other: Int[NDArray, "N"]  # class of the relation's object
+    scene: Int[NDArray, "N"]
+    source: Int[NDArray, "N"]  # data source of the scene
 
 
 def observed_offsets(scenes: Sequence[EncodedScene]) -> ObservedOffsets:

@@ -12,6 +12,8 @@ from functools import cache
 from typing import Final
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 
 from app.scene import (
     CANONICAL,
@@ -30,7 +32,7 @@ from app.scene.scene import pool_classes
 from app.scene.spatial_relations import INSIDE, ON_TOP, STACKED, SUPPORTS, pool_relations
 from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN, Heights, stands_of
 from scene_client.image_plane import are_neighbours, relation_between
-from training.datasets.array_types import Flags, Floats, Ints
+from training.datasets.array_types import ClassMask
 from training.datasets.records import AnnotatedObject, AnnotatedScene, Box2d
 from training.datasets.roles import lift_of
 from training.datasets.sources import Meaning, meaning_of, source_of
@@ -46,23 +48,17 @@ _IN_THE_IMAGE: Final = [CANONICAL.index("left"), CANONICAL.index("above")]
 class ClassEvidence:
     """The n distinct classes of a scene and their observed relations.
 
-    Attributes:
-        classes: (n,) distinct indices of the classes, in ascending order.
-        counts: (n,) number of instances of each class.
-        holds: (A, n, n), True for relations that hold. ``holds[a, x, y]`` means that classes[x] has
-            relation a to classes[y].
-        observed: (A, n, n), True for relations that were observed, whether they hold or not.
-            ``holds`` implies ``observed``.
-        room_type: index of the room type, or None if the room type is unknown.
+    ``holds[a, x, y]`` means that classes[x] has relation a to classes[y]. A relation that holds is
+    also observed.
     """
 
-    classes: Ints
-    counts: Ints
-    holds: Flags
-    observed: Flags
-    room_type: int | None
+    classes: Int[NDArray, "n"]  # in ascending order
+    counts: Int[NDArray, "n"]  # number of instances of each class
+    holds: Bool[NDArray, "A n n"]
+    observed: Bool[NDArray, "A n n"]
+    room_type: int | None  # index
 
-    def only(self, rows: Ints) -> ClassEvidence:
+    def only(self, rows: Int[NDArray, "m"]) -> ClassEvidence:
         """Return the evidence about some of the classes; `rows` are ascending indices of them."""
         pairs = np.ix_(np.arange(len(self.holds)), rows, rows)
         holds, observed = self.holds[pairs], self.observed[pairs]
@@ -70,22 +66,21 @@ class ClassEvidence:
 
 
 def pool_instances(
-    classes: Ints, holds: Flags, observed: Flags, room_type: int | None = None
+    classes: Int[NDArray, "N"],
+    holds: Bool[NDArray, "A N N"],
+    observed: Bool[NDArray, "A N N"],
+    room_type: int | None = None,
 ) -> ClassEvidence:
-    """Pool the instances of each class by a logical OR.
+    """Pool N instances by their class, with a logical OR.
 
     A relation between classes is on if the relation holds for at least one pair of instances. The
     relation is off if it was observed for at least one pair, but holds for none. Otherwise the
     relation is unobserved. If a class has a single instance, the relations between the class and
     itself stay unobserved.
-
-    Args:
-        classes: (N,) index of the class of each instance.
-        holds, observed: (A, N, N) relations between the instances.
     """
     distinct, _, row, counts, _ = pool_classes(classes, np.ones(len(classes)))
-    on, known = pool_relations(row, len(distinct), holds, observed)
-    return ClassEvidence(distinct, counts, on, known, room_type)
+    holds, observed = pool_relations(row, len(distinct), holds, observed)
+    return ClassEvidence(distinct, counts, holds, observed, room_type)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,19 +96,19 @@ class EncodedScene:
     group: str
     room_type: int  # index, -1 if unknown
     evidence: ClassEvidence  # classes, and relations between classes
-    instance_classes: Ints  # class index of each object instance, (instances,)
-    instance_holds: Flags  # relations that hold, (relations, instances, instances)
-    instance_observed: Flags  # relations whose truth is known, (relations, instances, instances)
+    instance_classes: Int[NDArray, "N"]
+    instance_holds: Bool[NDArray, "A N N"]
+    instance_observed: Bool[NDArray, "A N N"]
     unknown: tuple[str, ...]  # distinct labels outside the vocabulary, sorted; they are left out
-    instance_stands: Ints  # what holds each instance, (instances,); see `app.scene.stands`
-    instance_positions: Floats | None = None  # centres in metres, (instances, 3)
-    instance_sizes: Floats | None = None  # extents before the rotation in metres, (instances, 3)
-    instance_yaws: Floats | None = None  # rotations about the z axis in radians, (instances,)
+    instance_stands: Int[NDArray, "N"]  # what carries each instance; see `app.scene.stands`
+    instance_positions: Float[NDArray, "N 3"] | None = None  # centres in metres
+    instance_sizes: Float[NDArray, "N 3"] | None = None  # extents before the rotation in metres
+    instance_yaws: Float[NDArray, "N"] | None = None  # rotations about the z axis in radians
     weight: float = 1.0  # in the training of objects
     complete: bool = True  # the object list is nearly complete; see `Meaning`
 
-    def only(self, kept: Flags) -> EncodedScene:
-        """Return the scene with only some of its instances, (instances,) bool."""
+    def only(self, kept: Bool[NDArray, "N"]) -> EncodedScene:
+        """Return the scene with only some of its instances."""
         index, room = np.flatnonzero(kept), self.evidence.room_type
         names = ("classes", "stands", "positions", "sizes", "yaws")
         arrays = {f"instance_{name}": getattr(self, f"instance_{name}") for name in names}
@@ -149,14 +144,16 @@ def encode(
     return [encoder(scene, groups[scene.group]) for scene in scenes]
 
 
-def annotated_classes(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> dict[str, Flags]:
-    """Return the classes that each data source annotates, as masks (classes,) by source name.
+def annotated_classes(
+    scenes: Sequence[EncodedScene], vocabulary: Vocabulary
+) -> dict[str, ClassMask]:
+    """Return the classes that each data source annotates, as masks by source name.
 
     If a scene does not list an annotated class, the class is absent. A data source annotates the
     classes that it mentions at least once. A source with an open vocabulary annotates all classes.
     Labels in `Source.left_out` and `Source.coarse` are excluded.
     """
-    annotated: dict[str, Flags] = {}
+    annotated: dict[str, ClassMask] = {}
     for scene in scenes:
         if scene.source not in annotated:
             start = source_of(scene.source).open_vocabulary
@@ -179,11 +176,12 @@ class _Encoder:
         self.index = cache(vocabulary.index)
 
     def __call__(self, scene: AnnotatedScene, group_size: int) -> EncodedScene:
+        """Encode one scene of a group of `group_size` near-duplicates."""
         meaning = meaning_of(scene.source, listed=scene.relations is not None)
         left_out = _classes_named(source_of(scene.source).left_out, self.vocabulary)
-        found = [self.index(thing.label) for thing in scene.objects]
-        kept = [i for i, c in enumerate(found) if c is not None and c not in left_out]
-        indices = np.array([-1 if c is None else c for c in found], dtype=np.int64)
+        matches = [self.index(thing.label) for thing in scene.objects]
+        kept = [i for i, c in enumerate(matches) if c is not None and c not in left_out]
+        indices = np.array([-1 if c is None else c for c in matches], dtype=np.int64)
         relations, boxes = _relations(scene, meaning, indices, self.roles)
         structure = (indices >= 0) & self.vocabulary.structure[indices]
         stands = _stands(scene, relations, boxes, structure)[kept]
@@ -201,7 +199,7 @@ class _Encoder:
             numbers = [scene.objects[i].count for i in kept]
             np.add.at(counts, np.searchsorted(evidence.classes, classes), numbers)
             evidence = replace(evidence, counts=counts)
-        labels = [thing.label for thing, c in zip(scene.objects, found, strict=True) if c is None]
+        labels = [thing.label for thing, c in zip(scene.objects, matches, strict=True) if c is None]
         share = (meaning.scenes_per_group or group_size) / group_size
         return EncodedScene(
             scene_id=scene.scene_id,
@@ -224,9 +222,12 @@ class _Encoder:
 
 
 def _stands(
-    scene: AnnotatedScene, relations: PoseRelations, boxes: Floats | None, structure: Flags
-) -> Ints:
-    """Return what holds each object of a scene, (objects,); see `app.scene.stands`.
+    scene: AnnotatedScene,
+    relations: PoseRelations,
+    boxes: Float[NDArray, "N 7"] | None,
+    structure: Bool[NDArray, "N"],
+) -> Int[NDArray, "N"]:
+    """Return what carries each object of a scene; see `app.scene.stands`.
 
     Without positions, a listed support that is neither the floor nor an object is a wall.
     """
@@ -239,16 +240,16 @@ def _stands(
             return stands
     stands = np.full(len(scene.objects), UNKNOWN)
     stands[[*scene.supported]] = HANGS
-    supports: Flags = np.any(relations.holds[[*SUPPORTS]], axis=0)
+    supports: Bool[NDArray, "N N"] = np.any(relations.holds[[*SUPPORTS]], axis=0)
     stands[supports[:, structure].any(1)] = FLOOR
     stands[supports[:, ~structure].any(1)] = SUPPORTED
     return stands
 
 
 def _relations(
-    scene: AnnotatedScene, meaning: Meaning, classes: Ints, roles: RoleCounts | None
-) -> tuple[PoseRelations, Floats | None]:
-    """Return all relations, and the boxes (objects, 7) (position, size, yaw) or None."""
+    scene: AnnotatedScene, meaning: Meaning, classes: Int[NDArray, "N"], roles: RoleCounts | None
+) -> tuple[PoseRelations, Float[NDArray, "N 7"] | None]:
+    """Return all relations, and the boxes (position, size, yaw) of scenes with positions."""
     n, boxes = len(scene.objects), None
     if scene.relations is not None:
         return _from_lists(scene, scene.relations, meaning), None
@@ -306,8 +307,9 @@ def _apply_rules(
 
 
 def _from_poses(
-    scene: AnnotatedScene, classes: Ints, roles: RoleCounts | None
-) -> tuple[PoseRelations, Floats]:
+    scene: AnnotatedScene, classes: Int[NDArray, "N"], roles: RoleCounts | None
+) -> tuple[PoseRelations, Float[NDArray, "N 7"]]:
+    """Derive relations from positions in viewer axes. Return them and the boxes."""
     unknown = (math.nan,) * 3
     positions = np.array([thing.position or unknown for thing in scene.objects])
     sizes = np.array([thing.size or unknown for thing in scene.objects])
@@ -322,7 +324,7 @@ def _from_poses(
 def _add_supports(
     relations: PoseRelations,
     objects: Sequence[AnnotatedObject],
-    classes: Ints,
+    classes: Int[NDArray, "N"],
     roles: RoleCounts | None,
 ) -> None:
     """Set on-top or inside for each support link; see `encode`."""
@@ -342,12 +344,12 @@ def _add_supports(
             relations.observed[[*SUPPORTS], index, support] = False
 
 
-def room_viewpoint(scene_id: str, positions: Floats) -> Viewpoint:
+def room_viewpoint(scene_id: str, positions: Float[NDArray, "N 3"]) -> Viewpoint:
     """Return a viewpoint at the middle of one side of the room, facing inwards.
 
-    The room is the bounding box of the object centres in metres, (objects, 3). Centres with NaN are
-    ignored, and at least one centre must be known. A hash of the scene id selects the side, so the
-    viewpoint of a scene never changes. Over many scenes, all four sides occur.
+    The room is the bounding box of the object centres in metres. Centres with NaN are ignored, and
+    at least one centre is finite. A hash of the scene id selects the side, so the viewpoint of a
+    scene never changes. Over many scenes, all four sides occur.
     """
     (x0, y0), (x1, y1) = np.nanmin(positions[:, :2], 0), np.nanmax(positions[:, :2], 0)
     side = hashlib.sha256(scene_id.encode()).digest()[0] % 4

@@ -15,7 +15,7 @@ Each row of the table is one thing at one usual location in a place:
 A table `things.csv` in the same folder describes the things (`training.datasets.things`).
 
 `draw_scene` samples this model exactly. A careful visitor's list is longer than any detector's, so
-training uses parts of the drawn scenes (`listed_part`).
+training uses parts of the drawn scenes (`detected_part`).
 """
 
 import math
@@ -55,21 +55,14 @@ _COUNT: Final = re.compile(r"(\d{1,7})(?:-(\d{1,7}))?")
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """A thing at one of its usual locations in a place.
-
-    Attributes:
-        share: share of the places with the group that have the thing.
-        least, most: limits of the number of instances.
-        relation: relation to the anchor, or floor, wall or ceiling; "" means unknown.
-        anchor: label of another thing, or "".
-    """
+    """A thing at one of its usual locations in a place."""
 
     label: str
-    share: float
-    least: int
+    share: float  # of the places with the group that have the thing
+    least: int  # minimum number of instances
     most: int
-    relation: str
-    anchor: str
+    relation: str  # to the anchor, or floor, wall or ceiling; "" means unknown
+    anchor: str  # label of another thing, or ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,21 +90,16 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Inventory:
-    """The places of a file, and the things of the table beside it.
-
-    Attributes:
-        things: things of `things.csv` by label; empty without this file.
-        left_out: labels of rows that name no kind of object, and how often each occurs.
-    """
+    """The places of a file, and the things of the table beside it."""
 
     places: tuple[Place, ...]
-    things: Mapping[str, Thing]
-    left_out: Counter[str]
+    things: Mapping[str, Thing]  # things of `things.csv` by label; empty without this file
+    left_out: Counter[str]  # labels of rows that name no kind of object
 
     def scenes(self, each: int, seed: int) -> list[AnnotatedScene]:
         """Draw parts of a number of scenes of each place. The scenes of a place are one group."""
         described = (*self.things.values(), *shipped_things().values())
-        return written_scenes(self.places, listed_shares(described), each, seed)
+        return written_scenes(self.places, detection_rates(described), each, seed)
 
 
 @cache
@@ -191,6 +179,7 @@ class _Places:
 
 
 def _item(row: Row) -> Item:
+    """Return the thing of a row. Raise DatasetError if a value is invalid."""
     relation = row.one_of("relation", (*_AT_ANCHOR, *_BY_ITSELF, ""))
     anchor = row.optional("anchor")
     if relation in _AT_ANCHOR and not anchor:
@@ -199,8 +188,8 @@ def _item(row: Row) -> Item:
         raise row.error("anchor", f"must be empty, because the relation is {relation or 'empty'}")
     if anchor and is_placeholder(anchor):
         relation = anchor = ""
-    found = _COUNT.fullmatch(row.optional("count") or "1")
-    least, most = (int(found[1]), int(found[2] or found[1])) if found else (0, 0)
+    count = _COUNT.fullmatch(row.optional("count") or "1")
+    least, most = (int(count[1]), int(count[2] or count[1])) if count else (0, 0)
     if not 1 <= least <= most <= MAX_COUNT:
         raise row.error("count", "must be a number such as 2, or an interval such as 1-3")
     share = row.number("share", 1) if row.optional("share") else SHARE
@@ -251,34 +240,36 @@ def _scene(place: Place, scene_id: str, things: Sequence[tuple[Item, int]]) -> A
             relations.append((index, item.relation, anchor))
     supported += [i for i, name, _ in relations if name in ("on-top", "inside")]
     return AnnotatedScene(
-        *(scene_id, SOURCE, place.name, place.room_type, tuple(objects), tuple(relations)),
+        scene_id=scene_id,
+        source=SOURCE,
+        group=place.name,
+        room_type=place.room_type,
+        objects=tuple(objects),
+        relations=tuple(relations),
         supported=tuple(sorted(supported)),
     )
 
 
-def listed_shares(things: Iterable[Thing]) -> dict[str, float]:
+def detection_rates(things: Iterable[Thing]) -> dict[str, float]:
     """Return the probability that a detector lists a thing of a written place, by key of its name.
 
     It is 1 - .7 exp(-length / .4 m): nearly all of the large things, and a third of the smallest.
     """
-    shares: dict[str, float] = {}
+    rates: dict[str, float] = {}
     for thing in things:
         for name in (thing.label, *thing.other_names):
-            share = 1 - (1 - _SMALLEST) * math.exp(-max(thing.size) / _LENGTH)
-            shares.setdefault(label_key(name), share)
-    return shares
+            rate = 1 - (1 - _SMALLEST) * math.exp(-max(thing.size) / _LENGTH)
+            rates.setdefault(label_key(name), rate)
+    return rates
 
 
-def listed_part(scene: AnnotatedScene, shares: Mapping[str, float], rng: Rng) -> AnnotatedScene:
-    """Return a part of a scene, as a detector lists it.
+def detected_part(scene: AnnotatedScene, rates: Mapping[str, float], rng: Rng) -> AnnotatedScene:
+    """Return a part of a scene, as a detector with these `detection_rates` lists it.
 
     All objects with one label are in the part, or none. The floor stays.
-
-    Args:
-        shares: see `listed_shares`.
     """
     labels = list(dict.fromkeys(label_key(thing.label) for thing in scene.objects))
-    drawn = rng.random(len(labels)) < np.array([shares.get(label, LISTED) for label in labels])
+    drawn = rng.random(len(labels)) < np.array([rates.get(label, LISTED) for label in labels])
     is_listed = dict(zip(labels, drawn.tolist(), strict=True)) | {"floor": True}
     kept = [k for k, thing in enumerate(scene.objects) if is_listed[label_key(thing.label)]]
     part = scene.only(kept)
@@ -290,16 +281,15 @@ def listed_part(scene: AnnotatedScene, shares: Mapping[str, float], rng: Rng) ->
 
 
 def written_scenes(
-    places: Sequence[Place], shares: Mapping[str, float], each: int, seed: int
+    places: Sequence[Place], rates: Mapping[str, float], each: int, seed: int
 ) -> list[AnnotatedScene]:
-    """Draw parts of a number of scenes of each place. The scenes of a place are one group.
+    """Draw parts of a number of scenes of each place, with these `detection_rates`.
 
-    Args:
-        shares: see `listed_shares`.
+    The scenes of a place are one group.
     """
     rngs = np.random.default_rng(seed).spawn(len(places))
     return [
-        listed_part(draw_scene(place, f"{place.name} {number}", rng), shares, rng)
+        detected_part(draw_scene(place, f"{place.name} {number}", rng), rates, rng)
         for place, rng in zip(places, rngs, strict=True)
         for number in range(each)
     ]

@@ -124,6 +124,7 @@ def _fields_of(scene: AnnotatedScene) -> dict[str, Any]:
 
 
 def _parse_scene(line: bytes, default_id: str) -> AnnotatedScene:
+    """Return the scene of a line. One without `scene_id` gets the default."""
     values = _Line.model_validate_json(line.removeprefix(codecs.BOM_UTF8))
     scene_id, source = values.scene_id or default_id, values.source
     objects = _objects(values.objects, values.counts or {})

@@ -12,12 +12,14 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 
 from app.scene import Scene
 from app.scene.footprints import overlap_and_gap
 from app.scene.geometry import CONTACT
 from app.scene.spatial_relations import ON_TOP, SUPPORTS
-from training.datasets.array_types import Flags, Floats, Rng
+from training.datasets.array_types import ClassMask, Rng
 from training.datasets.cases import draw_true_relations, scene_of
 from training.datasets.encoding import EncodedScene
 
@@ -38,11 +40,7 @@ def has_boxes(encoded: EncodedScene) -> bool:
 
 
 def posed_scene(encoded: EncodedScene) -> Scene:
-    """Return a scene with the poses of all instances, without relations.
-
-    Raises:
-        ValueError: the relations of the scene do not come from positions.
-    """
+    """Return a scene with the poses of all instances, without relations."""
     centre, size, yaw = _poses(encoded)
     bare = scene_of(encoded, range(len(yaw)), ())
     objects = tuple(
@@ -57,19 +55,22 @@ def posed_scene(encoded: EncodedScene) -> Scene:
     return replace(bare, objects=objects)
 
 
-def _poses(encoded: EncodedScene) -> tuple[Floats, Floats, Floats]:
+def _poses(
+    encoded: EncodedScene,
+) -> tuple[Float[NDArray, "N 3"], Float[NDArray, "N 3"], Float[NDArray, "N"]]:
+    """Return the positions, sizes and yaws of a scene whose relations come from positions."""
     centre, size, yaw = encoded.instance_positions, encoded.instance_sizes, encoded.instance_yaws
     if centre is None or size is None or yaw is None:
         raise ValueError(f"the relations of scene {encoded.scene_id!r} do not come from positions")
     return centre, size, yaw
 
 
-def _point(row: Floats) -> tuple[float, float, float]:
+def _point(row: Float[NDArray, "3"]) -> tuple[float, float, float]:
     x, y, z = row.tolist()
     return x, y, z
 
 
-def untouched_scene(encoded: EncodedScene, structure: Flags, rng: Rng) -> Scene | None:
+def untouched_scene(encoded: EncodedScene, structure: ClassMask, rng: Rng) -> Scene | None:
     """Return the scene of `moved_scene` before the move, with an equal `rng`."""
     if has_boxes(encoded):
         return posed_scene(encoded)
@@ -77,13 +78,15 @@ def untouched_scene(encoded: EncodedScene, structure: Flags, rng: Rng) -> Scene 
     return scene_of(encoded, range(len(encoded.instance_classes)), triples) if triples else None
 
 
-def moved_scene(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[Scene, int] | None:
+def moved_scene(encoded: EncodedScene, structure: ClassMask, rng: Rng) -> tuple[Scene, int] | None:
     """Return `moved_by_pose` for a scene with boxes, and `moved_by_triple` for other scenes."""
     move = moved_by_pose if has_boxes(encoded) else moved_by_triple
     return move(encoded, structure, rng)
 
 
-def moved_by_triple(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[Scene, int] | None:
+def moved_by_triple(
+    encoded: EncodedScene, structure: ClassMask, rng: Rng
+) -> tuple[Scene, int] | None:
     """Return a scene with one altered support relation, and the index of the moved object.
 
     The scene states at most 40 true relations. One of them, object i on or in object j, becomes
@@ -92,7 +95,7 @@ def moved_by_triple(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[
     """
     triples = draw_true_relations(encoded, structure, rng) or []
     supports = [(i, j) for a, i, j in triples if a in SUPPORTS]
-    strange: Flags = _strangers(encoded) & ~structure[encoded.instance_classes]
+    strange: Bool[NDArray, "N N"] = _strangers(encoded) & ~structure[encoded.instance_classes]
     for index in rng.permutation(len(supports)).tolist():
         i, j = supports[index]
         if len(anchors := np.flatnonzero(strange[i])):
@@ -107,23 +110,24 @@ def moved_by_triple(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[
     return None
 
 
-def _supports(encoded: EncodedScene) -> Flags:
-    """Return which instances are on-top of or inside which instances, (instances, instances)."""
+def _supports(encoded: EncodedScene) -> Bool[NDArray, "N N"]:
+    """Return which instances are on-top of or inside which instances."""
     holds = encoded.instance_holds
     return np.any(holds[[a for a in SUPPORTS if a < len(holds)]], axis=0)
 
 
-def _strangers(encoded: EncodedScene) -> Flags:
+def _strangers(encoded: EncodedScene) -> Bool[NDArray, "N N"]:
     """Return the pairs of instances whose classes never support each other in the scene."""
     classes, row = np.unique(encoded.instance_classes, return_inverse=True)
     related = np.zeros((len(classes), len(classes)), dtype=np.bool_)
     i, j = np.nonzero(_supports(encoded))
     related[row[i], row[j]] = related[row[j], row[i]] = True
-    strange: Flags = ~related[row[:, None], row] & ~np.eye(len(row), dtype=np.bool_)
-    return strange
+    return np.logical_not(related[row[:, None], row]) & ~np.eye(len(row), dtype=np.bool_)
 
 
-def moved_by_pose(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[Scene, int] | None:
+def moved_by_pose(
+    encoded: EncodedScene, structure: ClassMask, rng: Rng
+) -> tuple[Scene, int] | None:
     """Return a scene with one object at a wrong place, and the index of this object.
 
     The scene has poses and no relations. Objects on the moved object move with it. In two thirds of
@@ -133,13 +137,10 @@ def moved_by_pose(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[Sc
     height by at least .3 m. In one third, an object on the floor moves onto another object. This
     object is at least .3 m high, and its footprint has at least half of the area. If a place does
     not exist, another one is tried. The result is None if the scene has none.
-
-    Raises:
-        ValueError: the relations of the scene do not come from positions.
     """
     bare = posed_scene(encoded)
     boxes = _Boxes.of(encoded, structure)
-    for pairs, place in _kinds(boxes, rng):
+    for pairs, place in _moves(boxes, rng):
         for i in rng.permutation(np.flatnonzero(pairs.any(1))).tolist():
             group = boxes.group(i)
             for j in rng.permutation(np.flatnonzero(pairs[i] & ~group)).tolist():
@@ -148,7 +149,7 @@ def moved_by_pose(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[Sc
     return None
 
 
-def _shifted(scene: Scene, group: Flags, step: Floats) -> Scene:
+def _shifted(scene: Scene, group: Bool[NDArray, "N"], step: Float[NDArray, "3"]) -> Scene:
     """Return the scene with the objects of a group shifted by (x, y, z) metres."""
     objects = tuple(
         replace(thing, position=_point(np.add(thing.position, step)))
@@ -163,19 +164,20 @@ def _shifted(scene: Scene, group: Flags, step: Floats) -> Scene:
 class _Boxes:
     """The boxes of n instances."""
 
-    centre: Floats  # (n, 3)
-    size: Floats  # extents before the rotation by `yaw`, (n, 3)
-    yaw: Floats  # (n,)
-    bottom: Floats  # height, (n,)
-    top: Floats  # height, (n,)
-    area: Floats  # of the footprint, (n,)
-    usable: Flags  # instances with position and size that are not structure, (n,)
+    centre: Float[NDArray, "n 3"]
+    size: Float[NDArray, "n 3"]  # extents before the rotation by `yaw`
+    yaw: Float[NDArray, "n"]
+    bottom: Float[NDArray, "n"]  # height
+    top: Float[NDArray, "n"]  # height
+    area: Float[NDArray, "n"]  # of the footprint
+    usable: Bool[NDArray, "n"]  # instances with position and size that are not structure
     floor: float  # lowest bottom of the usable instances
-    supports: Flags  # instance i stands on or in instance j, (n, n)
-    strange: Flags  # pairs of usable instances whose classes never support each other, (n, n)
+    supports: Bool[NDArray, "n n"]  # instance i stands on or in instance j
+    strange: Bool[NDArray, "n n"]  # usable instances whose classes never support each other
 
     @classmethod
-    def of(cls, encoded: EncodedScene, structure: Flags) -> _Boxes:
+    def of(cls, encoded: EncodedScene, structure: ClassMask) -> _Boxes:
+        """Read the boxes of a scene whose relations come from positions."""
         centre, size, yaw = _poses(encoded)
         bottom, top = centre[:, 2] - size[:, 2] / 2, centre[:, 2] + size[:, 2] / 2
         area = size[:, 0] * size[:, 1]
@@ -188,14 +190,14 @@ class _Boxes:
         strange = _strangers(encoded) & usable[:, None] & usable
         return cls(centre, size, yaw, bottom, top, area, usable, floor, supports, strange)
 
-    def group(self, i: int) -> Flags:
-        """Return instance i and all instances that stand on it, directly or not, (n,)."""
+    def group(self, i: int) -> Bool[NDArray, "n"]:
+        """Return instance i and all instances that stand on it, directly or not."""
         group = np.arange(len(self.yaw)) == i
         while (carried := self.supports[:, group].any(1) & ~group).any():
             group |= carried
         return group
 
-    def beside(self, j: int, share: Floats, margin: float) -> Floats:
+    def beside(self, j: int, share: Float[NDArray, "2"], margin: float) -> Float[NDArray, "2"]:
         """Return a point (x, y) at a share of the extents of instance j, plus a margin in metres.
 
         The share and the margin are measured from the centre, along the axes of the instance.
@@ -204,8 +206,8 @@ class _Boxes:
         cos, sin = np.cos(self.yaw[j]), np.sin(self.yaw[j])
         return np.array([cos * x - sin * y, sin * x + cos * y]) + self.centre[j, :2]
 
-    def is_free(self, i: int, point: Floats, obstacles: Flags) -> bool:
-        """Return whether the footprint of instance i at a point (x, y) touches no obstacle (n,)."""
+    def is_free(self, i: int, point: Float[NDArray, "2"], obstacles: Bool[NDArray, "n"]) -> bool:
+        """Return whether the footprint of instance i at a point (x, y) touches no obstacle."""
         rows = np.flatnonzero(obstacles)
         count = len(rows), 1
         mine = np.tile(point, count), np.tile(self.size[i, :2], count)
@@ -214,10 +216,11 @@ class _Boxes:
         return bool((gap > 0).all())
 
 
-_Place = Callable[[_Boxes, int, int, Rng], Floats | None]
+_Place = Callable[[_Boxes, int, int, Rng], NDArray[np.float64] | None]
+"""Function of boxes, moved instance, other instance and generator. It returns the new centre."""
 
 
-def _kinds(boxes: _Boxes, rng: Rng) -> Iterator[tuple[Flags, _Place]]:
+def _moves(boxes: _Boxes, rng: Rng) -> Iterator[tuple[Bool[NDArray, "n n"], _Place]]:
     """Yield the kinds of moves in random order: pairs (moved, other instance), and the place."""
     usable, area, bottom, height = boxes.usable, boxes.area, boxes.bottom, boxes.size[:, 2]
     smaller = usable[:, None] & usable & (area[:, None] < area)
@@ -225,36 +228,43 @@ def _kinds(boxes: _Boxes, rng: Rng) -> Iterator[tuple[Flags, _Place]]:
     fits = boxes.strange & (area[:, None] <= area)
     is_high = bottom >= boxes.floor + _LEAST_STEP
     is_deep = bottom[:, None] >= bottom + _LEAST_STEP
-    kinds: list[tuple[Flags, _Place]] = [
+    kinds: list[tuple[Bool[NDArray, "n n"], _Place]] = [
         (fits & supported.any(1, keepdims=True), _onto),
         (supported & is_high[:, None], _to_floor),
         (supported & is_deep & (height[:, None] <= height), _under),
     ]
     kinds = [kinds[k] for k in rng.permutation(len(kinds)).tolist()]
     on_floor = (bottom <= boxes.floor + CONTACT) & ~boxes.supports.any(1)
-    carries: Flags = boxes.strange & (height >= _LEAST_STEP) & (_LEAST_AREA * area[:, None] <= area)
+    carries = boxes.strange & (height >= _LEAST_STEP) & (_LEAST_AREA * area[:, None] <= area)
     lifted = carries & on_floor[:, None], _onto
     kinds.insert(0 if rng.random() < _LIFTED else len(kinds), lifted)
     yield from kinds
 
 
-def _onto(boxes: _Boxes, i: int, j: int, rng: Rng) -> Floats | None:
-    """Return a centre of instance i on the top of instance j, apart from the objects on it."""
+def _onto(boxes: _Boxes, i: int, j: int, rng: Rng) -> Float[NDArray, "3"] | None:
+    """Return a centre of instance i on the top of instance j, clear of the objects on it."""
     bottom, height = boxes.top[j], boxes.size[i, 2]
     obstacles = (boxes.top > bottom) & (boxes.bottom < bottom + height)
     return _free_spot(boxes, i, j, obstacles, _CENTRAL, 0.0, bottom, rng)
 
 
-def _to_floor(boxes: _Boxes, i: int, j: int, rng: Rng) -> Floats | None:
-    """Return a centre of instance i on the floor near instance j, apart from all objects."""
+def _to_floor(boxes: _Boxes, i: int, j: int, rng: Rng) -> Float[NDArray, "3"] | None:
+    """Return a centre of instance i on the floor near instance j, clear of all objects."""
     margin = _REACH + float(np.hypot(*boxes.size[i, :2])) / 2
     return _free_spot(boxes, i, j, boxes.usable, 0.5, margin, boxes.floor, rng)
 
 
 def _free_spot(
-    boxes: _Boxes, i: int, j: int, obstacles: Flags, reach: float, margin: float, z: float, rng: Rng
-) -> Floats | None:
-    """Return a centre of instance i at height z near j, clear of the obstacles (n,), or None."""
+    boxes: _Boxes,
+    i: int,
+    j: int,
+    obstacles: Bool[NDArray, "n"],
+    reach: float,
+    margin: float,
+    z: float,
+    rng: Rng,
+) -> Float[NDArray, "3"] | None:
+    """Return a centre of instance i at height z near j, clear of the obstacles, or None."""
     obstacles = obstacles & boxes.usable & ~boxes.group(i)
     for _ in range(_ATTEMPTS):
         point = boxes.beside(j, rng.uniform(-reach, reach, 2), margin)
@@ -263,6 +273,6 @@ def _free_spot(
     return None
 
 
-def _under(boxes: _Boxes, i: int, j: int, rng: Rng) -> Floats:  # noqa: ARG001
+def _under(boxes: _Boxes, i: int, j: int, rng: Rng) -> Float[NDArray, "3"]:  # noqa: ARG001
     """Return the centre of instance i with its bottom at the bottom of instance j."""
     return np.array([*boxes.centre[i, :2], boxes.bottom[j] + boxes.size[i, 2] / 2])

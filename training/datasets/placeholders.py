@@ -19,28 +19,6 @@ from app.scene.labels import split_words, without_instance
 from training.datasets.records import AnnotatedScene
 from training.datasets.vocabulary import curated_names
 
-# A label is a placeholder if all its words are among these: "unknown object", "other_things_3".
-# So is a label that is one of these when its words are joined: "N/A", "don't care".
-_EMPTY: Final = frozenset(
-    (
-        *("object", "obj", "thing", "item", "entity", "instance", "stuff", "clutter"),
-        *("unknown", "unk", "undefined", "undef", "unlabeled", "unlabelled", "unannotated"),
-        *("unidentified", "unclassified", "uncategorized", "unrecognized", "unnamed", "untitled"),
-        *("none", "null", "nil", "nan", "na", "notapplicable", "void", "invalid", "ignore"),
-        *("ignored", "dontcare", "remove", "removed", "delete", "deleted", "split", "merge"),
-        *("merged", "background", "groundplane", "misc", "miscellaneous", "other", "otherprop"),
-        *("otherfurniture", "otherstructure", "default", "placeholder", "todo", "tbd", "class"),
-        *("cls", "category"),
-    )
-)
-# These words are real names on their own. With a number, they are ids: "track 7", "label_12".
-_NUMBERED: Final = frozenset(
-    (
-        *("id", "track", "cluster", "region", "segment", "node", "label", "part", "mesh", "model"),
-        *("blob", "detection", "proposal", "mask", "link", "body", "prim", "dummy", "geom"),
-        *("index", "type"),
-    )
-)
 # Catalogue numbers: offsets of WordNet, mids of Freebase, uuids and other hexadecimal ids.
 _CATALOGUE: Final = re.compile(
     r"[nvars]\d{8}|/[mg]/[\da-z_]{2,}|(?=[a-f\-]*\d)[\da-f][\da-f\-]{5,}", re.IGNORECASE
@@ -53,19 +31,20 @@ def is_placeholder(label: str) -> bool:
     text = label.strip()
     if not any(map(str.isalpha, text)) or _CATALOGUE.fullmatch(text) is not None:
         return True
-    name = without_instance(text)
-    empty = _EMPTY if name == text else _EMPTY | _NUMBERED
+    name, names = without_instance(text), curated_names()
+    empty = {*names.placeholders, *(() if name == text else names.numbered)}
     words = [word for word in split_words(name) if not word.isdigit()]
-    return label_key("".join(words)) in _EMPTY or (bool(words) and empty.issuperset(words))
+    joined = label_key("".join(words))
+    return joined in names.placeholders or (bool(words) and empty.issuperset(words))
 
 
 def plain_label(label: str) -> str:
-    """Return the label, or the known name in it: chair for "chair_12", sofa for "sofa.n.01".
+    """Return the curated name in a label: chair for "chair_12", sofa for "sofa.n.01".
 
-    A label without a known name stays, because its number may tell kinds apart: "screw m4".
+    A label without a curated name stays, because its number may distinguish kinds: "screw m4".
     """
     names = curated_names()
-    if names.knows(label) or not names.knows(name := without_instance(label)):
+    if names.is_curated(label) or not names.is_curated(name := without_instance(label)):
         return label
     return name
 

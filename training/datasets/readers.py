@@ -180,11 +180,7 @@ _PATTERNS: Final = {
 
 
 def guess_format(path: Path) -> str:
-    """Return the name of a file's format, derived from the file name.
-
-    Raises:
-        DatasetError: the name matches no known format.
-    """
+    """Return the name of a file's format, derived from the file name."""
     for pattern, name in _PATTERNS.items():
         if fnmatchcase(path.name, pattern):
             return name

@@ -44,12 +44,7 @@ MAX_LISTED: Final = 32
 
 
 class InvalidLinesError(DatasetError):
-    """Lines of a file are invalid.
-
-    Attributes:
-        errors: the first `MAX_LISTED` errors, in the order of the lines.
-        count: number of all errors.
-    """
+    """Lines of a file are invalid. `count` errors; `errors` has the first `MAX_LISTED` of them."""
 
     def __init__(self, path: Path, errors: Sequence[DatasetError], count: int) -> None:
         first = errors[0]
@@ -82,11 +77,7 @@ Length = Annotated[Number, Field(ge=0)]
 
 @pydantic_dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid"))
 class AnnotatedObject:
-    """One annotated object. None means that a value is unknown.
-
-    Raises:
-        ValueError: the label is blank, or a number is not finite or out of range.
-    """
+    """One annotated object. None means that a value is unknown."""
 
     id: Id  # distinct within the scene
     label: Text
@@ -104,11 +95,7 @@ class AnnotatedObject:
 
 @dataclass(frozen=True, slots=True)
 class AnnotatedScene:
-    """One annotated scene. Relations are triples (subject index, relation, object index).
-
-    Raises:
-        ValueError: two objects have the same id, or a link or relation names an unknown object.
-    """
+    """One annotated scene. Relations are triples (subject index, relation, object index)."""
 
     scene_id: str  # distinct within the data source
     source: str

@@ -53,8 +53,8 @@ def _stated_roles(scene: AnnotatedScene) -> Iterable[Role]:
     """Yield role, index of the object in this role and index of the larger object."""
     for subject, relation, anchor in scene.relations or ():
         if relation in _ROLES:
-            ends = (anchor, subject) if relation == "contains" else (subject, anchor)
-            yield _ROLES[relation], *ends
+            small, large = (anchor, subject) if relation == "contains" else (subject, anchor)
+            yield _ROLES[relation], small, large
 
 
 def lift_of(thing: AnnotatedObject, support: AnnotatedObject) -> float | None:
@@ -65,6 +65,7 @@ def lift_of(thing: AnnotatedObject, support: AnnotatedObject) -> float | None:
 
 
 def _table(own: Counter[Role], vocabulary: Vocabulary) -> RoleCounts:
+    """Return the counts of pairs and of larger objects, with those of their kin."""
     V, kin = len(vocabulary), _kin(vocabulary)
     pairs: defaultdict[int, np.ndarray] = defaultdict(lambda: np.zeros(3, np.float32))
     anchor = np.zeros((V, 3), np.float32)

@@ -41,24 +41,17 @@ Side = Literal["left", "right", "front", "around"]
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A piece of furniture or a small object, added with a probability in ``most`` attempts each.
-
-    Attributes:
-        size: mean extents of the piece.
-        where: place of the piece: at a wall, in the centre, hung on a wall, or under the ceiling.
-            Small objects stand on the piece that carries them.
-        carries: small objects that can stand on the piece.
-        beside: pieces beside the piece, such as a nightstand left of a bed, with their sides. The
-            side is seen from the wall behind the main piece; ``around`` means all four sides. The
-            ``chance`` of the adjacent piece applies to each side.
-    """
+    """A piece of furniture or a small object, which a room contains at most ``most`` times."""
 
     label: str
-    size: Size
-    chance: float = 1.0
-    where: Where = "wall"
+    size: Size  # mean extents
+    chance: float = 1.0  # probability of an attempt
+    where: Where = "wall"  # not used for small objects, which stand on the piece that carries them
     most: int = 1
-    carries: tuple[Piece, ...] = ()
+    carries: tuple[Piece, ...] = ()  # small objects that can stand on the piece
+    # Pieces beside the piece, such as a nightstand left of a bed, with their sides. The side is
+    # seen from the wall behind the main piece; ``around`` means all four sides. The ``chance`` of
+    # the adjacent piece applies to each side.
     beside: tuple[tuple[Piece, Side], ...] = ()
 
 
@@ -112,9 +105,6 @@ def generate_rooms(count: int, seed: int, rooms: Rooms = ROOMS) -> list[Annotate
 
     Positions are in viewer axes. Objects have sizes, yaws, and the id of the furniture below them
     (``supported_by``). ``relations`` is None, because encoding derives the relations.
-
-    Raises:
-        ValueError: ``count`` is negative.
     """
     if count < 0:
         raise ValueError(f"count must not be negative, not {count}")
@@ -171,7 +161,11 @@ class _Layout:
         )
         objects = tuple(
             AnnotatedObject(
-                *(str(index), box.label, tuple(position), box.size, yaw),
+                id=str(index),
+                label=box.label,
+                position=tuple(position),
+                size=box.size,
+                yaw=yaw,
                 supported_by=None if box.support is None else str(box.support),
             )
             for (index, box), position, yaw in zip(
@@ -186,10 +180,11 @@ class _Layout:
         return x, y, z
 
     def _furnish(self, piece: Piece) -> None:
+        """Add a piece at a random free place, if `_ATTEMPTS` attempts find one."""
         size = self._random_size(piece.size)
         for _ in range(_ATTEMPTS):
             if (box := self._propose(piece, size)) is not None and self._free(box):
-                self._place(piece, box)
+                self._add(piece, box)
                 return
 
     def _propose(self, piece: Piece, size: Size) -> _Box | None:
@@ -220,7 +215,8 @@ class _Layout:
             z = min(self.rng.uniform(1.5, 1.8), _HEIGHT - 0.05 - size[2] / 2)
         return _Box(piece.label, x, y, z, size, side * math.pi / 2)
 
-    def _place(self, piece: Piece, box: _Box) -> None:
+    def _add(self, piece: Piece, box: _Box) -> None:
+        """Add a box, the small objects on it, and the pieces beside it."""
         support = len(self.boxes)
         self.boxes.append(box)
         for small in piece.carries:
@@ -231,6 +227,7 @@ class _Layout:
             self._put_beside(beside, side, box)
 
     def _put_on(self, small: Piece, support: int) -> None:
+        """Add a small object at a random free spot on top of a box."""
         base = self.boxes[support]
         size = self._random_size(small.size)
         if size[0] > base.size[0] or size[1] > base.size[1]:
@@ -245,6 +242,7 @@ class _Layout:
                 return
 
     def _put_beside(self, piece: Piece, where: Side, anchor: _Box) -> None:
+        """Add a piece at the named sides of a box, where the room has space."""
         for side in ("left", "right", "front", "back") if where == "around" else (where,):
             if self.rng.random() >= piece.chance:
                 continue
@@ -260,9 +258,10 @@ class _Layout:
                 x, y = _point_on(anchor, 0.0, v if side == "front" else -v)
             box = _Box(piece.label, x, y, size[2] / 2, size, anchor.yaw)
             if self._inside(box) and self._free(box):
-                self._place(piece, box)
+                self._add(piece, box)
 
     def _inside(self, box: _Box) -> bool:
+        """Return True if a box lies between the walls."""
         cos, sin = abs(math.cos(box.yaw)), abs(math.sin(box.yaw))
         half_x, half_y = box.size[0] / 2, box.size[1] / 2
         # Half the side lengths of the axis-aligned rectangle around the rotated box.

@@ -43,11 +43,7 @@ FRACTIONS: Final[dict[Protocol, dict[Part, float]]] = {
 def split(
     scenes: Sequence[AnnotatedScene], *, seed: int, protocol: Protocol = "group"
 ) -> dict[Part, list[AnnotatedScene]]:
-    """Return the scenes of each part, in their original order.
-
-    Raises:
-        ValueError: the protocol is unknown, or two scenes of a data source have the same id.
-    """
+    """Return the scenes of each part, in their original order."""
     if protocol not in FRACTIONS:
         raise ValueError(f"protocol must be one of {', '.join(FRACTIONS)}, not {protocol!r}")
     if len({(scene.source, scene.scene_id) for scene in scenes}) < len(scenes):
@@ -79,6 +75,7 @@ def stable_part(scene: AnnotatedScene, seed: int) -> Part:
 
 
 def _stable_part(unit: str, seed: int) -> Part:
+    """Return the part of a unit from a hash of the seed and its name."""
     fraction = int.from_bytes(_rank(seed, unit)[:8], "big") / 2**64
     for part, share in FRACTIONS["stable"].items():
         if fraction < share:
@@ -116,7 +113,7 @@ def _families(
 
 
 def _assign(
-    rooms_of: Mapping[str, Counter[str]], shares: Mapping[Part, float], seed: int
+    rooms_of: Mapping[str, Counter[str]], fractions: Mapping[Part, float], seed: int
 ) -> dict[str, Part]:
     """Assign each unit to the part that is furthest below its target share of scenes.
 
@@ -136,10 +133,10 @@ def _assign(
             # Number of additional scenes with which a part reaches its target share.
             lack = {
                 part: sum(
-                    share * (counts.total() + weight[unit]) - counts[part]
+                    fraction * (counts.total() + weight[unit]) - counts[part]
                     for counts in (in_stratum, overall)
                 )
-                for part, share in shares.items()
+                for part, fraction in fractions.items()
             }
             part_of[unit] = part = max(lack, key=lack.__getitem__)
             in_stratum[part] += weight[unit]

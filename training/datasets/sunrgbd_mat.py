@@ -123,6 +123,7 @@ def read_sunrgbd_mat(path: Path) -> list[AnnotatedScene]:
 
 
 def _load(path: Path) -> Any:
+    """Return the variable SUNRGBDMeta of a MATLAB file. Raise DatasetError if it has none."""
     try:
         _check_sizes(path)
         content = loadmat(path, simplify_cells=True)

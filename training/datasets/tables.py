@@ -57,20 +57,15 @@ class Errors:
 
 
 class Row:
-    """One row of a table.
-
-    Args:
-        path: path of the file.
-        line: number of the line, from 1.
-        values: value of each column of the file.
-    """
+    """One row of a table: the values of the columns in a line of the file."""
 
     def __init__(self, path: Path, line: int, values: dict[str, str]) -> None:
-        self._path, self._line, self._values = path, line, values
+        self._path, self._values = path, values
+        self.position = f"line {line}"
 
     def error(self, column: str, problem: str) -> DatasetError:
         """Return an error about a value of the row."""
-        return DatasetError(self._path, f"line {self._line}, column {column}", problem)
+        return DatasetError(self._path, f"{self.position}, column {column}", problem)
 
     def __contains__(self, column: str) -> bool:
         return column in self._values
@@ -111,11 +106,8 @@ def read_table(
     """Yield the rows of a table in UTF-8, whose first line names the columns.
 
     Spaces around values are removed. Blank lines are skipped. A row with another number of values
-    is left out, and an error of the file ends the table. Both are added to the errors.
-
-    Args:
-        columns: columns that the file must have.
-        optional: columns that it may have. Any other named column is an error.
+    is left out, and an error of the file ends the table. Both are added to the errors. The file has
+    the `columns`, and may have the `optional` ones. Any other named column is an error.
     """
     line = 1
     try:
@@ -143,6 +135,7 @@ def read_table(
 
 
 def _decoded(path: Path) -> Iterator[str]:
+    """Yield the lines of a file in UTF-8."""
     for number, line in enumerate(read_lines(path, MAX_LINE), 1):
         try:
             yield line.decode("utf-8-sig")
@@ -154,11 +147,12 @@ def _decoded(path: Path) -> Iterator[str]:
 def _check_names(
     path: Path, names: Sequence[str], columns: Sequence[str], optional: Sequence[str]
 ) -> None:
+    """Raise DatasetError if a column is missing, named twice or unknown."""
     if missing := [name for name in columns if name not in names]:
         raise DatasetError(path, "line 1", f"must name the columns {', '.join(missing)}")
     named = [name for name in names if name]  # a spreadsheet may write empty columns
     if twice := sorted({name for name in named if named.count(name) > 1}):
         raise DatasetError(path, "line 1", f"names the column {twice[0]} twice")
     if unknown := [name for name in named if name not in (*columns, *optional)]:
-        known = ", ".join((*columns, *optional))
-        raise DatasetError(path, "line 1", f"has the unknown column {unknown[0]!r}; known: {known}")
+        names = ", ".join((*columns, *optional))
+        raise DatasetError(path, "line 1", f"has the unknown column {unknown[0]!r}; known: {names}")

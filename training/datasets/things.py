@@ -23,27 +23,17 @@ _CARRIERS: Final = ("hand", "hands", "people", "no")
 
 @dataclass(frozen=True, slots=True)
 class Thing:
-    """A kind of thing.
-
-    Attributes:
-        size: extents of a typical one in metres: long, wide and high.
-        large: how much longer a large one is, as a factor.
-        stands: share of each place where it stands: floor, wall, ceiling, surface, inside.
-        surface, container: whether things are commonly put on it or into it: no, sometimes or yes.
-        carried: who carries it: one hand, two hands, two people, or nobody ("no").
-        parent: label of the broader thing, or "".
-        other_names: names that detectors use for it.
-    """
+    """A kind of thing."""
 
     label: str
-    size: tuple[float, float, float]
-    large: float
-    stands: Mapping[str, float]
-    surface: str
-    container: str
-    carried: str
-    parent: str
-    other_names: tuple[str, ...]
+    size: tuple[float, float, float]  # extents of a typical one in metres: long, wide and high
+    large: float  # length of a large one, divided by the typical length
+    stands: Mapping[str, float]  # share of each of `_PLACES` where it stands
+    surface: str  # whether things are commonly put on it: no, sometimes or yes
+    container: str  # whether things are commonly put into it: no, sometimes or yes
+    carried: str  # by one hand, two hands, two people, or nobody ("no")
+    parent: str  # label of the broader thing, or ""
+    other_names: tuple[str, ...]  # names that detectors use for it
 
 
 def read_things(path: Path) -> dict[str, Thing]:
@@ -74,6 +64,7 @@ def read_things(path: Path) -> dict[str, Thing]:
 
 
 def _check_parents(label: str, things: Mapping[str, Thing], row: Row) -> None:
+    """Raise DatasetError if a parent has no row, or if the parents form a loop."""
     seen, at = {label}, things[label].parent
     while at:
         if at not in things:
@@ -85,6 +76,7 @@ def _check_parents(label: str, things: Mapping[str, Thing], row: Row) -> None:
 
 
 def _thing(row: Row) -> Thing:
+    """Return the thing of a row. Raise DatasetError if a value is invalid."""
     return Thing(
         label=row.text("label"),
         size=(row.number("long", 1000), row.number("wide", 1000), row.number("high", 1000)),
@@ -99,15 +91,15 @@ def _thing(row: Row) -> Thing:
 
 
 def _stands(row: Row) -> dict[str, float]:
+    """Return the share of each place where a thing stands. The shares add up to 1."""
     words = row.text("stands").split()
     try:
         shares = {place: float(share) for place, share in zip(words[::2], words[1::2], strict=True)}
     except ValueError:
         shares = {}
-    known = set(shares) <= set(_PLACES) and len(words) == 2 * len(shares)
-    if not known or not all(0 < share <= 1 for share in shares.values()):
-        shares = {}
-    if abs(sum(shares.values()) - 1) > 0.011:
+    is_valid = set(shares) <= set(_PLACES) and len(words) == 2 * len(shares)
+    is_valid = is_valid and all(0 < share <= 1 for share in shares.values())
+    if not is_valid or abs(sum(shares.values()) - 1) > 0.011:
         places = ", ".join(_PLACES)
         problem = f"must list shares that add up to 1, such as `floor .9 inside .1`; of {places}"
         raise row.error("stands", problem)

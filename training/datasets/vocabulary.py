@@ -32,6 +32,8 @@ class Names:
     not_objects: tuple[str, ...] = ()  # labels that never become a class
     surroundings: tuple[str, ...] = ()  # outdoor structures such as buildings
     anywhere: tuple[str, ...] = ()  # classes that belong in every room, such as pets and bags
+    placeholders: tuple[str, ...] = ()  # words of labels that name no kind of object
+    numbered: tuple[str, ...] = ()  # words that are placeholders if a number follows
     aliases: dict[str, tuple[str, ...]] = field(default_factory=dict)  # other names of each class
     # More specific names of each class. If a vocabulary has a class for the specific name, the
     # broader class is its parent. Otherwise the name can become an alias.
@@ -39,7 +41,7 @@ class Names:
     # Other names of each room type. The key "" lists names without a room type.
     rooms: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
-    def knows(self, label: str) -> bool:
+    def is_curated(self, label: str) -> bool:
         """Return True if a label is a curated name of a class in any spelling."""
         return label_key(label) in self._by_key
 
@@ -218,20 +220,15 @@ def read_vocabulary(path: Path) -> Vocabulary:
         raise ValueError(first_error(error)) from None
 
 
-def indoor_vocabulary() -> Vocabulary:
-    """Read the indoor vocabulary from the repository."""
-    return read_vocabulary(INDOOR_FILE)
-
-
 def source_vocabulary(
     scenes: Iterable[AnnotatedScene],
     *,
     minimum: int = MINIMUM_MENTIONS,
-    certain: Iterable[str] = (),
+    required: Iterable[str] = (),
 ) -> Vocabulary:
     """Build a vocabulary of the classes of one data source, without the base classes.
 
-    A label that is `certain` becomes a class, also with fewer objects than the minimum. Because the
+    A `required` label becomes a class, also with fewer objects than the minimum. Because the
     vocabulary has few classes, more specific names become aliases. For example, "coffee table"
     becomes an alias of "table".
     """
@@ -239,7 +236,7 @@ def source_vocabulary(
     # An empty entry preserves the curated spelling of a class without aliases.
     spellings = dict.fromkeys((*names.base, *names.household, *names.structure), ())
     aliases = spellings | names.aliases
-    base = tuple({label_key(name): name for name in map(names.canonical, certain)}.values())
+    base = tuple({label_key(name): name for name in map(names.canonical, required)}.values())
     mentioned_only = replace(names, base=base, household=(), kinds={}, aliases=aliases)
     return _with_kinds(build_vocabulary(scenes, mentioned_only, minimum=minimum))
 

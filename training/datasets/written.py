@@ -11,7 +11,12 @@ from app.scene import ObjectClass, Vocabulary, label_key
 from training.datasets.files import KNOWLEDGE
 from training.datasets.inventories import read_inventory
 from training.datasets.things import Thing
-from training.datasets.vocabulary import curated_names, indoor_vocabulary, with_room_aliases
+from training.datasets.vocabulary import (
+    INDOOR_FILE,
+    curated_names,
+    read_vocabulary,
+    with_room_aliases,
+)
 
 # A thing becomes a class if so many kinds of places are expected to have it.
 LEAST_PLACES: Final = 0.5
@@ -26,7 +31,7 @@ def written_vocabulary() -> Vocabulary:
     its nearest broader class. A name with a class of its own is never an alias. Of several classes
     with the same other name, `things.csv` comes before the curated names.
     """
-    names, indoor = curated_names(), indoor_vocabulary()
+    names, indoor = curated_names(), read_vocabulary(INDOOR_FILE)
     inventory = read_inventory(KNOWLEDGE / "inventories.csv")
     things, places = inventory.things, inventory.places
     expected: defaultdict[str, float] = defaultdict(float)
@@ -73,7 +78,7 @@ def with_things(vocabulary: Vocabulary, things: Mapping[str, Thing]) -> Vocabula
             described.setdefault(label_key(name), thing)
     classes = {label_key(label): label for label in vocabulary.labels}
     names = {thing.label: classes.get(label_key(thing.label)) for thing in things.values()}
-    known = {label for label, name in names.items() if name is not None}
+    with_class = {label for label, name in names.items() if name is not None}
     parents = {entry.label: entry.parent for entry in vocabulary.objects}
     aliases = _Aliases(vocabulary.labels)
     for entry in vocabulary.objects:
@@ -81,12 +86,12 @@ def with_things(vocabulary: Vocabulary, things: Mapping[str, Thing]) -> Vocabula
     objects = []
     for entry in vocabulary.objects:
         keys = map(label_key, (entry.label, *entry.aliases))
-        if (found := next(filter(None, map(described.get, keys)), None)) is not None:
-            aliases.add(entry.label, (found.label, *found.other_names))
-            parent = names.get(_broader(found, things, known) or "")
+        if (match := next(filter(None, map(described.get, keys)), None)) is not None:
+            aliases.add(entry.label, (match.label, *match.other_names))
+            parent = names.get(_broader(match, things, with_class) or "")
             if parents[entry.label] is None and entry.label not in _ancestors(parent, parents):
                 parents[entry.label] = parent
-            entry = replace(entry, size=entry.size or _size(found))
+            entry = replace(entry, size=entry.size or _size(match))
         objects.append(entry)
     objects = [
         replace(entry, parent=parents[entry.label], aliases=tuple(aliases.of[entry.label]))
@@ -97,11 +102,11 @@ def with_things(vocabulary: Vocabulary, things: Mapping[str, Thing]) -> Vocabula
 
 def _ancestors(label: str | None, parents: Mapping[str, str | None]) -> set[str]:
     """Return a class and its broader classes."""
-    found: set[str] = set()
+    ancestors: set[str] = set()
     while label is not None:
-        found.add(label)
+        ancestors.add(label)
         label = parents[label]
-    return found
+    return ancestors
 
 
 class _Aliases:

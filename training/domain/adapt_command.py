@@ -7,14 +7,14 @@ import shlex
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import torch
 import typer
 from pydantic import JsonValue
 
-from app.model import SceneModel
+from app.model import Calibration, SceneModel
 from app.registry import (
     DEFAULT_STORE,
     Artifact,
@@ -31,8 +31,8 @@ from training.datasets.placeholders import left_out_line
 from training.datasets.records import digest_of
 from training.domain.adaptation import FEWEST, Adapted, Measured, adapted
 from training.domain.home import JUDGED, Home, confirmed_scene
-from training.domain.init_command import ROWS, StorePath, console, fail
 from training.domain.material import read_material
+from training.domain.terminal import ROWS, StorePath, console, fail, print_lines
 from training.evaluation.metrics import Ratio
 from training.fit.configuration import ConfigError
 from training.runs.example_scenes import choose_examples
@@ -90,16 +90,15 @@ def adapt_command(
         with console.status("reading the scenes") as status:
             home = Home.of(parent.model, recorded, places)
             _print_home(home, parent)
-            _print(filter(None, [left_out_line(material.left_out, ROWS)]))
+            print_lines(*filter(None, [left_out_line(material.left_out, ROWS)]))
             result = adapted(home, seed=seed, progress=status.update)
         _print_result(result)
         if result.model is None:
-            console.print(_NOTHING, soft_wrap=True)
+            print_lines(_NOTHING)
             raise typer.Exit(3)
-        model_at_home, measured = result.model, result.measured
-        scenes = recorded, [*map(confirmed_scene, places)]
-        description = _describe(parent, home, model_at_home, measured, scenes, name, version, seed)
-        published = publish_rounded(models, description, model_at_home)
+        written = [*map(confirmed_scene, places)]
+        description = _description(home, parent, result, recorded, written, name, version, seed)
+        published = publish_rounded(models, description, result.model)
         _print_next(models, store, published, alias or "default" if promote else None)
     except (ConfigError, DatasetError, RegistryError, ValueError) as error:
         fail(error)
@@ -142,6 +141,7 @@ def _corrected(files: Iterable[Sequence[AnnotatedScene]]) -> list[AnnotatedScene
 
 
 def _print_home(home: Home, parent: Artifact) -> None:
+    """Print the numbers of scenes, new words, and objects without influence."""
     lines = [
         f"{home.recorded} recorded scenes; {len(home.scenes) - len(home.written)} distinct scenes, "
         f"{home.confirmed} of these confirmed; model {_reference(parent)}"
@@ -163,15 +163,11 @@ def _print_home(home: Home, parent: Artifact) -> None:
         for label, scenes in most:
             more = ", ..." if len(scenes) > _NAMED else ""
             lines.append(f"  {label} ({len(scenes)}): {', '.join(scenes[:_NAMED])}{more}")
-    _print(lines)
-
-
-def _print(lines: Iterable[str]) -> None:
-    for line in lines:
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    print_lines(*lines)
 
 
 def _print_result(result: Adapted) -> None:
+    """Print the comparison in folds, the objections, and the exceptions."""
     lines = []
     if (measured := result.measured) is None:
         lines.append(
@@ -192,25 +188,24 @@ def _print_result(result: Adapted) -> None:
         lines.append(f"exceptions, never reported from now on: {counts} (confirmed scenes)")
     if result.relations:
         lines.append(f"usual from now on: {', '.join(result.relations[:ROWS])} (confirmed scenes)")
-    _print(lines)
+    print_lines(*lines)
 
 
-def _describe(
-    parent: Artifact,
+def _description(
     home: Home,
-    model: SceneModel,
-    measured: Measured | None,
-    scenes: tuple[Sequence[AnnotatedScene], Sequence[AnnotatedScene]],
+    parent: Artifact,
+    result: Adapted,
+    recorded: Sequence[AnnotatedScene],
+    written: Sequence[AnnotatedScene],
     name: str,
     version: str,
     seed: int,
 ) -> Description:
     """Return the description of the adapted model. Its terms are those of the parent.
 
-    Args:
-        scenes: recorded scenes, and scenes of written places.
+    The written scenes are those of written places.
     """
-    manifest, (recorded, written) = parent.manifest, scenes
+    manifest, model = parent.manifest, result.model or parent.model
     own = next((scene.source for scene in recorded if scene.source != "jsonl"), name)
     sources = [
         DataSource(
@@ -233,16 +228,16 @@ def _describe(
         calibration=_calibration(home, model),
         training={"parent": origin, "seed": seed, "confirmed": home.confirmed},
         data=(*manifest.data, *sources),
-        metrics=tuple(_metrics(measured, own)),
+        metrics=tuple(_metrics(result.measured, own)),
         terms=manifest.terms,
         libraries={library: importlib.metadata.version(library) for library in _LIBRARIES},
         examples=choose_examples([*recorded, *written], model.vocabulary) or manifest.examples,
     )
 
 
-def _calibration(home: Home, model: SceneModel) -> Any:
+def _calibration(home: Home, model: SceneModel) -> Calibration:
     """Return the calibration, with the popularity of the new classes in the home."""
-    calibration, V = model.calibration, home.known[0]
+    calibration, V = model.calibration, home.parent_classes
     if not calibration.popularity:
         return calibration
     count, n = home.tensors.v.sum(0)[V:].double().numpy(), len(home.scenes)
@@ -252,7 +247,7 @@ def _calibration(home: Home, model: SceneModel) -> Any:
 
 
 def _metrics(measured: Measured | None, source: str) -> Iterable[Metric]:
-    """Yield what the folds measured, for the parent and for the adapted weights."""
+    """Yield the metrics of the folds, for the parent and for the adapted weights."""
     if measured is None:
         return
     tables = {"scenes with an alarm": measured.alarms, "MRR, one removed": measured.rank}
@@ -266,6 +261,7 @@ def _metrics(measured: Measured | None, source: str) -> Iterable[Metric]:
 
 
 def _print_next(store: Store, root: str, artifact: Artifact, alias: str | None) -> None:
+    """Print the published version. Move the alias, or print how to move it."""
     reference = _reference(artifact)
     console.print(f"published {reference}, digest {artifact.digest[:12]}")
     if alias is None:
@@ -278,4 +274,4 @@ def _print_next(store: Store, root: str, artifact: Artifact, alias: str | None) 
         if before is not None:
             command = f"python -m app.registry alias {alias} {before} --store {shlex.quote(root)}"
             line += f"; to roll back: {command}"
-    console.print(line, soft_wrap=True, markup=False, highlight=False)
+    print_lines(line)

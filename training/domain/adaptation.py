@@ -20,11 +20,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 
 from app.inference import Weights
 from app.model import SceneModel
 from app.scene import CANONICAL
-from training.datasets.array_types import Flags, Floats, Ints
 from training.domain.confirmed_relations import with_confirmed
 from training.domain.home import Home, alarms_of, with_exceptions
 from training.fit.adapt import adapt, part_loss
@@ -45,24 +46,20 @@ _LEAVE_ONE_OUT = 0.0
 class Measured:
     """The parent and the adapted weights on N scenes of the folds that their fit did not see.
 
-    Attributes:
-        loss: (N, 2) log loss of hidden objects: of the parent, and of the adapted weights.
-        rank: (M, 2) reciprocal rank of a hidden object.
-        alarms: (N, 2) True if the scene has an alarm about an object.
-        change: mean change of the probability of unrecorded classes in rooms of the parent.
+    The columns are those of the parent, and of the adapted weights.
     """
 
-    loss: Floats
-    rank: Floats
-    alarms: Flags
-    change: float
+    loss: Float[NDArray, "N 2"]  # log loss of hidden objects
+    rank: Float[NDArray, "M 2"]  # reciprocal rank of a hidden object
+    alarms: Bool[NDArray, "N 2"]  # True if the scene has an alarm about an object
+    change: float  # mean change of the probability of unrecorded classes in rooms of the parent
 
     @property
     def t(self) -> float:
-        """t statistic of the gain in log loss; inf if all scenes gain equally."""
-        gain = self.loss[:, 0] - self.loss[:, 1]
-        error = float(gain.std(ddof=1)) / math.sqrt(len(gain))
-        return float(gain.mean()) / error if error else math.copysign(math.inf, gain.mean())
+        """t statistic of the decrease of the log loss; inf if it is equal in all scenes."""
+        decrease = self.loss[:, 0] - self.loss[:, 1]
+        mean, error = decrease.mean(), float(decrease.std(ddof=1)) / math.sqrt(len(decrease))
+        return float(mean) / error if error else math.copysign(math.inf, mean)
 
     def objections(self) -> Iterator[str]:
         """Yield the reasons against the adapted weights."""
@@ -77,21 +74,14 @@ class Measured:
 
 @dataclass(frozen=True)
 class Adapted:
-    """The result.
+    """The result of an adaptation."""
 
-    Attributes:
-        model: the new model in memory, or None if the recordings teach nothing.
-        measured: comparison in folds; None with fewer than `FEWEST` scenes.
-        objections: reasons of the gate against new weights.
-        exceptions: classes that the new model never reports, and in how many confirmed scenes it
-            would report them.
-        relations: confirmed relations of classes that the parent reports, in words.
-    """
-
-    model: SceneModel | None
-    measured: Measured | None
-    objections: tuple[str, ...]
+    model: SceneModel | None  # the new model in memory, or None if it would equal the parent
+    measured: Measured | None  # comparison in folds; None with fewer than `FEWEST` scenes
+    objections: tuple[str, ...]  # reasons of the gate against new weights
+    # Classes that the new model never reports, and in how many confirmed scenes it would.
     exceptions: Counter[str]
+    # Confirmed relations of classes that the parent reports, in words.
     relations: tuple[str, ...] = ()
 
 
@@ -107,7 +97,7 @@ def adapted(
         objections = tuple(measured.objections())
         if not objections:
             progress("adapting to all scenes")
-            weights = adapt(model.weights, home.tensors, known=home.learnt, seed=seed)
+            weights = adapt(model.weights, home.tensors, trained_on=home.trained_on, seed=seed)
             model = replace(model, weights=weights)
     exceptions = home.confirmed_alarms(model)
     news = (exceptions, home.relations, home.new_classes, home.new_rooms)
@@ -123,7 +113,7 @@ def measure(home: Home, seed: int, progress: Callable[[str], None]) -> Measured:
     """Compare the parent with adapted weights in folds of groups.
 
     Scenes with fewer than two classes have no part in it. Written places take part in each fit, and
-    are never asked about. If a fold of groups has no other scene, the folds are made of scenes.
+    never in a fold. With fewer groups than folds, the folds are made of scenes.
     """
     index = home.measurable
     names, group = np.unique([home.scenes[k].group for k in index], return_inverse=True)
@@ -134,13 +124,13 @@ def measure(home: Home, seed: int, progress: Callable[[str], None]) -> Measured:
     loss, rank, alarms, change = [], [], [], []
     for fold in range(_FOLDS):
         progress(f"comparing in folds: {fold + 1} of {_FOLDS}")
-        held_out, seen = index[fold_of == fold], index[fold_of != fold]
+        test, seen = index[fold_of == fold], index[fold_of != fold]
         scenes = home.tensors.rows(torch.from_numpy(np.concatenate([seen, home.written])))
-        weights = adapt(home.parent.weights, scenes, known=home.learnt, seed=seed)
+        weights = adapt(home.parent.weights, scenes, trained_on=home.trained_on, seed=seed)
         sides = home.parent, replace(home.parent, weights=weights)
-        loss.append(_losses(home, held_out, sides, seed))
-        rank.append(_ranks(home, held_out, sides, seed))
-        alarms.append(_alarms(home, held_out, sides))
+        loss.append(_losses(home, test, sides, seed))
+        rank.append(_ranks(home, test, sides, seed))
+        alarms.append(_alarms(home, test, sides))
         change.append(_change(home, weights, scenes.v.sum(0) > 0, seed))
     return Measured(
         np.concatenate(loss), np.concatenate(rank), np.concatenate(alarms), float(np.mean(change))
@@ -148,11 +138,12 @@ def measure(home: Home, seed: int, progress: Callable[[str], None]) -> Measured:
 
 
 Sides = tuple[SceneModel, SceneModel]
+"""The parent, and the model with adapted weights."""
 
 
 @torch.no_grad()
-def _losses(home: Home, index: Ints, sides: Sides, seed: int) -> Floats:
-    """Return the mean log loss of random parts of each scene, (N, 2)."""
+def _losses(home: Home, index: Int[NDArray, "N"], sides: Sides, seed: int) -> Float[NDArray, "N 2"]:
+    """Return the mean log loss of random parts of each scene."""
     scenes = home.tensors.rows(torch.from_numpy(index))
     generator = torch.Generator().manual_seed(seed)
     table = torch.zeros(len(scenes), 2)
@@ -166,8 +157,8 @@ def _losses(home: Home, index: Ints, sides: Sides, seed: int) -> Floats:
 
 
 @torch.no_grad()
-def _ranks(home: Home, index: Ints, sides: Sides, seed: int) -> Floats:
-    """Return the reciprocal rank of one hidden class of each scene, (N, 2)."""
+def _ranks(home: Home, index: Int[NDArray, "N"], sides: Sides, seed: int) -> Float[NDArray, "N 2"]:
+    """Return the reciprocal rank of one hidden class of each scene."""
     scenes = home.tensors.rows(torch.from_numpy(index))
     parts = random_parts(scenes.v, 1.0, torch.Generator().manual_seed(seed))
     hidden = (scenes.v - parts.listed).argmax(1, keepdim=True)
@@ -175,13 +166,13 @@ def _ranks(home: Home, index: Ints, sides: Sides, seed: int) -> Floats:
     for column, side in enumerate(sides):
         machine = machine_of(side.weights)
         log_odds = machine.object_log_odds(parts.listed, room=scenes.room, share=parts.share)
-        log_odds[(parts.listed > 0) | ~scenes.asked] = -torch.inf
+        log_odds[(parts.listed > 0) | ~scenes.observed] = -torch.inf
         table[:, column] = 1 / (1 + (log_odds > log_odds.gather(1, hidden)).sum(1))
     return table.numpy()
 
 
-def _alarms(home: Home, index: Ints, sides: Sides) -> Flags:
-    """Return whether each scene has an alarm about an object, (N, 2)."""
+def _alarms(home: Home, index: Int[NDArray, "N"], sides: Sides) -> Bool[NDArray, "N 2"]:
+    """Return whether each scene has an alarm about an object."""
     table = np.zeros((len(index), 2), bool)
     for row, number in enumerate(index.tolist()):
         scene = home.scenes[number]
@@ -200,7 +191,7 @@ def _change(home: Home, weights: Weights, recorded: torch.Tensor, seed: int) -> 
         for side in (home.parent.weights, weights)
     )
     other = ~recorded & torch.from_numpy(~home.parent.vocabulary.structure)
-    other[home.known[0] :] = False
+    other[home.parent_classes :] = False
     counted = (other & (parts.listed == 0) & (torch.maximum(before, after) > 0.01)).float()
     change = ((after - before).abs() * counted).sum() / counted.sum().clamp(min=1)
     return float(change)

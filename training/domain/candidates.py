@@ -65,12 +65,7 @@ class Candidate:
 def run_candidate(folder: Path, data: Path | None, say: Progress) -> Candidate:
     """Load a finished run as a candidate, and calibrate its model as for publication.
 
-    Args:
-        data: folder with the scene files. None means the folder that the run records.
-
-    Raises:
-        RunError: the folder holds no finished run, or the scene files have changed since training.
-        ConfigError, DatasetError: the scene files cannot be read.
+    `data` is the folder with the scene files. None means the folder that the run records.
     """
     run = load_run(folder)
     root = data or run.data_folder
@@ -82,11 +77,7 @@ def run_candidate(folder: Path, data: Path | None, say: Progress) -> Candidate:
 
 
 def stored_candidate(reference: str, store: Store) -> Candidate:
-    """Load a published model as a candidate.
-
-    Raises:
-        StoreError, ArtifactError: the model does not exist or cannot be used.
-    """
+    """Load a published model as a candidate."""
     name, version = store.resolve(reference)
     artifact = store.load(name, version)
     try:
@@ -99,12 +90,7 @@ def stored_candidate(reference: str, store: Store) -> Candidate:
 
 
 def find(reference: str, store: Store, data: Path | None, say: Progress) -> Candidate:
-    """Return the candidate that a reference names: a folder of a run, `BASELINES`, or a model.
-
-    Raises:
-        ConfigError: the reference names none of these.
-        RunError: the folder holds no finished run. See also `run_candidate` and `stored_candidate`.
-    """
+    """Return the candidate that a reference names: a folder of a run, `BASELINES`, or a model."""
     if reference == BASELINES:
         # The baselines are fitted later, on the training scenes of the other candidate.
         return Candidate(BASELINES, None, {}, None)
@@ -153,12 +139,7 @@ HeldOut = tuple[list[AnnotatedScene], tuple[str, ...]]
 def held_out(a: Candidate, b: Candidate, sources: Sources) -> HeldOut:
     """Return the first model's test scenes without scenes that the second model learnt from.
 
-    Args:
-        sources: current scenes of the first model's configuration, by data source.
-
-    Raises:
-        ConfigError: the first model does not record its split, its test part is empty, or the
-            second model learnt from all its test scenes.
+    The sources have the current scenes of the first model's configuration, by name.
     """
     if a.config is None:
         raise ConfigError(
@@ -205,8 +186,8 @@ def _drop_learnt(candidate: Candidate, scenes: list[AnnotatedScene], sources: So
     data = None if candidate.config is None else candidate.config.data
     if data is not None and data.split == "stable":
         seed = data.split_seed
-        held = [s for s in scenes if s.source not in shared or stable_part(s, seed) == "test"]
-        return held, ()
+        test = [s for s in scenes if s.source not in shared or stable_part(s, seed) == "test"]
+        return test, ()
     names = [] if data is None else list(map(source_name, data.sources))
     if data is None or any(candidate.learnt.get(x) != digests.get(x, "") for x in names):
         note = (

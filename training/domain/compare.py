@@ -11,7 +11,6 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from rich import box
-from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
@@ -21,7 +20,7 @@ from training.datasets.batches import SceneTensors, scene_tensors
 from training.datasets.cases import some_scenes
 from training.datasets.files import DATA
 from training.domain.candidates import BASELINES, Candidate, find, held_out
-from training.domain.init_command import StorePath, fail
+from training.domain.terminal import StorePath, console, fail, print_lines
 from training.domain.translation import Translation, same_classes
 from training.evaluation.metrics import Figure
 from training.evaluation.model import Model
@@ -52,22 +51,18 @@ SCENES = 300
 
 _COLOURS = {"better": "green", "worse": "red"}
 
-console = Console()
-
 
 @dataclass(frozen=True)
 class Comparison:
-    """Comparison of two models.
-
-    `unmeasured` names the relation tasks that were measured for the second model before its
-    publication, but not in this comparison. It is empty if this comparison measures any such task.
-    """
+    """Comparison of two models."""
 
     results: Results  # of both models; the first model is the reference `ours`
     b: str  # title of the second model
     scenes: int
     groups: int  # groups of near-duplicates among the compared scenes
     notes: tuple[str, ...]
+    # Relation tasks that were measured for the second model before its publication, but not in this
+    # comparison. Empty if this comparison measures any such task.
     unmeasured: tuple[str, ...] = ()
 
     @property
@@ -122,15 +117,14 @@ def compare_command(
     if output is not None:
         text = json.dumps(comparison.to_dict(), indent=1, ensure_ascii=False)
         output.write_text(text + "\n", encoding="utf-8")
-    show(comparison, console)
+    show(comparison)
 
 
-def show(comparison: Comparison, console: Console) -> None:
+def show(comparison: Comparison) -> None:
     """Print the metrics of a comparison as a table, with its notes."""
     titles = (comparison.a, comparison.b)
     heading = f"{comparison.scenes} held-out scenes of {comparison.groups} groups"
-    text = f"{heading}\nA: {comparison.a}\nB: {comparison.b}"
-    console.print(text, markup=False, highlight=False, soft_wrap=True)
+    print_lines(heading, f"A: {comparison.a}", f"B: {comparison.b}")
     headings = "task, metric", "A", "B", "A - B, 95 % interval", "A is"
     # Without edges and padding, the table fits into 80 columns.
     table = Table(*headings, box=box.SIMPLE_HEAD, show_edge=False, padding=0)
@@ -165,12 +159,7 @@ def difference_text(figure: Figure) -> str:
 def compare(a: Candidate, b: Candidate, root: Path, *, say: Progress) -> Comparison:
     """Measure both models on the tasks of `COMPARED`. The questions use the first model's classes.
 
-    Args:
-        root: folder with the scene files of the first model's configuration.
-
-    Raises:
-        ConfigError: the first model lacks its training configuration, its scene files are missing,
-            or too few scenes are held out from both models.
+    `root` is the folder with the scene files of the first model's configuration.
     """
     if a.config is None or a.vocabulary is None:
         raise ConfigError(
@@ -213,11 +202,7 @@ def side_by_side(
     *,
     progress: Progress = silent,
 ) -> Results:
-    """Measure every metric that both models support, and the differences, paired by group.
-
-    Raises:
-        ValueError: all scenes belong to one group, or the models share no metric.
-    """
+    """Measure every metric that both models support, and the differences, paired by group."""
     setting = Setting(scenes, structure, limit=None)
     if len(np.unique(scenes.group_ids)) < 2:
         raise ValueError("the scenes belong to one group, but intervals need at least two groups")
@@ -237,14 +222,14 @@ def unmeasured(rows: Sequence[Difference], other: Candidate) -> tuple[str, ...]:
 
 
 def _notes(a: Candidate, b: Candidate, test: Sequence[AnnotatedScene]) -> Iterator[str]:
-    """Generate remarks on unknown classes of the second model, and on the number of scenes."""
+    """Generate remarks on classes that the second model lacks, and on the number of scenes."""
     ours, theirs = a.vocabulary, b.vocabulary
     if ours is not None and theirs is not None and not same_classes(ours, theirs):
-        is_unknown = Translation.between(ours, theirs).model_class < 0
+        lacks = Translation.between(ours, theirs).model_class < 0
         labels = [thing.label for scene in test for thing in scene.objects]
         mentions = [index for label in labels if (index := ours.index(label)) is not None]
-        if missing := int(is_unknown.sum()):
-            share = int(is_unknown[mentions].sum()) / max(len(mentions), 1)
+        if missing := int(lacks.sum()):
+            share = int(lacks[mentions].sum()) / max(len(mentions), 1)
             yield (
                 f"the questions use the {len(ours)} classes of {a.title}. {b.title} lacks "
                 f"{missing} of these classes ({share:.0%} of the objects in the scenes). Objects "

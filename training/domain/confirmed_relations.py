@@ -34,12 +34,12 @@ Triple = tuple[int, int, int]
 def reported_relations(model: SceneModel, recorded: Sequence[AnnotatedScene]) -> set[Triple]:
     """Return the relations (a, i, j) of classes that the model reports in confirmed scenes.
 
-    They are stacked relations, such as on-top. Each scene is asked as stated and with its boxes.
-    Boxes also show the stand of each object, so the model reports other relations with boxes.
+    They are stacked relations, such as on-top. The model judges each scene as stated and with its
+    boxes. Boxes also show the stand of each object, so it reports other relations with boxes.
     """
     if model.places is None:
         return set()
-    found: set[Triple] = set()
+    reported: set[Triple] = set()
     confirmed = [scene for scene in recorded if scene.confirmed]
     words = [_canonical(scene, model.vocabulary) for scene in confirmed]
     for encoded in encode(words, model.vocabulary, model.places.roles):
@@ -54,16 +54,16 @@ def reported_relations(model: SceneModel, recorded: Sequence[AnnotatedScene]) ->
                 if entry["is_misplaced"] and entry["object"] != THE_FLOOR:
                     a, i, j = canonical_triple(index, entry)
                     subject, other = encoded.instance_classes[[i, j]].tolist()
-                    found |= {(a, subject, other)} if a in STACKED else set()
-    return found
+                    reported |= {(a, subject, other)} if a in STACKED else set()
+    return reported
 
 
 def _canonical(scene: AnnotatedScene, vocabulary: Vocabulary) -> AnnotatedScene:
-    """Return the scene with the label of the class in place of each known label."""
-    labels = (vocabulary.look_up(thing.label) for thing in scene.objects)
+    """Return the scene with the label of the class in place of each name of it."""
+    matches = (vocabulary.look_up(thing.label) for thing in scene.objects)
     objects = tuple(
-        thing if found is None else replace(thing, label=vocabulary.labels[found.entry])
-        for thing, found in zip(scene.objects, labels, strict=True)
+        thing if match is None else replace(thing, label=vocabulary.labels[match.entry])
+        for thing, match in zip(scene.objects, matches, strict=True)
     )
     return replace(scene, objects=objects)
 
@@ -77,6 +77,6 @@ def with_confirmed(artifact: SceneModel, triples: Iterable[Triple]) -> SceneMode
     calibration = artifact.calibration.model_copy(update={"misplaced": misplaced})
     new = np.array([(a * V + i) * V + j for a, i, j in triples], places.triple.dtype)
     keys, index = np.unique(np.concatenate([places.triple, new]), return_inverse=True)
-    held = np.bincount(index, np.concatenate([places.held, np.full(len(new), _SCENES)]))
-    places = replace(places, triple=keys, held=held.astype(places.held.dtype))
+    scenes = np.bincount(index, np.concatenate([places.held, np.full(len(new), _SCENES)]))
+    places = replace(places, triple=keys, held=scenes.astype(places.held.dtype))
     return replace(artifact, places=places, calibration=calibration)

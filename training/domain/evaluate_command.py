@@ -9,14 +9,13 @@ from typing import Annotated, Any
 import torch
 import typer
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from app.registry import DEFAULT_STORE, Artifact, Metric, RegistryError, Store
 from training.datasets import DatasetError
 from training.datasets.batches import subset
 from training.datasets.files import DATA
-from training.domain.init_command import StorePath, fail
+from training.domain.terminal import StorePath, console, fail, print_lines
 from training.evaluation.everyday_task import EVERYDAY
 from training.evaluation.metrics import Figure
 from training.evaluation.outside import RoomList, read_test
@@ -27,8 +26,7 @@ from training.runs.config_files import stored_config
 from training.runs.pipeline import prepare
 
 Figures = dict[str, list[Metric]]
-
-console = Console()
+"""Metrics by model."""
 
 
 def evaluate_command(
@@ -94,7 +92,7 @@ def _ask(test: RoomList, artifacts: dict[str, Artifact]) -> Figures:
         learnt = test.trained(artifact)
         remarks = [f"{source} is training data of this model, not new data" for source in learnt]
         for remark in filter(None, [test.remark(artifact.model), *remarks]):
-            console.print(f"{name}: {remark}", markup=False, highlight=False, soft_wrap=True)
+            print_lines(f"{name}: {remark}")
     return figures
 
 
@@ -117,13 +115,17 @@ def _measure(
     test = subset(tensors.test, torch.tensor(index, dtype=torch.int64))
     with console.status(reference) as status:
         return evaluate(
-            *(artifact.model, test, tensors.structure, tensors.train),
+            artifact.model,
+            test,
+            tensors.structure,
+            tensors.train,
             everyday=EVERYDAY,
             progress=status.update,
         )
 
 
 def _show(tables: Figures, title: str | None = None) -> None:
+    """Print a table of the metrics of all models."""
     figures: dict[tuple[str, str, str], dict[str, str]] = {}
     for name, rows in tables.items():
         for row in rows:

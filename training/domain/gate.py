@@ -32,12 +32,12 @@ from training.evaluation.tasks import in_words
 # Accepted loss of a primary metric when a new version replaces the served version.
 MARGIN = 0.02
 
-GAIN = 0.02
+LEAST_LEAD = 0.02
 """Minimum lead of a new version over popularity, in MRR. A smaller lead is of no use, even if it is
 certain: a model that is trained on shuffled labels can lead by 0.006."""
 
 NEW = "the new version"
-_REQUIRED = f"at least {GAIN:+.3f}, whole interval above zero"
+_REQUIRED = f"at least {LEAST_LEAD:+.3f}, whole interval above zero"
 
 
 @dataclass(frozen=True)
@@ -70,18 +70,18 @@ class Usefulness:
                 "classes. Provide more scenes"
             ]
         reasons = []
-        gain, loss = self.differences[POPULARITY.name], self.differences[EASE.name]
-        if not (gain.value >= GAIN and gain.low > 0):
+        popularity, ease = self.differences[POPULARITY.name], self.differences[EASE.name]
+        if not (popularity.value >= LEAST_LEAD and popularity.low > 0):
             reasons.append(
                 f"{NEW} is not clearly better than {POPULARITY.name}, which only knows how "
-                f"frequent each class is: difference {difference_text(gain)} (required: "
+                f"frequent each class is: difference {difference_text(popularity)} (required: "
                 f"{_REQUIRED}), {self._sample_text()}. Check the labels, train longer or provide "
                 "more scenes"
             )
-        if loss.high < 0:
+        if ease.high < 0:
             reasons.append(
                 f"{NEW} is worse than EASE, a plain model of co-occurrence: difference "
-                f"{difference_text(loss)}, {self._sample_text()}"
+                f"{difference_text(ease)}, {self._sample_text()}"
             )
         return reasons
 
@@ -95,11 +95,11 @@ def measure_usefulness(artifact: SceneModel, data: TrainingData, *, say: Progres
     The baselines learn from the training scenes of the run. Scenes with incomplete object lists are
     left out, unless all test scenes are such scenes.
     """
-    complete = data.test.complete.nonzero().squeeze(1)
-    scenes = some_scenes(subset(data.test, complete) if len(complete) else data.test, SCENES)
+    complete = data.test.complete
+    scenes = some_scenes(subset(data.test, complete) if complete.any() else data.test, SCENES)
     # A question hides one class and lists the others.
     has_two_classes = ((scenes.v > 0) & ~data.structure).sum(1) > 1
-    scenes = subset(scenes, has_two_classes.nonzero().squeeze(1))
+    scenes = subset(scenes, has_two_classes)
     usefulness = Usefulness(scenes=len(scenes), groups=len(np.unique(scenes.group_ids)))
     if usefulness.groups < FEWEST_GROUPS:
         return usefulness
@@ -127,11 +127,7 @@ class ServedModel(NamedTuple):
 
 
 def served_model(store: Store, alias: str) -> ServedModel:
-    """Look up an alias in the store and load the model that it serves.
-
-    Raises:
-        StoreError: the aliases of the store cannot be read.
-    """
+    """Look up an alias in the store and load the model that it serves."""
     target = store.aliases().get(alias)
     if target is None:
         return ServedModel(None, None, f"{alias} is a new alias, so there is no older version")

@@ -20,16 +20,17 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from jaxtyping import Int
+from numpy.typing import NDArray
 
 from app.model import SceneModel
 from app.questions.outliers import intruders
 from app.scene import ObjectClass, Scene, SceneObject, label_key
 from training.datasets import AnnotatedScene
-from training.datasets.array_types import Ints
 from training.datasets.inventories import SHARE, Place, complete_scene
 from training.datasets.vocabulary import curated_names
 from training.domain.confirmed_relations import Triple, reported_relations
-from training.fit.adapt import HomeScenes, Known
+from training.fit.adapt import HomeScenes, TrainedOn
 from training.fit.extend import extended
 
 JUDGED = 3
@@ -38,23 +39,14 @@ JUDGED = 3
 
 @dataclass(frozen=True)
 class HomeScene:
-    """One recorded scene.
+    """One recorded scene."""
 
-    Attributes:
-        classes: distinct classes without structure, ascending.
-        left_out: those of the classes that teach nothing.
-        room: index of the room type, or None.
-        group: name that near-duplicates share.
-        confirmed: whether a person has confirmed the scene.
-        written: whether a person has written the scene. Other scenes were recorded.
-    """
-
-    classes: Ints
-    left_out: Ints
-    room: int | None
-    group: str
-    confirmed: bool
-    written: bool = False
+    classes: Int[NDArray, "n"]  # distinct classes without structure, ascending
+    left_out: Int[NDArray, "m"]  # the classes without influence on the fit
+    room: int | None  # index of the room type
+    group: str  # name that near-duplicates share
+    confirmed: bool  # by a person
+    written: bool = False  # by a person; other scenes were recorded
 
     def question(self, artifact: SceneModel) -> Scene:
         """Return the scene as a request of labels."""
@@ -63,22 +55,16 @@ class HomeScene:
 
 @dataclass(frozen=True)
 class Home:
-    """The recorded scenes of a home.
+    """The recorded scenes of a home."""
 
-    Attributes:
-        parent: the model before it knows the home, with the new classes and room types.
-        known: number of classes and of room types of the model itself.
-        scenes: distinct recorded scenes, and the written places.
-        recorded: number of recorded scenes, with the repeated ones.
-        left_out: ids of the unconfirmed scenes in which each label is left out.
-        relations: confirmed relations of classes that the parent reports as misplaced.
-    """
-
-    parent: SceneModel
-    known: tuple[int, int]
-    scenes: tuple[HomeScene, ...]
-    recorded: int
+    parent: SceneModel  # the model before its adaptation, with the new classes and room types
+    parent_classes: int  # number of classes of the model, without the new ones
+    parent_rooms: int  # number of room types of the model, without the new ones
+    scenes: tuple[HomeScene, ...]  # distinct recorded scenes, and the written places
+    recorded: int  # number of recorded scenes, with the repeated ones
+    # Ids of the unconfirmed scenes in which each label is left out.
     left_out: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    # Confirmed relations of classes that the parent reports as misplaced.
     relations: frozenset[Triple] = frozenset()
 
     @classmethod
@@ -104,27 +90,33 @@ class Home:
         for read, scene_id in scenes.values():
             for c in read.left_out.tolist():
                 left_out[parent.vocabulary.labels[c]].append(scene_id)
-        known = len(model.vocabulary), model.spec.C
-        relations = frozenset(reported_relations(parent, confirmed))
         distinct = (*(read for read, _ in scenes.values()), *(_written(parent, x) for x in places))
-        return cls(parent, known, distinct, len(recorded), left_out, relations)
+        return cls(
+            parent=parent,
+            parent_classes=len(model.vocabulary),
+            parent_rooms=model.spec.C,
+            scenes=distinct,
+            recorded=len(recorded),
+            left_out=left_out,
+            relations=frozenset(reported_relations(parent, confirmed)),
+        )
 
     @property
-    def learnt(self) -> Known:
-        """What the model knows: not the new classes and room types, nor its rare classes."""
+    def trained_on(self) -> TrainedOn:
+        """The classes and room types of the model without the new ones and the rare classes."""
         classes = torch.from_numpy(~self.parent.rarely_shown)
-        classes[self.known[0] :] = False
-        return Known(classes, self.known[1])
+        classes[self.parent_classes :] = False
+        return TrainedOn(classes, self.parent_rooms)
 
     @property
     def new_classes(self) -> tuple[str, ...]:
-        """Labels of the classes that the model did not know."""
-        return self.parent.vocabulary.labels[self.known[0] :]
+        """Labels of the new classes."""
+        return self.parent.vocabulary.labels[self.parent_classes :]
 
     @property
     def new_rooms(self) -> tuple[str, ...]:
-        """Room types that the model did not know."""
-        return tuple(self.parent.vocabulary.room_types[self.known[1] :])
+        """New room types."""
+        return tuple(self.parent.vocabulary.room_types[self.parent_rooms :])
 
     @property
     def confirmed(self) -> int:
@@ -132,12 +124,12 @@ class Home:
         return sum(scene.confirmed and not scene.written for scene in self.scenes)
 
     @cached_property
-    def written(self) -> Ints:
+    def written(self) -> Int[NDArray, "k"]:
         """Indices of the written places in `scenes`."""
         return np.flatnonzero([scene.written for scene in self.scenes])
 
     @cached_property
-    def measurable(self) -> Ints:
+    def measurable(self) -> Int[NDArray, "N"]:
         """Indices of the recorded scenes with two classes: they can measure a gain."""
         several = np.flatnonzero((self.tensors.v.sum(1) >= 2).numpy())
         return np.setdiff1d(several, self.written)
@@ -146,14 +138,14 @@ class Home:
     def tensors(self) -> HomeScenes:
         """The scenes for the fit."""
         shape = len(self.scenes), len(self.parent.vocabulary)
-        v, asked = torch.zeros(shape), torch.ones(shape, dtype=torch.bool)
-        asked &= torch.from_numpy(~self.parent.vocabulary.structure)
+        v, observed = torch.zeros(shape), torch.ones(shape, dtype=torch.bool)
+        observed &= torch.from_numpy(~self.parent.vocabulary.structure)
         for row, scene in enumerate(self.scenes):
             v[row, scene.classes] = 1
             v[row, scene.left_out] = 0
-            asked[row, scene.left_out] = False
+            observed[row, scene.left_out] = False
         rooms = [-1 if scene.room is None else scene.room for scene in self.scenes]
-        return HomeScenes(v, asked, torch.tensor(rooms))
+        return HomeScenes(v, observed, torch.tensor(rooms))
 
     def confirmed_alarms(self, artifact: SceneModel) -> Counter[str]:
         """Return the classes that a model reports, with the number of their confirmed scenes."""
@@ -198,9 +190,10 @@ def _with_new_words(model: SceneModel, recorded: Sequence[AnnotatedScene]) -> Sc
 
 
 def _read(parent: SceneModel, scene: AnnotatedScene) -> HomeScene:
+    """Return the scene in the classes of the parent."""
     names, vocabulary = curated_names(), parent.vocabulary
-    found = [vocabulary.look_up(thing.label) for thing in scene.objects]
-    classes = np.unique([entry.entry for entry in found if entry is not None]).astype(np.int64)
+    matches = [vocabulary.look_up(thing.label) for thing in scene.objects]
+    classes = np.unique([match.entry for match in matches if match is not None]).astype(np.int64)
     classes = classes[~vocabulary.structure[classes]]
     room = names.room_index(scene.room_type, vocabulary) if parent.spec.C else None
     left_out = classes[:0]
@@ -215,23 +208,24 @@ def confirmed_scene(place: Place) -> AnnotatedScene:
 
 
 def _written(parent: SceneModel, place: Place) -> HomeScene:
-    """Return the scene of a written place, in which things with a small share teach nothing."""
+    """Return the scene of a written place. Things with a small share do not influence the fit."""
     scene = _read(parent, confirmed_scene(place))
-    shares: dict[int, float] = defaultdict(float)
+    largest_share: dict[int, float] = defaultdict(float)
     for group, item in place.items:
-        if (found := parent.vocabulary.look_up(item.label)) is not None:
-            shares[found.entry] = max(shares[found.entry], group.share * item.share)
-    rare = [c for c in scene.classes.tolist() if shares[c] < SHARE]
+        if (match := parent.vocabulary.look_up(item.label)) is not None:
+            share = group.share * item.share
+            largest_share[match.entry] = max(largest_share[match.entry], share)
+    rare = [c for c in scene.classes.tolist() if largest_share[c] < SHARE]
     return replace(scene, left_out=np.array(rare, dtype=np.int64), written=True)
 
 
-def alarms_of(artifact: SceneModel, scene: Scene) -> Ints:
+def alarms_of(artifact: SceneModel, scene: Scene) -> Int[NDArray, "n"]:
     """Return the classes that `/outliers` reports at medium sensitivity."""
-    found = intruders(artifact, scene)
-    return found[~artifact.rarely_shown[found]]
+    classes = intruders(artifact, scene)
+    return classes[~artifact.rarely_shown[classes]]
 
 
-def of_classes(artifact: SceneModel, classes: Ints, room: int | None) -> Scene:
+def of_classes(artifact: SceneModel, classes: Int[NDArray, "n"], room: int | None) -> Scene:
     """Return a request with one object of each class, and the index of a room type or None."""
     labels = artifact.vocabulary.labels
     things = tuple(SceneObject(labels[c], labels[c], c) for c in classes.tolist())

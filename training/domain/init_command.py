@@ -6,37 +6,25 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal, NoReturn
+from typing import Annotated, Literal
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 
-from app.registry import RegistryError
 from app.scene import label_key
 from training.datasets import DatasetError, generate_rooms
 from training.datasets.files import write_whole
 from training.datasets.jsonl import write_jsonl
 from training.datasets.placeholders import left_out_line
-from training.datasets.records import InvalidLinesError
 from training.datasets.rooms import DOMAINS
 from training.datasets.vocabulary import vocabulary_json
 from training.domain.look import Label
 from training.domain.material import read_material
 from training.domain.proposal import Proposal, propose
+from training.domain.terminal import ROWS, console, fail, listing, print_lines
 from training.domain.update import PROPOSED, proposed_json, update
 from training.fit.configuration import ConfigError
 from training.runs.config_files import shipped_configs
 from training.runs.example_scenes import examples_json
-
-ROWS = 12
-"""Maximum number of entries of a printed list."""
-
-StorePath = Annotated[
-    str, typer.Option("--store", envvar="SCENE_STORE", help="folder of the model store")
-]
-
-console = Console()
 
 
 def init(
@@ -108,7 +96,7 @@ def init(
     written = "of written things or " if proposal.places else ""
     _show(proposal, f"classes {written}with at least {proposal.minimum} mentions")
     lines = _next(name, folder, promoted=not proposal.places)
-    _print_lines(f"\nwritten: {', '.join(map(str, targets))}", *lines)
+    print_lines(f"\nwritten: {', '.join(map(str, targets))}", *lines)
 
 
 def _update(name: str, folder: Path, files: Sequence[Path]) -> None:
@@ -119,12 +107,12 @@ def _update(name: str, folder: Path, files: Sequence[Path]) -> None:
         write_whole(path, text)
     _show(result.proposal, "classes in the vocabulary")
     title = f"new classes with at least {result.proposal.minimum} mentions:"
-    lines = _listing(title, _mentions(result.added)) or ["no new classes"]
-    lines += _listing("new room types:", result.rooms)
-    lines += _listing("removed earlier, and not added again:", _mentions(result.removed))
-    lines += _listing("new sources:", result.sources)
+    lines = listing(title, _mentions(result.added)) or ["no new classes"]
+    lines += listing("new room types:", result.rooms)
+    lines += listing("removed earlier, and not added again:", _mentions(result.removed))
+    lines += listing("new sources:", result.sources)
     kept = "the settings" if result.sources else f"{name}.toml"
-    _print_lines(
+    print_lines(
         *lines,
         f"\nwritten: {', '.join(map(str, result.files)) or 'nothing'}",
         f"kept as they are: the earlier classes, {kept} and the examples",
@@ -141,16 +129,12 @@ def _next(name: str, folder: Path, *, promoted: bool = True) -> list[str]:
     return lines
 
 
-def _print_lines(*lines: str) -> None:
-    for line in lines:
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
-
-
 def _mentions(labels: Sequence[Label]) -> list[str]:
     return [f"{label.name} ({label.mentions})" for label in labels]
 
 
 def _check_name(name: str) -> None:
+    """Raise ConfigError if a model cannot have this name."""
     if not re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", name):
         raise ConfigError(
             f"the model name is {name!r}; use lower-case words and digits, joined by hyphens, "
@@ -165,7 +149,7 @@ def _show(proposal: Proposal, classes: str) -> None:
     facts = proposal.facts
     least, mean, most = facts.objects_per_scene
     rooms = ", ".join(f"{room} {count}" for room, count in list(facts.rooms.items())[:ROWS])
-    shares = ", ".join(f"{name} {share:.0%}" for name, share in facts.shares.items())
+    shares = ", ".join(f"{name} {share:.0%}" for name, share in facts.annotated.items())
     lines = [
         *proposal.written_lines(),
         f"{facts.scenes} scenes in {facts.groups} groups, with {least} to {most} objects each "
@@ -175,13 +159,13 @@ def _show(proposal: Proposal, classes: str) -> None:
         f"{len(proposal.vocabulary)} {classes}; they cover {proposal.coverage:.1%} of the objects",
     ]
     joined = [x for x in proposal.labels if label_key(x.name) != label_key(x.spellings[0])]
-    lines += _listing(
+    lines += listing(
         "joined by built-in synonyms; vocabulary.json has the classes:",
         [f"{label.spellings[0]} = {label.name}" for label in joined],
     )
-    lines += _listing("labels without a class:", _mentions(proposal.dropped))
+    lines += listing("labels without a class:", _mentions(proposal.dropped))
     lines += filter(None, [left_out_line(proposal.left_out, ROWS)])
-    console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+    print_lines(*lines)
     console.print("Please check:" if facts.findings else "no contradictions found")
     for finding in facts.findings:
         console.print(f"  [yellow]{finding.count}[/yellow] × {finding.what}")
@@ -190,29 +174,6 @@ def _show(proposal: Proposal, classes: str) -> None:
             console.print(f"    - {example}", markup=False)
     if proposal.warning:
         console.print(f"[yellow]warning:[/yellow] {proposal.warning}", soft_wrap=True)
-
-
-def _listing(title: str, entries: Sequence[str]) -> list[str]:
-    """Return a title and at most `ROWS` indented entries; nothing without entries."""
-    more = [f"and {len(entries) - ROWS} more"] if len(entries) > ROWS else []
-    return [title, *(f"  {entry}" for entry in [*entries[:ROWS], *more])] if entries else []
-
-
-def fail(error: Exception) -> NoReturn:
-    """Print the error, without the code of a registry error, and exit with code 1.
-
-    Of invalid lines, the first ones are listed.
-    """
-    reason = error.reason if isinstance(error, RegistryError) else str(error)
-    further: list[str] = []
-    if isinstance(error, InvalidLinesError):
-        reason = f"{error.path.name} has {error.count} errors; nothing was written"
-        further = [f"  {error.path.name}, {one.where}: {one.problem}" for one in error.errors]
-        more = error.count - len(error.errors)
-        further += [f"  and {more} more"] if more else []
-    console.print(f"[red]error:[/red] {escape(reason)}", soft_wrap=True)
-    _print_lines(*further)
-    raise typer.Exit(1) from None
 
 
 def example(

@@ -40,14 +40,14 @@ class Facts:
     groups: int  # of near-duplicates
     objects_per_scene: tuple[int, float, int]  # minimum, mean and maximum
     rooms: dict[str, int]  # number of scenes of each canonical room type
-    shares: dict[str, float]  # share of scenes with each kind of annotation, such as "positions"
+    annotated: dict[str, float]  # share of scenes with each kind of annotation, such as "positions"
     findings: tuple[Finding, ...]
 
     @property
     def related(self) -> bool:
         """True if a model can learn relations from the scenes."""
         sources = ("relations", "positions", "supports", "boxes in an image")
-        return any(self.shares[name] > 0 for name in sources)
+        return any(self.annotated[name] > 0 for name in sources)
 
 
 def look(scenes: Sequence[AnnotatedScene], labels: Sequence[Label]) -> Facts:
@@ -64,7 +64,7 @@ def look(scenes: Sequence[AnnotatedScene], labels: Sequence[Label]) -> Facts:
         groups=len({scene.group for scene in scenes}),
         objects_per_scene=(min(sizes), sum(sizes) / len(sizes), max(sizes)),
         rooms=dict(rooms.most_common()),
-        shares={
+        annotated={
             "room type": rooms.total() / len(scenes),
             "relations": sum(bool(scene.relations) for scene in scenes) / len(scenes),
             "positions": share("position"),
@@ -80,6 +80,8 @@ def look(scenes: Sequence[AnnotatedScene], labels: Sequence[Label]) -> Facts:
 def _findings(
     scenes: Sequence[AnnotatedScene], labels: Sequence[Label], rooms: Counter[str]
 ) -> Iterator[Finding]:
+    """Generate the findings. A finding without cases has the count 0."""
+
     def finding(what: str, advice: str, cases: Iterable[str]) -> Finding:
         examples = list(cases)
         return Finding(what, advice, len(examples), examples[:SHOWN])
@@ -160,6 +162,7 @@ def _findings(
 
 
 def _beyond_metres(scene: AnnotatedScene) -> bool:
+    """Return True if a position or a side is too large to be in metres."""
     points = np.array([thing.position for thing in scene.objects if thing.position] or [(0, 0, 0)])
     middle = np.zeros(3) if scene.viewer_frame else np.median(points, 0)
     sides = [side for thing in scene.objects for side in thing.size or ()]

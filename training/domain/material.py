@@ -1,4 +1,4 @@
-"""What a user gives to `init` and `adapt`: files of scenes, and written inventories."""
+"""The input files of `init` and `adapt`: files of scenes, and written inventories."""
 
 from __future__ import annotations
 
@@ -20,17 +20,11 @@ from training.fit.configuration import ConfigError, source_name
 
 @dataclass(frozen=True)
 class Material:
-    """The content of files.
+    """The content of files."""
 
-    Attributes:
-        files: the scenes of each file of scenes, with plain labels.
-        inventories: the inventories by the name of their data source.
-        left_out: labels that name no kind of object, and how often each occurs.
-    """
-
-    files: tuple[tuple[AnnotatedScene, ...], ...]
-    inventories: Mapping[str, Inventory]
-    left_out: Counter[str]
+    files: tuple[tuple[AnnotatedScene, ...], ...]  # scenes of each file, with plain labels
+    inventories: Mapping[str, Inventory]  # by the name of their data source
+    left_out: Counter[str]  # labels that name no kind of object
 
     @property
     def scenes(self) -> list[AnnotatedScene]:
@@ -50,12 +44,12 @@ class Material:
     @property
     def descriptions(self) -> Mapping[str, Thing]:
         """The described things by label: of the tables beside the inventories, then the shipped."""
-        found: dict[str, Thing] = {}
+        described: dict[str, Thing] = {}
         own = (inventory.things for inventory in self.inventories.values())
         for things in (*own, shipped_things()):
             for label, thing in things.items():
-                found.setdefault(label, thing)
-        return found
+                described.setdefault(label, thing)
+        return described
 
     def drawn(self, each: int) -> list[AnnotatedScene]:
         """Draw a number of scenes of each written place. Training draws others, of the same law."""
@@ -67,10 +61,7 @@ class Material:
 
 
 def read_material(paths: Iterable[Path], *, recorded: bool = False) -> Material:
-    """Read files of scenes and inventories.
-
-    Args:
-        recorded: True if every file of scenes is JSONL, whatever its name.
+    """Read files of scenes and inventories. With `recorded`, every file of scenes is JSONL.
 
     Raises:
         DatasetError: a file cannot be read, or has no scene.
@@ -92,6 +83,7 @@ def read_material(paths: Iterable[Path], *, recorded: bool = False) -> Material:
 
 
 def _read_scenes(path: Path, recorded: bool) -> list[AnnotatedScene]:
+    """Return the scenes of a file. Raise all errors of its lines together."""
     is_jsonl = recorded or guess_format(path) == "jsonl"
     lines = list(scan_jsonl(path) if is_jsonl else read_scenes(path))
     errors = [line for line in lines if isinstance(line, DatasetError)]

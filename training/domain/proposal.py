@@ -119,8 +119,8 @@ def propose(name: str, material: Material, sources: Sequence[str], *, terms: str
     scenes = [*seen, *material.drawn(written)]
     labels = count_labels(described)
     facts = look(described, labels)
-    minimum, found = _choose_vocabulary(scenes, material.things)
-    vocabulary = use_frequent_names(found, scenes)
+    minimum, curated = _choose_vocabulary(scenes, material.things)
+    vocabulary = use_frequent_names(curated, scenes)
     if places:
         vocabulary = with_things(vocabulary, material.descriptions)
     seed, parts, test_groups = _split(scenes)
@@ -153,7 +153,7 @@ def propose(name: str, material: Material, sources: Sequence[str], *, terms: str
         facts=facts,
         labels=tuple(labels),
         minimum=minimum,
-        coverage=coverage(found, described),
+        coverage=coverage(curated, described),
         vocabulary=vocabulary,
         dropped=tuple(label for label in labels if vocabulary.index(label.name) is None),
         values=values,
@@ -169,15 +169,15 @@ def propose(name: str, material: Material, sources: Sequence[str], *, terms: str
 
 
 def _choose_vocabulary(
-    scenes: Sequence[AnnotatedScene], certain: Sequence[str]
+    scenes: Sequence[AnnotatedScene], required: Sequence[str]
 ) -> tuple[int, Vocabulary]:
     """Return the largest minimum that covers enough objects, else the smallest; its classes.
 
-    Every `certain` label has a class.
+    Every `required` label has a class.
     """
     for minimum in _MINIMA:
         try:
-            vocabulary = source_vocabulary(scenes, minimum=minimum, certain=certain)
+            vocabulary = source_vocabulary(scenes, minimum=minimum, required=required)
         except ValueError:
             continue  # no label has so many mentions
         if minimum == _MINIMA[-1] or coverage(vocabulary, scenes) >= _COVERED:
@@ -208,11 +208,11 @@ def use_frequent_names(vocabulary: Vocabulary, scenes: Sequence[AnnotatedScene])
 def _split(scenes: Sequence[AnnotatedScene]) -> tuple[int, dict[str, int], int]:
     """Return the first seed with parts near their shares, or the best; sizes, test groups."""
     best: tuple[int, dict[str, int], int] | None = None
-    smallest, shares = math.inf, FRACTIONS["stable"]
+    smallest, fractions = math.inf, FRACTIONS["stable"]
     for seed in range(_SPLIT_SEEDS):
         scenes_of = split(scenes, seed=seed, protocol="stable")
         sizes: dict[str, int] = {name: len(part) for name, part in scenes_of.items()}
-        deviation = max(abs(sizes[p] / (share * len(scenes)) - 1) for p, share in shares.items())
+        deviation = max(abs(sizes[p] / (x * len(scenes)) - 1) for p, x in fractions.items())
         if deviation < smallest and all(map(_is_informative, scenes_of.values())):
             smallest = deviation
             best = seed, sizes, len({scene.group for scene in scenes_of["test"]})

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from app.scene import Vocabulary
@@ -32,8 +33,8 @@ def same_classes(a: Vocabulary, b: Vocabulary) -> bool:
 class Translation:
     """Mapping from the classes of scenes to the classes of a model."""
 
-    model_class: Tensor  # (V,) int64, model class of each of the V scene classes; -1: unknown
-    size: int  # number of model classes
+    model_class: Int[Tensor, "V"]  # model class of each scene class; -1: unknown
+    size: int  # number of model classes W
     unknown: float = -BEYOND  # score of unknown classes
 
     @classmethod
@@ -66,17 +67,17 @@ class Translation:
         }
         return Model(**scores, parameters=model.parameters)
 
-    def presence(self, v: Tensor) -> Tensor:
-        """Map presence or counts (scenes, scene classes) to (scenes, model classes).
+    def presence(self, v: Float[Tensor, "B V"]) -> Float[Tensor, "B W"]:
+        """Map presence or counts of scene classes to model classes.
 
         If several scene classes map to one model class, the result is their maximum.
         """
-        is_known = self.model_class >= 0
-        index = self.model_class[is_known].expand(len(v), -1)
-        return torch.zeros(len(v), self.size).scatter_reduce(1, index, v[:, is_known], "amax")
+        is_mapped = self.model_class >= 0
+        index = self.model_class[is_mapped].expand(len(v), -1)
+        return torch.zeros(len(v), self.size).scatter_reduce(1, index, v[:, is_mapped], "amax")
 
-    def scores(self, values: Tensor) -> Tensor:
-        """Map scores (scenes, model classes) to scene classes; unknown classes get `unknown`."""
+    def scores(self, values: Float[Tensor, "B W"]) -> Float[Tensor, "B V"]:
+        """Map scores of model classes to scene classes; unknown classes get `unknown`."""
         scores = values[:, self.model_class.clamp(min=0)]
         return scores.masked_fill(self.model_class < 0, self.unknown)
 
@@ -84,6 +85,8 @@ class Translation:
         return lambda v: self.scores(score(self.presence(v)))
 
     def _placed(self, score: PlacedScore) -> PlacedScore:
+        """Return a score of places in the scene classes."""
+
         def score_scene_classes(places: Places) -> Tensor:
             """Score the places whose anchor class the model has; the others get `unknown`."""
             anchor = self.model_class[places.anchor]
@@ -104,6 +107,8 @@ class Translation:
         return score_scene_classes
 
     def _relations(self, score: RelationScore) -> RelationScore:
+        """Return a score of relations in the scene classes."""
+
         def score_scene_classes(batch: Batch) -> Tensor:
             scores = torch.full(batch.holds.shape, self.unknown)
             for row in range(len(batch)):
@@ -112,8 +117,10 @@ class Translation:
 
         return score_scene_classes
 
-    def _score_row(self, score: RelationScore, batch: Batch, row: int, scores: Tensor) -> None:
-        """Write the scores of one scene, (relations, classes, classes), for known classes."""
+    def _score_row(
+        self, score: RelationScore, batch: Batch, row: int, scores: Float[Tensor, "A n n"]
+    ) -> None:
+        """Write the scores of one scene, for classes that the model has."""
         classes = batch.classes[row]
         mapped = torch.where(classes >= 0, self.model_class[classes.clamp(min=0)], -1)
         columns = (mapped >= 0).nonzero().squeeze(1)

@@ -36,23 +36,14 @@ _NOTHING: Final[Mapping[str, set[str]]] = {}
 
 @dataclass(frozen=True)
 class Update:
-    """The files that `init --update` writes, and what it reports.
+    """The files that `init --update` writes, and its report."""
 
-    Attributes:
-        proposal: the proposal for all scenes, with the edited and extended vocabulary.
-        files: text of each changed file.
-        added: new classes.
-        rooms: new room types.
-        removed: frequent labels that the person removed from the vocabulary.
-        sources: new entries of `data.sources`.
-    """
-
-    proposal: Proposal
-    files: dict[Path, str]
-    added: tuple[Label, ...]
-    rooms: tuple[str, ...]
-    removed: tuple[Label, ...]
-    sources: tuple[str, ...]
+    proposal: Proposal  # for all scenes, with the edited and extended vocabulary
+    files: dict[Path, str]  # text of each changed file
+    added: tuple[Label, ...]  # new classes
+    rooms: tuple[str, ...]  # new room types
+    removed: tuple[Label, ...]  # frequent labels that the person removed from the vocabulary
+    sources: tuple[str, ...]  # new entries of `data.sources`
 
 
 def update(name: str, folder: Path, files: Sequence[Path]) -> Update:
@@ -67,8 +58,8 @@ def update(name: str, folder: Path, files: Sequence[Path]) -> Update:
     config_file = folder / f"{name}.toml"
     data = _data_of(config_file)
     own = [folder / source for source in data.sources if is_file(source)]
-    known = {path.resolve() for path in own}
-    new = [file for file in files if file.resolve() not in known]
+    own_paths = {path.resolve() for path in own}
+    new = [file for file in files if file.resolve() not in own_paths]
     added = tuple(Path(os.path.relpath(file, folder)).as_posix() for file in new)
     material = read_material((*own, *new))
     proposal = propose(name, material, (*data.sources, *added))
@@ -180,12 +171,12 @@ def _new_classes(
         things = [AnnotatedObject(x.id, x.label) for x in scene.objects if is_new(x.label)]
         rest.append(AnnotatedScene(scene.scene_id, scene.source, scene.group, None, tuple(things)))
     try:
-        certain = filter(is_new, written)
-        found = source_vocabulary(rest, minimum=minimum, certain=certain)
-        found = use_frequent_names(found, rest)
+        required = filter(is_new, written)
+        vocabulary = source_vocabulary(rest, minimum=minimum, required=required)
+        vocabulary = use_frequent_names(vocabulary, rest)
     except ValueError:
         return ()  # no new label is frequent
-    new = [entry for entry in found.objects if is_new(entry.label)]
+    new = [entry for entry in vocabulary.objects if is_new(entry.label)]
     labels = {entry.label for entry in new}
     return tuple(
         replace(
@@ -208,8 +199,7 @@ def _has(vocabulary: Vocabulary, label: Label) -> bool:
 def _with_sources(path: Path, sources: Sequence[str], written: int) -> str:
     """Return the text of a configuration with other sources. All other entries stay.
 
-    Args:
-        written: new value of `data.written`; 0 keeps the entry as it is.
+    `written` is the new value of `data.written`; 0 keeps the entry.
     """
     expected = read_toml(path)
     expected["data"]["sources"] = list(sources)

@@ -7,16 +7,16 @@ The weights change little where the home says little. δ is the change of the bi
          + 2 · mean over parts of stored samples of the cross-entropy of the parent and the home]
     + ρ_δ |δ|² + ρ_Δ |Δ|²
 
-- Random parts of the n recorded scenes ask for the rest, as in training (`training.fit.objects`).
-- The second line is distillation: random parts of the samples that the artifact stores ask both
-  machines for unlisted classes and room types. Without this line, the machine forgets other rooms.
+- Random parts of the n recorded scenes predict the rest, as in training (`training.fit.objects`).
+- The second line is distillation: both machines predict unlisted classes and room types of random
+  parts of the samples that the artifact stores. Without this line, the machine forgets other rooms.
 - Few scenes without a class k do not prove that the home lacks it. Let the parent expect the class
   in E_k of the n scenes. If no scene shows it, its target is the answer of the parent, divided by
   1 + E_k. The factor is the posterior mean of a rate with the prior exp(-rate), given no event
   where E_k were expected.
-- The parent does not know new classes (`training.fit.extend`), and hardly knows rare ones. The
-  recorded ones among them have no part in the distillation. The prior of their biases is weak, and
-  their biases start at least at the log-odds of the share of scenes that show the class.
+- New classes (`training.fit.extend`) and rare ones of the parent have no part in the distillation
+  if they are recorded. The prior of their biases is weak, and their biases start at least at the
+  log-odds of the share of scenes that show the class.
 
 Source of the distillation: Li and Hoiem, "Learning without forgetting" (2016).
 """
@@ -26,10 +26,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, one_hot
 
 from app.inference import Weights
+from training.datasets.array_types import Table
 from training.fit.objects import Parts, random_parts
 from training.machines.arrays import machine_of, weights_of
 
@@ -45,108 +47,91 @@ _BIAS, _NEW_BIAS, _WEIGHT = 3.0, 0.03, 0.3
 
 
 @dataclass(frozen=True)
-class Known:
-    """What the parent knows of its V classes and C room types.
+class TrainedOn:
+    """The classes and room types of the parent that its training scenes show."""
 
-    Attributes:
-        classes: True for the classes that its training scenes show often enough, (V,) bool.
-        rooms: number of room types that it learnt. The later ones are new.
-    """
-
-    classes: Tensor
-    rooms: int
+    classes: Bool[Tensor, "V"]  # True for the classes that they show often enough
+    rooms: int  # number of room types; the later ones are new
 
 
 @dataclass(frozen=True)
-class HomeScenes:
-    """N recorded scenes of a home.
+class HomeScenes(Table):
+    """N recorded scenes of a home."""
 
-    Attributes:
-        v: presence of the classes, without structure, (N, V) 0 or 1.
-        asked: True for classes whose presence or absence the scene teaches, (N, V) bool.
-        room: index of the room type, (N,) int64; -1 where unknown.
-    """
-
-    v: Tensor
-    asked: Tensor
-    room: Tensor
+    v: Float[Tensor, "N V"]  # presence of the classes, without structure
+    observed: Bool[Tensor, "N V"]  # classes whose presence or absence the scene shows
+    room: Int[Tensor, "N"]  # room type; -1 where unknown
 
     def __len__(self) -> int:
         return len(self.v)
 
-    def rows(self, index: Tensor) -> HomeScenes:
-        """Return the scenes at the indices, or where a mask is True."""
-        return HomeScenes(*(tensor[index] for tensor in vars(self).values()))
-
 
 def adapt(
-    parent: Weights, scenes: HomeScenes, *, known: Known | None = None, seed: int = 0
+    parent: Weights, scenes: HomeScenes, *, trained_on: TrainedOn | None = None, seed: int = 0
 ) -> Weights:
-    """Return the weights of a machine that knows the home.
+    """Return the weights of the parent, adapted to scenes of two or more classes.
 
-    Scenes with fewer than two classes teach nothing.
-
-    Args:
-        parent: weights of V classes and C room types, with stored samples.
-        known: what the parent knows. None means everything.
-
-    Raises:
-        ValueError: no scene has two classes, or the parent stores no samples.
+    Without `trained_on`, training scenes of the parent show all classes and room types.
     """
     scenes = scenes.rows(scenes.v.sum(1) >= 2)
     if not len(scenes):
         raise ValueError("no recorded scene has two known objects")
     if not parent.spec.N:
         raise ValueError("the model stores no samples, so its other rooms would be forgotten")
-    everything = Known(torch.ones(parent.spec.V, dtype=torch.bool), parent.spec.C)
-    fit = _Fit(parent, scenes, known or everything, seed)
+    everything = TrainedOn(torch.ones(parent.spec.V, dtype=torch.bool), parent.spec.C)
+    fit = _Fit(parent, scenes, trained_on or everything, seed)
     for _ in range(_STEPS):
         fit.step()
     return weights_of(fit.machine)
 
 
-def part_loss(log_odds: Tensor, target: Tensor, scenes: HomeScenes, parts: Parts) -> Tensor:
-    """Return the cross-entropy of the classes that random parts of N scenes do not list, (N,).
+def part_loss(
+    log_odds: Float[Tensor, "N V"],
+    target: Float[Tensor, "N V"],
+    scenes: HomeScenes,
+    parts: Parts,
+) -> Float[Tensor, "N"]:
+    """Return the cross-entropy of the classes that random parts of scenes do not list.
 
-    Args:
-        log_odds: answers of a machine about the parts, (N, V).
-        target: probabilities of the classes, (N, V).
+    The log-odds are those of a machine given the parts, and the targets are probabilities.
     """
-    weight = scenes.asked * (1 - parts.listed)
+    weight = scenes.observed * (1 - parts.listed)
     weight = weight * torch.where(scenes.v > 0, parts.weight.unsqueeze(1), 1.0)
     return binary_cross_entropy_with_logits(log_odds, target, weight, reduction="none").sum(1)
 
 
 class _Fit:
-    """The fit of one home. `known`: see `adapt`."""
+    """The fit of one home."""
 
-    def __init__(self, parent: Weights, scenes: HomeScenes, known: Known, seed: int) -> None:
+    def __init__(
+        self, parent: Weights, scenes: HomeScenes, trained_on: TrainedOn, seed: int
+    ) -> None:
         self.parent, self.scenes = machine_of(parent), scenes
         self.machine = machine_of(weights_of(self.parent))
         self._generator = torch.Generator().manual_seed(seed)
         self._recorded = (scenes.v > 0).any(0)
-        new = self._recorded & ~known.classes
+        new = self._recorded & ~trained_on.classes
         samples = torch.from_numpy(parent.scenes)
         rooms = torch.from_numpy(parent["fantasy_rooms"]).long()
         self._samples = HomeScenes(samples, (~new).expand_as(samples), rooms)
         self._samples = self._samples.rows(samples.sum(1) >= 2)
         self._kept = 1 / (1 + self._expected())
-        self._changes = self._changing(new, known.rooms)
+        self._changes = self._changing(new, trained_on.rooms)
         self._start = {weight: weight.clone() for weight in self._changes}
-        share = scenes.v.sum(0) / (scenes.asked.sum(0) + 1)
+        share = scenes.v.sum(0) / (scenes.observed.sum(0) + 1)
         self.machine.b[new] = self.machine.b.maximum(share.logit())[new]
         for weight in self._changes:
             weight.requires_grad_(True)
         self._optimiser = torch.optim.Adam(self._changes, lr=_RATE)
 
-    def _expected(self) -> Tensor:
-        """Return in how many recorded scenes the parent expects each class, (V,)."""
+    def _expected(self) -> Float[Tensor, "V"]:
+        """Return E_k: in how many recorded scenes the parent expects each class."""
         several = self.scenes.rows(torch.arange(len(self.scenes)).repeat(_REPEATS))
         parts = random_parts(several.v, _LEAVE_ONE_OUT, self._generator)
         p = self.parent.object_log_odds(parts.listed, room=several.room, share=parts.share)
-        return (several.asked * p.sigmoid()).sum(0) / _REPEATS
+        return (several.observed * p.sigmoid()).sum(0) / _REPEATS
 
-    def _changing(self, new: Tensor, C: int) -> dict[Tensor, Tensor]:
+    def _changing(self, new: Bool[Tensor, "V"], C: int) -> dict[Tensor, Tensor]:
         """Return the weights that change, with the precisions of their entries; 0 is constant."""
         machine = self.machine
         bias = torch.where(new, _NEW_BIAS, _BIAS)
@@ -188,14 +173,15 @@ class _Fit:
         p, present = of_parent.sigmoid(), scenes.v - parts.listed
         target = torch.where(of_home, torch.where(self._recorded, present, self._kept * p), p)
         loss = (scale * part_loss(log_odds, target, scenes, parts)).sum()
-        asked = (room < 0) & (scenes.room >= 0)
-        if bool(asked.any()):
+        is_hidden = (room < 0) & (scenes.room >= 0)
+        if bool(is_hidden.any()):
             p, log_p = (
-                machine.room_log_p(parts.listed[asked]) for machine in (self.parent, self.machine)
+                machine.room_log_p(parts.listed[is_hidden])
+                for machine in (self.parent, self.machine)
             )
-            true = one_hot(scenes.room[asked], self.machine.spec.C)
-            target = torch.where(of_home[asked], true, p.exp())
-            loss = loss - (scale[asked].unsqueeze(1) * target * log_p).sum()
+            true = one_hot(scenes.room[is_hidden], self.machine.spec.C)
+            target = torch.where(of_home[is_hidden], true, p.exp())
+            loss = loss - (scale[is_hidden].unsqueeze(1) * target * log_p).sum()
         return loss
 
     def _draw(self, scenes: HomeScenes, size: int) -> HomeScenes:

@@ -17,11 +17,12 @@ Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 
 from app.inference.quadrature import NO_UNIT
 from app.model import Calibration, CountSlope, SceneModel
@@ -29,12 +30,11 @@ from app.questions.placements import PLACES
 from app.questions.posterior import Posterior
 from app.scene.spatial_relations import CANONICAL, LATERAL, ON_TOP, STACKED
 from training.datasets import EncodedScene
-from training.datasets.array_types import Flags, Floats, Rng
+from training.datasets.array_types import ClassMask, Rng, Table
 from training.datasets.batches import SceneTensors, TrainingData, subset
 from training.datasets.cases import (
     Triple,
     annotated_relations,
-    logistic,
     observed_pairs,
     removed_class,
     scene_of,
@@ -42,9 +42,10 @@ from training.datasets.cases import (
 from training.evaluation.pair_task import ScenePairs, both_ways, lateral_shift, listed_pairs
 from training.fit.calibrate_at import fit_at
 from training.fit.calibrate_misplaced import fit_misplaced
-from training.fit.calibrate_objects import calibrate_objects, recalibrated
+from training.fit.calibrate_objects import calibrate_objects
 from training.fit.configuration import ObjectsConfig
 from training.fit.objects import ObjectScenes, served_popularity
+from training.fit.regression import fit_count_slope, recalibrated
 
 _SCENES = 1500
 _LISTED = 20  # relations that an answer of the service lists by default
@@ -52,8 +53,6 @@ _MOST_OF_A_PART = 8  # classes of a part of a scene
 _POSSIBLE = -3.5  # least log-odds of a relation that may well hold
 _OF_THE_REST = 0.02
 _ROUNDS = 3
-# Column indices of the table of examples. Column 0 is the scene.
-_RELATION, _LOGIT, _TRUTH, _SOURCE = 1, 2, 4, 5
 _UNKNOWN = -1.0  # truth of an example whose data source does not annotate the relation
 # Number of objects that are removed from each scene in turn to fit placements. With one removed
 # object, the fit depends too much on chance.
@@ -70,9 +69,8 @@ def calibrate(
     """Fit every entry of the calibration. `calibrate_objects` copies some values of `chosen`."""
     popularity = served_popularity(ObjectScenes.of(data.train, data.structure, config), config)
     scenes = data.validation
-    objects = calibrate_objects(
-        *(artifact, scenes, data.train, popularity, config.calibrated_sources, seed, chosen)
-    )
+    sources = config.calibrated_sources
+    objects = calibrate_objects(artifact, scenes, data.train, popularity, sources, seed, chosen)
     artifact = replace(artifact, calibration=objects)
     pick = torch.randperm(len(scenes), generator=torch.Generator().manual_seed(seed))
     annotated = [k for k in pick.tolist() if scenes.scenes[k].evidence.holds.any()]
@@ -121,7 +119,7 @@ def with_lower_lateral(
     """
     table = np.array([(s.intercept, s.slope, s.log_count) for s in slopes])[:, :, None, None]
 
-    def score(question: ScenePairs) -> Floats:
+    def score(question: ScenePairs) -> NDArray[np.float64]:
         scene = question.scene
         posterior = _posterior(artifact, scene, range(len(scene.instance_classes)))
         log_odds = posterior.relation_log_odds().astype(np.float64)
@@ -137,7 +135,7 @@ def with_lower_lateral(
     )
 
 
-def _part_of(encoded: EncodedScene, structure: Flags, rng: Rng) -> EncodedScene:
+def _part_of(encoded: EncodedScene, structure: ClassMask, rng: Rng) -> EncodedScene:
     """Return a random part of a scene: 2 to `_MOST_OF_A_PART` classes, with all their instances."""
     classes = encoded.evidence.classes
     things = rng.permutation(classes[~structure[classes]])
@@ -155,16 +153,44 @@ def _posterior(
     return Posterior(artifact, replace(scene_of(encoded, kept, observed), room_type=None))
 
 
+@dataclass(frozen=True, eq=False)
+class _Examples(Table):
+    """N candidate relations between two instances of a scene."""
+
+    scene: Int[NDArray, "N"]
+    relation: Int[NDArray, "N"]
+    log_odds: Float[NDArray, "N"]  # of the relation between the two classes
+    log_count: Float[NDArray, "N"]  # log of the instance counts: of both classes, or of the anchor
+    truth: Float[NDArray, "N"]  # 1, 0 or `_UNKNOWN`
+    source: Int[NDArray, "N"]
+
+    @classmethod
+    def joined(cls, blocks: Sequence[_Examples]) -> _Examples:
+        """Join blocks, without pairs for which the machine has no relation unit.
+
+        A column of a block is an array, or a single value of the whole block.
+        """
+        arrays = (np.broadcast_arrays(*vars(block).values()) for block in blocks)
+        columns = zip(*arrays, strict=True)
+        joined = map(np.concatenate, columns) if blocks else np.zeros((6, 0), dtype=np.int64)
+        examples = cls(*joined)
+        return examples.rows(examples.log_odds > NO_UNIT)
+
+    @property
+    def annotated(self) -> Bool[NDArray, "N"]:
+        """True for examples whose data source annotates the relation."""
+        return self.truth != _UNKNOWN
+
+
 def _examples_of_pairs(
     artifact: SceneModel, scenes: Sequence[EncodedScene], rng: Rng | None = None
-) -> Floats:
+) -> _Examples:
     """Return the examples of all pairs of a scene; with `rng`, of half, given the other half.
 
-    The columns are: scene, relation, log-odds between the classes, log n_i + log n_j of the
-    instance counts, truth value and data source, (examples, 6). Relations without annotation are
-    examples only if their log-odds are high enough for the list of an answer.
+    Relations without annotation are examples only if their log-odds are high enough for the list of
+    an answer.
     """
-    blocks: list[Floats] = []
+    blocks = []
     structure = artifact.vocabulary.structure
     sources = sorted({encoded.source for encoded in scenes})
     for number, encoded in enumerate(scenes):
@@ -183,13 +209,19 @@ def _examples_of_pairs(
         # The smallest of the `_LISTED` largest values of each relation.
         few = pairs.sum() <= _LISTED
         least = [-np.inf if few else np.partition(v[pairs], -_LISTED)[-_LISTED] for v in log_odds]
-        examples = pairs & (annotated | (log_odds >= np.array(least)[:, None, None]))
-        relation, i, j = np.nonzero(examples)
+        is_example = pairs & (annotated | (log_odds >= np.array(least)[:, None, None]))
+        relation, i, j = np.nonzero(is_example)
         logs = np.log(encoded.evidence.counts[index])
-        truth = np.where(annotated, encoded.instance_holds, _UNKNOWN)[examples]
-        columns = number, relation, log_odds[examples], logs[i] + logs[j], truth
-        blocks.append(_table(*columns, sources.index(encoded.source)))
-    return _examples(blocks)
+        block = _Examples(
+            scene=np.array(number),
+            relation=relation,
+            log_odds=log_odds[is_example].astype(np.float64),
+            log_count=logs[i] + logs[j],
+            truth=np.where(annotated, encoded.instance_holds, _UNKNOWN)[is_example],
+            source=np.array(sources.index(encoded.source)),
+        )
+        blocks.append(block)
+    return _Examples.joined(blocks)
 
 
 def fit_placements(
@@ -203,7 +235,7 @@ def fit_placements(
     rng = np.random.default_rng(seed)
     structure = artifact.vocabulary.structure
     sources = sorted({encoded.source for encoded in scenes})
-    blocks: list[Floats] = []
+    blocks = []
     for number in range(_PLACEMENT_CASES * len(scenes)):
         encoded = scenes[number % len(scenes)]
         if number % 2:
@@ -221,73 +253,69 @@ def fit_placements(
         removed_index = np.full_like(anchor_index, instance)
         holds, annotated = encoded.instance_holds, annotated_relations(encoded)
         directions = (removed_index, anchor_index), (anchor_index, removed_index)
-        for values, ends in zip(tables, directions, strict=True):
-            truth = np.where(annotated[:, *ends], holds[:, *ends], _UNKNOWN)
-            a, anchor = map(np.ravel, np.indices(truth.shape))
-            count = np.log(present.counts[anchors])[anchor]
-            columns = number, a, values[0].ravel(), count, truth.ravel()
-            blocks.append(_table(*columns, sources.index(encoded.source)))
-    return _fit_listed(_examples(blocks), PLACES)
+        for values, (subject, object_) in zip(tables, directions, strict=True):
+            truth = np.where(annotated[:, subject, object_], holds[:, subject, object_], _UNKNOWN)
+            relation, anchor = map(np.ravel, np.indices(truth.shape))
+            block = _Examples(
+                scene=np.array(number),
+                relation=relation,
+                log_odds=values[0].ravel().astype(np.float64),
+                log_count=np.log(present.counts[anchors])[anchor],
+                truth=truth.ravel(),
+                source=np.array(sources.index(encoded.source)),
+            )
+            blocks.append(block)
+    return _fit_listed(_Examples.joined(blocks), PLACES)
 
 
-def _table(*columns: Any) -> Floats:
-    """Return a table, (examples, columns), of columns that are arrays or single values."""
-    return np.stack(np.broadcast_arrays(*columns), 1).astype(np.float64)
-
-
-def _examples(blocks: list[Floats]) -> Floats:
-    """Return the examples for which the machine has a relation unit, and so log-odds."""
-    examples = np.concatenate(blocks or [np.zeros((0, _SOURCE + 1))])
-    return examples[examples[:, _LOGIT] > NO_UNIT]
-
-
-def _fit_possible(examples: Floats) -> tuple[CountSlope, ...]:
+def _fit_possible(examples: _Examples) -> tuple[CountSlope, ...]:
     """Fit the slopes to possible pairs: most pairs have far lower log-odds, and would decide."""
-    examples = examples[examples[:, _TRUTH] != _UNKNOWN]
-    is_possible = examples[:, _LOGIT] >= _POSSIBLE
+    examples = examples.rows(examples.annotated)
+    is_possible = examples.log_odds >= _POSSIBLE
     weight = np.where(is_possible, 1.0, _OF_THE_REST)
     return _fit_by_kind(examples, weight * _source_weights(examples, is_possible))
 
 
-def _fit_listed(examples: Floats, listed: int) -> tuple[CountSlope, ...]:
+def _fit_listed(examples: _Examples, listed: int) -> tuple[CountSlope, ...]:
     """Fit the slopes, mainly to the `listed` likeliest examples of each scene.
 
     An answer lists only these examples. Selection by high log-odds also selects errors, so listed
     relations hold less often than unselected relations with equal log-odds. Examples outside the
     list have a small weight. Examples without annotation take part only in the ranking.
     """
-    annotated = examples[:, _TRUTH] != _UNKNOWN
-    slopes = _fit_by_kind(examples[annotated], np.ones(annotated.sum()))
+    annotated = examples.annotated
+    fitted = examples.rows(annotated)
+    slopes = _fit_by_kind(fitted, np.ones(len(fitted.truth)))
     for _ in range(_ROUNDS):
         is_listed = _is_listed(examples, slopes, listed)[annotated]
         weight = np.where(is_listed, 1.0, _OF_THE_REST)
-        weight *= _source_weights(examples[annotated], is_listed)
-        slopes = _fit_by_kind(examples[annotated], weight)
+        slopes = _fit_by_kind(fitted, weight * _source_weights(fitted, is_listed))
     return slopes
 
 
-def _source_weights(examples: Floats, is_listed: Flags) -> Floats:
-    """Return weights (examples,) that give each source the same total of listed examples."""
-    relation, source = examples[:, [_RELATION, _SOURCE]].astype(int).T
-    key = relation * (source.max(initial=0) + 1) + source
+def _source_weights(examples: _Examples, is_listed: Bool[NDArray, "N"]) -> Float[NDArray, "N"]:
+    """Return weights that give each source the same total of listed examples of a relation."""
+    key = examples.relation * (examples.source.max(initial=0) + 1) + examples.source
     counts = np.bincount(key[is_listed], minlength=int(key.max(initial=-1)) + 1)
     return (1 / np.maximum(counts, 1.0))[key]
 
 
-def _is_listed(examples: Floats, slopes: tuple[CountSlope, ...], listed: int) -> Flags:
-    """Mark the examples of each scene with the highest calibrated log-odds, (examples,) bool."""
+def _is_listed(
+    examples: _Examples, slopes: tuple[CountSlope, ...], listed: int
+) -> Bool[NDArray, "N"]:
+    """Mark the `listed` examples of each scene with the highest calibrated log-odds."""
     table = np.array([(s.slope, s.log_count, s.intercept) for s in slopes])
-    weights = table[examples[:, _RELATION].astype(np.int64)]
-    logits = (examples[:, _LOGIT:_TRUTH] * weights[:, :2]).sum(1) + weights[:, 2]
-    order = np.lexsort((-logits, examples[:, 0]))
-    scene = examples[order, 0]
+    slope, log_count, intercept = table[examples.relation].T
+    logits = examples.log_odds * slope + examples.log_count * log_count + intercept
+    order = np.lexsort((-logits, examples.scene))
+    scene = examples.scene[order]
     rank = np.arange(len(order)) - np.searchsorted(scene, scene)
     is_listed = np.zeros(len(order), dtype=np.bool_)
     is_listed[order] = rank < listed
     return is_listed
 
 
-def _fit_by_kind(examples: Floats, weight: Floats) -> tuple[CountSlope, ...]:
+def _fit_by_kind(examples: _Examples, weight: Float[NDArray, "N"]) -> tuple[CountSlope, ...]:
     """Fit one slope to left and front, and one to on-top for all relations of stacked objects.
 
     Complete sources show hundreds of times more pairs with on-top than with inside, and no pairs
@@ -295,13 +323,11 @@ def _fit_by_kind(examples: Floats, weight: Floats) -> tuple[CountSlope, ...]:
     """
     entries = [CountSlope()] * len(CANONICAL)
     for fitted, kind in ((LATERAL, LATERAL), ((ON_TOP,), STACKED)):
-        rows = np.isin(examples[:, _RELATION], fitted)
-        truth = examples[rows, _TRUTH] > 0
-        if len(np.unique(truth)) < 2:
-            continue
-        features = examples[rows, _LOGIT : _LOGIT + 2]
-        slope, count, intercept = logistic(features, truth, weight[rows])
-        entry = CountSlope(intercept=intercept, slope=slope, log_count=count)
-        for a in kind:
-            entries[a] = entry
+        is_fitted = np.isin(examples.relation, fitted)
+        rows = examples.rows(is_fitted)
+        entry = fit_count_slope(
+            rows.log_odds, rows.log_count, rows.truth > 0, weight[is_fitted], C=1e6
+        )
+        if entry is not None:
+            entries = [entry if a in kind else other for a, other in enumerate(entries)]
     return tuple(entries)

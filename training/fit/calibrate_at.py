@@ -15,6 +15,8 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from app.model import PlaceFit, SceneModel
@@ -22,7 +24,6 @@ from app.questions.placements import place_log_p
 from app.questions.posterior import Posterior, calibrated_missing
 from app.scene.spatial_relations import LATERAL, STACKED
 from training.datasets import EncodedScene
-from training.datasets.array_types import Flags, Floats
 from training.evaluation.calibration_task import PlaceQuestion, place_question
 
 _QUESTIONS: Final = 80  # maximum questions of each source
@@ -31,18 +32,12 @@ _PENALTY: Final = 1e-3  # of the squared intercept, so that places without objec
 
 
 class PlaceTerms(NamedTuple):
-    """The terms of `PlaceFit` for N classes at a place, (N,) each.
+    """The terms of `PlaceFit` for N classes at a place."""
 
-    Attributes:
-        present: calibrated log-odds that the class is present.
-        relation, counts: terms p and c of `PlaceFit`.
-        placed: True if the class is at the place.
-    """
-
-    present: Floats
-    relation: Floats
-    counts: Floats
-    placed: Flags
+    present: Float[NDArray, "N"]  # calibrated log-odds that the class is present
+    relation: Float[NDArray, "N"]  # term p of `PlaceFit`
+    counts: Float[NDArray, "N"]  # term c of `PlaceFit`
+    is_there: Bool[NDArray, "N"]  # True if the class is at the place
 
 
 def fit_at(
@@ -52,22 +47,21 @@ def fit_at(
     entries = [PlaceFit()] * artifact.spec.A
     for kind in (LATERAL, STACKED):
         rng = np.random.default_rng(seed)
-        questions: dict[str, list[PlaceTerms]] = defaultdict(list)
+        terms: dict[str, list[PlaceTerms]] = defaultdict(list)
         for k in rng.permutation(len(scenes)).tolist():
-            of_source = questions[scenes[k].source]
-            if len(of_source) < _QUESTIONS:
+            if len(terms[scenes[k].source]) < _QUESTIONS:
                 question = place_question(artifact.vocabulary, scenes[k], rng, kind)
                 if question is not None:
-                    of_source.append(place_terms(artifact, question))
-        entry = fit_place([terms for terms in questions.values() if terms])
+                    terms[scenes[k].source].append(place_terms(artifact, question))
+        entry = fit_place([of_source for of_source in terms.values() if of_source])
         for a in kind:
             entries[a] = entry
     return tuple(entries)
 
 
 def place_terms(artifact: SceneModel, question: PlaceQuestion) -> PlaceTerms:
-    """Return the terms of the classes that may be asked for at a place."""
-    scene, place, placed, usable = question
+    """Return the terms of the candidate classes at a place."""
+    scene, place, is_there, usable = question
     posterior, classes = Posterior(artifact, scene), np.flatnonzero(usable)
     coverage = artifact.calibration.coverage
     z = posterior.absent_log_odds(classes, coverage).astype(np.float64)
@@ -79,7 +73,7 @@ def place_terms(artifact: SceneModel, question: PlaceQuestion) -> PlaceTerms:
         calibrated_missing(artifact.calibration, z, posterior.listed, None).astype(np.float64),
         place_log_p(posterior, classes, place).astype(np.float64),
         counts,
-        placed[classes],
+        is_there[classes],
     )
 
 
@@ -88,19 +82,19 @@ def fit_place(sources: Sequence[Sequence[PlaceTerms]]) -> PlaceFit:
     columns = [map(np.concatenate, zip(*terms, strict=True)) for terms in sources]
     if not columns:
         return PlaceFit()
-    present, relation, counts, placed = map(np.concatenate, zip(*columns, strict=True))
-    if placed.sum() < _LEAST_TRUE:
+    present, relation, counts, is_there = map(np.concatenate, zip(*columns, strict=True))
+    if is_there.sum() < _LEAST_TRUE:
         return PlaceFit()
-    share = np.concatenate(
-        [np.full(sum(len(t.placed) for t in terms), 1 / len(terms)) for terms in sources]
+    weight = np.concatenate(
+        [np.full(sum(len(t.is_there) for t in terms), 1 / len(terms)) for terms in sources]
     )
     log_present = -np.logaddexp(0.0, -present)
 
-    def loss(weights: Floats) -> float:
+    def loss(weights: NDArray[np.float64]) -> float:
         logits = weights[0] + weights[1] * relation + weights[2] * counts
         log_p = log_present - np.logaddexp(0.0, -logits)
         log_not = np.log(-np.expm1(np.minimum(log_p, -1e-12)))
-        likelihood = share @ np.where(placed, log_p, log_not)
+        likelihood = weight @ np.where(is_there, log_p, log_not)
         return float(_PENALTY * weights[0] ** 2 - likelihood / len(sources))
 
     limits = [(None, None), (0, 1.5), (0, 1.5)]

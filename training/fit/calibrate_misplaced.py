@@ -13,12 +13,12 @@ Long lists have a higher line than short ones.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import replace
-from typing import Any, Final, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from scipy.special import logit
 
@@ -41,21 +41,19 @@ from app.scene import RelationTable, Scene
 from app.scene.scene import observe
 from app.scene.spatial_relations import ON_TOP
 from training.datasets import EncodedScene
-from training.datasets.array_types import Flags, Floats, Ints, Rng
+from training.datasets.array_types import Rng, Table
 from training.datasets.cases import (
-    RIDGE,
     Triple,
     altered_scene,
     annotated_relations,
     draw_true_relations,
-    logistic,
     scene_rng,
 )
 from training.datasets.moved import moved_scene, untouched_scene
 from training.evaluation.alarms import ALARMS
+from training.fit.regression import LEAST_SCENES, RIDGE, at_most, logistic
 
 _SCENES: Final = 250  # maximum scenes of a source
-_LEAST_SCENES: Final = 20  # minimum validation scenes with entries of a kind
 _SOURCE_SCENES: Final = 60  # minimum scenes of a source with its own alarm line
 _OF_WORDS: Final = 0.1  # weight of an altered on-top that is asked in the words "under"
 _LENGTHS: Final = (1, 2, 4, 8, 16, 32)
@@ -64,34 +62,26 @@ _LENGTHS: Final = (1, 2, 4, 8, 16, 32)
 _BUDGET: Final = {"lateral": 0.05, "support": 0.45, "above": 0.1, "under": 0.1, "stand": 0.3}
 
 
-class _Cases(NamedTuple):
-    """The entries of many scenes, (entries,).
+@dataclass(frozen=True, eq=False)
+class _Cases(Table):
+    """N entries of scenes, in which one entry or no entry is wrong."""
 
-    Attributes:
-        scene: number of the scene, in which one entry or no entry is wrong.
-        encoded: number of the validation scene from which the scene was made.
-        untouched: True for entries of a scene without a wrong entry.
-        complete: True for entries of a source that annotates all supports.
-    """
-
-    scene: Ints
-    encoded: Ints
+    scene: Int[NDArray, "N"]  # number of the scene
+    encoded: Int[NDArray, "N"]  # number of the validation scene from which the scene was made
     source: NDArray[np.str_]
-    untouched: Flags
-    complete: Flags
-    kind: Ints
-    terms: Floats
-    wrong: Flags
-    weight: Floats
-
-    def rows(self, mask: Flags) -> _Cases:
-        columns: Any = (column[mask] for column in self)
-        return _Cases(*columns)
+    untouched: Bool[NDArray, "N"]  # True for entries of a scene without a wrong entry
+    complete: Bool[NDArray, "N"]  # True for entries of a source that annotates all supports
+    kind: Int[NDArray, "N"]
+    terms: Float[NDArray, "N terms"]
+    wrong: Bool[NDArray, "N"]
+    weight: Float[NDArray, "N"]
 
 
 def fit_misplaced(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int = 0) -> Misplaced:
     """Return the judgement of each kind of entry. A kind with too few scenes gets None."""
-    cases = _cases(artifact, _some(scenes, seed), seed)
+    order = np.random.default_rng(seed).permutation(len(scenes)).tolist()
+    some = at_most([scenes[k] for k in order], lambda scene: scene.source, _SCENES)
+    cases = _cases(artifact, some, seed)
     if cases is None:
         return Misplaced()
     kinds = {
@@ -101,20 +91,10 @@ def fit_misplaced(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: in
     return Misplaced().model_copy(update=kinds)
 
 
-def _some(scenes: Sequence[EncodedScene], seed: int) -> list[EncodedScene]:
-    """Return at most `_SCENES` random scenes of each source."""
-    counts, chosen = Counter[str](), []
-    for k in np.random.default_rng(seed).permutation(len(scenes)).tolist():
-        counts[scenes[k].source] += 1
-        if counts[scenes[k].source] <= _SCENES:
-            chosen.append(scenes[k])
-    return chosen
-
-
 def _cases(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int) -> _Cases | None:
     """Return the cases of the scenes, or None without any."""
     of_scene: list[tuple[int, str, bool, bool, float]] = []
-    of_entries: list[tuple[Ints, Floats, Flags]] = []
+    of_entries: list[tuple[NDArray, ...]] = []
     for number, encoded in enumerate(scenes):
         # Without annotated supports, stands show nothing.
         shows_all = annotated_relations(encoded)[ON_TOP].any()
@@ -136,9 +116,11 @@ def _cases(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int) -> _
     columns = (np.repeat(column, sizes) for column in zip(*of_scene, strict=True))
     encoded_index, source, untouched, complete, weights = columns
     kind, terms, wrong_entries = (np.concatenate(x) for x in zip(*of_entries, strict=True))
-    scene_index = np.repeat(np.arange(len(sizes)), sizes)
-    about = scene_index, encoded_index, source, untouched, complete
-    return _Cases(*about, kind, terms, wrong_entries, weights)
+    return _Cases(
+        scene=np.repeat(np.arange(len(sizes)), sizes), encoded=encoded_index, source=source,
+        untouched=untouched, complete=complete, kind=kind, terms=terms, wrong=wrong_entries,
+        weight=weights,
+    )  # fmt: skip
 
 
 def _questions(
@@ -187,8 +169,10 @@ def _part_of(scene: Scene, rng: Rng) -> Scene:
     return replace(scene, objects=tuple(scene.objects[k] for k in kept))
 
 
-def _truth(entries: Entries, wrong: Triple | int | None) -> tuple[Flags, Flags]:
-    """Return which entries are wrong, and which have a known truth, (n,) each.
+def _truth(
+    entries: Entries, wrong: Triple | int | None
+) -> tuple[Bool[NDArray, "n"], Bool[NDArray, "n"]]:
+    """Return which entries are wrong, and for which of them the truth is annotated.
 
     A moved object makes its own support wrong. Its other relations may be right or wrong.
     """
@@ -197,18 +181,17 @@ def _truth(entries: Entries, wrong: Triple | int | None) -> tuple[Flags, Flags]:
         return ~every, every
     if isinstance(wrong, tuple):
         return (entries.triple == np.array(wrong)).all(1), every
-    about: Flags = (entries.triple[:, 1:] == wrong).any(1)
     is_wrong = (entries.mover == wrong) & (entries.kind != BESIDE)
-    return is_wrong, ~about | is_wrong
+    return is_wrong, (entries.triple[:, 1:] != wrong).all(1) | is_wrong
 
 
 def _fit_kind(cases: _Cases, budget: float) -> Judgement | None:
     """Fit the judgement of one kind of entry; None with too few scenes or without any sense."""
     untouched = cases.rows(cases.untouched)
-    if len(np.unique(untouched.encoded)) < _LEAST_SCENES or not cases.wrong.any():
+    if len(np.unique(untouched.encoded)) < LEAST_SCENES or not cases.wrong.any():
         return None
     complete = untouched.rows(untouched.complete)
-    if len(np.unique(complete.encoded)) >= _LEAST_SCENES:
+    if len(np.unique(complete.encoded)) >= LEAST_SCENES:
         untouched = complete
     used = cases.terms.std(0) > 0
     weights, intercept = np.zeros(TERMS), 0.0
@@ -238,7 +221,7 @@ def _alarm_lines(judgement: Judgement, untouched: _Cases, budget: float) -> Alar
     sources = untouched.source[starts]
     for n in _LENGTHS:
         kept = [k for k, values in enumerate(lists) if len(values) >= n]
-        if len(kept) < _LEAST_SCENES:
+        if len(kept) < LEAST_SCENES:
             break
         highest = np.array([rng.permutation(lists[k])[:n].max() for k in kept])
         for name, share in ALARMS.items():
@@ -255,8 +238,8 @@ def _line(points: Sequence[tuple[float, float]], least: float) -> AlarmLine:
     return AlarmLine(intercept=max(intercept, float(logit(least))), log_count=slope)
 
 
-def hardest_quantile(values: Floats, sources: NDArray[np.str_], share: float) -> float:
-    """Return the highest quantile of the values, (N,), over the large sources.
+def hardest_quantile(values: Float[NDArray, "N"], sources: NDArray[np.str_], share: float) -> float:
+    """Return the highest quantile of the values over the large sources.
 
     A robot sees scenes of one source. Small sources count as one. A value equal to the quantile is
     below it.

@@ -25,20 +25,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
 from app.model import AlarmLine, AlarmLines, Calibration, CountSlope, CoverageFit, SceneModel
 from app.model.calibration import LEAST_COVERAGE, LONGEST_JUDGED
 from app.questions.posterior import calibrated
-from training.datasets.array_types import Flags, Floats, Ints
+from training.datasets.array_types import ClassMask
 from training.datasets.batches import SceneTensors, subset
-from training.datasets.cases import RIDGE, logistic
-from training.datasets.sources import source_of
 from training.evaluation.alarms import ALARMS
 from training.evaluation.intruders import draw_intruders, intruder_weights
 from training.evaluation.parts import (
@@ -50,8 +50,17 @@ from training.evaluation.parts import (
     share_of,
     up_to_longest,
 )
-from training.fit.calibrate_rooms import calibrate_rooms, posterior_of, quantile_of
+from training.fit.calibrate_rooms import calibrate_rooms, of_sources, posterior_of
 from training.fit.configuration import ObjectsConfig
+from training.fit.regression import (
+    LEAST_SCENES,
+    RIDGE,
+    fit_count_slope,
+    logistic,
+    quantile_of,
+    recalibrated,
+    structure_of,
+)
 
 COVERAGES = (0.15, 0.3, 0.45, 0.6, 0.8)
 # Tested exponents alpha of the prior of intruders.
@@ -66,7 +75,6 @@ MARGIN = 0.65
 """Share of the permitted alarms at which the lines aim, because foreign sources raise up to half as
 many alarms again as the sources of the fit."""
 
-_LEAST_SCENES = 20  # from which objects are judged
 _SEEDS = (0, 1, 2)
 _LISTED = 10  # classes in the fit of each part; an answer of the service lists ten by default
 _SOURCE_SCENES = 200  # maximum scenes of each source
@@ -76,7 +84,7 @@ def calibrate_objects(
     artifact: SceneModel,
     validation: SceneTensors,
     train: SceneTensors,
-    popularity: Tensor,
+    popularity: Float[Tensor, "V"],
     sources: Collection[str],
     seed: int = 0,
     chosen: Calibration | None = None,
@@ -84,27 +92,17 @@ def calibrate_objects(
     """Return the model's calibration with newly fitted entries about objects.
 
     The training scenes give the intruders, and limits for room types. The coverage and alpha of a
-    `chosen` calibration are copied.
-
-    Args:
-        popularity: log-odds of each class in the served mix of sources, (classes,); NaN for a
-            class without a training scene.
-        sources: see `calibration_scenes`.
+    `chosen` calibration are copied. `popularity` is the log-odds of each class in the served mix;
+    NaN for a class without a training scene. The `sources` are those of `calibration_scenes`.
     """
-    structure = torch.from_numpy(artifact.vocabulary.structure.copy())
     scenes = calibration_scenes(validation, sources)
     learnt = complete_scenes(train, seed)
     rounded = tuple(None if math.isnan(x) else round(x, 4) for x in popularity.double().tolist())
     artifact = recalibrated(artifact, popularity=rounded)
-    artifact = recalibrated(artifact, **fit_missing(artifact, scenes, structure, chosen))
-    entries = fit_outliers(artifact, scenes, learnt, structure, chosen)
-    entries |= calibrate_rooms(artifact, scenes, learnt, structure)
+    artifact = recalibrated(artifact, **fit_missing(artifact, scenes, chosen))
+    entries = fit_outliers(artifact, scenes, learnt, chosen)
+    entries |= calibrate_rooms(artifact, scenes, learnt)
     return recalibrated(artifact, **entries).calibration
-
-
-def recalibrated(artifact: SceneModel, **entries: Any) -> SceneModel:
-    """Return a copy of the model in which some entries of the calibration are replaced."""
-    return replace(artifact, calibration=artifact.calibration.model_copy(update=entries))
 
 
 def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
@@ -116,7 +114,7 @@ def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
     complete = scenes.complete.numpy()
     complete = complete if complete.any() else ~complete
     mask = complete & (rng.random(len(scenes)) < scenes.weight.numpy())
-    return subset(scenes, torch.from_numpy(np.flatnonzero(mask)))
+    return subset(scenes, torch.from_numpy(mask))
 
 
 def calibration_scenes(scenes: SceneTensors, sources: Collection[str]) -> SceneTensors:
@@ -127,9 +125,7 @@ def calibration_scenes(scenes: SceneTensors, sources: Collection[str]) -> SceneT
     """
     names, size = scenes.source_names, scenes.source.bincount(minlength=len(scenes.source_names))
     chosen = [
-        index
-        for index, name in enumerate(names)
-        if name in sources and size[index] >= _LEAST_SCENES
+        index for index, name in enumerate(names) if name in sources and size[index] >= LEAST_SCENES
     ]
     if not chosen:
         scenes = complete_scenes(scenes)
@@ -141,18 +137,13 @@ def calibration_scenes(scenes: SceneTensors, sources: Collection[str]) -> SceneT
     return subset(scenes, torch.tensor(sorted(kept), dtype=torch.int64))
 
 
-def written_scenes(scenes: SceneTensors, *, written: bool = True) -> SceneTensors:
-    """Return the scenes of written sources, or of the other sources."""
-    chosen = torch.tensor([source_of(name).written == written for name in scenes.source_names])
-    return subset(scenes, chosen[scenes.source].nonzero().squeeze(1))
-
-
 def fit_missing(
-    artifact: SceneModel, scenes: SceneTensors, structure: Tensor, chosen: Calibration | None = None
+    artifact: SceneModel, scenes: SceneTensors, chosen: Calibration | None = None
 ) -> dict[str, Any]:
     """Fit the entries `coverage`, `missing` and `covered` of the calibration."""
-    seen = written_scenes(scenes, written=False)
-    used = seen if len(seen) >= _LEAST_SCENES else scenes
+    structure = structure_of(artifact)
+    seen = subset(scenes, ~of_sources(scenes, "written"))
+    used = seen if len(seen) >= LEAST_SCENES else scenes
     lists = _joined(used, structure, map(exactly, LENGTHS))
     if not len(lists.v):
         return {}
@@ -162,9 +153,8 @@ def fit_missing(
     z, row, truth = _first_classes(log_odds[best], lists)
     log_n = np.log(np.maximum(lists.v.sum(1).numpy(), 1))
     entries: dict[str, Any] = {"coverage": coverages[best]}
-    if len(np.unique(truth)) == 2:
-        slope, count, intercept = logistic(np.stack([z, log_n[row]], 1), truth, C=RIDGE)
-        entries["missing"] = CountSlope(intercept=intercept, slope=slope, log_count=count)
+    if (missing := fit_count_slope(z, log_n[row], truth)) is not None:
+        entries["missing"] = missing
     parts = _joined(scenes, structure, (*map(share_of, COVERED), all_but_one))
     if len(parts.v):
         entries["covered"] = _fit_covered(artifact, parts)
@@ -172,13 +162,13 @@ def fit_missing(
 
 
 def _fit_covered(artifact: SceneModel, parts: _Lists) -> CoverageFit:
-    """Fit `covered` to the first classes of parts, each asked with its share of the scene."""
+    """Fit `covered` to the first classes of parts, given the share of the scene that they list."""
     n, hidden = parts.v.sum(1).numpy(), parts.hidden.sum(1)
     # The model's base rates for a complete list are those of all classes but one.
     share = np.where(hidden == 1, 1.0, n / (n + hidden))
     every = np.arange(artifact.spec.V)
-    asked = zip(parts.v, share.tolist(), strict=True)
-    rows = [posterior_of(artifact, v).absent_log_odds(every, s) for v, s in asked]
+    lists = zip(parts.v, share.tolist(), strict=True)
+    rows = [posterior_of(artifact, v).absent_log_odds(every, s) for v, s in lists]
     z, row, truth = _first_classes(np.array(rows, np.float64), parts)
     if len(np.unique(truth)) < 2:
         return CoverageFit()
@@ -190,21 +180,16 @@ def _fit_covered(artifact: SceneModel, parts: _Lists) -> CoverageFit:
 
 
 class _Lists(NamedTuple):
-    """Parts of scenes as arrays over the classes, (parts, classes).
+    """N parts of scenes."""
 
-    Attributes:
-        v: 1 for listed classes.
-        hidden, candidates: True for hidden classes, and for classes that an answer may list.
-        annotated: True for the classes that the data source of the scene can show.
-    """
-
-    v: Tensor
-    hidden: Flags
-    candidates: Flags
-    annotated: Flags
+    v: Float[Tensor, "N V"]  # 1 for listed classes
+    hidden: Bool[NDArray, "N V"]
+    candidates: Bool[NDArray, "N V"]  # classes that an answer may list
+    annotated: Bool[NDArray, "N V"]  # classes that the data source of the scene can show
 
 
-def _joined(scenes: SceneTensors, structure: Tensor, sizes: Iterable[Size]) -> _Lists:
+def _joined(scenes: SceneTensors, structure: Bool[Tensor, "V"], sizes: Iterable[Size]) -> _Lists:
+    """Draw parts of each of the sizes."""
     drawn = [draw_parts(scenes, structure, size) for size in sizes]
     v, hidden, related, scene = (
         torch.cat([getattr(parts, name) for parts in drawn])
@@ -215,14 +200,16 @@ def _joined(scenes: SceneTensors, structure: Tensor, sizes: Iterable[Size]) -> _
     return _Lists(v, (hidden & ~related).numpy(), candidates.numpy(), annotated.numpy())
 
 
-def unlisted_log_odds(artifact: SceneModel, v: Tensor, coverages: Sequence[float]) -> Floats:
-    """Return the log-odds of every class for lists v, (coverages, lists, classes)."""
+def unlisted_log_odds(
+    artifact: SceneModel, v: Float[Tensor, "N V"], coverages: Sequence[float]
+) -> Float[NDArray, "coverages N V"]:
+    """Return the log-odds of every class given the listed classes v, for each coverage."""
     every, posteriors = np.arange(artifact.spec.V), (posterior_of(artifact, row) for row in v)
     rows = [[posterior.absent_log_odds(every, c) for c in coverages] for posterior in posteriors]
     return np.stack(rows, 1)
 
 
-def _mean_rank(z: Floats, parts: _Lists) -> float:
+def _mean_rank(z: Float[NDArray, "N V"], parts: _Lists) -> float:
     """Return the mean reciprocal rank of hidden classes among the other candidates."""
     ranks = []
     for row, usable, truth in zip(z, parts.candidates, parts.hidden, strict=True):
@@ -234,8 +221,10 @@ def _mean_rank(z: Floats, parts: _Lists) -> float:
     return float(np.mean(ranks))
 
 
-def _first_classes(z: Floats, parts: _Lists) -> tuple[Floats, Ints, Flags]:
-    """Return log-odds, part and truth of the first classes of each part, (examples,) each.
+def _first_classes(
+    z: Float[NDArray, "N V"], parts: _Lists
+) -> tuple[Float[NDArray, "k"], Int[NDArray, "k"], Bool[NDArray, "k"]]:
+    """Return log-odds, part and truth of the first classes of each part.
 
     Classes that the data source cannot show are left out, because their truth is unknown.
     """
@@ -249,30 +238,21 @@ def _first_classes(z: Floats, parts: _Lists) -> tuple[Floats, Ints, Flags]:
 
 @dataclass(frozen=True, eq=False)
 class ListScores:
-    """Log-odds of the listed classes of N lists.
+    """Log-odds of the n listed classes of N lists."""
 
-    Attributes:
-        row: list of each listed class, (n,).
-        log_odds: log-odds of each listed class given the rest of its list, (n,).
-        popularity: log-odds of each class in the served mix, (n,).
-        intruder: True for intruders, (n,) bool.
-        can_alarm: False for classes that raise no alarm (`SceneModel.rarely_shown`), (n,) bool.
-        size: number of listed classes of each list, (N,).
-    """
+    row: Int[NDArray, "n"]  # list of each listed class
+    log_odds: Float[NDArray, "n"]  # of each listed class given the rest of its list
+    popularity: Float[NDArray, "n"]  # log-odds of each class in the served mix
+    intruder: Bool[NDArray, "n"]
+    can_alarm: Bool[NDArray, "n"]  # False for classes without alarms (`SceneModel.rarely_shown`)
+    size: Int[NDArray, "N"]  # number of listed classes of each list
 
-    row: Ints
-    log_odds: Floats
-    popularity: Floats
-    intruder: Flags
-    can_alarm: Flags
-    size: Ints
-
-    def score(self, alpha: float) -> Floats:
-        """Return log-odds with the prior of intruders, (n,); low values mean intruders."""
+    def score(self, alpha: float) -> Float[NDArray, "n"]:
+        """Return log-odds with the prior of intruders; low values mean intruders."""
         return self.log_odds - alpha * self.popularity
 
-    def extreme(self, values: Floats) -> Floats:
-        """Return the largest value of each list, (N,)."""
+    def largest(self, values: Float[NDArray, "n"]) -> Float[NDArray, "N"]:
+        """Return the largest value of each list."""
         worst = np.full(len(self.size), -np.inf)
         np.maximum.at(worst, self.row, values)
         return worst
@@ -282,28 +262,25 @@ def fit_outliers(
     artifact: SceneModel,
     scenes: SceneTensors,
     train: SceneTensors,
-    structure: Tensor,
     chosen: Calibration | None = None,
 ) -> dict[str, Any]:
     """Fit the calibration of outliers on random parts of scenes, with and without an intruder.
 
-    The training scenes give the distributions of intruders. A `chosen` calibration gives alpha.
-
-    Returns:
-        The fields `popularity_weight`, `outlier`, `outlier_lines` and `room_lines` of a
-        `Calibration`; none if there are too few scenes or parts.
+    The training scenes give the distributions of intruders. A `chosen` calibration gives alpha. The
+    entries are `popularity_weight`, `outlier`, `outlier_lines` and `room_lines`; none if there are
+    too few scenes or parts.
     """
-    if len(scenes) < _LEAST_SCENES:
+    if len(scenes) < LEAST_SCENES:
         return {}
-    untouched = score_untouched(artifact, scenes, structure)
+    untouched = score_untouched(artifact, scenes)
     laws = intruder_weights(scenes, train).values()
-    scored = (score_intruders(artifact, scenes, structure, weights) for weights in laws)
+    scored = (score_intruders(artifact, scenes, weights) for weights in laws)
     with_intruder = [scores for scores in scored if len(scores.size)]
     if not untouched or not with_intruder:
         return {}
     alpha = chosen.popularity_weight if chosen else choose_alpha(untouched.values(), with_intruder)
     entry = _fit_intruders(untouched.values(), with_intruder, alpha)
-    lines = fit_lines(artifact, scenes, structure, entry, alpha)
+    lines = fit_lines(artifact, scenes, entry, alpha) if entry else {}
     return {"popularity_weight": alpha, "outlier": entry, **lines}
 
 
@@ -311,17 +288,16 @@ def refitted_lines(
     artifact: SceneModel, validation: SceneTensors, config: ObjectsConfig
 ) -> SceneModel:
     """Return the model with alarm lines that are fitted again; a model without lines as it is."""
-    calibration = artifact.calibration
     scenes = calibration_scenes(validation, config.calibrated_sources)
-    structure = torch.from_numpy(artifact.vocabulary.structure.copy())
-    entry, alpha = calibration.outlier, calibration.popularity_weight
+    entry, alpha = artifact.calibration.outlier, artifact.calibration.popularity_weight
     if entry is None:
         return artifact
-    return recalibrated(artifact, **fit_lines(artifact, scenes, structure, entry, alpha))
+    lines = fit_lines(artifact, scenes, entry, alpha)
+    return recalibrated(artifact, **lines)
 
 
-def judged_classes(artifact: SceneModel) -> Flags:
-    """Return the classes that can be intruders and that training shows, (classes,) bool."""
+def judged_classes(artifact: SceneModel) -> ClassMask:
+    """Return the classes that can be intruders and that training shows."""
     popularity = np.array(artifact.calibration.popularity, dtype=np.float64)
     return artifact.vocabulary.judged & ~np.isnan(popularity)
 
@@ -329,13 +305,10 @@ def judged_classes(artifact: SceneModel) -> Flags:
 def score_lists(
     artifact: SceneModel,
     parts: Parts,
-    intruders: Tensor | None = None,
+    intruders: Int[Tensor, "N"] | None = None,
     rooms: Sequence[int] | None = None,
 ) -> ListScores:
-    """Return the scores of parts of scenes, each with an intruder (parts,) if these are given.
-
-    The room type (parts,) of each scene is stated if these are given.
-    """
+    """Return the scores of N parts of scenes, with an intruder and a room type of each part."""
     popularity = np.array(artifact.calibration.popularity, dtype=np.float64)
     v = parts.v.numpy() > 0
     is_intruder = np.zeros_like(v)
@@ -352,32 +325,31 @@ def score_lists(
 
 
 def score_untouched(
-    artifact: SceneModel, scenes: SceneTensors, structure: Tensor, *, in_room: bool = False
+    artifact: SceneModel, scenes: SceneTensors, *, in_room: bool = False
 ) -> dict[int, ListScores]:
     """Return the scores of random parts of scenes by length, without lengths of too few parts.
 
     With `in_room`, the request states the room type, and scenes without a type are left out.
     """
     if in_room:
-        scenes = subset(scenes, (scenes.room >= 0).nonzero().squeeze(1))
+        scenes = subset(scenes, scenes.room >= 0)
     scores: dict[int, ListScores] = {}
     for n in JUDGED_LENGTHS:
-        parts = draw_parts(scenes, structure, exactly(n), _SEEDS)
-        if len(parts.v) >= _LEAST_SCENES:
+        parts = draw_parts(scenes, structure_of(artifact), exactly(n), _SEEDS)
+        if len(parts.v) >= LEAST_SCENES:
             rooms = scenes.room[parts.scene].tolist() if in_room else None
             scores[n] = score_lists(artifact, parts, rooms=rooms)
     return scores
 
 
 def score_intruders(
-    artifact: SceneModel, scenes: SceneTensors, structure: Tensor, weights: Tensor | None
+    artifact: SceneModel, scenes: SceneTensors, weights: Tensor | None
 ) -> ListScores:
     """Return the scores of random parts of scenes, each with an intruder drawn by the weights."""
     unjudged = torch.from_numpy(~judged_classes(artifact))
     intruders = draw_intruders(scenes, unjudged, weights)
     kept = (intruders >= 0).nonzero().squeeze(1)
-    usable = subset(scenes, kept)
-    parts = draw_parts(usable, structure, up_to_longest, _SEEDS)
+    parts = draw_parts(subset(scenes, kept), structure_of(artifact), up_to_longest, _SEEDS)
     return score_lists(artifact, parts, intruders[kept][parts.scene])
 
 
@@ -385,7 +357,7 @@ def choose_alpha(untouched: Collection[ListScores], altered: Collection[ListScor
     """Return the alpha with the best mean of hit@1 and detected share over the intruder kinds."""
 
     def rate(alpha: float) -> float:
-        worst = [scores.extreme(-scores.score(alpha)) for scores in untouched]
+        worst = [scores.largest(-scores.score(alpha)) for scores in untouched]
         limit = float(np.mean([np.quantile(values, 1 - ALARMS["medium"]) for values in worst]))
         return float(np.mean([_detection(scores, alpha, limit) for scores in altered]))
 
@@ -395,30 +367,31 @@ def choose_alpha(untouched: Collection[ListScores], altered: Collection[ListScor
 def _detection(scores: ListScores, alpha: float, limit: float) -> float:
     """Return the mean of hit@1 and of the share of intruders above a limit."""
     values = -scores.score(alpha)
-    first = values >= scores.extreme(values)[scores.row]
+    first = values >= scores.largest(values)[scores.row]
     caught = values > limit
     return float(first[scores.intruder].mean() + caught[scores.intruder].mean()) / 2
 
 
 def _fit_intruders(
     untouched: Collection[ListScores], altered: Collection[ListScores], alpha: float
-) -> CountSlope:
+) -> CountSlope | None:
     """Fit the log-odds of being an intruder, with half of the lists altered."""
-    columns, truth, weights = [], [], []
-    for group in (untouched, altered):
-        for scores in group:
-            size = np.log(scores.size[scores.row])
-            columns.append(np.stack([scores.score(alpha), size], 1))
-            truth.append(scores.intruder)
-            weights.append(np.full(len(scores.row), 1 / (len(group) * len(scores.size))))
-    total = np.concatenate(weights)
-    total *= len(total) / total.sum()
-    slope, count, intercept = logistic(np.concatenate(columns), np.concatenate(truth), total, RIDGE)
-    return CountSlope(intercept=intercept, slope=slope, log_count=count)
+    columns = [
+        (
+            scores.score(alpha),
+            np.log(scores.size[scores.row]),
+            scores.intruder,
+            np.full(len(scores.row), 1 / (len(group) * len(scores.size))),
+        )
+        for group in (untouched, altered)
+        for scores in group
+    ]
+    score, log_size, truth, weight = map(np.concatenate, zip(*columns, strict=True))
+    return fit_count_slope(score, log_size, truth, weight * (len(weight) / weight.sum()))
 
 
 def fit_lines(
-    artifact: SceneModel, scenes: SceneTensors, structure: Tensor, entry: CountSlope, alpha: float
+    artifact: SceneModel, scenes: SceneTensors, entry: CountSlope, alpha: float
 ) -> dict[str, AlarmLines | None]:
     """Return the fields `outlier_lines` and `room_lines` of a `Calibration`.
 
@@ -426,25 +399,24 @@ def fit_lines(
     """
     fields: dict[str, AlarmLines | None] = {}
     for name, in_room in (("outlier_lines", False), ("room_lines", True)):
-        untouched = score_untouched(artifact, scenes, structure, in_room=in_room)
+        untouched = score_untouched(artifact, scenes, in_room=in_room)
         worst = worst_log_odds(untouched, entry, alpha)
         lines = {level: fit_line(worst, share) for level, share in ALARMS.items()} if worst else {}
         fields[name] = AlarmLines(**lines) if lines else None
     return fields
 
 
-def fit_line(worst: Mapping[int, Floats], share: float) -> AlarmLine:
+def fit_line(worst: Mapping[int, Float[NDArray, "N"]], share: float) -> AlarmLine:
     """Return a line above which about `MARGIN` times the share of the lists has an object.
+
+    `worst` has the largest log-odds of each list by the length of the lists.
 
     The shape of the line is the least-squares parabola in the log of the length through the
     quantiles of the lengths, weighted by the square roots of their numbers of lists. A parabola,
     because short lists say little, and long lists of written places contain rare things. With fewer
     than five lengths, the shape is a straight line, and with fewer than three, it is constant. The
     quantiles are those of medium sensitivity, so the lines of two sensitivities never cross. The
-    line is then moved until the mean share over the lengths is right.
-
-    Args:
-        worst: the largest log-odds of each list by the length of the lists.
+    intercept is such that the mean share over the lengths is right.
     """
     sizes, lists = np.log(list(worst)), list(worst.values())
     quantiles = [np.quantile(values, 1 - MARGIN * ALARMS["medium"]) for values in lists]
@@ -460,10 +432,10 @@ def fit_line(worst: Mapping[int, Floats], share: float) -> AlarmLine:
 
 def worst_log_odds(
     untouched: Mapping[int, ListScores], entry: CountSlope, alpha: float
-) -> dict[int, Floats]:
+) -> dict[int, Float[NDArray, "N"]]:
     """Return the largest log-odds of an alarm in each list, by the length of the lists."""
     worst = {}
     for n, scores in untouched.items():
         log_odds = calibrated(entry, scores.score(alpha), scores.size[scores.row])
-        worst[n] = scores.extreme(np.where(scores.can_alarm, log_odds, -np.inf))
+        worst[n] = scores.largest(np.where(scores.can_alarm, log_odds, -np.inf))
     return worst

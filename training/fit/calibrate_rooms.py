@@ -13,11 +13,13 @@ smallest, room_fit
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any, NamedTuple, Self
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import log_softmax
 from torch import Tensor
@@ -27,15 +29,15 @@ from app.model import FitLimit, SceneModel, Sharpness
 from app.model.calibration import NO_LIMIT
 from app.questions.generate import STEPS, room_fit
 from app.questions.posterior import Posterior
-from training.datasets.array_types import Flags, Floats, Ints
+from training.datasets.array_types import Table
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.sources import source_of
 from training.evaluation.asking import of_classes
 from training.evaluation.parts import Parts, Size, draw_parts, exactly
 from training.fit.long_chains import conditions_of
+from training.fit.regression import LEAST_SCENES, quantile_of, recalibrated, structure_of
 
 _LENGTHS = (1, 2, 3, 5, 8)  # numbers of listed classes in the fit of `rooms`
-_LEAST_SCENES = 20  # validation scenes with a room type in that fit
 # A room type of at least `_ENOUGH_SCENES` scenes is never rare; one of fewer than `_FEW_SCENES` is.
 _ENOUGH_SCENES, _FEW_SCENES = 50, 10
 _SPLITS = 20
@@ -49,35 +51,34 @@ _LONG_SCENES = 100  # of a room type, for a limit of the fit that grows with the
 
 
 def calibrate_rooms(
-    artifact: SceneModel, scenes: SceneTensors, train: SceneTensors, structure: Tensor
+    artifact: SceneModel, scenes: SceneTensors, train: SceneTensors
 ) -> dict[str, Any]:
     """Return the calibration entries about room types.
 
-    Args:
-        scenes: validation scenes of the served sources.
-        train: training scenes with complete object lists.
+    They are fitted to validation scenes of the served sources, and to training scenes with complete
+    object lists.
     """
     return {
-        "rooms": fit_rooms(artifact, scenes, structure),
-        "rare_rooms": rare_rooms(artifact, train, structure),
+        "rooms": fit_rooms(artifact, scenes),
+        "rare_rooms": rare_rooms(artifact, train),
         "written_rooms": written_rooms(train),
-        **limits(artifact, train, structure),
+        **limits(artifact, train),
     }
 
 
-def fit_rooms(artifact: SceneModel, scenes: SceneTensors, structure: Tensor) -> Sharpness:
-    """Fit the sharpness of room types; the default with fewer than 20 scenes of a known type."""
-    scenes = subset(scenes, (scenes.room >= 0).nonzero().squeeze(1))
-    if len(scenes) < _LEAST_SCENES:
+def fit_rooms(artifact: SceneModel, scenes: SceneTensors) -> Sharpness:
+    """Fit the sharpness of room types; the default with fewer than 20 scenes with a room type."""
+    scenes = subset(scenes, scenes.room >= 0)
+    if len(scenes) < LEAST_SCENES:
         return Sharpness()
     sizes: list[Size] = [lambda n, _: n, *map(exactly, _LENGTHS)]
-    parts = [draw_parts(scenes, structure, size) for size in sizes]
+    parts = [draw_parts(scenes, structure_of(artifact), size) for size in sizes]
     v = torch.cat([part.v for part in parts])
     room = torch.cat([scenes.room[part.scene] for part in parts]).numpy()
     log_p = np.stack([posterior_of(artifact, row).room_log_p() for row in v])
     size = np.log(v.sum(1).numpy())
 
-    def loss(weights: Floats) -> float:
+    def loss(weights: NDArray[np.float64]) -> float:
         sharpness = np.maximum(weights[0] + weights[1] * size, 0.05)
         table = log_softmax(sharpness[:, None] * log_p, axis=1)
         return -float(table[np.arange(len(room)), room].mean())
@@ -86,23 +87,26 @@ def fit_rooms(artifact: SceneModel, scenes: SceneTensors, structure: Tensor) -> 
     return Sharpness(slope=slope, log_count=log_count)
 
 
-def posterior_of(artifact: SceneModel, v: Tensor, room: int | None = None) -> Posterior:
-    """Return the posterior given the listed classes v, (classes,), and the room type."""
+def posterior_of(artifact: SceneModel, v: Float[Tensor, "V"], room: int | None = None) -> Posterior:
+    """Return the posterior given the listed classes v and the room type."""
     scene = of_classes(v.nonzero().squeeze(1).tolist())
     return Posterior(artifact, replace(scene, room_type=room))
 
 
+def of_sources(scenes: SceneTensors, attribute: str) -> Bool[Tensor, "B"]:
+    """Return True for scenes whose `Source` has an attribute, such as "written"."""
+    values = [getattr(source_of(name), attribute) for name in scenes.source_names]
+    return torch.tensor(values, dtype=torch.bool)[scenes.source]
+
+
 def written_rooms(train: SceneTensors) -> tuple[int, ...]:
     """Return the room types whose training scenes are all written, in ascending order."""
-    is_written = torch.tensor([source_of(name).written for name in train.source_names])
-    written = is_written[train.source]
+    written = of_sources(train, "written")
     others = {-1, *train.room[~written].tolist()}
     return tuple(sorted(set(train.room[written].tolist()) - others))
 
 
-def rare_rooms(
-    artifact: SceneModel, train: SceneTensors, structure: Tensor, seed: int = 0
-) -> tuple[int, ...]:
+def rare_rooms(artifact: SceneModel, train: SceneTensors, seed: int = 0) -> tuple[int, ...]:
     """Return the room types with too few training scenes to sample them, in ascending order.
 
     These are the types of fewer than 10 scenes. They are also the types of fewer than 50 scenes
@@ -110,7 +114,7 @@ def rare_rooms(
     resemblance of two sets is sum_i min(p_i, q_i) / sum_i max(p_i, q_i), where p_i and q_i are the
     shares of scenes with class i.
     """
-    rng, things = np.random.default_rng(seed), ~structure.numpy()
+    rng, things = np.random.default_rng(seed), ~artifact.vocabulary.structure
     rare = []
     for t in range(artifact.spec.C):
         v = train.v[train.room == t].numpy()[:, things] > 0
@@ -124,8 +128,8 @@ def rare_rooms(
     return tuple(rare)
 
 
-def _samples(artifact: SceneModel, room: int, seed: int) -> Flags:
-    """Draw scenes of a room type as `/generate` does, without its tests, (samples, classes)."""
+def _samples(artifact: SceneModel, room: int, seed: int) -> Bool[NDArray, "N V"]:
+    """Draw scenes of a room type as `/generate` does, without its tests."""
     chains = artifact.scene_chains.under(conditions_of(room))
     samples = np.zeros((_SAMPLES, artifact.spec.V), np.bool_)
     for k, row in enumerate(samples):
@@ -133,46 +137,36 @@ def _samples(artifact: SceneModel, room: int, seed: int) -> Flags:
     return samples
 
 
-def _resemblance(first: Flags, second: Flags) -> float:
+def _resemblance(first: Bool[NDArray, "N V"], second: Bool[NDArray, "M V"]) -> float:
+    """Return the resemblance of two sets of scenes, as defined by `rare_rooms`."""
     p, q = first.mean(0), second.mean(0)
     return float(np.minimum(p, q).sum() / max(np.maximum(p, q).sum(), 1e-9))
 
 
 def refitted_limits(artifact: SceneModel, train: SceneTensors) -> SceneModel:
-    """Return the model with limits of generated scenes that are fitted again.
-
-    Args:
-        train: training scenes with complete object lists.
-    """
-    structure = torch.from_numpy(artifact.vocabulary.structure.copy())
-    update = limits(artifact, train, structure)
-    return replace(artifact, calibration=artifact.calibration.model_copy(update=update))
+    """Return the model with newly fitted `limits` of generated scenes."""
+    return recalibrated(artifact, **limits(artifact, train))
 
 
-def limits(artifact: SceneModel, train: SceneTensors, structure: Tensor) -> dict[str, Any]:
-    """Return the limits of a generated scene of each room type.
+def limits(artifact: SceneModel, train: SceneTensors) -> dict[str, Any]:
+    """Return the entries `smallest` and `room_fit`: limits of a generated scene by room type.
 
     A limit is a 5 % quantile over parts of whole rooms. The number of classes has the parts of 30 %
     of the classes, as a robot lists a room, so rooms in short real lists also reach the limits. The
     fit grows with the number of classes. For a room type of at least 100 scenes, its limit is the
     least-squares line through the quantiles of parts of 30, 50, 75 and 100 %, in the log of their
     mean numbers of classes. All sources have equal weight. Sources of frames, sentences or
-    procedural rooms do not take part, except in data without whole rooms.
-
-    Args:
-        train: training scenes with complete object lists.
-
-    Returns:
-        The fields `smallest` and `room_fit` of a `Calibration`. A room type with fewer than 20
-        scenes has the number of classes of all rooms, and a fit of at least -1e9.
+    procedural rooms do not take part, except in data without whole rooms. A room type with fewer
+    than 20 scenes has the number of classes of all rooms, and a fit of at least -1e9. The training
+    scenes have complete object lists.
     """
     rooms = whole_rooms(train)
-    parts = [draw_parts(rooms, structure, _part_of(share)) for share in _PARTS]
+    parts = [draw_parts(rooms, structure_of(artifact), _part_of(share)) for share in _PARTS]
     lists = [_ListedRooms.of(rooms, part) for part in parts]
     least = lists[0].smallest() if len(lists[0].size) else 0
     smallest, fits = [], []
     for t in range(artifact.spec.C):
-        own = [each.of_type(t) for each in lists]
+        own = [each.rows(each.room == t) for each in lists]
         if len(np.unique(own[0].scene)) < _ROOM_SCENES:
             smallest.append(least)
             fits.append(NO_LIMIT)
@@ -182,30 +176,21 @@ def limits(artifact: SceneModel, train: SceneTensors, structure: Tensor) -> dict
     return {"smallest": (*smallest, least), "room_fit": tuple(fits)}
 
 
-class _ListedRooms(NamedTuple):
-    """Listed parts of rooms.
+@dataclass(frozen=True, eq=False)
+class _ListedRooms(Table):
+    """N listed parts of rooms."""
 
-    Attributes:
-        listed: True for listed classes, (parts, classes).
-        size: number of listed classes, (parts,).
-        scene, source, room: index of the scene, of its source and of its room type, (parts,) each.
-    """
-
-    listed: Flags
-    size: Ints
-    scene: Ints
-    source: Ints
-    room: Ints
+    listed: Bool[NDArray, "N V"]
+    size: Int[NDArray, "N"]  # number of listed classes
+    scene: Int[NDArray, "N"]
+    source: Int[NDArray, "N"]
+    room: Int[NDArray, "N"]  # room type
 
     @classmethod
     def of(cls, scenes: SceneTensors, parts: Parts) -> Self:
         listed, scene = parts.v.numpy() > 0, parts.scene.numpy()
         source, room = scenes.source.numpy()[scene], scenes.room.numpy()[scene]
         return cls(listed, listed.sum(1), scene, source, room)
-
-    def of_type(self, room: int) -> Self:
-        """Return the parts of scenes of a room type."""
-        return type(self)(*(values[self.room == room] for values in self))
 
     def smallest(self) -> int:
         return int(_low_quantile(self.size.astype(np.float64), self.source))
@@ -229,20 +214,14 @@ def _fit_limit(artifact: SceneModel, lists: Sequence[_ListedRooms], room: int) -
 
 def whole_rooms(scenes: SceneTensors) -> SceneTensors:
     """Return the scenes of sources of whole rooms, or all scenes if there are none."""
-    is_whole = torch.tensor([source_of(name).whole_rooms for name in scenes.source_names])
-    mask = is_whole[scenes.source] if len(scenes) else torch.zeros(0, dtype=torch.bool)
-    return subset(scenes, mask.nonzero().squeeze(1)) if mask.any() else scenes
+    mask = of_sources(scenes, "whole_rooms")
+    return subset(scenes, mask) if mask.any() else scenes
 
 
 def _part_of(share: float) -> Size:
     return lambda classes, _: max(1, round(share * classes))
 
 
-def _low_quantile(values: Floats, source: Ints) -> float:
+def _low_quantile(values: Float[NDArray, "N"], source: Int[NDArray, "N"]) -> float:
     """Return the quantile `_LEAST` of the values, in which all sources have equal weight."""
     return quantile_of(values, 1 / np.bincount(source)[source], _LEAST)
-
-
-def quantile_of(values: Floats, weights: Floats, share: float) -> float:
-    """Return the smallest value below or at which the given share of the weights lies."""
-    return float(np.quantile(values, share, weights=weights, method="inverted_cdf"))

@@ -153,7 +153,7 @@ class ObjectsConfig(_Section):
 
 
 class RelationsConfig(_Section):
-    """The fit of the relation weights (`training.fit.relations`)."""
+    """The fit of the relation weights (`training.fit.relation_weights`)."""
 
     epochs: int = Field(default=8, ge=0, description="passes over the scenes; 0: no relations")
     learning_rate: float = Field(default=0.01, gt=0)

@@ -9,25 +9,27 @@ class and a term that all classes share. `docs/decisions/counts.md` describes th
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from typing import Final
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.optimize import minimize
 
 from app.model.count_statistics import EXPONENTS, INTERCEPT, ROOM, SEVERAL, SINGLE, Counts
 from app.scene import Vocabulary
 from training.datasets import EncodedScene
-from training.datasets.array_types import Flags, Floats, Ints
+from training.datasets.array_types import ClassMask, Table
 from training.datasets.cases import MOST, Part, counted_classes, listed_cases
 from training.datasets.sources import source_of
 from training.evaluation.count_task import class_mean
 from training.fit.offset_statistics import half_precision, source_weights
+from training.fit.regression import at_most
 
 _OF_GROUP: Final = 8  # maximum number of scenes of a group; they are near-duplicates
 _DRAWS: Final = 2  # listings of each training and validation scene
@@ -52,24 +54,24 @@ def fit_counts(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> Counts
     statistics only if, in a cross-validation, the expected number is closer to the truth than the
     class mean.
     """
-    counting = {
-        name: counted
-        for name, counted in counted_classes(scenes, vocabulary).items()
+    counted = {
+        name: classes
+        for name, classes in counted_classes(scenes, vocabulary).items()
         if not (source_of(name).of_one_view or source_of(name).written)
     }
-    counted = [scene for scene in scenes if scene.source in counting]
-    most = _most_listed(counted, counting, vocabulary)
+    scenes = [scene for scene in scenes if scene.source in counted]
+    most = _most_listed(scenes, counted, vocabulary)
     if not (most > 1).any():
         return None
-    counted = _limit_groups(counted)
-    counting = {source: of_source & (most > 0) for source, of_source in counting.items()}
-    cases = _Cases.of(counted, counting, vocabulary)
-    most *= _is_better_than_mean(counted, cases, most, counting, vocabulary)
-    cases = cases.where(most[cases.index] > 0)
+    scenes = at_most(scenes, lambda scene: (scene.source, scene.group), _OF_GROUP)
+    counted = {source: classes & (most > 0) for source, classes in counted.items()}
+    cases = _Cases.of(scenes, counted, vocabulary)
+    most *= _is_better_than_mean(scenes, cases, most, counted, vocabulary)
+    cases = cases.rows(most[cases.index] > 0)
     return _fit(cases, most, vocabulary) if (most > 1).any() else None
 
 
-def _folds(scenes: Sequence[EncodedScene]) -> Ints:
+def _folds(scenes: Sequence[EncodedScene]) -> Int[NDArray, "scenes"]:
     """Return the number of the fold, of five, that tests each scene. A group is in one fold."""
     groups = sorted({scene.group for scene in scenes})
     order = np.random.default_rng(0).permutation(len(groups)) % _FOLDS
@@ -77,42 +79,33 @@ def _folds(scenes: Sequence[EncodedScene]) -> Ints:
     return np.array([fold[scene.group] for scene in scenes])
 
 
-def _fit(cases: _Cases, most: Ints, vocabulary: Vocabulary) -> Counts:
-    """Fit the statistics to the cases, which are of the classes with a `most`."""
-    share = _shares(cases, len(vocabulary))
-    weights = _weights(cases, share, most > 0)
+def _fit(cases: _Cases, most: Int[NDArray, "V"], vocabulary: Vocabulary) -> Counts:
+    """Fit the statistics of the classes whose maximum listed number `most` is above 0."""
+    log_frequency = _log_frequencies(cases, len(vocabulary))
+    weights = _weights(cases, log_frequency, most > 0)
     # The exponent -1 stands for the listed number, which is uniform from 1 to n.
     weights[:, 0, INTERCEPT] -= 1.0
     itself = ROOM + len(vocabulary.room_types) + np.arange(len(vocabulary))
     weights[np.arange(len(vocabulary)), :, itself] = 0.0
     classes = np.flatnonzero(most)
-    return Counts(
-        classes, most[classes], half_precision(share[classes]), half_precision(weights[classes])
-    )
-
-
-def _limit_groups(scenes: Sequence[EncodedScene]) -> list[EncodedScene]:
-    """Return at most `_OF_GROUP` scenes of each group."""
-    kept, counts = [], Counter[tuple[str, str]]()
-    for scene in scenes:
-        counts[scene.source, scene.group] += 1
-        if counts[scene.source, scene.group] <= _OF_GROUP:
-            kept.append(scene)
-    return kept
+    tables = half_precision(log_frequency[classes]), half_precision(weights[classes])
+    return Counts(classes, most[classes], *tables)
 
 
 def _most_listed(
-    scenes: Sequence[EncodedScene], counting: dict[str, Flags], vocabulary: Vocabulary
-) -> Ints:
-    """Return the maximum listed number of each class that the data can tell about, (V,).
+    scenes: Sequence[EncodedScene],
+    counted: dict[str, ClassMask],
+    vocabulary: Vocabulary,
+) -> Int[NDArray, "V"]:
+    """Return the maximum listed number of each class for which the data suffice.
 
     It is at least 2 for a class with enough scenes and enough groups with several instances, and 0
-    for the other classes.
+    for the other classes. `counted` are the counted classes by source.
     """
     scene_counts = np.zeros(len(vocabulary), dtype=np.int64)
-    largest: dict[tuple[str, str], Ints] = {}  # numbers of instances in a group, (V,)
+    largest: dict[tuple[str, str], Int[NDArray, "V"]] = {}  # numbers of instances in a group
     for scene in scenes:
-        is_counted = counting[scene.source][scene.evidence.classes]
+        is_counted = counted[scene.source][scene.evidence.classes]
         classes, counts = scene.evidence.classes[is_counted], scene.evidence.counts[is_counted]
         scene_counts[classes] += 1
         of_group = largest.setdefault((scene.source, scene.group), np.zeros_like(scene_counts))
@@ -124,35 +117,34 @@ def _most_listed(
 
 
 @dataclass(frozen=True, eq=False)
-class _Cases:
-    """N cases: a class of a partly listed scene.
+class _Cases(Table):
+    """N cases: a class of a partly listed scene."""
 
-    Attributes:
-        index: (N,) the class.
-        listed, number: (N,) numbers of instances, listed (from 1 to `number`) and in the scene.
-        features: (N, 3 + C + V) features of the listed part, in the columns of `Counts.weights`.
-        scene, source: (N,) indices of the scene and of its data source.
-    """
-
-    index: Ints
-    listed: Ints
-    number: Ints
+    index: Int[NDArray, "N"]  # class
+    listed: Int[NDArray, "N"]  # number of listed instances, from 1 to `number`
+    number: Int[NDArray, "N"]  # number of instances in the scene
+    # Features of the listed part, (N, 3 + C + V), in the columns of `Counts.weights`.
     features: sparse.csr_matrix
-    scene: Ints
-    source: Ints
+    scene: Int[NDArray, "N"]
+    source: Int[NDArray, "N"]  # data source of the scene
 
     @classmethod
     def of(
-        cls, scenes: Sequence[EncodedScene], counting: dict[str, Flags], vocabulary: Vocabulary
+        cls,
+        scenes: Sequence[EncodedScene],
+        counted: dict[str, ClassMask],
+        vocabulary: Vocabulary,
     ) -> _Cases:
         """List each scene in part, `_DRAWS` times."""
-        names, start = sorted(counting), ROOM + len(vocabulary.room_types)
-        rows: list[tuple[Ints, Floats]] = []
+        names, start = sorted(counted), ROOM + len(vocabulary.room_types)
+        rows: list[tuple[NDArray, NDArray]] = []
         cases: list[tuple[int, ...]] = []
         for row, scene in enumerate(scenes):
-            counted, source = counting[scene.source], names.index(scene.source)
+            source = names.index(scene.source)
             for seed in range(_DRAWS):
-                part, indices = listed_cases(scene, counted, vocabulary.structure, seed)
+                part, indices = listed_cases(
+                    scene, counted[scene.source], vocabulary.structure, seed
+                )
                 rows += [_features(part, k, start) for k in indices.tolist()]
                 numbers = np.stack([part.classes, part.listed, part.number])[:, indices]
                 cases += [(*case, row, source) for case in numbers.T.tolist()]
@@ -163,18 +155,19 @@ class _Cases:
         features = sparse.csr_matrix((values, columns, bounds), shape=shape)
         return cls(index, listed, number, features, scene_rows, sources)
 
-    def where(self, chosen: Flags) -> _Cases:
-        """Return the chosen cases; `chosen` is a mask, (N,)."""
-        return _Cases(*(getattr(self, field.name)[chosen] for field in fields(self)))
-
     @cached_property
-    def weight(self) -> Floats:
-        """Weight of each case, (N,), that balances the data sources."""
+    def weight(self) -> Float[NDArray, "N"]:
+        """Weight of each case that balances the data sources."""
         return source_weights(self.source, self.scene) / _DRAWS
 
 
-def _features(part: Part, k: int, start: int) -> tuple[Ints, Floats]:
-    """Return columns of `Counts.weights` and their values for the k-th class of a part."""
+def _features(
+    part: Part, k: int, start: int
+) -> tuple[Int[NDArray, "columns"], Float[NDArray, "columns"]]:
+    """Return columns of `Counts.weights` and their values for the k-th class of a part.
+
+    The columns of the classes begin at `start`.
+    """
     others, listed = np.delete(part.classes, k), np.delete(part.listed, k)
     columns = [INTERCEPT, SINGLE, SEVERAL, *(start + others).tolist()]
     values = [1.0, float(part.listed[k] == 1), float((listed > 1).any())]
@@ -185,8 +178,8 @@ def _features(part: Part, k: int, start: int) -> tuple[Ints, Floats]:
     return np.array(columns, dtype=np.int64), np.array(values)
 
 
-def _shares(cases: _Cases, V: int) -> Floats:
-    """Return the log of the share of each number of instances, (V, M)."""
+def _log_frequencies(cases: _Cases, V: int) -> Float[NDArray, "V M"]:
+    """Return the smoothed log frequency of each number of instances of each class."""
     table = np.zeros((V, MOST))
     np.add.at(table, (cases.index, cases.number - 1), cases.weight)
     # Each number needs a positive share, because the fitted scene may favour it.
@@ -195,10 +188,12 @@ def _shares(cases: _Cases, V: int) -> Floats:
     return np.log(table / table.sum(axis=1, keepdims=True))
 
 
-def _weights(cases: _Cases, share: Floats, fitted: Flags) -> Floats:
-    """Return the weights of each class, (V, 2, 3 + C + V), by maximum penalised likelihood.
+def _weights(
+    cases: _Cases, log_frequency: Float[NDArray, "V M"], fitted: ClassMask
+) -> Float[NDArray, "V 2 3+C+V"]:
+    """Return the weights of each class by maximum penalised likelihood.
 
-    A class has terms of its own only where `fitted`, (V,), is true and `_OWN_CASES` cases show it.
+    A class has terms of its own only where `fitted` is true and `_OWN_CASES` cases show it.
     """
     features, (N, width), V = cases.features, cases.features.shape, len(fitted)
     # The terms of a class act only on cases of this class.
@@ -216,10 +211,10 @@ def _weights(cases: _Cases, share: Floats, fitted: Flags) -> Floats:
     log = np.log(numbers)
     of_number = np.stack([log, log * (math.log(MOST) - log)])
     observed, case = cases.number - 1, np.arange(N)
-    base = share.T[:, cases.index] - np.log(numbers)[:, None]
+    base = log_frequency.T[:, cases.index] - np.log(numbers)[:, None]
     base[numbers[:, None] < cases.listed] = -np.inf
 
-    def loss(flat: Floats) -> tuple[float, Floats]:
+    def loss(flat: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         terms = flat.reshape(-1, EXPONENTS)
         logits = of_number.T @ (all_terms @ terms).T
         logits += base
@@ -243,24 +238,23 @@ def _weights(cases: _Cases, share: Floats, fitted: Flags) -> Floats:
 def _is_better_than_mean(
     scenes: Sequence[EncodedScene],
     cases: _Cases,
-    most: Ints,
-    counting: dict[str, Flags],
+    most: Int[NDArray, "V"],
+    counted: dict[str, ClassMask],
     vocabulary: Vocabulary,
-) -> Flags:
-    """Return the classes, (V,), whose expected number is closer than the class mean."""
+) -> ClassMask:
+    """Return the classes whose expected number is closer to the truth than the class mean."""
     V, fold = len(vocabulary), _folds(scenes)
-    gain = np.zeros(V)
+    improvement = np.zeros(V)
     for number in range(_FOLDS):
-        counts = _fit(cases.where(fold[cases.scene] != number), most, vocabulary)
+        counts = _fit(cases.rows(fold[cases.scene] != number), most, vocabulary)
         test = [scenes[k] for k in np.flatnonzero(fold == number).tolist()]
         for scene, seed in product(test, range(_DRAWS)):
-            counted = counting[scene.source]
-            part, indices = listed_cases(scene, counted, vocabulary.structure, seed)
+            part, indices = listed_cases(scene, counted[scene.source], vocabulary.structure, seed)
             room = part.room if part.room >= 0 else None
             rows, p = counts.distribution(V, part.classes, part.listed, room)
-            is_asked = np.isin(rows, indices)
-            rows, expected = rows[is_asked], p[is_asked] @ np.arange(1, MOST + 1)
+            is_case = np.isin(rows, indices)
+            rows, expected = rows[is_case], p[is_case] @ np.arange(1, MOST + 1)
             classes, truth = part.classes[rows], part.number[rows]
             mean = class_mean(counts, np.searchsorted(counts.classes, classes), part.listed[rows])
-            gain[classes] -= np.abs(expected - truth) - np.abs(mean - truth)
-    return gain > 0
+            improvement[classes] -= np.abs(expected - truth) - np.abs(mean - truth)
+    return improvement > 0

@@ -14,21 +14,13 @@ from training.machines import BoltzmannMachine
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """One point of the training curve.
+    """One point of the training curve."""
 
-    Attributes:
-        phase: "objects" or "relations".
-        done: finished share of the phase, from 0 to 1.
-        loss: mean loss since the previous point of the phase.
-        score: score on validation scenes. NaN means that no scene can be scored.
-        seconds: duration since the previous point.
-    """
-
-    phase: str
-    done: float
-    loss: float
-    score: float
-    seconds: float
+    phase: str  # "objects" or "relations"
+    done: float  # finished share of the phase, from 0 to 1
+    loss: float  # mean since the previous point of the phase
+    score: float  # on validation scenes; NaN means that no scene can be scored
+    seconds: float  # since the previous point
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from app.model import Calibration, Places, SceneModel
 from app.scene import RoleCounts, Vocabulary
 from training.datasets import EncodedScene
-from training.datasets.array_types import Floats
 from training.datasets.batches import TrainingData
 from training.machines import BoltzmannMachine
 from training.machines.arrays import weights_of
@@ -59,12 +60,12 @@ def fit_places(
         i, j = evidence.classes[subject], evidence.classes[anchor]
         counted = is_thing[i] & is_thing[j] & (i != j)
         blocks.append(((relation * V + i) * V + j)[counted])
-    keys, held = np.unique(np.concatenate(blocks), return_counts=True)
+    keys, scene_counts = np.unique(np.concatenate(blocks), return_counts=True)
     if not len(keys):
         return None
     return Places(
         triple=keys.astype(np.int32),
-        held=held.astype(np.float32),
+        held=scene_counts.astype(np.float32),
         frequency=(listed / listed.sum()).astype(np.float32),
         role_pair=roles.pair.astype(np.int32),
         role_counts=roles.counts,
@@ -73,16 +74,15 @@ def fit_places(
     )
 
 
-def _stands(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> Floats:
-    """Return shares of floor, wall and supports, (V, 3), smoothed to the parent and to all."""
+def _stands(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> Float[NDArray, "V 3"]:
+    """Return frequencies of floor, wall and supports, smoothed to the parent and to all."""
     counts = np.zeros((len(vocabulary), 3))
     for scene in scenes:
-        known = scene.instance_stands >= 0
-        np.add.at(counts, (scene.instance_classes[known], scene.instance_stands[known]), 1)
-    usual = counts.sum(0) + 1
-    shares = (counts + _OF_ALL * usual / usual.sum()) / (counts.sum(1, keepdims=True) + _OF_ALL)
+        observed = scene.instance_stands >= 0
+        np.add.at(counts, (scene.instance_classes[observed], scene.instance_stands[observed]), 1)
+    overall, totals = counts.sum(0) + 1, counts.sum(1, keepdims=True)
+    smoothed = (counts + _OF_ALL * overall / overall.sum()) / (totals + _OF_ALL)
     parents = vocabulary.parents
-    prior = np.where((parents >= 0)[:, None], shares[parents], usual / usual.sum())
+    prior = np.where((parents >= 0)[:, None], smoothed[parents], overall / overall.sum())
     weight = np.where(parents >= 0, _OF_PARENT, _OF_ALL)[:, None]
-    smoothed: Floats = (counts + weight * prior) / (counts.sum(1, keepdims=True) + weight)
-    return smoothed
+    return (counts + weight * prior) / (totals + weight)

@@ -1,8 +1,8 @@
 """Add classes and room types to a model, before the fit to the home where they occur.
 
-New classes follow the known classes, and new room types the known ones. Their weights are 0: such
-a class says nothing about others, and its relations are those of an average pair. The biases make
-it rare. `training.fit.adapt` fits biases and weights.
+New classes follow the classes of the model, and new room types its room types. Their weights are 0:
+such a class does not change the log-odds of others, and its relations are those of an average pair.
+The biases make it rare. `training.fit.adapt` fits biases and weights.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from app.model.calibration import NO_LIMIT
 from app.model.count_statistics import ROOM
 from app.scene import CANONICAL, ObjectClass, Vocabulary
 
-_RARE: Final = 0.1  # quantile of the known biases that a new class or room type gets
-# Arrays whose new entries are the mean of the known ones.
+_RARE: Final = 0.1  # quantile of the old biases that a new class or room type gets
+# Arrays whose new entries are the mean of the old ones.
 _AVERAGED: Final = ("kappa", "u", "usual")
 
 
@@ -31,15 +31,13 @@ def extended(
     """Return the model in memory with further classes and room types at the end.
 
     Raises:
-        ValueError: a name is that of a known class or room type.
+        ValueError: a name is that of a class or room type of the model.
     """
     if not classes and not rooms:
         return artifact
-    known = artifact.vocabulary
-    vocabulary = Vocabulary(
-        (*known.objects, *classes), (*known.room_types, *rooms), known.room_aliases
-    )
-    V, C = len(known), len(known.room_types)
+    old = artifact.vocabulary
+    vocabulary = Vocabulary((*old.objects, *classes), (*old.room_types, *rooms), old.room_aliases)
+    V, C = len(old), len(old.room_types)
     return replace(
         artifact,
         vocabulary=vocabulary,
@@ -52,6 +50,7 @@ def extended(
 
 
 def _weights(weights: Weights, V: int, C: int) -> Weights:
+    """Return the weights with V classes and C room types."""
     old, larger = weights.spec, weights.enlarged(V, C if weights.spec.C else 0)
     arrays = larger.arrays
     arrays["b"][old.V :] = np.quantile(weights["b"], _RARE)
@@ -64,6 +63,7 @@ def _weights(weights: Weights, V: int, C: int) -> Weights:
 
 
 def _calibration(calibration: Calibration, classes: int, C: int, rooms: int) -> Calibration:
+    """Return the calibration with further classes, and room types after the first C."""
     update: Mapping[str, Any] = {
         "popularity": (*calibration.popularity, *[None] * classes),
         "rare_rooms": (*calibration.rare_rooms, *range(C, C + rooms)),
@@ -79,6 +79,7 @@ def _calibration(calibration: Calibration, classes: int, C: int, rooms: int) -> 
 
 
 def _offsets(offsets: Offsets, old: int, new: int) -> Offsets:
+    """Return the offsets of `new` classes instead of `old` ones."""
     A, more = len(offsets.relation), ((0, 0), (0, new - old), (0, 0))
     return replace(
         offsets,
@@ -96,6 +97,7 @@ def _triple_keys(keys: NDArray[Any], old: int, new: int, A: int) -> NDArray[Any]
 
 
 def _counts(counts: Counts, C: int, rooms: int, classes: int) -> Counts:
+    """Return the counts with further room types, after the first C, and further classes."""
     # The columns are the fixed features, the room types and the classes.
     fixed, of_classes = np.split(counts.weights, [ROOM + C], axis=-1)
     fixed, of_classes = (
@@ -106,6 +108,8 @@ def _counts(counts: Counts, C: int, rooms: int, classes: int) -> Counts:
 
 
 def _places(places: Places, old: int, new: int) -> Places:
+    """Return the places of `new` classes instead of `old` ones."""
+
     def averaged(table: NDArray[Any]) -> NDArray[Any]:
         mean = table.mean(0, keepdims=True).repeat(new - old, 0)
         return np.concatenate([table, mean.astype(table.dtype)])

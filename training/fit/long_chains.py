@@ -15,6 +15,8 @@ from typing import Final, TypeVar
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from app.inference.chains import Conditions, SceneChains, random_stream
 from app.inference.weights import Weights
@@ -22,7 +24,7 @@ from app.model import SceneModel
 from app.questions.generate import ATTEMPTS, STEPS, is_plausible
 from app.registry import Metric
 from app.scene import Scene
-from training.datasets.array_types import Flags, Floats, Ints
+from training.datasets.array_types import ClassMask
 from training.datasets.sources import source_of
 from training.fit.configuration import ObjectsConfig
 from training.fit.objects import ObjectScenes, served_weights
@@ -37,36 +39,27 @@ _SETTLED = 2000  # sweeps before the first recorded state of the test
 _COMMONEST = 50
 _SIZE_LIMIT, _SHARE_LIMIT = 0.10, 0.20
 _MIX: Final = "served mix"
-_CERTAIN = 3.0  # standard errors beyond a limit
+_STANDARD_ERRORS = 3.0  # beyond a limit, for a significant violation
 
 
 @dataclass(frozen=True, eq=False)
 class Population:
-    """The scenes that the chains of one row of u should draw.
+    """The N scenes that the chains of one row of u should draw."""
 
-    Attributes:
-        profile: index of the data source, or None for the served mix.
-        weight: weight of each scene, (scenes,). The sum is 1.
-        room: room type of each scene, (scenes,). -1 means unknown.
-        shows: True for classes that the scenes can show, (classes,).
-        p: share of the scenes with each class, (classes,).
-    """
+    profile: int | None  # index of the data source, or None for the served mix
+    weight: Float[NDArray, "N"]  # of each scene; the sum is 1
+    room: Int[NDArray, "N"]  # room type; -1 means unknown
+    shows: ClassMask  # classes that the scenes can show
+    p: Float[NDArray, "V"]  # share of the scenes with each class
 
-    profile: int | None
-    weight: Floats
-    room: Ints
-    shows: Flags
-    p: Floats
-
-    def draw(self, count: int, rng: np.random.Generator) -> Ints:
-        """Return indices of scenes, (count,), drawn in proportion to their weights.
+    def draw(self, count: int, rng: np.random.Generator) -> Int[NDArray, "count"]:
+        """Return indices of scenes, drawn in proportion to their weights.
 
         The draw is systematic: each room type has its share of the scenes, rounded.
         """
         order = np.lexsort((rng.random(len(self.room)), self.room))
         position = (np.arange(count) + rng.random()) / count
-        index: Ints = order[np.searchsorted(self.weight[order].cumsum()[:-1], position)]
-        return index
+        return order[np.searchsorted(self.weight[order].cumsum()[:-1], position)]
 
 
 def populations(scenes: ObjectScenes, config: ObjectsConfig) -> Iterator[Population]:
@@ -92,13 +85,9 @@ def populations(scenes: ObjectScenes, config: ObjectsConfig) -> Iterator[Populat
 
 
 class LongChains:
-    """Gibbs chains that start at the scenes of a population, and continue from call to call.
+    """A number of Gibbs chains that start at scenes of a population.
 
-    Each chain keeps the room type of its scene.
-
-    Args:
-        chains: chains of the machine; see `scene_chains`.
-        count: number of chains.
+    Each chain keeps the room type of its scene, and continues from call to call.
     """
 
     def __init__(
@@ -115,13 +104,11 @@ class LongChains:
         self.rooms = population.room[index]
         self._streams = [random_stream(seed, k) for k in range(count)]
 
-    def run(self, sweeps: int, every: int = RECORDED) -> Floats:
-        """Run sweeps of each chain, and record the presence of the classes every ``every`` sweeps.
+    def run(self, sweeps: int, every: int = RECORDED) -> Float[NDArray, "chains V"]:
+        """Run sweeps, and return the share of the recorded states in which each class is present.
 
-        The number of sweeps is rounded up to a multiple of ``every``.
-
-        Returns:
-            The share of the records in which each class is present, (chains, classes).
+        A state is recorded every ``every`` sweeps. The number of sweeps is rounded up to a multiple
+        of it.
         """
         count = np.zeros(self.on.shape)  # number of records with each class
         records = range(0, sweeps, every)
@@ -136,8 +123,7 @@ class LongChains:
                 count[k] += self.on[k]
 
         in_threads(run_chain, len(count))
-        share: Floats = count / len(records)
-        return share
+        return count / len(records)
 
 
 def in_threads(run: Callable[[int], T], count: int) -> list[T]:
@@ -160,19 +146,12 @@ def scene_chains(weights: Weights) -> SceneChains:
 
 @dataclass(frozen=True)
 class Drift:
-    """How far long chains are from the scenes of the served mix of data sources.
+    """Relative changes from the scenes of the served mix of data sources to long chains."""
 
-    Attributes:
-        size, size_error: relative change of the number of classes in a scene, and its standard
-            error.
-        label: the class among the 50 commonest whose share of the scenes changes most.
-        share, share_error: relative change of this share, and its standard error.
-    """
-
-    size: float
-    size_error: float
-    label: str
-    share: float
+    size: float  # change of the number of classes in a scene
+    size_error: float  # standard error
+    label: str  # the class among the 50 commonest whose share of the scenes changes most
+    share: float  # change of this share
     share_error: float
 
     def metrics(self) -> list[Metric]:
@@ -192,10 +171,10 @@ class Drift:
     def objection(self) -> str | None:
         """Return why samples of the model are unlike the scenes, or None."""
         after = f"after {_SWEEPS} sweeps,"
-        if abs(self.size) - _CERTAIN * self.size_error > _SIZE_LIMIT:
+        if abs(self.size) - _STANDARD_ERRORS * self.size_error > _SIZE_LIMIT:
             scenes = f"generated scenes have {self.size:+.0%} classes"
             return f"{after} {scenes}; at most {_SIZE_LIMIT:.0%} are allowed"
-        if abs(self.share) - _CERTAIN * self.share_error > _SHARE_LIMIT:
+        if abs(self.share) - _STANDARD_ERRORS * self.share_error > _SHARE_LIMIT:
             scenes = f"{self.share:+.0%} generated scenes have the class"
             return f"{after} {scenes} {self.label}; at most {_SHARE_LIMIT:.0%} are allowed"
         return None
@@ -205,35 +184,32 @@ def measure_drift(artifact: SceneModel, scenes: ObjectScenes, config: ObjectsCon
     """Run 3,000 sweeps from training scenes of the served mix, and compare chains and scenes.
 
     The states of the last 1,000 sweeps count if the filter of `/generate` accepts them
-    (`accepted`).
+    (`served_frequencies`).
     """
     *_, population = populations(scenes, config)
     long = LongChains(scene_chains(artifact.weights), scenes, population, _CHAINS, seed=1)
     long.run(_SETTLED, every=_SETTLED)
-    drawn = accepted(artifact, long, (_SWEEPS - _SETTLED) // STEPS)
+    drawn = served_frequencies(artifact, long, (_SWEEPS - _SETTLED) // STEPS)
     sizes = drawn[:, population.shows].sum(1) / population.p[population.shows].sum()
     top = np.argsort(-np.where(population.shows, population.p, 0))[:_COMMONEST]
     top = top[population.p[top] > 0]
     change = drawn[:, top] / population.p[top] - 1
     share, error = change.mean(0), change.std(0) / np.sqrt(_CHAINS)
-    # The class that is most certainly beyond the limit.
-    k = int(np.argmax(np.abs(share) - _CERTAIN * error))
+    # The class with the most significant violation of the limit.
+    k = int(np.argmax(np.abs(share) - _STANDARD_ERRORS * error))
     size, size_error = float(sizes.mean() - 1), float(sizes.std() / np.sqrt(_CHAINS))
     label = artifact.vocabulary.labels[top[k]]
     return Drift(size, size_error, label, float(share[k]), float(error[k]))
 
 
-def accepted(artifact: SceneModel, long: LongChains, states: int) -> Floats:
-    """Continue the chains, and return the share of the served scenes with each class.
+def served_frequencies(
+    artifact: SceneModel, long: LongChains, states: int
+) -> Float[NDArray, "chains V"]:
+    """Continue the chains, and return the share of each class in the served scenes of each chain.
 
     A state is recorded every `STEPS` sweeps, the length of a draw of `/generate`. A served scene is
-    the first plausible one of `ATTEMPTS` states, or the last of them.
-
-    Args:
-        states: number of recorded states of each chain, at least `ATTEMPTS`.
-
-    Returns:
-        The share of each class in the served scenes of each chain, (chains, classes).
+    the first plausible one of `ATTEMPTS` states, or the last of them. The number of states is at
+    least `ATTEMPTS`.
     """
     evidence = Scene(())
     count, served = np.zeros(long.on.shape), np.zeros(len(long.on))
@@ -250,5 +226,4 @@ def accepted(artifact: SceneModel, long: LongChains, states: int) -> Floats:
         count[taken] += long.on[taken]
         served[taken] += 1
         refused[taken] = 0
-    share: Floats = count / served[:, None]
-    return share
+    return count / served[:, None]

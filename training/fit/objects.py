@@ -13,10 +13,10 @@ softplus.
   classes. The other parts list a share of U(.05, 1) of the classes.
 - The room type t is listed in 15 % of the parts. If it is not listed, the loss contains its
   cross-entropy, with the weight k.
-- A class that a source shows in fewer than 3 scenes says nothing there: it has no term in the loss
-  (partial labels). Structure is neither listed nor asked for.
-- A present class says nothing about unlisted classes of its family (`Vocabulary.related`): a desk
-  lamp is a lamp, and an annotator may call it so.
+- A class that a source shows in fewer than 3 scenes has no term in the loss there (partial labels).
+  Structure is neither listed nor predicted.
+- Unlisted classes of the family of a present class (`Vocabulary.related`) have no term: a desk lamp
+  is a lamp, and an annotator may call it so.
 - Each source q has its own base rates a_q and y_q, and each listed share its own bias kappa. The
   machine also learns p(q | listed), with the weight s, because a robot's list names no source.
 - With the weight g, persistent Gibbs chains (PCD) keep samples of the machine like scenes. The
@@ -36,6 +36,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import cross_entropy, nll_loss, softplus
 from torch.nn.utils.parametrize import cached
@@ -57,38 +58,24 @@ _UNSERVED = 1e-9  # weight of a source outside of the served mix
 
 @dataclass(frozen=True)
 class ObjectScenes:
-    """The scenes that teach objects: they have at least two classes, and a weight above 0.
+    """The N training scenes of objects: they have at least two classes, and a weight above 0."""
 
-    Attributes:
-        v: presence of the classes that the source shows, without structure, (scenes, classes).
-        room: index of the room type, (scenes,) int64; -1 where unknown.
-        source: index of the source in `sources`, (scenes,) int64.
-        weight: weight of each scene, (scenes,).
-        shows: True for classes that a source shows, (sources, classes) bool.
-        known: True for classes whose presence the scene tells, (scenes, classes) bool.
-        sources: names of the sources of these scenes.
-    """
-
-    v: Tensor
-    room: Tensor
-    source: Tensor
-    weight: Tensor
-    shows: Tensor
-    known: Tensor
-    sources: tuple[str, ...]
+    v: Float[Tensor, "N V"]  # presence of the classes that the source shows, without structure
+    room: Int[Tensor, "N"]  # room type; -1 where unknown
+    source: Int[Tensor, "N"]  # index in `sources`
+    weight: Float[Tensor, "N"]
+    shows: Bool[Tensor, "sources V"]  # classes that a source shows
+    observed: Bool[Tensor, "N V"]  # classes whose presence or absence the scene shows
+    sources: tuple[str, ...]  # names
 
     @classmethod
-    def of(cls, train: SceneTensors, structure: Tensor, config: ObjectsConfig) -> Self:
-        """Select the scenes.
-
-        Raises:
-            ValueError: no scene has two classes.
-        """
+    def of(cls, train: SceneTensors, structure: Bool[Tensor, "V"], config: ObjectsConfig) -> Self:
+        """Select the scenes."""
         names, annotated = train.source_names, train.annotated_classes
         weights = torch.tensor([config.source_weights.get(q, 1.0) for q in names])
         counts = torch.zeros(annotated.shape).index_add_(0, train.source, (train.v > 0).float())
-        # A user's own source and one with an open vocabulary show every class, except those that a
-        # known source annotates incompletely.
+        # A user's own source and one with an open vocabulary show every class, except those that
+        # one of `SOURCES` annotates incompletely.
         is_open = [q not in SOURCES or SOURCES[q].open_vocabulary for q in names]
         shows_all = [q in config.open_sources for q in names] if config.open_sources else is_open
         partial = torch.tensor([q in SOURCES for q in names]) & torch.tensor(is_open)
@@ -102,34 +89,37 @@ class ObjectScenes:
             raise ValueError("no training scene has two classes; add scenes with more objects")
         used, source = train.source[kept].unique(return_inverse=True)
         sources, v = tuple(names[q] for q in used.tolist()), v[kept]
-        known = shows[used][source] & (v | ~train.relatives_of(v.float()))
-        return cls(v.float(), train.room[kept], source, weight[kept], shows[used], known, sources)
+        observed = shows[used][source] & (v | ~train.relatives_of(v.float()))
+        return cls(
+            v=v.float(), room=train.room[kept], source=source, weight=weight[kept],
+            shows=shows[used], observed=observed, sources=sources,
+        )  # fmt: skip
 
     @property
     def size(self) -> float:
         """Sum of the weights of the scenes."""
         return float(self.weight.sum())
 
-    def draw(self, count: int, generator: torch.Generator) -> Tensor:
-        """Return indices of scenes, (count,), drawn in proportion to their weights."""
+    def draw(self, count: int, generator: torch.Generator) -> Int[Tensor, "count"]:
+        """Return indices of scenes, drawn in proportion to their weights."""
         return torch.multinomial(self.weight, count, replacement=True, generator=generator)
 
     @property
-    def source_sizes(self) -> Tensor:
-        """Sum of the weights of the scenes of each source, (sources,)."""
+    def source_sizes(self) -> Float[Tensor, "sources"]:
+        """Sum of the weights of the scenes of each source."""
         return torch.zeros(len(self.sources)).index_add_(0, self.source, self.weight)
 
     @property
-    def shows_rooms(self) -> Tensor:
-        """True for each source with scenes of two room types, (sources, 1) bool.
+    def shows_rooms(self) -> Bool[Tensor, "sources 1"]:
+        """True for each source with scenes of two room types.
 
-        A source of bedrooms alone does not tell how common bedrooms are.
+        A source of bedrooms alone does not show how common bedrooms are.
         """
         kinds = [self.room[self.source == q] for q in range(len(self.sources))]
         return torch.tensor([[len(room[room >= 0].unique()) > 1] for room in kinds])
 
-    def log_odds(self) -> Tensor:
-        """Return the smoothed log-odds of each class in the scenes that can show it, (classes,)."""
+    def log_odds(self) -> Float[Tensor, "V"]:
+        """Return the smoothed log-odds of each class in the scenes that can show it."""
         weight = self.weight.unsqueeze(1)
         count = (self.v * weight).sum(0)
         total = (self.shows * self.source_sizes.unsqueeze(1)).sum(0)
@@ -138,21 +128,17 @@ class ObjectScenes:
 
 
 class Parts(NamedTuple):
-    """Random parts of scenes.
+    """Random parts of scenes."""
 
-    Attributes:
-        listed: listed classes, (scenes, classes) 0 or 1.
-        share: bin of the listed share, (scenes,) int64; see `share_bin`.
-        weight: weight of a hidden class that is present, (scenes,).
-    """
-
-    listed: Tensor
-    share: Tensor
-    weight: Tensor
+    listed: Float[Tensor, "B V"]  # 1 for listed classes
+    share: Int[Tensor, "B"]  # bin of the listed share; see `share_bin`
+    weight: Float[Tensor, "B"]  # weight of a hidden class that is present
 
 
-def random_parts(v: Tensor, leave_one_out: float, generator: torch.Generator) -> Parts:
-    """List a random part of each scene, (scenes, classes), with at least one class hidden.
+def random_parts(
+    v: Float[Tensor, "B V"], leave_one_out: float, generator: torch.Generator
+) -> Parts:
+    """List a random part of the classes v of each scene, with at least one class hidden.
 
     A share `leave_one_out` of the scenes hides one class.
     """
@@ -171,9 +157,7 @@ def random_parts(v: Tensor, leave_one_out: float, generator: torch.Generator) ->
 class ObjectFit:
     """The fit of the object weights of a machine. It can stop after each step and continue.
 
-    Attributes:
-        steps: number of finished steps.
-        loss: loss of the last step.
+    `steps` counts the finished steps, and `loss` is that of the last step.
     """
 
     def __init__(
@@ -207,11 +191,7 @@ class ObjectFit:
         return self.steps >= self.config.steps
 
     def step(self) -> None:
-        """Update the weights by one batch of random parts.
-
-        Raises:
-            FloatingPointError: the loss is infinite or NaN.
-        """
+        """Update the weights by one batch of random parts."""
         config = self.config
         with cached():
             loss = self._batch_loss()
@@ -243,8 +223,8 @@ class ObjectFit:
             loss = loss + self.config.generative_weight * difference
         return loss
 
-    def _conditional_loss(self, index: Tensor) -> Tensor:
-        """Return the mean over scenes of the negative log-likelihood of what is not listed."""
+    def _conditional_loss(self, index: Int[Tensor, "B"]) -> Float[Tensor, ""]:
+        """Return the mean over scenes of the negative log-likelihood of unlisted variables."""
         machine, scenes = self.machine, self.scenes
         v, room, source = scenes.v[index], scenes.room[index], scenes.source[index]
         parts = random_parts(v, self.config.leave_one_out, self._generator)
@@ -253,34 +233,43 @@ class ObjectFit:
             parts.listed, room=listed_room, source=source, share=parts.share
         )
         hidden = v - parts.listed
-        weight = scenes.known[index] * (1 - parts.listed)
+        weight = scenes.observed[index] * (1 - parts.listed)
         weight = weight * torch.where(hidden > 0, parts.weight.unsqueeze(1), 1.0)
         loss = ((softplus(log_odds) - hidden * log_odds) * weight).sum()
         served = served_weights(scenes, self.config)
         rates, _ = with_served_rates(machine.a, scenes.shows, served)
         logits = machine.f + parts.listed @ rates.T
         loss = loss + self.config.source_loss * cross_entropy(logits, source, reduction="sum")
-        asked = (listed_room < 0) & (room >= 0)
-        if bool(asked.any()):
-            log_p = machine.room_log_p(parts.listed[asked], source[asked])
-            loss = loss + self.config.room_loss * nll_loss(log_p, room[asked], reduction="sum")
+        is_hidden = (listed_room < 0) & (room >= 0)
+        if bool(is_hidden.any()):
+            log_p = machine.room_log_p(parts.listed[is_hidden], source[is_hidden])
+            loss = loss + self.config.room_loss * nll_loss(log_p, room[is_hidden], reduction="sum")
         return loss / len(v)
 
-    def _some_rooms(self, room: Tensor) -> Tensor:
-        """Return the room types, (scenes,), with those outside of `room_share` unknown (-1)."""
+    def _some_rooms(self, room: Int[Tensor, "B"]) -> Int[Tensor, "B"]:
+        """Return the room types, with those outside of `room_share` unknown (-1)."""
         is_listed = torch.rand(len(room), generator=self._generator) < self.config.room_share
         return torch.where(is_listed, room, -1)
 
-    def _generative_loss(self, chains: Chains, v: Tensor, room: Tensor, source: Tensor) -> Tensor:
-        """Return F(scenes) - F(chains) after a sweep of the chains, which keep their room types."""
-        sweep(self.machine, chains, self._generator, classes=self.config.classes_per_sweep)
-        pairs = ((v, chains.v), (room, chains.room), (source, chains.source))
-        free = self._free_energy(*map(torch.cat, pairs))
-        return free[: len(v)].mean() - free[len(v) :].mean()
+    def _generative_loss(
+        self,
+        chains: Chains,
+        v: Float[Tensor, "B V"],
+        room: Int[Tensor, "B"],
+        source: Int[Tensor, "B"],
+    ) -> Float[Tensor, ""]:
+        """Return F(scenes) - F(chains) after a sweep of the chains, which keep their room types.
 
-    def _free_energy(self, v: Tensor, room: Tensor, source: Tensor) -> Tensor:
-        """Return the free energy given the room types, which the chains do not draw, (scenes,)."""
-        return self.machine.free_energy(v, room, source) + self.machine.room_rate(room, source)
+        F is the free energy given the room types, because the chains do not draw them.
+        """
+        sweep(self.machine, chains, self._generator, classes=self.config.classes_per_sweep)
+        n = len(v)
+        v, room, source = (
+            torch.cat(pair)
+            for pair in ((v, chains.v), (room, chains.room), (source, chains.source))
+        )
+        free = self.machine.free_energy(v, room, source) + self.machine.room_rate(room, source)
+        return free[:n].mean() - free[n:].mean()
 
     def _schedule(self) -> float:
         """Return the factor of the learning rate: it rises, stays, and falls along a cosine."""
@@ -322,24 +311,23 @@ class ObjectFit:
         machine.f.add_((served / served.sum() * scenes.size / scenes.source_sizes).log())
 
 
-def with_served_rates(rates: Tensor, shows: Tensor, served: Tensor) -> tuple[Tensor, Tensor]:
-    """Return rates a or y in which the served mean replaces the rates of what a source lacks.
+def with_served_rates(
+    rates: Float[Tensor, "sources k"],
+    shows: Bool[Tensor, "sources k|1"],
+    served: Float[Tensor, "sources"],
+) -> tuple[Float[Tensor, "sources k"], Float[Tensor, "k"]]:
+    """Return rates a or y in which the served mean replaces rates that a source does not show.
 
-    The second result is the served mean, (classes,): the weighted mean over the sources that show
-    the class or the room types.
-
-    Args:
-        rates: a[q] or y[q] of each source q, (sources, classes).
-        shows: True where the source tells the rate, (sources, classes or 1) bool.
-        served: weight of each source in the served mix, (sources,).
+    The second result is the served mean: the mean over the sources that show the class or the room
+    types, with the weights of the served mix.
     """
     weights = served.unsqueeze(1) * shows
     mean = (weights * rates).sum(0) / weights.sum(0).clamp(min=1e-9)
     return torch.where(shows, rates, mean), mean
 
 
-def served_popularity(scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
-    """Return the log-odds that a scene of the served mix has each class, (classes,).
+def served_popularity(scenes: ObjectScenes, config: ObjectsConfig) -> Float[Tensor, "V"]:
+    """Return the log-odds that a scene of the served mix has each class.
 
     The value is NaN for a class that no scene shows.
     """
@@ -352,8 +340,8 @@ def served_popularity(scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
     return torch.where(scenes.v.any(0), rate.logit(), torch.nan)
 
 
-def served_weights(scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
-    """Return the weight of each source in the served mix, (sources,)."""
+def served_weights(scenes: ObjectScenes, config: ObjectsConfig) -> Float[Tensor, "sources"]:
+    """Return the weight of each source in the served mix."""
     served = config.served_sources or dict.fromkeys(scenes.sources, 1.0)
     return torch.tensor([served.get(q, 0.0) for q in scenes.sources])
 

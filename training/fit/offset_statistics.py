@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import gammaln
@@ -29,7 +30,6 @@ from scipy.special import gammaln
 from app.model import Offsets
 from app.scene import CANONICAL
 from training.datasets import EncodedScene
-from training.datasets.array_types import Floats, Ints
 from training.datasets.cases import ObservedOffsets, observed_offsets
 
 # Shrinkage of the class effects u and v. It acts like `LAMBDA` additional pairs with effect 0.
@@ -55,7 +55,7 @@ def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
         return None
     A = len(CANONICAL)
     relation, scenes_of = np.zeros((A, 6)), np.zeros(A, dtype=np.int32)
-    ends = np.zeros((2, A, V, 6))
+    effects = np.zeros((2, A, V, 6))
     pair, moments, counts = [], [], []
     for a in range(A):
         offsets = observed.rows(observed.relation == a)
@@ -63,67 +63,64 @@ def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
             continue
         pairs = _pool_pairs(offsets)
         fit = _fit(pairs, V)
-        relation[a], ends[:, a] = fit.tables()
+        relation[a], effects[:, a] = fit.tables()
         mean, variance = fit.predict(pairs)
         scenes_of[a] = len(np.unique(offsets.scene))
-        pair.append((a * V + pairs.ends[0]) * V + pairs.ends[1])
+        pair.append((a * V + pairs.subject) * V + pairs.object)
         moments.append(np.concatenate([mean, np.sqrt(variance)], axis=1))
         counts.append(pairs.scenes.astype(np.int32))
-    subject, other = half_precision(ends)
+    subject, object_ = half_precision(effects)
     return Offsets(
-        *(half_precision(relation), scenes_of, subject, other),
-        *(np.concatenate(pair), half_precision(np.concatenate(moments)), np.concatenate(counts)),
+        relation=half_precision(relation),
+        relation_scenes=scenes_of,
+        subject=subject,
+        object=object_,
+        pair=np.concatenate(pair),
+        pair_offset=half_precision(np.concatenate(moments)),
+        pair_scenes=np.concatenate(counts),
     )
 
 
 class _Pairs(NamedTuple):
-    """Pairs of classes in one relation, with the moments of their offsets.
+    """P pairs of classes in one relation, with the moments of their offsets."""
 
-    Attributes:
-        ends: class indices of subject and object, (2, pairs), sorted by subject, then by object.
-        scenes: number of scenes with the pair, (pairs,).
-        n: total weight of the offsets of the pair, (pairs, 1).
-        mean: weighted mean of the offsets, (pairs, 3).
-        scatter: weighted sum of squared deviations from the mean, (pairs, 3).
-    """
-
-    ends: Ints
-    scenes: Ints
-    n: Floats
-    mean: Floats
-    scatter: Floats
+    subject: Int[NDArray, "P"]  # sorted by subject, then by object
+    object: Int[NDArray, "P"]
+    scenes: Int[NDArray, "P"]  # number of scenes with the pair
+    n: Float[NDArray, "P 1"]  # total weight of the offsets of the pair
+    mean: Float[NDArray, "P 3"]  # weighted mean of the offsets
+    scatter: Float[NDArray, "P 3"]  # weighted sum of squared deviations from the mean
 
 
 def _pool_pairs(observed: ObservedOffsets) -> _Pairs:
     """Compute the moments of each pair of classes. Its offsets in a scene share the weight 1."""
     classes = np.stack([observed.subject, observed.other])
-    ends, pair = np.unique(classes, axis=1, return_inverse=True)
+    (subject, object_), pair = np.unique(classes, axis=1, return_inverse=True)
     # Group the offsets by scene and pair of classes.
     _, first, group, size = np.unique(
         np.stack([pair, observed.scene]),
         axis=1, return_index=True, return_inverse=True, return_counts=True,
     )  # fmt: skip
-    P, weight = ends.shape[1], source_weights(observed.source, observed.scene) / size[group]
+    P, weight = len(subject), source_weights(observed.source, observed.scene) / size[group]
     weight = weight[:, None]
     n = _sums(pair, weight, P)
     mean = _sums(pair, weight * observed.offset, P) / n
     squares = np.square(observed.offset - mean[pair]) + _RESOLUTION**2
     scenes = np.bincount(pair[first], minlength=P)
-    return _Pairs(ends, scenes, n, mean, _sums(pair, weight * squares, P))
+    return _Pairs(subject, object_, scenes, n, mean, _sums(pair, weight * squares, P))
 
 
-def _sums(group: Ints, values: Floats, groups: int) -> Floats:
-    """Return the sum of the values, (rows, k), over each group of rows, (groups, k)."""
+def _sums(
+    group: Int[NDArray, "N"], values: Float[NDArray, "N k"], groups: int
+) -> Float[NDArray, "groups k"]:
+    """Return the sum of the values over each group of rows."""
     sums = np.zeros((groups, values.shape[1]))
     np.add.at(sums, group, values)
     return sums
 
 
-def source_weights(source: Ints, scene: Ints) -> Floats:
-    """Return weights, (N,), that balance large and small data sources.
-
-    The arguments are the indices of the data source and the scene of each item, (N,).
-    """
+def source_weights(source: Int[NDArray, "N"], scene: Int[NDArray, "N"]) -> Float[NDArray, "N"]:
+    """Return weights that balance large and small data sources, given those of each item."""
     count = np.array([len(np.unique(scene[source == s])) for s in range(source.max() + 1)])
     least = count[count >= _FEW].min(initial=count.max())
     return np.minimum(1.0, least / np.maximum(count, 1))[source]
@@ -131,39 +128,32 @@ def source_weights(source: Ints, scene: Ints) -> Floats:
 
 @dataclass(eq=False)
 class _Fit:
-    """Fitted parameters of one relation. The last dimension of each array is x, y and z.
+    """Fitted parameters of one relation; the module describes them. Columns are x, y and z."""
 
-    Attributes:
-        kappa, alpha, beta, mu: parameters of the prior (see the module), one for each axis, (3,).
-        effects: effects u and v of the classes as subject and as object of the relation,
-            (2, classes, 3).
-        effect_variances: variances of the effects in units of s / kappa, (2, classes, 3).
-    """
+    kappa: Float[NDArray, "3"]
+    alpha: Float[NDArray, "3"]
+    beta: Float[NDArray, "3"]
+    mu: Float[NDArray, "3"]
+    effects: Float[NDArray, "2 V 3"]  # u and v of the classes
+    effect_variances: Float[NDArray, "2 V 3"]  # in units of s / kappa
 
-    kappa: Floats
-    alpha: Floats
-    beta: Floats
-    mu: Floats
-    effects: Floats
-    effect_variances: Floats
-
-    def expected(self, pairs: _Pairs) -> Floats:
-        """Return the prior mean of the offset of each pair, (pairs, 3)."""
+    def expected(self, pairs: _Pairs) -> Float[NDArray, "P 3"]:
+        """Return the prior mean of the offset of each pair."""
         u, v = self.effects
-        return self.mu + u[pairs.ends[0]] + v[pairs.ends[1]]
+        return self.mu + u[pairs.subject] + v[pairs.object]
 
-    def predict(self, pairs: _Pairs) -> tuple[Floats, Floats]:
-        """Return mean and variance of a new offset of each pair, both (pairs, 3)."""
+    def predict(self, pairs: _Pairs) -> tuple[Float[NDArray, "P 3"], Float[NDArray, "P 3"]]:
+        """Return mean and variance of a new offset of each pair."""
         var_u, var_v = self.effect_variances
-        kappa = self.kappa / (1 + var_u[pairs.ends[0]] + var_v[pairs.ends[1]])
+        kappa = self.kappa / (1 + var_u[pairs.subject] + var_v[pairs.object])
         prior = self.expected(pairs), kappa, self.alpha, self.beta
         return posterior(prior, pairs.n, pairs.mean, pairs.scatter)
 
-    def tables(self) -> tuple[Floats, Floats]:
+    def tables(self) -> tuple[Float[NDArray, "6"], Float[NDArray, "2 V 6"]]:
         """Return tables whose sum gives mean and variance of a pair without data, as `predict`.
 
-        The first table, (6,), contains three means and three variances for unknown classes. The
-        other, (2, classes, 6), contains the contributions of the subject and of the object class.
+        The first table contains three means and three variances for unknown classes, and the other
+        the contributions of the subject and of the object class.
         """
         spread, unknown = self.beta / (self.alpha - 1), 1 / LAMBDA
         relation = np.concatenate([self.mu, spread * (1 + (1 + 2 * unknown) / self.kappa)])
@@ -175,19 +165,17 @@ Prior = tuple[Any, Any, Any, Any]
 """Mean expected, kappa, alpha and beta of a normal–inverse-gamma prior."""
 
 
-def posterior(prior: Prior, n: Floats, mean: Floats, scatter: Floats) -> tuple[Floats, Floats]:
-    """Return mean and variance of a new value given n values with this mean.
+def posterior(prior: Prior, n: Any, mean: Any, scatter: Any) -> tuple[Any, Any]:
+    """Return mean and variance of a new value given n values with this mean and scatter.
 
-    Args:
-        prior: alpha + n / 2 must be above 1.
-        scatter: sum of the squared deviations from the mean.
+    The scatter is the sum of the squared deviations. alpha + n / 2 must be above 1.
     """
     after, shape, rate = _updated(prior, n, mean, scatter)
     expected, kappa, _, _ = prior
     return (kappa * expected + n * mean) / after, rate / (shape - 1) * (1 + 1 / after)
 
 
-def log_likelihood(prior: Prior, n: Floats, mean: Floats, scatter: Floats) -> Floats:
+def log_likelihood(prior: Prior, n: Any, mean: Any, scatter: Any) -> Any:
     """Return the log-likelihood of n values, with their mean and variance integrated out."""
     after, shape, rate = _updated(prior, n, mean, scatter)
     _, kappa, alpha, beta = prior
@@ -197,7 +185,7 @@ def log_likelihood(prior: Prior, n: Floats, mean: Floats, scatter: Floats) -> Fl
     )  # fmt: skip
 
 
-def _updated(prior: Prior, n: Floats, mean: Floats, scatter: Floats) -> tuple[Any, Any, Any]:
+def _updated(prior: Prior, n: Any, mean: Any, scatter: Any) -> tuple[Any, Any, Any]:
     """Return kappa, alpha and beta of the posterior."""
     expected, kappa, alpha, beta = prior
     after = kappa + n
@@ -218,10 +206,10 @@ def _fit(pairs: _Pairs, V: int) -> _Fit:
     return fit
 
 
-def _fit_prior(pairs: _Pairs, axis: int, expected: Floats) -> Floats:
+def _fit_prior(pairs: _Pairs, axis: int, expected: Float[NDArray, "P"]) -> Float[NDArray, "3"]:
     """Return kappa, alpha and beta of one axis, fitted by maximum likelihood."""
 
-    def loss(logs: Floats) -> float:
+    def loss(logs: NDArray[np.float64]) -> float:
         n, mean, scatter = pairs.n[:, 0], pairs.mean[:, axis], pairs.scatter[:, axis]
         return -float(log_likelihood((expected, *np.exp(logs)), n, mean, scatter).sum())
 
@@ -235,7 +223,7 @@ def _fit_effects(fit: _Fit, pairs: _Pairs, V: int) -> None:
     The function updates mu, u and v in turn, `_SWEEPS` times. Each update is a fit by weighted
     least squares, given the other two. The ridge penalty `LAMBDA` shrinks u and v towards 0.
     """
-    subject, object_ = pairs.ends
+    subject, object_ = pairs.subject, pairs.object
     # Precision of the mean offset of each pair as a measurement of u and v, in units of kappa / s.
     weight = pairs.n / (pairs.n + fit.kappa)
     precision_u = _sums(subject, weight, V) + LAMBDA
@@ -250,6 +238,6 @@ def _fit_effects(fit: _Fit, pairs: _Pairs, V: int) -> None:
     fit.effect_variances = 1 / np.stack([precision_u, precision_v])
 
 
-def half_precision(table: Floats) -> NDArray[np.float32]:
+def half_precision(table: Float[NDArray, "..."]) -> NDArray[np.float32]:
     """Round a table to half precision, the precision of the model file."""
     return table.astype(np.float16).astype(np.float32)

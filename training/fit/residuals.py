@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from scipy.special import expit
 from torch import Tensor
 
@@ -29,21 +30,25 @@ _CHANCES = 10
 
 
 @torch.no_grad()
-def means_of_parts(machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
-    """Return the means of h1 given a random subset of the objects, (scenes, H1).
+def means_of_parts(
+    machine: BoltzmannMachine, batch: Batch, generator: torch.Generator
+) -> Float[Tensor, "B H1"]:
+    """Return the means of h1 given a random subset of the objects.
 
-    For each scene, the function draws a probability uniformly from [0, 1]. It lists each class of
-    the scene with this probability. It also lists the room type with probability 1/2.
+    A scene lists each of its classes with a probability that is drawn uniformly from [0, 1]. It
+    lists its room type with probability 1/2.
     """
     probability = torch.rand(len(batch), 1, generator=generator)
     listed = batch.v * (torch.rand(batch.v.shape, generator=generator) < probability)
     lists_room = torch.rand(len(batch), generator=generator) < 0.5
-    x = machine.context(listed, torch.where(lists_room, batch.room, -1))
+    x = machine.hidden_logits(listed, torch.where(lists_room, batch.room, -1))
     return machine.state_means(x)
 
 
 @torch.no_grad()
-def lower_unseen_roles(machine: BoltzmannMachine, train: SceneTensors, parents: Tensor) -> None:
+def lower_unseen_roles(
+    machine: BoltzmannMachine, train: SceneTensors, parents: Int[Tensor, "V"]
+) -> None:
     """Lower the weights of classes that no training scene shows on, in or above an object.
 
     Factors extrapolate: they put windows on tables. A class has a role, as the subject or as the
@@ -72,7 +77,10 @@ def lower_unseen_roles(machine: BoltzmannMachine, train: SceneTensors, parents: 
 
 @torch.no_grad()
 def with_counted_residuals(
-    machine: BoltzmannMachine, train: SceneTensors, offsets: Tensor, source_weights: Tensor
+    machine: BoltzmannMachine,
+    train: SceneTensors,
+    offsets: Float[Tensor, "sources A"],
+    source_weights: Float[Tensor, "sources"],
 ) -> BoltzmannMachine:
     """Return the machine with fitted residual weights of single triples.
 
@@ -84,11 +92,8 @@ def with_counted_residuals(
         sum over scenes of log p(r_e | v, E[h1 | v], w_e' + δ_e) - τ/2 δ_e².
 
     All other weights are fixed. As in training, the hidden units depend on a random subset of the
-    objects. With few scenes, δ_e stays close to 0.
-
-    Args:
-        offsets: corrections of the logits for each data source, (sources, relations).
-        source_weights: weight of a relation from each data source, (sources,).
+    objects. With few scenes, δ_e stays close to 0. The offsets are corrections of the logits for
+    each data source, and the source weights those of a relation from each source.
     """
     V, columns = machine.spec.V, []
     generator = torch.Generator().manual_seed(0)

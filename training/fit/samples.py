@@ -21,11 +21,12 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
 from scipy.special import logit
 
 from app.inference.chains import Bits, random_stream
 from app.inference.weights import pack_scenes
-from training.datasets.array_types import Floats
 from training.fit.configuration import ObjectsConfig
 from training.fit.long_chains import RECORDED, LongChains, in_threads, populations, scene_chains
 from training.fit.objects import ObjectScenes
@@ -60,11 +61,10 @@ def fit_scene_rates(
     machine.u.copy_(torch.from_numpy(u))
 
 
-def _log_odds(p: Floats, sweeps: int) -> Floats:
+def _log_odds(p: Float[NDArray, "V"], sweeps: int) -> Float[NDArray, "V"]:
     """Return the log-odds of shares of the states in a round, with half a state added."""
     states = _CHAINS * sweeps / RECORDED / 2  # neighbouring states are similar
-    log_odds: Floats = logit((p * states + 0.5) / (states + 1))
-    return log_odds
+    return logit((p * states + 0.5) / (states + 1))
 
 
 def store_samples(machine: BoltzmannMachine, scenes: ObjectScenes, seed: int) -> None:

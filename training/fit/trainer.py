@@ -1,7 +1,7 @@
 """Train a machine in two phases: the object weights, and then the relation weights.
 
-`training.fit.objects` and `training.fit.relations` define the losses. Two runs with the same seed
-and one thread give bit-identical weights.
+`training.fit.objects` and `training.fit.relation_weights` define the losses. Two runs with the same
+seed and one thread give bit-identical weights.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from training.fit.configuration import Config
 from training.fit.curve import CurvePoint, TrainingResult
 from training.fit.draft import draft_artifact
 from training.fit.objects import ObjectFit, ObjectScenes, start_objects
-from training.fit.relations import SHARED, RelationFit, bake_shared_weights, share_weights
+from training.fit.relation_weights import SHARED, RelationFit, bake_shared_weights, share_weights
 from training.fit.samples import fit_scene_rates, store_samples
 from training.machines import BoltzmannMachine, MachineSpec, build
 from training.machines.edges import find_triples, triple_keys
@@ -83,19 +83,15 @@ def _start_relations(machine: BoltzmannMachine, data: TrainingData) -> None:
     def log_odds(count: Tensor, total: Tensor | int) -> Tensor:
         return ((count + 0.5) / (total - count + 0.5)).log()
 
-    usual = logs / times.clamp(min=1)
-    machine.start_relations(log_odds(holding, observed), log_odds(per_unit, len(annotated)), usual)
+    machine.start_relations(
+        by_relation=log_odds(holding, observed),
+        by_unit=log_odds(per_unit, len(annotated)),
+        mean_log_counts=logs / times.clamp(min=1),
+    )
 
 
 class Trainer:
-    """Train one configuration on one set of scenes.
-
-    Attributes:
-        curve: points of the training curve so far.
-
-    Raises:
-        ValueError: no training scene has two classes.
-    """
+    """Train one configuration on one set of scenes. `curve` has the points so far."""
 
     def __init__(self, config: Config, data: TrainingData) -> None:
         self.config, self.data = config, data
@@ -111,11 +107,7 @@ class Trainer:
     def run(
         self, progress: Progress = lambda *_: None, passed: Passed = lambda _: None
     ) -> TrainingResult:
-        """Run both phases.
-
-        Raises:
-            FloatingPointError: the training diverged.
-        """
+        """Run both phases."""
         began, seed = time.perf_counter(), self.config.training.seed
 
         def add(point: CurvePoint) -> None:

@@ -11,26 +11,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
 @dataclass(frozen=True)
 class Edges:
-    """The relation units of some scenes.
+    """The relation units (a, i, j) of B scenes. A single row applies to all scenes."""
 
-    Attributes:
-        relation, subject, object: indices a, i and j of each unit, (scenes or 1, units) int64. A
-            single row applies to all scenes.
-        valid: bool, (scenes or 1, units). False marks padding. Padded units are 0.
-    """
+    relation: Int[Tensor, "B E"]
+    subject: Int[Tensor, "B E"]
+    object: Int[Tensor, "B E"]
+    valid: Bool[Tensor, "B E"]  # False marks padding; padded units are 0
 
-    relation: Tensor
-    subject: Tensor
-    object: Tensor
-    valid: Tensor
-
-    def ends_present(self, v: Tensor) -> Tensor:
-        """Return 1 where both classes of a unit are present in v, else 0, (..., scenes, units)."""
+    def both_present(self, v: Float[Tensor, "... B V"]) -> Float[Tensor, "... B E"]:
+        """Return 1 where both classes of a unit are present in v, else 0."""
         lead = v.shape[:-1]
         subject, object_ = (v.gather(-1, i.expand(*lead, -1)) for i in (self.subject, self.object))
         return subject * object_ * self.valid
@@ -42,28 +37,23 @@ class PairEdges(Edges):
 
     The units of a scene have the flattened layout (relations, subjects, objects). With this layout,
     shared weights need only small matrix products.
-
-    Attributes:
-        classes: class indices, (scenes, n) int64. Padding is 0.
-        log_counts: log of the number of instances of each class, (scenes, n).
     """
 
-    classes: Tensor
-    log_counts: Tensor
+    classes: Int[Tensor, "B n"]  # padding is 0
+    log_counts: Float[Tensor, "B n"]  # log of the number of instances of each class
 
-    def unflatten(self, values: Tensor) -> Tensor:
-        """Reshape the units of `values` (..., units) to (..., relations, subjects, objects)."""
+    def unflatten(self, values: Float[Tensor, "... E"]) -> Float[Tensor, "... A n n"]:
+        """Reshape values of the units into a table of relations, subjects and objects."""
         n = self.classes.shape[1]
         return values.reshape(*values.shape[:-1], -1, n, n)
 
 
-def pair_edges(classes: Tensor, relations: int, log_counts: Tensor | None = None) -> PairEdges:
-    """Return the relation units between the given classes.
+def pair_edges(
+    classes: Int[Tensor, "B n"], relations: int, log_counts: Float[Tensor, "B n"] | None = None
+) -> PairEdges:
+    """Return the units of `relations` canonical relations between the classes; -1 is padding.
 
-    Args:
-        classes: class indices, (scenes, n) int64. Padding is -1.
-        relations: number of canonical relations A.
-        log_counts: see `PairEdges`. The default is one instance of each class.
+    Without `log_counts`, each class has one instance.
     """
     B, n = classes.shape
     exists, classes = classes >= 0, classes.clamp(min=0)
@@ -78,18 +68,22 @@ def pair_edges(classes: Tensor, relations: int, log_counts: Tensor | None = None
     return PairEdges(relation, subject, object_, valid, classes, log_counts)
 
 
-def triple_edges(triples: Tensor) -> Edges:
-    """Return the units of a table of triples (a, i, j), (triples, 3), which apply to all scenes."""
+def triple_edges(triples: Int[Tensor, "T 3"]) -> Edges:
+    """Return the units of a table of triples (a, i, j), which apply to all scenes."""
     relation, subject, object_ = triples.long().T.unsqueeze(1).unbind(0)
     return Edges(relation, subject, object_, torch.ones_like(subject, dtype=torch.bool))
 
 
-def triple_keys(relation: Tensor, subject: Tensor, object_: Tensor, classes: int) -> Tensor:
-    """Return one int64 key for each unit. The keys have the same order as the triples (a, i, j)."""
-    return (relation * classes + subject) * classes + object_
+def triple_keys(
+    relation: Int[Tensor, "*E"], subject: Int[Tensor, "*E"], object_: Int[Tensor, "*E"], V: int
+) -> Int[Tensor, "*E"]:
+    """Return one key for each unit. The keys have the same order as the triples (a, i, j)."""
+    return (relation * V + subject) * V + object_
 
 
-def find_triples(table: Tensor, keys: Tensor) -> tuple[Tensor, Tensor]:
+def find_triples(
+    table: Int[Tensor, "T"], keys: Int[Tensor, "*E"]
+) -> tuple[Int[Tensor, "*E"], Bool[Tensor, "*E"]]:
     """Return the index of each key in a sorted table, and True where the table has the key."""
     if not table.numel():
         return torch.zeros_like(keys), torch.zeros_like(keys, dtype=torch.bool)

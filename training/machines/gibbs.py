@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from training.machines.machine import BoltzmannMachine
@@ -22,18 +23,12 @@ from training.machines.machine import BoltzmannMachine
 
 @dataclass
 class Chains:
-    """The state of several Gibbs chains.
+    """The state of B Gibbs chains."""
 
-    Attributes:
-        v: presence of objects, (chains, classes).
-        room, source: room type and data source of each chain, (chains,) int64. -1 means none.
-        possible: True for classes that a chain may switch on, (chains, classes) bool.
-    """
-
-    v: Tensor
-    room: Tensor
-    source: Tensor
-    possible: Tensor
+    v: Float[Tensor, "B V"]
+    room: Int[Tensor, "B"]  # -1: no room type
+    source: Int[Tensor, "B"]  # data source; -1: none
+    possible: Bool[Tensor, "B V"]  # classes that the chain may switch on
 
 
 @torch.no_grad()
@@ -46,10 +41,9 @@ def sweep(
 ) -> None:
     """Run one Gibbs sweep, in place.
 
-    Args:
-        classes: number of random classes that a sweep over coupled classes draws. None means all.
+    A sweep over coupled classes draws a number of random `classes`. None means all.
     """
-    h1 = draw_states(machine.context(chains.v, chains.room), machine.spec.states, generator)
+    h1 = draw_states(machine.hidden_logits(chains.v, chains.room), machine.spec.states, generator)
     bias = machine.scene_bias(chains.source) + machine.room_bias(chains.room)
     field = bias + h1 @ machine.W.T
     couplings = machine.couplings
@@ -60,8 +54,10 @@ def sweep(
         chains.v = _draw_coupled(chains, field, couplings, classes, generator)
 
 
-def draw_states(x: Tensor, states: int, generator: torch.Generator) -> Tensor:
-    """Draw the states of hidden units with the logits x; 0 or 1, both (chains, H1).
+def draw_states(
+    x: Float[Tensor, "B H1"], states: int, generator: torch.Generator
+) -> Float[Tensor, "B H1"]:
+    """Draw the states h1 of hidden units with the logits x.
 
     Each unit has `states` states. Its first state has the logit 0 and no entry in x.
     """
@@ -78,12 +74,12 @@ def draw_states(x: Tensor, states: int, generator: torch.Generator) -> Tensor:
 
 def _draw_coupled(
     chains: Chains,
-    field: Tensor,
-    couplings: Tensor,
+    field: Float[Tensor, "B V"],
+    couplings: Float[Tensor, "V V"],
     classes: int | None,
     generator: torch.Generator,
-) -> Tensor:
-    """Draw some random classes, None means all, one after another given all other classes."""
+) -> Float[Tensor, "B V"]:
+    """Draw some random classes (None: all), one after another given all other classes."""
     # numpy has a smaller overhead than torch for the many small steps.
     V = field.shape[1]
     order = torch.randperm(V, generator=generator)[:classes].tolist()

@@ -24,7 +24,8 @@ with the probabilities p(q | v) = softmax(f + a v). A room type has the probabil
 
 p_m are the probabilities of the states of unit m, with the logits x = c1 + Q_t + v'W.
 
-Tensor dimensions: "..." stands for samples. They come first, then scenes, then units.
+Dimensions: "..." samples, B scenes, "B|1" scenes or one row for all, V classes, C room types, H1
+hidden units, E relation units, n listed classes.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from abc import ABC, abstractmethod
 from typing import Self
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
@@ -98,8 +100,8 @@ class BoltzmannMachine(nn.Module, ABC):
             )
         self.triple_keys = keys
 
-    def set_triples(self, triples: Tensor) -> Self:
-        """Set the triples (a, i, j) that have their own weights: (triples, 3), sorted, distinct."""
+    def set_triples(self, triples: Int[Tensor, "T 3"]) -> Self:
+        """Set the triples (a, i, j) that have their own weights; they are sorted and distinct."""
         if tuple(triples.shape) != (self.spec.T, 3):
             raise ValueError(
                 f"triples have the shape {tuple(triples.shape)}; expected ({self.spec.T}, 3)"
@@ -126,52 +128,52 @@ class BoltzmannMachine(nn.Module, ABC):
     # ------------------------------------------------------------------ hidden units and objects
 
     @property
-    def couplings(self) -> Tensor | None:
-        """The couplings between classes, (V, V), symmetric with a diagonal of 0, or None.
+    def couplings(self) -> Float[Tensor, "V V"] | None:
+        """The couplings between classes, symmetric with a diagonal of 0, or None.
 
         L starts at 0, and each step of the training changes it by a symmetric matrix.
         """
         return self.L if self.spec.coupled else None
 
-    def by_unit(self, x: Tensor) -> Tensor:
-        """Return values of h1, (..., H1), by unit and state, (..., units, states - 1)."""
+    def by_unit(self, x: Float[Tensor, "... H1"]) -> Float[Tensor, "... units states-1"]:
+        """Return values of h1 by hidden unit and state."""
         return x.unflatten(-1, (self.spec.units, self.spec.states - 1))
 
-    def state_means(self, x: Tensor) -> Tensor:
-        """Return the probabilities of the states of h1 with the logits x, both (..., H1)."""
+    def state_means(self, x: Float[Tensor, "... H1"]) -> Float[Tensor, "... H1"]:
+        """Return the probabilities of the states of h1 with the logits x."""
         if self.spec.states == 2:
             return x.sigmoid()
         return self._all_states(x).softmax(-1)[..., 1:].flatten(-2)
 
-    def _all_states(self, x: Tensor) -> Tensor:
-        """Return the logits of all states, the first one included, (..., units, states)."""
+    def _all_states(self, x: Float[Tensor, "... H1"]) -> Float[Tensor, "... units states"]:
+        """Return the logits of all states, the first one included."""
         logits = self.by_unit(x)
         return torch.cat([torch.zeros_like(logits[..., :1]), logits], -1)
 
-    def context_bias(self, room: Tensor | None) -> Tensor:
-        """Return the bias c1 + Q[t] of h1, (scenes or 1, H1).
-
-        The room type t of a scene is its entry of `room`, (scenes,) int64. -1 means unknown.
-        """
+    def hidden_bias(self, room: Int[Tensor, "B"] | None) -> Float[Tensor, "B|1 H1"]:
+        """Return the bias c1 + Q[t] of h1. A room type t of -1 is unknown."""
         return self.c1 + _rows(self.Q, room)
 
-    def context(self, v: Tensor, room: Tensor | None = None) -> Tensor:
-        """Return the logits x = c1 + Q[t] + v'W of h1 given the objects v, (scenes, H1)."""
-        return self.context_bias(room) + sums(v, self.W)
+    def hidden_logits(
+        self, v: Float[Tensor, "B V"], room: Int[Tensor, "B"] | None = None
+    ) -> Float[Tensor, "B H1"]:
+        """Return the logits x = c1 + Q[t] + v'W of h1 given the objects v."""
+        return self.hidden_bias(room) + sparse_product(v, self.W)
 
-    def gain(self, x: Tensor, weights: Tensor) -> Tensor:
-        """Return sum_m log sum_z p_m(z) exp(w[m, z]) for each row w of the weights, (scenes, rows).
+    def hidden_log_odds(
+        self, x: Float[Tensor, "B H1"], weights: Float[Tensor, "rows H1"]
+    ) -> Float[Tensor, "B rows"]:
+        """Return what h1 with the logits x adds to the log-odds of a unit.
 
-        Args:
-            x: logits of h1, (scenes, H1).
-            weights: rows of weights between h1 and a unit, (rows, H1).
+        It is sum_m log sum_z p_m(z) exp(w[m, z]), where a row w has the weights between h1 and the
+        unit.
         """
         states = self._all_states(x).softmax(-1).movedim(-2, 0)
         factors = self.by_unit(weights).exp().permute(1, 2, 0)
         return (states[..., :1] + states[..., 1:] @ factors).log().sum(0)
 
-    def scene_bias(self, source: Tensor | None) -> Tensor:
-        """Return the bias of each class in whole scenes, b + a[q] + u[q], (scenes or 1, classes).
+    def scene_bias(self, source: Int[Tensor, "B"] | None) -> Float[Tensor, "B|1 V"]:
+        """Return the bias of each class in whole scenes, b + a[q] + u[q].
 
         A source q of -1 or None has the bias of the served mix of sources, b + u[-1].
         """
@@ -179,46 +181,47 @@ class BoltzmannMachine(nn.Module, ABC):
             return (self.b + self.u[-1]).unsqueeze(0)
         return self.b + _rows(self.a, source) + self.u[source]
 
-    def source_weights(self, v: Tensor, source: Tensor | None) -> Tensor:
-        """Return p(q | v, source) of each data source q, (scenes, sources).
+    def source_weights(
+        self, v: Float[Tensor, "B V"], source: Int[Tensor, "B"] | None
+    ) -> Float[Tensor, "B sources"]:
+        """Return p(q | v, source) of each data source q.
 
-        A known source has the probability 1. An unknown source is -1 or None.
+        A stated source has the probability 1. A source of -1 or None is unknown.
         """
         inferred = (self.f + v @ self.a.T).softmax(-1)
         if source is None or not self.spec.profiles:
             return inferred
-        known = torch.nn.functional.one_hot(source.clamp(min=0), self.spec.profiles)
-        return torch.where((source >= 0).unsqueeze(-1), known.to(v.dtype), inferred)
+        stated = torch.nn.functional.one_hot(source.clamp(min=0), self.spec.profiles)
+        return torch.where((source >= 0).unsqueeze(-1), stated.to(v.dtype), inferred)
 
     def object_log_odds(
         self,
-        v: Tensor,
+        v: Float[Tensor, "B V"],
         *,
-        room: Tensor | None = None,
-        source: Tensor | None = None,
-        share: Tensor | None = None,
-    ) -> Tensor:
-        """Return the log-odds of each unlisted class, (scenes, classes), in closed form.
+        room: Int[Tensor, "B"] | None = None,
+        source: Int[Tensor, "B"] | None = None,
+        share: Int[Tensor, "B"] | None = None,
+    ) -> Float[Tensor, "B V"]:
+        """Return the log-odds of each unlisted class given the listed classes v, in closed form.
 
-        Args:
-            v: listed classes, (scenes, classes) 0 or 1. The entry of a listed class has no meaning.
-            room, source: room types and data sources, (scenes,) int64. -1 or None means unknown.
-            share: bin of the listed share, (scenes,) int64; see `app.inference.weights.SHARES`. It
-                adds kappa to the log-odds.
+        The result of a listed class has no meaning. Room types and sources of -1 are unknown.
+        `share` is the bin of the listed share (`app.inference.weights.SHARES`), which adds kappa.
         """
         bias = self.b + self.source_weights(v, source) @ self.a + self.room_bias(room)
-        log_odds = bias + self.gain(self.context(v, room), self.W)
+        log_odds = bias + self.hidden_log_odds(self.hidden_logits(v, room), self.W)
         couplings = self.couplings
         if couplings is not None:
-            log_odds = log_odds + sums(v, couplings)
+            log_odds = log_odds + sparse_product(v, couplings)
         return log_odds if share is None else log_odds + self.kappa[share]
 
-    def room_bias(self, room: Tensor | None) -> Tensor:
-        """Return the couplings Y[t] of the room type t to the classes, (scenes or 1, classes)."""
+    def room_bias(self, room: Int[Tensor, "B"] | None) -> Float[Tensor, "B|1 V"]:
+        """Return the couplings Y[t] of the room type t to the classes."""
         return _rows(self.Y, room) if self.spec.coupled else torch.zeros(1, self.spec.V)
 
-    def room_rate(self, room: Tensor | None, source: Tensor | None) -> Tensor:
-        """Return the bias e_t + y_qt of the room type of each scene, (scenes or 1,)."""
+    def room_rate(
+        self, room: Int[Tensor, "B"] | None, source: Int[Tensor, "B"] | None
+    ) -> Float[Tensor, "B|1"]:
+        """Return the bias e_t + y_qt of the room type of each scene."""
         if room is None or not self.spec.C:
             return torch.zeros(1)
         rate = self.e[room.clamp(min=0)]
@@ -227,14 +230,16 @@ class BoltzmannMachine(nn.Module, ABC):
             rate = rate + by_source * (source >= 0)
         return rate * (room >= 0)
 
-    def room_log_p(self, v: Tensor, source: Tensor | None = None) -> Tensor:
-        """Return log p(t | v, source) of each room type t, (scenes, C), for an unlisted type.
+    def room_log_p(
+        self, v: Float[Tensor, "B V"], source: Int[Tensor, "B"] | None = None
+    ) -> Float[Tensor, "B C"]:
+        """Return log p(t | v, source) of each room type t, for an unlisted type.
 
         The mean over the sources has the probabilities of `source_weights`.
         """
-        logits = self.e + self.gain(self.context(v), self.Q)
+        logits = self.e + self.hidden_log_odds(self.hidden_logits(v), self.Q)
         if self.spec.coupled:
-            logits = logits + sums(v, self.Y.T)
+            logits = logits + sparse_product(v, self.Y.T)
         if not self.spec.profiles:
             return logits.log_softmax(-1)
         by_source = (logits.unsqueeze(-2) + self.y).log_softmax(-1)
@@ -242,91 +247,102 @@ class BoltzmannMachine(nn.Module, ABC):
         return (weights.log() + by_source).logsumexp(-2)
 
     def free_energy(
-        self, v: Tensor, room: Tensor | None = None, source: Tensor | None = None
-    ) -> Tensor:
-        """Return F = -log sum over h1 and r of exp(-E), (scenes,), in closed form."""
+        self,
+        v: Float[Tensor, "B V"],
+        room: Int[Tensor, "B"] | None = None,
+        source: Int[Tensor, "B"] | None = None,
+    ) -> Float[Tensor, "B"]:
+        """Return F = -log sum over h1 and r of exp(-E), in closed form."""
         free = -(v * self.scene_bias(source)).sum(-1)
         couplings = self.couplings
         if couplings is not None:
-            free = free - 0.5 * (sums(v, couplings) * v).sum(-1)
+            free = free - 0.5 * (sparse_product(v, couplings) * v).sum(-1)
             free = free - (v * self.room_bias(room)).sum(-1)
-        return free - self.room_rate(room, source) - self.log_states(self.context(v, room))
-
-    def log_states(self, x: Tensor) -> Tensor:
-        """Return the log of the sum over the states of h1 of exp(h1·x), (scenes,)."""
-        return self._all_states(x).logsumexp(-1).sum(-1)
+        log_states = self._all_states(self.hidden_logits(v, room)).logsumexp(-1).sum(-1)
+        return free - self.room_rate(room, source) - log_states
 
     # ---------------------------------------------------------------------------------- relations
 
     @abstractmethod
-    def start_relations(self, by_relation: Tensor, by_unit: Tensor, usual: Tensor) -> None:
+    def start_relations(
+        self,
+        by_relation: Float[Tensor, "A"],
+        by_unit: Float[Tensor, "T"],
+        mean_log_counts: Float[Tensor, "V"],
+    ) -> None:
         """Set relation biases to log-odds of the training data.
 
-        They are the log-odds that an observed relation holds, (relations,), and that a triple holds
-        in a scene with annotated relations, (triples,). `usual` is the mean log number of instances
-        of each class, (classes,).
+        They are the log-odds that an observed relation holds, and that a triple holds in a scene
+        with annotated relations. The means are of the log number of instances of each class.
         """
 
     @abstractmethod
-    def edges(self, classes: Tensor, counts: Tensor | None = None) -> Edges:
-        """Return the relation units between the given classes of each scene.
+    def edges(self, classes: Int[Tensor, "B n"], counts: Int[Tensor, "B n"] | None = None) -> Edges:
+        """Return the relation units between the given classes of each scene; -1 is padding.
 
-        The class indices are (scenes, n) int64, with padding -1. The counts are the numbers of
-        instances, 0 where unknown. The default is one instance of each class.
+        The counts are the numbers of instances, 0 where unknown. The default is one of each class.
         """
 
     @abstractmethod
     def lay_out(
-        self, classes: Tensor, counts: Tensor, holds: Tensor, observed: Tensor
-    ) -> tuple[Edges, Tensor, Tensor]:
+        self,
+        classes: Int[Tensor, "B n"],
+        counts: Int[Tensor, "B n"],
+        holds: Float[Tensor, "B A n n"],
+        observed: Bool[Tensor, "B A n n"],
+    ) -> tuple[Edges, Float[Tensor, "B E"], Bool[Tensor, "B E"]]:
         """Return the relations between classes in the layout of this machine: edges, r, observed.
 
         In an RBM or GBM, the units of absent classes are 0. They count as observed if the scene has
-        any annotated relation. `edges` describes classes and counts. `holds` are the values of the
-        relations, and `observed` is True where they are observed, (scenes, relations, n, n).
+        any annotated relation. `edges` describes classes and counts.
         """
 
     @abstractmethod
-    def gate(self, edges: Edges, v: Tensor) -> Tensor:
-        """Return 1 for each unit that can be 1 given v, else 0, (..., scenes, units)."""
+    def gate(self, edges: Edges, v: Float[Tensor, "... B V"]) -> Float[Tensor, "... B E"]:
+        """Return 1 for each unit that can be 1 given v, else 0."""
 
     @abstractmethod
-    def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
-        """Return the logit ℓ_e(v, h1) of each relation unit e, (..., scenes, units).
+    def relation_logits(
+        self, edges: Edges, v: Float[Tensor, "... B V"], h1: Float[Tensor, "... B H1"]
+    ) -> Float[Tensor, "... B E"]:
+        """Return the logit ℓ_e(v, h1) of each relation unit e, given states or means of h1."""
 
-        Args:
-            h1: states or means of the hidden units, (..., scenes, H1).
-        """
+    def implied(
+        self, edges: Edges, observed: Float[Tensor, "B E"], h1: Float[Tensor, "B H1"]
+    ) -> Float[Tensor, "B E"]:
+        """Return the change of each relation logit due to relations that are observed to hold.
 
-    def implied(self, edges: Edges, observed: Tensor, h1: Tensor) -> Tensor:
-        """Return the change of each relation logit due to observed relations, (scenes, units).
-
-        `observed` is 1 for relations that are observed to hold, (scenes, units), and h1 are means
-        given the objects, (scenes, H1). Without implication weights, the change is zero.
+        h1 are means given the objects. Without implication weights, the change is zero.
         """
         del edges, h1
         return torch.zeros_like(observed)
 
-    def relation_term(self, edges: Edges, v: Tensor, r: Tensor, h1: Tensor) -> Tensor:
-        """Return sum_e g_e (r_e ℓ_e - log(1 + exp ℓ_e)) = log p(r | v, h1), (..., scenes)."""
+    def relation_term(
+        self,
+        edges: Edges,
+        v: Float[Tensor, "... B V"],
+        r: Float[Tensor, "... B E"],
+        h1: Float[Tensor, "... B H1"],
+    ) -> Float[Tensor, "... B"]:
+        """Return sum_e g_e (r_e ℓ_e - log(1 + exp ℓ_e)) = log p(r | v, h1)."""
         logits = self.relation_logits(edges, v, h1)
         return ((r * logits - softplus(logits)) * self.gate(edges, v)).sum(-1)
 
     def energy(
         self,
-        v: Tensor,
-        r: Tensor,
-        h1: Tensor,
+        v: Float[Tensor, "B V"],
+        r: Float[Tensor, "B E"],
+        h1: Float[Tensor, "B H1"],
         edges: Edges,
-        room: Tensor | None = None,
-        source: Tensor | None = None,
-    ) -> Tensor:
-        """Return the energy E(v, r, h1, t), (scenes,); +inf if a unit with gate 0 is 1.
+        room: Int[Tensor, "B"] | None = None,
+        source: Int[Tensor, "B"] | None = None,
+    ) -> Float[Tensor, "B"]:
+        """Return the energy E(v, r, h1, t); +inf if a unit with gate 0 is 1.
 
-        The states of h1 are 0 or 1, (scenes, H1). At most one state of each unit is 1.
+        The states of h1 are 0 or 1. At most one state of each unit is 1.
         """
-        context = (h1 * (self.context_bias(room) + v @ self.W)).sum(-1)
-        log_weight = (v * self.scene_bias(source)).sum(-1) + context
+        hidden = (h1 * (self.hidden_bias(room) + v @ self.W)).sum(-1)
+        log_weight = (v * self.scene_bias(source)).sum(-1) + hidden
         couplings = self.couplings
         if couplings is not None:
             log_weight = log_weight + 0.5 * ((v @ couplings) * v).sum(-1)
@@ -336,13 +352,13 @@ class BoltzmannMachine(nn.Module, ABC):
         return torch.where((r > self.gate(edges, v)).any(-1), torch.inf, energy)
 
 
-def sums(v: Tensor, weights: Tensor) -> Tensor:
-    """Return v @ weights for presence v, (scenes, classes). Most classes of a scene are absent."""
+def sparse_product(v: Float[Tensor, "B V"], weights: Float[Tensor, "V k"]) -> Float[Tensor, "B k"]:
+    """Return v @ weights by a sparse product: most classes of a scene are absent."""
     return torch.sparse.mm(v.to_sparse(), weights)
 
 
-def _rows(table: Tensor, index: Tensor | None) -> Tensor:
-    """Return the rows of a table at the indices, (scenes or 1, columns); 0 for -1 and None."""
+def _rows(table: Float[Tensor, "m k"], index: Int[Tensor, "B"] | None) -> Float[Tensor, "B|1 k"]:
+    """Return the rows of a table at the indices; 0 for -1 and None."""
     if index is None or not len(table):
         return table.new_zeros(1, table.shape[1])
     return table[index.clamp(min=0)] * (index >= 0).unsqueeze(-1)

@@ -10,6 +10,7 @@ second hidden layer, which `training.seed` keeps.
 from __future__ import annotations
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from app.inference.variants import MachineSpec
@@ -26,16 +27,25 @@ class RBM(BoltzmannMachine):
         self.U = nn.Parameter(torch.zeros(spec.T, spec.H1))
 
     @torch.no_grad()
-    def start_relations(self, by_relation: Tensor, by_unit: Tensor, usual: Tensor) -> None:
+    def start_relations(
+        self,
+        by_relation: Float[Tensor, "A"],
+        by_unit: Float[Tensor, "T"],
+        mean_log_counts: Float[Tensor, "V"],
+    ) -> None:
         self.d.copy_(by_unit)
 
-    def edges(self, classes: Tensor, counts: Tensor | None = None) -> Edges:
+    def edges(self, classes: Int[Tensor, "B n"], counts: Int[Tensor, "B n"] | None = None) -> Edges:
         """Return all relation units of the machine, whatever the classes are."""
         return triple_edges(self.triples)
 
     def lay_out(
-        self, classes: Tensor, counts: Tensor, holds: Tensor, observed: Tensor
-    ) -> tuple[Edges, Tensor, Tensor]:
+        self,
+        classes: Int[Tensor, "B n"],
+        counts: Int[Tensor, "B n"],
+        holds: Float[Tensor, "B A n n"],
+        observed: Bool[Tensor, "B A n n"],
+    ) -> tuple[Edges, Float[Tensor, "B E"], Bool[Tensor, "B E"]]:
         # Relations without a unit are left out.
         pairs = pair_edges(classes, holds.shape[1])
         keys = triple_keys(pairs.relation, pairs.subject, pairs.object, self.spec.V)
@@ -48,11 +58,13 @@ class RBM(BoltzmannMachine):
         unit_observed[row, unit] = observed.flatten(1)[row, slot]
         return triple_edges(self.triples), r, unit_observed
 
-    def gate(self, edges: Edges, v: Tensor) -> Tensor:
+    def gate(self, edges: Edges, v: Float[Tensor, "... B V"]) -> Float[Tensor, "... B E"]:
         # The units have no gate.
         return edges.valid.to(v.dtype).expand(*v.shape[:-1], -1)
 
-    def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
+    def relation_logits(
+        self, edges: Edges, v: Float[Tensor, "... B V"], h1: Float[Tensor, "... B H1"]
+    ) -> Float[Tensor, "... B E"]:
         return self.d + h1 @ self.U.T
 
 
@@ -63,7 +75,9 @@ class GBM(RBM):
         super().__init__(spec)
         self.g = nn.Parameter(torch.zeros(spec.T, 2))
 
-    def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
+    def relation_logits(
+        self, edges: Edges, v: Float[Tensor, "... B V"], h1: Float[Tensor, "... B H1"]
+    ) -> Float[Tensor, "... B E"]:
         subject, object_ = v[..., edges.subject[0]], v[..., edges.object[0]]
         two_way = subject * self.g[:, 0] + object_ * self.g[:, 1]
         return super().relation_logits(edges, v, h1) + two_way

@@ -35,6 +35,7 @@ structured output prediction" (2011), whose model is also conditioned on observe
 from __future__ import annotations
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import embedding
 
@@ -68,28 +69,41 @@ class Triway(BoltzmannMachine):
             self.B = nn.Parameter(torch.zeros(spec.G, H1))
 
     @torch.no_grad()
-    def start_relations(self, by_relation: Tensor, by_unit: Tensor, usual: Tensor) -> None:
+    def start_relations(
+        self,
+        by_relation: Float[Tensor, "A"],
+        by_unit: Float[Tensor, "T"],
+        mean_log_counts: Float[Tensor, "V"],
+    ) -> None:
         self.d.copy_(by_relation)
-        self.usual.copy_(usual)
+        self.usual.copy_(mean_log_counts)
 
-    def edges(self, classes: Tensor, counts: Tensor | None = None) -> PairEdges:
+    def edges(
+        self, classes: Int[Tensor, "B n"], counts: Int[Tensor, "B n"] | None = None
+    ) -> PairEdges:
         """Return the A·n² relation units between n classes. All other units are 0."""
         if counts is None:
             return pair_edges(classes, self.spec.A)
-        usual = self.usual[classes.clamp(min=0)]
-        logs = torch.where(counts > 0, counts.clamp(min=1).to(self.b.dtype).log(), usual)
+        mean_log_counts = self.usual[classes.clamp(min=0)]
+        logs = torch.where(counts > 0, counts.clamp(min=1).to(self.b.dtype).log(), mean_log_counts)
         return pair_edges(classes, self.spec.A, logs)
 
     def lay_out(
-        self, classes: Tensor, counts: Tensor, holds: Tensor, observed: Tensor
-    ) -> tuple[Edges, Tensor, Tensor]:
+        self,
+        classes: Int[Tensor, "B n"],
+        counts: Int[Tensor, "B n"],
+        holds: Float[Tensor, "B A n n"],
+        observed: Bool[Tensor, "B A n n"],
+    ) -> tuple[Edges, Float[Tensor, "B E"], Bool[Tensor, "B E"]]:
         # A flattened table has the layout of this machine.
         return self.edges(classes, counts), holds.flatten(1), observed.flatten(1)
 
-    def gate(self, edges: Edges, v: Tensor) -> Tensor:
-        return edges.ends_present(v)
+    def gate(self, edges: Edges, v: Float[Tensor, "... B V"]) -> Float[Tensor, "... B E"]:
+        return edges.both_present(v)
 
-    def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
+    def relation_logits(
+        self, edges: Edges, v: Float[Tensor, "... B V"], h1: Float[Tensor, "... B H1"]
+    ) -> Float[Tensor, "... B E"]:
         pairs = _pairs(edges)
         shared = self.R + torch.einsum("akh,...bh->...bak", self.M, h1)
         left = embedding(pairs.classes, self.S).unsqueeze(-3) * shared.unsqueeze(-2)
@@ -101,15 +115,17 @@ class Triway(BoltzmannMachine):
             weights[:, pairs.classes].transpose(0, 1) + n.unsqueeze(1) * pairs.log_counts[:, None]
             for weights, n in zip((self.s, self.o), self.n.unbind(1), strict=True)
         )
-        ends = (subject + bias.unsqueeze(-1)).unsqueeze(-1) + object_.unsqueeze(-2)
-        logits: Tensor = product + ends
+        pair_bias = (subject + bias.unsqueeze(-1)).unsqueeze(-1) + object_.unsqueeze(-2)
+        logits: Tensor = product + pair_bias
         if self.spec.T:
             keys = triple_keys(pairs.relation, pairs.subject, pairs.object, self.spec.V)
             position, exists = find_triples(self.triple_keys, keys)
             logits = logits + pairs.unflatten(self.residual[position] * exists)
         return logits.flatten(-3)
 
-    def implied(self, edges: Edges, observed: Tensor, h1: Tensor) -> Tensor:
+    def implied(
+        self, edges: Edges, observed: Float[Tensor, "B E"], h1: Float[Tensor, "B H1"]
+    ) -> Float[Tensor, "B E"]:
         if not self.spec.G:
             return super().implied(edges, observed, h1)
         grid = _pairs(edges).unflatten(observed)
@@ -117,6 +133,7 @@ class Triway(BoltzmannMachine):
 
 
 def _pairs(edges: Edges) -> PairEdges:
+    """Return the edges, or raise TypeError if they are not `PairEdges`."""
     if not isinstance(edges, PairEdges):
         raise TypeError(
             "edges have the wrong type; a Triway machine needs PairEdges: build them with "
@@ -125,13 +142,10 @@ def _pairs(edges: Edges) -> PairEdges:
     return edges
 
 
-def implication_features(observed: Tensor) -> Tensor:
-    """Return the features phi of observed relations, (scenes, features, n, n) over class pairs.
+def implication_features(observed: Float[Tensor, "B A n n"]) -> Float[Tensor, "B F n n"]:
+    """Return the features phi of relations that are observed to hold, over pairs of classes.
 
     The pair feature of relation a equals r_e itself, so `implied` does not use that feature for a.
-
-    Args:
-        observed: observed relations, (scenes, relations, n, n). 1 means that the relation holds.
     """
     n = observed.shape[-1]
     between = observed * ~torch.eye(n, dtype=torch.bool)
@@ -146,16 +160,16 @@ def implication_features(observed: Tensor) -> Tensor:
     return torch.cat([directed, paths, degrees], 1)
 
 
-def implied(gamma: Tensor, B: Tensor, observed: Tensor, h1: Tensor) -> Tensor:
-    """Return the changes x of the relation logits due to observed relations.
+def implied(
+    gamma: Float[Tensor, "1+G A F"],
+    B: Float[Tensor, "G H1"],
+    observed: Float[Tensor, "B A n n"],
+    h1: Float[Tensor, "B H1"],
+) -> Float[Tensor, "B A n n"]:
+    """Return the changes x of the relation logits due to relations that are observed to hold.
 
-    The result has the shape (scenes, relations, n, n) over pairs of n classes.
-
-    Args:
-        gamma: weights of the features, (1 + G, relations, features).
-        B: weights from hidden units to z, (G, hidden units).
-        observed: observed relations, (scenes, relations, n, n). 1 means that the relation holds.
-        h1: means of the hidden units given the objects, (scenes, hidden units).
+    gamma are the weights of the features, B the weights from h1 to z, and h1 means of the hidden
+    units given the objects.
     """
     A = observed.shape[1]
     itself = torch.zeros(gamma.shape[1:], dtype=torch.bool)

@@ -30,7 +30,7 @@ from torch import Tensor
 from app.registry import DEFAULT_STORE, Store
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import some_scenes
-from training.domain.init_command import StorePath
+from training.domain.terminal import StorePath
 from training.evaluation.outside import read_test
 from training.evaluation.parts import draw_parts, exactly, rank_hidden
 from training.evaluation.setting import Structure, with_relations
@@ -61,7 +61,7 @@ def joint_room_log_p(machine: BoltzmannMachine, v: Float[Tensor, "B V"]) -> Floa
 
     The room type is one of the C types.
     """
-    logits = machine.e + machine.gain(machine.context(v), machine.Q)
+    logits = machine.e + machine.hidden_log_odds(machine.hidden_logits(v), machine.Q)
     if machine.spec.coupled:
         logits = logits + v @ machine.Y.T
     if not machine.spec.profiles:
@@ -85,7 +85,7 @@ def change_by_relations(
     p(h1 | v), and weighted by p(r | v, h1). `r` are the values of the relation units `edges`
     between the listed classes.
     """
-    x = machine.by_unit(machine.context(v))[0]
+    x = machine.by_unit(machine.hidden_logits(v))[0]
     states = torch.cat([torch.zeros_like(x[:, :1]), x], 1).softmax(1)
     drawn = torch.multinomial(states, draws, replacement=True, generator=generator).T
     one = torch.nn.functional.one_hot(drawn, machine.spec.states)[..., 1:]

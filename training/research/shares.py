@@ -27,7 +27,7 @@ from app.inference.weights import Weights
 from app.model import SceneModel
 from app.model.calibration import KINDS
 from app.registry import DEFAULT_STORE, Store
-from training.domain.init_command import StorePath
+from training.domain.terminal import StorePath
 from training.evaluation.artifact_model import artifact_model
 from training.evaluation.outside import read_test
 from training.evaluation.setting import Setting

@@ -45,7 +45,7 @@ from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.cases import scene_rng
 from training.datasets.files import DATA, write_whole
-from training.domain.init_command import StorePath
+from training.domain.terminal import StorePath
 from training.evaluation.metrics import Ratio, paired_difference
 from training.fit.configuration import Config, ConfigError
 from training.fit.draft import draft_artifact

@@ -32,11 +32,7 @@ def _toml_files(folder: str) -> dict[str, Path]:
 
 
 def own_or_shipped(path: Path | None, config: Config, kind: str, option: str) -> Path:
-    """Return the file of the user, or the shipped file of a kind for a configuration.
-
-    Raises:
-        ConfigError: the user names no file, and no file is shipped.
-    """
+    """Return the file of the user, or the shipped file of a kind for a configuration."""
     shipped = shipped_files(kind)
     if path is None and config.name not in shipped:
         available = f"(available for: {', '.join(shipped)})"
@@ -47,11 +43,7 @@ def own_or_shipped(path: Path | None, config: Config, kind: str, option: str) ->
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file.
-
-    Raises:
-        ConfigError: the file is missing or is not TOML.
-    """
+    """Read a TOML file."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
@@ -75,9 +67,6 @@ def load_config(reference: str, *, seed: int | None = None) -> Config:
     """Read a configuration. `config_path` describes the possible references.
 
     The entry `base` names a shipped configuration, whose entries apply where the file has none.
-
-    Raises:
-        ConfigError: the file is missing, is not TOML, or has an invalid entry.
     """
     path = config_path(reference)
     if not path.is_file():
@@ -90,6 +79,7 @@ def load_config(reference: str, *, seed: int | None = None) -> Config:
 
 
 def _with_base(path: Path) -> dict[str, Any]:
+    """Return the entries of a file, merged into those of its base."""
     values = read_toml(path)
     if (base := values.pop("base", None)) is None:
         return values
@@ -109,11 +99,7 @@ def _merged(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def stored_config(artifact: Artifact) -> Config:
-    """Return the configuration of a published model.
-
-    Raises:
-        ConfigError: the model was adapted to a home, so it has no configuration.
-    """
+    """Return the configuration of a published model."""
     if "config" not in artifact.manifest.training:
         reference = "@".join(artifact.key)
         raise ConfigError(
@@ -130,11 +116,7 @@ def _validated(values: Mapping[str, Any], title: str) -> Config:
 
 
 def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
-    """Return a configuration with new values of entries, such as "relations.epochs".
-
-    Raises:
-        ConfigError: an entry does not exist, or a value is invalid.
-    """
+    """Return a configuration with new values of entries, such as "relations.epochs"."""
     values = config.model_dump()
     for name, value in settings.items():
         section, _, entry = name.partition(".")
@@ -174,6 +156,7 @@ def sections_toml(values: Mapping[str, Any], reasons: Mapping[str, str] | None =
 
 
 def _entry(name: str, value: Any) -> str:
+    """Return an entry as a line of TOML."""
     if isinstance(value, Mapping):
         entries = ", ".join(_entry(json.dumps(key), entry) for key, entry in value.items())
         return f"{name} = {{ {entries} }}"

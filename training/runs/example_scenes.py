@@ -41,12 +41,8 @@ _FEWEST_CLASSES: Final = 3
 def read_examples(reference: str, root: Path) -> tuple[Example, ...]:
     """Read the examples of a configuration.
 
-    Args:
-        reference: entry `examples` of the configuration: the name of a shipped file, or a file in
-            `root` that ends in .json. An empty text means no examples.
-
-    Raises:
-        ConfigError: the file is missing or invalid.
+    The reference is its entry `examples`: the name of a shipped file, or a file in `root` that ends
+    in .json. An empty text means no examples.
     """
     if not reference:
         return ()
@@ -64,7 +60,7 @@ def read_examples(reference: str, root: Path) -> tuple[Example, ...]:
         ) from error
 
 
-def known_examples(
+def accepted_examples(
     examples: Sequence[Example], vocabulary: Vocabulary
 ) -> tuple[tuple[Example, ...], list[str]]:
     """Return the examples that a model of this vocabulary accepts, and reasons against others."""
@@ -175,6 +171,7 @@ def _viewpoint(scene: AnnotatedScene) -> dict[str, float]:
 
 
 def _pose(thing: AnnotatedObject) -> dict[str, Any]:
+    """Return position, size and orientation of an object as members of a request."""
     pose: dict[str, Any] = {}
     for name, values in (("position", thing.position), ("size", thing.size)):
         if values is not None:

@@ -10,6 +10,8 @@ from functools import partial
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from app.registry import Example
 from app.scene import RoleCounts, Vocabulary
@@ -48,7 +50,7 @@ class SplitScenes:
     parts: dict[str, list[EncodedScene]]
     counts: dict[str, int]  # number of scenes, by source
     digests: dict[str, str]  # sha256 of the contents of the scenes, by source
-    words: torch.Tensor | None = None  # (V, D) unit word vectors of the classes
+    words: Float[Tensor, "V D"] | None = None  # unit word vectors of the classes
     examples: tuple[Example, ...] = ()  # for the artifact
 
     @property
@@ -65,9 +67,6 @@ class SplitScenes:
         """Return the tensors for the trainer.
 
         A data source annotates the classes that occur in its training part.
-
-        Raises:
-            ConfigError: a source has no scene in the training part.
         """
         annotated = annotated_classes(self.parts["train"], self.vocabulary)
         sources = {scene.source for scenes in self.parts.values() for scene in scenes}
@@ -88,11 +87,7 @@ class SplitScenes:
         )
 
     def complete_data(self) -> TrainingData:
-        """Return the tensors for an experiment, which needs all three parts.
-
-        Raises:
-            ConfigError: the training, validation or test part contains no scenes.
-        """
+        """Return the tensors for an experiment, which needs all three parts."""
         for part, scenes in self.parts.items():
             if not scenes:
                 raise ConfigError(
@@ -107,10 +102,6 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
     A data source is a file, or a name. A name means `<name>.jsonl.gz` in `root` or in `root/extra`
     (`<name>.tsv.gz` for the placing priors). `rooms` and `inventories` come from the repository.
     The scenes of a file have plain labels, and no placeholders (`plain_scenes`).
-
-    Raises:
-        ConfigError: a file is missing.
-        DatasetError: a file is invalid.
     """
     _require_files(data, root)
     scenes: dict[str, list[AnnotatedScene]] = {}
@@ -131,6 +122,7 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
 
 
 def _path(source: str, root: Path) -> Path:
+    """Return the file of a data source."""
     if source == inventories.SOURCE:
         return KNOWLEDGE / "inventories.csv"
     if is_file(source):
@@ -160,11 +152,7 @@ def _require_files(data: DataConfig, root: Path) -> None:
 
 
 def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path) -> Vocabulary:
-    """Return the vocabulary of a configuration, with typical object sizes from the scenes.
-
-    Raises:
-        ConfigError: the vocabulary name is unknown, or the file contains no vocabulary.
-    """
+    """Return the vocabulary of a configuration, with typical object sizes from the scenes."""
     name = data.vocabulary
     makers: dict[str, Callable[[], Vocabulary]] = {
         "written": written_vocabulary,
@@ -197,22 +185,13 @@ def split_and_encode(
 ) -> SplitScenes:
     """Split the scenes into train, validation and test parts, and encode them.
 
-    The split includes all data sources at once, because sources can contain the same room.
-
-    Args:
-        root: folder of the vocabulary.
-        vocabulary: vocabulary of a published model. The default is that of the configuration.
-
-    Raises:
-        ConfigError: the vocabulary is invalid; see `build_vocabulary`.
+    The split includes all data sources at once, because sources can contain the same room. The
+    vocabulary is that of a published model, or by default that of the configuration in `root`.
     """
     all_scenes = [scene for source in scenes.values() for scene in source]
     parts = split(all_scenes, seed=data.split_seed, protocol=data.split)
     if vocabulary is None:
         vocabulary = build_vocabulary(data, parts["train"], root)
-    words = None
-    if data.words:
-        words = torch.from_numpy(vocabulary.vectors[0])
     roles = count_roles(parts["train"], vocabulary)
     return SplitScenes(
         data=data,
@@ -221,7 +200,7 @@ def split_and_encode(
         parts={name: encode(part, vocabulary, roles) for name, part in parts.items()},
         counts={name: len(source) for name, source in scenes.items()},
         digests={name: digest_of(source) for name, source in scenes.items()},
-        words=words,
+        words=torch.from_numpy(vocabulary.vectors[0]) if data.words else None,
     )
 
 
@@ -229,9 +208,5 @@ def prepare(config: Config, root: Path, vocabulary: Vocabulary | None = None) ->
     """Read the scenes of a configuration from the folder `root`, split and encode them.
 
     `vocabulary` is that of a published model. The default is that of the configuration.
-
-    Raises:
-        ConfigError: a file is missing, or the vocabulary is invalid.
-        DatasetError: a file of scenes is invalid.
     """
     return split_and_encode(config.data, read_sources(config.data, root), root, vocabulary)

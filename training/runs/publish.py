@@ -28,7 +28,7 @@ from training.fit.long_chains import measure_drift
 from training.fit.objects import ObjectScenes
 from training.fit.offset_statistics import fit_offsets
 from training.runs.config_files import load_config, shipped_configs, stored_config, with_settings
-from training.runs.example_scenes import known_examples, read_examples
+from training.runs.example_scenes import accepted_examples, read_examples
 from training.runs.folder import FinishedRun, RunError
 from training.runs.pipeline import SplitScenes, read_sources, split_and_encode
 
@@ -67,8 +67,8 @@ def publish_run(
         measured: second run of the same configuration, and its scenes, for a `run` that was trained
             on test scenes. Its test results and chosen calibration values are published.
         judge: function that returns further reasons against the calibrated model.
-        accept: function that is called with each reason against the model, which is published all
-            the same. None refuses a model with such a reason.
+        accept: function of each reason against a model that is published all the same. None refuses
+            the model.
 
     Raises:
         RefusedError: there is a reason against the model.
@@ -130,10 +130,8 @@ def refit(
     shipped configuration with the name of the model, otherwise those of its own configuration. The
     metrics of weights that were trained on test scenes come from statistics that were not fitted to
     test scenes. The new version has no shares of flagged intruders, of alarms and of refused rooms
-    of such weights, because they would need other weights.
-
-    Args:
-        root: folder of the training scenes.
+    of such weights, because they would need other weights. `root` is the folder of the training
+    scenes.
 
     Raises:
         RunError: the scenes in `root` are not the training scenes of the model.
@@ -144,7 +142,7 @@ def refit(
     config = stored_config(artifact)
     data, is_shipped = config.data, manifest.name in shipped_configs()
     named = load_config(manifest.name).examples if is_shipped else config.examples
-    examples, reasons = known_examples(read_examples(named, root), model.vocabulary)
+    examples, reasons = accepted_examples(read_examples(named, root), model.vocabulary)
     for reason in reasons:
         progress(reason)
     progress("reading scenes")
@@ -161,13 +159,13 @@ def refit(
         other = with_settings(config, {"data.split": split}).data
         evaluated_scenes = split_and_encode(other, annotated, root, model.vocabulary)
     progress("fitting statistics")
-    held_out, own = evaluated_scenes.training_data(), scenes.training_data()
+    test, own = evaluated_scenes.training_data(), scenes.training_data()
     refitted = refitted_lines(with_statistics(model, scenes), own.validation, config.objects)
     refitted = refitted_limits(refitted, complete_scenes(own.train))
     evaluated = with_statistics(model, evaluated_scenes)
-    rows = _measure(evaluated, held_out, progress, tuple(STATISTICS))
+    rows = _measure(evaluated, test, progress, tuple(STATISTICS))
     if not split:
-        rows += _measure(refitted, held_out, progress, _OF_LIMITS)
+        rows += _measure(refitted, test, progress, _OF_LIMITS)
     again = {metric.task for metric in rows} | {*STATISTICS, "T4 rooms"}
     kept = [m for m in manifest.metrics if m.task not in again and not _ALARM.search(m.metric)]
     vocabulary = VocabularyEntry.of(
@@ -219,29 +217,24 @@ def _measure(
     """Return the metrics on test scenes, or an empty list if there are no test scenes."""
     if not len(data.test):
         return []
-    return evaluate(
-        *(model, data.test, data.structure, data.train),
-        everyday=EVERYDAY,
-        tasks=tasks,
-        progress=progress,
-    )
+    scenes = data.test, data.structure, data.train
+    return evaluate(model, *scenes, everyday=EVERYDAY, tasks=tasks, progress=progress)
 
 
 def data_sources(scenes: SplitScenes, learnt: ObjectScenes) -> tuple[DataSource, ...]:
     """Return the data sources with the digests of their scenes, their terms of use and shares.
 
-    Args:
-        learnt: the scenes that teach objects.
+    The shares are those of the weights of the scenes in the training of objects, `learnt`.
     """
     sources = []
-    shares = dict(zip(learnt.sources, (learnt.source_sizes / learnt.size).tolist(), strict=True))
+    share_of = dict(zip(learnt.sources, (learnt.source_sizes / learnt.size).tolist(), strict=True))
     written = {source_name(source) for source in scenes.data.sources if is_inventory(source)}
     for name, count in scenes.counts.items():
         words, research_only = terms_of(name, scenes.data)
         digest = scenes.digests[name]
         source = DataSource(
             source=name, scenes=count, digest=digest, terms=words, research_only=research_only,
-            share=round(shares.get(name, 0.0), 4),
+            share=round(share_of.get(name, 0.0), 4),
             written=name in written,
         )  # fmt: skip
         sources.append(source)

@@ -168,6 +168,7 @@ def _run(job: Job, source: str, data: Path, folder: Path, settings: Mapping[str,
 
 
 def _references(material: Material, seeds: int) -> dict[str, list[Row]]:
+    """Measure the reference rows, once for each seed."""
     answers = {
         "frequency": frequency_answer(material.triples, material.train),
         "nothing": nothing_answer,
@@ -208,6 +209,7 @@ def markdown(source: str, materials: Mapping[str, Material], results: Mapping[st
 
 
 def _table(result: Mapping[str, Any]) -> str:
+    """Return the table of a split in Markdown."""
     columns: dict[str, list[Row]] = dict(result["references"])
     columns |= {name: [_row(run) for run in runs] for name, runs in result["machines"].items()}
     metrics = dict.fromkeys(metric for rows in columns.values() for row in rows for metric in row)
@@ -235,6 +237,7 @@ def _row(run: Run) -> Row:
 
 
 def _cells(metric: str, columns: Iterable[list[Row]]) -> Iterator[str]:
+    """Yield the mean ± standard deviation of a metric in each column."""
     for rows in columns:
         values = [row[metric] for row in rows if metric in row]
         digits = 0 if metric in ("epochs", "weights") else 1 if metric.startswith("E ") else 3

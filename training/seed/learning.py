@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from training.seed.machines import Free, Machine, State
@@ -53,12 +54,11 @@ class Epoch:
 
 def phases(
     machine: Machine, scenes: Scenes, generator: torch.Generator, steps: int = 1
-) -> tuple[State, State, Tensor, Tensor]:
+) -> tuple[State, State, Float[Tensor, "B"], Float[Tensor, "B"]]:
     """Run the positive phase and `steps` sweeps of the negative phase.
 
-    Returns:
-        The states at the end of both phases, with the mean of h1 given all other units in place of
-        h1; the error E of the objects, (B,), and of the relations, (B,).
+    The results are the states at the end of both phases, with the mean of h1 given all other units
+    in place of h1, and the errors E of the objects and of the relations.
     """
     v, r, free = scenes.v, scenes.r, Free.of(scenes.v, scenes.annotated, scenes.r)
     start = state = State(v, r, *machine.hidden(v, r, generator))
@@ -88,11 +88,7 @@ def train(
     epochs: int = EPOCHS,
     rate: float = LEARNING_RATE,
 ) -> list[Epoch]:
-    """Train a machine in place, and return the errors of each epoch.
-
-    Raises:
-        FloatingPointError: training has diverged.
-    """
+    """Train a machine in place, and return the errors of each epoch."""
     history: list[Epoch] = []
     best, best_epoch, weights = math.inf, 0, machine.state_dict()
     for epoch in range(epochs):
@@ -109,6 +105,7 @@ def train(
 
 
 def _epoch(machine: Machine, material: Material, generator: torch.Generator, rate: float) -> Epoch:
+    """Update the weights by all batches of an epoch, and return its errors."""
     start, own = time.perf_counter(), []
     for index in torch.randperm(len(material.train), generator=generator).split(BATCH):
         positive, negative, *error = phases(machine, material.train.rows(index), generator)

@@ -30,6 +30,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 _SCALE: Final = 0.01  # standard deviation of the initial weights
@@ -38,43 +39,43 @@ _ROUNDS: Final = 5  # sweeps over two hidden layers, given the visible units
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Values of all units of B scenes: v (B, V), r (B, T), h1 (B, H1), h2 (B, H2)."""
+    """Values of all units of B scenes."""
 
-    v: Tensor
-    r: Tensor
-    h1: Tensor
-    h2: Tensor
+    v: Float[Tensor, "B V"]
+    r: Float[Tensor, "B T"]
+    h1: Float[Tensor, "B H1"]
+    h2: Float[Tensor, "B H2"]
 
 
 @dataclass(frozen=True, eq=False)
 class Free:
-    """Units that a sweep samples, bool: v (B, V) and r (B, T). The other units stay as they are."""
+    """True for the units that a sweep samples. The other units keep their values."""
 
-    v: Tensor
-    r: Tensor
+    v: Bool[Tensor, "B V"]
+    r: Bool[Tensor, "B T"]
 
     @classmethod
-    def of(cls, v: Tensor, annotated: Tensor, r: Tensor) -> Free:
-        """Return all objects, and the relations of the `annotated` scenes, (B,)."""
+    def of(
+        cls, v: Float[Tensor, "B V"], annotated: Bool[Tensor, "B"], r: Float[Tensor, "B T"]
+    ) -> Free:
+        """Return all objects, and the relations of the `annotated` scenes."""
         return cls(torch.ones_like(v).bool(), annotated.unsqueeze(1).expand(r.shape))
 
 
-def bernoulli(p: Tensor, generator: torch.Generator) -> Tensor:
-    """Sample units that are on with probability p, in the shape of p."""
+def bernoulli(p: Float[Tensor, "*s"], generator: torch.Generator) -> Float[Tensor, "*s"]:
+    """Sample units that are on with probability p."""
     return (torch.rand(p.shape, generator=generator, dtype=p.dtype) < p).to(p.dtype)
 
 
 class Machine(nn.Module):
     """The parts that all machines share. A subclass defines its relations and their effect.
 
-    Args:
-        triples: (T, 3) int64, the relation, subject class and object class of each unit of r.
-        V, H1, H2: number of classes and of hidden units.
-        generator: source of the initial weights W, J and U. The biases start at zero.
+    The triples are the relation, subject class and object class of each unit of r. The generator
+    draws the initial weights W, J and U. The biases start at zero.
     """
 
     def __init__(
-        self, triples: Tensor, V: int, H1: int, H2: int, generator: torch.Generator
+        self, triples: Int[Tensor, "T 3"], V: int, H1: int, H2: int, generator: torch.Generator
     ) -> None:
         super().__init__()
         T = len(triples)
@@ -103,43 +104,53 @@ class Machine(nn.Module):
         for weights, rows, columns in ((self.W, v, h1), (self.J, h1, h2), (self.U, r, h1)):
             weights.addmm_(rows.T, columns, alpha=step)
 
-    def gate(self, v: Tensor) -> Tensor:
-        """Return 1 for each relation that can be on given the objects, (B, T)."""
+    def gate(self, v: Float[Tensor, "B V"]) -> Float[Tensor, "B T"]:
+        """Return 1 for each relation that can be on given the objects."""
         return v.new_ones(len(v), len(self.d))
 
-    def relation_logits(self, v: Tensor, h1: Tensor) -> Tensor:
-        """Return l_e, (B, T), the log-odds of each relation whose gate is 1."""
+    def relation_logits(
+        self, v: Float[Tensor, "B V"], h1: Float[Tensor, "B H1"]
+    ) -> Float[Tensor, "B T"]:
+        """Return l_e, the log-odds of each relation whose gate is 1."""
         return self.d + h1 @ self.U.T
 
-    def h1_logits(self, v: Tensor, r: Tensor, h2: Tensor) -> Tensor:
-        """Return the log-odds of h1 given all other units, (B, H1)."""
+    def h1_logits(
+        self, v: Float[Tensor, "B V"], r: Float[Tensor, "B T"], h2: Float[Tensor, "B H2"]
+    ) -> Float[Tensor, "B H1"]:
+        """Return the log-odds of h1 given all other units."""
         return self.c1 + v @ self.W + r @ self.U + h2 @ self.J.T
 
-    def h2_logits(self, h1: Tensor) -> Tensor:
-        """Return the log-odds of h2 given h1, (B, H2)."""
+    def h2_logits(self, h1: Float[Tensor, "B H1"]) -> Float[Tensor, "B H2"]:
+        """Return the log-odds of h2 given h1."""
         return self.c2 + h1 @ self.J
 
     def sample_objects(
         self, state: State, free: Free, temperature: float, generator: torch.Generator
-    ) -> tuple[Tensor, Tensor]:
-        """Sample the free objects given h1 and r. Return v and p(v_i = 1), both (B, V)."""
-        p = ((self.b + state.h1 @ self.W.T + self.pull(state)) / temperature).sigmoid()
+    ) -> tuple[Float[Tensor, "B V"], Float[Tensor, "B V"]]:
+        """Sample the free objects given h1 and r. Return v and p(v_i = 1)."""
+        p = ((self.b + state.h1 @ self.W.T + self.relation_field(state)) / temperature).sigmoid()
         return torch.where(free.v, bernoulli(p, generator), state.v), p
 
-    def pull(self, state: State) -> Tensor:
-        """Return the effect of the relations on the log-odds of objects, (B, V)."""
+    def relation_field(self, state: State) -> Float[Tensor, "B V"]:
+        """Return the effect of the relations on the log-odds of objects."""
         return torch.zeros_like(state.v)
 
-    def ends(self, v: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the presence of the subject and of the object of each relation, both (B, T)."""
+    def presence(
+        self, v: Float[Tensor, "B V"]
+    ) -> tuple[Float[Tensor, "B T"], Float[Tensor, "B T"]]:
+        """Return the presence of the subject and of the object of each relation."""
         return v.index_select(1, self.subject), v.index_select(1, self.object)
 
-    def to_ends(self, subject: Tensor, object_: Tensor) -> Tensor:
-        """Add values of relations (B, T) up over their subjects and over their objects, (B, V)."""
+    def sum_by_class(
+        self, subject: Float[Tensor, "B T"], object_: Float[Tensor, "B T"]
+    ) -> Float[Tensor, "B V"]:
+        """Sum values of the relations over their subject classes and over their object classes."""
         total = subject.new_zeros(len(subject), len(self.b)).index_add(1, self.subject, subject)
         return total.index_add(1, self.object, object_)
 
-    def hidden(self, v: Tensor, r: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def hidden(
+        self, v: Float[Tensor, "B V"], r: Float[Tensor, "B T"], generator: torch.Generator
+    ) -> tuple[Float[Tensor, "B H1"], Float[Tensor, "B H2"]]:
         """Sample h1 and h2 given the visible units. Exact with one layer, else `_ROUNDS` sweeps."""
         h1, h2 = v.new_zeros(len(v), len(self.c1)), v.new_zeros(len(v), len(self.c2))
         visible = self.h1_logits(v, r, h2)
@@ -150,10 +161,10 @@ class Machine(nn.Module):
 
     def sweep(
         self, state: State, free: Free, temperature: float, generator: torch.Generator
-    ) -> tuple[State, Tensor, Tensor]:
+    ) -> tuple[State, Float[Tensor, "B V"], Float[Tensor, "B T"]]:
         """Sample h2, h1, the free objects and the free relations once, in this order.
 
-        Return the new state, and the probabilities of objects (B, V) and relations (B, T) to be on.
+        Return the new state, and the probabilities of objects and relations to be on.
         """
         h2 = bernoulli((self.h2_logits(state.h1) / temperature).sigmoid(), generator)
         logits = self.h1_logits(state.v, state.r, h2)
@@ -185,33 +196,35 @@ class GBM(Machine):
 
     def add_products(self, state: State, step: float) -> None:
         super().add_products(state, step)
-        for g, end in zip(self.g, self.ends(state.v), strict=True):
-            g.add_((state.r * end).sum(0), alpha=step)
+        for g, presence in zip(self.g, self.presence(state.v), strict=True):
+            g.add_((state.r * presence).sum(0), alpha=step)
 
-    def relation_logits(self, v: Tensor, h1: Tensor) -> Tensor:
-        subject, object_ = self.ends(v)
+    def relation_logits(
+        self, v: Float[Tensor, "B V"], h1: Float[Tensor, "B H1"]
+    ) -> Float[Tensor, "B T"]:
+        subject, object_ = self.presence(v)
         return super().relation_logits(v, h1) + self.g[0] * subject + self.g[1] * object_
 
-    def pull(self, state: State) -> Tensor:
-        return self.to_ends(state.r * self.g[0], state.r * self.g[1])
+    def relation_field(self, state: State) -> Float[Tensor, "B V"]:
+        return self.sum_by_class(state.r * self.g[0], state.r * self.g[1])
 
 
 class GatedRBM(Machine):
-    """The RBM whose sampled relations of absent objects are off. Relations do not pull objects."""
+    """The RBM with gates. Its relations do not act on objects."""
 
-    def gate(self, v: Tensor) -> Tensor:
-        subject, object_ = self.ends(v)
+    def gate(self, v: Float[Tensor, "B V"]) -> Float[Tensor, "B T"]:
+        subject, object_ = self.presence(v)
         return subject * object_
 
 
 class Triway(GatedRBM):
-    """Tri-way edges r_e v_i v_j: a relation also pulls its objects."""
+    """Tri-way edges r_e v_i v_j: a relation also acts on its objects."""
 
-    def pull(self, state: State) -> Tensor:
+    def relation_field(self, state: State) -> Float[Tensor, "B V"]:
         logits = state.r * self.relation_logits(state.v, state.h1)
-        subject, object_ = self.ends(state.v)
+        subject, object_ = self.presence(state.v)
         same = self.subject == self.object  # v_i v_i = v_i
-        return self.to_ends(
+        return self.sum_by_class(
             logits * object_.masked_fill(same, 1.0), logits * subject.masked_fill(same, 0.0)
         )
 

@@ -4,7 +4,7 @@ A sampled reconstruction answers each question: the model gets a scene, samples 
 the free units, and the sample is the answer. `ONE_PASS` is one sweep at temperature 1. `ANNEALED`
 cools the temperature from 2 to 1.
 
-    T1  relations  All objects are given, and no relation. Share of listed relations that are on
+    T1  relations  All objects are listed, and no relation. Share of listed relations that are on
     T2  missing    One random class is removed. Share of removed classes that are on again. In the
                    published code, the listed relations of the removed class stay on. They force
                    the class on in a gated machine and hint at it in the others. A second variant
@@ -24,6 +24,7 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from app.scene import Vocabulary
@@ -61,19 +62,19 @@ def machine_answer(machine: Machine, schedule: Sequence[float] = ONE_PASS) -> An
     return answer
 
 
-def frequency_answer(triples: Tensor, train: Scenes) -> Answer:
+def frequency_answer(triples: Int[Tensor, "T 3"], train: Scenes) -> Answer:
     """Return the reconstruction by frequencies in the training scenes, without any context.
 
     p(v_i) is the share of scenes with class i. p(r_e) is the share of listed relations among the
     annotated scenes with both classes.
     """
-    ends = triples[:, 1], triples[:, 2]
-    both = train.v[:, ends[0]] * train.v[:, ends[1]] * train.annotated.unsqueeze(1)
+    subject, object_ = triples[:, 1], triples[:, 2]
+    both = train.v[:, subject] * train.v[:, object_] * train.annotated.unsqueeze(1)
     object_p, relation_p = train.v.mean(0), train.r.sum(0) / both.sum(0).clamp(min=1)
 
     def answer(v: Tensor, r: Tensor, free: Free, generator: torch.Generator) -> Visible:
         v = torch.where(free.v, bernoulli(object_p.expand(v.shape), generator), v)
-        p = relation_p * v[:, ends[0]] * v[:, ends[1]]
+        p = relation_p * v[:, subject] * v[:, object_]
         return v, torch.where(free.r, bernoulli(p, generator), r)
 
     return answer
@@ -84,7 +85,9 @@ def nothing_answer(v: Tensor, r: Tensor, free: Free, generator: torch.Generator)
     return v, r
 
 
-def measure(answer: Answer, triples: Tensor, test: Scenes, seed: int) -> dict[str, float]:
+def measure(
+    answer: Answer, triples: Int[Tensor, "T 3"], test: Scenes, seed: int
+) -> dict[str, float]:
     """Return all figures of T1 to T3. T1 is left out without listed relations."""
     generator = torch.Generator().manual_seed(seed)
     figures = relations_on(answer, test, generator)
@@ -112,7 +115,11 @@ def relations_on(answer: Answer, test: Scenes, generator: torch.Generator) -> di
 
 
 def removed_on(
-    answer: Answer, triples: Tensor, test: Scenes, left: bool, generator: torch.Generator
+    answer: Answer,
+    triples: Int[Tensor, "T 3"],
+    test: Scenes,
+    left: bool,
+    generator: torch.Generator,
 ) -> dict[str, float]:
     """Measure T2 over the scenes of two or more classes.
 
@@ -122,10 +129,10 @@ def removed_on(
     scenes = test.rows(test.v.sum(1) >= 2)
     removed = torch.multinomial(scenes.v, 1, generator=generator)
     shown = scenes.v.scatter(1, removed, 0.0)
-    known = scenes.v if left else shown
-    is_known = (known[:, triples[:, 1]] * known[:, triples[:, 2]]).bool()
-    free = Free(shown == 0, ~is_known & scenes.annotated.unsqueeze(1))
-    v, _ = answer(shown, scenes.r * is_known, free, generator)
+    present = scenes.v if left else shown
+    is_fixed = (present[:, triples[:, 1]] * present[:, triples[:, 2]]).bool()
+    free = Free(shown == 0, ~is_fixed & scenes.annotated.unsqueeze(1))
+    v, _ = answer(shown, scenes.r * is_fixed, free, generator)
     return {
         "on": float(v.gather(1, removed).mean()),
         "false objects": float((v * (1 - scenes.v)).sum(1).mean()),
@@ -150,11 +157,9 @@ def generate(
 ) -> tuple[dict[str, float], dict[str, list[str]]]:
     """Measure T4 for the hidden units of h1 whose mean varies most over the training scenes.
 
-    Objects and then relations are sampled given h1 from an empty scene.
-
-    Returns:
-        Figures, and the most frequent classes by hidden unit. A pair of sampled classes is "seen"
-        if both classes are in one training scene.
+    Objects and then relations are sampled given h1 from an empty scene. The results are figures,
+    and the most frequent classes by hidden unit. A pair of sampled classes is "seen" if both
+    classes are in one training scene.
     """
     generator = torch.Generator().manual_seed(seed)
     _, h2 = machine.hidden(train.v, train.r, generator)
@@ -176,8 +181,10 @@ def generate(
     return figures, classes
 
 
-def _objects_given(machine: Machine, h1: Tensor, generator: torch.Generator) -> Tensor:
-    """Sample objects given h1, (B, V), by ten alternations with relations."""
+def _objects_given(
+    machine: Machine, h1: Float[Tensor, "B H1"], generator: torch.Generator
+) -> Float[Tensor, "B V"]:
+    """Sample objects given h1 by ten alternations with relations."""
     v, r, h2 = (h1.new_zeros(len(h1), len(bias)) for bias in (machine.b, machine.d, machine.c2))
     free = Free(torch.ones_like(v).bool(), torch.ones_like(r).bool())
     for _ in range(10):

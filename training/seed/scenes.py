@@ -10,6 +10,8 @@ from typing import Final
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
 from app.scene import Vocabulary, canonicalise
@@ -21,6 +23,7 @@ from training.datasets import (
     source_vocabulary,
     split,
 )
+from training.datasets.array_types import Table
 from training.datasets.splits import Protocol
 
 SPLITS: Final[dict[str, Protocol]] = {"scenes": "paper", "groups": "paper groups"}
@@ -31,43 +34,28 @@ RELATIONS: Final = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Scenes:
-    """N scenes. In an annotated scene, an unlisted relation is false.
+class Scenes(Table):
+    """N scenes. In an annotated scene, an unlisted relation is false."""
 
-    Attributes:
-        v, r: (N, V) presence of each class; (N, T) listed triples among those of training.
-        labelled: (N,) number of listed triples, those without a unit included.
-        annotated: (N,) bool, False for a scene without annotation of relations.
-    """
-
-    v: Tensor
-    r: Tensor
-    labelled: Tensor
-    annotated: Tensor
+    v: Float[Tensor, "N V"]  # presence of each class
+    r: Float[Tensor, "N T"]  # listed triples among those of training
+    labelled: Int[Tensor, "N"]  # number of listed triples, those without a unit included
+    annotated: Bool[Tensor, "N"]  # False for a scene without annotation of relations
 
     def __len__(self) -> int:
         return len(self.v)
 
-    def rows(self, index: Tensor) -> Scenes:
-        """Return the scenes at these indices, or the scenes where a mask is True."""
-        return Scenes(*(tensor[index] for tensor in vars(self).values()))
-
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """The scenes of one split.
-
-    Attributes:
-        triples: (T, 3) int64 relation, subject and object class of each triple of `train`.
-        digest: sha256 of the scenes and their split.
-    """
+    """The scenes of one split."""
 
     vocabulary: Vocabulary
-    triples: Tensor
+    triples: Int[Tensor, "T 3"]  # relation, subject and object class of each triple of `train`
     train: Scenes
     validation: Scenes
     test: Scenes
-    digest: str
+    digest: str  # sha256 of the scenes and their split
 
 
 def read_material(source: str, folder: Path) -> dict[str, Material]:
@@ -105,6 +93,7 @@ def _material(
     vocabulary: Vocabulary,
     protocol: Protocol,
 ) -> Material:
+    """Split the scenes by a protocol. The triples of the training part become units."""
     parts = split(scenes, seed=0, protocol=protocol)
     V = len(vocabulary)
     members = {part: [encoded[x.scene_id] for x in own] for part, own in parts.items()}
@@ -118,14 +107,15 @@ def _material(
     return Material(vocabulary, torch.from_numpy(triples), **tensors, digest=sha.hexdigest())
 
 
-def _keys(scene: EncodedScene, V: int) -> np.ndarray:
+def _keys(scene: EncodedScene, V: int) -> Int[NDArray, "n"]:
     """Return the listed triples of a scene as integers (relation * V + i) * V + j."""
     relation, subject, object_ = scene.evidence.holds[:RELATIONS].nonzero()
     classes = scene.evidence.classes
     return np.asarray((relation * V + classes[subject]) * V + classes[object_])
 
 
-def _scenes(scenes: Sequence[EncodedScene], units: np.ndarray, V: int) -> Scenes:
+def _scenes(scenes: Sequence[EncodedScene], units: Int[NDArray, "T"], V: int) -> Scenes:
+    """Return the scenes as tensors, with the triples `units` as relation units."""
     v, r = torch.zeros(len(scenes), V), torch.zeros(len(scenes), len(units))
     keys = [_keys(scene, V) for scene in scenes]
     for row, (scene, own) in enumerate(zip(scenes, keys, strict=True)):

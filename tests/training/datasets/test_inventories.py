@@ -19,8 +19,8 @@ from training.datasets.inventories import (
     Item,
     Place,
     complete_scene,
+    detection_rates,
     draw_scene,
-    listed_shares,
     read_inventory,
     shipped_things,
     written_scenes,
@@ -96,9 +96,12 @@ def test_places_are_read_in_order(tmp_path):
     ],
 )
 def test_errors_name_line_and_column(tmp_path, row, message):
-    path = write(tmp_path, DESK, row)
+    check_error(read_inventory, write(tmp_path, DESK, row), message)
+
+
+def check_error(read, path: Path, message: str) -> None:
     with pytest.raises(DatasetError) as caught:
-        read_inventory(path)
+        read(path)
     assert str(caught.value).startswith(f"{path}, {message}")
 
 
@@ -222,7 +225,7 @@ def test_a_detector_lists_a_part_of_each_scene():
     )
     place = Place("den", "study", (Group("basics", 1, items),))
     things = shipped_things()
-    shares = listed_shares([replace(things["table"], size=(0.5, 2.0, 0.7))])
+    shares = detection_rates([replace(things["table"], size=(0.5, 2.0, 0.7))])
     assert shares["table"] == pytest.approx(1 - 0.7 * math.exp(-5))
     scenes = written_scenes([place], shares, 4000, seed=3)
     assert len({scene.scene_id for scene in scenes}) == 4000
@@ -305,10 +308,7 @@ def test_things_are_read(tmp_path):
     ],
 )
 def test_errors_of_things_name_line_and_column(tmp_path, row, message):
-    path = write(tmp_path, VESSEL, row, columns=THING_COLUMNS)
-    with pytest.raises(DatasetError) as caught:
-        read_things(path)
-    assert str(caught.value).startswith(f"{path}, {message}")
+    check_error(read_things, write(tmp_path, VESSEL, row, columns=THING_COLUMNS), message)
 
 
 def test_a_long_loop_of_parents_is_found(tmp_path):

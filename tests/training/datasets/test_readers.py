@@ -24,8 +24,9 @@ from training.datasets import (
     jsonl,
     read_scenes,
 )
-from training.datasets.priors import COLUMNS, MAX_LINE, SOURCE, read_prior_scenes
+from training.datasets.priors import COLUMNS, SOURCE, read_prior_scenes
 from training.datasets.readers import READERS, guess_format
+from training.datasets.tables import MAX_LINE
 from training.fit.configuration import ConfigError, DataConfig
 from training.runs.pipeline import read_sources
 
@@ -529,8 +530,8 @@ def test_rows_become_scenes_of_two_objects(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        ("nobody\tcup\ton-top\ttable\t1\t", "line 2: unknown source 'nobody'"),
-        ("tidybot\tcup\ton-top\ttable\t1", "line 2: the row has 5 columns, not 6"),
+        ("nobody\tcup\ton-top\ttable\t1\t", "line 2, column source: must be .*, not 'nobody'"),
+        ("tidybot\tcup\ton-top\ttable\t1", "line 2: the row has 5 values, not 6"),
         ("x" * MAX_LINE, f"line 2: the line is longer than {MAX_LINE} bytes"),
         ("\udcff", "line 2: is not UTF-8"),
     ],

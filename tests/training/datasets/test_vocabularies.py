@@ -7,12 +7,13 @@ from app.scene import ObjectClass, Vocabulary, label_key
 from tests.training.scenes import scene
 from training.datasets import AnnotatedObject, AnnotatedScene, source_vocabulary
 from training.datasets.vocabulary import (
+    INDOOR_FILE,
     MINIMUM_MENTIONS,
     Names,
     build_vocabulary,
     coverage,
     curated_names,
-    indoor_vocabulary,
+    read_vocabulary,
     with_room_aliases,
     with_typical_sizes,
 )
@@ -123,7 +124,7 @@ def test_curated_classes_are_no_aliases() -> None:
 
 
 def test_the_committed_vocabulary_follows_the_curated_names() -> None:
-    names, vocabulary = curated_names(), indoor_vocabulary()
+    names, vocabulary = curated_names(), read_vocabulary(INDOOR_FILE)
     assert 700 < len(vocabulary) <= 900
     for label in (*names.base, *names.household):
         index = vocabulary.index(label)

@@ -64,16 +64,16 @@ def default(store: Store) -> SceneModel:
 def test_a_confirmed_object_is_never_reported_again(store, tmp_path):
     scene = {"objects": INTRUDER, "room_type": "bedroom", "confirmed": True}
     assert alarms(default(store), INTRUDER, "bedroom") == ["toilet"]
-    said = adapt(store, write([scene], tmp_path / "scenes.jsonl"))
-    assert "never reported from now on: toilet (1)" in said
+    output = adapt(store, write([scene], tmp_path / "scenes.jsonl"))
+    assert "never reported from now on: toilet (1)" in output
     assert alarms(home(store), INTRUDER, "bedroom") == []
     parent, adapted_one = stored(store, "default"), stored(store, "home")
     assert adapted_one.manifest.training["parent"]["digest"] == parent.digest
     text = f"adapted to one home from {'@'.join(parent.key)}"
     assert text in " ".join(adapted_one.card.split())
     for command in (["evaluate", "home"], ["publish", "home@1.0.0", "1.0.1"]):
-        said = invoke(*command, "--store", store.root, code=1)
-        assert "home@1.0.0 was adapted to a home" in said
+        output = invoke(*command, "--store", store.root, code=1)
+        assert "home@1.0.0 was adapted to a home" in output
 
 
 def test_a_home_keeps_the_terms_of_its_parent(store, tmp_path):
@@ -133,8 +133,8 @@ def test_a_relation_of_boxes_that_stands_right_is_not_reported_again(
     line = {"objects": objects, "viewer_frame": True}
     unconfirmed = write([line], tmp_path / "unconfirmed.jsonl")
     assert "nothing was published" in adapt(store, unconfirmed, code=3)
-    said = adapt(store, write([line | {"confirmed": True}], tmp_path / "scenes.jsonl"))
-    assert f"usual from now on: {top} on-top {support}" in said
+    output = adapt(store, write([line | {"confirmed": True}], tmp_path / "scenes.jsonl"))
+    assert f"usual from now on: {top} on-top {support}" in output
     for asked in (right, stated):
         assert (top, support) not in reported(home(store), asked)
     assert (top, "dining table") in reported(home(store), scene("dining table"))
@@ -146,12 +146,12 @@ def test_an_unconfirmed_object_teaches_nothing(store, tmp_path):
         {"scene_id": f"id{n}", "objects": objects, "room_type": "bedroom"}
         for n, objects in enumerate(rooms)
     ]
-    said = adapt(store, write(scenes[:1], tmp_path / "scenes.jsonl"), code=3)
-    assert "left out, because no person has confirmed them" in said
-    assert "toilet (1): id0" in said
-    said = adapt(store, write(scenes, tmp_path / "scenes.jsonl"), code=3)
-    assert "toilet (4): id0, id1, id2, ..." in said
-    assert "nothing was published" in said
+    output = adapt(store, write(scenes[:1], tmp_path / "scenes.jsonl"), code=3)
+    assert "left out, because no person has confirmed them" in output
+    assert "toilet (1): id0" in output
+    output = adapt(store, write(scenes, tmp_path / "scenes.jsonl"), code=3)
+    assert "toilet (4): id0, id1, id2, ..." in output
+    assert "nothing was published" in output
     assert store.versions("home") == ()
 
 
@@ -159,8 +159,8 @@ def test_a_later_file_confirms_a_scene(store, tmp_path):
     scenes = [{"scene_id": name, "objects": INTRUDER} for name in "ab"]
     recorded = write(scenes, tmp_path / "scenes.jsonl.1")
     corrected = write([scene | {"confirmed": True} for scene in scenes], tmp_path / "scenes.jsonl")
-    said = adapt(store, recorded, corrected)
-    assert "2 recorded scenes; 1 distinct scenes, 1 of these confirmed" in said
+    output = adapt(store, recorded, corrected)
+    assert "2 recorded scenes; 1 distinct scenes, 1 of these confirmed" in output
 
 
 def test_a_written_room_is_one_confirmed_scene(store, tmp_path):
@@ -170,12 +170,12 @@ def test_a_written_room_is_one_confirmed_scene(store, tmp_path):
     path = tmp_path / "places.csv"
     path.write_text("\n".join(["room_type,label,share", *rows]))
     assert alarms(default(store), INTRUDER, "bedroom") == ["toilet"]
-    said = adapt(store, path)
-    assert "0 recorded scenes; 0 distinct scenes, 0 of these confirmed" in said
-    assert "2 written places, each as one confirmed scene" in said
-    assert "left out, because they name no kind of object: object_7 (1)" in said
-    assert "the weights stay: fewer than 20 distinct recorded scenes" in said
-    assert "never reported from now on: toilet (1)" in said
+    output = adapt(store, path)
+    assert "0 recorded scenes; 0 distinct scenes, 0 of these confirmed" in output
+    assert "2 written places, each as one confirmed scene" in output
+    assert "left out, because they name no kind of object: object_7 (1)" in output
+    assert "the weights stay: fewer than 20 distinct recorded scenes" in output
+    assert "never reported from now on: toilet (1)" in output
     assert alarms(home(store), INTRUDER, "bedroom") == []
     assert home(store).vocabulary.index("stairlift") is not None
     source = store.load("home", "1.0.0").manifest.data[-1]
@@ -209,9 +209,9 @@ def test_words_that_the_model_cannot_read_become_classes(store, tmp_path):
     """They are accepted at once, and judged after three scenes."""
     darkroom = {"room_type": "darkroom", "objects": ["deck chair", "stairlift"]}
     others = ["plant", "lamp", "table"]
-    said = adapt(store, write([darkroom], tmp_path / "scenes.jsonl"))
-    assert "new classes, judged after 3 scenes: stairlift" in said
-    assert "new room types: darkroom" in said
+    output = adapt(store, write([darkroom], tmp_path / "scenes.jsonl"))
+    assert "new classes, judged after 3 scenes: stairlift" in output
+    assert "new room types: darkroom" in output
     words = home(store).vocabulary
     assert words.objects[words.index("Stairlifts")].anywhere
     assert words.room_types[words.room_index("darkroom")] == "darkroom"
@@ -241,7 +241,7 @@ def test_errors_name_the_reason(store, tmp_path):
 @pytest.mark.slow
 def test_five_habits_are_learnt_from_a_hundred_scenes(store, tmp_path):
     scenes = write(home_scenes(100, 7), tmp_path / "scenes.jsonl")
-    said = adapt(store, scenes, "--promote")
+    output = adapt(store, scenes, "--promote")
     key = store.resolve("places-triway")
     before, after = store.load(*key).model, home(store)
     new = home_scenes(50, 8)
@@ -257,7 +257,7 @@ def test_five_habits_are_learnt_from_a_hundred_scenes(store, tmp_path):
     p = [tv_is_missing(side, living_room) for side in (before, after)]
     assert p[1] < 0.5 * p[0]
     assert str(store.aliases()["default"]) == "home@1.0.0"
-    assert f"to roll back: python -m app.registry alias default {'@'.join(key)}" in said
+    assert f"to roll back: python -m app.registry alias default {'@'.join(key)}" in output
     # `default` is now the home, whose parent is adapted again.
     few = write(reported[0][:15], tmp_path / "few.jsonl")  # the weights stay
     assert "is itself adapted" in adapt(store, few)
@@ -285,6 +285,6 @@ def test_scenes_that_the_model_expects_change_no_weights(store, tmp_path):
         if sample.sum() >= 2
     ]
     scenes += [{"objects": [label], "group": label} for label in ("lamp", "chair", "bed", "plant")]
-    said = adapt(store, write(scenes, tmp_path / "scenes.jsonl"), code=3)
-    assert "the weights stay: hidden objects are not certainly predicted better" in said
+    output = adapt(store, write(scenes, tmp_path / "scenes.jsonl"), code=3)
+    assert "the weights stay: hidden objects are not certainly predicted better" in output
     assert store.versions("home") == ()

@@ -33,7 +33,7 @@ def test_facts_are_counted() -> None:
     assert (facts.scenes, facts.groups) == (2, 1)
     assert facts.objects_per_scene == (2, 2.5, 3)
     assert facts.rooms == {"kitchen": 1}
-    assert facts.shares["relations"] == facts.shares["positions"] == 0.5
+    assert facts.annotated["relations"] == facts.annotated["positions"] == 0.5
     assert facts.related
     assert not look([scene("a", "cup", "table"), scene("b", "lamp", "bed")]).related
 
@@ -90,7 +90,7 @@ def test_millimetres_are_found() -> None:
 def test_generated_scenes_contradict_nothing() -> None:
     facts = look(generate_rooms(60, 0, DOMAINS["workplaces"]))
     assert [x.examples for x in facts.findings] == [["pallet jack (3) and pallet rack (31)"]]
-    assert facts.shares["viewer axes"] == 1.0
+    assert facts.annotated["viewer axes"] == 1.0
 
 
 def test_spellings_and_aliases_count_as_one_label() -> None:

@@ -169,11 +169,11 @@ def test_from_the_table_to_answers(ward, tmp_path) -> None:
     folder, store = tmp_path / "ward", Store(tmp_path / "store")
     init(ward, folder=folder)
     runs = ("--runs", tmp_path / "runs", "--store", store.root)
-    said = invoke("train", folder, "--publish", "1.0.0", *runs)
-    assert "published ward@1.0.0" in said
+    output = invoke("train", folder, "--publish", "1.0.0", *runs)
+    assert "published ward@1.0.0" in output
     artifact = store.load("ward", "1.0.0")
-    assert "Scenes drawn from written places have 100.0 %" in " ".join(artifact.card.split())
     model = artifact.model
+    assert "Scenes drawn from written places have 100.0 %" in " ".join(artifact.card.split())
     assert model.calibration.outlier_lines is not None
     words = model.vocabulary
     places = read_inventory(ward).places

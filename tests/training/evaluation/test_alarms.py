@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from tests.training.evaluation.furnished_rooms import room_model, rooms
 from training.evaluation.alarms import ALARMS, EXCESS, Alarms, untouched_alarms
-from training.fit.calibrate_objects import recalibrated
+from training.fit.regression import recalibrated
 
 
 def test_the_first_alarms_are_accepted_and_too_many_refused():

@@ -11,7 +11,7 @@ from app.inference import MachineSpec, Weights
 from app.model import SceneModel
 from app.registry import Store
 from app.scene import ObjectClass, Scene, SceneObject
-from training.fit.adapt import HomeScenes, Known, adapt
+from training.fit.adapt import HomeScenes, TrainedOn, adapt
 from training.fit.extend import extended
 from training.fit.objects import random_parts
 from training.machines import build
@@ -36,8 +36,8 @@ def scenes_of(*classes: list[int], rooms: list[int] | None = None, size: int = V
     v = torch.zeros(len(classes), size)
     for row, present in zip(v, classes, strict=True):
         row[present] = 1
-    asked = torch.ones(len(classes), size, dtype=torch.bool)
-    return HomeScenes(v, asked, torch.tensor(rooms or [-1] * len(classes)))
+    observed = torch.ones(len(classes), size, dtype=torch.bool)
+    return HomeScenes(v, observed, torch.tensor(rooms or [-1] * len(classes)))
 
 
 HOME = [[0, 1, 2], [0, 1, 3], [0, 1, 2, 3], [0, 1]] * 6
@@ -71,11 +71,11 @@ def test_the_same_seed_gives_the_same_weights():
 def test_a_class_that_is_left_out_keeps_its_log_odds():
     """Class 5 is neither present nor absent in the scenes, so its bias has no reason to fall."""
     parent, home = small(), scenes_of(*HOME)
-    asked = home.asked.clone()
-    asked[:, 5] = False
+    observed = home.observed.clone()
+    observed[:, 5] = False
     shift = [
-        float(adapt(parent, replace(home, asked=mask))["b"][5] - parent["b"][5])
-        for mask in (home.asked, asked)
+        float(adapt(parent, replace(home, observed=mask))["b"][5] - parent["b"][5])
+        for mask in (home.observed, observed)
     ]
     assert shift[0] < -0.1
     assert abs(shift[1]) < 0.5 * abs(shift[0])
@@ -100,12 +100,12 @@ def test_a_class_that_the_parent_hardly_knows_is_learnt_from_few_scenes():
     weights["b"] = weights["b"].copy()
     weights["b"][3] = -10
     parent, home = Weights(small().spec, weights), scenes_of(*HOME)
-    known = Known(torch.arange(V) != 3, C)
+    trained_on = TrainedOn(torch.arange(V) != 3, C)
     listed = torch.zeros(1, V)
     listed[0, :2] = 1
     rare, common = (
-        float(machine_of(adapt(parent, home, known=x)).object_log_odds(listed).sigmoid()[0, 3])
-        for x in (known, None)
+        float(machine_of(adapt(parent, home, trained_on=x)).object_log_odds(listed).sigmoid()[0, 3])
+        for x in (trained_on, None)
     )
     assert common < 0.2
     assert 0.3 < rare < 0.7
@@ -197,8 +197,10 @@ def test_a_new_room_is_recognised_by_its_objects(repository):
     lists = [["deck chair", "flower pot", "watering can"], ["deck chair", "clothespin", "plant"]]
     classes = [[words.index(label) for label in labels] for labels in lists * 10]
     home = scenes_of(*classes, rooms=[room] * 20, size=len(words))
-    known = Known(torch.ones(len(words), dtype=torch.bool), len(model.vocabulary.room_types))
-    adapted = replace(larger, weights=adapt(larger.weights, home, known=known))
+    trained_on = TrainedOn(
+        torch.ones(len(words), dtype=torch.bool), len(model.vocabulary.room_types)
+    )
+    adapted = replace(larger, weights=adapt(larger.weights, home, trained_on=trained_on))
     answer = questions.rooms(adapted, scene(adapted, "deck chair", "flower pot"), top_k=1)
     assert answer["room_types"][0]["room_type"] == "darkroom"
     answer = questions.rooms(adapted, scene(adapted, "bed", "nightstand"), top_k=1)

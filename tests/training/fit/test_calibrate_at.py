@@ -45,7 +45,7 @@ def test_sources_count_alike():
 
 def test_few_true_classes_keep_the_default_entry():
     assert fit_place([]) == PlaceFit()
-    terms = [one._replace(placed=np.zeros(CLASSES, np.bool_)) for one in places(20, seed=4)]
+    terms = [one._replace(is_there=np.zeros(CLASSES, np.bool_)) for one in places(20, seed=4)]
     assert fit_place([terms]) == PlaceFit()
 
 

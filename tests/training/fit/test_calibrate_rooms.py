@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 
 from app.model import Sharpness
 from app.model.calibration import NO_LIMIT
@@ -12,7 +11,6 @@ from tests.questions.artifacts import LABELS, larger_artifact
 from tests.training.evaluation.scenes import scene, tensors
 from training.evaluation.asking import of_classes
 from training.fit import calibrate_rooms
-from training.fit.calibrate_objects import recalibrated
 from training.fit.calibrate_rooms import (
     fit_rooms,
     limits,
@@ -20,9 +18,10 @@ from training.fit.calibrate_rooms import (
     refitted_limits,
     written_rooms,
 )
+from training.fit.regression import recalibrated
 
 V = len(LABELS)
-STRUCTURE = torch.arange(V) == V - 1
+
 OFFICE = [2, 3, 4]
 
 
@@ -46,14 +45,14 @@ def test_the_sharpness_that_draws_the_room_types_is_fitted(model, sharpness):
         )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(calibrate_rooms, "_LENGTHS", ())  # whole scenes only
-        fitted = fit_rooms(model, tensors(made, V), STRUCTURE)
+        fitted = fit_rooms(model, tensors(made, V))
     for n in (1, 6):
         assert fitted.of(n) == pytest.approx(sharpness.of(n), abs=0.15)
 
 
 def test_few_scenes_leave_the_room_types_as_they_are(model):
     few = [scene([0, 1], room=0)] * 19 + [scene([0, 1])] * 50
-    assert fit_rooms(model, tensors(few, V), STRUCTURE) == Sharpness()
+    assert fit_rooms(model, tensors(few, V)) == Sharpness()
 
 
 def test_written_room_types_are_those_without_other_scenes():
@@ -69,9 +68,9 @@ def test_rare_room_types_are_those_that_samples_do_not_resemble(model):
     like = [scene(np.flatnonzero(row).tolist() or [0], room=1) for row in samples]
     unlike = [scene([int(np.argmin(samples[:, : V - 1].mean(0)))], room=1)] * 20
     few, enough = [scene(OFFICE, room=0)] * 9, [scene(OFFICE, room=0)] * 50
-    assert rare_rooms(model, tensors(few + like, V), STRUCTURE) == (0,)
-    assert rare_rooms(model, tensors(enough + like, V), STRUCTURE) == ()
-    assert rare_rooms(model, tensors(enough + unlike, V), STRUCTURE) == (1,)
+    assert rare_rooms(model, tensors(few + like, V)) == (0,)
+    assert rare_rooms(model, tensors(enough + like, V)) == ()
+    assert rare_rooms(model, tensors(enough + unlike, V)) == (1,)
 
 
 def test_the_fit_does_not_see_structure(model):
@@ -81,7 +80,7 @@ def test_the_fit_does_not_see_structure(model):
         made = [
             scene([k % 6, (k + 1) % 6, *structure], room=k % 2, name=f"room {k}") for k in range(60)
         ]
-        return fit_rooms(model, tensors(made, V), STRUCTURE)
+        return fit_rooms(model, tensors(made, V))
 
     both = [fit([]), fit([V - 1])]
     assert both[0] == both[1]
@@ -89,7 +88,7 @@ def test_the_fit_does_not_see_structure(model):
 
 
 def limits_of(model, scenes):
-    return limits(model, tensors(scenes, V), STRUCTURE)
+    return limits(model, tensors(scenes, V))
 
 
 def test_limits_are_those_of_short_lists_of_a_room_type(model):

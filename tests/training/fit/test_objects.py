@@ -18,10 +18,10 @@ from training.fit import long_chains, objects
 from training.fit.configuration import ObjectsConfig
 from training.fit.long_chains import (
     LongChains,
-    accepted,
     measure_drift,
     populations,
     scene_chains,
+    served_frequencies,
 )
 from training.fit.objects import ObjectFit, ObjectScenes, random_parts, start_objects
 from training.fit.samples import fit_scene_rates, store_samples
@@ -130,7 +130,7 @@ def test_a_present_class_says_nothing_about_its_family():
     data = replace(tensors([scene(row, source="house") for row in rows], 4), related=related)
     found = ObjectScenes.of(data, torch.zeros(4, dtype=torch.bool), CONFIG)
     # Present classes are known, and so are absent classes without a relative.
-    assert found.known.int().tolist() == [[0, 1, 0, 1], [0, 0, 1, 1], [1, 0, 1, 1]]
+    assert found.observed.int().tolist() == [[0, 1, 0, 1], [0, 0, 1, 1], [1, 0, 1, 1]]
     # The log-odds of an unknown class change no loss.
     machine = machine_of("coupled", scale=0.7)
     losses = []
@@ -540,7 +540,7 @@ def test_served_scenes_of_long_chains_are_the_plausible_ones():
     artifact = artifact_of(machine, smallest=(2,) * (machine.spec.C + 1))
     long = LongChains(scene_chains(weights_of(machine)), scenes, population, 512, seed=2)
     long.run(100)
-    drawn = accepted(artifact, long, 40).mean(0)
+    drawn = served_frequencies(artifact, long, 40).mean(0)
     p = log_p(machine, -1, -1).double().exp()
     is_small = EVERY.sum(1) < 2
     refused = float(p[is_small].sum())

@@ -7,7 +7,7 @@ import pytest
 from tests.training.commands import invoke, small_config, write_config
 from training.evaluation.tasks import TASKS
 from training.fit.configuration import ConfigError
-from training.fit.relations import RelationFit
+from training.fit.relation_weights import RelationFit
 from training.fit.trainer import Trainer
 from training.research.benchmark import DEFAULT, chosen_tasks, read_configs
 from training.research.entries import baseline_entries

@@ -14,9 +14,9 @@ from training.datasets import generate_rooms, source_vocabulary
 from training.datasets.rooms import DOMAINS
 from training.fit.configuration import ConfigError
 from training.runs.example_scenes import (
+    accepted_examples,
     choose_examples,
     examples_json,
-    known_examples,
     read_examples,
 )
 
@@ -93,7 +93,7 @@ def test_examples_that_the_model_would_refuse_are_left_out_with_the_reason() -> 
     )
     examples = [Example.model_validate({"name": "a", "scene": scene}) for scene in scenes]
     words = Vocabulary([ObjectClass("bed"), ObjectClass("cup")], ["bedroom"])
-    kept, reasons = known_examples(examples, words)
+    kept, reasons = accepted_examples(examples, words)
     assert kept == (examples[0],)
     places = ("#/objects/1", "#/room_type", "#/relations/1", "#/relations/0/object")
     for reason, place in zip(reasons, places, strict=True):

@@ -14,7 +14,7 @@ from tests.enumeration.small_machines import random_weights
 from tests.training.evaluation.scenes import V, scene, tensors, toy
 from training.datasets.batches import relation_units
 from training.fit.configuration import RelationsConfig
-from training.fit.relations import SHARED, RelationFit, bake_shared_weights, share_weights
+from training.fit.relation_weights import SHARED, RelationFit, bake_shared_weights, share_weights
 from training.fit.residuals import lower_unseen_roles, means_of_parts, with_counted_residuals
 from training.machines import MachineSpec, build
 from training.machines.machine import OBJECT_WEIGHTS
@@ -77,7 +77,7 @@ def trained(machine, scenes, **changes):
 
 def of_whole_scenes(machine, batch, generator):
     with torch.no_grad():
-        return machine.state_means(machine.context(batch.v))
+        return machine.state_means(machine.hidden_logits(batch.v))
 
 
 def logit_of(machine, a, i, j):
@@ -185,7 +185,7 @@ def test_hidden_units_depend_on_a_random_part_of_the_objects():
 
 def test_the_loss_is_the_mean_over_scenes_and_the_prior_of_one(monkeypatch):
     """With hidden units that depend on all objects."""
-    monkeypatch.setattr("training.fit.relations.means_of_parts", of_whole_scenes)
+    monkeypatch.setattr("training.fit.relation_weights.means_of_parts", of_whole_scenes)
     scenes, machine = scenes_of({"captions": 0.5}), machine_of("triway")
     batch = whole(scenes)
     nothing = replace(batch, observed=torch.zeros_like(batch.observed))

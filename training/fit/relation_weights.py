@@ -37,6 +37,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 from torch.nn.utils.parametrize import (
@@ -61,16 +62,14 @@ _MAP_PRIOR = 0.1
 _MOST_CLASSES = 20
 # Random change of the log of the number of classes by which scenes are sorted into batches.
 _MIXING = 0.5
-# Weights that classes share; see `training.fit.relations`.
-SHARED = ("S", "O", "s", "o")
+SHARED = ("S", "O", "s", "o")  # weights that classes share
 
 
 class RelationFit:
     """The fit of the relation weights of a machine: epochs over the scenes with annotations.
 
-    Attributes:
-        epochs: number of finished epochs.
-        offsets: corrections of the logits for each data source, (sources, relations).
+    `epochs` counts the finished epochs. `offsets` are the corrections of the logits for each data
+    source, (sources, A).
     """
 
     def __init__(
@@ -138,12 +137,9 @@ class RelationFit:
         return self.epochs >= self.config.epochs or not len(self.train)
 
     def epoch(self, progress: Callable[[float, float], None]) -> float:
-        """Run one epoch, and return its mean loss.
+        """Run one epoch, and return its mean loss. Raise FloatingPointError if it is not finite.
 
         It calls `progress` with the finished share of the fit and the mean loss.
-
-        Raises:
-            FloatingPointError: the loss is infinite or NaN.
         """
         batches = self._batches()
         total = 0.0
@@ -175,6 +171,7 @@ class RelationFit:
         return evidence.only(order[:_MOST_CLASSES].sort().values.numpy())
 
     def _update(self, index: Tensor, total: int) -> float:
+        """Update the weights by one batch of `total` updates in all, and return its loss."""
         with cached():
             loss = self.loss(self.train.batch(index, part=self._part), self._generator)
         for group in self._optimiser.param_groups:
@@ -212,10 +209,10 @@ class RelationFit:
         for name, weight in self._weights.items():
             weight.copy_(values[name])
 
-    def finish(self, parents: Tensor) -> BoltzmannMachine:
+    def finish(self, parents: Int[Tensor, "V"]) -> BoltzmannMachine:
         """Return the machine for storage, with averaged weights and counted residuals.
 
-        `parents` are the indices of the parents of the classes, (classes,); -1 without a parent.
+        `parents` are the parents of the classes; -1 without a parent.
         """
         self._set(self._average)
         machine = self.machine
@@ -227,7 +224,9 @@ class RelationFit:
         return machine
 
 
-def _nll(logits: Tensor, r: Tensor, weight: Tensor) -> Tensor:
+def _nll(
+    logits: Float[Tensor, "B E"], r: Float[Tensor, "B E"], weight: Float[Tensor, "B E"]
+) -> Float[Tensor, ""]:
     """Return the sum of -weight log p(r) over all relation units."""
     return ((softplus(logits) - r * logits) * weight).sum()
 
@@ -235,14 +234,18 @@ def _nll(logits: Tensor, r: Tensor, weight: Tensor) -> Tensor:
 class Sharing(nn.Module):
     """Add the parent's deviation and a trained map of word vectors to the weights of each class.
 
-    Args:
-        words: scaled word vectors, (classes, dimensions), 0 where unknown.
-        parents: index of the parent of each class, (classes,) int64. -1 means no parent.
-        width: number of weights of a class.
-        columns: True if the weights have the shape (width, classes), else (classes, width).
+    A class has `width` weights. With `columns`, the weights have the shape (width, V), else
+    (V, width). Word vectors are 0 where unknown, and parents -1.
     """
 
-    def __init__(self, words: Tensor, parents: Tensor, width: int, *, columns: bool) -> None:
+    def __init__(
+        self,
+        words: Float[Tensor, "V D"],
+        parents: Int[Tensor, "V"],
+        width: int,
+        *,
+        columns: bool,
+    ) -> None:
         super().__init__()
         self.words, self.parents, self.columns = words, parents, columns
         self.map = nn.Parameter(torch.zeros(words.shape[1], width))
@@ -255,12 +258,12 @@ class Sharing(nn.Module):
 
 
 def share_weights(
-    machine: BoltzmannMachine, words: Tensor, parents: Tensor, names: Iterable[str]
+    machine: BoltzmannMachine,
+    words: Float[Tensor, "V D"],
+    parents: Int[Tensor, "V"],
+    names: Iterable[str],
 ) -> None:
-    """Let classes share the weights of the given names. Weights that a machine lacks are skipped.
-
-    `Sharing` describes words and parents.
-    """
+    """Let classes share the named weights (`Sharing`). Weights that a machine lacks are skipped."""
     parameters = dict(machine.named_parameters())
     for name in names:
         if name in parameters:
