@@ -222,7 +222,7 @@ class Settings(BaseSettings):
 
     @field_validator("host")
     @classmethod
-    def _is_host(cls, value: str) -> str:
+    def _check_host(cls, value: str) -> str:
         try:
             return _host(value)
         except ValueError:
@@ -230,7 +230,7 @@ class Settings(BaseSettings):
 
     @field_validator("allowed_hosts")
     @classmethod
-    def _are_hosts(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+    def _check_allowed_hosts(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         try:
             return tuple(name if name == "*" else _host(name) for name in value)
         except ValueError:
@@ -241,21 +241,21 @@ class Settings(BaseSettings):
 
     @field_validator("store")
     @classmethod
-    def _is_directory(cls, value: Path) -> Path:
+    def _check_store(cls, value: Path) -> Path:
         if not value.is_dir():
             raise ValueError(f"SCENE_STORE must be an existing directory, but is {value}")
         return value
 
     @field_validator("max_request_timeout_ms")
     @classmethod
-    def _covers_the_default(cls, value: int, info: ValidationInfo) -> int:
+    def _check_longest_timeout(cls, value: int, info: ValidationInfo) -> int:
         if value < info.data.get("request_timeout_ms", 0):
             raise ValueError("it must be at least SCENE_REQUEST_TIMEOUT_MS")
         return value
 
     @field_validator("opentelemetry")
     @classmethod
-    def _can_export(cls, value: bool) -> bool:
+    def _check_telemetry(cls, value: bool) -> bool:
         if not value:
             return value
         try:
@@ -269,7 +269,7 @@ class Settings(BaseSettings):
 
     @field_validator("api_key")
     @classmethod
-    def _is_key(cls, value: SecretStr | None) -> SecretStr | None:
+    def _check_api_key(cls, value: SecretStr | None) -> SecretStr | None:
         if value is None:
             return None
         key = value.get_secret_value()
@@ -282,7 +282,7 @@ class Settings(BaseSettings):
 
     @field_validator("cors_origins")
     @classmethod
-    def _are_origins(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+    def _check_cors_origins(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         if not all(map(_ORIGIN.fullmatch, value)) or any(map(_DEFAULT_PORT.fullmatch, value)):
             raise ValueError(
                 "SCENE_CORS_ORIGINS must list origins as browsers send them: http or https, a host "

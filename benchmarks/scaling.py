@@ -22,8 +22,10 @@ import torch
 
 from app import questions
 from app.inference.weights import pack_scenes
-from app.registry.artifact import Artifact, load_artifact, write_artifact
-from app.registry.description import Calibration, Description, VocabularyEntry
+from app.model import SceneModel
+from app.model.calibration import Calibration
+from app.registry.artifact import load_artifact, write_artifact
+from app.registry.description import Description, VocabularyEntry
 from app.scene.scene import Scene, SceneObject
 from app.scene.spatial_relations import CANONICAL
 from app.scene.vocabulary import ObjectClass, Vocabulary
@@ -75,7 +77,7 @@ def scaling(
         }
         memory = {V: _memory(paths[classes[0]], paths[V], scene) for V in classes}
         files = {V: sum(file.stat().st_size for file in paths[V].iterdir()) for V in classes}
-        artifacts = {V: load_artifact(path) for V, path in paths.items()}
+        models = {V: load_artifact(path).model for V, path in paths.items()}
     names = {V: f"{V:,} classes" for V in classes}
     facts: dict[str, Fact] = {}
     for V, name in names.items():
@@ -84,7 +86,7 @@ def scaling(
         facts[f"{name}, resident kB a class"] = memory[V] / V / 1e3
     results: list[Result] = []
     for question, ask in QUESTIONS.items():
-        calls = {names[V]: partial(ask, artifact, scene) for V, artifact in artifacts.items()}
+        calls = {names[V]: partial(ask, model, scene) for V, model in models.items()}
         results.append(
             Result(
                 title=f"/{question}: latency relative to {names[classes[0]]}",
@@ -96,7 +98,7 @@ def scaling(
     return results
 
 
-QUESTIONS: Mapping[str, Callable[[Artifact, Scene], object]] = {
+QUESTIONS: Mapping[str, Callable[[SceneModel, Scene], object]] = {
     "relations": questions.relations,
     "missing": questions.missing,
     "outliers": questions.outliers,
@@ -172,11 +174,11 @@ def _resident(first: Path, path: Path, scene: Scene) -> int:
     return _resident_bytes() - before
 
 
-def _asked(path: Path, scene: Scene) -> Artifact:
-    artifact = load_artifact(path)
+def _asked(path: Path, scene: Scene) -> SceneModel:
+    model = load_artifact(path).model
     for ask in QUESTIONS.values():
-        ask(artifact, scene)
-    return artifact
+        ask(model, scene)
+    return model
 
 
 def _resident_bytes() -> int:

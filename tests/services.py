@@ -147,12 +147,12 @@ def hold(replace: Replace) -> Iterator[Hold]:
     """Hold a question from the call on, of all models or of some."""
     held = Held()
 
-    def hold(name: str, of: Callable[[Any], bool] = lambda manifest: True) -> Held:
-        def wait(question: Any, artifact: Any, *args: Any, **parameters: Any) -> Any:
-            if of(artifact.manifest):
+    def hold(name: str, of: Callable[[Any], bool] = lambda model: True) -> Held:
+        def wait(question: Any, model: Any, *args: Any, **parameters: Any) -> Any:
+            if of(model):
                 held.started.set()
                 assert held.release.wait(PATIENCE)
-            return question(artifact, *args, **parameters)
+            return question(model, *args, **parameters)
 
         replace(name, wait)
         return held

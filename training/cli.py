@@ -14,6 +14,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 from rich.console import Console
 
+from app.model import SceneModel
 from app.registry import DEFAULT_STORE, Artifact, RegistryError, Store
 from app.registry.references import AliasTarget
 from training.datasets import DatasetError
@@ -280,14 +281,14 @@ def _promote(
     """Publish the version and point the alias at it, unless the gate refuses the version."""
     served = served_model(store, alias)
 
-    def judge(artifact: Artifact, say: Progress) -> list[str]:
-        useful = measure_usefulness(artifact, scenes.training_data(), say=say)
+    def judge(model: SceneModel, say: Progress) -> list[str]:
+        useful = measure_usefulness(model, scenes.training_data(), say=say)
         for line in useful.lines():
             console.print(line, highlight=False)
         reasons = useful.objections()
         if served.candidate is not None and (even_if_worse or not reasons):
             try:
-                new = Candidate(NEW, run.config, scenes.digests, artifact, root)
+                new = Candidate(NEW, run.config, scenes.digests, model, root)
                 sides = (new, served.candidate, root)
                 comparison = compare(*sides, say=say)
                 show(comparison, console)

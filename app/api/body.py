@@ -61,8 +61,8 @@ def validated(value: Any, form: type[FormT], *, at: errors.Location = ()) -> For
         raise errors.InvalidRequestError(errors=invalid) from None
 
 
-def _too_many(place: str, most: int) -> FieldError:
-    return FieldError(pointer=place, message=f"must have at most {most} entries")
+def _too_many(at: str, most: int) -> FieldError:
+    return FieldError(pointer=at, message=f"must have at most {most} entries")
 
 
 @cache
@@ -148,11 +148,11 @@ def _in_pieces(text: str, most: int) -> dict[str, Any]:
     def mark(expected: str) -> str:
         """Read one of the expected characters and the spaces around it. Return the character."""
         nonlocal at
-        found = _MARK.match(text, at)
-        if found is None or found[1] not in expected:
+        match = _MARK.match(text, at)
+        if match is None or match[1] not in expected:
             raise ValueError(f"expected one of {expected} at character {at}")
-        at = found.end()
-        return found[1]
+        at = match.end()
+        return match[1]
 
     def parts(opening: str, closing: str) -> Iterator[None]:
         """Read the brackets and commas of an object or array. Yield before each of its parts."""
@@ -167,21 +167,21 @@ def _in_pieces(text: str, most: int) -> dict[str, Any]:
         # The parsers would read the rest of the body, so the slice bounds the step.
         part, start = (text, at) if text.startswith('"', at) else (text[at : at + most], 0)
         try:
-            found, end = _DECODER.raw_decode(part, start)
+            parsed, end = _DECODER.raw_decode(part, start)
             from_json(part[start:end], allow_inf_nan=False)
         except (ValueError, RecursionError) as error:
             message = f"the value at character {at} is invalid or too long: {error}"
             raise ValueError(message) from None
         at += end - start
-        return found
+        return parsed
 
     def entries(name: str) -> list[Any]:
-        found: list[Any] = []
+        items: list[Any] = []
         for _ in parts("[", "]"):
-            if len(found) == MAX_BATCH:
+            if len(items) == MAX_BATCH:
                 raise errors.InvalidRequestError(errors=[_too_many(pointer((name,)), MAX_BATCH)])
-            found.append(value())
-        return found
+            items.append(value())
+        return items
 
     members: list[tuple[str, Any]] = []
     for _ in parts("{", "}"):

@@ -1,22 +1,45 @@
-"""The steps of a request before its route: ASGI middleware with one concern each."""
+"""The steps of a request before its route: ASGI middleware with one concern each.
 
+A request passes the steps in the order of this module. `Turn` is the last step before the route.
+"""
+
+import hmac
 import logging
 import re
 from asyncio import CancelledError
 from collections.abc import Sequence
-from time import perf_counter
+from time import monotonic, perf_counter
 from typing import Any, Final
 from uuid import uuid4
 
+from pydantic import SecretStr
+from starlette.datastructures import Headers
 from starlette.middleware.cors import CORSMiddleware
+from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.api.access import API_KEY, TIMEOUT_HEADER, HostCheck, KeyCheck
+from app import errors
 from app.api.problems import answer, from_exception
-from app.api.turns import Deadline, Size, Turn
+from app.questions import QUESTIONS
+from app.serving.admission import SMALL, Admission, Bodies, Ticket
+from app.serving.models import NO_MODELS
 from app.serving.request import SUCCESS, Record
 from app.serving.runtime import Runtime
 from app.settings import Settings
+
+API_KEY: Final = "X-API-Key"
+TIMEOUT_HEADER: Final = "X-Request-Timeout-Ms"
+
+HEALTH: Final = frozenset(("/health/live", "/health/ready"))
+"""Routes of health checks. They accept every Host header and take no turn."""
+
+# Paths that need no API key. Orchestrators send health checks without credentials. The HTML pages
+# contain no private data. docs/security.md gives the reasons.
+OPEN_ROUTES: Final = HEALTH | {"/", "/docs", "/redoc", "/openapi.json", "/problems"}
+_OPEN_FOLDERS: Final = ("/docs/", "/redoc/", "/static/", "/problems/")
+
+_HOST: Final = re.compile(rb"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::[0-9]{1,5})?")
+_ADDRESS: Final = re.compile(rb"\[.+\]|[0-9]{1,3}(\.[0-9]{1,3}){3}")
 
 _REQUEST_ID: Final = re.compile(rb"[A-Za-z0-9._~:-]{1,128}")
 
@@ -24,6 +47,11 @@ _REQUEST_ID: Final = re.compile(rb"[A-Za-z0-9._~:-]{1,128}")
 _ALWAYS: Final = ((b"x-content-type-options", b"nosniff"), (b"referrer-policy", b"no-referrer"))
 _POLICY: Final = (b"content-security-policy", b"default-src 'none'; frame-ancestors 'none'")
 _NOT_KEPT: Final = (b"cache-control", b"no-store")
+
+_TIMEOUT: Final = re.compile(rb"[1-9][0-9]{0,5}")
+_WITH_BODY: Final = frozenset(("POST", "PUT", "PATCH"))
+# Routes whose bodies may be larger than one scene.
+_LARGE: Final = frozenset(("/scenes", *(f"/{question.name}/batch" for question in QUESTIONS)))
 
 _access = logging.getLogger("app.access")
 
@@ -48,6 +76,12 @@ def gateway(app: ASGIApp, settings: Settings, runtime: Runtime) -> ASGIApp:
     if (names := settings.accepted_hosts) is not None:
         steps = HostCheck(steps, names)
     return Recorded(steps, app, settings, runtime)
+
+
+def route_path(scope: Scope) -> str:
+    """Return the path of a request below the root path of the service."""
+    path: str = scope["path"]
+    return path.removeprefix(scope.get("root_path", ""))
 
 
 class Recorded:
@@ -129,6 +163,35 @@ def _with_defaults(headers: Sequence[tuple[bytes, bytes]], request_id: bytes) ->
     return completed
 
 
+class HostCheck:
+    """Refuse requests whose Host header does not name this service.
+
+    This check prevents DNS rebinding, where an attacker points the host name of a web page at this
+    machine. That attack needs a name, so every IP address is accepted.
+
+    Args:
+        names: accepted host names, in lower case, without ports.
+    """
+
+    def __init__(self, app: ASGIApp, names: frozenset[str]) -> None:
+        self._app = app
+        self._names = frozenset(name.encode("ascii") for name in names)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass an accepted request on, or answer with status 421."""
+        hosts = [value for name, value in scope["headers"] if name == b"host"]
+        host = _HOST.fullmatch(hosts[0].lower()) if len(hosts) == 1 else None
+        is_named = host is not None and (host[1] in self._names or _ADDRESS.fullmatch(host[1]))
+        if is_named or route_path(scope) in HEALTH:
+            await self._app(scope, receive, send)
+            return
+        detail = (
+            "The service does not know the name in the Host header. Use its IP address, or list "
+            "the name in SCENE_ALLOWED_HOSTS (docs/network.md)."
+        )
+        await answer(errors.HostRefusedError(detail), scope, receive, send)
+
+
 class Failures:
     """Answer every failure with a problem document."""
 
@@ -160,3 +223,122 @@ async def _fail(error: Exception, scope: Scope, receive: Receive, send: Send) ->
         record.outcome, record.status = problem.slug, 500
         raise error
     await answer(problem, scope, receive, send)
+
+
+class KeyCheck:
+    """Refuse requests without the API key, except for open routes."""
+
+    def __init__(self, app: ASGIApp, key: SecretStr) -> None:
+        self._app, self._key = app, key.get_secret_value().encode()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on.
+
+        Raises:
+            UnauthorizedError: the request lacks the key.
+        """
+        path, headers = route_path(scope), Headers(scope=scope)
+        scheme, _, token = headers.get("authorization", "").partition(" ")
+        key = headers.get(API_KEY) or (token.strip() if scheme.lower() == "bearer" else "")
+        # The comparison takes constant time. Otherwise the response time would show how many
+        # characters match.
+        has_key = hmac.compare_digest(key.encode(), self._key)
+        if not (has_key or path in OPEN_ROUTES or path.startswith(_OPEN_FOLDERS)):
+            raise errors.UnauthorizedError("This service needs its API key.")
+        await self._app(scope, receive, send)
+
+
+class Deadline:
+    """Give each request a ticket with its deadline, in ``scope["state"]``, except health checks."""
+
+    def __init__(self, app: ASGIApp, health: ASGIApp, settings: Settings, runtime: Runtime) -> None:
+        self._app, self._health, self._runtime = app, health, runtime
+        self._seconds = settings.request_timeout_ms / 1e3
+        self._longest = settings.max_request_timeout_ms
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on.
+
+        Raises:
+            NotReadyError: the service is starting.
+            BadRequestError: the time limit in the header of the request is invalid.
+        """
+        if route_path(scope) in HEALTH:
+            await self._health(scope, receive, send)
+            return
+        if self._runtime.models is NO_MODELS:
+            raise errors.NotReadyError("The service is starting.")
+        stated = [value for name, value in scope["headers"] if name == b"x-request-timeout-ms"]
+        seconds = self._seconds_of(stated[0]) if stated else self._seconds
+        client = (scope.get("client") or ("",))[0]
+        is_gone = Request(scope, receive).is_disconnected
+        scope["state"]["ticket"] = Ticket(client, monotonic() + seconds, is_gone)
+        try:
+            await self._app(scope, receive, send)
+        finally:
+            # The ticket refers to the scope: without this deletion, they form a reference cycle.
+            del scope["state"]["ticket"]
+
+    def _seconds_of(self, value: bytes) -> float:
+        if not _TIMEOUT.fullmatch(value) or int(value) > self._longest:
+            detail = (
+                f"{TIMEOUT_HEADER} must be a whole number from 1 to {self._longest} (milliseconds)."
+            )
+            raise errors.BadRequestError(detail)
+        return int(value) / 1e3
+
+
+class Size:
+    """Read the body of each request, up to the limit of its route, into ``scope["state"]``."""
+
+    def __init__(self, app: ASGIApp, settings: Settings, bodies: Bodies) -> None:
+        self._app, self._bodies = app, bodies
+        self._limit = settings.max_body_bytes
+        self._limit_of_scene = min(settings.max_scene_bytes, self._limit)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on. The errors are those of `Bodies.read`."""
+        client, body = scope["state"]["ticket"].client, b""
+        if scope["method"] in _WITH_BODY:
+            limit = self._limit if route_path(scope) in _LARGE else self._limit_of_scene
+            length = next((v for name, v in scope["headers"] if name == b"content-length"), b"")
+            body = await self._bodies.read(receive, client, limit, length)
+        scope["state"]["body"] = body
+        try:
+            await self._app(scope, receive, send)
+        finally:
+            self._bodies.release(client, len(body))
+
+
+class Turn:
+    """Let each request wait for its turn, which ends when its response starts."""
+
+    def __init__(self, app: ASGIApp, admission: Admission) -> None:
+        self._app, self._quick, self._slow = app, admission.quick, admission.slow
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on.
+
+        Raises:
+            QueueFullError: too many requests of the client, or of all clients, are waiting.
+            DeadlinePassedError: the deadline passed while the request was waiting.
+        """
+        ticket: Ticket = scope["state"]["ticket"]
+
+        async def send_after_turn(message: Message) -> None:
+            ticket.leave()
+            await send(message)
+
+        try:
+            if len(scope["state"]["body"]) > SMALL:
+                await ticket.enter(self._slow, 1)
+            elif self._quick.is_full(ticket.client, 1):
+                # A refusal takes a turn, too. Otherwise refusals of one client would take the time
+                # of all others.
+                await ticket.enter(self._quick, 0)
+                raise errors.QueueFullError("Too many requests of this client are waiting.")
+            else:
+                await ticket.enter(self._quick, 1)
+            await self._app(scope, receive, send_after_turn)
+        finally:
+            ticket.leave()

@@ -100,10 +100,10 @@ async def show_version(
 )
 async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> Response:
     """List the object classes with their aliases, the relations and the room types of a model."""
-    model = runtime.models.resolve(name)
-    if model not in _VOCABULARIES:
-        _VOCABULARIES[model] = _vocabulary(model).model_dump_json()
-    return Response(_VOCABULARIES[model], media_type="application/json")
+    served = runtime.models.resolve(name)
+    if served not in _VOCABULARIES:
+        _VOCABULARIES[served] = _vocabulary(served).model_dump_json()
+    return Response(_VOCABULARIES[served], media_type="application/json")
 
 
 @_get(
@@ -118,7 +118,7 @@ async def show_word(
     if len(word) > MAX_LABEL:
         raise InvalidRequestError(detail=f"A label has at most {MAX_LABEL} characters.")
     served = runtime.models.resolve(name)
-    vocabulary = served.vocabulary
+    vocabulary = served.model.vocabulary
 
     def look_up(_: object) -> schemas.WordAnswer:
         answer = partial(schemas.WordAnswer, model=served.reference, word=word)
@@ -134,15 +134,16 @@ async def show_word(
 
 
 def _vocabulary(served: Artifact) -> schemas.VocabularyAnswer:
-    vocabulary, manifest = served.vocabulary, served.manifest
-    relations, rooms = relation_names(served.spec.A), vocabulary.room_types
+    manifest, model = served.manifest, served.model
+    vocabulary, calibration = model.vocabulary, model.calibration
+    relations, rooms = relation_names(model.spec.A), vocabulary.room_types
     return schemas.VocabularyAnswer(
         model=served.reference,
         objects=[_class(entry) for entry in vocabulary.objects],
         relations=[cast("schemas.RelationName", name) for name in relations],
         room_types=list(rooms),
-        rare_room_types=[rooms[t] for t in served.calibration.rare_rooms],
-        written_room_types=[rooms[t] for t in served.calibration.written_rooms],
+        rare_room_types=[rooms[t] for t in calibration.rare_rooms],
+        written_room_types=[rooms[t] for t in calibration.written_rooms],
         profiles=list(manifest.vocabulary.profiles),
         examples=[
             schemas.ExampleScene(name=example.name, scene=example.request())

@@ -8,7 +8,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
 from app.api import examples
-from app.api.access import API_KEY, HEALTH, OPEN_ROUTES, TIMEOUT_HEADER
+from app.api.gateway import API_KEY, HEALTH, OPEN_ROUTES, TIMEOUT_HEADER
 from app.api.problems import MEDIA_TYPE
 from app.errors import ERRORS, Step
 from app.questions.question import Example

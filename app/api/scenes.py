@@ -66,7 +66,7 @@ def _read(data: ScenesRequest, request_id: str, limit: int, stop: Callable[[], b
         readers = scenes_of(content, data.name, labels)
     except MessageError as error:
         raise UnreadableFileError(detail=_in_one_line(str(error))) from None
-    found: list[bytes] = []
+    converted: list[bytes] = []
     notes: list[FileNote] = []
     size = 0
 
@@ -90,13 +90,13 @@ def _read(data: ScenesRequest, request_id: str, limit: int, stop: Callable[[], b
             note(None, None, "refused", f"{name}: {words}" if name else words)
             continue
         for place, reason, detail in fields.notes[:_MOST_NOTES]:
-            note(len(found), place, reason, detail)
-        found.append(scene)
-    if not found:
+            note(len(converted), place, reason, detail)
+        converted.append(scene)
+    if not converted:
         raise UnreadableFileError(detail=notes[0].detail if notes else "The file is empty.")
     return b'{"request_id":%b,"scenes":[%b],"notes":%b}' % (
         to_json(request_id),
-        b",".join(found),
+        b",".join(converted),
         to_json(notes),
     )
 

@@ -10,7 +10,9 @@
 The function of a question takes a published model and a scene. It returns the fields of the answer,
 as `scene_client.schemas` defines them. The first four questions compute expectations, in closed
 form or with fixed random numbers. So the same scene always gets the same answer. `generate` draws
-random scenes. To add a question, add a module to this package and its record to `QUESTIONS`.
+random scenes. In the examples of the functions, `model` is the default model of the shipped store:
+`store.load(*store.resolve("default")).model`. To add a question, add a module to this package and
+its record to `QUESTIONS`.
 """
 
 from typing import Any, Final

@@ -1,4 +1,4 @@
-"""Parts of all answers: common fields, rounded numbers, reasons, and JSON.
+"""Parts of all answers: common fields, rounded numbers, reasons, ranking, and JSON.
 
 The schemas of `scene_client.schemas` describe the answers. An answer contains its fields in the
 order of the schema, without null fields. Answers are dictionaries, because pydantic objects would
@@ -9,12 +9,12 @@ from typing import Any, Final, TypeAlias
 
 import numpy as np
 import orjson
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from pydantic_core import from_json, to_json, to_jsonable_python
 
 from app.compiling import compiled
 from app.questions.posterior import Present
-from app.questions.ranking import best
 from app.questions.reading import Reading
 from app.scene.scene import Scene
 from scene_client.schemas import ModelReference, SceneRequest
@@ -70,8 +70,8 @@ def named(label: str, word: str | None) -> Fields:
 def reasons(
     scene: Scene,
     present: Present,
-    change: NDArray[np.floating[Any]],
-    rows: NDArray[np.int64] | None = None,
+    change: Float[NDArray[np.floating[Any]], "N n"],
+    rows: Int[NDArray[np.int64], "N"] | None = None,
     *,
     least: float = 0.0,
     scale: float = 1.0,
@@ -82,10 +82,8 @@ def reasons(
     absolute changes come first. The answer names the first object of the class.
 
     Args:
-        change: (N, n) change of each explained class's log-odds by each of the n classes of the
-            scene.
-        rows: (N,) index of each explained class among the n classes. None means that the explained
-            classes are absent.
+        change: change of each explained class's log-odds by each class of the scene.
+        rows: index of each explained class among the classes of the scene; None: they are absent.
         least: minimum absolute value of a change. Rounding errors of a change of 0 are left out.
         scale: slope of the calibration, so that an answer's changes are those of its `log_odds`.
 
@@ -103,8 +101,8 @@ def reasons(
     return entries
 
 
-def significant(numbers: NDArray[np.floating[Any]]) -> list[float]:
-    """Round numbers (n,) to `DIGITS` significant digits."""
+def significant(numbers: Float[NDArray[np.floating[Any]], "n"]) -> list[float]:
+    """Round numbers to `DIGITS` significant digits."""
     values = numbers.astype(np.float64)
     exact = _round_to_digits(values)
     rounded: list[float] = values.tolist()
@@ -199,3 +197,52 @@ def _round_to_digits(values):
         elif size != 0.0:
             exact = False
     return exact
+
+
+@compiled
+def best(
+    values: Float[NDArray, " N"], usable: Bool[NDArray, " N"], count: int
+) -> Int[NDArray, " k"]:
+    """Return the indices of the k <= `count` largest usable values, largest first.
+
+    Of equal values, the value with the lower index comes first. The time is O(N log count).
+    """
+    size, rest, kept = 0, 0, min(count, len(values))
+    # The heap contains the best indices so far. Its root is the worst of these indices: the index
+    # with the smallest value, and of several equal values the largest index.
+    heap = np.empty(kept, np.int64)
+    while size < kept and rest < len(values):
+        if usable[rest]:
+            heap[size] = rest
+            size += 1
+        rest += 1
+    for node in range(size // 2 - 1, -1, -1):
+        _sink(values, heap, size, node, heap[node])
+    for index in range(rest, len(values)):
+        if size and usable[index] and values[index] > values[heap[0]]:
+            _sink(values, heap, size, 0, index)
+    for last in range(size - 1, 0, -1):
+        worst, moved = heap[0], heap[last]
+        _sink(values, heap, last, 0, moved)
+        heap[last] = worst
+    return heap[:size]
+
+
+@compiled
+def _sink(
+    values: Float[NDArray, " N"], heap: Int[NDArray, " k"], size: int, node: int, index: int
+) -> None:
+    """Replace a node of the heap by an index, and restore the heap order below the node."""
+    value = values[index]
+    while 2 * node + 1 < size:
+        child = 2 * node + 1
+        if child + 1 < size:
+            one, other = heap[child], heap[child + 1]
+            if values[other] < values[one] or (values[other] == values[one] and other > one):
+                child += 1
+        worse = heap[child]
+        if not (values[worse] < value or (values[worse] == value and worse > index)):
+            break
+        heap[node] = worse
+        node = child
+    heap[node] = index

@@ -19,19 +19,21 @@ from collections.abc import Callable, Collection, Iterator
 from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled
 from app.errors import LocatedError, RareRoomTypeError
 from app.inference.chains import ChainState, ConditionedChains, Conditions, random_stream
 from app.inference.relation_units import encode
+from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, rounded_number
 from app.questions.names import ErrorList
 from app.questions.outliers import intruders
 from app.questions.posterior import Present, given_relations, present
 from app.questions.question import BEDROOM, POSES, REFUSED, Example, Options, Question
-from app.questions.reading import Reading, Triple
-from app.registry.artifact import Artifact
+from app.questions.reading import Reading
+from app.scene.relation_table import Triple
 from app.scene.scene import Scene, SceneObject
 from app.scene.spatial_relations import CANONICAL, ON_TOP
 from scene_client.schemas import GenerateAnswer, GenerateRequest
@@ -48,7 +50,7 @@ _SEED_BITS: Final = 53
 
 
 def generate(
-    artifact: Artifact,
+    model: SceneModel,
     scene: Scene,
     *,
     count: int = 1,
@@ -83,28 +85,33 @@ def generate(
         The fields of `scene_client.schemas.GenerateAnswer`. For `log_score`, see
         `ConditionedChains.log_score`. Only scores of the same model, for the same listed classes
         and profile, can be compared.
+
+    Example:
+        >>> scene = Scene(model.vocabulary.bare_objects(["desk"]))
+        >>> "desk" in generate(model, scene, seed=1)["scenes"][0]["objects"]
+        True
     """
-    listing = present(scene, artifact.spec)
-    observed = given_relations(scene, listing, artifact.spec.A)
+    listing = present(scene, model.spec)
+    observed = given_relations(scene, listing, model.spec.A)
     conditions = Conditions(listing.classes, observed, scene.room_type, scene.profile)
-    chains = artifact.scene_chains.under(conditions, temperature)
-    shown = ~artifact.vocabulary.structure
+    chains = model.scene_chains.under(conditions, temperature)
+    shown = ~model.vocabulary.structure
     shown[conditions.classes] = True
     class_of = [thing.class_index or 0 for thing in scene.objects]
-    evidence = {(a, class_of[i], class_of[j]) for a, i, j in scene.relations or ()}
+    evidence = {(a, class_of[i], class_of[j]) for a, i, j in scene.triples}
     scenes: list[Fields] = []
     while len(scenes) < count and not stop():
         stream = random_stream(seed, len(scenes))
-        state = draw_plausible(artifact, chains, scene, steps, stream, stop)
-        scenes.append(_scene(artifact, chains, state, shown[state.classes], evidence))
+        state = draw_plausible(model, chains, scene, steps, stream, stop)
+        scenes.append(_scene(model, chains, state, shown[state.classes], evidence))
     fields: Fields = {"seed": seed, "scenes": scenes}
-    if listed_as := _words(artifact, scene, listing):
+    if listed_as := _words(model, scene, listing):
         fields["listed_as"] = listed_as
     return fields
 
 
 def draw_plausible(
-    artifact: Artifact,
+    model: SceneModel,
     chains: ConditionedChains,
     evidence: Scene,
     steps: int,
@@ -117,36 +124,36 @@ def draw_plausible(
     """
     state = chains.draw(steps, stream)
     for _ in range(ATTEMPTS - 1):
-        if is_plausible(artifact, evidence, state.classes, state.room) or stop():
+        if is_plausible(model, evidence, state.classes, state.room) or stop():
             break
         state = chains.draw(steps, stream)
     return state
 
 
-def _words(artifact: Artifact, scene: Scene, listing: Present) -> dict[str, str]:
+def _words(model: SceneModel, scene: Scene, listing: Present) -> dict[str, str]:
     """Return the words of the evidence that differ from the label of their class, by this label."""
-    labels, objects = artifact.vocabulary.labels, scene.objects
+    labels, objects = model.vocabulary.labels, scene.objects
     pairs = zip(listing.classes.tolist(), listing.first.tolist(), strict=True)
     words = {labels[index]: objects[number].label for index, number in pairs}
     return {label: word for label, word in words.items() if word != label}
 
 
 def _scene(
-    artifact: Artifact,
+    model: SceneModel,
     chains: ConditionedChains,
     state: ChainState,
-    shown: NDArray[np.bool_],
+    shown: Bool[NDArray[np.bool_], "n"],
     evidence: set[Triple],
 ) -> Fields:
     """Return the fields of `scene_client.schemas.GeneratedScene` for a drawn scene.
 
-    ``shown`` (n,) is True for the classes of ``state`` that the answer lists.
+    ``shown`` is True for the classes of ``state`` that the answer lists.
     """
-    labels, room_types = artifact.vocabulary.labels, artifact.vocabulary.room_types
+    labels, room_types = model.vocabulary.labels, model.vocabulary.room_types
     units = np.nonzero(state.r & shown[:, None] & shown)
     a, i, j = units
     named = np.stack([a, state.classes[i], state.classes[j]], axis=1)
-    stay = staying(named, state.logits[units], evidence, artifact.vocabulary.structure)
+    stay = staying(named, state.logits[units], evidence, model.vocabulary.structure)
     kept = np.zeros_like(state.r)
     kept[units] = stay
     triples = sorted({*map(tuple, named[stay].tolist()), *evidence})
@@ -162,12 +169,12 @@ def _scene(
 
 
 def staying(
-    units: NDArray[np.int64],
-    logits: NDArray[np.floating[Any]],
+    units: Int[NDArray[np.int64], "m 3"],
+    logits: Float[NDArray[np.floating[Any]], "m"],
     evidence: Collection[Triple],
-    structure: NDArray[np.bool_],
-) -> NDArray[np.bool_]:
-    """Select drawn relations that do not contradict each other. Return them as a bool mask (m,).
+    structure: Bool[NDArray[np.bool_], "V"],
+) -> Bool[NDArray[np.bool_], "m"]:
+    """Select drawn relations that do not contradict each other.
 
     Relations of the evidence always stay. The function then tries the other relations one by one,
     likeliest first. A tried relation stays if all of these conditions are met:
@@ -181,20 +188,20 @@ def staying(
       a drawn relation of such a class has no meaning.
 
     Args:
-        units: (m, 3) distinct triples (relation a, subject class i, object class j).
-        logits: (m,) logit of each triple. Of triples with equal logits, the smallest (a, i, j) is
-            tried first.
+        units: distinct triples (relation a, subject class i, object class j).
+        logits: logit of each triple. Of triples with equal logits, the smallest (a, i, j) is tried
+            first.
         evidence: triples (a, i, j) of the evidence.
-        structure: (V,) bool, True for structural classes.
+        structure: True for structural classes.
     """
     fixed = np.array(sorted(evidence), dtype=np.int64).reshape(-1, 3)
     order = np.lexsort((*units.T[::-1], -logits))
     possible = (units[:, 1] != units[:, 2]) & ~structure[units[:, 1:]].any(axis=1)
     triples = np.concatenate([fixed, units])
     relation = np.ascontiguousarray(triples[:, 0])
-    classes, ends = np.unique(triples[:, 1:], return_inverse=True)
+    classes, pairs = np.unique(triples[:, 1:], return_inverse=True)
     stay: NDArray[np.bool_] = _select_consistent(
-        relation, ends.reshape(-1, 2), order[possible[order]], len(fixed), len(classes)
+        relation, pairs.reshape(-1, 2), order[possible[order]], len(fixed), len(classes)
     )
     # A drawn relation that is part of the evidence always stays.
     if evidence:
@@ -243,41 +250,41 @@ def _select_consistent(relation, ends, order, fixed, count):
 
 
 def is_plausible(
-    artifact: Artifact, evidence: Scene, present: NDArray[np.int64], room: int | None
+    model: SceneModel, evidence: Scene, present: Int[NDArray[np.int64], "n"], room: int | None
 ) -> bool:
     """Return whether a drawn scene meets none of the three conditions of the module.
 
     Args:
-        present: (n,) indices of the classes of the drawn scene. Structural classes count only if
+        present: indices of the classes of the drawn scene. Structural classes count only if
             the evidence lists them.
         room: index of the room type of the drawn scene, or None if unknown.
     """
     listed = {thing.class_index for thing in evidence.objects}
-    is_structure = artifact.vocabulary.structure
+    is_structure = model.vocabulary.structure
     classes = [index for index in present.tolist() if not is_structure[index] or index in listed]
-    if not is_within_limits(artifact, classes, room):
+    if not is_within_limits(model, classes, room):
         return False
     if not classes:
         return True
-    labels = artifact.vocabulary.labels
+    labels = model.vocabulary.labels
     objects = [SceneObject(labels[index], labels[index], index) for index in classes]
-    drawn = intruders(artifact, Scene(tuple(objects), room_type=room)).tolist()
+    drawn = intruders(model, Scene(tuple(objects), room_type=room)).tolist()
     return listed.issuperset(drawn)
 
 
-def is_within_limits(artifact: Artifact, classes: list[int], room: int | None) -> bool:
+def is_within_limits(model: SceneModel, classes: list[int], room: int | None) -> bool:
     """Return whether a scene reaches the minima of its room type: `smallest` and `room_fit`."""
-    calibration = artifact.calibration
+    calibration = model.calibration
     smallest, fits = calibration.smallest or (0,), calibration.room_fit
     # The last entry is for scenes without a room type.
     if len(classes) < smallest[-1 if room is None else min(room, len(smallest) - 1)]:
         return False
     if room is None or not fits:
         return True
-    return room_fit(artifact, classes, room) >= fits[room].of(len(classes))
+    return room_fit(model, classes, room) >= fits[room].of(len(classes))
 
 
-def room_fit(artifact: Artifact, classes: list[int], room: int) -> float:
+def room_fit(model: SceneModel, classes: list[int], room: int) -> float:
     """Return how well a scene fits a room type t: log p(v | t) / p(v), plus a constant of t.
 
     Args:
@@ -286,16 +293,16 @@ def room_fit(artifact: Artifact, classes: list[int], room: int) -> float:
     """
     presence = np.ones(len(classes), np.float32)
     index = np.array(classes, dtype=np.int64)
-    context = encode(artifact.weights, index, presence, np.zeros_like(presence))
-    return float(artifact.objects.room_evidence(context.x[None], index, presence[None])[0, room])
+    context = encode(model.weights, index, presence, np.zeros_like(presence))
+    return float(model.objects.room_evidence(context.x[None], index, presence[None])[0, room])
 
 
-def _read(request: GenerateRequest, artifact: Artifact, reading: Reading) -> Options:
+def _read(request: GenerateRequest, model: SceneModel, reading: Reading) -> Options:
     if (name := request.room_type) is not None and reading.scene.room_type is None:
         errors = ErrorList()
         reading.unknown.refuse(name, ("room_type",), errors, is_room=True)
         errors.raise_any()
-    if reading.scene.room_type in artifact.calibration.rare_rooms:
+    if reading.scene.room_type in model.calibration.rare_rooms:
         message = "the model has too few training scenes of this room type to sample such a room"
         raise RareRoomTypeError([LocatedError(("room_type",), message)])
     return {
@@ -306,9 +313,9 @@ def _read(request: GenerateRequest, artifact: Artifact, reading: Reading) -> Opt
     }
 
 
-def _ask_all(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
+def _ask_all(model: SceneModel, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
     # One Gibbs sweep compiles all kernels.
-    yield generate(artifact, scenes[0], count=2, seed=0, steps=1)
+    yield generate(model, scenes[0], count=2, seed=0, steps=1)
 
 
 _EXAMPLES: Final = {

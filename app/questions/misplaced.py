@@ -13,7 +13,7 @@ of the request tell them apart, or the boxes. People also say "under" for "below
 entry is the larger of the two. It is at least `Places.under_evidence`. An object may be above
 another object if a third object supports it.
 
-The log-odds that an entry is wrong are a weighted sum of four terms (`app.registry.Judgement`):
+The log-odds that an entry is wrong are a weighted sum of four terms (`app.model.Judgement`):
 
     z   log-odds of the relation given the objects, at least `LEAST_Z`
     d   change of these log-odds by the other observed relations
@@ -30,23 +30,24 @@ The sum of the shares q is over the listed classes. Positions and sizes show the
 object; otherwise s = 0. Classes that belong everywhere, such as pets and bags, have s = q = 0, and
 only their supports are judged.
 
-A relation that a person has confirmed (`app.registry.Misplaced.usual`) has z = `EXPLAINED` and
+A relation that a person has confirmed (`app.model.Misplaced.usual`) has z = `EXPLAINED` and
 d = s = q = 0, because its stand may be rare for the class.
 """
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from app.inference.elementary import sigmoid
+from app.model.calibration import KINDS, Judgement, Sensitivity
+from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, significant
 from app.questions.posterior import Posterior
-from app.questions.reading import Triple
-from app.registry.artifact import Artifact
-from app.registry.description import KINDS, Judgement, Sensitivity
+from app.scene.relation_table import Triple
 from app.scene.scene import Scene, boxes_of
 from app.scene.spatial_relations import (
     ABOVE,
@@ -90,16 +91,16 @@ class Entries(NamedTuple):
     """The n judged entries of a scene of N objects.
 
     Attributes:
-        triple: (n, 3) relation, subject and object. The object is -1 for the floor.
-        kind: (n,) index of the kind in `KINDS`.
-        terms: (n, 4) terms z, d, s and q; see the module.
-        mover: (n,) object that would have moved if the entry is wrong.
+        triple: relation, subject and object. The object is -1 for the floor.
+        kind: index of the kind in `KINDS`.
+        terms: terms z, d, s and q; see the module.
+        mover: object that would have moved if the entry is wrong.
     """
 
-    triple: Indices
-    kind: Indices
-    terms: Floats
-    mover: Indices
+    triple: Int[Indices, "n 3"]
+    kind: Int[Indices, "n"]
+    terms: Float[Floats, "n 4"]
+    mover: Int[Indices, "n"]
 
 
 _NO_ENTRIES: Final = Entries(
@@ -107,45 +108,40 @@ _NO_ENTRIES: Final = Entries(
 )
 
 
-def entries_of(
-    artifact: Artifact, posterior: Posterior, scene: Scene, flipped: Collection[Triple] = ()
-) -> Entries:
+def entries_of(model: SceneModel, posterior: Posterior, scene: Scene) -> Entries:
     """Return the entries of a scene that the model can judge.
 
     Relations of structural classes are left out, because training does not learn them.
-
-    Args:
-        flipped: relations of the scene that the request states by their opposite.
     """
-    row, A, places = posterior.present.row, artifact.spec.A, artifact.places
-    classes = artifact.vocabulary.stand_in[posterior.present.classes][row]
-    is_thing = (~artifact.vocabulary.structure[classes]).tolist()
-    stated = [t for t in scene.relations or () if t[0] < A and is_thing[t[1]] and is_thing[t[2]]]
-    if not stated and scene.poses is None:
+    row, A, places = posterior.present.row, model.spec.A, model.places
+    classes = model.vocabulary.stand_in[posterior.present.classes][row]
+    is_thing = (~model.vocabulary.structure[classes]).tolist()
+    stated = [t for t in scene.triples if t[0] < A and is_thing[t[1]] and is_thing[t[2]]]
+    if not stated and not scene.has_boxes:
         return _NO_ENTRIES
-    heights, around = None, None
-    if scene.poses is not None:
-        heights = _heights(artifact, scene, classes)
+    heights, around, opposites = None, None, scene.opposites
+    if scene.has_boxes:
+        heights = _heights(model, scene, classes)
         around = heights.around
     unders = {
         (a, i, j)
         for a, i, j in stated
-        if a == ON_TOP and ((a, i, j) in flipped if around is None else around[i, j])
+        if a == ON_TOP and ((a, i, j) in opposites if around is None else around[i, j])
     }
     supports = [(i, j) for a, i, j in stated if a in SUPPORTS and (a, i, j) not in unders]
     stands, log_p, log_q = (
-        values.tolist() for values in _stands(artifact, posterior, scene, supports, heights)
+        values.tolist() for values in _stands(model, posterior, scene, supports, heights)
     )
-    moves = (~artifact.vocabulary.anywhere[classes]).tolist()
+    moves = (~model.vocabulary.anywhere[classes]).tolist()
     relation, subject, object_ = np.fromiter(chain(*stated), np.int64).reshape(-1, 3).T
     alone, pairs = posterior.alone_log_odds(), (row[subject], row[object_])
     of_relation, changes = (
         values[relation, *pairs].tolist() for values in (alone, posterior.relation_change())
     )
-    usual = {*artifact.calibration.misplaced.usual}
+    confirmed = {*model.calibration.misplaced.usual}
     entries: list[tuple[float, ...]] = []  # relation, subject, object, kind, terms, mover
     for (a, i, j), z, d in zip(stated, of_relation, changes, strict=True):
-        mover = j if (a, i, j) in flipped and a != INSIDE else i
+        mover = j if (a, i, j) in opposites and a != INSIDE else i
         s = q = 0.0
         if a in LATERAL:
             kind = BESIDE
@@ -167,26 +163,26 @@ def entries_of(
             kind, mover, s, q = SUPPORT, i, log_p[i], log_q[i]
         if not moves[mover]:
             s = q = 0.0
-        if (a, classes[i], classes[j]) in usual:
+        if (a, classes[i], classes[j]) in confirmed:
             z, d, s, q = EXPLAINED, 0.0, 0.0, 0.0
         entries.append((a, i, j, kind, max(z, LEAST_Z), d, s, q, mover))
     for i, stand in enumerate(stands if heights is not None else ()):
         if is_thing[i] and moves[i] and stand in (FLOOR, HANGS):
-            held = ON_TOP if stand == FLOOR else ABOVE
-            entries.append((held, i, -1, STAND, 0.0, 0.0, log_p[i], 0.0, i))
+            relation_to_floor = ON_TOP if stand == FLOOR else ABOVE
+            entries.append((relation_to_floor, i, -1, STAND, 0.0, 0.0, log_p[i], 0.0, i))
     table = np.fromiter(chain(*entries), np.float64).reshape(-1, 5 + TERMS)
     numbers = table.astype(np.int64)
     return Entries(numbers[:, :3], numbers[:, 3], table[:, 4 : 4 + TERMS], numbers[:, -1])
 
 
 def _stands(
-    artifact: Artifact,
+    model: SceneModel,
     posterior: Posterior,
     scene: Scene,
     supports: Sequence[tuple[int, int]],
     heights: Heights | None,
-) -> tuple[Indices, Floats, Floats]:
-    """Return the stand of each of N objects, its log p, and log q of its supporter, (N,) each.
+) -> tuple[Int[Indices, "N"], Float[Floats, "N"], Float[Floats, "N"]]:
+    """Return the stand of each object, its log p, and log q of its supporter.
 
     The values are 0 for an unknown stand, and log p without poses.
 
@@ -194,22 +190,22 @@ def _stands(
         supports: pairs of objects (i, j) with i on or in j.
         heights: heights of the boxes, or None for a scene without poses.
     """
-    present, places = posterior.present, artifact.places
+    present, places = posterior.present, model.places
     stands, zeros = np.full(len(present.row), UNKNOWN), np.zeros(len(present.row))
     if places is None:
         return stands, zeros, zeros
-    listed = artifact.vocabulary.stand_in[present.classes]
+    listed = model.vocabulary.stand_in[present.classes]
     classes = listed[present.row]
-    shares = places.stands[classes].astype(np.float64)
-    if heights is not None and scene.poses is not None:
-        floor = floor_level(heights.bottoms, shares[:, FLOOR])
-        stands = stands_of(scene.poses.holds, scene.poses.observed, heights, floor)
+    stand_shares = places.stands[classes].astype(np.float64)
+    if heights is not None and scene.relations is not None:
+        floor = floor_level(heights.bottoms, stand_shares[:, FLOOR])
+        stands = stands_of(*scene.relations.grids(len(classes)), heights, floor)
     else:
         stands[[i for i, _ in supports]] = SUPPORTED
     if (stands == UNKNOWN).all():
         return stands, zeros, zeros
     by_class = places.supporters(classes, listed)
-    by_class[:, artifact.vocabulary.structure[present.classes]] = 0.0
+    by_class[:, model.vocabulary.structure[present.classes]] = 0.0
     is_supported = stands == SUPPORTED
     q = np.where(is_supported, 0.0, 1.0)
     for i, j in supports:
@@ -218,73 +214,72 @@ def _stands(
     log_q = np.log(np.maximum(q, _LEAST_P))
     if heights is None:
         return stands, zeros, log_q
-    shares[:, HANGS] += shares[:, SUPPORTED] * (1 - by_class.sum(1))
-    p = np.where(stands == UNKNOWN, 1.0, shares[np.arange(len(stands)), stands])
+    stand_shares[:, HANGS] += stand_shares[:, SUPPORTED] * (1 - by_class.sum(1))
+    p = np.where(stands == UNKNOWN, 1.0, stand_shares[np.arange(len(stands)), stands])
     return stands, np.log(np.maximum(p, _LEAST_P)), log_q
 
 
-def _heights(artifact: Artifact, scene: Scene, classes: Indices) -> Heights:
+def _heights(model: SceneModel, scene: Scene, classes: Indices) -> Heights:
     """Return the heights of the objects. Furniture whose box is only its top reaches down."""
-    centres, extents = boxes_of(scene.objects, artifact.vocabulary.sizes)
-    heights, places = Heights.of(centres, extents), artifact.places
+    centres, extents = boxes_of(scene.objects, model.vocabulary.sizes)
+    heights, places = Heights.of(centres, extents), model.places
     if places is None:
         return heights
-    usual, tops = artifact.vocabulary.sizes[classes, 2], heights.tops
-    is_top = (places.stands[classes, FLOOR] >= USUAL) & (extents[:, 2] < usual / 2)
-    bottoms = np.where(is_top, np.fmin(heights.bottoms, tops - usual), heights.bottoms)
+    heights_of_class, tops = model.vocabulary.sizes[classes, 2], heights.tops
+    is_top = (places.stands[classes, FLOOR] >= USUAL) & (extents[:, 2] < heights_of_class / 2)
+    bottoms = np.where(is_top, np.fmin(heights.bottoms, tops - heights_of_class), heights.bottoms)
     return Heights(bottoms, tops, heights.areas)
 
 
-def wrong_log_odds(judgement: Judgement, terms: Floats) -> Floats:
-    """Return the log-odds that entries of one kind are wrong, (n,). `terms` is (n, 4)."""
+def wrong_log_odds(judgement: Judgement, terms: Float[Floats, "n 4"]) -> Float[Floats, "n"]:
+    """Return the log-odds that entries of one kind are wrong."""
     weights = np.array([judgement.relation, judgement.change, judgement.stand, judgement.supporter])
     return judgement.intercept + terms @ weights
 
 
-def wrong_relations(artifact: Artifact, scene: Scene) -> dict[Triple, float]:
+def wrong_relations(model: SceneModel, scene: Scene) -> dict[Triple, float]:
     """Return the log-odds that each judged relation of a scene is wrong."""
-    entries = entries_of(artifact, Posterior(artifact, scene), scene)
+    entries = entries_of(model, Posterior(model, scene), scene)
     return {
         (a, i, j): z
-        for _, rows, values in _judged(artifact, entries)
+        for _, rows, values in _judged(model, entries)
         for (a, i, j), z in zip(entries.triple[rows].tolist(), values.tolist(), strict=True)
         if j >= 0
     }
 
 
-def _judged(artifact: Artifact, entries: Entries) -> Iterator[tuple[Judgement, Indices, Floats]]:
+def _judged(model: SceneModel, entries: Entries) -> Iterator[tuple[Judgement, Indices, Floats]]:
     """Yield the judgement of each kind, its entries, and their log-odds to be wrong."""
     for kind in sorted({*entries.kind.tolist()}):
-        judgement: Judgement | None = getattr(artifact.calibration.misplaced, KINDS[kind])
+        judgement: Judgement | None = getattr(model.calibration.misplaced, KINDS[kind])
         if judgement is not None:
             rows = (entries.kind == kind).nonzero()[0]
             yield judgement, rows, wrong_log_odds(judgement, entries.terms[rows])
 
 
 def misplaced_fields(
-    artifact: Artifact,
+    model: SceneModel,
     posterior: Posterior,
     scene: Scene,
     sensitivity: Sensitivity,
-    flipped: Collection[Triple],
 ) -> list[Fields]:
     """Judge the observed relations, and the objects that nothing supports.
 
     The answer lists every observed relation of a kind that the model judges, without those of
     structure. An object on the floor, or hanging above it, is listed only if it reaches the most
     sensitive alarm line. The entry that is most probably wrong comes first. Entries with equal
-    probabilities keep the order of `Scene.relations`. An object under another object is the subject
+    probabilities keep the order of `Scene.triples`. An object under another object is the subject
     of its entry.
 
     Returns:
         The fields of `scene_client.schemas.MisplacedRelation`.
     """
-    entries = entries_of(artifact, posterior, scene, flipped)
+    entries = entries_of(model, posterior, scene)
     n = len(entries.kind)
     if not n:
         return []
     log_odds, line, lowest = np.full(n, -np.inf), np.full(n, np.inf), np.full(n, np.inf)
-    for judgement, rows, values in _judged(artifact, entries):
+    for judgement, rows, values in _judged(model, entries):
         log_odds[rows] = values
         line[rows] = getattr(judgement.lines, sensitivity).threshold(len(rows))
         lowest[rows] = judgement.lines.high.threshold(len(rows))
@@ -301,7 +296,7 @@ def misplaced_fields(
         *columns, strict=True
     ):
         name = CANONICAL[relation]
-        if kind == BELOW or (relation, subject, object_) in flipped:
+        if kind == BELOW or (relation, subject, object_) in scene.opposites:
             subject, name, object_ = object_, opposite(name), subject
         fields.append(
             {

@@ -2,40 +2,55 @@
 
 The answers are object classes that the scene does not list (candidates), and their placements
 (`app.questions.placements`). Structural classes (floor, wall) are neither candidates nor anchors of
-placements.
+placements. `more` adds listed classes with probably more instances than listed, by the statistics
+of counts (`app.model.count_statistics`).
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from app.errors import InvalidRequestError
 from app.inference.elementary import sigmoid
-from app.questions.answer import EXPLAINED, Fields, named, reasons, significant
-from app.questions.counts import more
+from app.model.scene_model import SceneModel
+from app.questions.answer import EXPLAINED, Fields, best, named, reasons, significant
 from app.questions.names import ErrorList
 from app.questions.placements import Place, place_log_p, placements
-from app.questions.posterior import LEAST_CHANGE, Posterior, calibrated_missing, log_odds_of
+from app.questions.posterior import (
+    LEAST_CHANGE,
+    Posterior,
+    Present,
+    calibrated_missing,
+    log_odds_of,
+)
 from app.questions.question import LABELS, REFUSED, SCENES, Example, Options, Question
-from app.questions.ranking import best
 from app.questions.reading import Reading
-from app.registry.artifact import Artifact
 from app.scene.scene import Scene
-from app.scene.spatial_relations import opposite
+from app.scene.spatial_relations import CANONICAL, opposite
 from scene_client.frames import Axes, viewer_axes
 from scene_client.schemas import Anchor, MissingAnswer, MissingRequest
 
 VIEWER = viewer_axes()
 """Axes of a viewer who looks along the x axis of the frame."""
 
+Indices = NDArray[np.int64]
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+LIKELY: Final = 0.5
+"""Minimum probability of further instances at which an answer contains a class."""
+
 _BLOCK: Final = 32
+_OUTSIDE: Final = 0.1  # probability of a count below `low`, and of a count above `high`
+_FIELDS: Final = ("listed_count", "expected_count", "low", "high", "probability")
 
 
 def missing(
-    artifact: Artifact,
+    model: SceneModel,
     scene: Scene,
     *,
     top_k: int = 10,
@@ -73,12 +88,17 @@ def missing(
 
     Returns:
         The fields `coverage`, `missing` and `more` of `scene_client.schemas.MissingAnswer`.
+
+    Example:
+        >>> scene = Scene(model.vocabulary.bare_objects(["desk", "chair"]))
+        >>> missing(model, scene, at=("on-top", 0))["missing"][0]["label"]
+        'laptop'
     """
     place = None if at is None else Place.of(*at)
-    posterior = Posterior(artifact, scene)
-    calibration = artifact.calibration
-    classes, log_odds, placed = _ranked(artifact, posterior, top_k, candidates, place, coverage)
-    labels = artifact.vocabulary.labels
+    posterior = Posterior(model, scene)
+    calibration = model.calibration
+    classes, log_odds, placed = _ranked(model, posterior, top_k, candidates, place, coverage)
+    labels = model.vocabulary.labels
     columns = classes.tolist(), significant(sigmoid(log_odds)), significant(log_odds)
     entries: list[Fields] = []
     for index, probability, value in zip(*columns, strict=True):
@@ -86,7 +106,7 @@ def missing(
         entry["probability"], entry["log_odds"] = probability, value
         entries.append(entry)
     if details and entries:
-        places = placements(artifact, posterior, scene, classes, axes, place)
+        places = placements(model, posterior, scene, classes, axes, place)
         for entry, class_places in zip(entries, places, strict=True):
             entry["placements"], entry["because"] = class_places, []
         if place is not None:
@@ -95,7 +115,7 @@ def missing(
                     requested["probability"] = p
         if len(posterior.present.classes):
             explained = classes[:EXPLAINED]
-            change = posterior.reasons_for_absent(explained)
+            change = model.objects.reasons_for_absent(posterior.context, scene.profile, explained)
             slope = (calibration.missing if coverage is None else calibration.covered).slope
             causes = reasons(scene, posterior.present, change, least=LEAST_CHANGE, scale=slope)
             for entry, because in zip(entries, causes, strict=False):
@@ -103,7 +123,7 @@ def missing(
     further: list[Fields] = []
     if at is None:
         further = more(
-            artifact,
+            model,
             scene,
             posterior.present,
             top_k=top_k,
@@ -114,21 +134,86 @@ def missing(
     return {"coverage": used_coverage, "missing": entries, "more": further}
 
 
+def more(
+    model: SceneModel,
+    scene: Scene,
+    listing: Present,
+    *,
+    top_k: int = 10,
+    candidates: Collection[int] | None = None,
+    coverage: float | None = None,
+) -> list[Fields]:
+    """Return the listed classes with probably more instances than listed, likeliest first.
+
+    Listed objects count as present, whatever their confidence. The answer never contains structural
+    classes, classes without statistics, or classes with more listed objects than these cover.
+
+    Args:
+        scene: the listed objects and the room type. The first object of a class is its name in
+            the request.
+        listing: the classes of the listed objects.
+        top_k: maximum number of classes in the answer.
+        candidates: indices of classes. The answer then contains these classes at any probability,
+            and no others. None means all classes with a probability of at least `LIKELY`.
+        coverage: probability that the request lists an object of the scene. Only values above the
+            model's coverage change the answer. At 1, the scene has no further instances.
+
+    Returns:
+        The fields of `scene_client.schemas.MoreInstances`. `low` and `high` are limits of the
+        number of instances, which is between them with a probability of at least 0.8.
+    """
+    if model.counts is None:
+        return []
+    # Words without a class have no statistics; their classes follow those of the statistics.
+    size = model.vocabulary.trained
+    plain = ~model.vocabulary.structure[listing.classes] & (listing.classes < size)
+    classes, listed = listing.classes[plain], listing.counts[plain]
+    own, unlisted = model.calibration.coverage, 1.0
+    if coverage is not None and coverage > own:
+        unlisted = (1 - coverage) / (1 - own)
+    rows, p = model.counts.distribution(size, classes, listed, scene.room_type, unlisted)
+    classes, listed = classes[rows], listed[rows]
+    numbers, cumulative = np.arange(1, p.shape[1] + 1), p.cumsum(axis=1)
+    p_more = 1 - cumulative[np.arange(len(p)), listed - 1]
+    usable = p_more >= LIKELY if candidates is None else np.isin(classes, list(candidates))
+    order = best(p_more, usable, top_k)
+    if not len(order):
+        return []
+    labels, first = model.vocabulary.labels, listing.first[plain][rows][order]
+    names = [
+        named(labels[index], scene.objects[number].label)
+        for index, number in zip(classes[order].tolist(), first.tolist(), strict=True)
+    ]
+    columns = (
+        listed[order].tolist(),
+        significant(p[order] @ numbers),
+        *(
+            ((cumulative[order] < share).sum(axis=1) + 1).tolist()
+            for share in (_OUTSIDE, 1 - _OUTSIDE)
+        ),
+        significant(p_more[order]),
+    )
+    return [
+        name | dict(zip(_FIELDS, values, strict=True))
+        for name, *values in zip(names, *columns, strict=True)
+    ]
+
+
 def _ranked(
-    artifact: Artifact,
+    model: SceneModel,
     posterior: Posterior,
     top_k: int,
     candidates: Sequence[int] | None,
     place: Place | None,
     coverage: float | None,
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Int[Indices, "k"], Float[Floats, "k"], Float[Floats, "k"]]:
     """Return the likeliest candidates, likeliest first.
 
     Returns:
         The class indices, the log-odds that they are present (and at the place), and the
-        probabilities of the place if they are present (1 without a place), each (k,).
+        probabilities of the place if they are present (1 without a place).
     """
-    vocabulary, listed = artifact.vocabulary, posterior.present.classes
+    vocabulary, listed = model.vocabulary, posterior.present.classes
     usable = ~vocabulary.structure
     usable[listed] = False
     if candidates is None:
@@ -139,7 +224,7 @@ def _ranked(
         usable &= named & ~vocabulary.broader[listed].any(0)
     if not usable.any():
         return np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
-    calibration = artifact.calibration
+    calibration = model.calibration
     used_coverage = calibration.coverage if coverage is None else coverage
     raw = posterior.absent_log_odds(np.arange(len(usable)), used_coverage).astype(np.float64)
     log_odds = calibrated_missing(calibration, raw, posterior.listed, coverage)
@@ -148,7 +233,7 @@ def _ranked(
     while True:
         score = log_odds
         if place is not None:
-            score = _log_p_at(artifact, posterior, place, usable, log_odds, count)
+            score = _log_p_at(model, posterior, place, usable, log_odds, count)
         first = best(score, usable, count)
         chosen = np.arange(len(first))
         if candidates is None:
@@ -166,11 +251,10 @@ def _ranked(
     )
 
 
-def _one_of_a_family(related: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the indices of N ranked classes without those related to a class that is kept before.
+def _one_of_a_family(related: Bool[Mask, "N N"]) -> Int[Indices, "k"]:
+    """Return the indices of ranked classes without relatives of a better class.
 
-    Args:
-        related: (N, N) True for classes of one family.
+    ``related`` is True for classes of one family.
     """
     left_out = np.zeros(len(related), np.bool_)
     for k in np.flatnonzero(related.any(1)):
@@ -180,29 +264,26 @@ def _one_of_a_family(related: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def _log_p_at(
-    artifact: Artifact,
+    model: SceneModel,
     posterior: Posterior,
     place: Place,
-    usable: NDArray[np.bool_],
-    log_odds: NDArray[np.floating[Any]],
+    usable: Bool[Mask, "V"],
+    log_odds: Float[NDArray[np.floating[Any]], "V"],
     top_k: int,
-) -> NDArray[np.float64]:
-    """Return log p(present and at the place), (V,): log p(present) + log p(place | present).
+) -> Float[Floats, "V"]:
+    """Return log p(present and at the place): log p(present) + log p(place | present).
 
     The log probability of the relation is at most 0. So the other terms of `PlaceFit` give an upper
     bound. The function scores candidates in blocks, in descending order of this bound. It stops
     when the bound of the next candidate is below the `top_k` largest values. The remaining
-    candidates get the value -inf.
-
-    Args:
-        log_odds: (V,) log-odds that each class is present.
+    candidates get the value -inf. ``log_odds`` are those that each class is present.
     """
-    entry, log_p = artifact.calibration.at[place.relation], -np.logaddexp(0.0, -log_odds)
+    entry, log_p = model.calibration.at[place.relation], -np.logaddexp(0.0, -log_odds)
     at_most = np.full_like(log_p, entry.intercept)
-    if artifact.places is not None and entry.counts:
-        stand_in = artifact.vocabulary.stand_in
+    if model.places is not None and entry.counts:
+        stand_in = model.vocabulary.stand_in
         anchor = int(stand_in[posterior.present.classes[posterior.present.row[place.anchor]]])
-        ratio = artifact.places.log_ratio(place.relation, anchor, outgoing=place.outgoing)
+        ratio = model.places.log_ratio(place.relation, anchor, outgoing=place.outgoing)
         at_most += entry.counts * ratio[stand_in]
     bound = log_p - np.logaddexp(0.0, -at_most)
     joint = np.full_like(log_p, -np.inf)
@@ -218,8 +299,8 @@ def _log_p_at(
     return joint
 
 
-def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Options:
-    errors, size = ErrorList(), len(artifact.vocabulary)
+def _read(request: MissingRequest, model: SceneModel, reading: Reading) -> Options:
+    errors, size = ErrorList(), len(model.vocabulary)
     # Only the default of `top_k` may exceed the size of the vocabulary.
     if request.top_k > size and "top_k" in request.model_fields_set:
         message = f"`top_k` must be at most {size}, the size of the vocabulary"
@@ -230,7 +311,7 @@ def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Opti
         candidates = list(labels_of)
         listed_as = {index: labels[0] for index, labels in labels_of.items()}
     if request.at is not None:
-        at = _at(request.at, artifact, reading, errors)
+        at = _at(request.at, model, reading, errors)
     errors.raise_any()
     return {
         "top_k": request.top_k,
@@ -244,10 +325,10 @@ def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Opti
 
 
 def _at(
-    at: Anchor, artifact: Artifact, reading: Reading, errors: ErrorList
+    at: Anchor, model: SceneModel, reading: Reading, errors: ErrorList
 ) -> tuple[str, int] | None:
     """Return relation and anchor index of the request's field `at`, or None after an error."""
-    canonical = artifact.manifest.vocabulary.relations
+    canonical = CANONICAL[: model.spec.A]
     if at.relation not in {*canonical, *map(opposite, canonical)}:
         errors.add(InvalidRequestError, ("at", "relation"), "the model does not know this relation")
     anchor = reading.names.find(at.object, ("at", "object"), errors)
@@ -259,13 +340,13 @@ def _at(
     return None if anchor is None else (at.relation, anchor)
 
 
-def _ask_all(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
+def _ask_all(model: SceneModel, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
     related, bare, _ = scenes
     for scene in scenes:
-        yield missing(artifact, scene)
+        yield missing(model, scene)
     if len(bare.objects) > 1:
-        yield missing(artifact, bare, at=("on-top", 0))
-        yield missing(artifact, related, at=("under", 0))
+        yield missing(model, bare, at=("on-top", 0))
+        yield missing(model, related, at=("under", 0))
 
 
 _EXAMPLES: Final = {

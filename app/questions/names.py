@@ -161,27 +161,27 @@ class Unknown:
         Returns:
             Index of the class or room type. None means that the label is ignored or refused.
         """
-        found = self.vocabulary.read(label, is_room=is_room)
-        if found is None and self._may_guess(label, is_room=is_room):
-            found = self.vocabulary.guess(label, is_room=is_room)
-            if found is None and not is_room and (index := self._by_meaning(label)) is not None:
+        match = self.vocabulary.read(label, is_room=is_room)
+        if match is None and self._may_guess(label, is_room=is_room):
+            match = self.vocabulary.guess(label, is_room=is_room)
+            if match is None and not is_room and (index := self._by_meaning(label)) is not None:
                 return index
         # An answer without the room type is a good answer, so `nearest` ignores it too.
         is_ignored = self.treatment != "error" and (is_room or self.treatment != "nearest")
-        if found is None and is_ignored:
+        if match is None and is_ignored:
             self.ignored.append(name)
-        elif found is None:
+        elif match is None:
             self.refuse(label, location, errors, is_room=is_room)
         # Answers name objects by id, but room types and candidates by their canonical names.
-        elif found.rule not in (_SPELLINGS if location[0] == "objects" else ("label",)):
+        elif match.rule not in (_SPELLINGS if location[0] == "objects" else ("label",)):
             names = self.vocabulary.room_types if is_room else self.vocabulary.labels
             self.mapped[label, is_room] = Mapped(
                 label=label,
-                class_=names[found.entry],
-                similarity=found.similarity,
-                rule=found.rule,  # type: ignore[arg-type]
+                class_=names[match.entry],
+                similarity=match.similarity,
+                rule=match.rule,  # type: ignore[arg-type]
             )
-        return None if found is None else found.entry
+        return None if match is None else match.entry
 
     def resolve_all(
         self, labels: Sequence[str], field: str, errors: ErrorList, *, is_room: bool = False
@@ -190,8 +190,8 @@ class Unknown:
         labels_of: dict[int, list[str]] = {}
         for position, label in enumerate(labels):
             index = self.resolve(label, label, (field, position), errors, is_room=is_room)
-            if index is not None and label not in (found := labels_of.setdefault(index, [])):
-                found.append(label)
+            if index is not None and label not in (spellings := labels_of.setdefault(index, [])):
+                spellings.append(label)
             if errors.by_class and errors.are_many:
                 break
         return labels_of

@@ -11,23 +11,25 @@ multiplied by the probability of the companion in a scene with the outlier. Clas
 is below half of the largest increase are ignored.
 """
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from app.inference.elementary import sigmoid
-from app.questions.answer import EXPLAINED, Fields, reasons, rounded_number, significant
+from app.model.calibration import CountSlope, Sensitivity
+from app.model.scene_model import SceneModel
+from app.questions.answer import EXPLAINED, Fields, best, reasons, rounded_number, significant
 from app.questions.misplaced import misplaced_fields
 from app.questions.posterior import Posterior, calibrated
 from app.questions.question import REFUSED, SCENES, WITH_TOILET, Example, Options, Question
-from app.questions.ranking import best
-from app.questions.reading import Reading, Triple
-from app.registry.artifact import Artifact
-from app.registry.description import CountSlope, Sensitivity
+from app.questions.reading import Reading
 from app.scene.scene import Scene, SceneObject
 from scene_client.schemas import OutliersAnswer, OutliersRequest, SceneWarning
+
+Floats = NDArray[np.floating[Any]]
 
 COMPANIONS: Final = 3
 """Maximum number of companions in the answer for one outlier."""
@@ -36,13 +38,12 @@ _LEAST_SHARE: Final = 0.5  # smallest increase of a companion, as a share of the
 
 
 def outliers(
-    artifact: Artifact,
+    model: SceneModel,
     scene: Scene,
     *,
     sensitivity: Sensitivity = "medium",
     threshold: float | None = None,
     details: bool = True,
-    flipped: Collection[Triple] = (),
 ) -> Fields:
     """Judge every object and every stated relation of a scene.
 
@@ -59,8 +60,8 @@ def outliers(
     scene with few objects gives little evidence, so its threshold is higher. A single class without
     structure is never an outlier, because no other object says whether it belongs.
 
-    The model knows little about a class that few training scenes show (`Artifact.rarely_shown`). At
-    a sensitivity, an object of such a class is never an outlier. If its probability reaches the
+    The model knows little about a class that few training scenes show (`rarely_shown`). At a
+    sensitivity, an object of such a class is never an outlier. If its probability reaches the
     threshold, a warning names the object. A stated threshold applies to all classes, but a word
     that is read by its meaning never is an outlier.
 
@@ -69,34 +70,38 @@ def outliers(
         sensitivity: name of one of the model's thresholds.
         threshold: minimum probability of an outlier. None means the threshold of `sensitivity`.
         details: whether the answer contains `because` and `usually_with`.
-        flipped: relations of the scene that the request states by their opposite. The answer uses
-            the words of the request.
 
     Returns:
         The fields `threshold`, `outliers` and `misplaced` of `scene_client.schemas.OutliersAnswer`.
         A list is empty if the model gives no such judgement. `warnings` names this case, a single
         class, and the objects of rare classes that reach the threshold.
         `threshold` is left out if the model judges no object and the caller states no threshold.
+
+    Example:
+        >>> labels = ["bed", "nightstand", "pillow", "toilet"]
+        >>> scene = Scene(model.vocabulary.bare_objects(labels))
+        >>> outliers(model, scene)["outliers"][0]["object"]
+        'toilet'
     """
-    entry = artifact.calibration.outlier
-    can_alarm = ~artifact.rarely_shown
+    entry = model.calibration.outlier
+    can_alarm = ~model.rarely_shown
     if threshold is not None:
         can_alarm = np.ones_like(can_alarm)
-    can_alarm[artifact.vocabulary.known :] = False
+    can_alarm[model.vocabulary.trained :] = False
     judged: list[Fields] = []
     wrong: list[Fields] = []
-    warnings = _unjudged(artifact, scene)
-    posterior = Posterior(artifact, scene) if scene.objects else None
+    warnings = _unjudged(model, scene)
+    posterior = Posterior(model, scene) if scene.objects else None
     if threshold is None:
         n, in_room = posterior.listed if posterior else 0, scene.room_type is not None
-        threshold = artifact.calibration.outlier_threshold(sensitivity, n, in_room=in_room)
+        threshold = model.calibration.outlier_threshold(sensitivity, n, in_room=in_room)
     if posterior is not None:
-        wrong = misplaced_fields(artifact, posterior, scene, sensitivity, flipped)
+        wrong = misplaced_fields(model, posterior, scene, sensitivity)
         if entry is not None and threshold is not None:
             judged, unsure = _judged(
-                artifact, entry, posterior, scene, threshold, can_alarm, details=details
+                model, entry, posterior, scene, threshold, can_alarm, details=details
             )
-            warnings += _too_rare(artifact, unsure) + _alone(artifact, posterior, scene)
+            warnings += _too_rare(model, unsure) + _alone(model, posterior, scene)
     fields: Fields = {"warnings": warnings}
     if threshold is not None:
         fields["threshold"] = rounded_number(threshold)
@@ -104,27 +109,27 @@ def outliers(
 
 
 def _judged(
-    artifact: Artifact,
+    model: SceneModel,
     entry: CountSlope,
     posterior: Posterior,
     scene: Scene,
     threshold: float,
-    can_alarm: NDArray[np.bool_],
+    can_alarm: Bool[NDArray[np.bool_], "V"],
     *,
     details: bool,
 ) -> tuple[list[Fields], list[SceneObject]]:
     """Return the fields of `scene_client.schemas.Outlier` for every object of a scene.
 
     The second result lists the objects that reach the threshold, but whose class raises no alarm.
-    `can_alarm` is True for the classes that raise an alarm, (V,).
+    `can_alarm` is True for the classes that raise an alarm.
 
     `because` lists up to three other objects, in order of their effect on `log_odds`. For an
     outlier, these objects raise its log-odds. For other objects, they lower the log-odds.
     """
-    present, vocabulary = posterior.present, artifact.vocabulary
+    present, vocabulary = posterior.present, model.vocabulary
     labels, broader = vocabulary.labels, vocabulary.broader_labels
     log_odds, change = posterior.given_rest(explained=details)
-    logits, p = _intruder_odds(artifact, entry, posterior, log_odds)
+    logits, p = _intruder_odds(model, entry, posterior, log_odds)
     reaches = (p >= threshold) & (posterior.listed > 1)
     is_outlier = reaches & can_alarm[present.classes]
     # The order follows the logits, because probabilities near 0 or 1 may round to the same number.
@@ -136,12 +141,12 @@ def _judged(
         lowered, raised = np.minimum(change, 0), np.maximum(change, 0)
         change = np.where(is_outlier[:, None], lowered, raised)
         causes = reasons(scene, present, change, np.arange(n), scale=entry.slope)
-    usual: list[list[str]] = [[] for _ in flags]
+    companions: list[list[str]] = [[] for _ in flags]
     judged: list[Fields] = []
     classes, probabilities, values = present.classes.tolist(), significant(p), significant(logits)
     for row in explained if details else ():
         if flags[row]:
-            usual[row] = _companions(artifact, present.classes, classes[row])
+            companions[row] = _companions(model, present.classes, classes[row])
     for number, row in zip(order.tolist(), rows, strict=True):
         thing = scene.objects[number]
         fields: Fields = {"object": thing.id, "label": labels[classes[row]]}
@@ -155,69 +160,76 @@ def _judged(
         fields["is_outlier"] = flags[row]
         if details:
             fields["because"] = causes[row] if row in explained else []
-            fields["usually_with"] = usual[row]
+            fields["usually_with"] = companions[row]
         judged.append(fields)
     unsure = np.flatnonzero((reaches & ~is_outlier)[present.row])
     return judged, [scene.objects[number] for number in unsure.tolist()]
 
 
 def misplaced(
-    artifact: Artifact, scene: Scene, *, sensitivity: Sensitivity = "medium"
+    model: SceneModel, scene: Scene, *, sensitivity: Sensitivity = "medium"
 ) -> list[Fields]:
-    """Judge every stated relation like `outliers`, but do not judge objects."""
+    """Judge every stated relation like `outliers`, but do not judge objects.
+
+    Example:
+        >>> bed_on_nightstand = RelationTable.stated([(ON_TOP, 0, 1)])
+        >>> scene = Scene(model.vocabulary.bare_objects(["bed", "nightstand"]), bed_on_nightstand)
+        >>> misplaced(model, scene)[0]["is_misplaced"]
+        True
+    """
     if not scene.objects:
         return []
-    return misplaced_fields(artifact, Posterior(artifact, scene), scene, sensitivity, ())
+    return misplaced_fields(model, Posterior(model, scene), scene, sensitivity)
 
 
-def intruders(artifact: Artifact, scene: Scene) -> NDArray[np.int64]:
+def intruders(model: SceneModel, scene: Scene) -> NDArray[np.int64]:
     """Return the classes that reach the threshold of medium sensitivity, rare classes included."""
-    calibration, posterior = artifact.calibration, Posterior(artifact, scene)
+    calibration, posterior = model.calibration, Posterior(model, scene)
     classes, in_room = posterior.present.classes, scene.room_type is not None
     threshold = calibration.outlier_threshold("medium", posterior.listed, in_room=in_room)
     if calibration.outlier is None or threshold is None:
         return classes[:0]
-    _, p = _intruder_odds(artifact, calibration.outlier, posterior, posterior.given_rest()[0])
+    _, p = _intruder_odds(model, calibration.outlier, posterior, posterior.given_rest()[0])
     return classes[(p >= threshold) & (posterior.listed > 1)]
 
 
 def _intruder_odds(
-    artifact: Artifact,
+    model: SceneModel,
     entry: CountSlope,
     posterior: Posterior,
-    log_odds: NDArray[np.floating[Any]],
-) -> tuple[NDArray[np.floating[Any]], NDArray[np.floating[Any]]]:
-    """Return logit and probability that each class is an intruder, (n,) each.
+    log_odds: Float[Floats, "n"],
+) -> tuple[Float[Floats, "n"], Float[Floats, "n"]]:
+    """Return logit and probability that each class is an intruder.
 
     They are -inf and 0 for a class that is not judged. `entry` is `Calibration.outlier`.
     """
     classes = posterior.present.classes
-    adjusted = log_odds - artifact.intruder_prior[classes]
+    adjusted = log_odds - model.intruder_prior[classes]
     logits = calibrated(entry, adjusted, max(1, posterior.listed))
-    p, is_excused = sigmoid(logits), ~artifact.vocabulary.judged[classes]
+    p, is_excused = sigmoid(logits), ~model.vocabulary.judged[classes]
     logits[is_excused], p[is_excused] = -np.inf, 0.0
     return logits, p
 
 
-def _companions(artifact: Artifact, present: NDArray[np.int64], flagged: int) -> list[str]:
+def _companions(model: SceneModel, present: Int[NDArray[np.int64], "n"], flagged: int) -> list[str]:
     """Return the labels of the companions of an outlier, best first; see the module.
 
     The classes in ``present``, those of the scene, and structural classes are never companions.
     """
-    usable = ~artifact.vocabulary.structure
+    usable = ~model.vocabulary.structure
     usable[present] = False
-    increase, rank = artifact.objects.increases(flagged)
+    increase, rank = model.objects.increases(flagged)
     least = max(_LEAST_SHARE * float(increase[usable].max(initial=0)), 1e-6)
     chosen = best(rank, usable & (increase >= least) & (rank > 0), COMPANIONS)
-    return [artifact.vocabulary.labels[index] for index in chosen.tolist()]
+    return [model.vocabulary.labels[index] for index in chosen.tolist()]
 
 
-def _too_rare(artifact: Artifact, objects: list[SceneObject]) -> list[SceneWarning]:
+def _too_rare(model: SceneModel, objects: list[SceneObject]) -> list[SceneWarning]:
     """Return a warning for objects that reach the threshold, but whose class is rarely shown."""
     if not objects:
         return []
     classes = {thing.class_index for thing in objects}
-    labels = sorted(artifact.vocabulary.labels[index] for index in classes if index is not None)
+    labels = sorted(model.vocabulary.labels[index] for index in classes if index is not None)
     message = (
         f"too few or no training scenes show {', '.join(labels)}, so the service raises no alarm"
     )
@@ -225,9 +237,9 @@ def _too_rare(artifact: Artifact, objects: list[SceneObject]) -> list[SceneWarni
     return [SceneWarning(code="not-judged", message=message, objects=ids)]
 
 
-def _alone(artifact: Artifact, posterior: Posterior, scene: Scene) -> list[SceneWarning]:
+def _alone(model: SceneModel, posterior: Posterior, scene: Scene) -> list[SceneWarning]:
     """Return a warning if the scene lists a single class without structure, and it is judged."""
-    present, vocabulary = posterior.present, artifact.vocabulary
+    present, vocabulary = posterior.present, model.vocabulary
     if posterior.listed != 1 or not vocabulary.judged[present.classes].any():
         return []
     rows = ~vocabulary.structure[present.classes][present.row]
@@ -236,11 +248,11 @@ def _alone(artifact: Artifact, posterior: Posterior, scene: Scene) -> list[Scene
     return [SceneWarning(code="not-judged", message=message, objects=ids)]
 
 
-def _unjudged(artifact: Artifact, scene: Scene) -> list[SceneWarning]:
+def _unjudged(model: SceneModel, scene: Scene) -> list[SceneWarning]:
     """Return a warning for objects, and one for relations, if the model gives no judgement."""
-    calibration = artifact.calibration
+    calibration = model.calibration
     parts = ["objects"] if scene.objects and calibration.outlier is None else []
-    if scene.relations and not calibration.misplaced.judges_relations:
+    if scene.triples and not calibration.misplaced.judges_relations:
         parts.append("relations")
     message = "the model does not judge {}, because its calibration had too few scenes"
     return [
@@ -248,20 +260,19 @@ def _unjudged(artifact: Artifact, scene: Scene) -> list[SceneWarning]:
     ]
 
 
-def _read(request: OutliersRequest, _: Artifact, reading: Reading) -> Options:
+def _read(request: OutliersRequest, _: SceneModel, __: Reading) -> Options:
     return {
         "sensitivity": request.sensitivity,
         "threshold": request.threshold,
         "details": request.detail == "full",
-        "flipped": reading.flipped,
     }
 
 
-def _ask_all(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
+def _ask_all(model: SceneModel, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
     # With threshold 0, every object is an outlier. So the function also computes `usually_with`.
-    yield outliers(artifact, scenes[0], threshold=0.0)
+    yield outliers(model, scenes[0], threshold=0.0)
     for scene in scenes[1:]:
-        yield outliers(artifact, scene)
+        yield outliers(model, scene)
 
 
 _EXAMPLES: Final = {

@@ -9,16 +9,16 @@ from itertools import repeat
 from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled
 from app.inference.quadrature import NO_UNIT
-from app.questions.answer import Fields, significant
+from app.model.offset_statistics import UNOBSERVED, rotated_offsets
+from app.model.place_statistics import add_unseen
+from app.model.scene_model import SceneModel
+from app.questions.answer import Fields, best, significant
 from app.questions.posterior import Posterior, exclusive, relation_probability
-from app.questions.ranking import best
-from app.registry.artifact import Artifact
-from app.registry.offsets import UNOBSERVED, rotated_offsets
-from app.registry.places import add_unseen
 from app.scene.scene import Scene, SceneObject, boxes_of
 from app.scene.spatial_relations import (
     INSIDE,
@@ -31,6 +31,7 @@ from app.scene.spatial_relations import (
 from app.scene.vocabulary import do_not_fit
 from scene_client.frames import Axes
 
+Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 PLACES: Final = 3
@@ -63,9 +64,9 @@ class Place(NamedTuple):
 
 
 def place_log_p(
-    posterior: Posterior, candidates: NDArray[np.int64], place: Place
-) -> NDArray[np.floating[Any]]:
-    """Return log p(relation to the anchor | candidate is present), not calibrated, (N,)."""
+    posterior: Posterior, candidates: Int[Indices, "N"], place: Place
+) -> Float[NDArray[np.floating[Any]], "N"]:
+    """Return log p(relation to the anchor | candidate is present), not calibrated."""
     anchor = posterior.present.row[[place.anchor]]
     forward, backward = posterior.placement_log_odds(candidates, anchor, place.relation)
     log_odds = (forward if place.outgoing else backward)[:, 0, 0]
@@ -73,10 +74,10 @@ def place_log_p(
 
 
 def placements(
-    artifact: Artifact,
+    model: SceneModel,
     posterior: Posterior,
     scene: Scene,
-    candidates: NDArray[np.int64],
+    candidates: Int[Indices, "N"],
     axes: Axes | None,
     at: Place | None = None,
 ) -> list[list[Fields]]:
@@ -89,7 +90,7 @@ def placements(
     empty. An offset needs an anchor with a position.
 
     Args:
-        candidates: (N,) indices of absent classes.
+        candidates: indices of absent classes.
         axes: viewer's axes, or None if the viewing direction is unknown; see `rotated_offsets`.
         at: the place in the request, or None. It comes first in each result, even if other places
             are likelier.
@@ -98,16 +99,16 @@ def placements(
         For each candidate, the fields of `scene_client.schemas.Placement`.
     """
     present = posterior.present
-    anchors = (~artifact.vocabulary.structure[present.classes]).nonzero()[0]
+    anchors = (~model.vocabulary.structure[present.classes]).nonzero()[0]
     if not len(anchors):
         return [[] for _ in candidates]
     forward, backward = posterior.placement_log_odds(candidates, anchors)
-    A, objects, stand_in = forward.shape[1], present.first[anchors], artifact.vocabulary.stand_in
+    A, objects, stand_in = forward.shape[1], present.first[anchors], model.vocabulary.stand_in
     classes, candidates = stand_in[present.classes[anchors]], stand_in[candidates]
     first = -1  # number of the requested place in `_likeliest_places`; -1 without a request
-    if A > ON_TOP and scene.relations:
-        held = held_objects(artifact, posterior, scene)
-        columns = [k for k, number in enumerate(objects.tolist()) if number in held]
+    if A > ON_TOP and scene.triples:
+        supported = supported_objects(model, posterior, scene)
+        columns = [k for k, number in enumerate(objects.tolist()) if number in supported]
         for a in SUPPORTS:
             if a < A:
                 backward[:, a, columns] = NO_UNIT
@@ -117,23 +118,28 @@ def placements(
             first = ((0 if at.outgoing else A) + at.relation) * len(anchors) + column
             objects[column] = at.anchor
     things = [scene.objects[number] for number in objects.tolist()]
-    if A > ON_TOP and artifact.places is not None:
-        add_unseen(*artifact.places.unseen, candidates, classes, forward, backward)
+    if A > ON_TOP and model.places is not None:
+        add_unseen(*model.places.unseen, candidates, classes, forward, backward)
     if A > INSIDE:
-        candidates_too_large, things_too_large = _too_large(artifact, things, candidates, classes)
+        candidates_too_large, things_too_large = _too_large(model, things, candidates, classes)
         forward[:, INSIDE][candidates_too_large] = NO_UNIT
         backward[:, INSIDE][things_too_large] = NO_UNIT
-    slopes, log_counts = artifact.relation_slopes.placement, present.log_counts[anchors]
-    limits = PLACES, first, LEAST_SHARE, LEAST_LIKELY
+    slopes, log_counts = model.relation_slopes.placement, present.log_counts[anchors]
     rows, relations, outgoing, columns, p = _likeliest_places(
-        slopes, forward, backward, log_counts, *limits
+        slopes, forward, backward, log_counts, PLACES, first, LEAST_SHARE, LEAST_LIKELY
     )
     offsets: Iterator[Fields | None] = repeat(None)
-    if artifact.offsets is not None and any(thing.position is not None for thing in things):
-        ends = relations, candidates[rows], classes[columns], outgoing
-        rotation = _UNTURNED if axes is None else np.array(axes)
-        tables = artifact.offsets.tables
-        offsets = _offset_fields(*rotated_offsets(tables, *ends, rotation, axes is not None))
+    if model.offsets is not None and any(thing.position is not None for thing in things):
+        mean, std, scenes = rotated_offsets(
+            model.offsets.tables,
+            relations,
+            candidates[rows],
+            classes[columns],
+            outgoing,
+            _UNTURNED if axes is None else np.array(axes),
+            axes is not None,
+        )
+        offsets = _offset_fields(mean, std, scenes)
     entries: list[list[Fields]] = [[] for _ in candidates]
     arrays = rows.tolist(), relations.tolist(), outgoing.tolist(), columns.tolist()
     for row, relation, is_subject, column, probability, offset in zip(
@@ -148,33 +154,33 @@ def placements(
     return entries
 
 
-def held_objects(artifact: Artifact, posterior: Posterior, scene: Scene) -> list[int]:
+def supported_objects(model: SceneModel, posterior: Posterior, scene: Scene) -> list[int]:
     """Return the indices of the objects that stand on or in an object, by the scene's relations.
 
     The list does not contain a desk with a bin under it, although its relation is on-top as well.
     """
-    places = artifact.places
+    places = model.places
     present = posterior.present
-    classes = artifact.vocabulary.stand_in[present.classes][present.row].tolist()
+    classes = model.vocabulary.stand_in[present.classes][present.row].tolist()
     return [
         i
-        for a, i, j in scene.relations or ()
+        for a, i, j in scene.triples
         if a == INSIDE
         or (a == ON_TOP and not (places and places.means_under(classes[i], classes[j])))
     ]
 
 
 def _too_large(
-    artifact: Artifact,
+    model: SceneModel,
     things: Sequence[SceneObject],
-    candidates: NDArray[np.int64],
-    classes: NDArray[np.int64],
-) -> tuple[Mask, Mask]:
+    candidates: Int[Indices, "N"],
+    classes: Int[Indices, "m"],
+) -> tuple[Bool[Mask, "N m"], Bool[Mask, "N m"]]:
     """Return which candidates do not fit into each object, and which objects not into candidates.
 
-    Both arrays are (N candidates, m objects). Candidates have the typical size of their class.
+    Candidates have the typical size of their class.
     """
-    rows, vocabulary = candidates[:, None], artifact.vocabulary
+    rows, vocabulary = candidates[:, None], model.vocabulary
     if all(thing.size is None for thing in things):
         return vocabulary.too_large[rows, classes], vocabulary.too_large[classes, rows]
     inner, (_, outer) = vocabulary.sizes[candidates], boxes_of(things, vocabulary.sizes)
@@ -182,7 +188,9 @@ def _too_large(
 
 
 def _offset_fields(
-    mean: NDArray[np.float64], std: NDArray[np.float64], scenes: NDArray[np.int64]
+    mean: Float[NDArray[np.float64], "n 3"],
+    std: Float[NDArray[np.float64], "n 3"],
+    scenes: Int[Indices, "n"],
 ) -> Iterator[Fields | None]:
     """Yield the fields of `scene_client.schemas.Offset`, or None for an unknown offset."""
     numbers = significant(np.concatenate([mean, std], axis=1).reshape(-1))

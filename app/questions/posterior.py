@@ -17,6 +17,7 @@ from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled, inlined
@@ -24,12 +25,12 @@ from app.inference import MachineSpec
 from app.inference.elementary import logistic
 from app.inference.quadrature import to_log_odds
 from app.inference.relation_units import ObservedRelations, RelationLogits, encode
-from app.registry.artifact import Artifact
-from app.registry.description import LEAST_COVERAGE, Calibration, CountSlope, CoverageFit
-from app.scene.scene import Scene, instance_evidence, pool_classes
-from app.scene.spatial_relations import pool_relations
+from app.model.calibration import LEAST_COVERAGE, Calibration, CountSlope, CoverageFit
+from app.model.scene_model import SceneModel
+from app.scene.scene import Scene, pool_classes
 
 Floats = NDArray[np.floating[Any]]
+Singles = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
@@ -43,20 +44,20 @@ class Present(NamedTuple):
     Models compute log-odds for classes, but answers list objects.
 
     Attributes:
-        classes: (n,) int64, class indices in ascending order.
-        counts: (n,) int64, number of objects of each class.
-        row: (N,) int64, index into `classes` of each object's class.
-        first: (n,) int64, index of the first object of each class in `Scene.objects`.
-        presence: (n,) float32, probability that at least one instance of the class is present.
-        log_counts: (n,) float32, log of `counts`.
+        classes: class indices in ascending order.
+        counts: number of objects of each class.
+        row: index into `classes` of each object's class.
+        first: index of the first object of each class in `Scene.objects`.
+        presence: probability that at least one instance of the class is present.
+        log_counts: log of `counts`.
     """
 
-    classes: Indices
-    counts: Indices
-    row: Indices
-    first: Indices
-    presence: NDArray[np.float32]
-    log_counts: NDArray[np.float32]
+    classes: Int[Indices, "n"]
+    counts: Int[Indices, "n"]
+    row: Int[Indices, "N"]
+    first: Int[Indices, "n"]
+    presence: Float[Singles, "n"]
+    log_counts: Float[Singles, "n"]
 
 
 def present(scene: Scene, spec: MachineSpec) -> Present:
@@ -83,27 +84,15 @@ def present(scene: Scene, spec: MachineSpec) -> Present:
     return Present(classes, counts, row, first, presence.astype(np.float32), log_counts)
 
 
-def given_relations(scene: Scene, present: Present, relations: int) -> ObservedRelations | None:
-    """Return the observed relations between the classes of a scene.
+def given_relations(scene: Scene, present: Present, A: int) -> ObservedRelations | None:
+    """Return the observed relations between the classes of a scene, or None without observations.
 
-    The result is None if the scene has neither relations nor poses.
-
-    Args:
-        relations: number of canonical relations that the machine knows.
+    The machine knows the first A canonical relations.
     """
-    if not relations_given(scene):
+    if scene.relations is None:
         return None
-    n = len(present.classes)
-    holds, observed = pool_relations(present.row, n, *instance_evidence(scene))
-    # The arrays are contiguous. For another layout, numba would compile the loops again.
-    units = observed[:relations].reshape(-1).nonzero()[0]
-    a, pair = np.divmod(units, n * n)
-    return ObservedRelations(a, *np.divmod(pair, n), holds.reshape(-1)[units].astype(np.float32))
-
-
-def relations_given(scene: Scene) -> bool:
-    """Return whether the scene has observed relations, either stated or derived from poses."""
-    return bool(scene.relations or scene.relations_complete or scene.poses)
+    columns = scene.relations.of_classes(present.row, len(present.classes), A)
+    return None if columns is None else ObservedRelations(*columns)
 
 
 class Posterior:
@@ -124,48 +113,55 @@ class Posterior:
         ValueError: the machine does not know the class of an object, the room type or the profile.
     """
 
-    def __init__(self, artifact: Artifact, scene: Scene) -> None:
-        self.present = listing = present(scene, artifact.spec)
-        is_structure = artifact.vocabulary.structure[listing.classes]
+    def __init__(self, model: SceneModel, scene: Scene) -> None:
+        self.present = listing = present(scene, model.spec)
+        is_structure = model.vocabulary.structure[listing.classes]
         self.listed = len(listing.classes) - int(np.count_nonzero(is_structure))
-        observed = given_relations(scene, listing, artifact.spec.A)
         self.context = encode(
-            artifact.weights,
-            *(listing.classes, listing.presence, listing.log_counts, scene.room_type, observed),
+            model.weights,
+            listing.classes,
+            listing.presence,
+            listing.log_counts,
+            room=scene.room_type,
+            observed=given_relations(scene, listing, model.spec.A),
         )
-        self._objects, self._units = artifact.objects, artifact.relation_units
+        self._objects, self._units = model.objects, model.relation_units
         self._profile, self._room = scene.profile, scene.room_type
 
-    def absent_log_odds(self, absent: Indices, coverage: float) -> Floats:
-        """Return the log-odds that each of N unlisted classes is present, (N,).
+    def absent_log_odds(self, absent: Int[Indices, "N"], coverage: float) -> Float[Floats, "N"]:
+        """Return the log-odds of unlisted classes, if the list has this share of the classes."""
+        log_odds = self._objects.absent(
+            self.context.x,
+            self.present.classes,
+            self.present.presence,
+            profile=self._profile,
+            coverage=coverage,
+            room=self._room,
+        )
+        return log_odds[absent]
 
-        Args:
-            absent: (N,) indices of the unlisted classes.
-            coverage: listed share of the classes of the scene.
+    def given_rest(
+        self, *, explained: bool = False
+    ) -> tuple[Float[Floats, "n"], Float[Floats, "n n"]]:
+        """Return the log-odds of each listed class given the others, and their changes by each.
+
+        `ObjectScorer.given_rest` describes the results.
         """
-        listed = self.present.classes, self.present.presence
-        arguments = self.context.x, *listed, self._profile, coverage, self._room
-        return self._objects.absent(*arguments)[absent]
-
-    def given_rest(self, *, explained: bool = False) -> tuple[Floats, Floats]:
-        """See `ObjectScorer.given_rest`."""
         return self._objects.given_rest(
             self.context, self._profile, self._room, explained=explained
         )
 
-    def reasons_for_absent(self, candidates: Indices) -> Floats:
-        """See `ObjectScorer.reasons_for_absent`."""
-        return self._objects.reasons_for_absent(self.context, self._profile, candidates)
-
-    def room_log_p(self) -> Doubles:
-        """Return log p(t | objects) of each room type t, (C,), in a scene of unknown room type."""
+    def room_log_p(self) -> Float[Doubles, "C"]:
+        """Return log p(t | objects) of each room type t in a scene of unknown room type."""
         return self._room_log_p(self.context.x[None], self.present.presence[None])[0]
 
-    def _room_log_p(self, x: Floats, presence: Floats) -> Doubles:
+    def _room_log_p(
+        self, x: Float[Floats, "B H1"], presence: Float[Floats, "B n"]
+    ) -> Float[Doubles, "B C"]:
         return self._objects.room_log_p(x, self.present.classes, presence, self._profile)
 
-    def room_reasons(self) -> Doubles:
-        """Return how much each class changes the log-odds of each room type, (C, n).
+    def room_reasons(self) -> Float[Doubles, "C n"]:
+        """Return how much each class changes the log-odds of each room type.
 
         An entry is the log-odds of the room type given all n classes, minus its log-odds given the
         scene without the class.
@@ -175,28 +171,27 @@ class Posterior:
         without = self._room_log_p(x, presence * (1 - np.eye(len(presence), dtype=np.float32)))
         return (log_odds_of(self.room_log_p()) - log_odds_of(without)).T
 
-    def relation_log_odds(self) -> Floats:
-        """Return the log-odds of every relation between the classes of the scene, (A, n, n).
+    def relation_log_odds(self) -> Float[Floats, "A n n"]:
+        """Return the log-odds of every relation between the classes of the scene.
 
         The observation of a relation is not evidence for the same relation.
         """
         return self._units.log_odds(self._between)
 
-    def alone_log_odds(self) -> Floats:
-        """Return the log-odds of every relation given the objects alone, (A, n, n)."""
+    def alone_log_odds(self) -> Float[Floats, "A n n"]:
+        """Return the log-odds of every relation given the objects alone."""
         return to_log_odds(self._between.mean, self._between.spread)
 
-    def relation_change(self) -> Floats:
-        """Return the change of every logit by observed relations of other pairs, (A, n, n)."""
+    def relation_change(self) -> Float[Floats, "A n n"]:
+        """Return the change of every logit by observed relations of other pairs."""
         return self._between.shift_by_others
 
-    def log_odds_apart(self, i: Indices, j: Indices) -> tuple[Floats, Floats]:
-        """Return the log-odds (A, P) of all relations from classes i to j, and (A, P) from j to i.
+    def log_odds_of_pairs(
+        self, i: Int[Indices, "P"], j: Int[Indices, "P"]
+    ) -> tuple[Float[Floats, "A P"], Float[Floats, "A P"]]:
+        """Return the log-odds of all relations from classes i to j of the scene, and from j to i.
 
         The observed relations of a pair are not evidence for the relations of the same pair.
-
-        Args:
-            i, j: (P,) indices of the two classes of each pair in the scene.
         """
         log_odds = self._units.log_odds(self._between, leave_out_pair=True)
         # The compiled functions of the questions need contiguous arrays.
@@ -204,9 +199,12 @@ class Posterior:
         return forward, backward
 
     def placement_log_odds(
-        self, candidates: Indices, anchors: Indices, only: int | None = None
-    ) -> tuple[Floats, Floats]:
-        """See `RelationUnits.placement_log_odds`."""
+        self, candidates: Int[Indices, "N"], anchors: Int[Indices, "m"], only: int | None = None
+    ) -> tuple[Float[Floats, "N R m"], Float[Floats, "N R m"]]:
+        """Return the log-odds of R relations from the candidates to the anchors, and back.
+
+        `RelationUnits.placement_log_odds` describes the arguments.
+        """
         return self._units.placement_log_odds(self.context, candidates, anchors, only)
 
     @cached_property
@@ -214,7 +212,7 @@ class Posterior:
         return self._units.logits(self.context)
 
 
-def log_odds_of(log_p: Doubles) -> Doubles:
+def log_odds_of(log_p: Float[Doubles, "..."]) -> Float[Doubles, "..."]:
     """Return log p - log(1 - p). A p of nearly 1 counts as 1 - 1e-12."""
     return log_p - np.log(-np.expm1(np.minimum(log_p, -1e-12)))
 
@@ -224,24 +222,20 @@ def log_odds_of(log_p: Doubles) -> Doubles:
 # Validation scenes determine the coefficients, which are fields of `Calibration`.
 
 
-def calibrated(entry: CountSlope, z: Floats, n: int | NDArray[np.integer[Any]]) -> Floats:
-    """Return the calibrated log-odds of N logits, (N,); see `CountSlope` for the formula.
-
-    Args:
-        entry: calibration of a question.
-        z: (N,) logits.
-        n: number n of the formula, or an array (N,) with a number for each logit.
-    """
+def calibrated(
+    entry: CountSlope, z: Float[Floats, "N"], n: int | Int[NDArray[np.integer[Any]], "N"]
+) -> Float[Floats, "N"]:
+    """Return the calibrated log-odds of logits z by the formula of `CountSlope`."""
     return entry.intercept + entry.log_count * np.log(n) + entry.slope * z
 
 
 def calibrated_missing(
-    calibration: Calibration, z: Floats, n: int, coverage: float | None
-) -> Floats:
-    """Return the calibrated log-odds that N unlisted classes are present, (N,).
+    calibration: Calibration, z: Float[Floats, "N"], n: int, coverage: float | None
+) -> Float[Floats, "N"]:
+    """Return the calibrated log-odds that unlisted classes are present.
 
     Args:
-        z: (N,) log-odds of the classes at the coverage.
+        z: log-odds of the classes at the coverage.
         n: number of listed classes without structure.
         coverage: share of the scene that the request states; None if it states none.
     """
@@ -253,11 +247,11 @@ def calibrated_missing(
 
 def calibrated_at_coverage(
     entry: CoverageFit,
-    z: Floats,
-    n: int | NDArray[np.integer[Any]],
-    coverage: float | NDArray[np.floating[Any]],
-) -> Floats:
-    """Return the calibrated log-odds of N logits, (N,); see `CoverageFit` for the formula."""
+    z: Float[Floats, "N"],
+    n: int | Int[NDArray[np.integer[Any]], "N"],
+    coverage: float | Float[Floats, "N"],
+) -> Float[Floats, "N"]:
+    """Return the calibrated log-odds of logits z by the formula of `CoverageFit`."""
     log_n, log_s = np.log(n), np.log(np.maximum(coverage, LEAST_COVERAGE))
     change = entry.log_share * log_s + entry.both * log_n * log_s
     last = entry.last * (np.asarray(coverage) == 1)

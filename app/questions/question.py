@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from inspect import cleandoc, getdoc
 from typing import Any, Final, Generic, TypeAlias, TypeVar
 
+from app.model.scene_model import SceneModel
 from app.questions.answer import Fields
 from app.questions.reading import Reading
-from app.registry.artifact import Artifact
 from app.scene.scene import Scene
 from scene_client import schemas
 
@@ -56,13 +56,13 @@ class Question(Generic[RequestT]):
     """
 
     answer: Callable[..., Fields]
-    read: Callable[[RequestT, Artifact, Reading], Options]
+    read: Callable[[RequestT, SceneModel, Reading], Options]
     request: type[RequestT]
     response: type[schemas.Answer]
     examples: Mapping[str, Example]
     example_answer: Fields
     description: str
-    ask_all: Callable[[Artifact, tuple[Scene, ...]], Iterable[Fields]] | None = None
+    ask_all: Callable[[SceneModel, tuple[Scene, ...]], Iterable[Fields]] | None = None
     samples: bool = False
 
     def __post_init__(self) -> None:
@@ -70,11 +70,11 @@ class Question(Generic[RequestT]):
         self.summary = getdoc(self.request) or ""
         self.description = cleandoc(self.description)
 
-    def warm_up(self, artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterable[Fields]:
+    def warm_up(self, model: SceneModel, scenes: tuple[Scene, ...]) -> Iterable[Fields]:
         """Ask a model about scenes, and return the answers. The first call compiles the kernels."""
         if self.ask_all is not None:
-            return self.ask_all(artifact, scenes)
-        return (self.answer(artifact, scene) for scene in scenes)
+            return self.ask_all(model, scenes)
+        return (self.answer(model, scene) for scene in scenes)
 
 
 LABELS: Final[dict[str, Any]] = {"objects": ["bed", "nightstand", "lamp"]}

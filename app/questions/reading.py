@@ -3,7 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import cached_property
 from itertools import compress, count
@@ -12,6 +12,7 @@ from app.errors import ContradictionError, InvalidRequestError, Location
 from app.questions.names import ErrorList, LookUps, Names, Unknown
 from app.questions.scene_warnings import scene_warnings
 from app.scene.geometry import Viewpoint
+from app.scene.relation_table import RelationTable, Triple
 from app.scene.roles import RoleCounts
 from app.scene.scene import Scene, SceneObject, observe
 from app.scene.spatial_relations import CANONICAL, canonicalise, support_cycle
@@ -24,8 +25,6 @@ from scene_client.schemas import (
     SceneRequest,
     SceneWarning,
 )
-
-Triple = tuple[int, int, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,8 +51,6 @@ class Reading:
         unknown: unknown labels of the request and their treatment.
         left_out: pairs (id, label) of the ignored objects.
         observed: relations that the service has derived from poses, or None without poses.
-        flipped: relations of `scene` that the request states by their opposite, for example right
-            instead of left. Each is a triple (relation, subject, object) of indices.
         warnings: warnings about probable mistakes in the scene.
     """
 
@@ -61,13 +58,13 @@ class Reading:
     unknown: Unknown
     left_out: list[tuple[str, str]]
     observed: list[ObservedRelation] | None = None
-    flipped: frozenset[Triple] = frozenset()
     warnings: list[SceneWarning] = field(default_factory=list)
 
     @property
     def vocabulary(self) -> Vocabulary:
         """The classes of the model, and those of the words that are read by their meaning."""
-        return self.unknown.vocabulary.with_words(list(self.unknown.words.values()))
+        words = list(self.unknown.words.values())
+        return self.unknown.vocabulary.with_words(words) if words else self.unknown.vocabulary
 
     @cached_property
     def names(self) -> Names:
@@ -117,12 +114,16 @@ def read_scene(
         errors.add(InvalidRequestError, ("objects",), message)
     errors.raise_any()
 
-    reading = Reading(Scene(objects, None, False, room, profile), unknown, left_out)
+    reading = Reading(Scene(objects, None, room, profile), unknown, left_out)
     stated = _stated(request, ids) if detections or request.relations is not None else None
     if stated is not None:
-        triples, reading.flipped = _triples(stated, reading, errors)
+        is_opposite = _triples(stated, reading, errors)
         errors.raise_any()
-        reading.scene = Scene(objects, triples, request.relations_complete, room, profile)
+        complete_for = len(objects) if request.relations_complete else None
+        table = RelationTable.stated(
+            is_opposite, list(is_opposite.values()), complete_for=complete_for
+        )
+        reading.scene = replace(reading.scene, relations=table)
     if detections:
         vocabulary = reading.vocabulary
         in_frame, view = reading.scene, request.viewpoint
@@ -134,10 +135,10 @@ def read_scene(
             stand_in=vocabulary.stand_in,
             roles=roles,
         )
-        if reading.scene.poses is not None:
+        if reading.scene.has_boxes:
             reading.observed = [
                 ObservedRelation(objects[i].id, CANONICAL[a], objects[j].id)  # type: ignore[arg-type]
-                for a, i, j in reading.scene.relations or ()
+                for a, i, j in reading.scene.triples
             ]
         derived = reading.observed is not None
         reading.warnings = scene_warnings(
@@ -272,11 +273,8 @@ def _stated(
 
 def _triples(
     stated: Sequence[tuple[Location, str, RelationName, str]], reading: Reading, errors: ErrorList
-) -> tuple[tuple[Triple, ...], frozenset[Triple]]:
-    """Return the canonical triples of the stated relations.
-
-    The second value contains the triples that the request states by the opposite relation.
-    """
+) -> dict[Triple, bool]:
+    """Return the canonical triples of the stated relations, with True if stated by the opposite."""
     names, some_ignored = reading.names, bool(reading.left_out)
     triples: dict[Triple, bool] = {}
     for location, first, relation, second in stated:
@@ -302,4 +300,4 @@ def _triples(
         ids = [reading.scene.objects[number].id for number in circle]
         message = f"objects hold each other in a circle: {' on or in '.join(ids)}"
         errors.add(ContradictionError, ("relations",), message)
-    return tuple(triples), frozenset([triple for triple, flipped in triples.items() if flipped])
+    return triples

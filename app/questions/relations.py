@@ -12,32 +12,42 @@ instance counts as observed for all instances. Example: one chair is to the left
 another chair is to the right. Then left and right both count as observed for each chair.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled, inlined
 from app.errors import InvalidRequestError, Location
 from app.inference.quadrature import NO_UNIT
-from app.questions.answer import Fields, significant
+from app.model.scene_model import SceneModel
+from app.questions.answer import Fields, best, significant
 from app.questions.names import ErrorList
-from app.questions.placements import held_objects
+from app.questions.placements import supported_objects
 from app.questions.posterior import (
     Posterior,
     Present,
     exclusive,
     relation_probability,
-    relations_given,
 )
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
-from app.questions.ranking import best
-from app.questions.reading import Reading, Triple
-from app.registry.artifact import Artifact
-from app.scene.scene import Scene, instance_evidence
-from app.scene.spatial_relations import ON_TOP, SUPPORTS, canonicalise, opposite, relation_names
+from app.questions.reading import Reading
+from app.scene.relation_table import RelationTable
+from app.scene.scene import Scene
+from app.scene.spatial_relations import (
+    CANONICAL,
+    ON_TOP,
+    SUPPORTS,
+    canonicalise,
+    opposite,
+    relation_names,
+)
 from scene_client.schemas import RelationsAnswer, RelationsRequest, SceneWarning
+
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 EXPECTED = 0.5
 """Minimum probability of the expected relation of a disagreement.
@@ -52,14 +62,13 @@ _MOST_EXCLUDED = np.float32(0.01)
 
 
 def relations(
-    artifact: Artifact,
+    model: SceneModel,
     scene: Scene,
     *,
     top_k: int = 20,
     min_probability: float = 0.0,
     pairs: Sequence[tuple[int, int]] | None = None,
     include_opposites: bool = False,
-    flipped: Collection[Triple] = (),
 ) -> Fields:
     """Return the likeliest relations between the objects of a scene, and the disagreements.
 
@@ -78,8 +87,6 @@ def relations(
             all pairs.
         include_opposites: whether the answer also lists opposite relations, such as right(y, x) for
             left(x, y).
-        flipped: relations of the scene that the request states by their opposite. Disagreements
-            use the words of the request.
 
     Returns:
         The fields `relations` and `disagreements` of `scene_client.schemas.RelationsAnswer`. The
@@ -87,32 +94,36 @@ def relations(
         `observed_probability` comes first. Entries with equal values are ordered by their indices.
         If the training scenes of the model have no relations, the answer lists observed relations
         only. Then the field `warnings` says so.
+
+    Example:
+        >>> scene = Scene(model.vocabulary.bare_objects(["lamp", "nightstand"]))
+        >>> likeliest = relations(model, scene)["relations"][0]
+        >>> likeliest["subject"], likeliest["relation"], likeliest["object"]
+        ('lamp', 'on-top', 'nightstand')
     """
     if not scene.objects:
         return {"relations": [], "disagreements": []}
-    posterior, A = Posterior(artifact, scene), artifact.spec.A
-    present, slopes = posterior.present, artifact.relation_slopes
-    judged = _judged(artifact, present, pairs)
+    posterior, A = Posterior(model, scene), model.spec.A
+    present, slopes = posterior.present, model.relation_slopes
+    judged = _judged(model, present, pairs)
     # This limit is slightly lower than the requested minimum, because the final comparison uses
     # rounded probabilities.
     least = min_probability * (1 - 1e-5)
-    table = slopes.relation_given if relations_given(scene) else slopes.relation
+    table = slopes.relation if posterior.context.observed is None else slopes.relation_given
     log_odds, log_counts, row = posterior.relation_log_odds(), present.log_counts, present.row
-    evidence = _evidence(artifact, posterior, scene)
+    evidence = _evidence(model, posterior, scene)
     subjects, objects, kinds, p, of_model = _likeliest_relations(
         table, log_odds, log_counts, row, judged, evidence, least, include_opposites, top_k
     )
     columns = subjects.tolist(), objects.tolist(), kinds.tolist(), significant(p)
     expected = significant(of_model)
-    disagreements = _disagreements(
-        artifact, scene, posterior, judged, flipped, top_k=top_k, least=least
-    )
-    names, observed, things = relation_names(A), set(scene.relations or ()), scene.objects
-    judges = artifact.spec.judges_relations
+    disagreements = _disagreements(model, scene, posterior, judged, top_k=top_k, least=least)
+    names, observed, things = relation_names(A), set(scene.triples), scene.objects
+    judges = model.spec.judges_relations
     entries: list[Fields] = []
     for subject, object_, kind, probability, own in zip(*columns, expected, strict=True):
-        ends = (subject, object_) if kind < A else (object_, subject)
-        is_observed = (kind % A, *ends) in observed
+        pair = (subject, object_) if kind < A else (object_, subject)
+        is_observed = (kind % A, *pair) in observed
         if probability < min_probability or not (judges or is_observed):
             continue
         entry: Fields = {
@@ -129,40 +140,45 @@ def relations(
     return {"relations": entries, "disagreements": disagreements, "warnings": warnings}
 
 
-def _evidence(artifact: Artifact, posterior: Posterior, scene: Scene) -> NDArray[np.float32]:
+def _evidence(
+    model: SceneModel, posterior: Posterior, scene: Scene
+) -> Float[NDArray[np.float32], "A N N"]:
     """Return the evidence about the relations of a scene; see `_likeliest_relations`.
 
-    The probability of an observed relation is the product of the confidences of its objects. An
+    The probability of an observed relation is multiplied by the confidences of its objects. An
     object on or in one object is not on or in another object.
     """
-    A = artifact.spec.A
-    if scene.excluded is None and not relations_given(scene):
+    A, N, table = model.spec.A, len(scene.objects), scene.relations
+    if table is None or not len(table):
         return np.zeros((0, 0, 0), np.float32)
-    holds, observed = instance_evidence(scene)
+    excluded = np.zeros((len(CANONICAL), N, N), np.bool_)
+    excluded[table.relation, table.subject, table.object] = True
     # A stacked relation excludes all other relations of its two objects. Left and front exclude
     # stacked relations.
-    lateral, stacked = holds[:ON_TOP].any(0), holds[ON_TOP:].any(0)
-    excluded = observed | stacked | stacked.T
-    excluded[ON_TOP:] |= lateral | lateral.T
-    held = held_objects(artifact, posterior, scene)
+    holds, (beside, stacked) = table.holding, np.zeros((2, N, N), np.bool_)
+    is_stacked = holds.relation >= ON_TOP
+    for pairs, rows in ((beside, ~is_stacked), (stacked, is_stacked)):
+        pairs[holds.subject[rows], holds.object[rows]] = True
+    excluded |= stacked | stacked.T
+    excluded[ON_TOP:] |= beside | beside.T
+    supported = supported_objects(model, posterior, scene)
     for a in SUPPORTS:
-        excluded[a, held] = True
-    if scene.excluded is not None:
-        excluded |= scene.excluded
+        excluded[a, supported] = True
     evidence = np.where(excluded[:A], _EXCLUDED, np.float32(np.nan))
     confidence = np.array([thing.confidence for thing in scene.objects], np.float32)
-    units = holds[:A].nonzero()
-    evidence[units] = confidence[units[1]] * confidence[units[2]]
+    observed = holds.rows(holds.relation < A)
+    p = observed.probability * confidence[observed.subject] * confidence[observed.object]
+    evidence[observed.relation, observed.subject, observed.object] = p
     return evidence
 
 
 def _judged(
-    artifact: Artifact, present: Present, pairs: Sequence[tuple[int, int]] | None
-) -> NDArray[np.bool_]:
-    """Return a bool mask (N subjects, N objects) of the ordered pairs to judge."""
+    model: SceneModel, present: Present, pairs: Sequence[tuple[int, int]] | None
+) -> Bool[Mask, "N N"]:
+    """Return whether to judge each ordered pair of objects."""
     size = len(present.row)
     if pairs is None:
-        things = ~artifact.vocabulary.structure[present.classes][present.row]
+        things = ~model.vocabulary.structure[present.classes][present.row]
         return things[:, None] & things & ~np.eye(size, dtype=np.bool_)
     judged = np.zeros((size, size), dtype=np.bool_)
     for subject, object_ in pairs:
@@ -171,73 +187,107 @@ def _judged(
 
 
 def _disagreements(
-    artifact: Artifact,
+    model: SceneModel,
     scene: Scene,
     posterior: Posterior,
-    judged: NDArray[np.bool_],
-    flipped: Collection[Triple],
+    judged: Bool[Mask, "N N"],
     *,
     top_k: int,
     least: float,
 ) -> list[Fields]:
     """Return the fields of `scene_client.schemas.Disagreement` for each disagreement.
 
-    Disagreements with the largest ratio of `probability` to `observed_probability` come first. If a
-    pair has several observed relations, the first of them in `CANONICAL` defines the subject of the
-    disagreement. A relation is never expected if the machine has no unit for it. ``judged`` is
-    (N, N) bool. The function judges a pair of objects if one of its two orders is True.
+    Disagreements with the largest ratio of `probability` to `observed_probability` come first. The
+    observed probability is that of the likeliest observed relation. A relation is never expected if
+    the machine has no unit for it, or if two objects of the same classes have it. The function
+    judges a pair of objects if one of its two orders is True in ``judged``.
     """
-    A = artifact.spec.A
-    stated = [triple for triple in scene.relations or () if triple[0] < A]
-    if not stated:
+    A, row = model.spec.A, posterior.present.row
+    if scene.relations is None or not scene.triples:
         return []
-    present = posterior.present
-    pairs = _observed_pairs(np.array(stated), present.row, judged, len(present.classes), A)
-    subjects, objects, holds, of_classes = pairs
+    observed = scene.relations.holding
+    of_model = observed.rows(observed.relation < A)
+    holds, of_classes = _named_relations(of_model, row, len(posterior.present.classes), A)
+    subjects, objects = _observed_pairs(holds, judged, A)
     if not len(subjects):
         return []
-    i, j = present.row[subjects], present.row[objects]
-    table, least = artifact.relation_slopes.relation_given, max(least, EXPECTED)
-    log_odds, log_counts = posterior.log_odds_apart(i, j), present.log_counts
-    chosen, expected, p, observed_p = _disagreeing(
-        table, *log_odds, log_counts[i] + log_counts[j], holds, of_classes, least, top_k
-    )
-    columns = *(part[chosen].tolist() for part in (subjects, objects, holds)), expected.tolist()
+    i, j = row[subjects], row[objects]
+    log_odds, log_counts = posterior.log_odds_of_pairs(i, j), posterior.present.log_counts
+    slopes, counts = model.relation_slopes.relation_given, log_counts[i] + log_counts[j]
+    to, back = (relation_probability(slopes, part[None], counts)[0] for part in log_odds)
+    # A relation cannot hold in both directions; see `exclusive`.
+    total = np.maximum(to + back, np.float32(1.0))
+    p = np.concatenate([to / total, back / total]).T.astype(np.float64)
+    has_unit = np.concatenate(log_odds).T > NO_UNIT
+    expected, every = np.where(has_unit, p, -1.0).argmax(1), np.arange(len(p))
+    p_observed = np.where(holds[subjects, objects], p, 0.0).max(1)
+    likeliest = p[every, expected]
+    usable = has_unit.any(1) & ~of_classes[i, j, expected] & (likeliest > p_observed)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = likeliest / p_observed
+    chosen = best(ratio, usable & (likeliest >= max(least, EXPECTED)), top_k)
+    columns = subjects[chosen].tolist(), objects[chosen].tolist(), expected[chosen].tolist()
+    names = holds[subjects, objects][chosen]
     return [
         {
-            **_names(scene, A, flipped, subject, object_, bits, kind),
+            **_names(scene, A, subject, object_, flags.nonzero()[0].tolist(), kind),
             "probability": probability,
             "observed_probability": observed_probability,
         }
-        for subject, object_, bits, kind, probability, observed_probability in zip(
-            *columns, significant(p), significant(observed_p), strict=True
+        for subject, object_, kind, flags, probability, observed_probability in zip(
+            *columns,
+            names,
+            significant(likeliest[chosen]),
+            significant(p_observed[chosen]),
+            strict=True,
         )
     ]
 
 
+def _named_relations(
+    stated: RelationTable, row: Int[Indices, "N"], n: int, A: int
+) -> tuple[Bool[Mask, "N N B"], Bool[Mask, "n n B"]]:
+    """Return which of the B = 2A relations hold from each object, and class, to each other one.
+
+    Relation A + a is the opposite of relation a.
+    """
+    N, a = len(row), stated.relation
+    holds, of_classes = np.zeros((N, N, 2 * A), np.bool_), np.zeros((n, n, 2 * A), np.bool_)
+    for grid, i, j in (
+        (holds, stated.subject, stated.object),
+        (of_classes, row[stated.subject], row[stated.object]),
+    ):
+        grid[i, j, a] = grid[j, i, A + a] = True
+    return holds, of_classes
+
+
+def _observed_pairs(
+    holds: Bool[Mask, "N N B"], judged: Bool[Mask, "N N"], A: int
+) -> tuple[Int[Indices, "P"], Int[Indices, "P"]]:
+    """Return the subjects and objects of the pairs with an observed relation, in either order.
+
+    The subject is that of the first of the pair's relations in `CANONICAL`.
+    """
+    forward = holds[..., :A]
+    first = np.where(forward.any(-1), forward.argmax(-1), A)
+    x, y = np.triu(holds.any(-1) & (judged | judged.T), 1).nonzero()
+    swapped = first[y, x] < first[x, y]
+    return np.where(swapped, y, x), np.where(swapped, x, y)
+
+
 def _names(
-    scene: Scene,
-    A: int,
-    flipped: Collection[Triple],
-    subject: int,
-    object_: int,
-    holds: int,
-    expected: int,
+    scene: Scene, A: int, subject: int, object_: int, observed_kinds: list[int], expected: int
 ) -> Fields:
     """Return the names of a disagreement, from the subject of the relation in the request.
 
-    Args:
-        A: number of canonical relations that the machine knows.
-        flipped: relations that the request states by their opposite.
-        holds: bit set of the observed relations; see `_observed_pairs`.
-        expected: number of the expected relation.
+    `observed_kinds` and `expected` are indices in `relation_names(A)`.
     """
     names = relation_names(A)
-    observed = [name for bit, name in enumerate(names) if holds >> bit & 1]
+    observed = [names[kind] for kind in observed_kinds]
     triples = {canonicalise(subject, relation, object_) for relation in observed}
     # A relation comes from this subject if the request states it with this subject, or if the
     # request states its opposite with the other object as subject.
-    if all((triple[1] == subject) == (triple in flipped) for triple in triples):
+    if all((triple[1] == subject) == (triple in scene.opposites) for triple in triples):
         subject, object_ = object_, subject
         names, observed = tuple(map(opposite, names)), list(map(opposite, observed))
     return {
@@ -248,13 +298,12 @@ def _names(
     }
 
 
-def _read(request: RelationsRequest, _: Artifact, reading: Reading) -> Options:
+def _read(request: RelationsRequest, _: SceneModel, reading: Reading) -> Options:
     return {
         "top_k": request.top_k,
         "min_probability": request.min_probability,
         "pairs": None if request.pairs is None else _pairs(request, reading),
         "include_opposites": request.include_opposites,
-        "flipped": reading.flipped,
     }
 
 
@@ -348,98 +397,6 @@ def with_evidence(p, evidence, opposite):
     if opposite > _EXCLUDED:
         return min(p, _MOST_EXCLUDED, max(np.float32(1.0) - opposite, np.float32(0.0)))
     return min(p, _MOST_EXCLUDED) if evidence == _EXCLUDED else p
-
-
-@compiled
-def _observed_pairs(triples, row, judged, classes, relations):
-    """Return the pairs of objects with at least one observed relation, and their relations.
-
-    A bit set contains the relations of a pair. Bit a stands for relation a from subject to object.
-    Bit A + a stands for relation a from object to subject.
-
-    Args:
-        triples: (T, 3) observed relations, each as (relation, subject, object).
-        row: (N,) index of each object's class among the n classes.
-        judged: (N, N) bool, True for the ordered pairs of objects to judge. The result contains a
-            pair if one of its two orders is True.
-        classes: number n of classes in the scene.
-        relations: number A of canonical relations.
-
-    Returns:
-        Four arrays (P,): subject, object, bit set of the relations between these two objects, and
-        bit set of the relations between any two objects of their classes.
-    """
-    size = len(row)
-    holds, of_classes = np.zeros((size, size), np.int64), np.zeros((classes, classes), np.int64)
-    for t in range(len(triples)):
-        a, x, y = triples[t, 0], triples[t, 1], triples[t, 2]
-        holds[x, y] |= 1 << a
-        holds[y, x] |= 1 << (relations + a)
-        of_classes[row[x], row[y]] |= 1 << a
-        of_classes[row[y], row[x]] |= 1 << (relations + a)
-    columns = np.empty((4, min(len(triples), size * size)), np.int64)
-    pairs, forward = 0, (1 << relations) - 1
-    for x in range(size):
-        for y in range(x + 1, size):
-            if holds[x, y] and (judged[x, y] or judged[y, x]):
-                # The subject of the pair is the subject of its observed relation with the lowest
-                # number. n & -n is the lowest bit of n.
-                from_x, from_y = holds[x, y] & forward, holds[y, x] & forward
-                y_is_lower = from_y != 0 and (from_y & -from_y) < (from_x & -from_x)
-                swapped = from_x == 0 or y_is_lower
-                subject, object_ = (y, x) if swapped else (x, y)
-                columns[0, pairs], columns[1, pairs] = subject, object_
-                columns[2, pairs] = holds[subject, object_]
-                columns[3, pairs] = of_classes[row[subject], row[object_]]
-                pairs += 1
-    return columns[0, :pairs], columns[1, :pairs], columns[2, :pairs], columns[3, :pairs]
-
-
-@compiled
-def _disagreeing(slopes, forward, backward, log_counts, holds, of_classes, least, count):
-    """Return the `count` pairs whose observed relations differ most from the expected relation.
-
-    The expected relation of a pair is its likeliest relation. The observed probability is the
-    probability of the likeliest observed relation. Pairs are ranked by the probability of the
-    expected relation divided by the observed probability. The result contains a pair only if its
-    expected relation is not observed between any two objects of its classes.
-
-    Args:
-        slopes: (A, 3) table of `RelationSlopes`.
-        forward: (A, P) log-odds of the relations from subject to object.
-        backward: (A, P) log-odds of the relations from object to subject.
-        log_counts: (P,) log of the number of object pairs with these two classes.
-        holds, of_classes: (P,) bit sets of the relations of the pair and of its classes; see
-            `_observed_pairs`.
-        least: minimum probability of an expected relation.
-        count: maximum number k of pairs.
-
-    Returns:
-        Four arrays (k,): index of the pair, number of the expected relation, probability of the
-        expected relation, and observed probability.
-    """
-    A, P = forward.shape
-    to = relation_probability(slopes, forward.reshape(1, A, P), log_counts)[0]
-    back = relation_probability(slopes, backward.reshape(1, A, P), log_counts)[0]
-    expected, ratio = np.empty(P, np.int64), np.empty(P, np.float64)
-    likely, usable = np.empty((2, P), np.float64), np.zeros(P, np.bool_)
-    p = np.empty(2 * A, forward.dtype)
-    for k in range(P):
-        for a in range(A):
-            p[a], p[A + a] = exclusive(to[a, k], back[a, k])
-        top, observed = -1, np.float64(0.0)
-        for name in range(2 * A):
-            log_odds = forward[name, k] if name < A else backward[name - A, k]
-            if log_odds > NO_UNIT and (top < 0 or p[name] > p[top]):
-                top = name
-            if holds[k] >> name & 1:
-                observed = max(observed, np.float64(p[name]))
-        if top >= 0 and not of_classes[k] >> top & 1 and p[top] > observed and p[top] >= least:
-            usable[k], expected[k] = True, top
-            likely[0, k], likely[1, k] = p[top], observed
-            ratio[k] = likely[0, k] / observed
-    indices = best(ratio, usable, count)
-    return indices, expected[indices], likely[0][indices], likely[1][indices]
 
 
 _NO_RELATIONS: Final = SceneWarning(

@@ -13,18 +13,18 @@ from typing import Any, Final
 import numpy as np
 
 from app.inference.elementary import softmax
+from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, reasons, significant
 from app.questions.names import ErrorList
 from app.questions.posterior import LEAST_CHANGE, Posterior
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
 from app.questions.reading import Reading
-from app.registry.artifact import Artifact
 from app.scene.scene import Scene
 from scene_client.schemas import RoomsAnswer, RoomsRequest, SceneWarning
 
 
 def rooms(
-    artifact: Artifact,
+    model: SceneModel,
     scene: Scene,
     *,
     top_k: int = 5,
@@ -43,18 +43,23 @@ def rooms(
     Returns:
         The field `room_types` of `scene_client.schemas.RoomsAnswer`. The list is empty if the model
         has no room types. Then the field `warnings` says so.
+
+    Example:
+        >>> scene = Scene(model.vocabulary.bare_objects(["bed", "nightstand"]))
+        >>> rooms(model, scene)["room_types"][0]["room_type"]
+        'bedroom'
     """
-    C = artifact.spec.C
+    C = model.spec.C
     among = np.arange(C) if candidates is None else np.array([*candidates], dtype=np.int64)
     if not len(among):
         return {"warnings": [] if C else [_NO_ROOM_TYPES], "room_types": []}
-    posterior = Posterior(artifact, replace(scene, room_type=None))
-    sharpness = artifact.calibration.rooms.of(posterior.listed)
+    posterior = Posterior(model, replace(scene, room_type=None))
+    sharpness = model.calibration.rooms.of(posterior.listed)
     p = softmax(sharpness * posterior.room_log_p()[among])
     first = np.argsort(-p, kind="stable")[:top_k]
     entries: list[Fields] = []
     for t, probability in zip(among[first].tolist(), significant(p[first]), strict=True):
-        name = artifact.vocabulary.room_types[t]
+        name = model.vocabulary.room_types[t]
         entries.append({"room_type": name, "probability": probability})
         if candidates is not None and candidates[t] != [name]:
             entries[-1]["listed_as"] = candidates[t]
@@ -66,7 +71,7 @@ def rooms(
     return {"room_types": entries}
 
 
-def _read(request: RoomsRequest, _: Artifact, reading: Reading) -> Options:
+def _read(request: RoomsRequest, _: SceneModel, reading: Reading) -> Options:
     candidates = None
     if request.candidates is not None:
         errors = ErrorList()

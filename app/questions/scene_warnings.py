@@ -188,10 +188,10 @@ def _fits(sized: Sequence[_Sized]) -> list[_Fit]:
         # The yaw decides which side of the box is nearer to the y axis.
         if abs(math.sin(thing.yaw)) > abs(math.cos(thing.yaw)):
             x, y = y, x
-        usual = _proportion(typical[2], typical[0], typical[1])
+        expected = _proportion(typical[2], typical[0], typical[1])
         by_z, by_y = _proportion(z, x, y), _proportion(y, x, z)
         by_own_z = _proportion(own.z, own.x, own.y)
-        fits.append((thing, abs(by_z - usual), abs(by_y - usual), abs(by_own_z - usual)))
+        fits.append((thing, abs(by_z - expected), abs(by_y - expected), abs(by_own_z - expected)))
     return fits
 
 
@@ -215,9 +215,9 @@ def _rolled(fits: Sequence[_Fit], detections: Mapping[int, Detection]) -> list[S
 
 def _y_up(fits: Sequence[_Fit]) -> list[SceneObject]:
     """Return the furniture that fits its class better if y points up, if most furniture does."""
-    gains = [by_z - by_y for _, by_z, by_y, _ in fits]
-    total = sum(gains)
-    agree = total >= _MOST * sum(map(abs, gains))
-    if len(gains) < _LEAST or not agree or total < _BETTER * len(gains):
+    advantages = [by_z - by_y for _, by_z, by_y, _ in fits]
+    total = sum(advantages)
+    agree = total >= _MOST * sum(map(abs, advantages))
+    if len(advantages) < _LEAST or not agree or total < _BETTER * len(advantages):
         return []
-    return [fit[0] for fit, gain in zip(fits, gains, strict=True) if gain > 0]
+    return [fit[0] for fit, advantage in zip(fits, advantages, strict=True) if advantage > 0]

@@ -1,13 +1,12 @@
-"""Artifacts: the files of one version of a model, and the loaded model.
+"""Artifacts: the files of one version of a model.
 
 Every load reads each file once and checks it against its checksum. Symbolic links are not followed.
 """
 
 import errno
 import hashlib
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -16,21 +15,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from app.inference import MachineSpec, Weights
-from app.inference.chains import SceneChains
-from app.inference.objects import LARGEST_WEIGHT, ObjectScorer
-from app.inference.relation_units import RelationUnits, StandIns, relation_units
+from app.inference.objects import LARGEST_WEIGHT
 from app.inference.weights import layout
+from app.model import Counts, Offsets, Places, SceneModel
 from app.registry.card import render_card
-from app.registry.counts import Counts
-from app.registry.description import Calibration, Description, RelationSlopes
+from app.registry.description import Description
 from app.registry.durable import read_file, sync_directory, write_file
 from app.registry.errors import ArtifactError, cause
 from app.registry.manifest import CARD, MANIFEST, WEIGHTS, FileEntry, Manifest
-from app.registry.meaning import RowMap
-from app.registry.offsets import Offsets
-from app.registry.places import Places
-from app.registry.tensors import StorageDtype, pack, require_equal, unpack
-from app.scene.vocabulary import Vocabulary, Word
+from app.registry.tensors import StorageDtype, pack, read_group, require_equal, unpack
 from scene_client.schemas import ModelReference
 
 MAX_MANIFEST_BYTES: Final = 4 * 2**20
@@ -39,42 +32,26 @@ MAX_CARD_BYTES: Final = 2**20
 MAX_WEIGHTS_BYTES: Final = 2**30
 """Default maximum size of the weights file in bytes."""
 
-_MOST_KEPT: Final = 4  # models with words that a model keeps, of about 20 MB each
-
-RARELY: Final = 1 / 500
-"""A class is rarely shown if a smaller share of the training scenes shows it."""
-
 _DTYPES: Final = {float: "float32", int: "int32"}
 
 
 @dataclass(frozen=True, eq=False)
 class Artifact:
-    """A verified model, ready to answer questions.
+    """The verified files of one version of a model, and the model that they contain.
 
     Attributes:
         manifest: description of the model and its files.
-        weights: weights of the machine.
-        vocabulary: names of the model's V object classes and C room types.
-        calibration: conversion of log-odds into probabilities.
+        model: the model.
         digest: SHA-256 of the manifest in hexadecimal. It depends on all files of the artifact.
         card: model card in Markdown.
         path: directory of the artifact.
-        offsets: vectors in metres between the centres of related objects; None without poses in the
-            training scenes.
-        counts: statistics of the numbers of instances; None without such numbers.
-        places: counts of where objects stand; None without relations in the training scenes.
     """
 
     manifest: Manifest
-    weights: Weights
-    vocabulary: Vocabulary
-    calibration: Calibration
+    model: SceneModel
     digest: str
     card: str
     path: Path
-    offsets: Offsets | None = None
-    counts: Counts | None = None
-    places: Places | None = None
 
     @cached_property
     def key(self) -> tuple[str, str]:
@@ -88,90 +65,6 @@ class Artifact:
         return ModelReference(
             name=name, version=version, variant=self.manifest.variant, digest=self.digest
         )
-
-    @cached_property
-    def spec(self) -> MachineSpec:
-        """Sizes and form of the machine."""
-        return self.weights.spec
-
-    @cached_property
-    def objects(self) -> ObjectScorer:
-        """Log-odds of classes and room types. The first access prepares the weights."""
-        return ObjectScorer(self.weights)
-
-    @cached_property
-    def relation_units(self) -> RelationUnits:
-        """Relation units of the machine. The first access prepares the weights."""
-        return relation_units(self.weights)
-
-    @cached_property
-    def relation_slopes(self) -> RelationSlopes:
-        """Calibration of the relations, as arrays."""
-        return RelationSlopes.of(self.calibration)
-
-    @cached_property
-    def intruder_prior(self) -> NDArray[np.float64]:
-        """(V,) log prior that an intruder has each class, up to a constant: alpha · popularity.
-
-        A class that no training scene shows counts as the rarest other class.
-        """
-        calibration, none = self.calibration, np.zeros(0, np.int64)
-        if not calibration.popularity:
-            return np.zeros(self.spec.V)
-        popularity = np.array(calibration.popularity, dtype=np.float64)
-        nothing = self.weights["c1"], none, none.astype(np.float32)
-        alone = self.objects.absent(*nothing, profile=None, coverage=1.0)
-        rarest, alpha = np.nanmin(popularity), calibration.popularity_weight
-        return np.where(np.isnan(popularity), alone - (1 - alpha) * rarest, alpha * popularity)
-
-    @cached_property
-    def rarely_shown(self) -> NDArray[np.bool_]:
-        """(V,) True for classes that fewer than `RARELY` of the training scenes show."""
-        if not self.calibration.popularity:
-            return np.zeros(self.spec.V, np.bool_)
-        popularity = np.array(self.calibration.popularity, dtype=np.float64)
-        return ~(popularity >= math.log(RARELY / (1 - RARELY)))  # NaN: no training scene
-
-    @cached_property
-    def row_map(self) -> RowMap:
-        """Regression from word vectors to weights. The first access takes about 0.5 s."""
-        return RowMap.fit(self.weights, self.vocabulary)
-
-    def with_words(self, words: Sequence[Word]) -> "Artifact":
-        """Return the model with a further class for each word, in the order of the words.
-
-        The weights of such a class are predicted (`RowMap`). Its relations and its places are those
-        of the nearest class. It never raises an alarm.
-        """
-        if not words:
-            return self
-        names = tuple(word.name for word in words)
-        kept = self._with_words.get(names)
-        if kept is None:
-            popularity = self.calibration.popularity
-            popularity = (*popularity, *(None for _ in words if popularity))
-            kept = replace(
-                self,
-                weights=self.row_map.with_words(self.weights, words),
-                vocabulary=self.vocabulary.with_words(words),
-                calibration=self.calibration.model_copy(update={"popularity": popularity}),
-            )
-            # A reference to this model would close a cycle; see `app.serving.runtime`.
-            stand_in = kept.vocabulary.stand_in
-            vars(kept)["relation_units"] = StandIns(kept.weights, self.relation_units, stand_in)
-            if len(self._with_words) >= _MOST_KEPT:
-                self._with_words.clear()  # in one step, because other threads read it
-            self._with_words[names] = kept
-        return kept
-
-    @cached_property
-    def _with_words(self) -> dict[tuple[str, ...], "Artifact"]:
-        return {}
-
-    @cached_property
-    def scene_chains(self) -> SceneChains:
-        """Compiled Gibbs chains that sample scenes."""
-        return SceneChains(self.weights, self.relation_units, self.calibration.rare_rooms)
 
 
 def write_artifact(
@@ -242,24 +135,24 @@ def load_artifact(
     digest = _digest(text)
     if previous is not None and previous.digest == digest:
         return previous
-    tensors = unpack(stored, manifest.tensors)
+    model = _model(manifest, unpack(stored, manifest.tensors))
+    return Artifact(manifest, model, digest, card, directory)
+
+
+def _model(manifest: Manifest, tensors: dict[str, NDArray[Any]]) -> SceneModel:
     offsets, counts, places = (
         {name: tensors.pop(name) for name in list(tensors) if name.startswith(group.prefix)}
         for group in (Offsets, Counts, Places)
     )
     weights = _weights(manifest, tensors)
-    A, V, C = weights.spec.A, weights.spec.V, len(manifest.vocabulary.room_types)
-    return Artifact(
-        manifest=manifest,
-        weights=weights,
-        vocabulary=manifest.vocabulary.vocabulary(),
-        calibration=manifest.calibration,
-        digest=digest,
-        card=card,
-        path=directory,
-        offsets=Offsets.from_tensors(offsets, A, V) if offsets else None,
-        counts=Counts.from_tensors(counts, V, C) if counts else None,
-        places=Places.from_tensors(places, A, V) if places else None,
+    sizes = weights.spec.A, weights.spec.V, len(manifest.vocabulary.room_types)
+    return SceneModel(
+        weights,
+        manifest.vocabulary.vocabulary(),
+        manifest.calibration,
+        read_group(Offsets, offsets, *sizes),
+        read_group(Counts, counts, *sizes),
+        read_group(Places, places, *sizes),
     )
 
 

@@ -7,10 +7,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from math import prod
 
 from app.inference import MachineSpec
-from app.registry.counts import Counts
+from app.model.count_statistics import Counts
+from app.model.offset_statistics import Offsets
 from app.registry.description import DataSource, Description
 from app.registry.manifest import TensorEntry, of_machine
-from app.registry.offsets import Offsets
 
 _RESEARCH_WARNING = """\
 > **Research use.** These weights were trained on {sources}, whose terms allow research use. Ask

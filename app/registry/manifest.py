@@ -14,12 +14,12 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import Field, ValidationError, field_validator
 
-from app.registry.counts import Counts
+from app.model.count_statistics import Counts
+from app.model.fields import Count, Frozen, Many, Sha256, first_error, to_json
+from app.model.offset_statistics import Offsets
+from app.model.place_statistics import Places
 from app.registry.description import Description
 from app.registry.errors import ArtifactError, Code
-from app.registry.fields import Count, Frozen, Many, Sha256, first_error, to_json
-from app.registry.offsets import Offsets
-from app.registry.places import Places
 
 FORMAT: Final = 10
 MAX_TENSORS: Final = 10_000
@@ -59,7 +59,7 @@ class Manifest(Description):
 
     @field_validator("files")
     @classmethod
-    def _names_every_file(cls, files: dict[str, FileEntry]) -> dict[str, FileEntry]:
+    def _check_files(cls, files: dict[str, FileEntry]) -> dict[str, FileEntry]:
         if set(files) != {WEIGHTS, CARD}:
             raise ValueError(f"the files must be exactly {WEIGHTS} and {CARD}")
         return files

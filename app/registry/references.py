@@ -20,9 +20,9 @@ from typing import Annotated, Any, Final, NamedTuple, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, TypeAdapter, ValidationError
 
+from app.model.fields import Sha256
 from app.registry.durable import read_file
 from app.registry.errors import OUTDATED, StoreError, cause
-from app.registry.fields import Sha256
 
 MAX_ALIASES_BYTES: Final = 256 * 2**10
 

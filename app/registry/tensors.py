@@ -1,15 +1,19 @@
-"""Reading and writing weights: a safetensors file with float32 or float16 weights."""
+"""Reading and writing tensors: a safetensors file with float32 or float16 weights, and tables."""
 
 from collections.abc import Mapping
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, TypeVar, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from safetensors import SafetensorError, deserialize
 from safetensors.numpy import save
 
+from app.model.count_statistics import ROOM
+from app.model.fields import TensorGroup
 from app.registry.errors import ArtifactError
 from app.registry.manifest import WEIGHTS, TensorEntry
+
+GroupT = TypeVar("GroupT", bound=TensorGroup)
 
 StorageDtype = Literal["float16", "float32"]
 
@@ -87,6 +91,48 @@ def require_equal(
         entry, needed = actual.get(name, "none"), expected.get(name, "none")
         if entry != needed:
             raise ArtifactError("wrong_shape", f"tensor '{name}': {has} {entry}, {needs} {needed}")
+
+
+def read_group(
+    group: type[GroupT], tensors: Mapping[str, NDArray[Any]], A: int, V: int, C: int
+) -> GroupT | None:
+    """Return the tables of a model with A relations, V classes and C room types, or None.
+
+    Args:
+        group: class of the tables.
+        tensors: the stored tensors of the group. Without any, the result is None.
+
+    Raises:
+        ArtifactError: `wrong_shape` if a tensor is missing, unexpected or of a wrong shape;
+            `invalid_tensor` if a tensor has a wrong dtype or an impossible value.
+    """
+    if not tensors:
+        return None
+    # The first field with another size defines this size.
+    sizes, shapes = {"A": A, "V": V, "features": ROOM + C + V}, {}
+    for name, hint in get_type_hints(group, include_extras=True).items():
+        if axes := getattr(hint, "__metadata__", ()):
+            actual = np.shape(tensors.get(f"{group.prefix}{name}", ()))
+            sizes = dict(zip(axes, actual, strict=False)) | sizes
+            shapes[name] = tuple(
+                sizes.get(axis, 0) if isinstance(axis, str) else axis for axis in axes
+            )
+    for name in sorted(tensors.keys() | {f"{group.prefix}{name}" for name in shapes}):
+        required = shapes.get(name.removeprefix(group.prefix))
+        shape = tensors[name].shape if name in tensors else None
+        if shape != required:
+            reason = f"tensor '{name}' has the shape {shape}, not {required} (None: no tensor)"
+            raise ArtifactError("wrong_shape", reason)
+    tables = group(**{name: tensors[f"{group.prefix}{name}"] for name in shapes})
+    try:
+        for name in shapes:
+            kind = np.integer if name in group.integers else np.floating
+            is_right = np.issubdtype(getattr(tables, name).dtype, kind)
+            tables.require(is_right, f"{name} must have a dtype of {kind.__name__}")
+        tables.check(A, V, C)
+    except ValueError as error:
+        raise ArtifactError("invalid_tensor", str(error)) from None
+    return tables
 
 
 def _stored(name: str, value: ArrayLike, storage_dtype: StorageDtype) -> NDArray[Any]:

@@ -2,13 +2,14 @@
 
 from app.scene.geometry import PoseRelations, Viewpoint, derive_relations, to_viewer_frame
 from app.scene.labels import head_of, label_key
+from app.scene.relation_table import RelationTable
 from app.scene.roles import RoleCounts
-from app.scene.scene import Scene, SceneObject, instance_evidence, observe
+from app.scene.scene import Scene, SceneObject, observe
 from app.scene.spatial_relations import CANONICAL, OPPOSITES, RELATIONS, canonicalise, opposite
 from app.scene.vocabulary import ObjectClass, Vocabulary
 
 __all__ = [
-    "CANONICAL", "OPPOSITES", "RELATIONS", "ObjectClass", "PoseRelations", "RoleCounts", "Scene",
-    "SceneObject", "Viewpoint", "Vocabulary", "canonicalise", "derive_relations", "head_of",
-    "instance_evidence", "label_key", "observe", "opposite", "to_viewer_frame",
+    "CANONICAL", "OPPOSITES", "RELATIONS", "ObjectClass", "PoseRelations", "RelationTable",
+    "RoleCounts", "Scene", "SceneObject", "Viewpoint", "Vocabulary", "canonicalise",
+    "derive_relations", "head_of", "label_key", "observe", "opposite", "to_viewer_frame",
 ]  # fmt: skip

@@ -1,19 +1,14 @@
 """A scene as observed by one viewer: objects, and their relations.
 
-`observe` derives the relations of a scene from the poses of its objects.
-
-Scenes contain instances (objects), but models only know classes. `pool_classes` and
-`pool_relations` convert the evidence about instances (`instance_evidence`) to evidence about
-classes. A relation is on if it holds, and off if it was observed not to hold. Relation a between
-classes x and y is on if at least one instance of x has relation a to an instance of y. Pairs of
-instances without an observed relation have no influence.
+`observe` derives the relations of a scene from the poses of its objects. Scenes contain instances
+(objects), but models only know classes: `app.questions.posterior` pools the instances of a class.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -22,17 +17,14 @@ from numpy.typing import NDArray
 from app.compiling import compiled
 from app.scene.geometry import (
     SMALLEST,
-    PoseRelations,
     Viewpoint,
     derive_relations,
     excluded_by_centres,
     to_viewer_frame,
 )
+from app.scene.relation_table import EXCLUDED, RelationTable, Triple
 from app.scene.roles import RoleCounts
-from app.scene.spatial_relations import CANONICAL
 
-A = len(CANONICAL)
-Indices = NDArray[np.int64]
 Point = tuple[float, float, float]
 
 
@@ -68,25 +60,30 @@ class Scene:
 
     Attributes:
         objects: objects of the scene. ``relations`` refers to their indices in this tuple.
-        relations: triples (canonical relation, subject, object) that hold. None means that all
-            relations are unobserved.
-        relations_complete: whether all relations missing from ``relations`` do not hold.
+        relations: observed and excluded relations. None: nothing states or shows a relation.
         room_type: index of the room type in the model's vocabulary, if known.
         profile: index of the data source whose base rates apply. None: inferred from the objects.
-        poses: relations derived from poses by `observe`, also those observed not to hold. They
-            replace ``relations`` as evidence, and ``relations`` must list those that hold.
-        excluded: (A, n, n) bool, True for relations that the poses of the objects exclude, without
-            the stated relations. Left and front also count if the objects are far apart. None means
-            that no object has a position.
     """
 
     objects: tuple[SceneObject, ...]
-    relations: tuple[tuple[int, int, int], ...] | None = None
-    relations_complete: bool = False
+    relations: RelationTable | None = None
     room_type: int | None = None
     profile: int | None = None
-    poses: PoseRelations | None = field(default=None, compare=False, repr=False)
-    excluded: NDArray[np.bool_] | None = field(default=None, compare=False, repr=False)
+
+    @property
+    def triples(self) -> tuple[Triple, ...]:
+        """The relations that hold."""
+        return () if self.relations is None else self.relations.triples
+
+    @property
+    def opposites(self) -> frozenset[Triple]:
+        """The relations that the request states by their opposite."""
+        return frozenset() if self.relations is None else self.relations.opposites
+
+    @property
+    def has_boxes(self) -> bool:
+        """Whether the observed relations come from boxes."""
+        return self.relations is not None and self.relations.of_boxes
 
 
 # ------------------------------------------------------------------------- relations from poses
@@ -99,23 +96,23 @@ def observe(
     *,
     viewpoint: Viewpoint | None = None,
     has_viewer: bool = True,
-    typical_sizes: NDArray[np.float64] | None = None,
-    stand_in: NDArray[np.int64] | None = None,
+    typical_sizes: Float[NDArray[np.float64], "V 3"] | None = None,
+    stand_in: Int[NDArray[np.int64], "V"] | None = None,
     roles: RoleCounts | None = None,
 ) -> Scene:
     """Derive the relations of a scene from the poses of its objects.
 
     Positions and yaws must be in body axes (x forward, y left, z up). The result has viewer axes.
-    If the scene states relations, the function only sets the field ``excluded``. It returns a scene
-    without positions unchanged.
+    If the scene states relations, the function only adds those that the boxes exclude. It returns a
+    scene without positions unchanged.
 
     Args:
         viewpoint: position and heading of the viewer in this frame. By default, the viewer is at
             the origin and looks along x.
         has_viewer: whether the viewer's pose is known. Otherwise, left and front are undefined.
-        typical_sizes: (V, 3) typical extents of each class in metres (`Vocabulary.sizes`). They
+        typical_sizes: typical extents of each class in metres (`Vocabulary.sizes`). They
             replace missing sizes of objects, and sizes below `SMALLEST`. NaN means an unknown size.
-        stand_in: (V,) class whose roles each class has (`Vocabulary.stand_in`); None means itself.
+        stand_in: class whose roles each class has (`Vocabulary.stand_in`); None means itself.
         roles: counts that decide between on-top, under and inside; see `derive_relations`.
     """
     if all(thing.position is None for thing in scene.objects):
@@ -133,14 +130,12 @@ def observe(
         classes=classes,
         roles=roles,
     )
-    excluded = poses.observed & ~poses.holds
-    excluded |= excluded_by_centres(points, sizes, horizontal=has_viewer)
+    far = excluded_by_centres(points, sizes, horizontal=has_viewer)
     if scene.relations is not None:
-        for triple in scene.relations:
-            excluded[triple] = False
-        return replace(scene, excluded=excluded)
-    triples = tuple(zip(*(ends.tolist() for ends in np.nonzero(poses.holds)), strict=True))
-    return replace(scene, objects=objects, relations=triples, poses=poses, excluded=excluded)
+        excluded = far | (poses.observed & ~poses.holds)
+        return replace(scene, relations=scene.relations.excluding(excluded, EXCLUDED))
+    table = RelationTable.shown_by_boxes(poses.holds, poses.observed, far)
+    return replace(scene, objects=objects, relations=table)
 
 
 def _in_viewer_frame(
@@ -157,9 +152,9 @@ def _in_viewer_frame(
 
 
 def boxes_of(
-    objects: Sequence[SceneObject], typical_sizes: NDArray[np.float64] | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the centres and the extents of n objects, (n, 3) each, NaN where unknown.
+    objects: Sequence[SceneObject], typical_sizes: Float[NDArray[np.float64], "V 3"] | None
+) -> tuple[Float[NDArray[np.float64], "n 3"], Float[NDArray[np.float64], "n 3"]]:
+    """Return the centres and the extents of objects, NaN where unknown.
 
     An object without a plausible size has the typical extents of its class (`Vocabulary.sizes`).
     """
@@ -174,22 +169,6 @@ def boxes_of(
         elif thing.class_index is None:
             extents[row] = math.nan
     return centres, extents
-
-
-def instance_evidence(scene: Scene) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which relations between the N instances of a scene hold, and which are observed.
-
-    Both bool arrays have the shape (A relations, N subjects, N objects). Poses define the values.
-    Without poses, stated relations hold, and other relations are observed only if
-    `relations_complete` is True.
-    """
-    if scene.poses is not None:
-        return scene.poses.holds, scene.poses.observed
-    size = len(scene.objects)
-    holds = np.zeros((A, size, size), dtype=np.bool_)
-    if scene.relations:
-        holds[tuple(np.array(scene.relations).T)] = True
-    return holds, np.full((A, size, size), scene.relations_complete)
 
 
 @compiled

@@ -7,6 +7,7 @@ from functools import cached_property, wraps
 from typing import Any, ClassVar, Final, NamedTuple, TypeVar, cast
 
 import numpy as np
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike, NDArray
 
 from app.scene.labels import LookUp, Rule, head_of, label_key, readings, split_words
@@ -47,14 +48,14 @@ def _remembered(search: SearchT) -> SearchT:
     @wraps(search)
     def recall(self: "Vocabulary", label: str, *, is_room: bool = False) -> Any:
         memory, key = self._memory, (search.__name__, label, is_room)
-        found = memory.get(key, memory)  # a result may be None
-        if found is memory:
-            found = search(self, label, is_room=is_room)
+        result = memory.get(key, memory)  # a result may be None
+        if result is memory:
+            result = search(self, label, is_room=is_room)
             if len(memory) >= _MOST_REMEMBERED:
                 memory.clear()  # in one step, because other threads read the memory
             if len(label) <= _LONGEST:
-                memory[key] = found
-        return found
+                memory[key] = result
+        return result
 
     return cast("SearchT", recall)
 
@@ -102,7 +103,7 @@ class Vocabulary:
         room_types: canonical names of the room types. Their order defines the room indices.
         room_aliases: maps room types to their synonyms.
         parents: (V,) index of the parent of each class, -1 without a parent.
-        known: number of classes without those of words (`with_words`), which come last.
+        trained: number of classes without those of words (`with_words`), which come last.
         stand_in: (V,) class whose counts and relations each class has: itself, or the nearest class
             for a word of `with_words`.
 
@@ -129,8 +130,8 @@ class Vocabulary:
         self._by_spelling, self._by_key = _tables(names, "an object class", clash)
         self._bare = {name: SceneObject(name, name, k) for name, k in self._by_spelling.items()}
         self.parents = self._parent_indices()
-        self.known = len(self.objects)
-        self.stand_in = _read_only(np.arange(self.known))
+        self.trained = len(self.objects)
+        self.stand_in = _read_only(np.arange(self.trained))
         names = [(room, *self.room_aliases.get(room, ())) for room in self.room_types]
         clash = "room types {first!r} and {second!r} have the same name"
         self._room_by_spelling, self._room_by_key = _tables(names, "a room type", clash)
@@ -163,38 +164,38 @@ class Vocabulary:
     # The arrays are read-only.
 
     @cached_property
-    def structure(self) -> NDArray[np.bool_]:
-        """(V,) True for structural classes, which a model never proposes."""
+    def structure(self) -> Bool[NDArray[np.bool_], "V"]:
+        """True for structural classes, which a model never proposes."""
         return _read_only([entry.structure for entry in self.objects])
 
     @cached_property
-    def anywhere(self) -> NDArray[np.bool_]:
-        """(V,) True for classes whose objects belong in every room."""
+    def anywhere(self) -> Bool[NDArray[np.bool_], "V"]:
+        """True for classes whose objects belong in every room."""
         return _read_only([entry.anywhere for entry in self.objects])
 
     @cached_property
-    def judged(self) -> NDArray[np.bool_]:
-        """(V,) True for classes that can be intruders: neither structure nor `anywhere`."""
+    def judged(self) -> Bool[NDArray[np.bool_], "V"]:
+        """True for classes that can be intruders: neither structure nor `anywhere`."""
         return _read_only(~(self.structure | self.anywhere))
 
     @cached_property
-    def sizes(self) -> NDArray[np.float64]:
-        """(V, 3) typical extents in metres, or NaN for classes of unknown size."""
+    def sizes(self) -> Float[NDArray[np.float64], "V 3"]:
+        """Typical extents in metres, or NaN for classes of unknown size."""
         return _read_only([entry.size or (math.nan,) * 3 for entry in self.objects])
 
     @cached_property
-    def too_large(self) -> NDArray[np.bool_]:
-        """(V, V) True if a box of the size of class i does not fit into one of class j."""
+    def too_large(self) -> Bool[NDArray[np.bool_], "V V"]:
+        """True if a box of the size of class i does not fit into one of class j."""
         return _read_only(do_not_fit(self.sizes, self.sizes))
 
     @cached_property
-    def broader(self) -> NDArray[np.bool_]:
-        """(V, V) True if class j is the parent of class i, or a parent of its parent."""
+    def broader(self) -> Bool[NDArray[np.bool_], "V V"]:
+        """True if class j is the parent of class i, or a parent of its parent."""
         is_broader = np.zeros((len(self), len(self)), np.bool_)
         rows, ancestors = np.arange(len(self)), self.parents
-        while (known := ancestors >= 0).any():
-            is_broader[rows[known], ancestors[known]] = True
-            ancestors = np.where(known, self.parents[ancestors], -1)
+        while (has_parent := ancestors >= 0).any():
+            is_broader[rows[has_parent], ancestors[has_parent]] = True
+            ancestors = np.where(has_parent, self.parents[ancestors], -1)
         return _read_only(is_broader)
 
     @cached_property
@@ -210,8 +211,8 @@ class Vocabulary:
         return tuple(chains)
 
     @cached_property
-    def related(self) -> NDArray[np.bool_]:
-        """(V, V) True if one of the classes i and j is broader than the other: one family."""
+    def related(self) -> Bool[NDArray[np.bool_], "V V"]:
+        """True if one of the classes i and j is broader than the other: one family."""
         return _read_only(self.broader | self.broader.T)
 
     def bare_objects(self, labels: Sequence[str]) -> tuple[SceneObject, ...] | None:
@@ -304,10 +305,10 @@ class Vocabulary:
         alternatives = [name for rule, name in pairs if rule == "alternative"]
         for text in alternatives[:_MOST_GUESSED] or [name for _, name in pairs][-1:] or [label]:
             name = " ".join(split_words(text))
-            vector, (vectors, known) = word_vectors().of(name), self.vectors
+            vector, (vectors, has_vector) = word_vectors().of(name), self.vectors
             # Structure has no weights, so it cannot predict those of a word.
-            if vector is not None and (known & ~self.structure).any():
-                cosines = np.where(known, vectors @ vector, -1.0)
+            if vector is not None and (has_vector & ~self.structure).any():
+                cosines = np.where(has_vector, vectors @ vector, -1.0)
                 nearest = int(cosines.argmax())
                 similarity = round(min(max(float(cosines[nearest]), 0.0), 1.0), 3)
                 return Word(name, vector, nearest, similarity)
@@ -353,24 +354,24 @@ class _WithWords(Vocabulary):
     Its arrays extend those of the known classes, because a new vocabulary would take 0.1 s.
     """
 
-    def __init__(self, known: Vocabulary, words: Sequence[Word]) -> None:
-        vars(self).update({name: vars(known)[name] for name in _SHARED})
-        self._base, self._nearest = known, [word.nearest for word in words]
-        self.known = len(known)
-        nearest = [known.objects[index] for index in self._nearest]
+    def __init__(self, base: Vocabulary, words: Sequence[Word]) -> None:
+        vars(self).update({name: vars(base)[name] for name in _SHARED})
+        self._base, self._nearest = base, [word.nearest for word in words]
+        self.trained = len(base)
+        nearest = [base.objects[index] for index in self._nearest]
         self.objects = (
-            *known.objects,
+            *base.objects,
             *(
                 replace(entry, label=word.name, aliases=(), size=None, parent=None)
                 for word, entry in zip(words, nearest, strict=True)
             ),
         )
-        self.parents = _read_only([*known.parents, *(-1 for _ in words)])
-        self.stand_in = _read_only([*known.stand_in, *self._nearest])
+        self.parents = _read_only([*base.parents, *(-1 for _ in words)])
+        self.stand_in = _read_only([*base.stand_in, *self._nearest])
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
-        new = self.objects[self.known :]
+        new = self.objects[self.trained :]
         return (*self._base.labels, *(entry.label for entry in new))
 
     @cached_property
@@ -409,8 +410,10 @@ _SHARED: Final = (
 )
 
 
-def do_not_fit(inner: NDArray[np.float64], outer: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which boxes (N, 3) do not fit into which boxes (m, 3), (N, m).
+def do_not_fit(
+    inner: Float[NDArray[np.float64], "N 3"], outer: Float[NDArray[np.float64], "m 3"]
+) -> Bool[NDArray[np.bool_], "N m"]:
+    """Return which boxes do not fit into which other boxes.
 
     A box fits into another box if each of its extents, in order of size, is at most `_TIGHT` times
     that of the other. A box of unknown size (NaN) fits everywhere.

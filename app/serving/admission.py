@@ -271,7 +271,7 @@ class Bodies:
     One client holds at most a quarter of the budget, or a single body.
 
     Attributes:
-        held: total size of the bodies in bytes.
+        total: total size of the bodies in bytes.
         patience: maximum time in seconds to receive a body or to send an answer.
     """
 
@@ -279,7 +279,7 @@ class Bodies:
         self._budget = settings.held_body_bytes
         self.patience = settings.client_timeout
         self._of_clients: dict[str, int] = {}
-        self.held = 0
+        self.total = 0
 
     @contextmanager
     def hold(self, client: str, size: int) -> Iterator[None]:
@@ -333,14 +333,14 @@ class Bodies:
         return bytes(body)
 
     def _add(self, client: str, size: int) -> None:
-        self.held += size
+        self.total += size
         of_client = self._of_clients.pop(client, 0) + size
         if of_client:
             self._of_clients[client] = of_client
 
     def _check(self, client: str, size: int) -> None:
         share = max(self._budget // SHARE, size)
-        if self.held > self._budget or self._of_clients.get(client, 0) > share:
+        if self.total > self._budget or self._of_clients.get(client, 0) > share:
             detail = (
                 f"All bodies in progress exceed {self._budget} bytes together, or those of this "
                 f"client {share} bytes."

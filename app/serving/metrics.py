@@ -172,10 +172,10 @@ class Metrics:
                 self._compute.labels(*key, question),
                 self._objects.labels(*key, question),
             )
-        queue, compute, asked = series
+        queue, compute, counted = series
         queue.observe(waited)
         compute.observe(seconds)
-        asked.inc(objects)
+        counted.inc(objects)
         outliers = [entry["is_outlier"] for entry in answer.get("outliers", ())]
         misplaced = [entry["is_misplaced"] for entry in answer.get("misplaced", ())]
         guessed = [mapped.rule in _GUESSES for mapped in answer["mapped"]]

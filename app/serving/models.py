@@ -19,7 +19,9 @@ from app.questions.answer import written
 from app.registry import Artifact, ArtifactError, ModelSet, StoreError
 from app.registry.model_set import EMPTY
 from app.scene.nearest import spelt_alike
+from app.scene.relation_table import RelationTable
 from app.scene.scene import Scene, SceneObject, observe
+from app.scene.spatial_relations import ON_TOP
 from app.scene.vocabulary import Vocabulary
 from scene_client.schemas import Failure
 
@@ -38,7 +40,7 @@ class ServedModels:
 
     @property
     def served(self) -> Mapping[Key, Artifact]:
-        """Maps the (name, version) of each usable model to the model."""
+        """Maps the (name, version) of each usable model to its artifact."""
         return self.store.artifacts
 
     def resolve(self, reference: str) -> Artifact:
@@ -182,12 +184,13 @@ def warm_up(artifact: Artifact) -> None:
     Raises:
         ArtifactError: `warm_up_failed` if the model could not answer a question.
     """
-    related = _scene(artifact.vocabulary)
+    model = artifact.model
+    related = _scene(model.vocabulary)
     bare = replace(related, relations=None)
-    posed = observe(bare, typical_sizes=artifact.vocabulary.sizes)
+    posed = observe(bare, typical_sizes=model.vocabulary.sizes)
     try:
         for question in QUESTIONS:
-            for answer in question.warm_up(artifact, (related, bare, posed)):
+            for answer in question.warm_up(model, (related, bare, posed)):
                 written(answer)
     except Exception:
         # A broken model may raise any exception. The service must still serve other models.
@@ -197,10 +200,11 @@ def warm_up(artifact: Artifact) -> None:
 
 
 def _scene(vocabulary: Vocabulary) -> Scene:
-    """Return a scene of up to three objects in a row. The third object is on top of the second."""
+    """Return a scene of up to three objects in a row. The second object is on top of the first."""
     proposable = [i for i, entry in enumerate(vocabulary.objects) if not entry.structure]
     objects = tuple(
         SceneObject(str(k), vocabulary.labels[index], index, position=(1.0, 0.5 * k, 0.5))
         for k, index in enumerate((proposable or [0])[:3])
     )
-    return Scene(objects, ((2, 1, 0),) if len(objects) > 1 else None)
+    relations = RelationTable.stated([(ON_TOP, 1, 0)]) if len(objects) > 1 else None
+    return Scene(objects, relations)

@@ -92,6 +92,7 @@ class Request:
             QueueFullError, DeadlinePassedError, DisconnectedError: see `admission`.
         """
         artifact, record = self.models.resolve(scene.model), self.record
+        model = artifact.model
         record.models.add(artifact.key)
         limits, admission, ticket = self.runtime.limits, self.runtime.admission, self.ticket
         most = limits.answer_bytes if most_bytes is None else most_bytes
@@ -99,16 +100,17 @@ class Request:
         def read(_: object) -> tuple[Reading, partial[Fields]]:
             reading = read_scene(
                 scene,
-                artifact.vocabulary,
+                model.vocabulary,
                 limits,
                 self.look_ups,
-                roles=None if artifact.places is None else artifact.places.roles,
+                roles=None if model.places is None else model.places.roles,
                 profiles=artifact.manifest.vocabulary.profiles,
                 may_be_empty=question.samples,
             )
-            options = question.read(scene, artifact, reading)
-            model = artifact.with_words(list(reading.unknown.words.values()))
-            return reading, partial(question.answer, model, reading.scene, **options)
+            options = question.read(scene, model, reading)
+            words = list(reading.unknown.words.values())
+            asked = model.with_words(words) if words else model
+            return reading, partial(question.answer, asked, reading.scene, **options)
 
         def finish(reading: Reading, ask: Callable[[], Fields], began: float) -> _Computed:
             fields = ask()
@@ -125,7 +127,7 @@ class Request:
             began = monotonic()
             return finish(*read(None), began)
 
-        is_fast = is_quick(scene, artifact.vocabulary)
+        is_fast = is_quick(scene, model.vocabulary)
         if question.samples:
             reading, ask = read(None) if is_fast else await admission.in_worker(ticket, read)
             weight = ask.keywords["count"] * (ask.keywords["steps"] or STEPS)

@@ -115,8 +115,8 @@ class Runtime:
     def _serve(self, models: ServedModels) -> None:
         previous, self.models = self.models, models
         is_first = previous is NO_MODELS
-        known = {} if is_first else previous.failures
-        new = [one for name, one in models.failures.items() if known.get(name) != one]
+        old = {} if is_first else previous.failures
+        new = [one for name, one in models.failures.items() if old.get(name) != one]
         _log_failures("", new)
         if not is_first:
             _logger.info("the service has loaded the store: %d usable versions", len(models.served))

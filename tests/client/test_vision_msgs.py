@@ -300,7 +300,7 @@ def test_numbers_without_a_label_map_are_an_error_that_says_what_to_do() -> None
 
 def test_the_default_model_knows_most_of_cocos_indoor_classes(repository: Path) -> None:
     store = Store(repository / "model_store")
-    vocabulary = store.load(*store.resolve("default")).vocabulary
+    vocabulary = store.load(*store.resolve("default")).model.vocabulary
     known = {label for label in COCO if vocabulary.index(label) is not None}
     assert len(COCO) == len(set(COCO)) == 80
     assert {"chair", "couch", "dining table", "cell phone", "refrigerator", "potted plant"} <= known

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import torch
 
-from app.registry import AliasTarget, Calibration, Counts, Offsets, Store, VocabularyEntry
+from app.model import Calibration, Counts, Offsets
+from app.registry import AliasTarget, Store, VocabularyEntry
 from app.scene.spatial_relations import CANONICAL
 from app.scene.vocabulary import ObjectClass, Vocabulary
 from tests.enumeration.small_machines import with_symmetric_couplings

@@ -8,7 +8,7 @@ from typing import Any
 import httpx
 import pytest
 
-from app.api.access import HEALTH
+from app.api.gateway import HEALTH
 from app.settings import Settings
 from tests.http.test_problems import problem
 from tests.services import Replace, client_of_service, defect, serve

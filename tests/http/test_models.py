@@ -177,9 +177,11 @@ async def test_a_version_that_cannot_answer_is_refused(
     caplog: pytest.LogCaptureFixture,
     log_odds: float | None,
 ) -> None:
-    def fails(missing: Any, artifact: Any, *args: Any, **parameters: Any) -> Any:
-        answer = missing(artifact, *args, **parameters)
-        if artifact.manifest.version != "2.0.0":
+    served = own.app.state.runtime.models.served.values()  # type: ignore[attr-defined]
+
+    def fails(missing: Any, model: Any, *args: Any, **parameters: Any) -> Any:
+        answer = missing(model, *args, **parameters)
+        if any(model is artifact.model for artifact in served):
             return answer
         if log_odds is None:
             return defect()
@@ -221,7 +223,8 @@ async def test_requests_are_answered_while_the_store_is_read(
 async def test_a_request_keeps_the_models_it_started_with(
     own: httpx.AsyncClient, store: Path, hold: Hold
 ) -> None:
-    held = hold("missing", lambda manifest: manifest.version == "1.0.0")
+    served = own.app.state.runtime.models.served  # type: ignore[attr-defined]
+    held = hold("missing", lambda model: model is served["home", "1.0.0"].model)
     batch = {"scenes": [{"objects": ["bed"] * 33}] * 3}  # so many are not for the event loop
     asking = asyncio.create_task(own.post("/missing/batch", json=batch))
     assert await asyncio.to_thread(held.started.wait, PATIENCE)
@@ -238,9 +241,9 @@ async def test_replaced_models_are_freed(
 ) -> None:
     asked: list[weakref.ref[Any]] = []
 
-    def note(missing: Any, artifact: Any, *args: Any, **parameters: Any) -> Any:
-        asked.append(weakref.ref(artifact.weights))
-        return missing(artifact, *args, **parameters)
+    def note(missing: Any, model: Any, *args: Any, **parameters: Any) -> Any:
+        asked.append(weakref.ref(model.weights))
+        return missing(model, *args, **parameters)
 
     replace("missing", note)
     for model in ("general", "home"):

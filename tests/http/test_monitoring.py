@@ -204,7 +204,8 @@ async def test_metrics_of_a_removed_model_disappear(
     assert {"scene_objects_total", "scene_alarms_total", "scene_model_info"} <= everything
     assert await names("plain") == everything
     # A request that still holds the old snapshot reports late.
-    held = hold("missing", lambda manifest: manifest.name == "plain")
+    served = own.app.state.runtime.models.served  # type: ignore[attr-defined]
+    held = hold("missing", lambda model: model is served["plain", "1.0.0"].model)
     late = asyncio.ensure_future(ask("plain", 33))  # on a thread
     assert await asyncio.to_thread(held.started.wait, PATIENCE)
     shutil.rmtree(store / "plain")

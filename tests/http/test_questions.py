@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from app import questions
+from app.model import Counts
 from app.questions import QUESTIONS
-from app.registry import Counts, Store
-from app.scene import Scene, SceneObject
+from app.registry import Store
+from app.scene import RelationTable, Scene, SceneObject
 from scene_client.frames import viewer_axes
 from tests.http.stores import PROFILES, VOCABULARY, C, V, publish
 from tests.http.test_problems import problem
@@ -227,15 +228,15 @@ async def measured(own_store: Path, anyio_backend: str) -> AsyncIterator[httpx.A
 
 
 def computed(
-    store: Path, labels: tuple[str, ...], position: Any, *scene: Any, **options: Any
+    store: Path, labels: tuple[str, ...], position: Any, stated: Any = None, **options: Any
 ) -> Any:
     """The answer of the question itself."""
-    artifact = Store(store).load("measured", "1.0.0")
+    artifact = Store(store).load("measured", "1.0.0").model
     things = (
         SceneObject(str(k), label, VOCABULARY.index(label), position=position)
         for k, label in enumerate(labels)
     )
-    return questions.missing(artifact, Scene(tuple(things), *scene), **options)
+    return questions.missing(artifact, Scene(tuple(things), stated), **options)
 
 
 async def test_likely_further_instances_are_listed(
@@ -286,7 +287,7 @@ async def test_placements_have_offsets_in_the_axes_of_the_frame(
     axes = viewer_axes(frame or "", None if viewpoint is None else viewpoint["yaw"])
     answer = await ask(measured, "missing", **REQUEST, **options)
     position = tuple(PLACE.values())
-    expected = computed(own_store, POSED, position, (), top_k=11, axes=axes)
+    expected = computed(own_store, POSED, position, RelationTable.stated(()), top_k=11, axes=axes)
     assert answer["missing"] == expected["missing"]
     places = [place for entry in answer["missing"] for place in entry["placements"]]
     kinds = {"offset" in place for place in places}

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from app import questions
-from app.questions import counts
+from app.model import SceneModel
+from app.questions.missing import more as more_instances
 from app.questions.posterior import present
-from app.registry import Artifact
 from app.scene import Scene
 
 _entry = lru_cache(partial(namedtuple, "Entry"))
@@ -31,7 +31,7 @@ def _converted(part: Any, indices: dict[str, int]) -> Any:
 
 
 def _question(function: Callable[..., Any], *path: str) -> Callable[..., Any]:
-    def ask(artifact: Artifact, scene: Scene, **options: Any) -> Any:
+    def ask(artifact: SceneModel, scene: Scene, **options: Any) -> Any:
         answer = function(artifact, scene, **options)
         for name in path:
             answer = answer[name]
@@ -40,8 +40,8 @@ def _question(function: Callable[..., Any], *path: str) -> Callable[..., Any]:
     return ask
 
 
-def _more(artifact: Artifact, scene: Scene, **options: Any) -> Any:
-    return counts.more(artifact, scene, present(scene, artifact.spec), **options)
+def _more(artifact: SceneModel, scene: Scene, **options: Any) -> Any:
+    return more_instances(artifact, scene, present(scene, artifact.spec), **options)
 
 
 # The answer to `outliers` has all its fields. The other functions return one list of an answer.
@@ -49,7 +49,7 @@ def _judged(entry: dict[str, Any]) -> dict[str, Any]:
     return {"object": entry["object"], "log_odds": None} | entry
 
 
-def outliers(artifact: Artifact, scene: Scene, **options: Any) -> Any:
+def outliers(artifact: SceneModel, scene: Scene, **options: Any) -> Any:
     """Return the answer, with `log_odds` None for objects that are not judged."""
     answer = questions.outliers(artifact, scene, **options)
     answer["outliers"] = [_judged(entry) for entry in answer["outliers"]]

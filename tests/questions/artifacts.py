@@ -1,12 +1,9 @@
 """Small artifacts for tests of the questions. Every test uses each machine of this module."""
 
-from pathlib import Path
-
 import numpy as np
 import torch
 
-from app.registry.artifact import Artifact
-from app.registry.description import (
+from app.model.calibration import (
     KINDS,
     AlarmLine,
     AlarmLines,
@@ -15,8 +12,9 @@ from app.registry.description import (
     Judgement,
     Misplaced,
 )
-from app.registry.places import Places
-from app.scene import ObjectClass, Scene, SceneObject, Vocabulary
+from app.model.place_statistics import Places
+from app.model.scene_model import SceneModel
+from app.scene import ObjectClass, RelationTable, Scene, SceneObject, Vocabulary
 from tests.enumeration.small_machines import SMALL, random_weights
 from training.machines import BoltzmannMachine, MachineSpec, build
 from training.machines.arrays import weights_of
@@ -90,26 +88,18 @@ PLACES = places_of(
 
 def artifact_of(
     machine: BoltzmannMachine, places: Places | None = None, **changes: object
-) -> Artifact:
+) -> SceneModel:
     """An artifact with a neutral calibration, except for the changed fields."""
     spec = machine.spec
     vocabulary = Vocabulary(
         [ObjectClass(label, structure=label in STRUCTURE) for label in LABELS[: spec.V]],
         ROOMS[: spec.C],
     )
-    return Artifact(
-        manifest=None,
-        weights=weights_of(machine),
-        vocabulary=vocabulary,
-        calibration=calibration(spec.A, **changes),
-        digest="",
-        card="",
-        path=Path(),
-        places=places,
-    )
+    fitted = calibration(spec.A, **changes)
+    return SceneModel(weights_of(machine), vocabulary, fitted, places=places)
 
 
-def larger_artifact(name: str, scale: float = 0.7, **changes: object) -> Artifact:
+def larger_artifact(name: str, scale: float = 0.7, **changes: object) -> SceneModel:
     """An artifact with many states. All weights are random numbers from N(0, scale²).
 
     Structure has no object weights, as in a trained machine.
@@ -150,5 +140,8 @@ def scene_of(
 ) -> Scene:
     """A scene. The relations are canonical triples of a relation and two indices of objects."""
     objects = tuple(SceneObject(f"{LABELS[c]}_{k}", LABELS[c], c) for k, c in enumerate(classes))
-    triples = None if relations is None else tuple(relations)
-    return Scene(objects, triples, complete, room, profile=profile)
+    table = None
+    if relations is not None or complete:
+        complete_for = len(objects) if complete else None
+        table = RelationTable.stated(relations or (), complete_for=complete_for)
+    return Scene(objects, table, room, profile)

@@ -5,7 +5,7 @@ import math
 import pytest
 from scipy.special import expit as sigmoid
 
-from app.registry.description import CountSlope, CoverageFit, PlaceFit
+from app.model.calibration import CountSlope, CoverageFit, PlaceFit
 from tests.questions.answers import missing, outliers, relations, without_minimums
 from tests.questions.artifacts import LARGER, STRUCTURE, larger_artifact, lines, scene_of
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.questions.counts import LIKELY, distribution
-from app.registry import Counts
+from app.model import Counts
+from app.questions.missing import LIKELY
 from tests.questions.answers import more
 from tests.questions.artifacts import LARGER, larger_artifact, scene_of
 
@@ -38,7 +38,7 @@ EVERY = list(range(V))
 def by_hand(
     counts: Counts, row: int, listed: dict[int, int], room: int | None, rho: float = 1.0
 ) -> list[float]:
-    """The formula of `app.questions.counts`, term by term."""
+    """The formula of `app.model.count_statistics`, term by term."""
     own = int(counts.classes[row])
     k, others = listed[own], [j for j in listed if j != own]
     exponents = []
@@ -68,7 +68,7 @@ def test_the_distribution_is_the_formula(listed, room, unlisted, seed):
     random = counts(seed=seed)
     classes = np.array(sorted(listed))
     numbers = np.array([listed[index] for index in classes.tolist()])
-    which, p = distribution(random, V, classes, numbers, room, unlisted)
+    which, p = random.distribution(V, classes, numbers, room, unlisted)
     largest = dict(zip(random.classes.tolist(), MOST.tolist(), strict=True))
     covered = [listed[index] <= largest.get(index, 0) for index in sorted(listed)]
     assert which.tolist() == np.flatnonzero(covered).tolist()

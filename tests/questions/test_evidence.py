@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from app import questions
-from app.scene import Scene, SceneObject, observe
+from app.scene import RelationTable, Scene, SceneObject, observe
 from app.scene.spatial_relations import ABOVE, CANONICAL, INSIDE, LEFT, ON_TOP
 from tests.questions.answers import relations
 from tests.questions.artifacts import (
@@ -28,7 +28,7 @@ def boxes(*bottoms, stated=None):
         SceneObject(LABELS[k], LABELS[k], k, 1.0, (x, y, z + 0.25), SIZE)
         for k, (x, y, z) in enumerate(bottoms)
     )
-    return Scene(objects, stated)
+    return Scene(objects, None if stated is None else RelationTable.stated(stated))
 
 
 def entries(scene, **options):
@@ -43,7 +43,8 @@ def test_an_observed_relation_has_the_confidence_of_its_objects():
         replace(thing, confidence=c)
         for thing, c in zip(scene_of([0, 1, 2]).objects, (0.9, 0.5, 1.0), strict=True)
     )
-    plain, scene = entries(Scene(objects)), Scene(objects, ((ON_TOP, 1, 2), (LEFT, 0, 1)))
+    plain = entries(Scene(objects))
+    scene = Scene(objects, RelationTable.stated([(ON_TOP, 1, 2), (LEFT, 0, 1)]))
     answer = entries(scene)
     assert answer["on-top", 1, 2].probability == pytest.approx(0.5)
     assert answer["left", 0, 1].probability == pytest.approx(0.45)

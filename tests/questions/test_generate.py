@@ -42,8 +42,7 @@ every_model = pytest.mark.parametrize("artifact", ARTIFACTS.values(), ids=NAMES)
 def test_scenes_contain_the_evidence_and_no_contradiction(name, scene, seed):
     evidence = {thing.label for thing in scene.objects}
     stated = {
-        (scene.objects[i].label, CANONICAL[a], scene.objects[j].label)
-        for a, i, j in scene.relations or ()
+        (scene.objects[i].label, CANONICAL[a], scene.objects[j].label) for a, i, j in scene.triples
     }
     pairs = [{subject, object_} for subject, _, object_ in stated]
     for drawn in generate(ARTIFACTS[name], scene, count=9, seed=seed, steps=4):

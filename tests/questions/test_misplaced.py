@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from app.model.calibration import Judgement
 from app.questions.misplaced import (
     BELOW,
     BESIDE,
@@ -21,8 +22,7 @@ from app.questions.misplaced import (
     wrong_relations,
 )
 from app.questions.posterior import present
-from app.registry.description import Judgement
-from app.scene import ObjectClass, Scene, SceneObject, Vocabulary, observe
+from app.scene import ObjectClass, RelationTable, Scene, SceneObject, Vocabulary, observe
 from app.scene.spatial_relations import ABOVE, INSIDE, LEFT, ON_TOP
 from tests.questions.answers import misplaced
 from tests.questions.artifacts import judging, larger_artifact, lines, places_of, scene_of
@@ -82,11 +82,12 @@ def posterior_of(scene, alone=(), change=()):
     )
 
 
-def stated(classes, triples):
+def stated(classes, triples, by_opposite=()):
     """A scene without poses."""
     names = list(SIZES)
     objects = tuple(SceneObject(names[c], names[c], c) for c in classes)
-    return Scene(objects, tuple(triples))
+    flags = [triple in by_opposite for triple in triples]
+    return Scene(objects, RelationTable.stated(triples, flags))
 
 
 def posed(*bottoms, artifact=ARTIFACT):
@@ -100,9 +101,9 @@ def posed(*bottoms, artifact=ARTIFACT):
     return observe(Scene(objects), typical_sizes=VOCABULARY.sizes, roles=roles)
 
 
-def entries(scene, alone=(), change=(), flipped=(), artifact=ARTIFACT):
+def entries(scene, alone=(), change=(), artifact=ARTIFACT):
     """Entries as a dictionary from triples to kind, terms and mover."""
-    table = entries_of(artifact, posterior_of(scene, alone, change), scene, flipped)
+    table = entries_of(artifact, posterior_of(scene, alone, change), scene)
     rows = zip(*(column.tolist() for column in table), strict=True)
     return {tuple(triple): (kind, terms, mover) for triple, kind, terms, mover in rows}
 
@@ -110,10 +111,10 @@ def entries(scene, alone=(), change=(), flipped=(), artifact=ARTIFACT):
 def test_the_terms_of_a_hand_computed_example():
     """A monitor on a desk, a bin under the desk, and the bin to the left of the monitor."""
     on, under, left = (ON_TOP, 1, 0), (ON_TOP, 0, 2), (LEFT, 2, 1)
-    scene = stated([DESK, MONITOR, BIN], [on, under, left])
+    scene = stated([DESK, MONITOR, BIN], [on, under, left], {under})
     alone = {on: 1.0, under: -2.0, (ABOVE, 0, 2): -0.5, left: 0.25, (ON_TOP, 1, 2): -1.0}
     change = {on: 0.5, under: -0.125, left: -1.5}
-    table = entries(scene, alone, change, flipped={under})
+    table = entries(scene, alone, change)
     # Nine scenes show the monitor on a desk. The counts of all supporters are smoothed by .5.
     q = math.log((9 + 10 * 9.5 / (9 + 0.5 * V)) / (9 + 10))
     assert table == {
@@ -125,7 +126,7 @@ def test_the_terms_of_a_hand_computed_example():
 
 
 @pytest.mark.parametrize(
-    ("triple", "is_flipped", "kind", "mover"),
+    ("triple", "is_opposite", "kind", "mover"),
     [
         ((LEFT, 0, 1), False, BESIDE, 0),
         ((LEFT, 0, 1), True, BESIDE, 1),  # "the bin is to the right of the desk"
@@ -138,8 +139,8 @@ def test_the_terms_of_a_hand_computed_example():
         ((ABOVE, 0, 1), True, OVER, 1),
     ],
 )
-def test_kind_and_mover_of_a_stated_relation(triple, is_flipped, kind, mover):
-    table = entries(stated([DESK, BIN], [triple]), flipped={triple} if is_flipped else ())
+def test_kind_and_mover_of_a_stated_relation(triple, is_opposite, kind, mover):
+    table = entries(stated([DESK, BIN], [triple], {triple} if is_opposite else ()))
     assert {key: (k, m) for key, (k, _, m) in table.items()} == {triple: (kind, mover)}
 
 
@@ -148,8 +149,8 @@ def test_the_stand_of_classes_that_belong_everywhere_is_not_judged():
     objects = [replace(thing, anywhere=thing.label == "bin") for thing in VOCABULARY.objects]
     artifact = replace(ARTIFACT, vocabulary=Vocabulary(objects, VOCABULARY.room_types))
     under, on = (ON_TOP, 0, 1), (ON_TOP, 1, 2)
-    scene = stated([DESK, BIN, MONITOR], [under, on])
-    table = entries(scene, {on: -2.0}, flipped={under}, artifact=artifact)
+    scene = stated([DESK, BIN, MONITOR], [under, on], {under})
+    table = entries(scene, {on: -2.0}, artifact=artifact)
     assert table == {on: (SUPPORT, [-2.0, 0.0, 0.0, 0.0], 1)}
     alone = entries(posed((BIN, (0, 0, 0)), (DESK, (4, 0, 0))), artifact=artifact)
     assert [mover for _, _, mover in alone.values()] == [1]
@@ -195,17 +196,17 @@ def test_without_places_stands_are_unknown(is_posed):
         scene = stated([DESK, MONITOR], [(ON_TOP, 1, 0)])
     table = entries(scene, {(ON_TOP, 1, 0): 1.5}, artifact=artifact)
     assert table == {(ON_TOP, 1, 0): (SUPPORT, [1.5, 0.0, 0.0, 0.0], 1)}
-    (entry,) = misplaced_fields(artifact, posterior_of(scene), scene, "medium", ())
+    (entry,) = misplaced_fields(artifact, posterior_of(scene), scene, "medium")
     assert (entry["subject"], entry["moved"]) == ("monitor", "monitor")
 
 
 JUDGED = judging(lines(3.0, 2.0, 1.0), stand=-1.0)
 
 
-def fields_of(scene, alone=(), sensitivity="medium", flipped=(), judgements=JUDGED):
+def fields_of(scene, alone=(), sensitivity="medium", judgements=JUDGED):
     calibration = ARTIFACT.calibration.model_copy(update={"misplaced": judgements})
     artifact = replace(ARTIFACT, calibration=calibration)
-    return misplaced_fields(artifact, posterior_of(scene, alone), scene, sensitivity, flipped)
+    return misplaced_fields(artifact, posterior_of(scene, alone), scene, sensitivity)
 
 
 def test_the_log_odds_are_a_weighted_sum_of_the_terms():

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from app.model.calibration import CountSlope
 from app.questions.posterior import Posterior
-from app.registry.description import CountSlope
 from tests.questions.answers import misplaced, missing, outliers
 from tests.questions.artifacts import LABELS, STRUCTURE, judging, larger_artifact, lines, scene_of
 from training.machines.arrays import machine_of

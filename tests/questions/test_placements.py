@@ -13,11 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import logit
 
+from app.model import CountSlope, Offsets
+from app.model.calibration import PlaceFit
+from app.model.offset_statistics import UNOBSERVED, rotated_offsets
 from app.questions.placements import Place, place_log_p, placements
 from app.questions.posterior import Posterior
-from app.registry import CountSlope, Offsets
-from app.registry.description import PlaceFit
-from app.registry.offsets import UNOBSERVED, rotated_offsets
 from app.scene import RELATIONS, ObjectClass, Scene, SceneObject, Vocabulary
 from app.scene.spatial_relations import (
     ABOVE,

@@ -178,7 +178,7 @@ def test_outliers(artifact, scene, threshold):
         assert len(entry.usually_with) <= 3
         assert not set(entry.usually_with) & labels
     things = {k for k, thing in enumerate(scene.objects) if thing.label not in STRUCTURE}
-    relations_of_things = [(a, i, j) for a, i, j in scene.relations or () if {i, j} <= things]
+    relations_of_things = [(a, i, j) for a, i, j in scene.triples if {i, j} <= things]
     stated = {(i, CANONICAL[a], j) for a, i, j in relations_of_things}
     assert triples_of(answer.misplaced) == stated
     ids = [thing.id for thing in scene.objects]
@@ -193,9 +193,11 @@ def test_the_order_of_the_objects_does_not_matter(artifact, scene, random):
     order = list(range(len(scene.objects)))
     random.shuffle(order)
     new = {old: new for new, old in enumerate(order)}
-    stated = scene.relations and tuple((a, new[i], new[j]) for a, i, j in scene.relations)
+    table, moved = scene.relations, np.array([new[k] for k in range(len(order))])
+    if table is not None:
+        table = replace(table, subject=moved[table.subject], object=moved[table.object])
     objects = tuple(scene.objects[k] for k in order)
-    shuffled = Scene(objects, stated, scene.relations_complete, scene.room_type)
+    shuffled = Scene(objects, table, scene.room_type)
 
     def summaries(scene, order):
         answer = outliers(artifact, scene)

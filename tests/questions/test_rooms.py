@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from app.registry import Sharpness
+from app.model import Sharpness
 from tests.questions.answers import rooms
 from tests.questions.artifacts import LARGER, larger_artifact, scene_of
 from training.machines.arrays import machine_of

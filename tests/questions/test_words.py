@@ -9,7 +9,7 @@ from app.questions.outliers import outliers
 from app.questions.posterior import Posterior
 from app.questions.relations import relations
 from app.questions.rooms import rooms
-from app.scene import Scene, SceneObject
+from app.scene import RelationTable, Scene, SceneObject
 from tests.questions.artifacts import LARGER, larger_artifact, lines
 
 ALARM = lines(-1e3, -1e3, -1e3)
@@ -40,7 +40,7 @@ def test_a_word_that_is_listed_is_evidence(variant) -> None:
     without = Posterior(artifact, Scene(objects(artifact, "bed")))
     absent = np.array([1, 2])
     change = posterior.absent_log_odds(absent, 0.5) - without.absent_log_odds(absent, 0.5)
-    reason = posterior.reasons_for_absent(absent)[:, 1]
+    reason = artifact.objects.reasons_for_absent(posterior.context, None, absent)[:, 1]
     assert change == pytest.approx(reason, abs=1e-4)
     assert np.abs(change).min() > 1e-4
 
@@ -78,7 +78,7 @@ def test_relations_and_places_are_those_of_the_nearest_class(variant) -> None:
         )
         for a, b in zip(of_word, of_sofa, strict=True):
             assert a == pytest.approx(b, abs=1e-4)
-    scene = Scene(objects(artifact, "couch", "rug"), ((3, 0, 1),))
+    scene = Scene(objects(artifact, "couch", "rug"), RelationTable.stated([(3, 0, 1)]))
     answer = relations(artifact, scene, top_k=50)
     assert {one["subject"] for one in answer["relations"]} >= {"couch_0"}
 

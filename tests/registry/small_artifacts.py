@@ -9,22 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from app.model import AlarmLine, AlarmLines, Calibration, CountSlope, Judgement, Misplaced
+from app.model.calibration import KINDS
 from app.registry import (
-    AlarmLine,
-    AlarmLines,
     AliasTarget,
     Artifact,
     ArtifactError,
-    Calibration,
-    CountSlope,
     Description,
-    Judgement,
-    Misplaced,
     Store,
     StoreError,
     VocabularyEntry,
 )
-from app.registry.description import KINDS
 from app.registry.manifest import FORMAT, MANIFEST
 from app.registry.references import Replacement, Shipped, aliases_to_bytes
 from app.scene.vocabulary import ObjectClass, Vocabulary

@@ -52,12 +52,12 @@ def test_round_trip_is_exact_in_float32(variant: str, tmp_path: Path) -> None:
     manifest = write_artifact(tmp_path / "a", saying, weights)
     read = load_artifact(tmp_path / "a")
     assert read.manifest == manifest
-    assert read.spec == MachineSpec.from_dict(SPECS[variant])
-    assert read.vocabulary == VOCABULARY
-    assert read.calibration == saying.calibration
+    assert read.model.spec == MachineSpec.from_dict(SPECS[variant])
+    assert read.model.vocabulary == VOCABULARY
+    assert read.model.calibration == saying.calibration
     assert read.card == (tmp_path / "a" / CARD).read_text()
     assert read.path == tmp_path / "a"
-    loaded = read.weights.arrays
+    loaded = read.model.weights.arrays
     assert loaded.keys() == weights.keys()
     for name, array in weights.items():
         assert np.array_equal(loaded[name], array), name
@@ -99,7 +99,7 @@ def test_refuses_couplings_that_no_machine_has(entry: tuple[int, int], tmp_path:
 def test_half_precision_keeps_biases_and_integers_whole(tmp_path: Path) -> None:
     weights = state()
     manifest = write_artifact(tmp_path / "a", description(), weights, storage_dtype="float16")
-    loaded = load_artifact(tmp_path / "a").weights
+    loaded = load_artifact(tmp_path / "a").model.weights
     for name, array in weights.items():
         stored = manifest.tensors[name].dtype
         if array.dtype == np.float32 and array.ndim > 1:

@@ -7,7 +7,7 @@ import pytest
 
 from app.inference.objects import ObjectScorer
 from app.inference.weights import layout
-from app.registry.meaning import RowMap
+from app.model.word_weights import RowMap
 from app.scene import ObjectClass, Vocabulary
 from app.scene.vocabulary import Word
 from tests.questions.artifacts import LARGER, larger_artifact

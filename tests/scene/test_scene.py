@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from app.scene import PoseRelations, Scene, SceneObject, instance_evidence, observe
+from app.scene import RelationTable, Scene, SceneObject, observe
 from app.scene.geometry import Viewpoint, derive_relations, to_viewer_frame
 from app.scene.scene import pool_classes
 from app.scene.spatial_relations import (
@@ -37,56 +37,67 @@ MONITOR = SceneObject("monitor", "monitor", 1, position=(2.0, 0.2, 1.0), size=(0
 CHAIR = SceneObject("chair", "chair", 2, position=(1.2, 0.0, 0.5))
 
 
+def excluded(scene: Scene) -> np.ndarray:
+    """Which relations do not hold, (A, N, N)."""
+    assert scene.relations is not None
+    off = scene.relations.rows(scene.relations.probability == 0)
+    grid = np.zeros((len(CANONICAL), *[len(scene.objects)] * 2), bool)
+    grid[off.relation, off.subject, off.object] = True
+    return grid
+
+
 def test_poses_become_relations() -> None:
     seen = observe(Scene((DESK, MONITOR, CHAIR)))
-    assert set(seen.relations or ()) == {(ON_TOP, 1, 0), (FRONT, 2, 0), (FRONT, 2, 1)}
-    assert seen.poses is not None
-    assert seen.poses.observed[LEFT, 0, 2]
-    assert not seen.poses.observed[ABOVE, 0, 2]  # the chair has no size
+    assert set(seen.triples) == {(ON_TOP, 1, 0), (FRONT, 2, 0), (FRONT, 2, 1)}
+    assert seen.has_boxes
+    assert seen.relations is not None
+    _, observed = seen.relations.grids(3)
+    assert observed[LEFT, 0, 2]
+    assert not observed[ABOVE, 0, 2]  # the chair has no size
 
 
 def test_flat_boxes_have_relations_and_boxes_below_a_millimetre_have_no_size() -> None:
     rug = replace(MONITOR, id="rug", position=(2.0, 0.0, 0.0), size=(2.0, 3.0, 0.0))
-    assert observe(Scene((DESK, rug))).relations == ((ON_TOP, 0, 1),)
+    assert observe(Scene((DESK, rug))).triples == ((ON_TOP, 0, 1),)
     speck = replace(rug, size=(0.0, 0.0, 0.0005))
     bare = replace(rug, size=None)
-    assert observe(Scene((DESK, speck))).relations == observe(Scene((DESK, bare))).relations
+    assert observe(Scene((DESK, speck))).triples == observe(Scene((DESK, bare))).triples
 
 
 def test_typical_sizes_take_the_place_of_unknown_ones() -> None:
     cup = SceneObject("cup", "cup", 2, position=(2.0, -0.5, 0.85))
     sizes = np.array([[math.nan] * 3, [math.nan] * 3, [0.1, 0.1, 0.1]])
     without = observe(Scene((DESK, cup)))
-    assert (ON_TOP, 1, 0) not in (without.relations or ())
-    assert observe(Scene((DESK, cup)), typical_sizes=sizes).relations == ((ON_TOP, 1, 0),)
+    assert (ON_TOP, 1, 0) not in without.triples
+    assert observe(Scene((DESK, cup)), typical_sizes=sizes).triples == ((ON_TOP, 1, 0),)
     # A label outside the vocabulary has no typical size.
     stranger = SceneObject("cup", "goblet", None, position=(2.0, -0.5, 0.85))
-    assert observe(Scene((DESK, stranger)), typical_sizes=sizes).relations == without.relations
+    assert observe(Scene((DESK, stranger)), typical_sizes=sizes).triples == without.triples
 
 
 def test_stated_relations_stay_and_poses_exclude_others() -> None:
     """The monitor stands on the desk, 20 cm to the left, and the sofa is far away."""
     sofa = SceneObject("sofa", "sofa", 3, position=(6.0, 0.0, 0.4), size=(0.9, 2.0, 0.8))
     objects = (DESK, MONITOR, sofa)
-    stated = Scene(objects, relations=((ON_TOP, 2, 0), (LEFT, 1, 0)))
+    stated = Scene(objects, RelationTable.stated([(ON_TOP, 2, 0), (LEFT, 1, 0)], [False, True]))
     seen, derived = observe(stated, viewpoint=Viewpoint(0, 0, 0)), observe(Scene(objects))
-    assert (seen, seen.poses) == (stated, None)
-    assert seen.excluded is not None
-    assert derived.excluded is not None
-    added = derived.excluded ^ seen.excluded
-    assert np.argwhere(added).tolist() == [[LEFT, 1, 0], [ON_TOP, 2, 0]]
-    assert seen.excluded[[*STACKED], 0, 2].all()
-    assert not seen.excluded[ON_TOP, 1, 0]
+    assert (seen.objects, seen.triples, seen.opposites) == (
+        objects, ((ON_TOP, 2, 0), (LEFT, 1, 0)), {(LEFT, 1, 0)}
+    )  # fmt: skip
+    assert not seen.has_boxes
+    assert np.argwhere(excluded(derived) ^ excluded(seen)).tolist() == [
+        [LEFT, 1, 0], [ON_TOP, 2, 0]
+    ]  # fmt: skip
+    assert excluded(seen)[[*STACKED], 0, 2].all()
+    assert not excluded(seen)[ON_TOP, 1, 0]
     # The sofa is behind the desk.
-    assert np.argwhere(~seen.excluded[[LEFT, FRONT], 0, 2]).tolist() == [[FRONT]]
-    assert seen.excluded[[LEFT, FRONT], 2, 0].all()
+    assert np.argwhere(~excluded(seen)[[LEFT, FRONT], 0, 2]).tolist() == [[FRONT]]
+    assert excluded(seen)[[LEFT, FRONT], 2, 0].all()
 
 
 def test_in_a_map_without_a_viewer_no_direction_is_excluded() -> None:
     sofa = SceneObject("sofa", "sofa", 3, position=(6.0, 0.0, 0.4), size=(0.9, 2.0, 0.8))
-    seen = observe(Scene((DESK, sofa)), has_viewer=False)
-    assert seen.excluded is not None
-    assert not seen.excluded[[LEFT, FRONT]].any()
+    assert not excluded(observe(Scene((DESK, sofa)), has_viewer=False))[[LEFT, FRONT]].any()
 
 
 @pytest.mark.parametrize(("distance", "is_far"), [(2.9, False), (3.1, True)])
@@ -97,9 +108,7 @@ def test_boxes_of_unknown_size_are_not_stacked_from_far_apart(
     ends = [
         SceneObject(name, name, 0, position=(x, 0, 0)) for name, x in (("a", 0), ("b", distance))
     ]
-    seen = observe(Scene(tuple(ends)))
-    assert seen.excluded is not None
-    assert seen.excluded[[*STACKED], 0, 1].all() == is_far
+    assert excluded(observe(Scene(tuple(ends))))[[*STACKED], 0, 1].all() == is_far
 
 
 A = len(CANONICAL)
@@ -136,18 +145,38 @@ def test_classes_are_the_or_over_instance_pairs(
                 assert evidence.observed[a, x, y] == observes
 
 
-def test_the_evidence_about_instances_is_stated_complete_or_from_poses() -> None:
-    things = tuple(SceneObject(str(k), "x", 0) for k in range(3))
-    triples = ((ON_TOP, 1, 0), (LEFT, 1, 2))
-    holds, observed = instance_evidence(Scene(things, relations=triples))
+def test_observations_are_stated_complete_or_from_boxes() -> None:
+    triples = [(ON_TOP, 1, 0), (LEFT, 1, 2)]
+    holds, observed = RelationTable.stated(triples).grids(3)
     assert np.argwhere(holds).tolist() == [[LEFT, 1, 2], [ON_TOP, 1, 0]]
-    assert not observed.any()
-    stated, observed = instance_evidence(Scene(things, relations=triples, relations_complete=True))
-    assert (stated == holds).all()
-    assert observed.all()
-    poses = PoseRelations(holds, np.roll(holds, 1))
-    of_poses = instance_evidence(Scene(things, relations=((LEFT, 0, 1),), poses=poses))
-    assert of_poses == (poses.holds, poses.observed)
+    assert np.array_equal(observed, holds)
+    complete = RelationTable.stated(triples, complete_for=3)
+    assert complete.triples == tuple(triples)
+    stated, observed = complete.grids(3)
+    assert np.array_equal(stated, holds)
+    others = ~np.eye(3, dtype=bool)
+    assert np.array_equal(observed, np.broadcast_to(others, observed.shape))
+    # Excluded relations are no observations.
+    far = np.roll(holds, 1)
+    table = RelationTable.shown_by_boxes(holds, holds | far, np.ones_like(far))
+    assert table.of_boxes
+    assert len(table) == len(CANONICAL) * 6
+    for grid, expected in zip(table.grids(3), (holds, holds | far & others), strict=True):
+        assert np.array_equal(grid, expected)
+
+
+@given(instances())
+def test_a_relation_of_classes_has_the_largest_probability_of_their_objects(
+    drawn: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+) -> None:
+    classes, _, holds, observed = drawn
+    evidence = pool_instances(classes, holds & observed, observed)
+    table = RelationTable.shown_by_boxes(holds & observed, observed, ~observed)
+    row = np.searchsorted(evidence.classes, classes)
+    a, i, j, p = table.of_classes(row, len(evidence.classes), A - 1) or ()
+    expected = np.argwhere(evidence.observed[: A - 1])
+    assert np.stack([a, i, j], 1).tolist() == expected.tolist()
+    assert p.tolist() == evidence.holds[tuple(expected.T)].tolist()
 
 
 relations = st.sampled_from(RELATIONS)

@@ -56,17 +56,17 @@ def test_an_artifact_is_small(artifact):
 
 def test_structure_has_no_object_weights(artifact):
     """So listing it changes no answer about other classes."""
-    structure = artifact.vocabulary.structure
+    structure = artifact.model.vocabulary.structure
     assert structure.any()
-    assert not artifact.weights["W"][structure].any()
-    if artifact.spec.coupled:
-        assert not artifact.weights["L"][structure].any()
+    assert not artifact.model.weights["W"][structure].any()
+    if artifact.model.spec.coupled:
+        assert not artifact.model.weights["L"][structure].any()
 
 
 def test_the_vocabulary_is_large_enough(artifact):
-    assert len(artifact.vocabulary) >= 1500
+    assert len(artifact.model.vocabulary) >= 1500
     for words in ("TV", "garbage_bin", "trash cans", "night stand", "refrigerator"):
-        assert artifact.vocabulary.index(words) is not None
+        assert artifact.model.vocabulary.index(words) is not None
 
 
 def test_it_has_the_examples_of_its_configuration(artifact):
@@ -74,7 +74,7 @@ def test_it_has_the_examples_of_its_configuration(artifact):
 
     examples = read_examples(load_config(artifact.manifest.name).examples, Path())
     assert examples
-    assert known_examples(examples, artifact.vocabulary) == (examples, [])
+    assert known_examples(examples, artifact.model.vocabulary) == (examples, [])
     assert artifact.manifest.examples == examples
 
 
@@ -110,7 +110,7 @@ ASKED = (43, 43, 43, 20, 10, 67, 67, 10, 320, 320, 320)
 def found(models) -> dict[str, tuple[int, int]]:
     if facts_file(FOLDER) is None:
         pytest.skip("the facts are not here")
-    lines = ask_everyday(models.resolve("default"), FOLDER)
+    lines = ask_everyday(models.resolve("default").model, FOLDER)
     return {line: tuple(map(sum, zip(*each, strict=True))) for line, each in lines.items()}
 
 

@@ -54,7 +54,7 @@ async def main(store):
         before = compiled()
         assert sum(before.values()) > 20
         for model in ("places-triway", "places-rbm"):
-            vocabulary = Store(store).load(*Store(store).resolve(model)).vocabulary
+            vocabulary = Store(store).load(*Store(store).resolve(model)).model.vocabulary
             labels, rooms = vocabulary.labels, vocabulary.room_types
             for scene in scenes(labels):
                 some = {"pairs": [labels[:2]]} if len(scene["objects"]) > 1 else {}

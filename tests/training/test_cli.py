@@ -41,18 +41,18 @@ def check_equal(arrays, others) -> None:
 
 def check_offsets(artifact, config) -> None:
     """The offsets are those of the training scenes; test scenes have no part in them."""
-    parts, V = prepare(config, Path()).parts, len(artifact.vocabulary)
-    check_equal(fit_offsets(parts["train"], V).tensors(), artifact.offsets.tensors())
+    parts, V = prepare(config, Path()).parts, len(artifact.model.vocabulary)
+    check_equal(fit_offsets(parts["train"], V).tensors(), artifact.model.offsets.tensors())
     leaking = fit_offsets([*parts["train"], *parts["test"]], V)
-    assert not np.array_equal(leaking.pair_scenes, artifact.offsets.pair_scenes)
+    assert not np.array_equal(leaking.pair_scenes, artifact.model.offsets.pair_scenes)
 
 
 def check_refit(artifact, store) -> None:
     """`publish NAME@VERSION` changes only statistics."""
     invoke("publish", "rooms-triway@1.0.0", "1.0.1", "--store", store)
     again = Store(store).load("rooms-triway", "1.0.1")
-    check_equal(artifact.weights.arrays, again.weights.arrays)
-    check_equal(artifact.counts.tensors(), again.counts.tensors())
+    check_equal(artifact.model.weights.arrays, again.model.weights.arrays)
+    check_equal(artifact.model.counts.tensors(), again.model.counts.tensors())
     before, after = artifact.manifest, again.manifest
     same = {}
     for name in ("outlier_lines", "room_lines"):
@@ -109,19 +109,18 @@ def test_from_rooms_to_answers(tmp_path):
     }  # fmt: skip
     check_offsets(artifact, load_config(str(config)))
     check_refit(artifact, tmp_path / "store")
-    assert artifact.calibration.outlier.slope < 0  # likely objects are no intruders
-    lines = artifact.calibration.outlier_lines
+    assert artifact.model.calibration.outlier.slope < 0  # likely objects are no intruders
+    lines = artifact.model.calibration.outlier_lines
     limits = [line.threshold(3) for line in (lines.low, lines.medium, lines.high)]
     assert limits == sorted(limits, reverse=True)
     assert 1 > limits[0] >= limits[2] > 0
     things = ("bed", "nightstand", "lamp")
-    scene = Scene(
-        tuple(SceneObject(name, name, artifact.vocabulary.index(name)) for name in things)
-    )
-    assert missing(artifact, scene)
-    assert relations(artifact, scene)
-    assert len(outliers(artifact, scene).outliers) == 3
-    assert len(generate(artifact, scene, seed=0, steps=5)) == 1
+    model = artifact.model
+    scene = Scene(tuple(SceneObject(name, name, model.vocabulary.index(name)) for name in things))
+    assert missing(model, scene)
+    assert relations(model, scene)
+    assert len(outliers(model, scene).outliers) == 3
+    assert len(generate(model, scene, seed=0, steps=5)) == 1
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from app.scene import CANONICAL, Scene, SceneObject, Vocabulary
+from app.scene import CANONICAL, RelationTable, Scene, SceneObject, Vocabulary
 from app.scene.spatial_relations import ABOVE, LATERAL, STACKED
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Ints, Rng
@@ -60,7 +60,8 @@ def scene_of(encoded: EncodedScene, kept: Sequence[int], triples: Sequence[Tripl
         for k, c in enumerate(encoded.instance_classes[list(kept)])
     )
     room = encoded.room_type
-    return Scene(objects, tuple(triples) or None, room_type=room if room >= 0 else None)
+    table = RelationTable.stated(triples) if triples else None
+    return Scene(objects, table, room_type=room if room >= 0 else None)
 
 
 def annotated_relations(encoded: EncodedScene) -> Flags:

@@ -81,7 +81,7 @@ def pool_instances(
 
     Args:
         classes: (N,) index of the class of each instance.
-        holds, observed: (A, N, N), see `app.scene.instance_evidence`.
+        holds, observed: (A, N, N) relations between the instances.
     """
     distinct, _, row, counts, _ = pool_classes(classes, np.ones(len(classes)))
     on, known = pool_relations(row, len(distinct), holds, observed)

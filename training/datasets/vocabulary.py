@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from app.model.fields import first_error
 from app.registry import VocabularyEntry
-from app.registry.fields import first_error
 from app.scene import ObjectClass, Vocabulary, head_of, label_key
 from training.datasets.records import AnnotatedScene
 

@@ -14,6 +14,7 @@ import torch
 import typer
 from pydantic import JsonValue
 
+from app.model import SceneModel
 from app.registry import (
     DEFAULT_STORE,
     Artifact,
@@ -87,18 +88,18 @@ def adapt_command(
         material = read_material(files, recorded=True)
         recorded, places = _corrected(material.files), material.places
         with console.status("reading the scenes") as status:
-            home = Home.of(parent, recorded, places)
+            home = Home.of(parent.model, recorded, places)
             _print_home(home, parent)
             _print(filter(None, [left_out_line(material.left_out, ROWS)]))
             result = adapted(home, seed=seed, progress=status.update)
         _print_result(result)
-        if result.artifact is None:
+        if result.model is None:
             console.print(_NOTHING, soft_wrap=True)
             raise typer.Exit(3)
-        artifact, measured = result.artifact, result.measured
+        model_at_home, measured = result.model, result.measured
         scenes = recorded, [*map(confirmed_scene, places)]
-        description = _describe(parent, home, artifact, measured, scenes, name, version, seed)
-        published = publish_rounded(models, description, artifact)
+        description = _describe(parent, home, model_at_home, measured, scenes, name, version, seed)
+        published = publish_rounded(models, description, model_at_home)
         _print_next(models, store, published, alias or "default" if promote else None)
     except (ConfigError, DatasetError, RegistryError, ValueError) as error:
         fail(error)
@@ -197,7 +198,7 @@ def _print_result(result: Adapted) -> None:
 def _describe(
     parent: Artifact,
     home: Home,
-    artifact: Artifact,
+    model: SceneModel,
     measured: Measured | None,
     scenes: tuple[Sequence[AnnotatedScene], Sequence[AnnotatedScene]],
     name: str,
@@ -227,23 +228,21 @@ def _describe(
         name=name,
         version=version,
         created=datetime.now(UTC).replace(microsecond=0),
-        spec=artifact.spec.to_dict(),
-        vocabulary=VocabularyEntry.of(
-            artifact.vocabulary, artifact.spec.A, manifest.vocabulary.profiles
-        ),
-        calibration=_calibration(home, artifact),
+        spec=model.spec.to_dict(),
+        vocabulary=VocabularyEntry.of(model.vocabulary, model.spec.A, manifest.vocabulary.profiles),
+        calibration=_calibration(home, model),
         training={"parent": origin, "seed": seed, "confirmed": home.confirmed},
         data=(*manifest.data, *sources),
         metrics=tuple(_metrics(measured, own)),
         terms=manifest.terms,
         libraries={library: importlib.metadata.version(library) for library in _LIBRARIES},
-        examples=choose_examples([*recorded, *written], artifact.vocabulary) or manifest.examples,
+        examples=choose_examples([*recorded, *written], model.vocabulary) or manifest.examples,
     )
 
 
-def _calibration(home: Home, artifact: Artifact) -> Any:
+def _calibration(home: Home, model: SceneModel) -> Any:
     """Return the calibration, with the popularity of the new classes in the home."""
-    calibration, V = artifact.calibration, home.known[0]
+    calibration, V = model.calibration, home.known[0]
     if not calibration.popularity:
         return calibration
     count, n = home.tensors.v.sum(0)[V:].double().numpy(), len(home.scenes)

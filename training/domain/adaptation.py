@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from app.inference import Weights
-from app.registry import Artifact
+from app.model import SceneModel
 from app.scene import CANONICAL
 from training.datasets.array_types import Flags, Floats, Ints
 from training.domain.confirmed_relations import with_confirmed
@@ -80,7 +80,7 @@ class Adapted:
     """The result.
 
     Attributes:
-        artifact: the new model in memory, or None if the recordings teach nothing.
+        model: the new model in memory, or None if the recordings teach nothing.
         measured: comparison in folds; None with fewer than `FEWEST` scenes.
         objections: reasons of the gate against new weights.
         exceptions: classes that the new model never reports, and in how many confirmed scenes it
@@ -88,7 +88,7 @@ class Adapted:
         relations: confirmed relations of classes that the parent reports, in words.
     """
 
-    artifact: Artifact | None
+    model: SceneModel | None
     measured: Measured | None
     objections: tuple[str, ...]
     exceptions: Counter[str]
@@ -101,22 +101,22 @@ def adapted(
     """Adapt a model to a home."""
     measured: Measured | None = None
     objections: tuple[str, ...] = ()
-    artifact = home.parent
+    model = home.parent
     if len(home.measurable) >= FEWEST:
         measured = measure(home, seed, progress)
         objections = tuple(measured.objections())
         if not objections:
             progress("adapting to all scenes")
-            weights = adapt(artifact.weights, home.tensors, known=home.learnt, seed=seed)
-            artifact = replace(artifact, weights=weights)
-    exceptions = home.confirmed_alarms(artifact)
+            weights = adapt(model.weights, home.tensors, known=home.learnt, seed=seed)
+            model = replace(model, weights=weights)
+    exceptions = home.confirmed_alarms(model)
     news = (exceptions, home.relations, home.new_classes, home.new_rooms)
-    if artifact is home.parent and not any(news):
+    if model is home.parent and not any(news):
         return Adapted(None, measured, objections, exceptions)
-    artifact = with_confirmed(with_exceptions(artifact, exceptions), home.relations)
-    labels = artifact.vocabulary.labels
+    model = with_confirmed(with_exceptions(model, exceptions), home.relations)
+    labels = model.vocabulary.labels
     relations = [f"{labels[i]} {CANONICAL[a]} {labels[j]}" for a, i, j in sorted(home.relations)]
-    return Adapted(artifact, measured, objections, exceptions, tuple(relations))
+    return Adapted(model, measured, objections, exceptions, tuple(relations))
 
 
 def measure(home: Home, seed: int, progress: Callable[[str], None]) -> Measured:
@@ -147,7 +147,7 @@ def measure(home: Home, seed: int, progress: Callable[[str], None]) -> Measured:
     )
 
 
-Sides = tuple[Artifact, Artifact]
+Sides = tuple[SceneModel, SceneModel]
 
 
 @torch.no_grad()

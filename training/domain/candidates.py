@@ -11,7 +11,8 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from app.registry import Artifact, Store, StoreError
+from app.model import SceneModel
+from app.registry import Store, StoreError
 from app.scene import Vocabulary
 from training.datasets import AnnotatedScene, split
 from training.datasets.batches import TrainingData, has_relations
@@ -42,22 +43,23 @@ class Candidate:
     title: str  # name of the model in tables
     config: Config | None
     learnt: dict[str, str]  # digest of each data source of the training, by source name
-    artifact: Artifact | None  # None for the baselines
+    scene_model: SceneModel | None  # None for the baselines
     data: Path | None = None  # folder with the scene files of a run
+    tasks: frozenset[str] = frozenset()  # tasks of the figures on the card of a published model
 
     @property
     def vocabulary(self) -> Vocabulary | None:
         """Classes of the model. None for the baselines, which use those of the other candidate."""
-        return None if self.artifact is None else self.artifact.vocabulary
+        return None if self.scene_model is None else self.scene_model.vocabulary
 
     def model(self, scenes: Vocabulary, data: TrainingData, say: Progress) -> Model:
         """Return the scores of this candidate in the classes of the test scenes, `scenes`."""
-        if self.artifact is None:
+        if self.scene_model is None:
             return _baselines(data, say)
-        model = artifact_model(self.artifact)
-        if same_classes(scenes, self.artifact.vocabulary):
+        model = artifact_model(self.scene_model)
+        if same_classes(scenes, self.scene_model.vocabulary):
             return model
-        return Translation.between(scenes, self.artifact.vocabulary).translate(model)
+        return Translation.between(scenes, self.scene_model.vocabulary).translate(model)
 
 
 def run_candidate(folder: Path, data: Path | None, say: Progress) -> Candidate:
@@ -92,7 +94,8 @@ def stored_candidate(reference: str, store: Store) -> Candidate:
     except ValidationError:
         config = None
     learnt = {source.source: source.digest for source in artifact.manifest.data}
-    return Candidate(f"{name}@{version}", config, learnt, artifact)
+    tasks = frozenset(metric.task for metric in artifact.manifest.metrics)
+    return Candidate(f"{name}@{version}", config, learnt, artifact.model, tasks=tasks)
 
 
 def find(reference: str, store: Store, data: Path | None, say: Progress) -> Candidate:
@@ -188,7 +191,7 @@ def held_out(a: Candidate, b: Candidate, sources: Sources) -> HeldOut:
 
 def _drop_learnt(candidate: Candidate, scenes: list[AnnotatedScene], sources: Sources) -> HeldOut:
     """Leave out the scenes that a candidate learnt from."""
-    if candidate.artifact is None:
+    if candidate.scene_model is None:
         return scenes, ()  # baselines are fitted on the training scenes of the first model
     digests = {name: digest_of(source) for name, source in sources.items()}
     shared = {

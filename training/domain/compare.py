@@ -231,10 +231,9 @@ def side_by_side(
 
 def unmeasured(rows: Sequence[Difference], other: Candidate) -> tuple[str, ...]:
     """Return the relation tasks that only the other card measures; () if `rows` measure any."""
-    if other.artifact is None or any(row.task in RELATIONAL for row in rows):
+    if any(row.task in RELATIONAL for row in rows):
         return ()
-    measured = {metric.task for metric in other.artifact.manifest.metrics}
-    return tuple(task for task in RELATIONAL if task in measured)
+    return tuple(task for task in RELATIONAL if task in other.tasks)
 
 
 def _notes(a: Candidate, b: Candidate, test: Sequence[AnnotatedScene]) -> Iterator[str]:

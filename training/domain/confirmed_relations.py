@@ -2,7 +2,7 @@
 
 The new model never reports a confirmed relation of two classes (`app.registry.Misplaced.usual`).
 The relation also counts like `_SCENES` training scenes in the places of the model
-(`app.registry.places`), so the place becomes a usual one for missing objects.
+(`app.model.place_statistics`), so the place becomes a usual one for missing objects.
 
 Of 150 random pairs of common classes whose relation on-top is reported with boxes, none is reported
 afterwards. In 111 of these scenes, the model also reports the object on another class, before and
@@ -17,8 +17,8 @@ from typing import Final
 
 import numpy as np
 
+from app.model import SceneModel
 from app.questions.misplaced import THE_FLOOR
-from app.registry import Artifact
 from app.scene import Vocabulary
 from app.scene.spatial_relations import STACKED
 from training.datasets import AnnotatedScene, encode
@@ -31,7 +31,7 @@ _SCENES: Final = 20.0
 Triple = tuple[int, int, int]
 
 
-def reported_relations(model: Artifact, recorded: Sequence[AnnotatedScene]) -> set[Triple]:
+def reported_relations(model: SceneModel, recorded: Sequence[AnnotatedScene]) -> set[Triple]:
     """Return the relations (a, i, j) of classes that the model reports in confirmed scenes.
 
     They are stacked relations, such as on-top. Each scene is asked as stated and with its boxes.
@@ -68,7 +68,7 @@ def _canonical(scene: AnnotatedScene, vocabulary: Vocabulary) -> AnnotatedScene:
     return replace(scene, objects=objects)
 
 
-def with_confirmed(artifact: Artifact, triples: Iterable[Triple]) -> Artifact:
+def with_confirmed(artifact: SceneModel, triples: Iterable[Triple]) -> SceneModel:
     """Return the model, which never reports these relations of classes."""
     places, V, triples = artifact.places, len(artifact.vocabulary), sorted(triples)
     if places is None:

@@ -90,10 +90,10 @@ def _ask(test: RoomList, artifacts: dict[str, Artifact]) -> Figures:
     for name, artifact in artifacts.items():
         with console.status(name) as status:
             say: Progress = status.update
-            figures[name] = test.measure(artifact, say)
+            figures[name] = test.measure(artifact.model, say)
         learnt = test.trained(artifact)
         remarks = [f"{source} is training data of this model, not new data" for source in learnt]
-        for remark in filter(None, [test.remark(artifact), *remarks]):
+        for remark in filter(None, [test.remark(artifact.model), *remarks]):
             console.print(f"{name}: {remark}", markup=False, highlight=False, soft_wrap=True)
     return figures
 
@@ -107,7 +107,7 @@ def _measure(
     with console.status("reading scenes"):
         # The split must include all data sources, as in training. Otherwise the test part
         # could contain training scenes.
-        scenes = prepare(config, data, artifact.vocabulary)
+        scenes = prepare(config, data, artifact.model.vocabulary)
     tensors = scenes.training_data()
     index = [k for k, scene in enumerate(tensors.test.scenes) if scene.source in names]
     if not index:
@@ -117,7 +117,7 @@ def _measure(
     test = subset(tensors.test, torch.tensor(index, dtype=torch.int64))
     with console.status(reference) as status:
         return evaluate(
-            *(artifact, test, tensors.structure, tensors.train),
+            *(artifact.model, test, tensors.structure, tensors.train),
             everyday=EVERYDAY,
             progress=status.update,
         )

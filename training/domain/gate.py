@@ -14,7 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from app.registry import Artifact, ArtifactError, Store, StoreError
+from app.model import SceneModel
+from app.registry import ArtifactError, Store, StoreError
 from app.registry.references import AliasTarget
 from training.datasets.batches import TrainingData, subset
 from training.datasets.cases import some_scenes
@@ -88,7 +89,7 @@ class Usefulness:
         return f"{self.scenes} test scenes of {self.groups} groups"
 
 
-def measure_usefulness(artifact: Artifact, data: TrainingData, *, say: Progress) -> Usefulness:
+def measure_usefulness(artifact: SceneModel, data: TrainingData, *, say: Progress) -> Usefulness:
     """Compare a new version with popularity and EASE on the test scenes of its run.
 
     The baselines learn from the training scenes of the run. Scenes with incomplete object lists are

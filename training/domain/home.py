@@ -21,8 +21,8 @@ from functools import cached_property
 import numpy as np
 import torch
 
+from app.model import SceneModel
 from app.questions.outliers import intruders
-from app.registry import Artifact
 from app.scene import ObjectClass, Scene, SceneObject, label_key
 from training.datasets import AnnotatedScene
 from training.datasets.array_types import Ints
@@ -56,7 +56,7 @@ class HomeScene:
     confirmed: bool
     written: bool = False
 
-    def question(self, artifact: Artifact) -> Scene:
+    def question(self, artifact: SceneModel) -> Scene:
         """Return the scene as a request of labels."""
         return of_classes(artifact, self.classes, self.room)
 
@@ -74,7 +74,7 @@ class Home:
         relations: confirmed relations of classes that the parent reports as misplaced.
     """
 
-    parent: Artifact
+    parent: SceneModel
     known: tuple[int, int]
     scenes: tuple[HomeScene, ...]
     recorded: int
@@ -84,7 +84,7 @@ class Home:
     @classmethod
     def of(
         cls,
-        model: Artifact,
+        model: SceneModel,
         recorded: Sequence[AnnotatedScene],
         places: Sequence[Place] = (),
     ) -> Home:
@@ -155,7 +155,7 @@ class Home:
         rooms = [-1 if scene.room is None else scene.room for scene in self.scenes]
         return HomeScenes(v, asked, torch.tensor(rooms))
 
-    def confirmed_alarms(self, artifact: Artifact) -> Counter[str]:
+    def confirmed_alarms(self, artifact: SceneModel) -> Counter[str]:
         """Return the classes that a model reports, with the number of their confirmed scenes."""
         labels, counts = artifact.vocabulary.labels, Counter[str]()
         for scene in self.scenes:
@@ -165,7 +165,7 @@ class Home:
         return counts
 
 
-def with_exceptions(artifact: Artifact, labels: Iterable[str]) -> Artifact:
+def with_exceptions(artifact: SceneModel, labels: Iterable[str]) -> SceneModel:
     """Return the model, which never reports objects of these classes."""
     excused, vocabulary = set(labels), artifact.vocabulary
     objects = [
@@ -175,7 +175,7 @@ def with_exceptions(artifact: Artifact, labels: Iterable[str]) -> Artifact:
     return replace(artifact, vocabulary=replace(vocabulary, objects=objects))
 
 
-def _with_new_words(model: Artifact, recorded: Sequence[AnnotatedScene]) -> Artifact:
+def _with_new_words(model: SceneModel, recorded: Sequence[AnnotatedScene]) -> SceneModel:
     """Return the model with the labels and room types that it cannot read."""
     names, vocabulary = curated_names(), model.vocabulary
     scenes_of: Counter[str] = Counter()
@@ -197,7 +197,7 @@ def _with_new_words(model: Artifact, recorded: Sequence[AnnotatedScene]) -> Arti
     return extended(model, classes, sorted(rooms.values()) if model.spec.C else ())
 
 
-def _read(parent: Artifact, scene: AnnotatedScene) -> HomeScene:
+def _read(parent: SceneModel, scene: AnnotatedScene) -> HomeScene:
     names, vocabulary = curated_names(), parent.vocabulary
     found = [vocabulary.look_up(thing.label) for thing in scene.objects]
     classes = np.unique([entry.entry for entry in found if entry is not None]).astype(np.int64)
@@ -214,7 +214,7 @@ def confirmed_scene(place: Place) -> AnnotatedScene:
     return replace(complete_scene(place), confirmed=True)
 
 
-def _written(parent: Artifact, place: Place) -> HomeScene:
+def _written(parent: SceneModel, place: Place) -> HomeScene:
     """Return the scene of a written place, in which things with a small share teach nothing."""
     scene = _read(parent, confirmed_scene(place))
     shares: dict[int, float] = defaultdict(float)
@@ -225,13 +225,13 @@ def _written(parent: Artifact, place: Place) -> HomeScene:
     return replace(scene, left_out=np.array(rare, dtype=np.int64), written=True)
 
 
-def alarms_of(artifact: Artifact, scene: Scene) -> Ints:
+def alarms_of(artifact: SceneModel, scene: Scene) -> Ints:
     """Return the classes that `/outliers` reports at medium sensitivity."""
     found = intruders(artifact, scene)
     return found[~artifact.rarely_shown[found]]
 
 
-def of_classes(artifact: Artifact, classes: Ints, room: int | None) -> Scene:
+def of_classes(artifact: SceneModel, classes: Ints, room: int | None) -> Scene:
     """Return a request with one object of each class, and the index of a room type or None."""
     labels = artifact.vocabulary.labels
     things = tuple(SceneObject(labels[c], labels[c], c) for c in classes.tolist())

@@ -17,8 +17,8 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
+from app.model.fields import first_error
 from app.registry import VocabularyEntry
-from app.registry.fields import first_error
 from app.scene import ObjectClass, Vocabulary, label_key
 from training.datasets import AnnotatedScene, DatasetError, source_vocabulary
 from training.datasets.records import AnnotatedObject

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.special import betaincinv
 
 from app import questions
-from app.registry import Artifact, Sensitivity
+from app.model import SceneModel, Sensitivity
 from app.scene import Scene
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Rng
@@ -69,7 +69,7 @@ class Alarms:
         )
 
 
-def untouched_alarms(artifact: Artifact, scenes: Sequence[EncodedScene]) -> Iterator[Alarms]:
+def untouched_alarms(artifact: SceneModel, scenes: Sequence[EncodedScene]) -> Iterator[Alarms]:
     """Ask about an untouched part of each scene, and count the scenes with an alarm.
 
     One random scene of each group takes part, because its scenes are not independent. Objects
@@ -108,7 +108,7 @@ def _random_part(encoded: EncodedScene, structure: Flags, rng: Rng) -> Scene:
 
 
 def _alarms(
-    artifact: Artifact, scene: Scene, complete: bool, sensitivity: Sensitivity
+    artifact: SceneModel, scene: Scene, complete: bool, sensitivity: Sensitivity
 ) -> tuple[bool, bool]:
     """Return whether the model raises an alarm about an object, and about a relation."""
     answer = questions.outliers(artifact, scene, sensitivity=sensitivity, details=False)

@@ -8,11 +8,11 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from app.model import SceneModel
 from app.questions.misplaced import wrong_relations
 from app.questions.posterior import Posterior
-from app.questions.reading import Triple
-from app.registry import Artifact
-from app.scene import CANONICAL, OPPOSITES, Scene
+from app.scene import CANONICAL, OPPOSITES, RelationTable, Scene
+from app.scene.relation_table import Triple
 from training.datasets.batches import Batch
 from training.evaluation.asking import (
     flag_outliers,
@@ -35,7 +35,7 @@ from training.evaluation.setting import Setting
 from training.machines.arrays import machine_of
 
 
-def artifact_model(artifact: Artifact, *, profiles: Sequence[str] = ()) -> Model:
+def artifact_model(artifact: SceneModel, *, profiles: Sequence[str] = ()) -> Model:
     """Return the answers of a trained model. Requests about rooms may name the `profiles`."""
     sampler = machine_sampler(artifact)
     judges_relations = artifact.calibration.misplaced.judges_relations
@@ -51,11 +51,11 @@ def artifact_model(artifact: Artifact, *, profiles: Sequence[str] = ()) -> Model
         rooms=partial(score_rooms, artifact, profiles) if artifact.spec.C else None,
         generate=lambda _: sampler,
         parameters=machine_of(artifact.weights).parameter_count,
-        artifact=artifact,
+        scene_model=artifact,
     )
 
 
-def score_relations(artifact: Artifact, batch: Batch, *, given: bool) -> Tensor:
+def score_relations(artifact: SceneModel, batch: Batch, *, given: bool) -> Tensor:
     """Return the log-odds of each relation between two present classes, (B, A, n, n).
 
     With `given`, the other observed relations that hold are evidence. The log-odds of a relation
@@ -69,7 +69,7 @@ def score_relations(artifact: Artifact, batch: Batch, *, given: bool) -> Tensor:
     return log_odds
 
 
-def score_false_relations(artifact: Artifact, batch: Batch) -> Tensor:
+def score_false_relations(artifact: SceneModel, batch: Batch) -> Tensor:
     """Return the log-odds that observed relations hold, (B, A, n, n); others are -inf.
 
     `/outliers` ranks the observed relations by these log-odds.
@@ -100,10 +100,11 @@ def _scenes(batch: Batch, given: bool = True) -> Iterator[tuple[Scene, dict[Trip
         for a, x, y in sorted(observed):
             index = last if (a, y, x) in observed and x > y else first
             triples[a, x, y] = (a, int(index[x]), int(index[y]))
-        yield Scene(scene.objects, tuple(triples.values()) or None), triples
+        table = RelationTable.stated(triples.values()) if triples else None
+        yield Scene(scene.objects, table), triples
 
 
-def score_placed(artifact: Artifact, places: Places) -> Tensor:
+def score_placed(artifact: SceneModel, places: Places) -> Tensor:
     """Return the log-probability of each class at B places by `/missing`, (B, V).
 
     The value is -inf for classes it cannot propose.

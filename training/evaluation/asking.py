@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from app import questions
-from app.registry import Artifact, Sensitivity
+from app.model import SceneModel, Sensitivity
 from app.scene import CANONICAL, Scene, SceneObject, canonicalise, observe
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats
@@ -100,7 +100,7 @@ def instances_of(classes: Tensor, counts: Tensor) -> tuple[Scene, Tensor]:
     return of_classes(classes.repeat_interleave(copies).tolist()), copies.cumsum(0) - copies
 
 
-def with_intruder(artifact: Artifact, scene: Scene, intruder: int) -> Scene:
+def with_intruder(artifact: SceneModel, scene: Scene, intruder: int) -> Scene:
     """Return the scene with one more object, of the class `intruder`."""
     thing = SceneObject("intruder", artifact.vocabulary.labels[intruder], intruder)
     return replace(scene, objects=(*scene.objects, thing))
@@ -120,7 +120,7 @@ def canonical_triple(index: Mapping[str, int], entry: Mapping[str, Any]) -> tupl
 
 
 def missing_probabilities(
-    artifact: Artifact, scene: Scene, at: tuple[str, int] | None = None
+    artifact: SceneModel, scene: Scene, at: tuple[str, int] | None = None
 ) -> Floats:
     """Return the probability that each class is missing, (V,).
 
@@ -140,7 +140,7 @@ def missing_probabilities(
     return p
 
 
-def judge(artifact: Artifact, scene: Scene, sensitivity: Sensitivity = "medium") -> Floats:
+def judge(artifact: SceneModel, scene: Scene, sensitivity: Sensitivity = "medium") -> Floats:
     """Return the answers of `/outliers` about the n objects of a scene, (n, 2).
 
     The columns are the probability that the object is an outlier, and 1 if the service reports the
@@ -159,7 +159,7 @@ def log_of(p: Floats) -> Tensor:
     return torch.from_numpy(np.log(np.maximum(p, np.finfo(np.float64).tiny)))
 
 
-def score_missing(artifact: Artifact, v: Tensor, room: Tensor | None = None) -> Tensor:
+def score_missing(artifact: SceneModel, v: Tensor, room: Tensor | None = None) -> Tensor:
     """Return the log-probabilities of `/missing`, (B, V), for lists v (B, V).
 
     `room` (B,) are the room types to state. None states no room type.
@@ -169,7 +169,7 @@ def score_missing(artifact: Artifact, v: Tensor, room: Tensor | None = None) -> 
     return log_of(np.stack([missing_probabilities(artifact, scene) for scene in scenes]))
 
 
-def score_rooms(artifact: Artifact, profiles: Sequence[str], v: Tensor, profile: str) -> Tensor:
+def score_rooms(artifact: SceneModel, profiles: Sequence[str], v: Tensor, profile: str) -> Tensor:
     """Return the log-probabilities of `/rooms`, (B, room types), for lists v (B, V).
 
     The requests name the profile if it is one of the `profiles` of the model.
@@ -185,18 +185,18 @@ def score_rooms(artifact: Artifact, profiles: Sequence[str], v: Tensor, profile:
     return log_of(p)
 
 
-def score_suspicion(artifact: Artifact, v: Tensor) -> Tensor:
+def score_suspicion(artifact: SceneModel, v: Tensor) -> Tensor:
     """Return the probabilities of `/outliers`, or -inf, (B, V), for lists v (B, V)."""
     return _judged(artifact, v, 0, "medium", -torch.inf)
 
 
-def flag_outliers(artifact: Artifact, v: Tensor, sensitivity: Sensitivity) -> Tensor:
+def flag_outliers(artifact: SceneModel, v: Tensor, sensitivity: Sensitivity) -> Tensor:
     """Return the reported outliers, (B, V) bool, for lists v (B, V)."""
     return _judged(artifact, v, 1, sensitivity, 0.0) > 0
 
 
 def _judged(
-    artifact: Artifact, v: Tensor, column: int, sensitivity: Sensitivity, unlisted: float
+    artifact: SceneModel, v: Tensor, column: int, sensitivity: Sensitivity, unlisted: float
 ) -> Tensor:
     values = torch.full(v.shape, unlisted, dtype=torch.float64)
     for row, scene in enumerate(_scenes(v)):
@@ -209,7 +209,7 @@ def _scenes(v: Tensor) -> Iterator[Scene]:
     return (of_classes(row.nonzero().squeeze(1).tolist()) for row in v)
 
 
-def score_misplaced(artifact: Artifact, scene: Scene) -> list[dict[str, Any]]:
+def score_misplaced(artifact: SceneModel, scene: Scene) -> list[dict[str, Any]]:
     """Return the misplaced relations of a scene.
 
     Relations of scenes with poses follow from the poses, as in a request in viewer axes.
@@ -220,7 +220,7 @@ def score_misplaced(artifact: Artifact, scene: Scene) -> list[dict[str, Any]]:
 
 
 def relation_probabilities(
-    artifact: Artifact, scene: Scene, pairs: Sequence[tuple[int, int]] | None = None
+    artifact: SceneModel, scene: Scene, pairs: Sequence[tuple[int, int]] | None = None
 ) -> Floats:
     """Return the probability of each canonical relation, (relations, objects, objects).
 

@@ -29,17 +29,17 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from app.questions import misplaced, missing, outliers, relations
-from app.questions.placements import Place
-from app.registry import (
+from app.model import (
     AlarmLine,
     AlarmLines,
-    Artifact,
     Calibration,
     CountSlope,
     Judgement,
     Misplaced,
+    SceneModel,
 )
+from app.questions import misplaced, missing, outliers, relations
+from app.questions.placements import Place
 from app.scene import CANONICAL, Scene, Vocabulary, canonicalise
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Ints, Rng
@@ -79,7 +79,7 @@ _REMOVALS = 4
 _NO_ALARM = AlarmLine(intercept=1e3)
 # (probability, truth) of each answer about one scene.
 Answered = list[tuple[float, bool]]
-Ask = Callable[[Artifact, EncodedScene, Rng], Answered | None]
+Ask = Callable[[SceneModel, EncodedScene, Rng], Answered | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +100,7 @@ class Items:
         return Scored(statistic, self.scene, self.score, self.truth, np.arange(self.scenes))
 
 
-def uncalibrated(artifact: Artifact) -> Artifact:
+def uncalibrated(artifact: SceneModel) -> SceneModel:
     """Return the artifact with raw log-odds in place of calibrated log-odds.
 
     The slope -1 turns the log-odds of an object or relation into those that it is wrong.
@@ -119,7 +119,7 @@ def uncalibrated(artifact: Artifact) -> Artifact:
     return replace(artifact, calibration=neutral)
 
 
-def collect(artifact: Artifact, scenes: SceneTensors, ask: Ask, seed: int = 0) -> Items:
+def collect(artifact: SceneModel, scenes: SceneTensors, ask: Ask, seed: int = 0) -> Items:
     """Ask one of `QUESTIONS` about every scene, and collect the answers with their truth."""
     answers: list[tuple[int, float, bool]] = []
     skipped = 0
@@ -136,7 +136,7 @@ def _items(answers: list[tuple[int, float, bool]], scenes: int, skipped: int) ->
 
 
 def ask_relations(
-    artifact: Artifact,
+    artifact: SceneModel,
     encoded: EncodedScene,
     rng: Rng,  # noqa: ARG001
 ) -> Answered | None:
@@ -145,7 +145,7 @@ def ask_relations(
     return _answers_on(artifact, encoded, labels_alone(encoded), is_known) or None
 
 
-def ask_given(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
+def ask_given(artifact: SceneModel, encoded: EncodedScene, rng: Rng) -> Answered | None:
     """Ask for the relations of half of the pairs. The relations of the other half are evidence."""
     is_asked, evidence = observed_pairs(encoded, artifact.vocabulary.structure, rng)
     if not evidence:
@@ -154,7 +154,7 @@ def ask_given(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered |
     return _answers_on(artifact, encoded, scene, annotated_relations(encoded) & is_asked) or None
 
 
-def _answers_on(artifact: Artifact, encoded: EncodedScene, scene: Scene, mask: Flags) -> Answered:
+def _answers_on(artifact: SceneModel, encoded: EncodedScene, scene: Scene, mask: Flags) -> Answered:
     """Return the answers about the relations in `mask`, (relations, objects, objects) bool."""
     index = index_of_ids(scene)
     answers = [
@@ -164,7 +164,7 @@ def _answers_on(artifact: Artifact, encoded: EncodedScene, scene: Scene, mask: F
     return [(p, bool(encoded.instance_holds[triple])) for p, triple in answers if mask[triple]]
 
 
-def ask_placements(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
+def ask_placements(artifact: SceneModel, encoded: EncodedScene, rng: Rng) -> Answered | None:
     """Ask where an instance of a removed class belongs, for up to `_REMOVALS` removals."""
     is_known = annotated_relations(encoded)
     answers: Answered = []
@@ -185,7 +185,7 @@ def ask_placements(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answe
 
 
 def collect_missing(
-    artifact: Artifact, scenes: SceneTensors, size: Size, seed: int = 0, *, stated: bool = False
+    artifact: SceneModel, scenes: SceneTensors, size: Size, seed: int = 0, *, stated: bool = False
 ) -> Items:
     """Ask for the missing classes of random parts of this size, and collect the answers.
 
@@ -248,7 +248,7 @@ def place_question(
     return PlaceQuestion(labels_alone(encoded, kept), at, placed, usable)
 
 
-def ask_placed(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
+def ask_placed(artifact: SceneModel, encoded: EncodedScene, rng: Rng) -> Answered | None:
     """Ask for the hidden classes at one place, without those of an unknown relation."""
     question = place_question(artifact.vocabulary, encoded, rng, range(artifact.spec.A))
     if question is None:
@@ -262,7 +262,7 @@ def ask_placed(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered 
 
 
 def ask_outliers(
-    artifact: Artifact,
+    artifact: SceneModel,
     encoded: EncodedScene,
     rng: Rng,
     intruders: Mapping[tuple[str, str], Ints] | None = None,
@@ -294,7 +294,7 @@ def ask_outliers(
     ] or None
 
 
-def ask_misplaced(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
+def ask_misplaced(artifact: SceneModel, encoded: EncodedScene, rng: Rng) -> Answered | None:
     """Ask for misplaced relations. One relation is altered in half of the scenes."""
     case = altered_case(encoded, artifact.vocabulary.structure, rng)
     if case is None:
@@ -327,7 +327,7 @@ NAMES = (*QUESTIONS, *LISTED)
 """Names of all questions in the metrics of the task."""
 
 
-def calibration_task(artifact: Artifact, setting: Setting) -> Outcome | None:
+def calibration_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
     """Measure the calibration of the answers to all questions, published and uncalibrated."""
     related = setting.some(related=True, share=3)
     complete, complete_related = (

@@ -20,10 +20,10 @@ from typing import Final
 import numpy as np
 import torch
 
-from app.questions.counts import LIKELY, more
+from app.model import SceneModel
+from app.model.count_statistics import Counts
+from app.questions.missing import LIKELY, more
 from app.questions.posterior import present
-from app.registry import Artifact
-from app.registry.counts import Counts
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.cases import MOST, counted_classes, listed_cases
@@ -41,7 +41,7 @@ METRICS: Final = (
 )
 
 
-def counts_task(artifact: Artifact, setting: Setting) -> Outcome | None:
+def counts_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
     """Measure the errors, the share of counts in the interval and the precision of proposals."""
     train = setting.train
     if artifact.counts is None or train is None:
@@ -81,7 +81,7 @@ def counts_task(artifact: Artifact, setting: Setting) -> Outcome | None:
 
 
 def _ask_counts(
-    artifact: Artifact, scene: EncodedScene, counted: Flags, seed: int
+    artifact: SceneModel, scene: EncodedScene, counted: Flags, seed: int
 ) -> list[tuple[float, ...]]:
     """Return (class, number, listed, expected, low, high, probability) of each listed class."""
     part, asked = listed_cases(scene, counted, artifact.vocabulary.structure, seed)
@@ -98,7 +98,7 @@ def _ask_counts(
     return [(*number_of[entry["label"]], *(entry[name] for name in fields)) for entry in entries]
 
 
-def _mean_counts(scenes: Sequence[EncodedScene], artifact: Artifact) -> Floats:
+def _mean_counts(scenes: Sequence[EncodedScene], artifact: SceneModel) -> Floats:
     """Return the mean number of instances of each class in the scenes with the class, (V,)."""
     times, total = np.zeros((2, len(artifact.vocabulary)))
     for scene in scenes:

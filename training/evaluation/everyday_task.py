@@ -17,9 +17,9 @@ import numpy as np
 
 from app import questions
 from app.errors import RequestError
+from app.model import SceneModel
 from app.questions.names import ErrorList
 from app.questions.reading import Limits, Reading, read_scene
-from app.registry import Artifact
 from app.scene import Scene, opposite
 from scene_client.schemas import SceneRequest
 from training.datasets.files import DATA
@@ -67,7 +67,7 @@ def facts_file(folder: Path = EVERYDAY) -> Path | None:
     return path if path.is_file() else None
 
 
-def everyday_task(artifact: Artifact, setting: Setting) -> Outcome | None:
+def everyday_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
     """Measure the everyday facts. Each fact counts as one scene. `setting.scenes` is not used."""
     folder = setting.everyday
     if folder is None or facts_file(folder) is None:
@@ -82,7 +82,7 @@ def everyday_task(artifact: Artifact, setting: Setting) -> Outcome | None:
     return Outcome(metrics, count, 0)
 
 
-def ask_everyday(artifact: Artifact, folder: Path = EVERYDAY) -> Lines:
+def ask_everyday(artifact: SceneModel, folder: Path = EVERYDAY) -> Lines:
     """Ask about every fact in the folder.
 
     Raises:
@@ -116,7 +116,7 @@ def ask_everyday(artifact: Artifact, folder: Path = EVERYDAY) -> Lines:
     return lines
 
 
-def _read(artifact: Artifact, labels: Sequence[str]) -> Reading | None:
+def _read(artifact: SceneModel, labels: Sequence[str]) -> Reading | None:
     """Read the labels as a request does. Return None if the model knows none of them."""
     request = SceneRequest(objects=list(labels), unknown_labels="ignore")
     try:
@@ -125,7 +125,7 @@ def _read(artifact: Artifact, labels: Sequence[str]) -> Reading | None:
         return None
 
 
-def _relation_hits(artifact: Artifact, fact: Mapping[str, str]) -> tuple[bool, bool, bool]:
+def _relation_hits(artifact: SceneModel, fact: Mapping[str, str]) -> tuple[bool, bool, bool]:
     """Return whether the relation is the likeliest, the likeliest vertical one, and has p >= .5.
 
     The facts were written before the relations inside and contains existed, so these are left out.
@@ -146,7 +146,7 @@ def _relation_hits(artifact: Artifact, fact: Mapping[str, str]) -> tuple[bool, b
     return likeliest == relation, vertical == relation, p.get(relation, 0.0) >= 0.5
 
 
-def _first_missing(artifact: Artifact, fact: Mapping[str, Any]) -> list[str]:
+def _first_missing(artifact: SceneModel, fact: Mapping[str, Any]) -> list[str]:
     """Return the first five labels, or an empty list if the service would reject the request."""
     reading, at = _read(artifact, fact["objects"]), None
     if reading is None:
@@ -160,7 +160,7 @@ def _first_missing(artifact: Artifact, fact: Mapping[str, Any]) -> list[str]:
     return [entry["label"] for entry in answer["missing"]]
 
 
-def _outliers(artifact: Artifact, labels: Sequence[str]) -> tuple[list[str], set[str]]:
+def _outliers(artifact: SceneModel, labels: Sequence[str]) -> tuple[list[str], set[str]]:
     """Return the labels, the most suspicious first, and the labels of reported outliers."""
     reading = _read(artifact, labels)
     entries = [] if reading is None else questions.outliers(artifact, reading.scene)["outliers"]

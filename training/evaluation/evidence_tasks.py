@@ -22,8 +22,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from app.registry import Artifact
-from app.scene import PoseRelations, Scene
+from app.model import SceneModel
+from app.scene import RelationTable, Scene
 from training.datasets.array_types import Flags, Floats
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import scene_of, scene_rng
@@ -55,7 +55,7 @@ class Case(NamedTuple):
     truth: Flags
 
 
-def missing_evidence_task(artifact: Artifact, setting: Setting) -> Outcome | None:
+def missing_evidence_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
     """Measure T2 (missing objects) with labels only and with the room type."""
     scenes, structure = with_room_type(setting.some()), setting.structure
     # With one question per scene, the random choice of the class changes the result of a small data
@@ -91,11 +91,13 @@ def halves(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -> 
         triples = [(int(a), int(i), int(j)) for a, i, j in np.argwhere(given)]
         scene = replace(scene_of(encoded, range(len(instances)), triples), room_type=None)
         if kind == "poses":
-            scene = replace(scene, poses=PoseRelations(given, encoded.instance_observed & between))
+            observed = encoded.instance_observed & between
+            table = RelationTable.shown_by_boxes(given, observed, np.zeros_like(observed))
+            scene = replace(scene, relations=table)
         yield Case(index, scene, queried, truth)
 
 
-def relations_evidence_task(artifact: Artifact, setting: Setting) -> Outcome | None:
+def relations_evidence_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
     """Measure T1 (relations) with labels only, and with relations or poses."""
     scenes, structure = setting.some(related=True), setting.structure.numpy()
     metrics: dict[str, Metric] = {}
@@ -103,7 +105,7 @@ def relations_evidence_task(artifact: Artifact, setting: Setting) -> Outcome | N
 
     def ask(case: Case) -> Floats:
         count, truth = int(case.truth.sum()), case.truth[case.queried]
-        bare = replace(case.scene, relations=None, poses=None)
+        bare = replace(case.scene, relations=None)
         p = (relation_probabilities(artifact, scene) for scene in (bare, case.scene))
         return np.array([expected_hits(x[case.queried], truth, count) for x in p])
 

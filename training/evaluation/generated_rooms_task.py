@@ -20,8 +20,8 @@ import numpy as np
 from torch import Tensor
 
 from app.inference.chains import Conditions, random_stream
+from app.model import SceneModel
 from app.questions.generate import STEPS, draw_plausible, is_within_limits
-from app.registry import Artifact
 from app.scene import Scene
 from training.datasets.array_types import Floats, Ints
 from training.datasets.sources import source_of
@@ -38,7 +38,7 @@ _DRAWS = 200  # generated scenes of each condition
 _RESAMPLES = 200
 
 
-def generated_rooms_task(artifact: Artifact, setting: Setting) -> Outcome | None:
+def generated_rooms_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
     """Measure the task on held-out scenes. The figures of a room type need 10 scenes."""
     names = artifact.vocabulary.room_types
     types = {name: names.index(name) for name in ROOMS if artifact.spec.C and name in names}
@@ -66,7 +66,7 @@ def generated_rooms_task(artifact: Artifact, setting: Setting) -> Outcome | None
     return Outcome.over(scenes, metrics, int((~asked).sum()))
 
 
-def _drawn_size(artifact: Artifact, room: int | None, things: Tensor, seed: int) -> float:
+def _drawn_size(artifact: SceneModel, room: int | None, things: Tensor, seed: int) -> float:
     """Return the mean number of classes of generated scenes, without structure."""
     chains = artifact.scene_chains.under(Conditions(np.zeros(0, np.int64), None, room))
     evidence, is_thing = Scene((), room_type=room), things.numpy()

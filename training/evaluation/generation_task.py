@@ -29,8 +29,8 @@ import torch
 from torch import Tensor
 
 from app.inference.chains import Conditions, random_stream
+from app.model import SceneModel
 from app.questions.generate import STEPS, draw_plausible
-from app.registry import Artifact
 from training.datasets.array_types import Floats, Ints
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.cases import some_scenes
@@ -84,7 +84,7 @@ def scene_sampler(scenes: SceneTensors) -> Sampler:
     return sample
 
 
-def machine_sampler(artifact: Artifact) -> Sampler:
+def machine_sampler(artifact: SceneModel) -> Sampler:
     """Return a sampler that draws scenes as the service does, and also samples relations.
 
     Of two contradictory relations a(x, y) and a(y, x), the service keeps only one. This sampler

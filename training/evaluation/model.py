@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import torch
 from torch import Tensor
 
-from app.registry import Artifact, Sensitivity
+from app.model import SceneModel, Sensitivity
 from app.scene import Scene
 from training.datasets.batches import Batch
 from training.evaluation.setting import Setting
@@ -87,7 +87,7 @@ class Model:
         lateral: change of the log-odds of left and front in T1 pairs, see `lateral_shift`.
         rooms: log-probabilities of the room types.
         generate: sampler of T4 for a setting.
-        artifact: model for Calibration and for all questions to the service.
+        scene_model: model for Calibration and for all questions to the service.
         parameters: number of trained weights, or None if this number is not meaningful.
     """
 
@@ -102,7 +102,7 @@ class Model:
     lateral: float = 0.0
     rooms: RoomScore | None = None
     generate: SamplerOf | None = None
-    artifact: Artifact | None = None
+    scene_model: SceneModel | None = None
     parameters: int | None = None
 
     def __post_init__(self) -> None:

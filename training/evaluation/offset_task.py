@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from scipy.special import chdtri
 
-from app.registry import Artifact
+from app.model import SceneModel
 from app.scene import CANONICAL
 from training.datasets.cases import observed_offsets
 from training.evaluation.metrics import Metric, Ratio
@@ -34,7 +34,7 @@ METRICS: Final = (
 )
 
 
-def offsets_task(artifact: Artifact, setting: Setting) -> Outcome | None:
+def offsets_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
     """Measure the share of covered offsets for each relation, and the distances for all relations.
 
     Return None if the model has no offsets, or if no scene has related objects with poses.

@@ -13,6 +13,7 @@ from typing import Final
 
 import torch
 
+from app.model import SceneModel
 from app.registry import Artifact
 from app.registry import Metric as CardMetric
 from app.scene import Vocabulary
@@ -58,18 +59,19 @@ class RoomList:
             encoded = [replace(scene, group=scene.scene_id) for scene in encoded]
         return scene_tensors(encoded, annotated_classes(encoded, vocabulary), vocabulary)
 
-    def measure(self, artifact: Artifact, progress: Progress = silent) -> list[CardMetric]:
+    def measure(self, model: SceneModel, progress: Progress = silent) -> list[CardMetric]:
         """Return the metrics of `ROOM_TASKS` that the scenes support.
 
         Intervals are over groups. The intruders of T3 have the popularity and the typical rooms of
         the file itself.
         """
-        scenes = self.tensors(artifact.vocabulary)
-        structure = torch.from_numpy(artifact.vocabulary.structure.copy())
+        scenes = self.tensors(model.vocabulary)
+        structure = torch.from_numpy(model.vocabulary.structure.copy())
         setting = Setting(scenes, structure, train=scenes, limit=None)
-        model = artifact_model(artifact)
         return card_figures(
-            measure(model, setting, self.source, tasks=ROOM_TASKS, progress=progress)
+            measure(
+                artifact_model(model), setting, self.source, tasks=ROOM_TASKS, progress=progress
+            )
         )
 
     def trained(self, artifact: Artifact) -> list[str]:
@@ -82,9 +84,9 @@ class RoomList:
         )
         return [self.source] if is_trained else []
 
-    def remark(self, artifact: Artifact) -> str:
+    def remark(self, model: SceneModel) -> str:
         """Return the number of objects with unknown labels."""
         labels = [thing.label for scene in self.scenes for thing in scene.objects]
-        unknown = sum(artifact.vocabulary.index(label) is None for label in labels)
+        unknown = sum(model.vocabulary.index(label) is None for label in labels)
         reason = "objects are left out, because their labels are unknown"
         return f"{unknown:,} of {len(labels):,} {reason}" if unknown else ""

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.special import expit
 from torch import Tensor
 
-from app.registry import Artifact
+from app.model import SceneModel
 from app.scene.spatial_relations import INSIDE, LATERAL, VERTICAL
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Ints
@@ -89,7 +89,7 @@ def listed_pairs(
     return pairs
 
 
-def service_score(artifact: Artifact) -> PairScore:
+def service_score(artifact: SceneModel) -> PairScore:
     """Return a score: probabilities of `/relations` between the first instances of both classes."""
 
     def score(question: ScenePairs) -> Floats:
@@ -224,8 +224,8 @@ def _ask(model: Model, setting: Setting, relations: Sequence[int]) -> _Answers |
         return None
     scenes = setting.at(torch.tensor(sorted(related), dtype=torch.int64)).some()
     questions = listed_pairs(scenes, setting.structure, relations)
-    if model.artifact is not None:
-        score = service_score(model.artifact)
+    if model.scene_model is not None:
+        score = service_score(model.scene_model)
     elif model.relations is not None:
         score = baseline_score(scenes, model.relations, model.lateral)
     else:

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from app.registry import Artifact
+from app.model import SceneModel
 from app.registry import Metric as CardMetric
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.files import write_whole
@@ -141,7 +141,7 @@ def pooled(reports: Sequence[SourceReport], source: str = "pooled") -> SourceRep
 
 
 def evaluate(
-    artifact: Artifact,
+    artifact: SceneModel,
     scenes: SceneTensors,
     structure: Tensor,
     train: SceneTensors,

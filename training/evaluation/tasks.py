@@ -102,7 +102,7 @@ TASKS: dict[str, Task] = {
         of_objects=False,
     ),
     "T1 with evidence": _task(
-        *("relations, with more evidence", "artifact", evidence.relations_evidence_task),
+        *("relations, with more evidence", "scene_model", evidence.relations_evidence_task),
         _each(("change of R-precision",), evidence.OF_RELATIONS),
         of_objects=False,
     ),
@@ -115,7 +115,7 @@ TASKS: dict[str, Task] = {
         (*_MRR, "top-1", "top-10"),
     ),
     "T2 with evidence": _task(
-        *("missing object, with the room type", "artifact", evidence.missing_evidence_task),
+        *("missing object, with the room type", "scene_model", evidence.missing_evidence_task),
         _each(("change of MRR",), evidence.OF_OBJECTS),
     ),
     "T2-at missing at a place": _task(
@@ -153,17 +153,17 @@ TASKS: dict[str, Task] = {
         ("MMD², free", "pair correlation, free"),
     ),
     "T4 rooms": _task(
-        *("generated rooms", "artifact", generated_rooms_task),
+        *("generated rooms", "scene_model", generated_rooms_task),
         (REFUSED, *_each((REFUSED,), ROOMS), *_each((SIZE,), (FREE, *ROOMS))),
         (REFUSED, *_each((SIZE,), (FREE,))),
     ),
     "Calibration": _task(
-        *("calibration", "artifact", calibration_task),
+        *("calibration", "scene_model", calibration_task),
         _each(("ECE", "Brier skill"), NAMES),
         tuple(f"{figure}, {name}" for name in NAMES for figure in ("ECE", "Brier skill")),
         of_objects=False,
     ),
-    "Everyday": _task("everyday facts", "artifact", everyday_task, LINES, of_objects=False),
+    "Everyday": _task("everyday facts", "scene_model", everyday_task, LINES, of_objects=False),
 }
 
 
@@ -171,12 +171,12 @@ TASKS: dict[str, Task] = {
 # but not in tables that compare machines.
 STATISTICS: dict[str, Task] = {
     "Offsets": _task(
-        *("offsets of placements", "artifact", offsets.offsets_task),
+        *("offsets of placements", "scene_model", offsets.offsets_task),
         (),
         offsets.METRICS,
         of_objects=False,
     ),
-    "Counts": _task("numbers of instances", "artifact", counts.counts_task, (), counts.METRICS),
+    "Counts": _task("numbers of instances", "scene_model", counts.counts_task, (), counts.METRICS),
 }
 
 EVERY_TASK = TASKS | STATISTICS

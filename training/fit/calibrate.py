@@ -24,9 +24,9 @@ import numpy as np
 import torch
 
 from app.inference.quadrature import NO_UNIT
+from app.model import Calibration, CountSlope, SceneModel
 from app.questions.placements import PLACES
 from app.questions.posterior import Posterior
-from app.registry import Artifact, Calibration, CountSlope
 from app.scene.spatial_relations import CANONICAL, LATERAL, ON_TOP, STACKED
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Rng
@@ -61,7 +61,7 @@ _PLACEMENT_CASES = 4
 
 
 def calibrate(
-    artifact: Artifact,
+    artifact: SceneModel,
     data: TrainingData,
     config: ObjectsConfig,
     seed: int = 0,
@@ -92,7 +92,7 @@ def calibrate(
 
 
 def fit_relations(
-    artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
+    artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int = 0
 ) -> tuple[CountSlope, ...]:
     """Fit the probability that a relation holds between two instances, in whole and partial scenes.
 
@@ -105,14 +105,14 @@ def fit_relations(
 
 
 def fit_with_observed(
-    artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
+    artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int = 0
 ) -> tuple[CountSlope, ...]:
     """Fit the probability of relations of half of the pairs of a scene, given the other half."""
     return _fit_possible(_examples_of_pairs(artifact, scenes, np.random.default_rng(seed)))
 
 
 def with_lower_lateral(
-    artifact: Artifact, slopes: tuple[CountSlope, ...], scenes: SceneTensors
+    artifact: SceneModel, slopes: tuple[CountSlope, ...], scenes: SceneTensors
 ) -> tuple[CountSlope, ...]:
     """Lower the log-odds of left and front until the likeliest relations are the listed ones.
 
@@ -146,14 +146,17 @@ def _part_of(encoded: EncodedScene, structure: Flags, rng: Rng) -> EncodedScene:
 
 
 def _posterior(
-    artifact: Artifact, encoded: EncodedScene, kept: Sequence[int], observed: Sequence[Triple] = ()
+    artifact: SceneModel,
+    encoded: EncodedScene,
+    kept: Sequence[int],
+    observed: Sequence[Triple] = (),
 ) -> Posterior:
     """Return the posterior given some instances of a scene, without its room type."""
     return Posterior(artifact, replace(scene_of(encoded, kept, observed), room_type=None))
 
 
 def _examples_of_pairs(
-    artifact: Artifact, scenes: Sequence[EncodedScene], rng: Rng | None = None
+    artifact: SceneModel, scenes: Sequence[EncodedScene], rng: Rng | None = None
 ) -> Floats:
     """Return the examples of all pairs of a scene; with `rng`, of half, given the other half.
 
@@ -190,7 +193,7 @@ def _examples_of_pairs(
 
 
 def fit_placements(
-    artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
+    artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int = 0
 ) -> tuple[CountSlope, ...]:
     """Fit the probability of relations between a removed object and the objects of its scene.
 

@@ -17,9 +17,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 
+from app.model import PlaceFit, SceneModel
 from app.questions.placements import place_log_p
 from app.questions.posterior import Posterior, calibrated_missing
-from app.registry import Artifact, PlaceFit
 from app.scene.spatial_relations import LATERAL, STACKED
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats
@@ -46,7 +46,7 @@ class PlaceTerms(NamedTuple):
 
 
 def fit_at(
-    artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
+    artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int = 0
 ) -> tuple[PlaceFit, ...]:
     """Return the entry of each relation. Relations with few questions keep the default entry."""
     entries = [PlaceFit()] * artifact.spec.A
@@ -65,7 +65,7 @@ def fit_at(
     return tuple(entries)
 
 
-def place_terms(artifact: Artifact, question: PlaceQuestion) -> PlaceTerms:
+def place_terms(artifact: SceneModel, question: PlaceQuestion) -> PlaceTerms:
     """Return the terms of the classes that may be asked for at a place."""
     scene, place, placed, usable = question
     posterior, classes = Posterior(artifact, scene), np.flatnonzero(usable)

@@ -22,6 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logit
 
+from app.model import AlarmLine, AlarmLines, Judgement, Misplaced, SceneModel
+from app.model.calibration import KINDS, LEAST_ALARM
 from app.questions.misplaced import (
     BELOW,
     BESIDE,
@@ -35,9 +37,7 @@ from app.questions.misplaced import (
     wrong_log_odds,
 )
 from app.questions.posterior import Posterior
-from app.registry import AlarmLine, AlarmLines, Artifact, Judgement, Misplaced
-from app.registry.description import KINDS, LEAST_ALARM
-from app.scene import Scene
+from app.scene import RelationTable, Scene
 from app.scene.scene import observe
 from app.scene.spatial_relations import ON_TOP
 from training.datasets import EncodedScene
@@ -89,7 +89,7 @@ class _Cases(NamedTuple):
         return _Cases(*columns)
 
 
-def fit_misplaced(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0) -> Misplaced:
+def fit_misplaced(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int = 0) -> Misplaced:
     """Return the judgement of each kind of entry. A kind with too few scenes gets None."""
     cases = _cases(artifact, _some(scenes, seed), seed)
     if cases is None:
@@ -111,7 +111,7 @@ def _some(scenes: Sequence[EncodedScene], seed: int) -> list[EncodedScene]:
     return chosen
 
 
-def _cases(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int) -> _Cases | None:
+def _cases(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int) -> _Cases | None:
     """Return the cases of the scenes, or None without any."""
     of_scene: list[tuple[int, str, bool, bool, float]] = []
     of_entries: list[tuple[Ints, Floats, Flags]] = []
@@ -119,15 +119,15 @@ def _cases(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int) -> _Ca
         # Without annotated supports, stands show nothing.
         shows_all = annotated_relations(encoded)[ON_TOP].any()
         shown = range(len(KINDS)) if shows_all else (BESIDE, SUPPORT, OVER, BELOW)
-        for scene, flipped, wrong in _questions(artifact, encoded, seed):
+        for scene, wrong in _questions(artifact, encoded, seed):
             bare = replace(scene, room_type=None)
-            entries = entries_of(artifact, Posterior(artifact, bare), bare, flipped)
+            entries = entries_of(artifact, Posterior(artifact, bare), bare)
             is_wrong, usable = _truth(entries, wrong)
             usable &= np.isin(entries.kind, shown)
-            listed_of_boxes = bare.poses is None and encoded.instance_positions is not None
+            listed_of_boxes = not bare.has_boxes and encoded.instance_positions is not None
             explained = listed_of_boxes | (entries.terms[:, 0] >= EXPLAINED)
             usable &= (entries.kind != OVER) | ~explained
-            weight = _OF_WORDS if wrong in flipped else 1.0
+            weight = _OF_WORDS if wrong in bare.opposites else 1.0
             of_scene.append((number, encoded.source, wrong is None, STAND in shown, weight))
             of_entries.append((entries.kind[usable], entries.terms[usable], is_wrong[usable]))
     if not of_scene:
@@ -142,9 +142,9 @@ def _cases(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int) -> _Ca
 
 
 def _questions(
-    artifact: Artifact, encoded: EncodedScene, seed: int
-) -> Iterator[tuple[Scene, Collection[Triple], Triple | int | None]]:
-    """Yield scenes, triples stated as "under", and the wrong triple, moved object or None."""
+    artifact: SceneModel, encoded: EncodedScene, seed: int
+) -> Iterator[tuple[Scene, Triple | int | None]]:
+    """Yield scenes, and the wrong triple, moved object or None."""
     structure, places = artifact.vocabulary.structure, artifact.places
     classes, rng = encoded.instance_classes.tolist(), scene_rng(encoded, seed)
     triples = draw_true_relations(encoded, structure, rng)
@@ -156,10 +156,10 @@ def _questions(
             for a, i, j in triples
             if a == ON_TOP and places is not None and places.means_under(classes[i], classes[j])
         ]
-        yield replace(scene, relations=tuple(triples)), unders, None
-        yield scene, unders, false
+        yield _stating(scene, triples, unders), None
+        yield _stating(scene, scene.triples, unders), false
         if false[0] == ON_TOP:
-            yield scene, [*unders, false], false
+            yield _stating(scene, scene.triples, [*unders, false]), false
     state = scene_rng(encoded, seed + 1), scene_rng(encoded, seed + 1)
     untouched, moved = untouched_scene(encoded, structure, state[0]), None
     if untouched is not None:
@@ -169,7 +169,13 @@ def _questions(
         roles = None if places is None else places.roles
         part = _part_of(untouched, scene_rng(encoded, seed + 2))
         for shown, wrong in ((untouched, None), (part, None), moved):
-            yield observe(shown, typical_sizes=sizes, roles=roles), (), wrong
+            yield observe(shown, typical_sizes=sizes, roles=roles), wrong
+
+
+def _stating(scene: Scene, triples: Sequence[Triple], unders: Collection[Triple]) -> Scene:
+    """Return the scene with these relations. It states the triples of ``unders`` as "under"."""
+    table = RelationTable.stated(triples, [triple in unders for triple in triples])
+    return replace(scene, relations=table)
 
 
 def _part_of(scene: Scene, rng: Rng) -> Scene:

@@ -32,9 +32,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from app.model import AlarmLine, AlarmLines, Calibration, CountSlope, CoverageFit, SceneModel
+from app.model.calibration import LEAST_COVERAGE, LONGEST_JUDGED
 from app.questions.posterior import calibrated
-from app.registry import AlarmLine, AlarmLines, Artifact, Calibration, CountSlope, CoverageFit
-from app.registry.description import LEAST_COVERAGE, LONGEST_JUDGED
 from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.cases import RIDGE, logistic
@@ -73,7 +73,7 @@ _SOURCE_SCENES = 200  # maximum scenes of each source
 
 
 def calibrate_objects(
-    artifact: Artifact,
+    artifact: SceneModel,
     validation: SceneTensors,
     train: SceneTensors,
     popularity: Tensor,
@@ -102,7 +102,7 @@ def calibrate_objects(
     return recalibrated(artifact, **entries).calibration
 
 
-def recalibrated(artifact: Artifact, **entries: Any) -> Artifact:
+def recalibrated(artifact: SceneModel, **entries: Any) -> SceneModel:
     """Return a copy of the model in which some entries of the calibration are replaced."""
     return replace(artifact, calibration=artifact.calibration.model_copy(update=entries))
 
@@ -148,7 +148,7 @@ def written_scenes(scenes: SceneTensors, *, written: bool = True) -> SceneTensor
 
 
 def fit_missing(
-    artifact: Artifact, scenes: SceneTensors, structure: Tensor, chosen: Calibration | None = None
+    artifact: SceneModel, scenes: SceneTensors, structure: Tensor, chosen: Calibration | None = None
 ) -> dict[str, Any]:
     """Fit the entries `coverage`, `missing` and `covered` of the calibration."""
     seen = written_scenes(scenes, written=False)
@@ -171,7 +171,7 @@ def fit_missing(
     return entries
 
 
-def _fit_covered(artifact: Artifact, parts: _Lists) -> CoverageFit:
+def _fit_covered(artifact: SceneModel, parts: _Lists) -> CoverageFit:
     """Fit `covered` to the first classes of parts, each asked with its share of the scene."""
     n, hidden = parts.v.sum(1).numpy(), parts.hidden.sum(1)
     # The model's base rates for a complete list are those of all classes but one.
@@ -215,7 +215,7 @@ def _joined(scenes: SceneTensors, structure: Tensor, sizes: Iterable[Size]) -> _
     return _Lists(v, (hidden & ~related).numpy(), candidates.numpy(), annotated.numpy())
 
 
-def unlisted_log_odds(artifact: Artifact, v: Tensor, coverages: Sequence[float]) -> Floats:
+def unlisted_log_odds(artifact: SceneModel, v: Tensor, coverages: Sequence[float]) -> Floats:
     """Return the log-odds of every class for lists v, (coverages, lists, classes)."""
     every, posteriors = np.arange(artifact.spec.V), (posterior_of(artifact, row) for row in v)
     rows = [[posterior.absent_log_odds(every, c) for c in coverages] for posterior in posteriors]
@@ -256,7 +256,7 @@ class ListScores:
         log_odds: log-odds of each listed class given the rest of its list, (n,).
         popularity: log-odds of each class in the served mix, (n,).
         intruder: True for intruders, (n,) bool.
-        can_alarm: False for classes that raise no alarm (`Artifact.rarely_shown`), (n,) bool.
+        can_alarm: False for classes that raise no alarm (`SceneModel.rarely_shown`), (n,) bool.
         size: number of listed classes of each list, (N,).
     """
 
@@ -279,7 +279,7 @@ class ListScores:
 
 
 def fit_outliers(
-    artifact: Artifact,
+    artifact: SceneModel,
     scenes: SceneTensors,
     train: SceneTensors,
     structure: Tensor,
@@ -307,7 +307,9 @@ def fit_outliers(
     return {"popularity_weight": alpha, "outlier": entry, **lines}
 
 
-def refitted_lines(artifact: Artifact, validation: SceneTensors, config: ObjectsConfig) -> Artifact:
+def refitted_lines(
+    artifact: SceneModel, validation: SceneTensors, config: ObjectsConfig
+) -> SceneModel:
     """Return the model with alarm lines that are fitted again; a model without lines as it is."""
     calibration = artifact.calibration
     scenes = calibration_scenes(validation, config.calibrated_sources)
@@ -318,14 +320,14 @@ def refitted_lines(artifact: Artifact, validation: SceneTensors, config: Objects
     return recalibrated(artifact, **fit_lines(artifact, scenes, structure, entry, alpha))
 
 
-def judged_classes(artifact: Artifact) -> Flags:
+def judged_classes(artifact: SceneModel) -> Flags:
     """Return the classes that can be intruders and that training shows, (classes,) bool."""
     popularity = np.array(artifact.calibration.popularity, dtype=np.float64)
     return artifact.vocabulary.judged & ~np.isnan(popularity)
 
 
 def score_lists(
-    artifact: Artifact,
+    artifact: SceneModel,
     parts: Parts,
     intruders: Tensor | None = None,
     rooms: Sequence[int] | None = None,
@@ -350,7 +352,7 @@ def score_lists(
 
 
 def score_untouched(
-    artifact: Artifact, scenes: SceneTensors, structure: Tensor, *, in_room: bool = False
+    artifact: SceneModel, scenes: SceneTensors, structure: Tensor, *, in_room: bool = False
 ) -> dict[int, ListScores]:
     """Return the scores of random parts of scenes by length, without lengths of too few parts.
 
@@ -368,7 +370,7 @@ def score_untouched(
 
 
 def score_intruders(
-    artifact: Artifact, scenes: SceneTensors, structure: Tensor, weights: Tensor | None
+    artifact: SceneModel, scenes: SceneTensors, structure: Tensor, weights: Tensor | None
 ) -> ListScores:
     """Return the scores of random parts of scenes, each with an intruder drawn by the weights."""
     unjudged = torch.from_numpy(~judged_classes(artifact))
@@ -416,7 +418,7 @@ def _fit_intruders(
 
 
 def fit_lines(
-    artifact: Artifact, scenes: SceneTensors, structure: Tensor, entry: CountSlope, alpha: float
+    artifact: SceneModel, scenes: SceneTensors, structure: Tensor, entry: CountSlope, alpha: float
 ) -> dict[str, AlarmLines | None]:
     """Return the fields `outlier_lines` and `room_lines` of a `Calibration`.
 

@@ -23,10 +23,10 @@ from scipy.special import log_softmax
 from torch import Tensor
 
 from app.inference.chains import random_stream
+from app.model import FitLimit, SceneModel, Sharpness
+from app.model.calibration import NO_LIMIT
 from app.questions.generate import STEPS, room_fit
 from app.questions.posterior import Posterior
-from app.registry import Artifact, FitLimit, Sharpness
-from app.registry.description import NO_LIMIT
 from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.sources import source_of
@@ -49,7 +49,7 @@ _LONG_SCENES = 100  # of a room type, for a limit of the fit that grows with the
 
 
 def calibrate_rooms(
-    artifact: Artifact, scenes: SceneTensors, train: SceneTensors, structure: Tensor
+    artifact: SceneModel, scenes: SceneTensors, train: SceneTensors, structure: Tensor
 ) -> dict[str, Any]:
     """Return the calibration entries about room types.
 
@@ -65,7 +65,7 @@ def calibrate_rooms(
     }
 
 
-def fit_rooms(artifact: Artifact, scenes: SceneTensors, structure: Tensor) -> Sharpness:
+def fit_rooms(artifact: SceneModel, scenes: SceneTensors, structure: Tensor) -> Sharpness:
     """Fit the sharpness of room types; the default with fewer than 20 scenes of a known type."""
     scenes = subset(scenes, (scenes.room >= 0).nonzero().squeeze(1))
     if len(scenes) < _LEAST_SCENES:
@@ -86,7 +86,7 @@ def fit_rooms(artifact: Artifact, scenes: SceneTensors, structure: Tensor) -> Sh
     return Sharpness(slope=slope, log_count=log_count)
 
 
-def posterior_of(artifact: Artifact, v: Tensor, room: int | None = None) -> Posterior:
+def posterior_of(artifact: SceneModel, v: Tensor, room: int | None = None) -> Posterior:
     """Return the posterior given the listed classes v, (classes,), and the room type."""
     scene = of_classes(v.nonzero().squeeze(1).tolist())
     return Posterior(artifact, replace(scene, room_type=room))
@@ -101,7 +101,7 @@ def written_rooms(train: SceneTensors) -> tuple[int, ...]:
 
 
 def rare_rooms(
-    artifact: Artifact, train: SceneTensors, structure: Tensor, seed: int = 0
+    artifact: SceneModel, train: SceneTensors, structure: Tensor, seed: int = 0
 ) -> tuple[int, ...]:
     """Return the room types with too few training scenes to sample them, in ascending order.
 
@@ -124,7 +124,7 @@ def rare_rooms(
     return tuple(rare)
 
 
-def _samples(artifact: Artifact, room: int, seed: int) -> Flags:
+def _samples(artifact: SceneModel, room: int, seed: int) -> Flags:
     """Draw scenes of a room type as `/generate` does, without its tests, (samples, classes)."""
     chains = artifact.scene_chains.under(conditions_of(room))
     samples = np.zeros((_SAMPLES, artifact.spec.V), np.bool_)
@@ -138,7 +138,7 @@ def _resemblance(first: Flags, second: Flags) -> float:
     return float(np.minimum(p, q).sum() / max(np.maximum(p, q).sum(), 1e-9))
 
 
-def refitted_limits(artifact: Artifact, train: SceneTensors) -> Artifact:
+def refitted_limits(artifact: SceneModel, train: SceneTensors) -> SceneModel:
     """Return the model with limits of generated scenes that are fitted again.
 
     Args:
@@ -149,7 +149,7 @@ def refitted_limits(artifact: Artifact, train: SceneTensors) -> Artifact:
     return replace(artifact, calibration=artifact.calibration.model_copy(update=update))
 
 
-def limits(artifact: Artifact, train: SceneTensors, structure: Tensor) -> dict[str, Any]:
+def limits(artifact: SceneModel, train: SceneTensors, structure: Tensor) -> dict[str, Any]:
     """Return the limits of a generated scene of each room type.
 
     A limit is a 5 % quantile over parts of whole rooms. The number of classes has the parts of 30 %
@@ -211,7 +211,7 @@ class _ListedRooms(NamedTuple):
         return int(_low_quantile(self.size.astype(np.float64), self.source))
 
 
-def _fit_limit(artifact: Artifact, lists: Sequence[_ListedRooms], room: int) -> FitLimit:
+def _fit_limit(artifact: SceneModel, lists: Sequence[_ListedRooms], room: int) -> FitLimit:
     """Return the limit of the fit from lists of a room type, one entry for each of `_PARTS`.
 
     With few scenes, the quantile of whole lists is that of the few worst. A small machine cannot

@@ -1,6 +1,6 @@
 """Fit statistics of the numbers of instances of a class, such as the chairs of a kitchen.
 
-`app.questions.counts` has the formula. s(n) is a weighted share of the training scenes with n
+`app.model.count_statistics` has the formula. s(n) is a weighted share of the training scenes with n
 instances, shrunk towards the shares over all classes. The weights maximise the penalised likelihood
 of the numbers in partly listed scenes (`some_instances`). A weight is the sum of a term of the
 class and a term that all classes share. `docs/decisions/counts.md` describes the alternatives.
@@ -20,8 +20,7 @@ import numpy as np
 from scipy import sparse
 from scipy.optimize import minimize
 
-from app.questions.counts import distribution, functions
-from app.registry.counts import EXPONENTS, INTERCEPT, ROOM, SEVERAL, SINGLE, Counts
+from app.model.count_statistics import EXPONENTS, INTERCEPT, ROOM, SEVERAL, SINGLE, Counts
 from app.scene import Vocabulary
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Ints
@@ -213,7 +212,9 @@ def _weights(cases: _Cases, share: Floats, fitted: Flags) -> Floats:
     used_columns = columns[cases_of >= _OWN_CASES]
     all_terms = sparse.hstack([class_terms[:, used_columns], features]).tocsr()
     penalty = np.repeat([_OWN, _SHARED], [len(used_columns), width])[:, None]
-    numbers, of_number = np.arange(1, MOST + 1), functions(MOST)
+    numbers = np.arange(1, MOST + 1)
+    log = np.log(numbers)
+    of_number = np.stack([log, log * (math.log(MOST) - log)])
     observed, case = cases.number - 1, np.arange(N)
     base = share.T[:, cases.index] - np.log(numbers)[:, None]
     base[numbers[:, None] < cases.listed] = -np.inf
@@ -256,7 +257,7 @@ def _is_better_than_mean(
             counted = counting[scene.source]
             part, indices = listed_cases(scene, counted, vocabulary.structure, seed)
             room = part.room if part.room >= 0 else None
-            rows, p = distribution(counts, V, part.classes, part.listed, room)
+            rows, p = counts.distribution(V, part.classes, part.listed, room)
             is_asked = np.isin(rows, indices)
             rows, expected = rows[is_asked], p[is_asked] @ np.arange(1, MOST + 1)
             classes, truth = part.classes[rows], part.number[rows]

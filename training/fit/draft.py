@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
 
-from app.registry import Artifact, Calibration, Places
+from app.model import Calibration, Places, SceneModel
 from app.scene import RoleCounts, Vocabulary
 from training.datasets import EncodedScene
 from training.datasets.array_types import Floats
@@ -28,21 +27,13 @@ def as_stored(machine: BoltzmannMachine) -> BoltzmannMachine:
 
 def draft_artifact(
     machine: BoltzmannMachine, vocabulary: Vocabulary, places: Places | None = None
-) -> Artifact:
+) -> SceneModel:
     """Return a model in memory, without files. Its calibration leaves log-odds as is."""
-    return Artifact(
-        manifest=None,  # type: ignore[arg-type]  # questions never read it
-        weights=weights_of(machine),
-        vocabulary=vocabulary,
-        calibration=Calibration.neutral(machine.spec.A),
-        digest="",
-        card="",
-        path=Path(),
-        places=places,
-    )
+    calibration = Calibration.neutral(machine.spec.A)
+    return SceneModel(weights_of(machine), vocabulary, calibration, places=places)
 
 
-def placed_draft(machine: BoltzmannMachine, data: TrainingData) -> Artifact:
+def placed_draft(machine: BoltzmannMachine, data: TrainingData) -> SceneModel:
     """Return a machine in half precision, with the places of the training scenes."""
     places = data.roles and fit_places(data.train.scenes, data.roles, data.vocabulary)
     return draft_artifact(as_stored(machine), data.vocabulary, places)

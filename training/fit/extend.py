@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference import Weights
-from app.registry import Artifact, Calibration, Counts, Offsets, Places
-from app.registry.counts import ROOM
-from app.registry.description import NO_LIMIT
+from app.model import Calibration, Counts, Offsets, Places, SceneModel
+from app.model.calibration import NO_LIMIT
+from app.model.count_statistics import ROOM
 from app.scene import CANONICAL, ObjectClass, Vocabulary
 
 _RARE: Final = 0.1  # quantile of the known biases that a new class or room type gets
@@ -25,7 +25,9 @@ _RARE: Final = 0.1  # quantile of the known biases that a new class or room type
 _AVERAGED: Final = ("kappa", "u", "usual")
 
 
-def extended(artifact: Artifact, classes: Sequence[ObjectClass], rooms: Sequence[str]) -> Artifact:
+def extended(
+    artifact: SceneModel, classes: Sequence[ObjectClass], rooms: Sequence[str]
+) -> SceneModel:
     """Return the model in memory with further classes and room types at the end.
 
     Raises:

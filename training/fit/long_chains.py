@@ -18,8 +18,9 @@ import torch
 
 from app.inference.chains import Conditions, SceneChains, random_stream
 from app.inference.weights import Weights
+from app.model import SceneModel
 from app.questions.generate import ATTEMPTS, STEPS, is_plausible
-from app.registry import Artifact, Metric
+from app.registry import Metric
 from app.scene import Scene
 from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.sources import source_of
@@ -200,7 +201,7 @@ class Drift:
         return None
 
 
-def measure_drift(artifact: Artifact, scenes: ObjectScenes, config: ObjectsConfig) -> Drift:
+def measure_drift(artifact: SceneModel, scenes: ObjectScenes, config: ObjectsConfig) -> Drift:
     """Run 3,000 sweeps from training scenes of the served mix, and compare chains and scenes.
 
     The states of the last 1,000 sweeps count if the filter of `/generate` accepts them
@@ -222,7 +223,7 @@ def measure_drift(artifact: Artifact, scenes: ObjectScenes, config: ObjectsConfi
     return Drift(size, size_error, label, float(share[k]), float(error[k]))
 
 
-def accepted(artifact: Artifact, long: LongChains, states: int) -> Floats:
+def accepted(artifact: SceneModel, long: LongChains, states: int) -> Floats:
     """Continue the chains, and return the share of the served scenes with each class.
 
     A state is recorded every `STEPS` sweeps, the length of a draw of `/generate`. A served scene is

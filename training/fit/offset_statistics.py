@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import gammaln
 
-from app.registry import Offsets
+from app.model import Offsets
 from app.scene import CANONICAL
 from training.datasets import EncodedScene
 from training.datasets.array_types import Floats, Ints

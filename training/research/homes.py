@@ -26,7 +26,8 @@ import numpy as np
 import torch
 import typer
 
-from app.registry import DEFAULT_STORE, Artifact, Store
+from app.model import SceneModel
+from app.registry import DEFAULT_STORE, Store
 from training.datasets import EncodedScene, encode
 from training.datasets.array_types import Ints, Rng
 from training.datasets.files import DATA, write_whole
@@ -78,9 +79,10 @@ def homes(
     """
     with resumable(console):
         models = Store(store)
-        parent = models.load(*models.resolve(model))
-        if _SOURCE in (one.source for one in parent.manifest.data):
-            raise ConfigError(f"{parent.key} has learnt from the houses of {_SOURCE}")
+        artifact = models.load(*models.resolve(model))
+        if _SOURCE in (one.source for one in artifact.manifest.data):
+            raise ConfigError(f"{artifact.key} has learnt from the houses of {_SOURCE}")
+        parent = artifact.model
         houses = _houses(parent, data or DATA)
         measure = partial(_measure_house, parent, scenes or [20])
         with ProcessPoolExecutor(workers) as pool:
@@ -106,7 +108,7 @@ def summary(rows: Sequence[Row]) -> Iterator[str]:
                 yield f"  {name:12} {before:.3f} → {after:.3f}"
 
 
-def _houses(parent: Artifact, root: Path) -> list[tuple[str, list[EncodedScene]]]:
+def _houses(parent: SceneModel, root: Path) -> list[tuple[str, list[EncodedScene]]]:
     """Return each house with at least `_ROOMS` rooms, and its rooms in classes of the parent."""
     rooms: dict[str, list[EncodedScene]] = {}
     annotated = read_sources(DataConfig(sources=(_SOURCE,)), root)[_SOURCE]
@@ -116,13 +118,13 @@ def _houses(parent: Artifact, root: Path) -> list[tuple[str, list[EncodedScene]]
 
 
 def _measure_house(
-    parent: Artifact, counts: Sequence[int], name: str, rooms: Sequence[EncodedScene]
+    parent: SceneModel, counts: Sequence[int], name: str, rooms: Sequence[EncodedScene]
 ) -> list[Row]:
     torch.set_num_threads(1)
     return [_measure(parent, name, rooms, count) for count in counts]
 
 
-def _measure(parent: Artifact, name: str, rooms: Sequence[EncodedScene], count: int) -> Row:
+def _measure(parent: SceneModel, name: str, rooms: Sequence[EncodedScene], count: int) -> Row:
     structure = parent.vocabulary.structure
     rng = np.random.default_rng([zlib.crc32(name.encode()), count])
     classes = [(s.evidence.classes[~structure[s.evidence.classes]], s.room_type) for s in rooms]
@@ -141,7 +143,7 @@ def _measure(parent: Artifact, name: str, rooms: Sequence[EncodedScene], count: 
     seen_elsewhere = [_part(room, rng) for room in others for _ in range(_OTHER)]
     home = _home(parent, [(part, kind) for part, _, kind in recorded])
     result = adapted(home)
-    sides = parent, result.artifact or parent
+    sides = parent, result.model or parent
     lists = [part for part, *_ in later]
     return Row(
         home=name,
@@ -161,7 +163,7 @@ def _part(room: Ints, rng: Rng) -> Ints:
 
 
 def _home(
-    parent: Artifact, visits: Sequence[tuple[Ints, int]], unconfirmed: Sequence[Ints] = ()
+    parent: SceneModel, visits: Sequence[tuple[Ints, int]], unconfirmed: Sequence[Ints] = ()
 ) -> Home:
     """Return the recordings. A person has confirmed the visits that raise an alarm."""
     scenes = []
@@ -174,21 +176,21 @@ def _home(
     return Home(parent, (parent.spec.V, parent.spec.C), tuple(scenes), len(scenes))
 
 
-Sides = tuple[Artifact, Artifact]
+Sides = tuple[SceneModel, SceneModel]
 
 
-def _pair(sides: Sides, figure: Callable[[Artifact], float]) -> tuple[float, float]:
+def _pair(sides: Sides, figure: Callable[[SceneModel], float]) -> tuple[float, float]:
     return figure(sides[0]), figure(sides[1])
 
 
-def _alarm_share(side: Artifact, lists: Sequence[Ints], about: int | None = None) -> float:
+def _alarm_share(side: SceneModel, lists: Sequence[Ints], about: int | None = None) -> float:
     """Return the share of lists with an alarm, or with an alarm about a class."""
     alarms = [alarms_of(side, of_classes(side, part, None)) for part in lists]
     return float(np.mean([len(one) > 0 if about is None else about in one for one in alarms]))
 
 
 @torch.no_grad()
-def _mrr(side: Artifact, visits: Sequence[tuple[Ints, int, Ints]]) -> float:
+def _mrr(side: SceneModel, visits: Sequence[tuple[Ints, int, Ints]]) -> float:
     """Return the MRR of the hidden class of visits (part, hidden class, classes of the room)."""
     machine, structure = (
         machine_of(side.weights),

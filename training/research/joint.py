@@ -165,7 +165,7 @@ def main(
 ) -> None:
     """Print the differences between served log-odds and those of the joint."""
     models = Store(store)
-    artifact = models.load(*models.resolve(model))
+    artifact = models.load(*models.resolve(model)).model
     scenes = read_test(file).tensors(artifact.vocabulary)
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
     machine = machine_of(artifact.weights).double()

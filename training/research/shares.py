@@ -24,8 +24,9 @@ import torch
 import typer
 
 from app.inference.weights import Weights
-from app.registry import DEFAULT_STORE, Artifact, Store
-from app.registry.description import KINDS
+from app.model import SceneModel
+from app.model.calibration import KINDS
+from app.registry import DEFAULT_STORE, Store
 from training.domain.init_command import StorePath
 from training.evaluation.artifact_model import artifact_model
 from training.evaluation.outside import read_test
@@ -41,27 +42,27 @@ _SHOWN = {
 }
 
 
-def without_context(artifact: Artifact) -> Artifact:
+def without_context(artifact: SceneModel) -> SceneModel:
     """Return the model whose hidden units do not see the objects."""
     arrays = artifact.weights.arrays
     nothing = np.zeros_like(arrays["W"])
     return replace(artifact, weights=Weights(artifact.spec, {**arrays, "W": nothing}))
 
 
-def at_a_place(**entries: float) -> Callable[[Artifact], Artifact]:
+def at_a_place(**entries: float) -> Callable[[SceneModel], SceneModel]:
     """Return a function that changes the weights of the scores at a place."""
 
-    def change(artifact: Artifact) -> Artifact:
+    def change(artifact: SceneModel) -> SceneModel:
         fits = tuple(fit.model_copy(update=entries) for fit in artifact.calibration.at)
         return _recalibrated(artifact, at=fits)
 
     return change
 
 
-def misplaced(**entries: float) -> Callable[[Artifact], Artifact]:
+def misplaced(**entries: float) -> Callable[[SceneModel], SceneModel]:
     """Return a function that changes the weights of the scores of misplaced entries."""
 
-    def change(artifact: Artifact) -> Artifact:
+    def change(artifact: SceneModel) -> SceneModel:
         judged = artifact.calibration.misplaced
         kinds = {kind: getattr(judged, kind) for kind in KINDS}
         update = {kind: one and one.model_copy(update=entries) for kind, one in kinds.items()}
@@ -70,16 +71,16 @@ def misplaced(**entries: float) -> Callable[[Artifact], Artifact]:
     return change
 
 
-def _recalibrated(artifact: Artifact, **update: Any) -> Artifact:
+def _recalibrated(artifact: SceneModel, **update: Any) -> SceneModel:
     return replace(artifact, calibration=artifact.calibration.model_copy(update=update))
 
 
-def whole(artifact: Artifact) -> Artifact:
+def whole(artifact: SceneModel) -> SceneModel:
     """Return the model itself."""
     return artifact
 
 
-VARIANTS: dict[str, dict[str, Callable[[Artifact], Artifact]]] = {
+VARIANTS: dict[str, dict[str, Callable[[SceneModel], SceneModel]]] = {
     "T1a relations": {"whole": whole, "without hidden context": without_context},
     "T1 pairs": {"whole": whole, "without hidden context": without_context},
     "T2-at missing at a place": {
@@ -103,7 +104,7 @@ def main(
 ) -> None:
     """Print the metrics of a model and of its variants on the scenes of a file."""
     models = Store(store)
-    artifact = models.load(*models.resolve(model))
+    artifact = models.load(*models.resolve(model)).model
     scenes = read_test(file).tensors(artifact.vocabulary)
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
     setting = Setting(scenes, structure, train=scenes, limit=_LIMIT)

@@ -1,7 +1,7 @@
 """`python -m training words`: how well a model reads words that it has no class for.
 
 The classes of `words.csv` are left out in five parts. Each becomes a word, whose weights are
-predicted from the other classes (`app.registry.meaning`). The real permissive scenes of the
+predicted from the other classes (`app.model.word_weights`). The real permissive scenes of the
 validation and test parts are listed in part, three times each. A score of a class is its log-odds
 given such a list. The AUC of a class compares the lists that hide the class with those of scenes
 without it. The command measures the mean AUC over the classes of these scores:
@@ -35,8 +35,9 @@ from scipy.stats import rankdata
 
 from app.inference.objects import ObjectScorer
 from app.inference.weights import Weights
-from app.registry import DEFAULT_STORE, Artifact, Store
-from app.registry.meaning import RowMap
+from app.model import SceneModel
+from app.model.word_weights import RowMap
+from app.registry import DEFAULT_STORE, Store
 from app.scene import Vocabulary
 from app.scene.vocabulary import Word
 from app.scene.words import Vectors, word_vectors
@@ -152,7 +153,7 @@ def words(
     """
     with resumable(console):
         models = Store(store)
-        artifact = models.load(*models.resolve(model))
+        artifact = models.load(*models.resolve(model)).model
         settings, root = load_config(config), data or DATA
         parts = prepare(settings, root, artifact.vocabulary).parts
         scenes = [s for name in ("validation", "test") for s in parts[name] if s.source in REAL]
@@ -210,7 +211,7 @@ def read_parts(path: Path, vocabulary: Vocabulary) -> list[Ints]:
 
 
 def measure(
-    artifact: Artifact, reader: Artifact, lists: Lists, left_out: Ints, vectors: Vectors
+    artifact: SceneModel, reader: SceneModel, lists: Lists, left_out: Ints, vectors: Vectors
 ) -> tuple[dict[str, list[float]], dict[str, list[float]]]:
     """Return the AUC of each left-out class by `METHODS`, and the MRR by `EVIDENCE`.
 
@@ -295,7 +296,9 @@ def log_odds(weights: Weights, listed: Sequence[Ints], columns: Ints) -> Floats:
     return scores
 
 
-def _trained_without(left_out: Ints, artifact: Artifact, config: Config, root: Path) -> Artifact:
+def _trained_without(
+    left_out: Ints, artifact: SceneModel, config: Config, root: Path
+) -> SceneModel:
     """Train a model without some classes. Their kinds have no parent."""
     labels = {artifact.vocabulary.labels[index] for index in left_out.tolist()}
     kept = [

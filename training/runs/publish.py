@@ -9,15 +9,8 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from app.registry import (
-    Artifact,
-    Calibration,
-    DataSource,
-    Description,
-    Metric,
-    Store,
-    VocabularyEntry,
-)
+from app.model import Calibration, SceneModel
+from app.registry import Artifact, DataSource, Description, Metric, Store, VocabularyEntry
 from training.datasets.batches import TrainingData
 from training.datasets.sources import SOURCES, is_inventory
 from training.datasets.vocabulary import with_aliases, with_room_aliases
@@ -59,7 +52,7 @@ def publish_run(
     version: str,
     *,
     measured: tuple[FinishedRun, SplitScenes] | None = None,
-    judge: Callable[[Artifact, Progress], Sequence[str]] = lambda *_: (),
+    judge: Callable[[SceneModel, Progress], Sequence[str]] = lambda *_: (),
     accept: Callable[[str], None] | None = None,
     progress: Progress = silent,
 ) -> Artifact:
@@ -147,16 +140,16 @@ def refit(
         ConfigError, DatasetError: the scenes cannot be read.
         StoreError, ArtifactError: see `Store.publish`.
     """
-    manifest = artifact.manifest
+    manifest, model = artifact.manifest, artifact.model
     config = stored_config(artifact)
     data, is_shipped = config.data, manifest.name in shipped_configs()
     named = load_config(manifest.name).examples if is_shipped else config.examples
-    examples, reasons = known_examples(read_examples(named, root), artifact.vocabulary)
+    examples, reasons = known_examples(read_examples(named, root), model.vocabulary)
     for reason in reasons:
         progress(reason)
     progress("reading scenes")
     annotated = read_sources(data, root)
-    scenes = split_and_encode(data, annotated, root, artifact.vocabulary)
+    scenes = split_and_encode(data, annotated, root, model.vocabulary)
     digests = {source.source: source.digest for source in manifest.data}
     if changed := sorted(name for name in scenes.digests if digests[name] != scenes.digests[name]):
         raise RunError(
@@ -166,19 +159,19 @@ def refit(
     evaluated_scenes = scenes
     if split := manifest.training.get("measured_split"):
         other = with_settings(config, {"data.split": split}).data
-        evaluated_scenes = split_and_encode(other, annotated, root, artifact.vocabulary)
+        evaluated_scenes = split_and_encode(other, annotated, root, model.vocabulary)
     progress("fitting statistics")
     held_out, own = evaluated_scenes.training_data(), scenes.training_data()
-    refitted = refitted_lines(with_statistics(artifact, scenes), own.validation, config.objects)
+    refitted = refitted_lines(with_statistics(model, scenes), own.validation, config.objects)
     refitted = refitted_limits(refitted, complete_scenes(own.train))
-    evaluated = with_statistics(artifact, evaluated_scenes)
+    evaluated = with_statistics(model, evaluated_scenes)
     rows = _measure(evaluated, held_out, progress, tuple(STATISTICS))
     if not split:
         rows += _measure(refitted, held_out, progress, _OF_LIMITS)
     again = {metric.task for metric in rows} | {*STATISTICS, "T4 rooms"}
     kept = [m for m in manifest.metrics if m.task not in again and not _ALARM.search(m.metric)]
     vocabulary = VocabularyEntry.of(
-        with_aliases(artifact.vocabulary), artifact.spec.A, manifest.vocabulary.profiles
+        with_aliases(model.vocabulary), model.spec.A, manifest.vocabulary.profiles
     )
     fields = {name: getattr(manifest, name) for name in Description.model_fields}
     fields |= {"version": version, "created": _now(), "examples": examples}
@@ -187,20 +180,20 @@ def refit(
     return publish_rounded(store, description, refitted)
 
 
-def with_statistics(artifact: Artifact, scenes: SplitScenes) -> Artifact:
+def with_statistics(model: SceneModel, scenes: SplitScenes) -> SceneModel:
     """Return the model with the offsets and counts of the scenes."""
     train, vocabulary = scenes.parts["train"], scenes.vocabulary
     return replace(
-        artifact,
+        model,
         offsets=fit_offsets(train, len(vocabulary)),
         counts=fit_counts([*train, *scenes.parts["validation"]], vocabulary),
     )
 
 
-def publish_rounded(store: Store, description: Description, artifact: Artifact) -> Artifact:
+def publish_rounded(store: Store, description: Description, model: SceneModel) -> Artifact:
     """Publish weights and statistics in half precision."""
-    state = dict(artifact.weights.arrays)
-    for statistics in (artifact.offsets, artifact.counts, artifact.places):
+    state = dict(model.weights.arrays)
+    for statistics in (model.offsets, model.counts, model.places):
         if statistics is not None:
             state |= statistics.tensors()
     return store.publish(description, state, storage_dtype="float16")
@@ -212,7 +205,7 @@ def _now() -> datetime:
 
 def calibrated_draft(
     run: FinishedRun, scenes: SplitScenes, chosen: Calibration | None = None
-) -> Artifact:
+) -> SceneModel:
     """Return the calibrated model of a run in half precision. `chosen`: see `calibrate_objects`."""
     data = scenes.training_data()
     draft = placed_draft(run.machine, data)
@@ -221,13 +214,13 @@ def calibrated_draft(
 
 
 def _measure(
-    artifact: Artifact, data: TrainingData, progress: Progress, tasks: Collection[str] | None = None
+    model: SceneModel, data: TrainingData, progress: Progress, tasks: Collection[str] | None = None
 ) -> list[Metric]:
     """Return the metrics on test scenes, or an empty list if there are no test scenes."""
     if not len(data.test):
         return []
     return evaluate(
-        *(artifact, data.test, data.structure, data.train),
+        *(model, data.test, data.structure, data.train),
         everyday=EVERYDAY,
         tasks=tasks,
         progress=progress,

@@ -185,7 +185,7 @@ def test_one_support_is_replaced() -> None:
     altered = Counter()
     for seed in SEEDS:
         moved, i = moved_scene(scene, VOCABULARY.structure, np.random.default_rng(seed))
-        stated = set(moved.relations)
+        stated = set(moved.triples)
         (new,) = stated - listed
         assert new[:2] == (ON_TOP, i)
         k = new[2]
@@ -194,7 +194,7 @@ def test_one_support_is_replaced() -> None:
         assert listed - stated == lost
         altered[i, k] += 1
         whole = untouched_scene(scene, VOCABULARY.structure, np.random.default_rng(seed))
-        assert set(whole.relations) == listed
+        assert set(whole.triples) == listed
     # A cup supports the straw, and both cups have the same class. Walls carry nothing.
     assert set(altered) == {
         *((CUP, k) for k in (PILLOW, CHAIR, 6)),

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from app import questions
+from app.model import SceneModel
 from app.registry import Artifact, Store
-from app.scene import Scene, SceneObject
+from app.scene import RelationTable, Scene, SceneObject
 from app.scene.spatial_relations import ON_TOP
 from tests.registry.small_artifacts import rewrite_manifest
 from tests.training.commands import invoke
@@ -41,19 +42,23 @@ def adapt(store: Store, *arguments: object, code: int = 0) -> str:
     return invoke("adapt", "default", *arguments, "--store", store.root, code=code)
 
 
-def alarms(artifact: Artifact, labels: list[str], room: str | None = None) -> list[str]:
+def alarms(artifact: SceneModel, labels: list[str], room: str | None = None) -> list[str]:
     words = artifact.vocabulary
     objects = tuple(SceneObject(x, x, words.index(x)) for x in dict.fromkeys(labels))
     scene = Scene(objects, room_type=None if room is None else words.room_index(room))
     return [words.labels[c] for c in alarms_of(artifact, scene)]
 
 
-def home(store: Store, version: str = "1.0.0") -> Artifact:
-    return store.load("home", version)
+def stored(store: Store, reference: str) -> Artifact:
+    return store.load(*store.resolve(reference))
 
 
-def default(store: Store) -> Artifact:
-    return store.load(*store.resolve("default"))
+def home(store: Store, version: str = "1.0.0") -> SceneModel:
+    return stored(store, f"home@{version}").model
+
+
+def default(store: Store) -> SceneModel:
+    return stored(store, "default").model
 
 
 def test_a_confirmed_object_is_never_reported_again(store, tmp_path):
@@ -62,9 +67,10 @@ def test_a_confirmed_object_is_never_reported_again(store, tmp_path):
     said = adapt(store, write([scene], tmp_path / "scenes.jsonl"))
     assert "never reported from now on: toilet (1)" in said
     assert alarms(home(store), INTRUDER, "bedroom") == []
-    assert home(store).manifest.training["parent"]["digest"] == default(store).digest
-    parent = "@".join(default(store).key)
-    assert f"adapted to one home from {parent}" in " ".join(home(store).card.split())
+    parent, adapted_one = stored(store, "default"), stored(store, "home")
+    assert adapted_one.manifest.training["parent"]["digest"] == parent.digest
+    text = f"adapted to one home from {'@'.join(parent.key)}"
+    assert text in " ".join(adapted_one.card.split())
     for command in (["evaluate", "home"], ["publish", "home@1.0.0", "1.0.1"]):
         said = invoke(*command, "--store", store.root, code=1)
         assert "home@1.0.0 was adapted to a home" in said
@@ -77,14 +83,14 @@ def test_a_home_keeps_the_terms_of_its_parent(store, tmp_path):
         members["terms"] = terms
         members["data"][0]["research_only"] = True
 
-    rewrite_manifest(default(store).path, restrict)
+    rewrite_manifest(stored(store, "default").path, restrict)
     scene = {"objects": INTRUDER, "room_type": "bedroom", "confirmed": True}
     adapt(store, write([scene], tmp_path / "scenes.jsonl"))
-    manifest = home(store).manifest
+    manifest = stored(store, "home").manifest
     assert manifest.terms == terms
     assert manifest.data[0].research_only
     assert not manifest.data[-1].research_only, "the scenes of the home"
-    card = home(store).card
+    card = stored(store, "home").card
     assert f"Terms of the weights: {terms}" in card
     assert "**Research use.** These weights were trained on" in card
 
@@ -111,14 +117,14 @@ def test_a_relation_of_boxes_that_stands_right_is_not_reported_again(
             objects.append(SceneObject(label, label, words.index(label), 1.0, at, size))
         return Scene(tuple(objects))
 
-    def reported(artifact: Artifact, asked: Scene) -> list[tuple[str, str]]:
+    def reported(artifact: SceneModel, asked: Scene) -> list[tuple[str, str]]:
         found = score_misplaced(artifact, asked)
         return [(one["subject"], one["object"]) for one in found if one["is_misplaced"]]
 
     right = scene(support)
     assert (top, support) in reported(default(store), right)
     bare = [replace(thing, position=None, size=None) for thing in right.objects]
-    stated = Scene(tuple(bare), relations=((ON_TOP, 1, 0),))
+    stated = Scene(tuple(bare), RelationTable.stated([(ON_TOP, 1, 0)]))
     assert ((top, support) in reported(default(store), stated)) == is_stated_reported
     objects = [
         {"id": thing.id, "label": thing.label, "position": thing.position, "size": thing.size}
@@ -172,7 +178,7 @@ def test_a_written_room_is_one_confirmed_scene(store, tmp_path):
     assert "never reported from now on: toilet (1)" in said
     assert alarms(home(store), INTRUDER, "bedroom") == []
     assert home(store).vocabulary.index("stairlift") is not None
-    source = home(store).manifest.data[-1]
+    source = store.load("home", "1.0.0").manifest.data[-1]
     assert (source.source, source.scenes, source.written) == ("home, written", 2, True)
 
     bedroom = Home.of(default(store), [], read_inventory(path).places).scenes[0]
@@ -220,7 +226,7 @@ def test_words_that_the_model_cannot_read_become_classes(store, tmp_path):
 
 def test_errors_name_the_reason(store, tmp_path):
     scenes = write([{"objects": ["bed"]}], tmp_path / "scenes.jsonl")
-    name = default(store).manifest.name
+    name, _ = store.resolve("default")
     assert "choose another name" in adapt(store, scenes, "--name", name, code=1)
     assert "--alias belongs to --promote" in adapt(store, scenes, "--alias", "x", code=1)
     assert "alias" in adapt(store, scenes, "--name", "default", code=1)
@@ -236,7 +242,8 @@ def test_errors_name_the_reason(store, tmp_path):
 def test_five_habits_are_learnt_from_a_hundred_scenes(store, tmp_path):
     scenes = write(home_scenes(100, 7), tmp_path / "scenes.jsonl")
     said = adapt(store, scenes, "--promote")
-    before, after = store.load(*store.resolve("places-triway")), home(store)
+    key = store.resolve("places-triway")
+    before, after = store.load(*key).model, home(store)
     new = home_scenes(50, 8)
     reported = [
         [scene for scene in new if alarms(side, scene["objects"], scene["room_type"])]
@@ -250,14 +257,14 @@ def test_five_habits_are_learnt_from_a_hundred_scenes(store, tmp_path):
     p = [tv_is_missing(side, living_room) for side in (before, after)]
     assert p[1] < 0.5 * p[0]
     assert str(store.aliases()["default"]) == "home@1.0.0"
-    assert f"to roll back: python -m app.registry alias default {'@'.join(before.key)}" in said
+    assert f"to roll back: python -m app.registry alias default {'@'.join(key)}" in said
     # `default` is now the home, whose parent is adapted again.
     few = write(reported[0][:15], tmp_path / "few.jsonl")  # the weights stay
     assert "is itself adapted" in adapt(store, few)
-    assert store.load("home", "1.1.0").manifest.training["parent"]["name"] == before.key[0]
+    assert store.load("home", "1.1.0").manifest.training["parent"]["name"] == key[0]
 
 
-def tv_is_missing(artifact: Artifact, labels: list[str]) -> float:
+def tv_is_missing(artifact: SceneModel, labels: list[str]) -> float:
     words = artifact.vocabulary
     scene = Scene(tuple(SceneObject(x, x, words.index(x)) for x in labels))
     answer = questions.missing(artifact, scene, candidates=[words.index("tv")], coverage=0.8)

@@ -70,7 +70,7 @@ LEARNT = {"rooms": digest_of(SCENES["rooms"])}
 def candidate(title: str, learnt=LEARNT, **data) -> Candidate:
     # Any artifact except None stands for a model, because only its split matters.
     config = small_config("rooms", "rbm", rooms=500, **data)
-    return Candidate(title, config, learnt, artifact="a model")  # type: ignore[arg-type]
+    return Candidate(title, config, learnt, scene_model="a model")  # type: ignore[arg-type]
 
 
 def learnt_groups(seed: int, protocol) -> set[str]:

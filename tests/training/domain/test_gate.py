@@ -1,12 +1,12 @@
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from app.registry import Artifact, Store
+from app.model import SceneModel
+from app.registry import Store
 from tests.http.stores import corrupt, make_store
 from tests.training.commands import small_config
 from training.datasets import EncodedScene
@@ -76,8 +76,7 @@ def test_a_refusal_names_every_metric_that_is_worse() -> None:
 def test_a_model_without_relation_metrics_replaces_no_model_with_them(
     measured, task, expected
 ) -> None:
-    manifest = SimpleNamespace(metrics=[SimpleNamespace(task=name) for name in measured])
-    holder = Candidate("old", None, {}, SimpleNamespace(manifest=manifest))  # type: ignore[arg-type]
+    holder = Candidate("old", None, {}, None, tasks=frozenset(measured))
     names = unmeasured([difference(task, "MRR", -0.1, 0.1)], holder)
     assert len(names) == expected
     assert set(names) < set(RELATIONAL)
@@ -99,7 +98,7 @@ def rooms() -> SplitScenes:
     return prepare(small(), Path())
 
 
-def trained(scenes: SplitScenes, **objects: float) -> Artifact:
+def trained(scenes: SplitScenes, **objects: float) -> SceneModel:
     machine = Trainer(small(**objects), scenes.training_data()).run().machine
     return draft_artifact(as_stored(machine), scenes.vocabulary)
 
@@ -118,7 +117,7 @@ def with_random_classes(scenes: SplitScenes) -> SplitScenes:
     return replace(scenes, parts=scenes.parts | {"train": [drawn(scene) for scene in train]})
 
 
-def usefulness(artifact: Artifact, data: TrainingData) -> Usefulness:
+def usefulness(artifact: SceneModel, data: TrainingData) -> Usefulness:
     return measure_usefulness(artifact, data, say=lambda _: None)
 
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from app import questions
-from app.registry import Artifact, Store
+from app.model import SceneModel
+from app.registry import Store
 from app.scene import Scene, SceneObject
 from tests.training.commands import invoke
 from tests.training.scenes import scene
@@ -159,7 +160,7 @@ def test_junk_labels_become_no_classes(tmp_path, repository) -> None:
         assert scenes.vocabulary.index(name) is not None
     store = Store(repository / "model_store")
     recorded = read_material([path], recorded=True)
-    assert Home.of(store.load(*store.resolve("default")), recorded.scenes).new_classes == ()
+    assert Home.of(store.load(*store.resolve("default")).model, recorded.scenes).new_classes == ()
     assert recorded.left_out["/m/01mzpv"] == 5
 
 
@@ -170,8 +171,9 @@ def test_from_the_table_to_answers(ward, tmp_path) -> None:
     runs = ("--runs", tmp_path / "runs", "--store", store.root)
     said = invoke("train", folder, "--publish", "1.0.0", *runs)
     assert "published ward@1.0.0" in said
-    model = store.load("ward", "1.0.0")
-    assert "Scenes drawn from written places have 100.0 %" in " ".join(model.card.split())
+    artifact = store.load("ward", "1.0.0")
+    assert "Scenes drawn from written places have 100.0 %" in " ".join(artifact.card.split())
+    model = artifact.model
     assert model.calibration.outlier_lines is not None
     words = model.vocabulary
     places = read_inventory(ward).places
@@ -194,6 +196,6 @@ def test_from_the_table_to_answers(ward, tmp_path) -> None:
     assert len(generated["objects"]) > 2
 
 
-def of(model: Artifact, labels: list[str]) -> Scene:
+def of(model: SceneModel, labels: list[str]) -> Scene:
     words = model.vocabulary
     return Scene(tuple(SceneObject(x, x, words.index(x)) for x in labels))

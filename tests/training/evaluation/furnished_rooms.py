@@ -5,7 +5,7 @@ from functools import cache
 
 import torch
 
-from app.registry import Artifact, Calibration, CountSlope
+from app.model import Calibration, CountSlope, SceneModel
 from app.scene import CANONICAL
 from tests.questions.artifacts import lines
 from training.datasets import annotated_classes, encode, generate_rooms, rooms_vocabulary
@@ -25,7 +25,7 @@ def rooms(count: int, seed: int) -> SceneTensors:
 
 
 @cache
-def room_model() -> Artifact:
+def room_model() -> SceneModel:
     """An untrained machine with random weights."""
     spec = MachineSpec("triway", V=len(VOCABULARY), A=A, units=6, K=3, C=len(VOCABULARY.room_types))
     machine = build(spec)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from app.registry import CountSlope
+from app.model import CountSlope
 from app.scene import CANONICAL
 from app.scene.spatial_relations import LEFT, ON_TOP
 from tests.questions.answers import missing, relations

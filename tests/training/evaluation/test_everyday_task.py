@@ -81,7 +81,7 @@ needs_facts = pytest.mark.skipif(facts_file(FOLDER) is None, reason="the facts a
 @pytest.mark.parametrize(("model", "made"), [("places-triway", False), ("places-rbm", True)])
 def test_the_service_gives_the_same_eleven_lines(shipped, model, made, folder, monkeypatch, capsys):
     place = folder if made else FOLDER
-    artifact = load_model_set(Store(STORE)).resolve(model)
+    artifact = load_model_set(Store(STORE)).resolve(model).model
     expected = score(monkeypatch, capsys, shipped.url, str(place / "facts.json"), "--model", model)
     found = ask_everyday(artifact, place)
     assert found == expected

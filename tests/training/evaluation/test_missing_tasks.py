@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from app.registry import PlaceFit
+from app.model import PlaceFit
 from app.scene import CANONICAL, OPPOSITES, Scene, SceneObject
 from tests.questions.answers import missing as ask_missing
 from tests.questions.artifacts import LARGER, larger_artifact

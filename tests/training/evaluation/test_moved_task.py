@@ -25,7 +25,7 @@ BOTH = [(POSED, STRUCTURE), (LISTED, NO_STRUCTURE)]
 
 def keyed(request):
     """What tells two requests apart."""
-    return request.relations, tuple(thing.position for thing in request.objects)
+    return request.triples, tuple(thing.position for thing in request.objects)
 
 
 def oracle(scenes, structure, *, names=("moved", "subject")):
@@ -52,7 +52,7 @@ def test_each_scene_is_asked_twice(scenes, structure):
             assert case.moved.relations is case.untouched.relations is None
             assert case.moved.objects[index] != case.untouched.objects[index]
         else:
-            (new,) = set(case.moved.relations) - set(case.untouched.relations)
+            (new,) = set(case.moved.triples) - set(case.untouched.triples)
             assert new[:2] == (ON, index)
 
 

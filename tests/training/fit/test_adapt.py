@@ -8,7 +8,8 @@ import torch
 
 from app import questions
 from app.inference import MachineSpec, Weights
-from app.registry import Artifact, Store
+from app.model import SceneModel
+from app.registry import Store
 from app.scene import ObjectClass, Scene, SceneObject
 from training.fit.adapt import HomeScenes, Known, adapt
 from training.fit.extend import extended
@@ -137,15 +138,15 @@ def test_a_home_without_pairs_or_a_model_without_samples_is_refused():
 
 
 @pytest.fixture(scope="module", params=["places-rbm", "places-triway"])
-def model(request, repository) -> Artifact:
+def model(request, repository) -> SceneModel:
     store = Store(repository / "model_store")
-    return store.load(*store.resolve(request.param))
+    return store.load(*store.resolve(request.param)).model
 
 
 NEW = [ObjectClass("stairlift"), ObjectClass("oxygen concentrator")]
 
 
-def scene(artifact: Artifact, *labels: str, room: str | None = None) -> Scene:
+def scene(artifact: SceneModel, *labels: str, room: str | None = None) -> Scene:
     words = artifact.vocabulary
     things = [SceneObject(label, label, words.index(label)) for label in labels]
     return Scene(tuple(things), room_type=None if room is None else words.room_index(room))
@@ -189,7 +190,7 @@ def test_a_new_class_is_rare_and_has_relations(model):
 
 def test_a_new_room_is_recognised_by_its_objects(repository):
     store = Store(repository / "model_store")
-    model = store.load(*store.resolve("default"))
+    model = store.load(*store.resolve("default")).model
     larger = extended(model, (), ["darkroom"])
     words = larger.vocabulary
     room = words.room_index("darkroom")

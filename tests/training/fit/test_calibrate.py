@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from app.model import Calibration, CountSlope, CoverageFit
 from app.questions.posterior import calibrated
-from app.registry import Calibration, CountSlope, CoverageFit
 from app.scene import Vocabulary
 from app.scene.spatial_relations import ABOVE, INSIDE, LATERAL, LEFT, ON_TOP, STACKED
 from tests.questions.artifacts import artifact_of, random_machine

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import expit as sigmoid
 
-from app.registry import Calibration, PlaceFit
+from app.model import Calibration, PlaceFit
 from app.scene.spatial_relations import LATERAL, STACKED
 from tests.questions.artifacts import larger_artifact
 from tests.training.evaluation.scenes import scene, tensors

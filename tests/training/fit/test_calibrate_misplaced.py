@@ -7,9 +7,9 @@ import pytest
 import torch
 from scipy.special import expit
 
+from app.model import AlarmLine, AlarmLines, Judgement, Misplaced
 from app.questions import misplaced
 from app.questions.misplaced import BESIDE, STAND, SUPPORT, wrong_log_odds
-from app.registry import AlarmLine, AlarmLines, Judgement, Misplaced
 from app.scene import observe
 from app.scene.spatial_relations import ON_TOP
 from tests.questions.artifacts import artifact_of

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from app.model import Sharpness
+from app.model.calibration import NO_LIMIT
 from app.questions import rooms
 from app.questions.generate import is_within_limits, room_fit
-from app.registry import Sharpness
-from app.registry.description import NO_LIMIT
 from tests.questions.artifacts import LABELS, larger_artifact
 from tests.training.evaluation.scenes import scene, tensors
 from training.evaluation.asking import of_classes

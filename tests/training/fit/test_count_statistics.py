@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.questions.counts import distribution
-from app.registry import Counts
-from app.scene import ObjectClass, Vocabulary
+from app.model import Counts
+from app.registry.tensors import read_group
+from app.scene import CANONICAL, ObjectClass, Vocabulary
 from tests.training.evaluation.furnished_rooms import VOCABULARY, room_model, rooms
 from tests.training.evaluation.scenes import scene
 from training.datasets.cases import MOST, counted_classes, scene_rng, some_instances
@@ -37,7 +37,7 @@ def furnished(number: int, seed: int, source: str = "toy"):
 
 
 def expected(counts: Counts, anchor: int, listed: int) -> float:
-    _, p = distribution(counts, len(WORDS), np.array([CHAIR, anchor]), np.array([listed, 1]))
+    _, p = counts.distribution(len(WORDS), np.array([CHAIR, anchor]), np.array([listed, 1]))
     return float(p[0] @ np.arange(1, MOST + 1))
 
 
@@ -59,7 +59,8 @@ def test_the_scene_moves_the_expected_number():
             assert expected(counts, anchor, listed) == pytest.approx(
                 exact(law, listed), abs=0.15
             ), (anchor, listed)
-    again = Counts.from_tensors(counts.tensors(), len(WORDS), 2)
+    again = read_group(Counts, counts.tensors(), len(CANONICAL), len(WORDS), 2)
+    assert again is not None
     for name, tensor in counts.tensors().items():
         assert np.array_equal(again.tensors()[name], tensor)
         if tensor.ndim > 1:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, invgamma, norm
 
-from app.registry import Offsets
+from app.model import Offsets
+from app.registry.tensors import read_group
 from app.scene import CANONICAL
 from app.scene.spatial_relations import LEFT, ON_TOP
 from tests.training.evaluation.scenes import scene
@@ -164,7 +165,8 @@ def test_the_model_file_holds_the_statistics_exactly():
     vocabulary = rooms_vocabulary()
     scenes = encode(generate_rooms(150, seed=0), vocabulary)
     offsets = fit_offsets(scenes, len(vocabulary))
-    again = Offsets.from_tensors(offsets.tensors(), len(CANONICAL), len(vocabulary))
+    again = read_group(Offsets, offsets.tensors(), len(CANONICAL), len(vocabulary), 0)
+    assert again is not None
     for name, tensor in offsets.tensors().items():
         assert np.array_equal(again.tensors()[name], tensor)
         if tensor.ndim > 1:

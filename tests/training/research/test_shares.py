@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from app.model.calibration import CountSlope, PlaceFit
 from app.questions.posterior import Posterior
-from app.registry.description import CountSlope, PlaceFit
 from tests.questions.artifacts import larger_artifact, scene_of
 from training.evaluation.asking import missing_probabilities
 from training.research.shares import VARIANTS, at_a_place, misplaced, without_context

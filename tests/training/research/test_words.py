@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from app.registry.meaning import RowMap
+from app.model.word_weights import RowMap
 from app.scene import ObjectClass, Vocabulary
 from tests.questions.artifacts import LABELS, larger_artifact
 from training.fit.configuration import ConfigError

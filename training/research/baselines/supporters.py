@@ -58,13 +58,13 @@ def _supporters(scene: Scene, structure: Flags) -> Iterator[tuple[int, int, Ints
     classes = np.array([-1 if x.class_index is None else x.class_index for x in scene.objects])
     is_thing = (classes >= 0) & ~structure[classes]
     supports = np.zeros((len(classes), len(classes)), dtype=np.bool_)
-    for a, i, j in observed.relations or ():
+    for a, i, j in observed.triples:
         supports[i, j] |= a in SUPPORTS
     for i in np.flatnonzero(is_thing).tolist():
         of_object = np.unique(classes[supports[i] & is_thing])
         if len(of_object):
             yield i, int(classes[i]), of_object
-        elif observed.poses is not None or supports[i].any():
+        elif observed.has_boxes or supports[i].any():
             yield i, int(classes[i]), np.array([len(structure)])
 
 

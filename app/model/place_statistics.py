@@ -10,16 +10,16 @@ held is the number of scenes with a relation a from class i to class j, or in th
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Final, Self
+from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled
-from app.registry.fields import TensorGroup
+from app.model.fields import TensorGroup
 from app.scene.roles import IN, ON, UNDER, RoleCounts, find_row, role_counts
 from app.scene.spatial_relations import CANONICAL, ON_TOP, STACKED, SUPPORTS
 from app.scene.stands import HANGS, SUPPORTED, USUAL
@@ -41,12 +41,12 @@ class Places(TensorGroup):
     """Counts of relations between classes, of the roles of boxes, and of objects on the floor.
 
     Attributes:
-        triple: (N,) keys (a V + i) V + j of relations a from class i to class j, ascending.
-        held: (N,) number of training scenes with each triple.
-        frequency: (V,) share of each class among the listed classes of the training scenes.
+        triple: keys (a V + i) V + j of relations a from class i to class j, ascending.
+        held: number of training scenes with each triple.
+        frequency: share of each class among the listed classes of the training scenes.
         role_pair, role_counts, role_anchor: see `RoleCounts`.
-        stands: (V, 3) shares of the objects of each class that stand on the floor, hang, and stand
-            on or in an object.
+        stands: shares of the objects of each class that stand on the floor, hang, and stand on or
+            in an object.
     """
 
     prefix: ClassVar[str] = "places."
@@ -60,29 +60,22 @@ class Places(TensorGroup):
     role_anchor: Annotated[NDArray[np.float32], "V", 3]
     stands: Annotated[NDArray[np.float32], "V", 3]
 
-    @classmethod
-    def from_tensors(cls, tensors: Mapping[str, NDArray[Any]], A: int, V: int) -> Self:
-        """Build the counts of a machine with A relations and V classes from stored tensors.
-
-        Raises:
-            ArtifactError: `wrong_shape` or `invalid_tensor`; see `TensorGroup.read`.
-        """
-        places = cls.read(tensors, V=V)
-        places.require(len(places.triple), "there must be at least one triple")
-        places.require_keys("triple", A * V * V)
-        places.require_keys("role_pair", V * V)
-        counts = places.held, places.role_counts, places.role_anchor, places.stands
-        is_right = all((array >= 0).all() for array in counts) and (places.frequency > 0).all()
-        places.require(is_right, "counts must be at least 0, and frequencies must be above 0")
-        return places
+    def check(self, A: int, V: int, C: int) -> None:
+        """Check the values for a machine with A relations and V classes."""
+        self.require(len(self.triple), "there must be at least one triple")
+        self.require_keys("triple", A * V * V)
+        self.require_keys("role_pair", V * V)
+        counts = self.held, self.role_counts, self.role_anchor, self.stands
+        is_right = all((array >= 0).all() for array in counts) and (self.frequency > 0).all()
+        self.require(is_right, "counts must be at least 0, and frequencies must be above 0")
 
     @cached_property
     def roles(self) -> RoleCounts:
         """The roles of pairs of classes."""
         return RoleCounts(self.role_pair.astype(np.int64), self.role_counts, self.role_anchor)
 
-    def log_ratio(self, relation: int, anchor: int, *, outgoing: bool) -> Floats:
-        """Return log p(i at a, j) - log p(i) of each class i at a place, (V,).
+    def log_ratio(self, relation: int, anchor: int, *, outgoing: bool) -> Float[Floats, "V"]:
+        """Return log p(i at a, j) - log p(i) of each class i at a place.
 
         Args:
             relation: index a of the canonical relation of the place.
@@ -92,22 +85,26 @@ class Places(TensorGroup):
         start, classes, counts, back_off = self._by_anchor[int(outgoing)]
         V = len(self.frequency)
         begin, end = start[relation * V + anchor], start[relation * V + anchor + 1]
-        held = _PLACE * back_off[relation]
-        held[classes[begin:end]] += counts[begin:end]
-        return np.log(held / ((counts[begin:end].sum() + _PLACE) * self.frequency))
+        smoothed = _PLACE * back_off[relation]
+        smoothed[classes[begin:end]] += counts[begin:end]
+        return np.log(smoothed / ((counts[begin:end].sum() + _PLACE) * self.frequency))
 
-    def shows(self, relation: int, subject: Indices, other: Indices) -> NDArray[np.bool_]:
-        """Return whether training shows the relation from each subject to each other class, (N, M).
+    def shows(
+        self, relation: int, subject: Int[Indices, "N"], other: Int[Indices, "M"]
+    ) -> Bool[NDArray[np.bool_], "N M"]:
+        """Return whether training shows the relation from each subject class to each other class.
 
-        The class indices are (N,) and (M,). A single scene may be an error.
+        A single scene may be an error.
         """
         V = len(self.frequency)
         return _triple_counts(self.triple, self.held, V, relation, subject, other) >= _SHOWN
 
-    def supporters(self, subject: Indices, other: Indices) -> Floats:
-        """Return the share of each other class among the supporters of each subject, (N, M).
+    def supporters(
+        self, subject: Int[Indices, "N"], other: Int[Indices, "M"]
+    ) -> Float[Floats, "N M"]:
+        """Return the share of each other class among the supporters of each subject class.
 
-        A supporter is an object on or in which the subject is. The class indices are (N,) and (M,).
+        A supporter is an object on or in which the subject is.
         """
         total, share = self._supporters
         V, of_pairs = len(self.frequency), _SUPPORTER * share[other]
@@ -116,8 +113,8 @@ class Places(TensorGroup):
         return of_pairs / (total[subject, None] + _SUPPORTER)
 
     @cached_property
-    def _supporters(self) -> tuple[Floats, Floats]:
-        """Number of supporters of each class, (V,), and its share among all supporters, (V,)."""
+    def _supporters(self) -> tuple[Float[Floats, "V"], Float[Floats, "V"]]:
+        """Number of supporters of each class, and its share among all supporters."""
         V = len(self.frequency)
         is_support = np.isin(self.triple // (V * V), SUPPORTS)
         subject, other = np.divmod(self.triple[is_support] % (V * V), V)

@@ -6,16 +6,16 @@ The opposite relation, with both classes exchanged, has the negative offset.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Final, Self
+from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled
-from app.registry.fields import TensorGroup
+from app.model.fields import TensorGroup
 from app.scene.roles import find_row
 from app.scene.spatial_relations import FRONT, LEFT
 
@@ -54,32 +54,25 @@ class Offsets(TensorGroup):
     pair_offset: Annotated[Table, "P", 6]
     pair_scenes: Annotated[Ints, "P"]
 
-    @classmethod
-    def from_tensors(cls, tensors: Mapping[str, NDArray[Any]], A: int, V: int) -> Self:
-        """Build the offsets of a machine with A relations and V classes from stored tensors.
-
-        Raises:
-            ArtifactError: `wrong_shape` or `invalid_tensor`; see `TensorGroup.read`.
-        """
-        offsets = cls.read(tensors, A=A, V=V)
-        offsets.require_keys("pair", A * V * V)
-        is_right = (offsets.relation_scenes >= 0).all() and (offsets.pair_scenes >= 1).all()
-        offsets.require(is_right, "relation_scenes must be at least 0 and pair_scenes at least 1")
-        least = offsets.relation + offsets.subject.min(axis=1) + offsets.object.min(axis=1)
-        variances = least[offsets.relation_scenes > 0, 3:]
-        is_right = (variances > 0).all() and (offsets.pair_offset[:, 3:] > 0).all()
-        offsets.require(is_right, "variances and standard deviations must be positive")
-        return offsets
+    def check(self, A: int, V: int, C: int) -> None:
+        """Check the values for a machine with A relations and V classes."""
+        self.require_keys("pair", A * V * V)
+        is_right = (self.relation_scenes >= 0).all() and (self.pair_scenes >= 1).all()
+        self.require(is_right, "relation_scenes must be at least 0 and pair_scenes at least 1")
+        least = self.relation + self.subject.min(axis=1) + self.object.min(axis=1)
+        variances = least[self.relation_scenes > 0, 3:]
+        is_right = (variances > 0).all() and (self.pair_offset[:, 3:] > 0).all()
+        self.require(is_right, "variances and standard deviations must be positive")
 
     def find(
-        self, relation: Ints, subject: Ints, other: Ints
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return the offsets of n pairs (relation, subject class, object class) of indices (n,).
+        self, relation: Int[Ints, "n"], subject: Int[Ints, "n"], other: Int[Ints, "n"]
+    ) -> tuple[Float[NDArray[np.float64], "n 6"], Int[NDArray[np.int64], "n"]]:
+        """Return the offsets of pairs: relation, subject class and object class.
 
         Returns:
-            Offsets (n, 6): mean (3) and standard deviation (3). Then the number of training scenes
-            that contain each pair, (n,). If it is 0, the offset is the sum of a term of the
-            relation and one term of each class. `UNOBSERVED`: training lacks the relation.
+            Offsets: mean (3) and standard deviation (3). Then the number of training scenes that
+            contain each pair. If it is 0, the offset is the sum of a term of the relation and one
+            term of each class. `UNOBSERVED`: training lacks the relation.
         """
         return _look_up_offsets(self.tables, relation, subject, other)
 
@@ -142,7 +135,7 @@ def rotated_offsets(tables, relation, missing, anchor, outgoing, axes, has_axes)
 
 @compiled
 def _look_up_offsets(tables, relation, subject, other):
-    """See `Offsets.find`."""
+    """Return the offsets and the numbers of scenes of `Offsets.find`."""
     relation_offset, relation_scenes, subjects, objects, pair, pair_offset, pair_scenes = tables
     n, V = len(relation), subjects.shape[1]
     offset, scenes = np.empty((n, 6)), np.empty(n, np.int64)

@@ -1,17 +1,33 @@
-"""Statistics of the number of instances of a class in a scene, such as the chairs of a kitchen."""
+"""The numbers of instances of the listed classes: are there more chairs, or a second nightstand?
+
+The models score classes. This module adds statistics of counts. Let n be the number of instances of
+a class in the scene, of which the request lists k. Then, for n from k to M,
+
+    p(n) ∝ s(n) exp(η log n + ζ log n log(M/n)) ρ^(n - k)
+    η = a + b [k = 1] + c u + d_t + (1/√m) Σ_j e_j
+
+s(n) is the share of training scenes with n instances. A large η makes large numbers probable, and a
+large ζ makes numbers between 1 and M probable. ζ has the form of η, with weights of its own. u is 1
+if the request lists another class several times, and 0 otherwise. The sum goes over the m other
+listed classes j, without structure. a, b, c, d (for the room type t) and e are weights of the
+class. A request that states a coverage above the model's coverage lowers ρ from 1 to
+(1 - coverage) / (1 - model's coverage).
+"""
 
 import math
-from collections.abc import Mapping
+import sys
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Final, Self
+from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled
-from app.registry.fields import TensorGroup
+from app.model.fields import TensorGroup
 from app.scene.roles import find_row
 
+Floats = NDArray[np.float64]
 Table = NDArray[np.float32]
 Ints = NDArray[np.integer[Any]]
 
@@ -30,7 +46,7 @@ _MOST: Final = 256
 
 @dataclass(frozen=True, eq=False)
 class Counts(TensorGroup):
-    """Counts of K of a model's V classes. `app.questions.counts` has the formula.
+    """Counts of K of a model's V classes.
 
     Attributes:
         classes: (K,) indices of the classes with statistics, in ascending order.
@@ -50,34 +66,51 @@ class Counts(TensorGroup):
     log_share: Annotated[Table, "K", "M"]
     weights: Annotated[Table, "K", EXPONENTS, "features"]
 
-    @classmethod
-    def from_tensors(cls, tensors: Mapping[str, NDArray[Any]], V: int, C: int) -> Self:
-        """Build the counts of a model with V classes and C room types from stored tensors.
+    def check(self, A: int, V: int, C: int) -> None:
+        """Check the values for a model with V classes and C room types."""
+        K, M = self.log_share.shape
+        self.require(K, "there must be at least one class")
+        self.require_keys("classes", V)
+        self.require(2 <= M <= _MOST, f"log_share must have 2 to {_MOST} columns")
+        is_right = ((self.most >= 1) & (self.most < M)).all()
+        self.require(is_right, "most must be from 1 to the columns of log_share minus 1")
+        is_right = ((self.log_share <= 0) & (self.log_share >= -_LARGEST)).all()
+        self.require(is_right, f"log_share must be between -{_LARGEST:g} and 0")
+        is_right = (np.abs(self.weights) <= _LARGEST).all()
+        self.require(is_right, f"weights must be between -{_LARGEST:g} and {_LARGEST:g}")
+        on_itself = self.weights[np.arange(K), :, ROOM + C + self.classes]
+        self.require(not on_itself.any(), "the weight of a class on itself must be 0")
 
-        Raises:
-            ArtifactError: `wrong_shape` or `invalid_tensor`; see `TensorGroup.read`.
+    def distribution(
+        self,
+        V: int,
+        classes: Int[Ints, "n"],
+        listed: Int[Ints, "n"],
+        room: int | None = None,
+        unlisted: float = 1.0,
+    ) -> tuple[Int[Ints, "k"], Float[Floats, "k M"]]:
+        """Return the distributions of the numbers of instances of the listed classes.
+
+        Args:
+            V: number of classes of the model.
+            classes: indices of the listed classes, without structure, in ascending order.
+            listed: number of listed objects of each class.
+            room: index of the room type, or None.
+            unlisted: ρ of the formula.
+
+        Returns:
+            Indices into `classes` of the classes with statistics that cover the listed number, and
+            the probability of 1, 2, ... M instances of each.
         """
-        counts = cls.read(tensors, features=ROOM + C + V)
-        K, M = counts.log_share.shape
-        counts.require(K, "there must be at least one class")
-        counts.require_keys("classes", V)
-        counts.require(2 <= M <= _MOST, f"log_share must have 2 to {_MOST} columns")
-        is_right = ((counts.most >= 1) & (counts.most < M)).all()
-        counts.require(is_right, "most must be from 1 to the columns of log_share minus 1")
-        is_right = ((counts.log_share <= 0) & (counts.log_share >= -_LARGEST)).all()
-        counts.require(is_right, f"log_share must be between -{_LARGEST:g} and 0")
-        is_right = (np.abs(counts.weights) <= _LARGEST).all()
-        counts.require(is_right, f"weights must be between -{_LARGEST:g} and {_LARGEST:g}")
-        on_itself = counts.weights[np.arange(K), :, ROOM + C + counts.classes]
-        counts.require(not on_itself.any(), "the weight of a class on itself must be 0")
-        return counts
+        tables = self.classes, self.most, self.log_share, self.weights
+        scene = classes, listed, -1 if room is None else room
+        log_unlisted = math.log(max(unlisted, sys.float_info.min))
+        return _distributions(*tables, *scene, self.weights.shape[-1] - V, log_unlisted)
 
 
 @compiled
-def count_distributions(
-    known, most, log_share, weights, classes, listed, room, first, log_unlisted
-):
-    """Return the classes and distributions of `app.questions.counts.distribution`, (k,) and (k, M).
+def _distributions(known, most, log_share, weights, classes, listed, room, first, log_unlisted):
+    """Return the rows and distributions of `Counts.distribution`, (k,) and (k, M).
 
     Args:
         known, most, log_share, weights: see `Counts`. Column `first` of the weights is class 0.

@@ -1,12 +1,12 @@
 """Base class and field types of stored JSON, and of groups of stored tensors."""
 
 import json
-from collections.abc import Collection, Mapping
+from abc import abstractmethod
+from collections.abc import Collection
 from dataclasses import dataclass, fields
 from datetime import UTC
-from typing import Annotated, Any, ClassVar, Self, TypeVar, get_type_hints
+from typing import Annotated, Any, ClassVar, TypeVar
 
-import numpy as np
 from numpy.typing import NDArray
 from pydantic import (
     AfterValidator,
@@ -18,8 +18,6 @@ from pydantic import (
     StringConstraints,
     ValidationError,
 )
-
-from app.registry.errors import ArtifactError
 
 Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 Text = Annotated[str, StringConstraints(min_length=1)]
@@ -67,43 +65,19 @@ class TensorGroup:
         """Return a mapping of tensor names in an artifact to the arrays."""
         return {f"{self.prefix}{field.name}": getattr(self, field.name) for field in fields(self)}
 
-    @classmethod
-    def read(cls, tensors: Mapping[str, NDArray[Any]], **sizes: int) -> Self:
-        """Build the group from stored tensors.
-
-        Args:
-            sizes: named sizes of the model. The first field with another size defines it.
+    @abstractmethod
+    def check(self, A: int, V: int, C: int) -> None:
+        """Check the values for a model with A relations, V classes and C room types.
 
         Raises:
-            ArtifactError: `wrong_shape` if a tensor is missing, unexpected or of a wrong shape;
-                `invalid_tensor` if a tensor has a wrong dtype.
+            ValueError: a value is not possible.
         """
-        shapes = {}
-        for name, hint in get_type_hints(cls, include_extras=True).items():
-            if axes := getattr(hint, "__metadata__", ()):
-                actual = np.shape(tensors.get(f"{cls.prefix}{name}", ()))
-                sizes = dict(zip(axes, actual, strict=False)) | sizes
-                shapes[name] = tuple(
-                    sizes.get(axis, 0) if isinstance(axis, str) else axis for axis in axes
-                )
-        for name in sorted(tensors.keys() | {f"{cls.prefix}{name}" for name in shapes}):
-            required = shapes.get(name.removeprefix(cls.prefix))
-            shape = tensors[name].shape if name in tensors else None
-            if shape != required:
-                reason = f"tensor '{name}' has the shape {shape}, not {required} (None: no tensor)"
-                raise ArtifactError("wrong_shape", reason)
-        group = cls(**{name: tensors[f"{cls.prefix}{name}"] for name in shapes})
-        for name in shapes:
-            kind = np.integer if name in cls.integers else np.floating
-            is_right = np.issubdtype(getattr(group, name).dtype, kind)
-            group.require(is_right, f"{name} must have a dtype of {kind.__name__}")
-        return group
 
     def require(self, condition: object, complaint: str) -> None:
-        """Raise ArtifactError `invalid_tensor` with the complaint if the condition is false."""
+        """Raise ValueError with the complaint if the condition is false."""
         if not condition:
             subject = self.prefix.removesuffix("s.")
-            raise ArtifactError("invalid_tensor", f"the {subject} tensors are invalid: {complaint}")
+            raise ValueError(f"the {subject} tensors are invalid: {complaint}")
 
     def require_keys(self, name: str, limit: int) -> None:
         """Require that a field has ascending numbers from 0 to ``limit`` - 1."""

@@ -62,8 +62,8 @@ class RowMap:
         Raises:
             ValueError: no class has a word vector.
         """
-        vectors, known = vocabulary.vectors
-        used = known & ~vocabulary.structure
+        vectors, has_vector = vocabulary.vectors
+        used = has_vector & ~vocabulary.structure
         used[list(left_out)] = False
         if not used.any():
             raise ValueError("no class of the model has a word vector")

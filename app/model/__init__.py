@@ -1,0 +1,28 @@
+"""The model that answers questions, and its parts: calibration and statistics of training scenes.
+
+`app.registry` reads and writes the parts as the files of an artifact.
+"""
+
+from app.model.calibration import (
+    AlarmLine,
+    AlarmLines,
+    Calibration,
+    CountSlope,
+    CoverageFit,
+    FitLimit,
+    Judgement,
+    Misplaced,
+    PlaceFit,
+    Sensitivity,
+    Sharpness,
+)
+from app.model.count_statistics import Counts
+from app.model.offset_statistics import Offsets
+from app.model.place_statistics import Places
+from app.model.scene_model import SceneModel
+
+__all__ = [
+    "AlarmLine", "AlarmLines", "Calibration", "CountSlope", "Counts", "CoverageFit", "FitLimit",
+    "Judgement", "Misplaced", "Offsets", "PlaceFit", "Places", "SceneModel", "Sensitivity",
+    "Sharpness",
+]  # fmt: skip

@@ -1,0 +1,278 @@
+"""The calibration of a model: how its log-odds become probabilities, and when it raises an alarm.
+
+Validation scenes determine the coefficients (`training.fit`).
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, Final, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from app.model.fields import Count, Frozen, Many
+from app.scene.spatial_relations import CANONICAL
+from scene_client.schemas import Sensitivity as Sensitivity
+
+Floats = NDArray[np.floating[Any]]
+
+
+class CountSlope(Frozen):
+    """Calibration of a logit z: log-odds = intercept + slope·z + log_count·log n.
+
+    The attributes of `Calibration` define n for each question.
+    """
+
+    intercept: float = 0.0
+    slope: float = 1.0
+    log_count: float = 0.0
+
+
+class CoverageFit(Frozen):
+    """Calibration of a logit z about a scene of which a list of n classes is the share s:
+
+        log-odds = intercept + slope·z + log_count·log n + log_share·log s
+                   + both·log n·log s + last·[s = 1]
+
+    A share below `LEAST_COVERAGE` counts as this share.
+    """
+
+    intercept: float = 0.0
+    slope: float = 1.0
+    log_count: float = 0.0
+    log_share: float = 0.0
+    both: float = 0.0
+    last: float = 0.0
+
+
+LEAST_COVERAGE: Final = 0.15
+"""Least share of a scene that the base rates of `/missing` tell apart."""
+
+PairSlopes = Annotated[Many[CountSlope], Field(max_length=len(CANONICAL))]
+
+PAIR_CALIBRATIONS: Final = ("relation", "relation_given", "placement")
+"""Fields of `Calibration` with one `CountSlope` for each canonical relation.
+
+n of this entry is the number of object pairs with the two classes of the relation.
+"""
+
+
+class PlaceFit(Frozen):
+    """The log-odds that a class, if it is present, stands at the place that a request names.
+
+    With the model's log probability p of the relation to the anchor, and the log ratio c of the
+    counts (`Places.log_ratio`), they are
+
+        intercept + relation·p + counts·c
+    """
+
+    relation: Annotated[float, Field(ge=0)] = 1.0
+    counts: Annotated[float, Field(ge=0)] = 0.0
+    intercept: float = 0.0
+
+
+PlaceFits = Annotated[Many[PlaceFit], Field(max_length=len(CANONICAL))]
+
+
+class Sharpness(Frozen):
+    """Calibration of probabilities p of exclusive answers: p^(slope + log_count·log n) / sum.
+
+    n is the number of listed classes without structure, at least 1.
+    """
+
+    slope: float = 1.0
+    log_count: float = 0.0
+
+    def of(self, n: int) -> float:
+        """Return the exponent for a list of n classes. It is at least 0.05."""
+        return max(self.slope + self.log_count * math.log(max(n, 1)), 0.05)
+
+
+class FitLimit(Frozen):
+    """Minimum of `app.questions.generate.room_fit` for a scene of n classes.
+
+    It is intercept + log_count·log n.
+    """
+
+    intercept: float
+    log_count: float = 0.0
+
+    def of(self, n: int) -> float:
+        """Return the minimum for a scene of n classes."""
+        return self.intercept + self.log_count * math.log(max(n, 1))
+
+
+NO_LIMIT: Final = FitLimit(intercept=-1e9)
+
+LONGEST_JUDGED: Final = 36
+"""Maximum number of listed classes to which alarm lines are fitted. Longer lists count as such."""
+
+LEAST_ALARM: Final[Mapping[Sensitivity, float]] = {"low": 0.5, "medium": 0.3, "high": 0.15}
+"""Minimum probability of an alarm. Where the scores of right and wrong objects hardly overlap, the
+permitted share of alarms alone would flag objects that probably belong."""
+
+
+class AlarmLine(Frozen):
+    """Minimum log-odds of an alarm in a list of n entries.
+
+    They are intercept + log_count·log n + curve·log² n.
+    """
+
+    intercept: float
+    log_count: float = 0.0
+    curve: float = 0.0
+
+    def threshold(self, n: int) -> float:
+        """Return the minimum probability of an alarm in a list of n entries."""
+        log_n = math.log(max(n, 1))
+        log_odds = self.intercept + (self.log_count + self.curve * log_n) * log_n
+        return 0.5 + 0.5 * math.tanh(log_odds / 2)  # tanh cannot overflow
+
+
+class AlarmLines(Frozen):
+    """The alarm line of each sensitivity."""
+
+    low: AlarmLine
+    medium: AlarmLine
+    high: AlarmLine
+
+
+KINDS: Final = ("lateral", "support", "above", "under", "stand")
+"""Kinds of entries in `misplaced`; see `app.questions.misplaced`."""
+
+
+class Judgement(Frozen):
+    """The log-odds that an entry of `misplaced` is wrong, and the lines of an alarm.
+
+    The log-odds are intercept + relation·z + change·d + stand·s + supporter·q; see
+    `app.questions.misplaced`.
+    n of the lines is the number of entries of the kind in the scene.
+    """
+
+    intercept: float
+    relation: float
+    change: float
+    stand: float
+    supporter: float
+    lines: AlarmLines
+
+
+class Misplaced(Frozen):
+    """The judgement of each kind of entry. None: training had too few scenes for the fit.
+
+    Attributes:
+        usual: indices (relation, subject, object) of relations between classes that a person has
+            confirmed.
+    """
+
+    lateral: Judgement | None = None
+    support: Judgement | None = None
+    above: Judgement | None = None
+    under: Judgement | None = None
+    stand: Judgement | None = None
+    usual: Many[tuple[Count, Count, Count]] = ()
+
+    @property
+    def judges_relations(self) -> bool:
+        """Whether the model judges any kind of relation."""
+        return any(getattr(self, kind) is not None for kind in KINDS if kind != "stand")
+
+
+class Calibration(Frozen):
+    """The conversion of a machine's log-odds into probabilities.
+
+    With the default values, the calibration changes nothing, and the model judges neither objects
+    nor relations. An intruder is an object that does not belong to the scene. Tuples of the V
+    classes or C room types may be empty: all classes are equally popular, or there is no minimum.
+
+    Attributes:
+        coverage: share of the classes of a scene that the base rates of `/missing` assume if a
+            request states no coverage.
+        missing: calibration of the log-odds that an unlisted class is present, if a request states
+            no coverage. n is the number of listed classes without structure.
+        covered: the same if a request states the coverage.
+        popularity: (V,) log-odds that a training scene has each class; None for a class that no
+            source shows in training.
+        popularity_weight: exponent alpha. The prior probability of an intruder's class is
+            proportional to popularity^alpha, where popularity is the odds of the class.
+        outlier_lines: minimum log-odds of an outlier, by the number of listed classes without
+            structure. None exactly if `outlier` is None.
+        room_lines: the same if a request states the room type; None: as `outlier_lines`.
+        rooms: calibration of the probabilities of the room types.
+        rare_rooms: indices of the room types with too few training scenes for `/generate`.
+        written_rooms: indices of the room types that written scenes alone show.
+        smallest: (C + 1,) minimum number of classes in a generated scene of each room type. The
+            last entry is for scenes without a room type.
+        room_fit: (C,) minimum fit of a generated scene of each room type. About 95 % of the lists
+            of whole rooms reach both limits (`training.fit.calibrate_rooms`).
+        outlier: calibration that converts a class's log-odds of presence to the log-odds that its
+            object is an intruder. n is the number of classes in the scene without structure. None:
+            training had too few scenes for the fit, so the model judges no object.
+        relation, relation_given: calibrations of each canonical relation in scenes without and with
+            observed relations.
+        placement, at: calibrations of each canonical relation for a missing object at its most
+            probable places, and at the place that a request names.
+        misplaced: calibration of the observed relations, and of objects on the floor or on a wall.
+    """
+
+    coverage: Annotated[float, Field(ge=0, le=1)] = 0.5
+    missing: CountSlope = CountSlope()
+    covered: CoverageFit = CoverageFit()
+    popularity: Many[float | None] = ()
+    popularity_weight: Annotated[float, Field(ge=0, le=1)] = 0.0
+    outlier_lines: AlarmLines | None = None
+    room_lines: AlarmLines | None = None
+    rooms: Sharpness = Sharpness()
+    rare_rooms: Many[Count] = ()
+    written_rooms: Many[Count] = ()
+    smallest: Many[Count] = ()
+    room_fit: Many[FitLimit] = ()
+    outlier: CountSlope | None = None
+    relation: PairSlopes
+    relation_given: PairSlopes
+    placement: PairSlopes
+    at: PlaceFits
+    misplaced: Misplaced = Misplaced()
+
+    @model_validator(mode="after")
+    def _check_outlier_lines(self) -> Self:
+        if (self.outlier is None) != (self.outlier_lines is None):
+            raise ValueError("outlier and outlier_lines must both have a value, or neither")
+        return self
+
+    def outlier_threshold(self, sensitivity: Sensitivity, n: int, *, in_room: bool) -> float | None:
+        """Return the minimum probability of an outlier in a list of n classes without structure.
+
+        It is at least `LEAST_ALARM`. It is None if the model judges no object.
+        """
+        lines = (self.room_lines if in_room else None) or self.outlier_lines
+        if lines is None:
+            return None
+        line: AlarmLine = getattr(lines, sensitivity)
+        return max(line.threshold(min(n, LONGEST_JUDGED)), LEAST_ALARM[sensitivity])
+
+    @classmethod
+    def neutral(cls, relations: int) -> Self:
+        """Return the calibration with default values for A = ``relations`` canonical relations."""
+        neutral = dict.fromkeys(PAIR_CALIBRATIONS, (CountSlope(),) * relations)
+        return cls.model_validate({**neutral, "at": (PlaceFit(),) * relations})
+
+
+class RelationSlopes(NamedTuple):
+    """Calibration tables of the A canonical relations, each (A, 3).
+
+    Each row of a table is the `CountSlope` of one relation: intercept, slope, log_count. The tables
+    have the names of their fields in `Calibration`.
+    """
+
+    relation: Floats
+    relation_given: Floats
+    placement: Floats
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> Self:
+        """Build the tables of a calibration."""
+        entries = (getattr(calibration, name) for name in PAIR_CALIBRATIONS)
+        rows = ([(e.intercept, e.slope, e.log_count) for e in part] for part in entries)
+        return cls(*(np.array(part, np.float32).reshape(-1, 3) for part in rows))

@@ -1,0 +1,133 @@
+"""The model that answers: a trained machine, its vocabulary, its calibration and its statistics."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+
+from app.inference import MachineSpec, Weights
+from app.inference.chains import SceneChains
+from app.inference.objects import ObjectScorer
+from app.inference.relation_units import RelationUnits, StandIns, relation_units
+from app.model.calibration import Calibration, RelationSlopes
+from app.model.count_statistics import Counts
+from app.model.offset_statistics import Offsets
+from app.model.place_statistics import Places
+from app.model.word_weights import RowMap
+from app.scene.vocabulary import Vocabulary, Word
+
+_MOST_KEPT: Final = 4  # models with words that a model keeps, of about 20 MB each
+
+RARELY: Final = 1 / 500
+"""A class is rarely shown if a smaller share of the training scenes shows it."""
+
+
+@dataclass(frozen=True, eq=False)
+class SceneModel:
+    """A model, ready to answer questions.
+
+    Attributes:
+        weights: weights of the machine.
+        vocabulary: names of the model's V object classes and C room types.
+        calibration: conversion of log-odds into probabilities.
+        offsets: vectors in metres between the centres of related objects; None without poses in the
+            training scenes.
+        counts: statistics of the numbers of instances; None without such numbers.
+        places: counts of where objects stand; None without relations in the training scenes.
+    """
+
+    weights: Weights
+    vocabulary: Vocabulary
+    calibration: Calibration
+    offsets: Offsets | None = None
+    counts: Counts | None = None
+    places: Places | None = None
+
+    @cached_property
+    def spec(self) -> MachineSpec:
+        """Sizes and form of the machine."""
+        return self.weights.spec
+
+    @cached_property
+    def objects(self) -> ObjectScorer:
+        """Log-odds of classes and room types. The first access prepares the weights."""
+        return ObjectScorer(self.weights)
+
+    @cached_property
+    def relation_units(self) -> RelationUnits:
+        """Relation units of the machine. The first access prepares the weights."""
+        return relation_units(self.weights)
+
+    @cached_property
+    def relation_slopes(self) -> RelationSlopes:
+        """Calibration of the relations, as arrays."""
+        return RelationSlopes.of(self.calibration)
+
+    @cached_property
+    def intruder_prior(self) -> Float[NDArray[np.float64], "V"]:
+        """Log prior that an intruder has each class, up to a constant: alpha · popularity.
+
+        A class that no training scene shows counts as the rarest other class.
+        """
+        calibration, none = self.calibration, np.zeros(0, np.int64)
+        if not calibration.popularity:
+            return np.zeros(self.spec.V)
+        popularity = np.array(calibration.popularity, dtype=np.float64)
+        nothing = self.weights["c1"], none, none.astype(np.float32)
+        alone = self.objects.absent(*nothing, profile=None, coverage=1.0)
+        rarest, alpha = np.nanmin(popularity), calibration.popularity_weight
+        return np.where(np.isnan(popularity), alone - (1 - alpha) * rarest, alpha * popularity)
+
+    @cached_property
+    def rarely_shown(self) -> Bool[NDArray[np.bool_], "V"]:
+        """True for classes that fewer than `RARELY` of the training scenes show."""
+        if not self.calibration.popularity:
+            return np.zeros(self.spec.V, np.bool_)
+        popularity = np.array(self.calibration.popularity, dtype=np.float64)
+        return ~(popularity >= math.log(RARELY / (1 - RARELY)))  # NaN: no training scene
+
+    @cached_property
+    def row_map(self) -> RowMap:
+        """Regression from word vectors to weights. The first access takes about 0.5 s."""
+        return RowMap.fit(self.weights, self.vocabulary)
+
+    def with_words(self, words: Sequence[Word]) -> "SceneModel":
+        """Return the model with a further class for each word, in the order of the words.
+
+        The weights of such a class are predicted (`RowMap`). Its relations and its places are those
+        of the nearest class. It never raises an alarm.
+        """
+        if not words:
+            return self
+        names = tuple(word.name for word in words)
+        kept = self._with_words.get(names)
+        if kept is None:
+            popularity = self.calibration.popularity
+            popularity = (*popularity, *(None for _ in words if popularity))
+            kept = replace(
+                self,
+                weights=self.row_map.with_words(self.weights, words),
+                vocabulary=self.vocabulary.with_words(words),
+                calibration=self.calibration.model_copy(update={"popularity": popularity}),
+            )
+            # A reference to this model would close a cycle; see `app.serving.runtime`.
+            stand_in = kept.vocabulary.stand_in
+            vars(kept)["relation_units"] = StandIns(kept.weights, self.relation_units, stand_in)
+            if len(self._with_words) >= _MOST_KEPT:
+                self._with_words.clear()  # in one step, because other threads read it
+            self._with_words[names] = kept
+        return kept
+
+    @cached_property
+    def _with_words(self) -> dict[tuple[str, ...], "SceneModel"]:
+        return {}
+
+    @cached_property
+    def scene_chains(self) -> SceneChains:
+        """Compiled Gibbs chains that sample scenes."""
+        return SceneChains(self.weights, self.relation_units, self.calibration.rare_rooms)
