@@ -204,17 +204,17 @@ class ObjectScorer:
         n, others = len(classes) if explained else 0, self._states - 1
         x = scene.x - scene.contributions[rows] if len(rows) else scene.x[None]
         raised, removed = np.exp(weights["W"][targets]), np.exp(-scene.contributions[:n])
-        factors, ratios = _hidden_factors(
+        log_odds, change = _hidden_changes(
             all_states(x, self._states),
             raised.reshape(len(targets), weights.spec.units, others),
             removed.reshape(n, weights.spec.units, others),
         )
         possible = slice(None) if profile is None else slice(profile, profile + 1)
-        mean, change = _source_effects(
+        mean, change_by_source = _source_effects(
             weights["f"][possible], weights["a"][possible], classes, presence, rows, targets, n
         )
-        log_odds = bias[targets] + np.log(factors).sum(1) + mean
-        change -= np.log(ratios).sum(2)
+        log_odds += bias[targets] + mean
+        change += change_by_source
         if weights.spec.coupled:
             couplings = weights["L"][targets[:, None], classes] * presence
             log_odds += couplings.sum(1)
@@ -334,12 +334,12 @@ def _hidden_log_odds(
 
 
 @compiled_in_any_order
-def _hidden_factors(
+def _hidden_changes(
     p: Float[NDArray, "N|1 units states"],
     raised: Float[NDArray, "N units states-1"],
     removed: Float[NDArray, "n units states-1"],
-) -> tuple[Float[NDArray, "N units"], Float[NDArray, "N n units"]]:
-    """Return the factors e^hidden of N classes, and e^-change by n listed classes, of each unit.
+) -> tuple[Float[NDArray, " N"], Float[NDArray, "N n"]]:
+    """Return hidden(W_i) of N classes i, and its changes by n listed classes.
 
     Args:
         p: probabilities of the states of h1.
@@ -347,22 +347,28 @@ def _hidden_factors(
         removed: exponentials of the contributions of the n classes, negated.
     """
     (N, units, others), n = raised.shape, len(removed)
-    total, ratio = np.empty((N, units), np.float32), np.empty((N, n, units), np.float32)
+    total, change = np.zeros(N, np.float32), np.zeros((N, n), np.float32)
+    hidden, ratio = np.empty(units, np.float32), np.empty(units, np.float32)
     for c in range(N):
+        states = p[min(c, len(p) - 1)]
         for m in range(units):
-            row, factors = p[min(c, len(p) - 1), m], raised[c, m]
-            with_class = row[0]
+            hidden[m] = states[m, 0]
             for z in range(others):
-                with_class += row[z + 1] * factors[z]
-            total[c, m] = with_class
-            for j in range(n):
-                without, before, after = removed[j, m], row[0], row[0]
+                hidden[m] += states[m, z + 1] * raised[c, m, z]
+        for m in range(units):
+            total[c] += log(hidden[m])
+        for j in range(n):
+            for m in range(units):
+                row, factors, without = states[m], raised[c, m], removed[j, m]
+                before, after = row[0], row[0]
                 for z in range(others):
                     product = row[z + 1] * without[z]
                     before += product
                     after += product * factors[z]
-                ratio[c, j, m] = after / (before * with_class)
-    return total, ratio
+                ratio[m] = before * hidden[m] / after
+            for m in range(units):
+                change[c, j] += log(ratio[m])
+    return total, change
 
 
 @compiled
