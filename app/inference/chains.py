@@ -30,7 +30,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy.typing import NDArray
 
 from app.compiling import compiled
@@ -46,10 +46,8 @@ from app.inference.relation_units import (
 )
 from app.inference.weights import Weights, unpack_scenes
 
-Floats = NDArray[np.float32]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-Bits = NDArray[np.uint8]
+Bits = UInt8[NDArray, " V"]
+"""Presence of each class."""
 
 OTHER_ROOM = np.float32(6.0)
 """Reduction of the log weight of stored scenes whose room type differs from the requested one."""
@@ -69,13 +67,13 @@ class Conditions:
     """The fixed conditions of a chain.
 
     Attributes:
-        classes: (n,) int64, distinct indices of the classes that stay present, ascending.
+        classes: distinct indices of the classes that stay present, ascending.
         observed: observed relations between these classes, or None without observed relations.
         room: index of the room type, or None if unknown.
         profile: index of the data source whose base rates apply, or None.
     """
 
-    classes: Indices
+    classes: Int[NDArray, " n"]
     observed: ObservedRelations | None
     room: int | None = None
     profile: int | None = None
@@ -86,32 +84,31 @@ class ChainState:
     """The final state of a chain.
 
     Attributes:
-        classes: (n,) int64, indices of the present classes, ascending.
+        classes: indices of the present classes, ascending.
         room: index of the room type, or None if unknown.
-        logits: (A, n, n) logits of the relations between the classes at temperature 1.
-        r: (A, n, n) bool, relations that are on. Relations of a class to itself are on only if
-            observed.
+        logits: logits of the relations between the classes at temperature 1.
+        r: relations that are on. Relations of a class to itself are on only if observed.
     """
 
-    classes: Indices
+    classes: Int[NDArray, " n"]
     room: int | None
-    logits: Floats
-    r: Mask
+    logits: Float[NDArray, "A n n"]
+    r: Bool[NDArray, "A n n"]
 
 
 class ChainArrays(NamedTuple):
-    """Weights for the compiled kernel. `weights.layout` explains the attributes not listed here.
+    """Weights for Gibbs sweeps. `weights.layout` explains W.
 
     Attributes:
-        WT: (H1, V), transpose of W.
-        L: (V, V) couplings, or (0, V) for a machine without couplings.
-        b: (V,) biases of the classes.
+        WT: transpose of W.
+        L: couplings, or no rows for a machine without couplings.
+        b: biases of the classes.
     """
 
-    W: Floats
-    WT: Floats
-    L: Floats
-    b: Floats
+    W: Float[NDArray, "V H1"]
+    WT: Float[NDArray, "H1 V"]
+    L: Float[NDArray, "V|0 V"]
+    b: Float[NDArray, " V"]
 
 
 class SceneChains:
@@ -137,20 +134,25 @@ class SceneChains:
             L=weights["L"] if spec.coupled else np.zeros((0, spec.V), np.float32),
             b=weights["b"],
         )
-        # (N, H1) means of h1 given the stored scenes.
-        self.mean: Floats = weights.scene_means if spec.N else np.zeros((0, spec.H1), np.float32)
+        self.mean: Float[NDArray, "N H1"] = np.zeros((0, spec.H1), np.float32)
+        if spec.N:
+            self.mean = weights.sample_means
 
     def under(self, conditions: Conditions, temperature: float = 1.0) -> "ConditionedChains":
         """Return the chains under the conditions of one request."""
         return ConditionedChains(self, conditions, temperature)
 
     def continued(
-        self, present: Floats, room: int | None, steps: int, stream: np.random.Generator
+        self,
+        present: Float[NDArray, " V"],
+        room: int | None,
+        steps: int,
+        stream: np.random.Generator,
     ) -> Bits:
-        """Run ``steps`` sweeps of a chain that starts at a scene; return the presence, (V,).
+        """Return the presence of each class after ``steps`` sweeps of a chain from a scene.
 
         Args:
-            present: presence of each class in the scene, (V,).
+            present: presence of each class in the scene.
             room: index of the room type that the chain keeps, or None.
         """
         conditions = Conditions(np.zeros(0, np.int64), None, room)
@@ -158,22 +160,21 @@ class SceneChains:
         self.under(conditions).sweep(on, steps, stream)
         return on
 
-    def sample_weights(self, conditions: Conditions) -> NDArray[np.float64]:
-        """Return the probability of each stored scene as the start of a chain, (N,).
+    def sample_weights(self, conditions: Conditions) -> Float[NDArray, " N"]:
+        """Return the probability of each stored scene as the start of a chain.
 
-        The log weight of a stored scene is a sum of two terms: of its room type and of the required
-        classes. The module contains the formula.
+        The log weight has a term of its room type and one of the required classes; see the module.
         """
         machine, classes = self.machine, conditions.classes
         logits = machine["b"][classes] + self.mean @ machine["W"][classes].T
         if machine.spec.coupled:
-            logits += machine.scenes @ machine["L"][:, classes]
+            logits += machine.chain_samples @ machine["L"][:, classes]
         log_weights = self._room_log_weights(conditions.room) - softplus(-logits).sum(1)
         weights = np.exp(log_weights - log_weights.max()).astype(np.float64)
         return weights / weights.sum()
 
-    def _room_log_weights(self, room: int | None) -> Floats:
-        """Return the log weight of each stored scene for a requested room type, (N,).
+    def _room_log_weights(self, room: int | None) -> Float[NDArray, " N"]:
+        """Return the log weight of each stored scene for a requested room type.
 
         Without a requested room type, the excluded room types have a low weight. If no stored
         scene has the requested room type, Q and Y of this room type give the log weight.
@@ -185,8 +186,8 @@ class SceneChains:
         elif machine.spec.C:
             is_other = stored_rooms != room
             if is_other.all():
-                fit: Floats = self.mean @ machine["Q"][room]
-                return fit + machine.scenes @ machine.room_couplings(room)
+                fit = self.mean @ machine["Q"][room]
+                return fit + machine.chain_samples @ machine.room_couplings(room)
         else:
             is_other = np.zeros(len(self.mean), np.bool_)
         return np.where(is_other, -OTHER_ROOM, np.float32(0))
@@ -211,8 +212,8 @@ class ConditionedChains:
         self._others: dict[int | None, ConditionedChains] = {}
 
     @cached_property
-    def _start_cdf(self) -> NDArray[np.float64]:
-        """Cumulative probabilities of the stored scenes as the start of a chain, (N,)."""
+    def _start_cdf(self) -> Float[NDArray, " N"]:
+        """Cumulative probabilities of the stored scenes as the start of a chain."""
         return np.cumsum(self._chains.sample_weights(self._conditions))
 
     def _in_room(self, room: int | None) -> "ConditionedChains":
@@ -240,18 +241,18 @@ class ConditionedChains:
         return self._in_room(room)._continued(on, steps, stream)
 
     def _continued(self, on: Bits, steps: int, stream: np.random.Generator) -> ChainState:
-        """Return the state of a chain after ``steps`` sweeps from the classes ``on``, (V,)."""
+        """Return the state of a chain after ``steps`` sweeps from the classes ``on``."""
         h1 = self.sweep(on, steps, stream)
         classes = np.flatnonzero(on)
         logits = self._logits(classes, h1)
         r = self._relations(classes, logits, stream)
         return ChainState(classes, self._room, logits, r)
 
-    def sweep(self, on: Bits, steps: int, stream: np.random.Generator) -> Indices:
-        """Run ``steps`` sweeps from the classes ``on``, (V,), which change in place.
+    def sweep(self, on: Bits, steps: int, stream: np.random.Generator) -> Int[NDArray, " units"]:
+        """Run ``steps`` sweeps from the classes ``on``, which change in place.
 
         Returns:
-            The state of each hidden unit, (units,).
+            The state of each hidden unit.
         """
         on |= self._required_classes
         h1 = np.zeros(self._machine.spec.units, np.int64)
@@ -261,21 +262,27 @@ class ConditionedChains:
             steps -= _AT_ONCE
         return h1
 
-    def _hidden_logits(self, classes: Indices) -> Floats:
-        """Return the logits x of h1 given present classes, (H1,)."""
-        x: Floats = self._bias + self._machine["W"][classes].sum(0)
-        return x
+    def _hidden_logits(self, classes: Int[NDArray, " n"]) -> Float[NDArray, " H1"]:
+        """Return the logits x of h1 given present classes."""
+        return self._bias + self._machine["W"][classes].sum(0)
 
-    def _logits(self, classes: Indices, h1: Indices) -> Floats:
-        """Return the logits of the relations between classes with one instance each, (A, n, n)."""
+    def _logits(
+        self, classes: Int[NDArray, " n"], h1: Int[NDArray, " units"]
+    ) -> Float[NDArray, "A n n"]:
+        """Return the logits of the relations between classes with one instance each."""
         n, spec = len(classes), self._machine.spec
         pairs = Pairs(classes, np.zeros(n, np.float32), np.ones(n, np.float32), *all_pairs(n))
         entries = (h1[:, None] == np.arange(1, spec.states)).astype(np.float32).reshape(1, -1)
         mean, _ = self._chains.units.moments(entries, pairs, sampled=True)
         return mean.reshape(spec.A, n, n)
 
-    def _relations(self, classes: Indices, logits: Floats, stream: np.random.Generator) -> Mask:
-        """Sample the relations r (A, n, n) between different classes.
+    def _relations(
+        self,
+        classes: Int[NDArray, " n"],
+        logits: Float[NDArray, "A n n"],
+        stream: np.random.Generator,
+    ) -> Bool[NDArray, "A n n"]:
+        """Sample the relations r between different classes.
 
         Observed units keep their value. Relations of a class to itself are off unless observed,
         because other units do not depend on them.
@@ -299,7 +306,9 @@ class ConditionedChains:
             r |= free & (uniform < sigmoid(self._beta * logits))
         return r
 
-    def log_score(self, state: ChainState, shown: Mask, kept: Mask) -> float:
+    def log_score(
+        self, state: ChainState, shown: Bool[NDArray, " n"], kept: Bool[NDArray, "A n n"]
+    ) -> float:
         """Return the log score of a sampled scene at temperature 1.
 
         The score is a log-probability up to a constant of the model:
@@ -312,8 +321,8 @@ class ConditionedChains:
 
         Args:
             state: final state of a chain.
-            shown: (n,) bool, True for classes that count as present.
-            kept: (A, n, n) bool, True for relations that count as on.
+            shown: True for classes that count as present.
+            kept: True for relations that count as on.
         """
         if state.room != self._room:
             return self._in_room(state.room).log_score(state, shown, kept)
@@ -335,10 +344,10 @@ class ConditionedChains:
 def sweeps(
     w: ChainArrays,
     bias: Float[NDArray, " H1"],
-    required: UInt8[NDArray, " V"],
+    required: Bits,
     beta: float,
     uniform: Float[NDArray, "sweeps units+V"],
-    on: UInt8[NDArray, " V"],
+    on: Bits,
     h1: Int[NDArray, " units"],
 ) -> None:
     """Run Gibbs sweeps that change the presence `on` of the classes and the states `h1` in place.

@@ -1,21 +1,21 @@
 """Log-odds of classes and room types in closed form.
 
-The gain of a row w of weights is the contribution of the hidden units m to the log-odds of a class
-(row of W) or of a room type (row of Q). x are the logits of h1, see `weights`:
+The hidden units m contribute log E[exp(w·h1)] to the log-odds of a class (row w of W) or of a room
+type (row w of Q). x are the logits of h1, see `weights`:
 
-    gain = sum_m log sum_z p_m(z) exp(w[m, z]),   p_m = softmax over the states of unit m
+    hidden(w) = sum_m log sum_z p_m(z) exp(w[m, z]),   p_m = softmax over the states of unit m
 
 The first state of a unit has the weight 0. The log-odds of class i given the other classes are
 
-    b_i + Y_ti + sum_q p_q a_qi + sum_j presence_j L_ij + gain_i,   p = softmax(f + a v)
+    b_i + Y_ti + sum_q p_q a_qi + sum_j presence_j L_ij + hidden(W_i),   p = softmax(f + a v)
 
 at the logits x without class i, with the presence v of the other classes. p_q is the probability of
 the data source q. If a request names its profile q, p_q is 1. An unknown room type t has Y_t = 0.
 The probability of a room type t given the listed classes is
 
-    p(t | v) = sum_q p_q softmax_t(e + y_q + Y v + gain)
+    p(t | v) = sum_q p_q softmax_t(e + y_q + Y v + hidden(Q))
 
-Both factors of a product p_m(z) exp(w) are positive, so their sum loses no digits. A kernel
+Both factors of a product p_m(z) exp(w) are positive, so their sum loses no digits. A compiled loop
 multiplies the sums of several units and takes one log of the product. The group is small enough to
 keep the product within float32.
 """
@@ -26,17 +26,13 @@ from bisect import bisect
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled, compiled_in_any_order
 from app.inference.elementary import LN2, exp, exponent, log, log_softmax, mantissa, sigmoid
 from app.inference.relation_units import EncodedScene
 from app.inference.weights import SHARES, Weights, all_states
-
-Floats = NDArray[np.float32]
-Doubles = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 LARGEST_WEIGHT: Final = 40.0
 """Maximum |weight| between h1 and a class or room type that float32 products allow."""
@@ -57,21 +53,21 @@ _KEPT_BIASES: Final = 64
 _MIDDLES: Final = (0.15, 0.45, 0.8, 1.0)
 
 
-class Gains:
-    """Compute the gains of fixed rows of weights, such as W.
+class HiddenLogOdds:
+    """The contributions hidden(w) of the hidden units to log-odds, for constant rows of weights w.
 
     The object computes each row of a result separately with the same operations. So the bits of a
     row do not depend on the other rows.
 
     Args:
-        weights: (rows, H1) weights between h1 and each class or room type.
+        weights: weights between h1 and each class or room type.
         states: number of states of a hidden unit.
 
     Raises:
         ValueError: a weight is NaN, or its absolute value is above `LARGEST_WEIGHT`.
     """
 
-    def __init__(self, weights: Floats, states: int) -> None:
+    def __init__(self, weights: Float[NDArray, "rows H1"], states: int) -> None:
         largest = float(np.abs(weights).max(initial=0))
         if not largest <= LARGEST_WEIGHT:
             raise ValueError(f"weights must be between -{LARGEST_WEIGHT} and {LARGEST_WEIGHT}")
@@ -85,66 +81,68 @@ class Gains:
         by_state = factors.reshape(tiles, width, weights.shape[1] // (states - 1), states - 1)
         self._factors = np.ascontiguousarray(by_state.transpose(0, 2, 3, 1))
 
-    def __call__(self, x: Floats) -> Floats:
-        """Return the gain of each row of weights, (B, rows), at the logits x of h1, (B, H1)."""
+    def __call__(self, x: Float[NDArray, "B H1"]) -> Float[NDArray, "B rows"]:
+        """Return the contribution for each row of weights at the logits x of h1."""
         p = all_states(x, self._states)
-        return _gains(p, self._factors, self._group, self._rows)
+        return _hidden_log_odds(p, self._factors, self._group, self._rows)
 
 
 class ObjectScorer:
     """The log-odds of classes and room types of a machine with constant weights.
 
     Attributes:
-        gains, room_gains: gains of the classes, and of the room types.
+        hidden, hidden_of_rooms: contributions of the hidden units to the log-odds of the classes,
+            and of the room types.
 
     Raises:
-        ValueError: a weight is NaN or too large; see `Gains`.
+        ValueError: a weight is NaN or too large; see `HiddenLogOdds`.
     """
 
     def __init__(self, weights: Weights) -> None:
         self._weights, self._states = weights, weights.spec.states
-        self._biases: dict[tuple[float, int | None], Floats] = {}  # by coverage and room type
-        self._increases: dict[int, tuple[Floats, Floats]] = {}
-        self.gains = Gains(weights["W"], self._states)
-        self.room_gains = Gains(weights["Q"], self._states)
+        self._biases: dict[
+            tuple[float, int | None], Float[NDArray, " V"]
+        ] = {}  # by coverage and room type
+        self._increases: dict[int, tuple[Float[NDArray, " V"], Float[NDArray, " V"]]] = {}
+        self.hidden = HiddenLogOdds(weights["W"], self._states)
+        self.hidden_of_rooms = HiddenLogOdds(weights["Q"], self._states)
 
     def absent(
         self,
-        x: Floats,
-        classes: Indices,
-        presence: Floats,
+        x: Float[NDArray, " H1"],
+        classes: Int[NDArray, " n"],
+        presence: Float[NDArray, " n"],
         profile: int | None,
         coverage: float,
         room: int | None = None,
-    ) -> Floats:
-        """Return the log-odds of each class given the listed classes, (V,).
+    ) -> Float[NDArray, " V"]:
+        """Return the log-odds of each class given the listed classes.
 
         Entries of listed classes have no meaning.
 
         Args:
-            x: (H1,) logits of h1 given the listed classes.
-            classes, presence: (n,) indices of the listed classes, and the probabilities that they
-                are present.
+            x: logits of h1 given the listed classes.
+            classes, presence: the listed classes, and the probabilities that they are present.
             profile: index of a data source, whose base rates apply, or None.
             coverage: listed share of the scene. 1 means that all classes but one are listed.
             room: index of the room type, or None if unknown.
         """
-        weights, gain = self._weights, self.gains(x[None])[0]
+        weights, log_odds = self._weights, self.hidden(x[None])[0]
         bias = self._biases.get((coverage, room))
         if bias is None:
             bias = weights["b"] + weights.room_couplings(room) + self.kappa(coverage)
             if len(self._biases) < _KEPT_BIASES:
                 self._biases[coverage, room] = bias
-        gain += bias
+        log_odds += bias
         if weights.spec.profiles:
             p = weights.source_weights(classes, presence[None], profile)[0]
-            gain += p.astype(np.float32) @ weights["a"]
+            log_odds += p.astype(np.float32) @ weights["a"]
         if weights.spec.coupled:
-            gain += presence @ weights["L"][classes]
-        return gain
+            log_odds += presence @ weights["L"][classes]
+        return log_odds
 
-    def kappa(self, coverage: float) -> Floats:
-        """Return the bias of each class for a listed share, interpolated between the bins, (V,)."""
+    def kappa(self, coverage: float) -> Float[NDArray, " V"]:
+        """Return the bias of each class for a listed share, interpolated between the bins."""
         kappa = self._weights["kappa"]
         low = bisect(_MIDDLES, coverage, 1, len(SHARES)) - 1
         share = (coverage - _MIDDLES[low]) / (_MIDDLES[low + 1] - _MIDDLES[low])
@@ -158,12 +156,11 @@ class ObjectScorer:
         room: int | None = None,
         *,
         explained: bool = False,
-    ) -> tuple[Floats, Floats]:
-        """Return the log-odds of each listed class i given the other listed classes, (n,).
+    ) -> tuple[Float[NDArray, " n"], Float[NDArray, "n n|0"]]:
+        """Return the log-odds of each listed class i given the other listed classes.
 
-        If `explained`, the second result is how much each listed class j changes them, (n, n): the
-        log-odds of i with class j, minus the log-odds of i without class j. An entry with i = j is
-        0. Otherwise this result is (n, 0).
+        If `explained`, the second result is how much each listed class j changes them: the log-odds
+        of i with class j, minus the log-odds of i without class j. An entry with i = j is 0.
 
         Args:
             profile, room: see `absent`. The room type is that of the scene.
@@ -173,30 +170,30 @@ class ObjectScorer:
         return self._explained(bias, scene, profile, rows, scene.classes, explained=explained)
 
     def reasons_for_absent(
-        self, scene: EncodedScene, profile: int | None, candidates: Indices
-    ) -> Floats:
-        """Return how much each listed class changes the log-odds of unlisted classes, (N, n).
+        self, scene: EncodedScene, profile: int | None, candidates: Int[NDArray, " N"]
+    ) -> Float[NDArray, "N n"]:
+        """Return how much each listed class changes the log-odds of unlisted candidates.
 
-        An entry is the log-odds of one of the N candidates with the listed class, minus its
-        log-odds without this class.
+        An entry is the log-odds of a candidate with the listed class, minus its log-odds without
+        this class.
         """
         bias, rows = self._weights["b"], candidates[:0]
         return self._explained(bias, scene, profile, rows, candidates, explained=True)[1]
 
     def _explained(
         self,
-        bias: Floats,
+        bias: Float[NDArray, " V"],
         scene: EncodedScene,
         profile: int | None,
-        rows: Indices,
-        targets: Indices,
+        rows: Int[NDArray, " N|0"],
+        targets: Int[NDArray, " N"],
         *,
         explained: bool,
-    ) -> tuple[Float[NDArray, " N"], Float[NDArray, "N n"]]:
+    ) -> tuple[Float[NDArray, " N"], Float[NDArray, "N n|0"]]:
         """Return the log-odds of N target classes given the listed classes, and their changes.
 
-        The change by class j is the log-odds minus their value without class j. It is (N, 0) if not
-        `explained`.
+        The change by class j is the log-odds minus their value without class j. The result has no
+        changes if not `explained`.
 
         Args:
             bias: biases of all classes.
@@ -207,17 +204,17 @@ class ObjectScorer:
         n, others = len(classes) if explained else 0, self._states - 1
         x = scene.x - scene.contributions[rows] if len(rows) else scene.x[None]
         raised, removed = np.exp(weights["W"][targets]), np.exp(-scene.contributions[:n])
-        factors, ratios = _hidden_factors(
+        log_odds, change = _hidden_changes(
             all_states(x, self._states),
             raised.reshape(len(targets), weights.spec.units, others),
             removed.reshape(n, weights.spec.units, others),
         )
         possible = slice(None) if profile is None else slice(profile, profile + 1)
-        mean, change = _source_effects(
+        mean, change_by_source = _source_effects(
             weights["f"][possible], weights["a"][possible], classes, presence, rows, targets, n
         )
-        log_odds = bias[targets] + np.log(factors).sum(1) + mean
-        change -= np.log(ratios).sum(2)
+        log_odds += bias[targets] + mean
+        change += change_by_source
         if weights.spec.coupled:
             couplings = weights["L"][targets[:, None], classes] * presence
             log_odds += couplings.sum(1)
@@ -226,51 +223,56 @@ class ObjectScorer:
             change[np.arange(len(rows)), rows] = 0
         return log_odds, change
 
-    def increases(self, i: int) -> tuple[Floats, Floats]:
-        """Return how much the presence of class i increases the log-odds of each class, (V,).
+    def increases(self, i: int) -> tuple[Float[NDArray, " V"], Float[NDArray, " V"]]:
+        """Return how much the presence of class i increases the log-odds of each class j.
 
-        The scene has no other objects. The presence of class j raises the log-odds of class i by
+        In a scene without other objects, it raises them by
 
-            increase_ij = gain_j(c1 + W_i) - gain_j(c1) + L_ij
+            increase_ij = hidden(W_j) at x = c1 + W_i - hidden(W_j) at x = c1 + L_ij
 
-        Here c1 are the biases of the hidden units, and W_i are the weights of class i. The increase
-        is symmetric in i and j. It leaves out the room type, and what the classes tell about the
-        data source.
-
-        The second result is the increase multiplied by the probability of each class in this scene,
-        (V,). The scorer keeps both results of each class, at most 8 V² bytes.
+        The increase is symmetric in i and j. It leaves out the room type, and what the classes tell
+        about the data source. The second result is the increase multiplied by the probability of
+        each class in this scene. The scorer keeps both results of each class, at most 8 V² bytes.
         """
         kept = self._increases.get(i)
         if kept is None:
             weights = self._weights
-            alone, empty = self.gains(np.stack([weights["c1"] + weights["W"][i], weights["c1"]]))
+            alone, empty = self.hidden(np.stack([weights["c1"] + weights["W"][i], weights["c1"]]))
             if weights.spec.coupled:
                 alone += weights["L"][i]
             increase = alone - empty
             kept = self._increases[i] = increase, increase * sigmoid(weights["b"] + alone)
         return kept
 
-    def room_evidence(self, x: Floats, classes: Indices, presence: Floats) -> Doubles:
-        """Return log p(v | t) of the listed classes v for each room type t, (N, C).
+    def room_evidence(
+        self,
+        x: Float[NDArray, "N H1"],
+        classes: Int[NDArray, " n"],
+        presence: Float[NDArray, "N n"],
+    ) -> Float[NDArray, "N C"]:
+        """Return log p(v | t) of the listed classes v of N scenes for each room type t.
 
         The values of a room type have a constant of their own.
 
         Args:
-            x: (N, H1) logits of h1 given the listed classes of N scenes.
-            classes: (n,) indices of the listed classes.
-            presence: (N, n) probabilities that the classes are present.
+            x: logits of h1 given the listed classes.
+            presence: probabilities that the classes are present.
         """
         # The sum has float64 digits, so that listed structure, whose terms are 0, changes none.
-        evidence: Doubles = self.room_gains(x).astype(np.float64)
+        evidence = self.hidden_of_rooms(x).astype(np.float64)
         if self._weights.spec.coupled:
             Y = self._weights["Y"][:, classes].astype(np.float64)
             evidence += presence.astype(np.float64) @ Y.T
         return evidence
 
     def room_log_p(
-        self, x: Floats, classes: Indices, presence: Floats, profile: int | None
-    ) -> Doubles:
-        """Return log p(t | listed classes) of each room type t, (N, C).
+        self,
+        x: Float[NDArray, "N H1"],
+        classes: Int[NDArray, " n"],
+        presence: Float[NDArray, "N n"],
+        profile: int | None,
+    ) -> Float[NDArray, "N C"]:
+        """Return log p(t | listed classes) of each room type t.
 
         `room_evidence` and `absent` describe the arguments.
         """
@@ -284,20 +286,24 @@ class ObjectScorer:
 
 
 @compiled
-def _gains(p, factors, group, rows):
-    """Return the gain of each row of weights, (B, rows); see `Gains`.
+def _hidden_log_odds(
+    p: Float[NDArray, "B units states"],
+    factors: Float[NDArray, "tiles units states-1 width"],
+    group: int,
+    rows: int,
+) -> Float[NDArray, "B rows"]:
+    """Return the result of `HiddenLogOdds`.
 
     After each group of sums, the function splits the product into mantissa and exponent, and adds
     the exponent to an integer. So one log at the end is enough.
 
     Args:
-        p: (B, units, states) probabilities of the states of h1.
-        factors: (tiles, units, states - 1, rows per tile) exponentials of the weights.
+        p: probabilities of the states of h1.
+        factors: exponentials of the weights, in tiles of `width` rows.
         group: maximum number of sums in a product.
-        rows: number of rows of weights.
     """
-    tiles, units, states, width = factors.shape
-    gain = np.empty((len(p), rows), np.float32)
+    tiles, units, others, width = factors.shape
+    log_odds = np.empty((len(p), rows), np.float32)
     product, exponents = np.empty(width, np.float32), np.empty(width, np.int32)
     total = np.empty(width, np.float32)
     for t in range(tiles):
@@ -305,14 +311,14 @@ def _gains(p, factors, group, rows):
             product[:], exponents[:] = np.float32(1.0), np.int32(0)
             for m in range(units):
                 total[:] = p[b, m, 0]
-                for z in range(0, states - 1, 2):
+                for z in range(0, others - 1, 2):
                     # The loop takes two states at a time. This halves the reads and writes.
                     p1, row1 = p[b, m, z + 1], factors[t, m, z]
                     p2, row2 = p[b, m, z + 2], factors[t, m, z + 1]
                     for i in range(width):
                         total[i] += p1 * row1[i] + p2 * row2[i]
-                if states % 2:
-                    p1, row1 = p[b, m, states], factors[t, m, states - 1]
+                if others % 2:
+                    p1, row1 = p[b, m, others], factors[t, m, others - 1]
                     for i in range(width):
                         total[i] += p1 * row1[i]
                 for i in range(width):
@@ -321,19 +327,19 @@ def _gains(p, factors, group, rows):
                     for i in range(width):
                         exponents[i] += exponent(product[i])
                         product[i] = mantissa(product[i])
-            gain_b = gain[b, t * width :]
+            row = log_odds[b, t * width :]
             for i in range(min(width, rows - t * width)):
-                gain_b[i] = log(product[i]) + LN2 * np.float32(exponents[i])
-    return gain
+                row[i] = log(product[i]) + LN2 * np.float32(exponents[i])
+    return log_odds
 
 
 @compiled_in_any_order
-def _hidden_factors(
+def _hidden_changes(
     p: Float[NDArray, "N|1 units states"],
     raised: Float[NDArray, "N units states-1"],
     removed: Float[NDArray, "n units states-1"],
-) -> tuple[Float[NDArray, "N units"], Float[NDArray, "N n units"]]:
-    """Return the factors of each hidden unit in e^gain of N classes, and in e^-change by n classes.
+) -> tuple[Float[NDArray, " N"], Float[NDArray, "N n"]]:
+    """Return hidden(W_i) of N classes i, and its changes by n listed classes.
 
     Args:
         p: probabilities of the states of h1.
@@ -341,37 +347,45 @@ def _hidden_factors(
         removed: exponentials of the contributions of the n classes, negated.
     """
     (N, units, others), n = raised.shape, len(removed)
-    gain, ratio = np.empty((N, units), np.float32), np.empty((N, n, units), np.float32)
+    total, change = np.zeros(N, np.float32), np.zeros((N, n), np.float32)
+    hidden, ratio = np.empty(units, np.float32), np.empty(units, np.float32)
     for c in range(N):
+        states = p[min(c, len(p) - 1)]
         for m in range(units):
-            row, factors = p[min(c, len(p) - 1), m], raised[c, m]
-            with_class = row[0]
+            hidden[m] = states[m, 0]
             for z in range(others):
-                with_class += row[z + 1] * factors[z]
-            gain[c, m] = with_class
-            for j in range(n):
-                without, before, after = removed[j, m], row[0], row[0]
+                hidden[m] += states[m, z + 1] * raised[c, m, z]
+        for m in range(units):
+            total[c] += log(hidden[m])
+        for j in range(n):
+            for m in range(units):
+                row, factors, without = states[m], raised[c, m], removed[j, m]
+                before, after = row[0], row[0]
                 for z in range(others):
                     product = row[z + 1] * without[z]
                     before += product
                     after += product * factors[z]
-                ratio[c, j, m] = after / (before * with_class)
-    return gain, ratio
+                ratio[m] = before * hidden[m] / after
+            for m in range(units):
+                change[c, j] += log(ratio[m])
+    return total, change
 
 
 @compiled
-def _source_effects(f, a, classes, presence, rows, targets, n):
+def _source_effects(
+    f: Float[NDArray, " Q"],
+    a: Float[NDArray, "Q V"],
+    classes: Int[NDArray, " listed"],
+    presence: Float[NDArray, " listed"],
+    rows: Int[NDArray, " N|0"],
+    targets: Int[NDArray, " N"],
+    n: int,
+) -> tuple[Float[NDArray, " N"], Float[NDArray, "N n"]]:
     """Return the effect of the unknown data source on N target classes, and its changes.
 
     The effect on a class i is the mean base rate sum_q p_q a_qi over the Q data sources. p_q is the
-    probability of source q given the listed classes.
-
-    Args:
-        n: number of listed classes whose changes are computed. For the others, see
-            `explained_log_odds`.
-
-    Returns:
-        The effects, (N,), and the change of each effect due to each listed class, (N, n).
+    probability of source q given the listed classes. The changes are those by the first n listed
+    classes. `ObjectScorer._explained` describes the other arguments.
     """
     Q = len(f)
     # Part of each listed class in the logit of each source, and e^-part.

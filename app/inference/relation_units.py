@@ -28,6 +28,12 @@ from app.inference.implications import implication_shifts
 from app.inference.quadrature import to_log_odds
 from app.inference.weights import Weights, state_means
 
+Means = Float[NDArray, "B H1"]
+"""B different means of h1."""
+Moments = tuple[Float[NDArray, "B R P"], Float[NDArray, "B R P"]]
+"""Means and √3 σ of the logits of R relations for P pairs. σ is the standard deviation of a logit.
+"""
+
 NEVER: Final = np.float32(-1e4)
 """Logit of a relation for which the machine has no unit. Such a relation never holds."""
 
@@ -147,19 +153,11 @@ class RelationUnits(ABC):
 
     @abstractmethod
     def moments(
-        self,
-        means: Float[NDArray, "B H1"],
-        pairs: Pairs,
-        only: int | None = None,
-        *,
-        sampled: bool = False,
-    ) -> tuple[Float[NDArray, "B R P"], Float[NDArray, "B R P"]]:
-        """Return the means and √3 σ of the logits of R relations for P pairs.
-
-        σ is the standard deviation of a logit. A relation without a unit has the mean `NEVER`.
+        self, means: Means, pairs: Pairs, only: int | None = None, *, sampled: bool = False
+    ) -> Moments:
+        """Return the moments of logits. A relation without a unit has the mean `NEVER`.
 
         Args:
-            means: B different means of h1.
             only: index of one relation (R = 1), or None for all relations (R = A).
             sampled: True if h1 is a sample: its means are 0 or 1, so all variances are 0.
         """
@@ -260,13 +258,8 @@ class FreeUnits(RelationUnits):
         self._index[index] = np.arange(len(self._U))
 
     def moments(
-        self,
-        means: Float[NDArray, "B H1"],
-        pairs: Pairs,
-        only: int | None = None,
-        *,
-        sampled: bool = False,
-    ) -> tuple[Float[NDArray, "B R P"], Float[NDArray, "B R P"]]:
+        self, means: Means, pairs: Pairs, only: int | None = None, *, sampled: bool = False
+    ) -> Moments:
         """Return means and √3 σ of logits by the formula, which gives samples the variance 0."""
         chosen = _chosen_relations(self._A, only)
         shape = len(means), chosen.stop - chosen.start, pairs.i.shape[1]
@@ -339,13 +332,8 @@ class SharedUnits(RelationUnits):
             self._gamma = gamma.reshape(len(gamma), -1)
 
     def moments(
-        self,
-        means: Float[NDArray, "B H1"],
-        pairs: Pairs,
-        only: int | None = None,
-        *,
-        sampled: bool = False,
-    ) -> tuple[Float[NDArray, "B R P"], Float[NDArray, "B R P"]]:
+        self, means: Means, pairs: Pairs, only: int | None = None, *, sampled: bool = False
+    ) -> Moments:
         """Return means and √3 σ of logits from the factors of the classes."""
         chosen = _chosen_relations(self._A, only)
         Y = self._Y[chosen, :0] if sampled else self._Y[chosen]
@@ -391,13 +379,8 @@ class StandIns(RelationUnits):
         self._units, self._stand_in = units, stand_in
 
     def moments(
-        self,
-        means: Float[NDArray, "B H1"],
-        pairs: Pairs,
-        only: int | None = None,
-        *,
-        sampled: bool = False,
-    ) -> tuple[Float[NDArray, "B R P"], Float[NDArray, "B R P"]]:
+        self, means: Means, pairs: Pairs, only: int | None = None, *, sampled: bool = False
+    ) -> Moments:
         """Return means and √3 σ of the logits of the stand-ins."""
         pairs = pairs._replace(classes=self._stand_in[pairs.classes])
         return self._units.moments(means, pairs, only, sampled=sampled)
@@ -437,8 +420,8 @@ def _directions(
     rows = np.concatenate([weights["P"][:, None], weights["M"]], 1).astype(np.float64)
     frequency, means = np.ones(spec.V), np.full((1, spec.H1), 1 / spec.states)
     if spec.N:
-        frequency = weights.scenes.mean(0).astype(np.float64) + 1e-6
-        means = weights.scene_means
+        frequency = weights.chain_samples.mean(0).astype(np.float64) + 1e-6
+        means = weights.sample_means
     p = (frequency / frequency.sum())[:, None]
     ones = np.ones((spec.V, 1))
     S, O = (  # noqa: E741
@@ -542,7 +525,7 @@ def _shared_moments(
     Y: Float[NDArray, "R r K+1"],
     C: Float[NDArray, "B R r*(r+1)/2"],
     f: Float[NDArray, "units B R r"],
-) -> tuple[Float[NDArray, "B R P"], Float[NDArray, "B R P"]]:
+) -> Moments:
     """Return the means and √3 σ of the logits of R relations for P pairs.
 
     The mean of a logit is base + U z, and its variance σ² is q'C q - sum_u (f_u'q)² with q = Y z.

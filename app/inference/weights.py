@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled
@@ -111,20 +111,20 @@ class Weights:
         return self.arrays[name]
 
     @property
-    def triple_keys(self) -> NDArray[np.int64]:
-        """(T,) key (a V + i) V + j of each triple (a, i, j), in ascending order."""
+    def triple_keys(self) -> Int[NDArray, " T"]:
+        """The key (a V + i) V + j of each triple (a, i, j), in ascending order."""
         relation, subject, object_ = self["triples"].astype(np.int64).T
         return (relation * self.spec.V + subject) * self.spec.V + object_
 
     @property
-    def scenes(self) -> NDArray[np.float32]:
-        """(N, V) presence of each class in each stored sample. Each access unpacks all samples."""
+    def chain_samples(self) -> Float[NDArray, "N V"]:
+        """Presence of each class in each stored sample. Each access unpacks all samples."""
         return unpack_scenes(self["fantasies"], self.spec.V)
 
     @property
-    def scene_means(self) -> NDArray[np.float32]:
-        """(N, H1) means of h1 given each stored scene, without its room type."""
-        return state_means(self["c1"] + self.scenes @ self["W"], self.spec.states)
+    def sample_means(self) -> Float[NDArray, "N H1"]:
+        """Means of h1 given each stored sample, without its room type."""
+        return state_means(self["c1"] + self.chain_samples @ self["W"], self.spec.states)
 
     def enlarged(self, V: int, C: int) -> "Weights":
         """Return the weights with further classes and room types at the end, whose weights are 0.
@@ -136,29 +136,25 @@ class Weights:
         arrays = {name: _padded(self[name], shape) for name, (_, shape) in layout(spec).items()}
         return Weights(spec, arrays)
 
-    def room_bias(self, room: int | None) -> NDArray[Any]:
-        """Return the bias of h1 for a room type t, (H1,): c1 + Q[t].
-
-        The bias is c1 if the room type is None or the machine has no room types.
-        """
+    def room_bias(self, room: int | None) -> Float[NDArray, " H1"]:
+        """Return the bias of h1 for a room type t: c1 + Q[t], or c1 without a room type."""
         return self["c1"] if room is None or not self.spec.C else self["c1"] + self["Q"][room]
 
-    def room_couplings(self, room: int | None) -> NDArray[Any]:
-        """Return the change of the log-odds of each class by a room type t, (V,): Y[t] or 0."""
+    def room_couplings(self, room: int | None) -> Float[NDArray, " V"]:
+        """Return the change of the log-odds of each class by a room type t: Y[t] or 0."""
         if room is None or not self.spec.C or not self.spec.coupled:
             return np.zeros(self.spec.V, self["b"].dtype)
         return self["Y"][room]
 
     def source_weights(
-        self, classes: NDArray[Any], presence: NDArray[Any], profile: int | None
-    ) -> NDArray[np.float64]:
-        """Return p(q | listed classes) of each data source q, (N, profiles).
+        self, classes: Int[NDArray, " n"], presence: Float[NDArray, "N n"], profile: int | None
+    ) -> Float[NDArray, "N profiles"]:
+        """Return p(q | listed classes) of each data source q in N scenes.
 
         It is softmax(f + a v), or 1 for the source of a profile.
 
         Args:
-            classes: (n,) indices of the listed classes.
-            presence: (N, n) probabilities that the classes are present, in N scenes.
+            presence: probabilities that the listed classes are present.
             profile: index of the data source whose base rates apply, or None.
         """
         if profile is not None:
@@ -168,16 +164,16 @@ class Weights:
         return _source_weights(self["f"], self["a"], classes, presence)
 
     def scene_bias(
-        self, classes: NDArray[Any], profile: int | None, room: int | None
-    ) -> tuple[NDArray[Any], float]:
-        """Return the biases of whole scenes for Gibbs chains: of each class, (V,), and of the room.
+        self, classes: Int[NDArray, " n"], profile: int | None, room: int | None
+    ) -> tuple[Float[NDArray, " V"], float]:
+        """Return the biases of whole scenes for Gibbs chains: of each class, and of the room.
 
         The bias of a class is b + sum_q p(q) (a[q] + u[q]) + Y[t], and that of the room type t is
         e[t] + sum_q p(q) y[q, t]; see `source_weights`. Without a required class and without a
         profile, the mix of data sources determines them.
 
         Args:
-            classes: (n,) indices of the required classes.
+            classes: indices of the required classes.
             profile, room: index of the data source and of the room type, or None.
         """
         bias: NDArray[Any] = self["b"] + self.room_couplings(room)
@@ -199,24 +195,21 @@ def _padded(array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
     return padded
 
 
-def state_means(x: NDArray[Any], states: int) -> NDArray[Any]:
-    """Return the probabilities of the states of hidden units, shaped like the logits x, (..., H1).
-
-    Each unit has `states` states. Its first state has the logit 0 and no entry in x.
-    """
-    p: NDArray[Any] = all_states(x.reshape(-1, x.shape[-1]), states)
+def state_means(x: Float[NDArray, "*N H1"], states: int) -> Float[NDArray, "*N H1"]:
+    """Return the probabilities of all states of hidden units but the first, given the logits x."""
+    p = all_states(x.reshape(-1, x.shape[-1]), states)
     return p[:, :, 1:].reshape(x.shape)
 
 
-def unpack_scenes(packed: NDArray[np.int32], classes: int) -> NDArray[np.float32]:
-    """Convert scenes stored as bits, (N, 32-bit words), to the presence of each class, (N, V)."""
+def unpack_scenes(packed: Int[NDArray, "N words"], classes: int) -> Float[NDArray, "N V"]:
+    """Convert scenes stored as bits of 32-bit words to the presence of each class."""
     octets = packed.astype("<i4").view(np.uint8).reshape(len(packed), -1)
     bits = np.unpackbits(octets, axis=1, bitorder="little", count=classes)
     return bits.astype(np.float32)
 
 
-def pack_scenes(presence: NDArray[Any]) -> NDArray[np.int32]:
-    """Convert the presence of each class, (N, V), to bits, (N, 32-bit words)."""
+def pack_scenes(presence: NDArray[Any]) -> Int[NDArray, "N words"]:
+    """Convert the presence of each class, (N, V), to bits of 32-bit words."""
     bits = np.zeros((len(presence), -(-presence.shape[1] // WORD) * WORD), np.uint8)
     bits[:, : presence.shape[1]] = presence > 0
     return np.packbits(bits, axis=1, bitorder="little").view("<i4").astype(np.int32)
@@ -245,11 +238,15 @@ def all_states(x: Float[NDArray, "B H1"], states: int) -> Float[NDArray, "B unit
 
 
 @compiled
-def _source_weights(f, a, classes, presence):
-    """Return softmax(f + a v) of the data sources in N scenes, (N, profiles).
+def _source_weights(
+    f: Float[NDArray, " profiles"],
+    a: Float[NDArray, "profiles V"],
+    classes: Int[NDArray, " n"],
+    presence: Float[NDArray, "N n"],
+) -> Float[NDArray, "N profiles"]:
+    """Return softmax(f + a v) of the data sources in N scenes; see `Weights.source_weights`.
 
-    The sums have float64 digits, so that listed structure, whose terms are 0, changes none. See
-    `weights.Weights.source_weights` for the arguments.
+    The sums have float64 digits, so that listed structure, whose terms are 0, changes none.
     """
     p = np.empty((len(presence), len(f)), np.float64)
     for s in range(len(presence)):

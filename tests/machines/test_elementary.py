@@ -64,10 +64,10 @@ def test_log():
 _GAINS = """
 import sys
 import numpy as np
-from app.inference.objects import Gains
+from app.inference.objects import HiddenLogOdds
 random = np.random.default_rng(7)
 weights, x = random.normal(size=(500, 30)), random.normal(size=(2, 30))
-gain = Gains(weights.astype("f4"), 3)(x.astype("f4"))
+gain = HiddenLogOdds(weights.astype("f4"), 3)(x.astype("f4"))
 np.save(sys.argv[1], gain)
 """
 
@@ -84,5 +84,5 @@ def test_loops_for_a_generic_processor_give_equal_numbers(tmp_path, monkeypatch)
         path = tmp_path / f"{cpu}.npy"
         run_program(sys.executable, "-c", _GAINS, path)
         gains.append(np.load(path))
-    assert len(list(tmp_path.glob("loops/*/*/objects._gains*.nbc"))) == 2
+    assert len(list(tmp_path.glob("loops/*/*/objects._hidden_log_odds*.nbc"))) == 2
     np.testing.assert_allclose(*gains, rtol=1e-5, atol=1e-5)

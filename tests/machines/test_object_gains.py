@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.inference.objects import LARGEST_WEIGHT, Gains, ObjectScorer
+from app.inference.objects import LARGEST_WEIGHT, HiddenLogOdds, ObjectScorer
 from app.inference.relation_units import encode
 from tests.enumeration.small_machines import random_weights
 from training.machines import MachineSpec, build
@@ -44,7 +44,7 @@ def test_gain_is_exact_to_float32_rounding(
         w, x = w.sign() * weight, x.sign() * logit
     machine = build(MachineSpec("rbm", V=1, A=1, units=units, states=states))
     for weights in (w, w.abs(), -w.abs()):
-        gains = Gains(weights.numpy(), states)
+        gains = HiddenLogOdds(weights.numpy(), states)
         for logits in (x, x.abs(), -x.abs()):
             gain = torch.from_numpy(gains(logits.numpy())).double()
             # Each factor is good to some float32 roundings, and there are as many as units.
@@ -57,10 +57,10 @@ def test_many_rows_are_computed_alike():
     """Rows beyond one tile of 800 have the bits that they have alone."""
     generator = torch.Generator().manual_seed(0)
     w, x = uniform((1700, 40), 2.0, generator).numpy(), uniform((3, 40), 2.0, generator).numpy()
-    gain = Gains(w, 5)(x)
+    gain = HiddenLogOdds(w, 5)(x)
     for row in (0, 799, 800, 1599, 1600, 1699):
-        np.testing.assert_array_equal(Gains(w[row : row + 1], 5)(x)[:, 0], gain[:, row])
-    np.testing.assert_array_equal(Gains(w, 5)(x[1:2])[0], gain[1])
+        np.testing.assert_array_equal(HiddenLogOdds(w[row : row + 1], 5)(x)[:, 0], gain[:, row])
+    np.testing.assert_array_equal(HiddenLogOdds(w, 5)(x[1:2])[0], gain[1])
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 40.1])
@@ -68,7 +68,7 @@ def test_weights_that_float32_products_do_not_cover_are_refused(value):
     weights = np.zeros((2, 3), np.float32)
     weights[1, 2] = value
     with pytest.raises(ValueError, match="weights must be between"):
-        Gains(weights, 2)
+        HiddenLogOdds(weights, 2)
 
 
 V, C = 14, 3

@@ -183,7 +183,7 @@ def _alarms(home: Home, index: Int[NDArray, "N"], sides: Sides) -> Bool[NDArray,
 @torch.no_grad()
 def _change(home: Home, weights: Weights, recorded: torch.Tensor, seed: int) -> float:
     """Return the mean change of the probability of unrecorded classes in stored samples."""
-    samples = torch.from_numpy(home.parent.weights.scenes)
+    samples = torch.from_numpy(home.parent.weights.chain_samples)
     samples = samples[samples.sum(1) >= 2][:256]
     parts = random_parts(samples, _LEAVE_ONE_OUT, torch.Generator().manual_seed(seed))
     before, after = (

@@ -111,7 +111,7 @@ class _Fit:
         self._generator = torch.Generator().manual_seed(seed)
         self._recorded = (scenes.v > 0).any(0)
         new = self._recorded & ~trained_on.classes
-        samples = torch.from_numpy(parent.scenes)
+        samples = torch.from_numpy(parent.chain_samples)
         rooms = torch.from_numpy(parent["fantasy_rooms"]).long()
         self._samples = HomeScenes(samples, (~new).expand_as(samples), rooms)
         self._samples = self._samples.rows(samples.sum(1) >= 2)

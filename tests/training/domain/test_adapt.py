@@ -278,7 +278,7 @@ def test_scenes_that_the_model_expects_change_no_weights(store, tmp_path):
     All are of one group, and scenes of one object are groups of their own.
     """
     model = default(store)
-    labels, samples = model.vocabulary.labels, model.weights.scenes
+    labels, samples = model.vocabulary.labels, model.weights.chain_samples
     scenes = [
         {"objects": [labels[c] for c in np.flatnonzero(sample)], "group": "day"}
         for sample in samples[:30]
