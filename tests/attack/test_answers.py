@@ -7,8 +7,8 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-import httpx
 import pytest
+from httpx import AsyncClient, Response
 
 from app.questions import names
 from app.scene.vocabulary import Vocabulary
@@ -97,9 +97,9 @@ DRAWN = {"objects": LABELS[:8], "steps": 2, "seed": 0}
         ("generate", [DRAWN | {"count": count} for count in (1, 64)], "count"),
     ],
 )
-async def test_single_answers_have_the_same_limit(
-    client: httpx.AsyncClient,
-    limited: httpx.AsyncClient,
+async def test_single_answers_have_a_limit(
+    client: AsyncClient,
+    limited: AsyncClient,
     question: str,
     bodies: list[dict[str, Any]],
     parameter: str,
@@ -137,13 +137,13 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     return found
 
 
-def suggestions(answer: httpx.Response) -> int:
+def suggestions(answer: Response) -> int:
     problems = [entry["problem"] for entry in answer.json()["results"] if "problem" in entry]
     errors = [error for problem in problems for error in problem["errors"]]
     return sum("suggestions" in error and bool(error["suggestions"]) for error in errors)
 
 
-async def test_a_batch_has_few_suggestions(client: httpx.AsyncClient) -> None:
+async def test_a_batch_has_few_suggestions(client: AsyncClient) -> None:
     misspelt = [f"lammp{letter}" for letter in string.ascii_lowercase]
     batch = {"scenes": [{"objects": misspelt}] * 64}
     assert suggestions(await client.post("/missing/batch", json=batch)) == MAX_SUGGESTED
@@ -160,8 +160,8 @@ async def test_a_batch_has_few_suggestions(client: httpx.AsyncClient) -> None:
         ("by-meaning", MAX_MAPPED),
     ],
 )
-async def test_a_batch_looks_few_labels_up(
-    client: httpx.AsyncClient, calls: Counter[str], treatment: str, guesses: int
+async def test_a_batch_searches_few_labels(
+    client: AsyncClient, calls: Counter[str], treatment: str, guesses: int
 ) -> None:
     rng = Random(0)
     labels = ("".join(rng.choices(string.ascii_lowercase, k=12)) for _ in range(64 * 20))
@@ -177,9 +177,7 @@ async def test_a_batch_looks_few_labels_up(
     assert calls["nearest"] == (0 if ignores else MAX_SUGGESTED)
 
 
-async def test_relations_of_unknown_objects_cost_little(
-    client: httpx.AsyncClient, calls: Counter[str]
-) -> None:
+async def test_unknown_ends_cost_little(client: AsyncClient, calls: Counter[str]) -> None:
     """4,096 relations named 8,192 unknown objects: 74 ms, or 2 s with names of U+FDFA."""
     names = ["\ufdfa" * 3 + str(number) for number in range(8_192)]
     relations = [[names[2 * k], "left", names[2 * k + 1]] for k in range(4_096)]
@@ -191,7 +189,7 @@ async def test_relations_of_unknown_objects_cost_little(
 
 
 async def test_a_scene_of_unknown_labels_stops_early(
-    client: httpx.AsyncClient, calls: Counter[str]
+    client: AsyncClient, calls: Counter[str]
 ) -> None:
     objects = [f"a/{'b/' * 40}{number}" for number in range(256)]
     answer = await client.post("/missing", json={"objects": objects})

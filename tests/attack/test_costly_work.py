@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import anyio
-import httpx
 import pytest
+from httpx import AsyncClient
 from pydantic import ValidationError
 
 from app.settings import Settings
@@ -24,9 +24,7 @@ HOME = {"objects": LABELS[:4]}
 LONG = {"X-Request-Timeout-Ms": "60000"}
 
 
-async def test_quick_questions_pass_large_scenes_batches_and_documents(
-    shared_store: Path, hold: Hold
-) -> None:
+async def test_quick_questions_pass_costly_ones(shared_store: Path, hold: Hold) -> None:
     async with serve(shared_store) as client:
         client.headers.update(LONG)
         held = hold("outliers")
@@ -70,7 +68,7 @@ async def test_work_of_a_departed_client_ends(shared_store: Path, replace: Repla
         assert await asyncio.to_thread(ended.wait, 60)
 
 
-async def test_a_request_without_enough_memory_gets_503(
+async def test_a_memory_error_gets_503(
     shared_store: Path, replace: Replace, caplog: pytest.LogCaptureFixture
 ) -> None:
     def fail(*_: Any, **__: Any) -> Any:
@@ -135,7 +133,7 @@ async def status(app: Any, path: str, body: bytes) -> int:
 
 
 @pytest.mark.parametrize("case", CASES)
-async def test_no_cycle_keeps_a_request(client: httpx.AsyncClient, case: str) -> None:
+async def test_no_cycle_keeps_a_request(client: AsyncClient, case: str) -> None:
     path, content, expected = CASES[case]
     body = content if isinstance(content, bytes) else json.dumps(content).encode()
     app: Any = client.app  # type: ignore[attr-defined]

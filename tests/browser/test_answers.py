@@ -88,9 +88,7 @@ def test_a_ghost_becomes_an_object_where_it_was_drawn(bedroom: Board) -> None:
     assert all(label != row.split(" ")[0] for row in bedroom.rows("missing"))
 
 
-def test_the_menu_of_an_object_asks_what_is_missing_there(
-    bedroom: Board, api: httpx.Client
-) -> None:
+def test_the_menu_of_an_object(bedroom: Board, api: httpx.Client) -> None:
     bedroom.click("Actions for nightstand")
     bedroom.page.get_by_role("menuitem", name="What is missing on top of it?").click()
     bedroom.settle()
@@ -117,7 +115,7 @@ def test_the_menu_of_an_object_asks_what_is_missing_there(
     assert all("no likely place" in row for row in bedroom.rows("missing"))
 
 
-def test_a_model_of_labels_alone_shows_a_scene_and_says_what_it_does_not_judge(
+def test_a_model_of_labels_alone(
     open_board: OpenBoard,
 ) -> None:
     objects = ["bed", "lamp", "desk"]
@@ -178,9 +176,7 @@ def test_outliers_are_marked_with_reasons_in_words(bedroom: Board, api: httpx.Cl
     expect(outliers).to_have_count(sum(one["is_outlier"] for one in answer["outliers"]))
 
 
-def test_the_robots_own_words_are_shown_with_their_classes(
-    open_board: OpenBoard, api: httpx.Client
-) -> None:
+def test_words_are_shown_with_their_classes(open_board: OpenBoard, api: httpx.Client) -> None:
     board = open_board({"objects": ["counter", "air fryer", "Plates"]})
     answer = ask(api, "outliers", board.scene)
     classes = {one["object"]: one["label"] for one in answer["outliers"]}
@@ -199,9 +195,7 @@ def test_the_robots_own_words_are_shown_with_their_classes(
         assert (f"class: {listed}" in row) == (listed != word)
 
 
-def test_relations_are_edges_and_those_that_hold_are_told_apart(
-    bedroom: Board, api: httpx.Client
-) -> None:
+def test_relations_are_edges(bedroom: Board, api: httpx.Client) -> None:
     bedroom.page.get_by_label("Positions count as evidence").check()
     bedroom.add("lamp")  # its position does not count
     bedroom.tab("Relations")
@@ -256,9 +250,7 @@ def test_room_types_are_listed_by_their_probability(bedroom: Board, api: httpx.C
     expect(options).to_have_text(["unknown", *names])
 
 
-def test_another_name_of_a_room_type_has_its_probability(
-    open_board: OpenBoard, api: httpx.Client
-) -> None:
+def test_aliases_of_room_types(open_board: OpenBoard, api: httpx.Client) -> None:
     board = open_board({"objects": ["desk", "chair"], "room_type": "hall"})
     (answer,) = ask(api, "rooms", board.scene, candidates=["hall", "office"], top_k=4096)["mapped"]
     assert (answer["label"], answer["class"]) == ("hall", "corridor")
@@ -270,7 +262,7 @@ def test_another_name_of_a_room_type_has_its_probability(
     expect(board.page.locator("#room option:checked")).to_have_text(re.compile(r"Living Room \d"))
 
 
-def test_the_calls_shown_give_the_answer_shown_and_can_be_copied(
+def test_the_shown_calls_give_the_shown_answer(
     open_board: OpenBoard, api: httpx.Client, require_system_tool: Callable[[str], Path]
 ) -> None:
     require_system_tool("curl")

@@ -46,7 +46,7 @@ LINE = {"scene_id": "a", "objects": [{"id": 0, "label": "bed"}], "counts": {"bed
         ("request.json", json.dumps(REQUEST)[:-1], set()),
     ],
 )
-def test_requests_and_recordings_stay_in_the_browser(
+def test_requests_stay_in_the_browser(
     open_board: OpenBoard, tmp_path: Path, name: str, content: str, routes: set[str]
 ) -> None:
     board = open_board()
@@ -82,7 +82,7 @@ def test_the_service_reads_another_format_once(
     assert [thing["id"] for thing in board.exported()["objects"]] == names
 
 
-def test_a_scene_of_a_file_and_the_labels_of_its_class_ids_are_chosen(
+def test_scenes_and_class_ids_of_a_file(
     open_board: OpenBoard,
 ) -> None:
     board = open_board()

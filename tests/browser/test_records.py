@@ -71,9 +71,7 @@ def lines(file: Path) -> list[Any]:
     return [json.loads(line) for line in file.read_text("utf-8").splitlines()]
 
 
-def test_a_corrected_file_differs_only_in_the_confirmation(
-    open_board: OpenBoard, recorded: Path, tmp_path: Path
-) -> None:
+def test_a_confirmed_scene_is_marked(open_board: OpenBoard, recorded: Path, tmp_path: Path) -> None:
     board = open_board()
     choose(board, recorded, 2)
     board.tab("Wrong")
@@ -102,9 +100,7 @@ def test_a_corrected_file_differs_only_in_the_confirmation(
     assert downloaded(board, tmp_path, 1).read_text("utf-8") == file.read_text("utf-8")
 
 
-def test_an_intruder_is_removed_and_the_next_scene_follows(
-    open_board: OpenBoard, recorded: Path, tmp_path: Path
-) -> None:
+def test_an_intruder_is_removed(open_board: OpenBoard, recorded: Path, tmp_path: Path) -> None:
     board = open_board()
     choose(board, recorded, 2)
     board.press("toilet (track_5)", "Delete")
@@ -139,9 +135,7 @@ def test_missing_objects_are_added(open_board: OpenBoard, recorded: Path, tmp_pa
     expect(board.page.get_by_role("button", name="Download scenes.jsonl")).to_be_hidden()
 
 
-def test_confirmed_scenes_of_the_page_stay_in_the_browser(
-    open_board: OpenBoard, tmp_path: Path
-) -> None:
+def test_scenes_of_the_page_stay_in_the_browser(open_board: OpenBoard, tmp_path: Path) -> None:
     lamp = {
         "label": "lamp",
         "position": {"x": 2, "y": 0.5, "z": 0.94},
@@ -186,7 +180,7 @@ def test_confirmed_scenes_of_the_page_stay_in_the_browser(
     assert board.page.evaluate("Object.keys(localStorage)") == []
 
 
-def test_a_verdict_on_one_alarm_does_not_confirm_another(
+def test_each_alarm_needs_a_confirmation(
     open_board: OpenBoard, recorded: Path, tmp_path: Path
 ) -> None:
     wrong = {"subject": "track_0", "relation": "left", "object": "track_1", "log_odds": -3.0}
@@ -231,7 +225,7 @@ def test_the_list_of_scenes_marks_alarms(open_board: OpenBoard, recorded: Path) 
     assert any("confirmed" in row for row in board.rows("outliers") if "toilet" in row)
 
 
-def test_an_object_added_to_a_confirmed_scene_is_confirmed_too(
+def test_additions_to_a_confirmed_scene(
     open_board: OpenBoard, recorded: Path, tmp_path: Path
 ) -> None:
     board = open_board()

@@ -141,9 +141,7 @@ def test_a_link_holds_the_scene(open_board: OpenBoard) -> None:
 
 
 @pytest.mark.parametrize("is_bomb", [False, True])
-def test_a_link_that_cannot_be_read_says_so(
-    open_board: OpenBoard, api: httpx.Client, is_bomb: bool
-) -> None:
+def test_unreadable_links(open_board: OpenBoard, api: httpx.Client, is_bomb: bool) -> None:
     """300 MB of blanks in a link of 400 kB: the page neither hangs nor fills the memory."""
     link, words = "nonsense", "cannot be read"
     if is_bomb:

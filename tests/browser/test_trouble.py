@@ -22,7 +22,7 @@ for (let step = 0; step < 8; step += 1)
 
 
 @pytest.mark.slow
-def test_a_question_that_is_overtaken_is_dropped(open_board: OpenBoard) -> None:
+def test_a_superseded_question_is_dropped(open_board: OpenBoard) -> None:
     board = open_board()
     asked, held = list[str](), list[Route]()
 
@@ -46,7 +46,7 @@ def test_a_question_that_is_overtaken_is_dropped(open_board: OpenBoard) -> None:
 
 
 @pytest.mark.slow
-def test_a_full_service_is_asked_again_when_it_says(open_board: OpenBoard) -> None:
+def test_the_page_retries_after_429(open_board: OpenBoard) -> None:
     board = open_board(allow=("429",))
     asked = list[Route]()
 
@@ -75,9 +75,7 @@ def test_a_full_service_is_asked_again_when_it_says(open_board: OpenBoard) -> No
 
 
 @pytest.mark.slow
-def test_the_page_outlives_the_service(
-    open_board: OpenBoard, repository: Path, tmp_path: Path
-) -> None:
+def test_the_service_restarts(open_board: OpenBoard, repository: Path, tmp_path: Path) -> None:
     store = repository / "model_store"
     with launch(store, tmp_path / "log") as mortal:
         board = open_board(home=mortal.url, allow=("ERR_", "503"))
@@ -94,9 +92,7 @@ def test_the_page_outlives_the_service(
 
 
 @pytest.mark.slow
-def test_a_service_with_a_key_is_asked_with_it(
-    open_board: OpenBoard, repository: Path, tmp_path: Path
-) -> None:
+def test_the_page_sends_the_key(open_board: OpenBoard, repository: Path, tmp_path: Path) -> None:
     key = "a-key-of-sixteen-letters"
     with launch(repository / "model_store", tmp_path / "log", SCENE_API_KEY=key) as guarded:
         home = f"http://127.0.0.1:{guarded.port}"
@@ -137,7 +133,7 @@ def promote(service: LiveService, model: str) -> None:
 
 # The first test of the service, which moves the alias.
 @pytest.mark.parametrize("has_default", [False, True])
-def test_a_model_of_one_s_own_opens_without_errors(
+def test_own_models_open_without_errors(
     open_board: OpenBoard, own: LiveService, has_default: bool
 ) -> None:
     if has_default:

@@ -36,15 +36,13 @@ def test_the_blocking_client_is_up_to_date():
         ("CHANGELOG.md", r"^## (\d\S*)"),
     ],
 )
-def test_every_file_states_the_version_of_the_service(
-    repository: Path, path: str, pattern: str
-) -> None:
+def test_every_file_states_the_version(repository: Path, path: str, pattern: str) -> None:
     match = re.search(pattern, (repository / path).read_text("utf-8"), re.MULTILINE)
     assert match is not None
     assert match[1] == app.__version__
 
 
-def test_the_wheel_holds_the_client_alone(repository: Path, tmp_path: Path):
+def test_the_wheel_has_only_the_client(repository: Path, tmp_path: Path):
     # A copy: pip leaves its build folder in the source, and takes old modules from it.
     ignored = shutil.ignore_patterns("build", "*.egg-info")
     source = shutil.copytree(repository / "clients" / "python", tmp_path / "source", ignore=ignored)
@@ -81,7 +79,7 @@ except ImportError as error:
 """
 
 
-def test_the_client_works_where_nothing_of_the_service_is_installed() -> None:
+def test_the_client_needs_no_package_of_the_service() -> None:
     done = run_program(sys.executable, "-W", "error", "-c", PROGRAM)
     # An offline client says which packages it needs.
     assert "pip install '.[service]' in the repository" in done.stdout
@@ -148,7 +146,7 @@ def test_the_cpp_block_compiles_and_runs(
 
 @pytest.mark.slow
 @pytest.mark.system
-def test_the_cpp_example_is_made_and_asks_all_five_questions(
+def test_the_cpp_example_asks_all_questions(
     url: str, tmp_path: Path, bridge: Path, require_system_tool: Callable[[str], Path]
 ) -> None:
     # Asking for `bridge` leaves this test out where the libraries are missing.

@@ -96,7 +96,7 @@ def test_all_questions_about_a_scene_are_one_line(
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
 
 
-def test_only_observed_scenes_that_the_service_answers_are_written(url: str, file: Path) -> None:
+def test_only_answered_scenes_are_written(url: str, file: Path) -> None:
     with Client(url, record=file) as scene:
         scene.generate(["bed", "lamp"], steps=1)
         scene.missing(["bed"])
@@ -110,7 +110,7 @@ def test_only_observed_scenes_that_the_service_answers_are_written(url: str, fil
     assert labels(file) == [["bed", "desk"], ["lamp", "desk"]]
 
 
-def test_a_scene_is_written_again_if_the_request_says_more(file: Path) -> None:
+def test_new_evidence_is_written(file: Path) -> None:
     writer = Recorder(file)
     lamp, bed = {"id": "track_7", "label": "lamp"}, {"id": "track_9", "label": "bed"}
     on_top = [("track_7", "on-top", "track_9")]
@@ -135,9 +135,7 @@ def test_a_scene_is_written_again_if_the_request_says_more(file: Path) -> None:
     assert lines(file)[-1]["group"] == lines(file)[-1]["scene_id"][:13]
 
 
-def test_moved_objects_are_written_after_a_pause(
-    file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_moved_objects_wait_for_the_pause(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = 1000.0
     monkeypatch.setattr(recorder, "monotonic", lambda: now)
     writer = Recorder(file)
@@ -155,7 +153,7 @@ def test_moved_objects_are_written_after_a_pause(
     assert [see(2.8), see(2.8), see(1.2)] == [2, 2, 2]
 
 
-def test_another_run_does_not_repeat_the_last_scenes(file: Path) -> None:
+def test_another_run_repeats_no_scene(file: Path) -> None:
     stated = request("bed", {"label": "lamp", "supported_by": "bed"}, room_type="bedroom")
     complete = request("bed", "desk", relations=[("bed", "left", "desk")], relations_complete=True)
     write(file, [stated, complete])
@@ -197,7 +195,7 @@ FRAMES = [
     st.lists(st.tuples(*[st.integers(-20, 20)] * 3), min_size=3, max_size=3),
     st.sampled_from([{}, {"yaw": 0.7}, {"orientation": {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8}}]),
 )
-def test_the_training_derives_the_relations_of_the_service(
+def test_training_derives_the_relations_of_the_service(
     frame: dict[str, Any], places: list[tuple[int, int, int]], turn: dict[str, Any]
 ) -> None:
     names = VOCABULARY.labels[:3]
@@ -219,7 +217,7 @@ def test_the_training_derives_the_relations_of_the_service(
     }
 
 
-def test_in_a_map_without_a_viewpoint_the_viewer_is_unknown() -> None:
+def test_a_map_without_a_viewpoint() -> None:
     boxes = box("bed", 1, 2, 0.25), box("lamp", 3, 2, 0.25)
     scene = scene_of(request(*boxes, frame_id="robot/map"))
     assert scene["viewer_frame"] is False
@@ -247,9 +245,7 @@ def run(program: str, *arguments: object) -> str:
     return done.stdout + done.stderr
 
 
-def test_several_processes_and_threads_share_the_file(
-    file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_processes_and_threads_share_the_file(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recorder, "_LONGEST_WAIT", 30.0)
     writers = [
         threading.Thread(target=run, args=("""
@@ -373,7 +369,7 @@ writer.record([scene(20)])
     assert 100_000 * 2 / 3 < int(said[1]) < 100_000
 
 
-def test_a_folder_that_comes_and_goes_disturbs_no_question(
+def test_a_missing_folder_disturbs_no_question(
     url: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     file = tmp_path / "later" / "scenes.jsonl"
@@ -398,7 +394,7 @@ def test_a_folder_that_comes_and_goes_disturbs_no_question(
     ] * 2
 
 
-def test_a_pipe_is_no_file(file: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_pipe_is_refused(file: Path, caplog: pytest.LogCaptureFixture) -> None:
     os.mkfifo(file)
     write(file, [request("bed", "lamp")])
     assert "not a regular file" in caplog.text

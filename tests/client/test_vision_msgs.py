@@ -138,7 +138,7 @@ def bed(**fields: Any) -> dict[str, Any]:
         ],
     ],
 )
-def test_values_of_a_detection_are_taken_corrected_or_left_out(
+def test_values_of_a_detection(
     detection: Any, expected: dict[str, Any], reason: str | None
 ) -> None:
     fields = from_detection3d_array(array(detection))
@@ -156,9 +156,7 @@ def test_values_of_a_detection_are_taken_corrected_or_left_out(
         ([result("7")], "unwanted"),
     ],
 )
-def test_a_detection_without_a_sure_label_is_left_out_and_reported(
-    results: Any, reason: str
-) -> None:
+def test_detections_without_a_label_are_left_out(results: Any, reason: str) -> None:
     fields = from_detection3d_array(
         array(seen(*results), seen(result("lamp"))), {"7": None}, min_score=0.3
     )
@@ -166,7 +164,7 @@ def test_a_detection_without_a_sure_label_is_left_out_and_reported(
     assert reasons(fields) == [(0, reason)]
 
 
-def test_an_empty_box_is_replaced_by_the_pose_of_the_hypothesis() -> None:
+def test_an_empty_box_has_the_pose_of_the_hypothesis() -> None:
     where = pose((1, 2, 3))
     empty = {"at": (0, 0, 0), "size": (0, 0, 0)}
     fields = from_detection3d_array(
@@ -182,7 +180,7 @@ def test_an_empty_box_is_replaced_by_the_pose_of_the_hypothesis() -> None:
     assert reasons(fields) == [(1, "no-position")]
 
 
-def test_ids_are_the_detectors_own_or_numbered_labels() -> None:
+def test_ids_of_detections() -> None:
     labels = ("chair", "lamp", "chair", "lamp", "bed", "bed")
     names = ("", "chair_1", "", "chair_1", " \n ", "a\nb")
     detections = (seen(result(label), name=name) for label, name in zip(labels, names, strict=True))
@@ -192,7 +190,7 @@ def test_ids_are_the_detectors_own_or_numbered_labels() -> None:
     assert reasons(fields) == [(3, "renamed"), (5, "renamed")]
 
 
-def test_the_most_confident_of_too_many_are_kept_in_their_order() -> None:
+def test_the_most_confident_objects_are_kept() -> None:
     n = MAX_OBJECTS + 40
     scores = [0.1 + 0.8 * (k * 101 % n) / n for k in range(n)]
     cups = (seen(result("cup", score), name=str(k)) for k, score in enumerate(scores))
@@ -224,7 +222,7 @@ def test_frame_and_stamp_of_the_header(header: dict[str, Any], field: str, sent:
     assert reasons(fields) == ([(None, "no-stamp")] if field == "stamp" and sent is None else [])
 
 
-def test_the_frame_of_the_detections_serves_where_the_message_names_none() -> None:
+def test_the_frame_of_the_detections() -> None:
     detections = (bed(frame="/odom"), bed(), bed(frame="base_link"))
     fields = from_detection3d_array(array(*detections, frame=""))
     assert fields["frame_id"] == "odom"
@@ -261,7 +259,7 @@ def test_wrong_arguments_are_refused(wrong: dict[str, Any]) -> None:
         {"header": {"frame_id": "a\nb"}, "detections": []},
     ],
 )
-def test_other_values_than_messages_are_refused(message: Any) -> None:
+def test_other_values_are_refused(message: Any) -> None:
     with pytest.raises(MessageError):
         from_message(message)
 
@@ -290,7 +288,7 @@ def test_numbers_become_labels(label_map: Any, class_id: Any) -> None:
     assert [thing["label"] for thing in fields["objects"]] == ["chair", "lamp"]
 
 
-def test_numbers_without_a_label_map_are_an_error_that_says_what_to_do() -> None:
+def test_numbers_without_a_label_map_are_an_error() -> None:
     with pytest.raises(MessageError, match="label_map"):
         from_detection3d_array(array(seen(result("56")), seen(), seen(result("3", 0.0))))
     # With one, a class that it lacks is left out.
@@ -298,7 +296,7 @@ def test_numbers_without_a_label_map_are_an_error_that_says_what_to_do() -> None
     assert reasons(fields) == [(0, "no-label")]
 
 
-def test_the_default_model_knows_most_of_cocos_indoor_classes(repository: Path) -> None:
+def test_the_default_model_has_indoor_classes_of_coco(repository: Path) -> None:
     store = Store(repository / "model_store")
     vocabulary = store.load(*store.resolve("default")).vocabulary
     known = {label for label in COCO if vocabulary.index(label) is not None}
@@ -352,9 +350,7 @@ def test_invalid_boxes_are_reported() -> None:
 @pytest.mark.parametrize("store", [Layout.current, Layout.former], ids=["current", "former"])
 @pytest.mark.parametrize("kind", ["3D", "2D"])
 @pytest.mark.parametrize("number", [7.25, -1.0, 0.0, math.nan, math.inf, 1e300])
-def test_rosbridge_and_the_wire_of_ros_give_one_scene_that_is_a_request(
-    store: Typestore, kind: str, number: float
-) -> None:
+def test_rosbridge_and_cdr_give_one_scene(store: Typestore, kind: str, number: float) -> None:
     """The first of two detections has this number in every field of a floating-point type."""
     name = f"vision_msgs/msg/Detection{kind}Array"
     message = filled(store, name, repeat(number), 2)
@@ -370,7 +366,7 @@ def test_rosbridge_and_the_wire_of_ros_give_one_scene_that_is_a_request(
 
 
 @pytest.mark.parametrize("text", [b"null", b"3", b'"x"', b"[]", b"{}", b"[{}]"])
-def test_any_message_is_a_request_or_an_error_of_this_module(text: bytes) -> None:
+def test_any_message_is_a_request_or_an_error(text: bytes) -> None:
     """One value of a message is replaced."""
     for message in (array(seen(result("56"), name="t1")), array(flat("chair", 1.0, 2.0))):
         for place in places(message):

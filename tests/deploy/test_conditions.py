@@ -46,9 +46,7 @@ def url(live: LiveService) -> str:
     return live.url
 
 
-def test_a_scene_is_complete_if_nothing_missing_is_rather_there_than_not(
-    program: Path, url: str, scene: SceneFields
-) -> None:
+def test_scene_complete(program: Path, url: str, scene: SceneFields) -> None:
     with Client(url, timeout=60.0) as client:
         missing = client.missing(**scene).missing
     highest = max(missing, key=lambda thing: thing.log_odds)
@@ -68,9 +66,7 @@ def test_a_scene_is_complete_if_nothing_missing_is_rather_there_than_not(
     assert own["because"] == "missing: couch"
 
 
-def test_a_thing_belongs_unless_it_is_an_outlier(
-    program: Path, url: str, scene: SceneFields
-) -> None:
+def test_object_belongs(program: Path, url: str, scene: SceneFields) -> None:
     with Client(url, timeout=60.0) as client:
         outliers = client.outliers(**scene).outliers
     (toilet,) = (thing for thing in outliers if thing.label == "toilet")
@@ -96,7 +92,7 @@ def test_a_thing_belongs_unless_it_is_an_outlier(
     assert found["because"] == "desk belongs"
 
 
-def test_a_service_that_does_not_answer_fails_the_condition(program: Path) -> None:
+def test_an_unreachable_service_fails_the_condition(program: Path) -> None:
     scene = {"scene": '{"objects": ["bed"]}'}
     with socket.create_server(("127.0.0.1", 0)) as server:  # accepts and never answers
         url = f"http://127.0.0.1:{server.getsockname()[1]}"

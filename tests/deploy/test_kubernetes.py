@@ -129,7 +129,7 @@ def test_ports_are_those_of_the_image(repository: Path, overlay: Overlay) -> Non
         assert (port["port"], port["targetPort"]) == (exposed, opened["name"])
 
 
-def test_variables_are_settings_with_valid_values(
+def test_variables_are_valid_settings(
     monkeypatch: pytest.MonkeyPatch, repository: Path, overlay: Overlay
 ) -> None:
     assert set(re.findall(r"\bSCENE_[A-Z0-9_]+", overlay.text)) <= SETTINGS
@@ -207,7 +207,7 @@ def test_the_network_policy_opens_the_ports_in_use(overlay: Overlay) -> None:
     assert out == (dns | {(443, "TCP")} if has_bucket else dns)
 
 
-def test_the_sidecar_copies_what_the_service_loads(
+def test_the_sidecar_copies_whole_versions(
     folder: Path, require_system_tool: FindTool, tmp_path: Path
 ) -> None:
     """A version arrives whole, without its upload's leftovers, and aliases follow the bucket."""

@@ -42,7 +42,7 @@ def pods(cluster: dict[str, Any]) -> list[dict[str, Any]]:
     return [group["template"]["spec"] for group in groups]
 
 
-def test_the_manifest_has_the_same_configuration_for_another_host(
+def test_the_manifest_has_the_same_configuration(
     config: dict[str, Any], cluster: dict[str, Any]
 ) -> None:
     copy = yaml.safe_load(cluster["serveConfigV2"])

@@ -84,7 +84,7 @@ def served(site: Path) -> Iterator[str]:
 
 
 @pytest.mark.system
-def test_a_browser_loads_only_the_site_and_shows_the_formulas(
+def test_the_browser_shows_the_site(
     served: str, require_system_tool: Callable[[str], Path]
 ) -> None:
     chromium = require_system_tool("chromium")

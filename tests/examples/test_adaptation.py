@@ -40,7 +40,7 @@ def outputs(notebook: Any) -> list[list[str]]:
     return [[output["output_type"] for output in cell["outputs"]] for cell in cells]
 
 
-def test_the_shell_program_adapts_a_model_that_a_service_serves(
+def test_the_shell_program_adapts_a_model(
     tmp_path: Path, require_system_tool: Callable[[str], Path]
 ) -> None:
     bash, home = require_system_tool("bash"), tmp_path / "home"

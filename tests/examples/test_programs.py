@@ -86,7 +86,7 @@ def test_the_behaviour_tree_says_why_its_conditions_fail(shipped: LiveService) -
     assert printed[1].startswith("complete: missing: computer")
 
 
-def test_the_ros_node_publishes_outliers_and_logs_errors(
+def test_the_ros_node_publishes_outliers(
     shipped: LiveService, repository: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recorded = json.loads((repository / "clients/ros2/detections.json").read_text("utf-8"))

@@ -7,8 +7,8 @@ import threading
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
+from httpx import Client, ConnectError, Response
 
 from tests.http.test_problems import problem
 from tests.services import Hold, Replace, launch, serve, wait_until
@@ -35,9 +35,7 @@ async def test_a_deadline_is_a_whole_number_within_the_limit(shared_store: Path)
     assert [p["schema"]["maximum"] for p in parameters if "Timeout" in p["name"]] == [600_000]
 
 
-async def test_generate_past_its_deadline_gets_504_and_delays_no_request(
-    shared_store: Path, hold: Hold
-) -> None:
+async def test_generate_past_its_deadline_gets_504(shared_store: Path, hold: Hold) -> None:
     async with serve(shared_store) as client:
         held = hold("generate")
         drawing = asyncio.ensure_future(
@@ -51,7 +49,7 @@ async def test_generate_past_its_deadline_gets_504_and_delays_no_request(
         assert 'scene_pending{lane="draws"} 0.0' in (await client.get("/metrics")).text
 
 
-async def test_a_client_with_a_quarter_of_a_queue_gets_429(shared_store: Path, hold: Hold) -> None:
+async def test_a_client_above_its_share_gets_429(shared_store: Path, hold: Hold) -> None:
     async with serve(shared_store) as client:
         client.headers.update(LONG)
         held = hold("generate")
@@ -73,7 +71,7 @@ async def test_a_client_with_a_quarter_of_a_queue_gets_429(shared_store: Path, h
         assert "`steps` must be at most 32000" in document["errors"][0]["message"]
 
 
-async def test_a_batch_stops_where_its_deadline_passes(
+async def test_a_batch_stops_at_its_deadline(
     shared_store: Path, replace: Replace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each entry that was not begun says so itself. The deadline passes during the third entry."""
@@ -116,17 +114,15 @@ sys.exit(main())
 
 @pytest.mark.slow
 @pytest.mark.system
-def test_a_stopping_service_answers_requests_in_progress(
-    shared_store: Path, tmp_path: Path
-) -> None:
+def test_a_stopping_service_drains(shared_store: Path, tmp_path: Path) -> None:
     begun, release = tmp_path / "begun", tmp_path / "release"
     program = HELD.format(begun=str(begun), release=str(release))
     log = tmp_path / "log"
     with launch(shared_store, log, program=("-c", program), SCENE_DRAIN_SECONDS="3") as service:
-        answers: list[httpx.Response] = []
+        answers: list[Response] = []
 
         def draw() -> None:
-            with httpx.Client(base_url=service.client.base_url, timeout=60) as client:
+            with Client(base_url=service.client.base_url, timeout=60) as client:
                 answers.append(client.post("/generate", json={**SCENE, "count": 3}, headers=LONG))
 
         def is_draining() -> bool:
@@ -150,5 +146,5 @@ def test_a_stopping_service_answers_requests_in_progress(
         assert answers[0].status_code == 200
         service.process.wait(timeout=30)
         assert service.process.returncode == -signal.SIGTERM
-        with pytest.raises(httpx.ConnectError):
+        with pytest.raises(ConnectError):
             service.client.get("/health/live")

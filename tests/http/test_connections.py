@@ -6,8 +6,8 @@ import socket
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-import httpx
 import pytest
+from httpx import Response
 
 from tests.chaos.wire import BODY, LIVE, Wire, exchange
 from tests.http.test_problems import problem
@@ -39,9 +39,7 @@ def test_an_unfinished_body_gets_408(service: LiveService, part: bytes) -> None:
 @pytest.mark.parametrize(
     ("path", "status"), [(b"/health/live", 200), (b"/missing", 405), (b"/stream", 404)]
 )
-def test_an_upgrade_request_gets_a_plain_answer(
-    service: LiveService, path: bytes, status: int
-) -> None:
+def test_upgrade_requests_get_plain_answers(service: LiveService, path: bytes, status: int) -> None:
     upgrade = (
         b"Host: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
         b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="
@@ -80,7 +78,7 @@ def test_unfinished_bodies_use_bounded_memory(shared_store: Path, tmp_path: Path
         assert service.control() == answers
         batch = {"scenes": [{"objects": ["bed"] * 60}] * 256}
 
-        def asked() -> httpx.Response:
+        def asked() -> Response:
             return service.client.post("/missing/batch", json=batch)
 
         # The service reads the last bytes of the held bodies after the client sent them.

@@ -11,8 +11,8 @@ from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
+from httpx import AsyncClient
 from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTraceServiceRequest
 from opentelemetry.proto.trace.v1.trace_pb2 import Span
 from prometheus_client.parser import text_string_to_metric_families
@@ -52,7 +52,7 @@ def documented_metrics() -> dict[str, tuple[str, set[str], str]]:
     return listed
 
 
-async def samples(client: httpx.AsyncClient) -> dict[tuple[str, ...], float]:
+async def samples(client: AsyncClient) -> dict[tuple[str, ...], float]:
     """(name, label values in the order of their names) → value."""
     response = await client.get("/metrics")
     assert response.status_code == 200
@@ -73,9 +73,7 @@ def requests(found: dict[tuple[str, ...], float]) -> dict[tuple[str, ...], float
     }
 
 
-async def test_requests_are_counted_by_route_and_outcome(
-    shared_store: Path, replace: Replace
-) -> None:
+async def test_requests_are_counted_by_route(shared_store: Path, replace: Replace) -> None:
     async with serve(shared_store) as client:
         replace("outliers", defect)
         await client.post("/outliers", json=SCENE)
@@ -109,7 +107,7 @@ async def test_requests_are_counted_by_route_and_outcome(
     assert found["scene_request_duration_seconds_count", "/missing"] == 5
 
 
-async def test_unknown_paths_and_methods_add_no_metrics(client: httpx.AsyncClient) -> None:
+async def test_unknown_paths_and_methods_add_no_metrics(client: AsyncClient) -> None:
     async def ask(number: int) -> None:
         for folder in ("nowhere", "models", "problems", "static"):
             await client.get(f"/{folder}/m{number}")
@@ -171,7 +169,7 @@ async def test_metrics_can_be_switched_off(shared_store: Path) -> None:
         assert "/metrics" not in (await client.get("/openapi.json")).json()["paths"]
 
 
-async def test_model_info_has_every_alias(own: httpx.AsyncClient, store: Path) -> None:
+async def test_model_info_has_every_alias(own: AsyncClient, store: Path) -> None:
     Store(store).set_alias("night", AliasTarget(name="home"))
     await load_changes(own)
     infos = {key[1:] for key in await samples(own) if key[0] == "scene_model_info"}
@@ -188,9 +186,7 @@ async def test_model_info_has_every_alias(own: httpx.AsyncClient, store: Path) -
     assert infos == expected
 
 
-async def test_metrics_of_a_removed_model_disappear(
-    own: httpx.AsyncClient, store: Path, hold: Hold
-) -> None:
+async def test_removed_models_have_no_metrics(own: AsyncClient, store: Path, hold: Hold) -> None:
 
     async def names(of: str) -> set[str]:
         return {key[0] for key in await samples(own) if of in key}
@@ -294,7 +290,7 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[ExportTraceServiceRe
 
 
 @pytest.mark.system
-def test_a_request_is_a_span_named_by_its_route(
+def test_spans_have_names_of_routes(
     shared_store: Path, tmp_path: Path, taken: list[ExportTraceServiceRequest]
 ) -> None:
     """Probes and scrapes are none, and what a client made up is in none."""

@@ -8,8 +8,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
+from httpx import AsyncClient, Response
 
 from app.errors import ERRORS
 from app.questions import QUESTIONS
@@ -22,7 +22,7 @@ BED = {"label": "bed"}
 POINT = {"x": 1.0, "y": 1.0, "z": 1.0}
 
 
-def problem(response: httpx.Response, status: int, slug: str) -> dict[str, Any]:
+def problem(response: Response, status: int, slug: str) -> dict[str, Any]:
     """The problem of a response, checked for everything that every problem must be."""
     assert response.status_code == status, response.text
     assert response.headers["content-type"] == "application/problem+json"
@@ -39,12 +39,12 @@ def problem(response: httpx.Response, status: int, slug: str) -> dict[str, Any]:
     return document
 
 
-def pointers(response: httpx.Response, slug: str = "invalid-request") -> list[str]:
+def pointers(response: Response, slug: str = "invalid-request") -> list[str]:
     """The places of the errors that a response with status 422 points at."""
     return [error["pointer"] for error in problem(response, 422, slug)["errors"]]
 
 
-async def post(client: httpx.AsyncClient, body: Any, path: str = "/relations") -> Any:
+async def post(client: AsyncClient, body: Any, path: str = "/relations") -> Any:
     """Send bytes or text as a JSON body."""
     headers = {"Content-Type": "application/json"}
     return await client.post(path, content=body, headers=headers)
@@ -79,7 +79,7 @@ async def post(client: httpx.AsyncClient, body: Any, path: str = "/relations") -
     ],
     ids=lambda body: repr(body[:24]),
 )
-async def test_only_strict_json_is_accepted(client: httpx.AsyncClient, body: bytes) -> None:
+async def test_only_strict_json_is_accepted(client: AsyncClient, body: bytes) -> None:
     problem(await post(client, body), 400, "not-json")
 
 
@@ -92,7 +92,7 @@ async def test_only_strict_json_is_accepted(client: httpx.AsyncClient, body: byt
     ],
 )
 async def test_only_strict_json_is_accepted_in_a_large_body(
-    client: httpx.AsyncClient, body: bytes
+    client: AsyncClient, body: bytes
 ) -> None:
     problem(await post(client, body.ljust(2**18 + 1), "/missing/batch"), 400, "not-json")
 
@@ -119,7 +119,7 @@ async def test_only_strict_json_is_accepted_in_a_large_body(
     ],
 )
 async def test_only_plain_json_is_accepted(
-    client: httpx.AsyncClient, content_type: str | None, encoding: str | None, named: str | None
+    client: AsyncClient, content_type: str | None, encoding: str | None, named: str | None
 ) -> None:
     fields = {"Content-Type": content_type, "Content-Encoding": encoding}
     headers = {name: value for name, value in fields.items() if value is not None}
@@ -208,8 +208,8 @@ INVALID: dict[str, list[tuple[Any, ...]]] = {
     [(question, case) for question, cases in INVALID.items() for case in cases],
     ids=lambda value: value if isinstance(value, str) else value[1],
 )
-async def test_an_invalid_value_is_located_and_explained(
-    client: httpx.AsyncClient, question: str, case: tuple[Any, ...]
+async def test_invalid_values_are_explained(
+    client: AsyncClient, question: str, case: tuple[Any, ...]
 ) -> None:
     changes, pointer, words, *suggestions = case if case[2:] else (*case, "")
     # Infinity is not JSON. A number that is too large for a double is JSON.
@@ -226,16 +226,12 @@ async def test_an_invalid_value_is_located_and_explained(
 
 
 @pytest.mark.parametrize(("body", "pointer"), [("[]", "#"), ("{}", "#/objects")])
-async def test_a_body_is_an_object_with_objects(
-    client: httpx.AsyncClient, body: str, pointer: str
-) -> None:
+async def test_a_body_has_objects(client: AsyncClient, body: str, pointer: str) -> None:
     assert pointers(await post(client, body)) == [pointer]
 
 
 @pytest.mark.parametrize("question", NAMES)
-async def test_validation_stops_at_the_first_invalid_relation(
-    client: httpx.AsyncClient, question: str
-) -> None:
+async def test_validation_stops_at_the_first_relation(client: AsyncClient, question: str) -> None:
     unknown = {f"u{k}": 0 for k in range(29)}
     body = {"objects": ["bed", "lamp"], "relations": [LEFT, LEFT | unknown] * 64}
     # The errors are those of the first relation that does not fit.
@@ -248,7 +244,7 @@ async def test_validation_stops_at_the_first_invalid_relation(
 
 
 @pytest.mark.parametrize("question", NAMES)
-async def test_contradictions_are_refused(client: httpx.AsyncClient, question: str) -> None:
+async def test_contradictions_are_refused(client: AsyncClient, question: str) -> None:
     for second in (("bed", "right", "lamp"), ("lamp", "left", "bed"), ("bed", "front", "bed")):
         body = {"objects": ["bed", "lamp"], "relations": [("bed", "left", "lamp"), second]}
         response = await client.post(f"/{question}", json=body)
@@ -264,9 +260,7 @@ async def test_contradictions_are_refused(client: httpx.AsyncClient, question: s
 
 
 @pytest.mark.parametrize("question", NAMES)
-async def test_unknown_labels_are_named_with_suggestions(
-    client: httpx.AsyncClient, question: str
-) -> None:
+async def test_unknown_labels_have_suggestions(client: AsyncClient, question: str) -> None:
     body: dict[str, Any] = {
         "objects": ["nigthstand", "bed", {"label": MARKER}],
         "room_type": "bedrom",
@@ -282,7 +276,7 @@ async def test_unknown_labels_are_named_with_suggestions(
     assert "bathroom, bedroom, office" in known[0]
 
 
-async def test_numbers_that_are_not_json_are_pointed_at(client: httpx.AsyncClient) -> None:
+async def test_numbers_that_are_not_json_are_pointed_at(client: AsyncClient) -> None:
     place = '{"x": %s, "y": %s, "z": 0}'
     things = [f'{{"label": "bed", "position": {place % pair}}}' for pair in
               (("0", "1"), ("NaN", "0"), ("-Infinity", "Infinity"))]  # fmt: skip
@@ -304,12 +298,12 @@ async def test_numbers_that_are_not_json_are_pointed_at(client: httpx.AsyncClien
 @pytest.mark.parametrize(
     "key", ["<script>" + MARKER, MARKER + " x", MARKER * 20, MARKER + "\u202e"]
 )
-async def test_pointers_leave_out_unusual_field_names(client: httpx.AsyncClient, key: str) -> None:
+async def test_pointers_leave_out_unusual_field_names(client: AsyncClient, key: str) -> None:
     assert pointers(await client.post("/relations", json={"objects": ["bed"], key: 1})) == ["#"]
 
 
 @pytest.mark.parametrize("model", ["nobody", "home@9.9.9", "home@", "@", "../x", "home@1", "hoome"])
-async def test_unknown_models_are_not_found(client: httpx.AsyncClient, model: str) -> None:
+async def test_unknown_models_are_not_found(client: AsyncClient, model: str) -> None:
     body = {"objects": ["bed"], "model": model}
     document = problem(await client.post("/missing", json=body), 404, "model-not-found")
     named = "1.0.0, 1.1.0" if model.startswith("home@") else "Models: general, home, plain."
@@ -325,11 +319,11 @@ async def test_unknown_models_are_not_found(client: httpx.AsyncClient, model: st
         *("/docs/nothing", "/redoc/%00", "/problems/nothing", "/%F0%9F%98%80", "/%ff%fe"),
     ],
 )
-async def test_unknown_routes_are_not_found(client: httpx.AsyncClient, path: str) -> None:
+async def test_unknown_routes_are_not_found(client: AsyncClient, path: str) -> None:
     problem(await client.get(path), 404, "not-found")
 
 
-async def test_misspelt_ids_are_answered_with_similar_ids(client: httpx.AsyncClient) -> None:
+async def test_misspelt_ids_are_answered_with_similar_ids(client: AsyncClient) -> None:
     things = [{"id": "bed_7", "label": "bed"}, {"id": f"<{MARKER}>", "label": "lamp"}]
     body = {"objects": things, "at": {"relation": "on-top", "object": "bed7"}}
     (fault,) = problem(await client.post("/missing", json=body), 422, "invalid-request")["errors"]
@@ -346,7 +340,7 @@ async def test_misspelt_ids_are_answered_with_similar_ids(client: httpx.AsyncCli
     assert sum(bool(fault.get("suggestions")) for fault in errors) <= 32
 
 
-async def test_query_parameters_and_misspelt_paths_are_refused(client: httpx.AsyncClient) -> None:
+async def test_query_parameters_and_misspelt_paths_are_refused(client: AsyncClient) -> None:
     response = await client.post("/missing?model=home", json={"objects": ["bed"]})
     assert "JSON body" in problem(response, 400, "bad-request")["detail"]
     for path in ("/mising", "/Missing", "/missing/", "/api/missing"):
@@ -367,8 +361,8 @@ async def test_query_parameters_and_misspelt_paths_are_refused(client: httpx.Asy
         ("BREW", "/generate", {"POST"}),
     ],
 )
-async def test_other_methods_are_not_allowed(
-    client: httpx.AsyncClient, method: str, path: str, allowed: set[str]
+async def test_other_methods_are_refused(
+    client: AsyncClient, method: str, path: str, allowed: set[str]
 ) -> None:
     response = await client.request(method, path)
     document = problem(response, 405, "method-not-allowed")
@@ -384,7 +378,7 @@ async def test_other_methods_are_not_allowed(
     ],
 )
 async def test_only_valid_request_ids_are_kept(
-    client: httpx.AsyncClient, given: Any, is_kept: bool
+    client: AsyncClient, given: Any, is_kept: bool
 ) -> None:
     for path in ("/relations", "/nowhere"):
         headers = [(b"X-Request-Id", given)]
@@ -396,7 +390,7 @@ async def test_only_valid_request_ids_are_kept(
 
 @pytest.mark.parametrize("question", NAMES)
 async def test_a_defect_is_a_problem_without_details(
-    client: httpx.AsyncClient, replace: Replace, caplog: pytest.LogCaptureFixture, question: str
+    client: AsyncClient, replace: Replace, caplog: pytest.LogCaptureFixture, question: str
 ) -> None:
     replace(question, defect)
     response = await client.post(f"/{question}", json={"objects": ["bed"]})
@@ -408,8 +402,8 @@ async def test_a_defect_is_a_problem_without_details(
     assert record.entry["request_id"] == document["request_id"]
 
 
-async def test_an_answer_that_is_not_finite_is_a_defect(
-    client: httpx.AsyncClient, replace: Replace, caplog: pytest.LogCaptureFixture
+async def test_an_infinite_answer_is_a_defect(
+    client: AsyncClient, replace: Replace, caplog: pytest.LogCaptureFixture
 ) -> None:
     def not_finite(missing: Any, *args: Any, **parameters: Any) -> Any:
         return missing(*args, **parameters) | {"missing": [{"log_odds": math.nan}]}
@@ -420,7 +414,7 @@ async def test_an_answer_that_is_not_finite_is_a_defect(
     assert "not finite" in caplog.text
 
 
-async def test_every_problem_type_has_a_page(client: httpx.AsyncClient) -> None:
+async def test_every_problem_type_has_a_page(client: AsyncClient) -> None:
     index = (await client.get("/problems")).text
     for slug, kind in ERRORS.items():
         page = await client.get(f"/problems/{slug}")

@@ -6,9 +6,9 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
-import httpx
 import numpy as np
 import pytest
+from httpx import AsyncClient
 
 from app import questions
 from app.questions import QUESTIONS
@@ -42,7 +42,7 @@ def triples(listed: list[dict[str, Any]]) -> set[tuple[str, str, str]]:
     return {(entry["subject"], entry["relation"], entry["object"]) for entry in listed}
 
 
-async def ask(client: httpx.AsyncClient, question: str, **request: Any) -> dict[str, Any]:
+async def ask(client: AsyncClient, question: str, **request: Any) -> dict[str, Any]:
     """The answer, which must be one, validated against its schema and free of anything else."""
     response = await client.post(f"/{question}", json=request)
     assert response.status_code == 200, response.text
@@ -56,7 +56,7 @@ async def ask(client: httpx.AsyncClient, question: str, **request: Any) -> dict[
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("question", ANSWERS)
 async def test_every_model_answers_every_question(
-    client: httpx.AsyncClient, question: str, model: str
+    client: AsyncClient, question: str, model: str
 ) -> None:
     stamp = {"sec": 12, "nanosec": 5}
     answer = await ask(client, question, **SCENE, model=model, frame_id="map", stamp=stamp)
@@ -71,7 +71,7 @@ async def test_every_model_answers_every_question(
 
 
 @pytest.mark.parametrize("question", ANSWERS)
-async def test_observed_relations_are_returned(client: httpx.AsyncClient, question: str) -> None:
+async def test_observed_relations_are_returned(client: AsyncClient, question: str) -> None:
     answer = await ask(client, question, objects=LAMP_ON_DESK)
     assert answer["observed_relations"] == [{"subject": "l", "relation": "on-top", "object": "d"}]
     assert "observed_relations" not in await ask(client, question, objects=["desk", "lamp"])
@@ -88,8 +88,8 @@ async def test_observed_relations_are_returned(client: httpx.AsyncClient, questi
         ("rooms", {"because"}),
     ],
 )
-async def test_scores_are_the_answer_without_details(
-    client: httpx.AsyncClient, question: str, details: set[str]
+async def test_scores_leave_out_details(
+    client: AsyncClient, question: str, details: set[str]
 ) -> None:
     entries, name = {}, {"rooms": "room_types"}.get(question, question)
     for detail in ("full", "scores"):
@@ -129,7 +129,7 @@ async def test_rare_room_types_are_named_and_not_sampled(tmp_path: Path) -> None
         assert {one["room_type"] for one in other["scenes"]} == {words["room_types"][0]}
 
 
-async def test_a_drawn_seed_is_reported_and_draws_the_same_again(client: httpx.AsyncClient) -> None:
+async def test_the_seed_is_reported(client: AsyncClient) -> None:
     first = await ask(client, "generate", count=3)
     assert 0 <= first["seed"] < 2**53
     again = await ask(client, "generate", count=3, seed=first["seed"])
@@ -168,12 +168,12 @@ async def test_a_model_of_too_few_scenes_gives_no_judgement(tmp_path: Path) -> N
         assert (await ask(client, "generate", objects=["bed"]))["scenes"]
 
 
-async def test_coverage_is_the_models_unless_given(client: httpx.AsyncClient) -> None:
+async def test_the_default_coverage_is_that_of_the_model(client: AsyncClient) -> None:
     assert (await ask(client, "missing", **SCENE))["coverage"] == 0.5
     assert (await ask(client, "missing", **SCENE, coverage=0.125))["coverage"] == 0.125
 
 
-async def test_a_profile_changes_base_rates_only(client: httpx.AsyncClient) -> None:
+async def test_a_profile_changes_base_rates_only(client: AsyncClient) -> None:
     for question, changes in (("missing", True), ("outliers", True), ("relations", False)):
         answers = [
             (await ask(client, question, **SCENE, profile=profile))[question]
@@ -182,14 +182,14 @@ async def test_a_profile_changes_base_rates_only(client: httpx.AsyncClient) -> N
         assert (answers[0] != answers[1] != answers[2]) == changes
 
 
-async def test_relations_of_chosen_pairs(client: httpx.AsyncClient) -> None:
+async def test_relations_of_chosen_pairs(client: AsyncClient) -> None:
     pairs = [{"subject": "chair_2", "object": "lamp"}, {"subject": "bed", "object": "chair_1"}]
     found = (await ask(client, "relations", **SCENE, pairs=pairs, top_k=4096))["relations"]
     ends = {(entry["subject"], entry["object"]) for entry in found}
     assert ends == {("chair_2", "l"), ("bed", "chair_1")}
 
 
-async def test_misplaced_relations_are_spelled_as_stated(client: httpx.AsyncClient) -> None:
+async def test_misplaced_relations_are_spelled_as_stated(client: AsyncClient) -> None:
     stated = [("lamp", "under", "bed"), ("lamp", "left", "bed"), ("desk", "behind", "lamp")]
     answer = await ask(client, "outliers", objects=["bed", "lamp", "desk"], relations=stated)
     assert triples(answer["misplaced"]) == {*stated}
@@ -221,7 +221,7 @@ def own_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-async def measured(own_store: Path, anyio_backend: str) -> AsyncIterator[httpx.AsyncClient]:
+async def measured(own_store: Path, anyio_backend: str) -> AsyncIterator[AsyncClient]:
     async with serve(own_store) as client:
         yield client
 
@@ -238,9 +238,7 @@ def computed(
     return questions.missing(artifact, Scene(tuple(things), *scene), **options)
 
 
-async def test_likely_further_instances_are_listed(
-    measured: httpx.AsyncClient, own_store: Path
-) -> None:
+async def test_likely_further_instances_are_listed(measured: AsyncClient, own_store: Path) -> None:
     answer = (await ask(measured, "missing", objects=LABELS))["more"]
     assert answer == computed(own_store, LABELS, None)["more"]
     (entry,) = answer
@@ -277,8 +275,8 @@ REQUEST: dict[str, Any] = {
         ("robot_1/map", None),
     ],
 )
-async def test_placements_have_offsets_in_the_axes_of_the_frame(
-    measured: httpx.AsyncClient, own_store: Path, frame: str | None, viewpoint: Any
+async def test_offsets_are_in_the_axes_of_the_frame(
+    measured: AsyncClient, own_store: Path, frame: str | None, viewpoint: Any
 ) -> None:
     """In a map without a viewpoint, the relations left and front have no offset."""
     options = {"frame_id": frame, "viewpoint": viewpoint}
@@ -306,9 +304,7 @@ NAMES = [question.name for question in QUESTIONS if not question.samples]
 
 
 @pytest.mark.parametrize("question", NAMES)
-async def test_every_entry_gets_the_result_or_problem_of_a_single_request(
-    client: httpx.AsyncClient, question: str
-) -> None:
+async def test_batch_entries_are_single_answers(client: AsyncClient, question: str) -> None:
     headers = {"X-Request-Id": "one"}
     response = await client.post(f"/{question}/batch", json={"scenes": ENTRIES}, headers=headers)
     assert response.status_code == 200
@@ -325,7 +321,7 @@ async def test_every_entry_gets_the_result_or_problem_of_a_single_request(
 
 
 @pytest.mark.parametrize("scenes", [[], [{"objects": ["bed"]}] * 257, {}, None])
-async def test_a_batch_holds_1_to_256_scenes(client: httpx.AsyncClient, scenes: Any) -> None:
+async def test_a_batch_holds_1_to_256_scenes(client: AsyncClient, scenes: Any) -> None:
     response = await client.post("/relations/batch", json={"scenes": scenes})
     assert response.status_code == 422
     assert response.json()["errors"][0]["pointer"] == "#/scenes"
@@ -333,7 +329,7 @@ async def test_a_batch_holds_1_to_256_scenes(client: httpx.AsyncClient, scenes: 
 
 @pytest.mark.parametrize("fault", ["raised", math.nan])
 async def test_a_defect_affects_one_entry(
-    client: httpx.AsyncClient, replace: Replace, fault: Any
+    client: AsyncClient, replace: Replace, fault: Any
 ) -> None:
     def fail_on_sofas(outliers: Any, artifact: Any, scene: Any, **parameters: Any) -> Any:
         answer = outliers(artifact, scene, **parameters)
@@ -352,7 +348,7 @@ async def test_a_defect_affects_one_entry(
     assert (await client.post("/outliers", json=scenes[1])).status_code == 500
 
 
-async def test_an_id_may_be_the_text_nan(client: httpx.AsyncClient) -> None:
+async def test_an_id_may_be_the_text_nan(client: AsyncClient) -> None:
     objects = [{"id": "NaN", "label": "bed"}, {"id": "-Infinity", "label": "lamp"}]
     answer = (await client.post("/outliers", json={"objects": objects})).json()
     assert {entry["object"] for entry in answer["outliers"]} == {"NaN", "-Infinity"}

@@ -114,7 +114,7 @@ def test_unknown_names_stop_the_start(
     assert line.startswith(f"{name.upper()}: {message}")
 
 
-def test_arguments_are_refused_and_help_lists_the_settings(
+def test_help_lists_the_settings(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     with pytest.raises(SystemExit, match="2"):
@@ -133,9 +133,7 @@ def test_arguments_are_refused_and_help_lists_the_settings(
     assert ["SCENE_PORT", "8000"] in shown
 
 
-def test_variables_of_kubernetes_and_of_clients_are_no_settings(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_variables_are_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     variables = {
         "STORE": str(tmp_path),
         "STOER": "",
@@ -154,7 +152,7 @@ def test_variables_of_kubernetes_and_of_clients_are_no_settings(
 
 
 @pytest.mark.system
-def test_a_misconfigured_service_says_which_variables_and_exits(tmp_path: Path) -> None:
+def test_the_start_names_invalid_settings(tmp_path: Path) -> None:
     """Without a word of the keys."""
     wrong = {
         "SCENE_STORE": str(tmp_path / "none"),
@@ -203,7 +201,7 @@ def in_words(name: str, default: object) -> str:
     return f"{default:g}" if isinstance(default, float) else str(default)
 
 
-def test_the_documentation_lists_every_setting_once_with_its_default(repository: Path) -> None:
+def test_the_documentation_lists_every_setting(repository: Path) -> None:
     pages = {page.name: page.read_text("utf-8") for page in (repository / "docs").glob("*.md")}
     row = re.compile(r"^\| `SCENE_([A-Z_]+)` \| ([^|]+) \| [^|]+ \|$", re.MULTILINE)
     rows = [(name, *found) for name, page in pages.items() for found in row.findall(page)]

@@ -91,9 +91,7 @@ def taken() -> Iterator[socket.socket]:
         yield place
 
 
-def test_a_used_port_ends_the_start_before_models_are_loaded(
-    starting: Start, log: Path, taken: socket.socket
-) -> None:
+def test_a_used_port_ends_the_start(starting: Start, log: Path, taken: socket.socket) -> None:
     taken.listen()
     port = taken.getsockname()[1]
     assert starting(PORT=port).wait(timeout=PATIENCE) == 3
@@ -101,15 +99,13 @@ def test_a_used_port_ends_the_start_before_models_are_loaded(
 
 
 @pytest.mark.parametrize("host", ["203.0.113.1", "no-such-host.invalid"])
-def test_an_address_that_the_machine_does_not_have(starting: Start, log: Path, host: str) -> None:
+def test_an_invalid_address_ends_the_start(starting: Start, log: Path, host: str) -> None:
     assert starting(HOST=host, PORT=0).wait(timeout=PATIENCE) == 3
     (line,) = log.read_text().splitlines()
     assert line.startswith(f"SCENE_HOST: the service cannot listen on {host}:0: ")
 
 
-def test_connections_are_refused_until_the_service_is_ready(
-    starting: Start, log: Path, tmp_path: Path
-) -> None:
+def test_connections_are_refused_until_ready(starting: Start, log: Path, tmp_path: Path) -> None:
     port, go = free_port(), tmp_path / "go"
     process = starting(HELD.format(go=str(go)), PORT=port)
     wait_for("Waiting for application startup", log, process)
@@ -145,9 +141,7 @@ runpy.run_module("app", run_name="__main__")
 
 
 @pytest.mark.parametrize("during", ["imports", "load"])
-def test_an_interrupted_start_ends_without_a_traceback(
-    shared_store: Path, log: Path, during: str
-) -> None:
+def test_an_interrupted_start_has_no_traceback(shared_store: Path, log: Path, during: str) -> None:
     program = ("-c", INTERRUPTED.format(during=during))
     process = begin(shared_store, log, program=program, SCENE_PORT=str(free_port()))
     # A shell reports this as status 130.
@@ -156,7 +150,7 @@ def test_an_interrupted_start_ends_without_a_traceback(
     assert "ready" not in log.read_text()
 
 
-def test_every_address_of_both_families_is_bound_at_one_port() -> None:
+def test_both_address_families_have_one_port() -> None:
     sockets = _bind("::", 0, 1.0)
     try:
         names = [one.getsockname()[:2] for one in sockets]

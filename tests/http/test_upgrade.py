@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
+from httpx import AsyncClient
 
 from app.registry import DEFAULT_STORE, AliasTarget, Store
 from app.registry.__main__ import main
@@ -48,7 +48,7 @@ def copy(source: Store, target: Store) -> None:
     assert main(["copy", "--from", str(source.root), "--to", str(target.root)]) == 0
 
 
-async def answering(client: httpx.AsyncClient, **fields: Any) -> str:
+async def answering(client: AsyncClient, **fields: Any) -> str:
     response = await client.post("/missing", json=OBJECTS | fields)
     assert response.status_code == 200, response.text
     model = response.json()["model"]
@@ -56,7 +56,7 @@ async def answering(client: httpx.AsyncClient, **fields: Any) -> str:
 
 
 @pytest.mark.parametrize("is_copied", [True, False], ids=["volume", "own folder"])
-async def test_the_shipped_default_answers_for_outdated_own_models(
+async def test_the_shipped_default_answers_instead(
     volume: Store, release: Store, is_copied: bool
 ) -> None:
     if is_copied:
@@ -83,9 +83,7 @@ async def test_the_shipped_default_answers_for_outdated_own_models(
         assert shipped["versions"][0]["aliases"] == ["default", "mine"]
 
 
-async def test_the_default_is_the_own_model_again_once_it_is_adapted_again(
-    volume: Store, release: Store
-) -> None:
+async def test_an_adapted_model_is_the_default_again(volume: Store, release: Store) -> None:
     async with serve(volume.root, store_poll=0) as client:
         assert await answering(client) == "new@4.0.0"
         again = description("home", "1.1.0", training=PARENT)
@@ -103,7 +101,7 @@ async def test_a_damaged_own_model_is_not_replaced(volume: Store, release: Store
 
 
 @pytest.mark.parametrize("store", ["volume", "release"])
-async def test_a_replaced_name_is_an_error_that_names_the_new_one(
+async def test_replaced_names_are_errors(
     store: str, request: pytest.FixtureRequest, release: Store
 ) -> None:
     async with serve(request.getfixturevalue(store).root) as client:

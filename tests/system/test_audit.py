@@ -32,7 +32,7 @@ def skipped(name: str) -> dict[str, Any]:
     return {"name": name, "skip_reason": f"Dependency not found on PyPI: {name} (1.0)"}
 
 
-def test_answers_are_sound_packages_or_flaws_with_their_cure() -> None:
+def test_flaws_have_a_fixed_version() -> None:
     outcome = judge(report(sound("a"), sound("b")), "", {"a", "b"})
     assert outcome == Outcome(Verdict.OK, ("no known vulnerability in 2 packages",))
     outcome = judge(report(sound("a"), flawed("b"), skipped("c")), "", {"a", "b", "c"})
@@ -71,7 +71,7 @@ def test_missing_answers_are_not_run(output: str, trouble: str, reason: str) -> 
         ({"pypi": skipped, "osv": sound}, Verdict.NOT_RUN, []),
     ],
 )
-def test_a_database_without_the_canary_is_not_used(
+def test_a_database_needs_the_canary(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
     answers: dict[str, Any],

@@ -78,16 +78,14 @@ def load(fleet: Fleet, proxy: Proxy) -> ConstantLoad:
     return ConstantLoad(proxy.port, REQUESTS, judge, connections=4)
 
 
-def test_promotions_under_load_lose_and_mix_nothing(fleet: Fleet, load: ConstantLoad) -> None:
+def test_promotions_lose_nothing(fleet: Fleet, load: ConstantLoad) -> None:
     with load:
         for number in range(PROMOTIONS):
             fleet.promote(f"1.{number % 2}.0")
     load.tally.check()
 
 
-def test_a_rolling_update_of_the_settings_loses_and_mixes_nothing(
-    fleet: Fleet, load: ConstantLoad, proxy: Proxy
-) -> None:
+def test_rolling_updates_lose_nothing(fleet: Fleet, load: ConstantLoad, proxy: Proxy) -> None:
     with load:
         for number, old in enumerate(fleet.replicas):
             old.process.terminate()

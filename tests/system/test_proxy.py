@@ -90,7 +90,7 @@ def test_questions_and_pages_are_answered(proxy: Proxy) -> None:
         assert other_host.json()["type"] == "/problems/host-refused"
 
 
-def test_connections_without_a_whole_head_are_closed(
+def test_incomplete_heads_are_closed(
     behind: StartProxy, service: LiveService, tmp_path: Path
 ) -> None:
     with behind(service, tmp_path / "log", PROXY_HEAD_TIMEOUT="1s") as proxy:
@@ -131,7 +131,7 @@ def test_trailers_reach_no_service(proxy: Proxy, service: LiveService) -> None:
 
 
 @pytest.mark.slow
-def test_silent_connections_do_not_keep_others_out(
+def test_silent_connections_block_no_client(
     behind: StartProxy, shared_store: Path, tmp_path: Path
 ) -> None:
     """300 silent connections from ten addresses; the service may open 256 files."""
@@ -167,7 +167,7 @@ def lines(service: LiveService) -> int:
 
 
 @pytest.mark.slow
-def test_a_request_that_crashes_a_replica_reaches_no_other(
+def test_crashing_requests_are_not_repeated(
     haproxy: StartProxy, configuration: Path, tmp_path: Path
 ) -> None:
     """Three replicas close the connection of each question, as if it had crashed them."""
@@ -197,7 +197,7 @@ def test_a_request_that_crashes_a_replica_reaches_no_other(
     assert questions == ["/outliers"]
 
 
-def test_a_body_that_trickles_in_is_ended_by_the_service(proxy: Proxy) -> None:
+def test_slow_bodies_are_ended_by_the_service(proxy: Proxy) -> None:
     """Every byte restarts the proxy's time-out; the service bounds the time of the whole body."""
     received = b""
     with socket.create_connection(("127.0.0.1", proxy.port)) as connection:
@@ -264,9 +264,7 @@ def test_metrics_are_hidden_by_the_proxy(proxy: Proxy, service: LiveService, pat
 
 
 @pytest.mark.slow
-def test_the_log_holds_no_key_no_path_and_the_id_of_the_request(
-    behind: StartProxy, shared_store: Path, tmp_path: Path
-) -> None:
+def test_the_log_has_no_secrets(behind: StartProxy, shared_store: Path, tmp_path: Path) -> None:
     with (
         launch(shared_store, tmp_path / "service", SCENE_API_KEY=API_KEY) as service,
         behind(service, tmp_path / "log") as proxy,
@@ -290,7 +288,7 @@ def test_the_log_holds_no_key_no_path_and_the_id_of_the_request(
 
 
 @pytest.mark.slow
-def test_the_proxy_answers_503_without_a_ready_service(
+def test_without_a_service_the_status_is_503(
     behind: StartProxy, shared_store: Path, tmp_path: Path
 ) -> None:
     with (
@@ -306,7 +304,7 @@ def test_the_proxy_answers_503_without_a_ready_service(
         assert int(answer.headers["retry-after"]) > 0
 
 
-def test_the_proxy_leaves_the_service_room_for_health_checks(configuration: Path) -> None:
+def test_the_proxy_leaves_room_for_health_checks(configuration: Path) -> None:
     text = configuration.read_text("utf-8")
     (most,) = [int(line.split(" maxconn ")[1].split()[0])
                for line in text.splitlines() if "default-server" in line]  # fmt: skip
