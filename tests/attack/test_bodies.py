@@ -34,7 +34,7 @@ JSON = {"Content-Type": "application/json"}
 async def test_entries_are_counted_before_validation(
     client: AsyncClient, path: str, field: str, entry: Any, most: int
 ) -> None:
-    """All other faults of the body stay unreported, so pydantic has not seen it."""
+    # pydantic would report the unknown field.
     body = {"objects": ["bed"], "unknown": 1, field: [entry] * (most + 1)}
     document = problem(await client.post(f"/{path}", json=body), 422, "invalid-request")
     assert [(error["pointer"], error["message"]) for error in document["errors"]] == [
@@ -63,7 +63,6 @@ def batch(entry: bytes, size: int = 2**21) -> bytes:
 async def test_containers_are_counted_before_parsing(
     client: AsyncClient, parsed: list[int], entry: bytes
 ) -> None:
-    """They stopped the service for a second."""
     dense = b'{"scenes":[{"objects":["bed"],"candidates":[%b]}]}' % b",".join([entry] * 2**17)
     for body in (batch(entry), dense[: 2**21]):
         response = await client.post("/missing/batch", content=body, headers=JSON)
@@ -133,7 +132,6 @@ AT = {"x": 1, "y": 0, "z": 0}
 async def test_a_request_has_at_most_32_errors(
     client: AsyncClient, body: dict[str, Any], first: str, last: str
 ) -> None:
-    """6,600 unknown fields made health wait 557 ms, 4,096 unknown names 126 ms."""
     document = problem(await client.post("/missing", json=body), 422, "invalid-request")
     pointers = [error["pointer"] for error in document["errors"]]
     assert (len(pointers), pointers[0], pointers[-1]) == (32, f"#/{first}", f"#/{last}")
@@ -172,7 +170,7 @@ async def test_large_scenes_leave_the_event_loop(
 
 
 async def test_one_body_may_exceed_the_share(shared_store: Path) -> None:
-    """A quarter of this budget is less than the batch."""
+    # A quarter of this budget is less than the batch.
     batch = b'{"scenes":[{"objects":["bed"]}]}'.ljust(2**19)
     async with serve(shared_store, held_body_bytes=2**20) as client:
         answer = await client.post("/missing/batch", content=batch, headers=JSON)

@@ -192,7 +192,6 @@ def test_new_labels_leave_the_event_loop(treatment: Any) -> None:
 
 
 def test_words_leave_the_event_loop() -> None:
-    """Each time, because the model needs their weights."""
     vocabulary, options = fresh(), {"unknown_labels": "by-meaning"}
     scene = MissingRequest(objects=["bed", "ottoman"], **options)
     candidates = MissingRequest(objects=["bed"], candidates=["ottoman"], **options)
@@ -228,7 +227,6 @@ async def test_a_list_of_unknown_candidates_stops_early(client: AsyncClient) -> 
 
 
 async def test_a_long_word_in_a_path_is_refused(client: AsyncClient) -> None:
-    """A word of 8 kB kept a pattern busy for 26 seconds."""
     document = problem(
         await client.get(f"/models/default/vocabulary/the{'_' * 8000}"), 422, "invalid-request"
     )

@@ -77,7 +77,7 @@ def test_the_service_reads_another_format_once(
     board.click("Put on the board")
     assert asked.count("scenes") == 1
     assert set(asked) == {"scenes", *ASKED}
-    expected = EXAMPLES[name].expected["objects"]
+    expected = EXAMPLES[name].request["objects"]
     names = [one if isinstance(one, str) else one["id"] for one in expected]
     assert [thing["id"] for thing in board.exported()["objects"]] == names
 
