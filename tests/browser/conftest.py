@@ -35,25 +35,8 @@ DESK = {
 EXAMPLES = json.loads((REPOSITORY / "training/runs/examples/indoor.json").read_text("utf-8"))
 """Example scenes of the shipped vocabulary."""
 
-# Whatever a policy forbids is told to the page that tried it. `quiet` waits until no short timer is
-# pending: the page asks the service some time after the last change.
-_WITNESS = """
-window.violations = [];
-addEventListener('securitypolicyviolation', (event) =>
-  window.violations.push(`${event.violatedDirective} ${event.blockedURI}`));
-const pending = new Set();
-const { setTimeout: start, clearTimeout: stop } = window;
-window.setTimeout = (run, after = 0, ...rest) => {
-  const timer = start(() => { pending.delete(timer); run(...rest); }, after);
-  if (after < 200) pending.add(timer);
-  return timer;
-};
-window.clearTimeout = (timer) => { pending.delete(timer); stop(timer); };
-window.quiet = () => new Promise((done) => {
-  const look = () => (pending.size ? start(look, 10) : done());
-  look();
-});
-"""
+WITNESS = Path(__file__).parent / "witness.js"
+"""A script in each page: `violations` of the policy, and `quiet`, which waits for short timers."""
 
 
 @pytest.fixture(scope="package")
@@ -90,7 +73,7 @@ def open_board(chromium: Browser, shipped: LiveService) -> Iterator[Callable[...
     ) -> Board:
         context = chromium.new_context(viewport={"width": 1300, "height": 900}, **options)
         context.set_default_timeout(1000 * PATIENCE)
-        context.add_init_script(_WITNESS)
+        context.add_init_script(path=WITNESS)
         root = home or str(shipped.client.base_url)
         wrong: list[str] = []
 
