@@ -17,18 +17,8 @@ expect.set_options(timeout=1000 * PATIENCE)
 
 DESK = {
     "objects": [
-        {
-            "id": "desk",
-            "label": "desk",
-            "position": {"x": 2, "y": 0, "z": 0.37},
-            "size": {"x": 0.8, "y": 1.6, "z": 0.74},
-        },
-        {
-            "id": "chair",
-            "label": "chair",
-            "position": {"x": 1, "y": 0, "z": 0.45},
-            "size": {"x": 0.5, "y": 0.5, "z": 0.9},
-        },
+        {"id": "desk", "label": "desk", "position": [2, 0, 0.37], "size": [0.8, 1.6, 0.74]},
+        {"id": "chair", "label": "chair", "position": [1, 0, 0.45], "size": [0.5, 0.5, 0.9]},
     ]
 }
 

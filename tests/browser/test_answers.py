@@ -332,18 +332,24 @@ def test_a_drawn_scene_shows_the_words_of_the_board(open_board: OpenBoard) -> No
     assert len(board.things) == len(chips)
 
 
+def suggest(board: Board, relation: str, anchor: str, *labels: str) -> dict[str, Any]:
+    """Let the page receive these missing objects at one place, which the caller may change."""
+    place: dict[str, Any] = {"relation": relation, "object": anchor, "probability": 0.9}
+
+    def suggested(answer: Any) -> Any:
+        first = answer["missing"][0]
+        missing = [first | {"label": label, "placements": [place]} for label in labels]
+        return answer | {"more": [], "missing": missing}
+
+    board.alter("missing", suggested)
+    return place
+
+
 def test_a_suggestion_at_another_place_or_none_says_so(open_board: OpenBoard) -> None:
     far = {"mean": {"x": 9.0, "y": 0.0, "z": 0.5}, "std": dict.fromkeys("xyz", 0.2), "scenes": 9}
-    place = {"relation": "on-top", "object": "desk", "probability": 0.9, "offset": far}
     board = open_board()
-    board.alter(
-        "missing",
-        lambda answer: (
-            answer
-            | {"more": []}
-            | {"missing": [answer["missing"][0] | {"label": "cup", "placements": [place]}]}
-        ),
-    )
+    place = suggest(board, "on-top", "desk", "cup")
+    place["offset"] = far
     board.add("laptop")
     assert "drawn at the nearest free place" in board.rows("missing")[0]
     ghost = board.page.locator("#board .ghost").first
@@ -363,20 +369,7 @@ def test_a_suggestion_at_another_place_or_none_says_so(open_board: OpenBoard) ->
 
 def test_other_suggestions_lie_on_a_sheet(open_board: OpenBoard) -> None:
     board = open_board({"objects": ["bed", "nightstand"]})
-    place = {"relation": "on-top", "object": "bed", "probability": 0.9}
-    board.alter(
-        "missing",
-        lambda answer: (
-            answer
-            | {
-                "more": [],
-                "missing": [
-                    answer["missing"][0] | {"label": label, "placements": [place]}
-                    for label in ("sheet", "pillow")
-                ],
-            }
-        ),
-    )
+    suggest(board, "on-top", "bed", "sheet", "pillow")
     board.add("wardrobe")
     assert board.ghosts == ["sheet", "pillow"]
 
@@ -384,11 +377,7 @@ def test_other_suggestions_lie_on_a_sheet(open_board: OpenBoard) -> None:
 def test_no_suggestion_stands_at_an_outlier(open_board: OpenBoard) -> None:
     board = open_board({"objects": ["bed", "nightstand", "lamp", "toilet"]})
     (toilet,) = [thing["id"] for thing in board.scene["objects"] if thing["label"] == "toilet"]
-    place = {"relation": "above", "object": toilet, "probability": 0.9}
-    board.alter(
-        "missing",
-        lambda answer: answer | {"missing": [answer["missing"][0] | {"placements": [place]}]},
-    )
+    suggest(board, "above", toilet, "plunger")
     board.add("wardrobe")
     assert board.ghosts == []
     assert not any(re.search(rf"{toilet} \d+ %", row) for row in board.rows("missing"))

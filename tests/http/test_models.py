@@ -141,19 +141,6 @@ async def test_the_store_is_polled(store: Path) -> None:
                 await asyncio.sleep(0.05)
 
 
-async def test_a_request_for_a_check_loads_the_store_at_once(
-    own: AsyncClient, store: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Also a store without changes, and without a poll."""
-    caplog.set_level("INFO", "app.serving")
-    runtime = own.app.state.runtime  # type: ignore[attr-defined]
-    for loads in (1, 2):
-        runtime.request_check()
-        async with asyncio.timeout(60):
-            while caplog.text.count("has loaded the store") < loads:  # noqa: ASYNC110
-                await asyncio.sleep(0)
-
-
 async def test_an_error_keeps_the_served_models(
     own: AsyncClient,
     store: Path,

@@ -25,14 +25,6 @@ def no_environment(monkeypatch: pytest.MonkeyPatch) -> None:
             monkeypatch.delenv(name)
 
 
-def test_the_defaults_are_safe(tmp_path: Path) -> None:
-    settings = Settings(store=tmp_path)
-    assert settings.host == "127.0.0.1"
-    assert settings.api_key is None
-    assert settings.cors_origins == ()
-    assert settings.max_objects == 256
-
-
 def test_settings_come_from_the_environment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -83,15 +83,6 @@ async def test_the_shipped_default_answers_instead(
         assert shipped["versions"][0]["aliases"] == ["default", "mine"]
 
 
-async def test_an_adapted_model_is_the_default_again(volume: Store, release: Store) -> None:
-    async with serve(volume.root, store_poll=0) as client:
-        assert await answering(client) == "new@4.0.0"
-        again = description("home", "1.1.0", training=PARENT)
-        publish_as(volume, "default", again, state(seed=5))
-        await client.app.state.runtime.check_store()  # type: ignore[attr-defined]
-        assert await answering(client) == "home@1.1.0"
-
-
 async def test_a_damaged_own_model_is_not_replaced(volume: Store, release: Store) -> None:
     volume.publish(description("home", "1.1.0"), state(seed=5))
     volume.set_alias("default", AliasTarget.of("home@1.1.0"))
@@ -119,10 +110,3 @@ async def test_replaced_names_are_errors(
             path = f"/models/{name}/vocabulary"
             assert "errors" not in problem(await client.get(path), 404, "model-replaced")
         problem(await client.get("/models/older/vocabulary"), 404, "model-not-found")
-
-
-async def test_an_old_model_in_a_readable_format_answers(volume: Store, release: Store) -> None:
-    volume.publish(description("old", "3.6.0"), state(seed=6))
-    copy(release, volume)
-    async with serve(volume.root) as client:
-        assert await answering(client, model="old") == "old@3.6.0"
