@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Browser, Page, Route, expect, sync_playwright
 
 from tests.browser.driving import Board, link_to
-from tests.conftest import REPOSITORY
+from tests.conftest import REPOSITORY, FindTool
 from tests.services import PATIENCE, LiveService
 
 expect.set_options(timeout=1000 * PATIENCE)
@@ -30,9 +30,9 @@ WITNESS = Path(__file__).parent / "witness.js"
 
 
 @pytest.fixture(scope="package")
-def chromium(require_system_tool: Callable[[str], Path]) -> Iterator[Browser]:
+def chromium(find_tool: FindTool) -> Iterator[Browser]:
     """One browser for all tests of this folder; its event loop must not outlive them."""
-    program = require_system_tool("chromium")
+    program = find_tool("chromium")
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(
             executable_path=str(program), args=["--headless", "--no-sandbox"]

@@ -3,8 +3,6 @@
 import json
 import re
 import sys
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -12,7 +10,7 @@ import pytest
 from playwright.sync_api import expect
 
 from tests.browser.driving import Board, OpenBoard, body_of, percent
-from tests.conftest import run_program
+from tests.conftest import FindTool, run_program
 
 pytestmark = pytest.mark.system
 
@@ -263,9 +261,9 @@ def test_aliases_of_room_types(open_board: OpenBoard, api: httpx.Client) -> None
 
 
 def test_the_shown_calls_give_the_shown_answer(
-    open_board: OpenBoard, api: httpx.Client, require_system_tool: Callable[[str], Path]
+    open_board: OpenBoard, api: httpx.Client, find_tool: FindTool
 ) -> None:
-    require_system_tool("curl")
+    find_tool("curl")
     board = open_board(permissions=["clipboard-read", "clipboard-write"])
     programs = ("sh", board.curl("missing")), (sys.executable, board.python("missing"))
     curl, python = (json.loads(run_program(name, "-c", text).stdout) for name, text in programs)

@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,7 @@ import app
 from app.registry.manifest import FORMAT
 from scripts import sync_client
 from tests.client import callers
-from tests.conftest import REPOSITORY, run_program
+from tests.conftest import REPOSITORY, FindTool, run_program
 from tests.services import LiveService
 
 
@@ -132,13 +131,11 @@ GUIDE = (REPOSITORY / "docs" / "clients.md").read_text(encoding="utf-8")
 
 @pytest.mark.slow
 @pytest.mark.system
-def test_the_cpp_block_compiles_and_runs(
-    url: str, tmp_path: Path, require_system_tool: Callable[[str], Path]
-) -> None:
+def test_the_cpp_block_compiles_and_runs(url: str, tmp_path: Path, find_tool: FindTool) -> None:
     (program,) = re.findall(r"^```cpp\n(.*?)^```$", GUIDE, flags=re.MULTILINE | re.DOTALL)
     source = tmp_path / "block.cpp"
     source.write_text(program)
-    block = callers.compiled(require_system_tool, source, tmp_path / "block")
+    block = callers.compiled(find_tool, source, tmp_path / "block")
     assert run_program(block, url).stdout.strip().strip('"')
     done = run_program(block, "robot:8000", status=2)
     assert (done.stdout, bool(done.stderr)) == ("", True)
@@ -147,11 +144,11 @@ def test_the_cpp_block_compiles_and_runs(
 @pytest.mark.slow
 @pytest.mark.system
 def test_the_cpp_example_asks_all_questions(
-    url: str, tmp_path: Path, bridge: Path, require_system_tool: Callable[[str], Path]
+    url: str, tmp_path: Path, bridge: Path, find_tool: FindTool
 ) -> None:
     # Asking for `bridge` leaves this test out where the libraries are missing.
     folder = shutil.copytree(REPOSITORY / "clients" / "cpp", tmp_path / "cpp")
-    make = require_system_tool("make")
+    make = find_tool("make")
     run_program(make, "-C", folder, "CXXFLAGS=-O0")
     example = folder / "example"
     answered = run_program(example, url, "30").stdout

@@ -155,21 +155,15 @@ def test_names_are_quoted_in_addresses() -> None:
 
 
 KEYS = ["secret-key\n", "secret-\rkey", "sécret-key", "secret key", "secret\x7f", "secret\udcff"]
-each_key = pytest.mark.parametrize("key", KEYS)
 MESSAGE = "a key must have only ASCII characters, without spaces or line breaks"
 
 
-@each_key
-@pytest.mark.parametrize("kind", [Client, AsyncClient])
-def test_an_invalid_key_is_refused(kind: type[Client], key: str) -> None:
-    with pytest.raises(InvalidRequestError, match="ASCII") as raised:
-        kind("http://robot", api_key=key)
-    assert str(raised.value) == MESSAGE
-
-
-@each_key
-def test_the_command_refuses_an_invalid_key(monkeypatch: pytest.MonkeyPatch, key: str) -> None:
+@pytest.mark.parametrize("key", KEYS)
+def test_invalid_keys_are_refused(monkeypatch: pytest.MonkeyPatch, key: str) -> None:
+    for kind in (Client, AsyncClient):
+        with pytest.raises(InvalidRequestError) as raised:
+            kind("http://robot", api_key=key)
+        assert str(raised.value) == MESSAGE
     monkeypatch.setenv("SCENE_API_KEY", key)
     result = CliRunner().invoke(app, ["missing", "bed"])
-    assert (result.exit_code, result.stdout) == (2, "")
-    assert result.stderr == MESSAGE + "\n"
+    assert (result.exit_code, result.stdout, result.stderr) == (2, "", MESSAGE + "\n")

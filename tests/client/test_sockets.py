@@ -22,6 +22,7 @@ from scene_client import (
 )
 from tests.client.conftest import OVER_HTTP
 from tests.client.peers import answer, answering, read_head, say_nothing
+from tests.conftest import FindTool
 
 
 def serve(connection: socket.socket, heads: list[bytes] | None = None) -> None:
@@ -134,11 +135,11 @@ def test_tls(
     open_caller: Any,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    require_system_tool: Callable[[str], Path],
+    find_tool: FindTool,
 ) -> None:
     key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
     command = [
-        *(require_system_tool("openssl"), "req", "-x509", "-newkey", "ec"),
+        *(find_tool("openssl"), "req", "-x509", "-newkey", "ec"),
         *("-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2"),
         *("-subj", "/CN=robot", "-addext", "subjectAltName=IP:127.0.0.1"),
         *("-keyout", key, "-out", certificate),

@@ -2,7 +2,6 @@
 
 import json
 import socket
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import pytest
 from scene_client import Client
 from scene_client.vision_msgs import SceneFields
 from tests.client import callers
-from tests.conftest import run_program
+from tests.conftest import FindTool, run_program
 from tests.services import LiveService
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
@@ -21,12 +20,12 @@ pytestmark = [pytest.mark.system, pytest.mark.slow]
 def program(
     repository: Path,
     tmp_path_factory: pytest.TempPathFactory,
-    require_system_tool: Callable[[str], Path],
+    find_tool: FindTool,
 ) -> Path:
     """Ticks one condition as a tree does."""
     here = Path(__file__).parent
     return callers.compiled(
-        require_system_tool,
+        find_tool,
         here / "conditions.cpp",
         tmp_path_factory.mktemp("conditions") / "conditions",
         repository / "clients" / "ros2" / "behaviortree_cpp",

@@ -3,7 +3,7 @@
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from http.server import SimpleHTTPRequestHandler
 from pathlib import Path
@@ -12,7 +12,7 @@ import pytest
 from playwright.sync_api import sync_playwright
 
 from scripts.site import DIRECTIVE, checks
-from tests.conftest import REPOSITORY, run_program
+from tests.conftest import REPOSITORY, FindTool, run_program
 from tests.services import http_server
 
 pytestmark = pytest.mark.slow
@@ -84,10 +84,8 @@ def served(site: Path) -> Iterator[str]:
 
 
 @pytest.mark.system
-def test_the_browser_shows_the_site(
-    served: str, require_system_tool: Callable[[str], Path]
-) -> None:
-    chromium = require_system_tool("chromium")
+def test_the_browser_shows_the_site(served: str, find_tool: FindTool) -> None:
+    chromium = find_tool("chromium")
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(
             executable_path=str(chromium), args=["--no-sandbox", "--disable-dev-shm-usage"]

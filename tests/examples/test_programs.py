@@ -4,14 +4,13 @@ import json
 import os
 import runpy
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.conftest import REPOSITORY, run_program
+from tests.conftest import REPOSITORY, FindTool, run_program
 from tests.deploy.ros import Ros, from_json
 from tests.services import LiveService, wait_until
 
@@ -45,11 +44,9 @@ def test_the_readme_lists_every_program() -> None:
             )
 
 
-def test_curl_asks_the_five_questions(
-    shipped: LiveService, require_system_tool: Callable[[str], Path]
-) -> None:
-    require_system_tool("curl")
-    done = run(require_system_tool("bash"), "curl.sh", url=shipped.url)
+def test_curl_asks_the_five_questions(shipped: LiveService, find_tool: FindTool) -> None:
+    find_tool("curl")
+    done = run(find_tool("bash"), "curl.sh", url=shipped.url)
     lines = done.stdout.splitlines()
     answers = dict(zip(lines[::2], map(json.loads, lines[1::2]), strict=True))
     assert list(answers) == ["relations", "missing", "outliers", "rooms", "generate"]

@@ -82,19 +82,10 @@ def starting(shared_store: Path, log: Path) -> Iterator[Start]:
         process.wait(timeout=PATIENCE)
 
 
-@pytest.fixture
-def taken() -> Iterator[socket.socket]:
-    """A socket that is bound, and does not listen."""
-    with socket.socket() as place:
-        place.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        place.bind(("127.0.0.1", 0))
-        yield place
-
-
-def test_a_used_port_ends_the_start(starting: Start, log: Path, taken: socket.socket) -> None:
-    taken.listen()
-    port = taken.getsockname()[1]
-    assert starting(PORT=port).wait(timeout=PATIENCE) == 3
+def test_a_used_port_ends_the_start(starting: Start, log: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert starting(PORT=port).wait(timeout=PATIENCE) == 3
     assert log.read_text() == IN_USE.format(port)
 
 

@@ -60,18 +60,6 @@ def proxy(
         yield proxy
 
 
-def send(proxy: Proxy, *parts: bytes) -> tuple[list[Any], bool]:
-    return exchange(proxy.port, Wire("", parts, None))
-
-
-def refused(proxy: Proxy, request: bytes, status: int) -> Any:
-    """The answer to a request that the proxy refuses."""
-    answers, is_closed = send(proxy, request)
-    assert [answer.status for answer in answers] == [status]
-    assert is_closed
-    return answers[0]
-
-
 def test_questions_and_pages_are_answered(proxy: Proxy) -> None:
     with Client(proxy.address, timeout=60) as scene:
         assert scene.missing(SCENE["objects"]).missing
@@ -95,7 +83,7 @@ def test_incomplete_heads_are_closed(
 ) -> None:
     with behind(service, tmp_path / "log", PROXY_HEAD_TIMEOUT="1s") as proxy:
         for part, statuses in ((b"", ([], [408])), (LIVE[:-2], ([408],))):
-            answers, is_closed = send(proxy, part)
+            answers, is_closed = exchange(proxy.port, Wire("", [part], None))
             assert is_closed
             assert [answer.status for answer in answers] in statuses
 
@@ -118,18 +106,6 @@ def test_requests_below_http_are_refused(proxy: Proxy, service: LiveService) -> 
     assert '"smuggled"' not in service.log.read_text()
 
 
-def test_trailers_reach_no_service(proxy: Proxy, service: LiveService) -> None:
-    """The service would read them as headers: a key, a host, a media type."""
-    before = lines(service)
-    trailers = b"X-API-Key: 0123456789abcdef\r\nHost: evil.example\r\n"
-    request = HEAD + b"Transfer-Encoding: chunked\r\n\r\n2\r\n{}\r\n0\r\n" + trailers + b"\r\n"
-    (answer,), _ = exchange(proxy.port, Wire("", [request], (411,)))
-    assert answer.status == 411
-    assert answer.headers["content-type"] == "application/problem+json"
-    added = service.log.read_text().splitlines()[before:]
-    assert all("/health/" in line for line in added)
-
-
 @pytest.mark.slow
 def test_silent_connections_block_no_client(
     behind: StartProxy, shared_store: Path, tmp_path: Path
@@ -143,14 +119,9 @@ def test_silent_connections_block_no_client(
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     variables = {"PROXY_HEAD_TIMEOUT": "2s", "PROXY_REQUESTS": "1000000"}
     with service, behind(service, tmp_path / "log", **variables) as proxy, ExitStack() as held:
-        silent = [
-            held.enter_context(
-                socket.create_connection(
-                    ("127.0.0.1", proxy.port), 30, source_address=(f"127.0.0.{10 + k % 10}", 0)
-                )
-            )
-            for k in range(300)
-        ]
+        address, clients = ("127.0.0.1", proxy.port), [(f"127.0.0.{10 + k}", 0) for k in range(10)]
+        opened = (socket.create_connection(address, 30, client) for client in clients * 30)
+        silent = [held.enter_context(connection) for connection in opened]
         for _ in range(20):
             assert httpx.get(f"{proxy.address}/health/live").status_code == 200
             assert service.client.get("/health/live").status_code == 200
@@ -159,11 +130,6 @@ def test_silent_connections_block_no_client(
         for connection in silent:
             while part := connection.recv(4096):
                 assert b"408" in part or b"request-timeout" in part
-
-
-def lines(service: LiveService) -> int:
-    """Lines of its log."""
-    return len(service.log.read_text().splitlines())
 
 
 @pytest.mark.slow
@@ -252,13 +218,30 @@ def test_requests_per_address_are_limited(
     assert int(refusal.headers["retry-after"]) > 0
 
 
-@pytest.mark.parametrize("path", ["/metrics", "/metric%73", "/metrics/", "//metrics"])
-def test_metrics_are_hidden_by_the_proxy(proxy: Proxy, service: LiveService, path: str) -> None:
-    before = lines(service)
-    request = f"GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
-    answer = refused(proxy, request.encode(), 404)
+METRICS = b"GET %b HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
+# The service would read trailers as headers: a key, a host, a media type.
+CHUNKED = HEAD + b"Transfer-Encoding: chunked\r\n\r\n2\r\n{}\r\n0\r\n"
+TRAILERS = CHUNKED + b"X-API-Key: 0123456789abcdef\r\nHost: evil.example\r\n\r\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "status"),
+    [
+        *(
+            (METRICS % path, 404)
+            for path in (b"/metrics", b"/metric%73", b"/metrics/", b"//metrics")
+        ),
+        (TRAILERS, 411),
+    ],
+)
+def test_metrics_and_trailers_reach_no_service(
+    proxy: Proxy, service: LiveService, text: bytes, status: int
+) -> None:
+    before = len(service.log.read_text().splitlines())
+    (answer,), is_closed = exchange(proxy.port, Wire("", [text], (status,), closes=status == 404))
+    assert (answer.status, is_closed) == (status, status == 404)
     assert answer.headers["content-type"] == "application/problem+json"
-    assert json.loads(answer.body)["type"] == "/problems/not-found"
+    assert status == 411 or json.loads(answer.body)["type"] == "/problems/not-found"
     added = service.log.read_text().splitlines()[before:]
     assert all("/health/" in line for line in added)
 
@@ -270,11 +253,7 @@ def test_the_log_has_no_secrets(behind: StartProxy, shared_store: Path, tmp_path
         behind(service, tmp_path / "log") as proxy,
         httpx.Client(base_url=proxy.address, timeout=PATIENCE) as client,
     ):
-        keys = {
-            "X-API-Key": API_KEY,
-            "Authorization": f"Bearer {API_KEY}",
-        }
-        for headers in ({name: key} for name, key in keys.items()):
+        for headers in ({"X-API-Key": API_KEY}, {"Authorization": f"Bearer {API_KEY}"}):
             known = headers | {"X-Request-Id": "find-me"}
             # The service refuses a query, so a key in a query is of no use.
             answer = client.post(f"/missing?key={API_KEY}", json=SCENE, headers=known)
