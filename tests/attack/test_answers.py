@@ -152,9 +152,7 @@ async def test_a_batch_has_few_suggestions(client: AsyncClient) -> None:
 
 
 @pytest.mark.parametrize("treatment", ["error", "nearest", "nearest-or-ignore", "by-meaning"])
-async def test_a_batch_searches_few_labels(
-    client: AsyncClient, calls: Counter[str], treatment: str
-) -> None:
+async def test_batch_searches(client: AsyncClient, calls: Counter[str], treatment: str) -> None:
     rng = Random(0)
     labels = ("".join(rng.choices(string.ascii_lowercase, k=12)) for _ in range(64 * 20))
     scenes = [
@@ -179,9 +177,7 @@ async def test_unknown_ends_cost_little(client: AsyncClient, calls: Counter[str]
     assert calls["spelt_alike"] <= MAX_SUGGESTED
 
 
-async def test_a_scene_of_unknown_labels_stops_early(
-    client: AsyncClient, calls: Counter[str]
-) -> None:
+async def test_unknown_labels_stop_early(client: AsyncClient, calls: Counter[str]) -> None:
     objects = [f"a/{'b/' * 40}{number}" for number in range(256)]
     answer = await client.post("/missing", json={"objects": objects})
     assert len(answer.json()["errors"]) == MAX_ERRORS

@@ -88,9 +88,7 @@ SPOILED = [
 
 
 @pytest.mark.parametrize(("spoil", "code"), SPOILED)
-def test_a_hostile_version_is_refused(
-    published: Path, spoil: Callable[[Path], None], code: str
-) -> None:
+def test_hostile_versions(published: Path, spoil: Callable[[Path], None], code: str) -> None:
     spoil(published)
     with at_most(32):
         models = load_model_set(Store(published))
@@ -136,9 +134,7 @@ def test_the_operator_limits_the_weights(published: Path) -> None:
     assert {failure.code for failure in models.failures.values()} == {"too_large"}
 
 
-def test_a_load_is_linear_in_invalid_versions(
-    published: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_loads_are_linear_in_versions(published: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = Counter[str]()
 
     def counted(name: str) -> None:

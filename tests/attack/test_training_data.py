@@ -52,9 +52,7 @@ def refused(path: Path) -> tuple[str, int]:
 
 
 @pytest.mark.parametrize("name", ["scenes.jsonl.gz", "instances.json"])
-def test_a_text_file_has_a_limit(
-    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_text_files_are_limited(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Short lines too: 1 GB of blank lines fits into a megabyte."""
     monkeypatch.setattr(files, "MAX_BYTES", 2**20)
     path = tmp_path / name

@@ -113,9 +113,7 @@ def test_the_menu_of_an_object(bedroom: Board, api: httpx.Client) -> None:
     assert all("no likely place" in row for row in bedroom.rows("missing"))
 
 
-def test_a_model_of_labels_alone(
-    open_board: OpenBoard,
-) -> None:
+def test_a_model_of_labels_alone(open_board: OpenBoard) -> None:
     objects = ["bed", "lamp", "desk"]
     board = open_board(scene=None, examples=[{"name": "A room", "scene": {"objects": objects}}])
     board.settle()
@@ -292,9 +290,7 @@ def request(board: Board) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_a_drawn_scene_is_the_service_s_and_can_be_kept(
-    open_board: OpenBoard, api: httpx.Client
-) -> None:
+def test_a_drawn_scene_can_be_kept(open_board: OpenBoard, api: httpx.Client) -> None:
     board = open_board()
     board.page.locator("#room").select_option("kitchen")
     board.tab("Generate")

@@ -65,9 +65,7 @@ def test_requests_stay_in_the_browser(
 @pytest.mark.parametrize(
     "name", ["detections.csv", "labels.txt", "detection3d.json", "moveit.json"]
 )
-def test_the_service_reads_another_format_once(
-    open_board: OpenBoard, tmp_path: Path, name: str
-) -> None:
+def test_the_service_reads_other_formats(open_board: OpenBoard, tmp_path: Path, name: str) -> None:
     board = open_board()
     asked = posted(board)
     (tmp_path / name).write_text(EXAMPLES[name].text, "utf-8")
@@ -82,9 +80,7 @@ def test_the_service_reads_another_format_once(
     assert [thing["id"] for thing in board.exported()["objects"]] == names
 
 
-def test_scenes_and_class_ids_of_a_file(
-    open_board: OpenBoard,
-) -> None:
+def test_scenes_and_class_ids_of_a_file(open_board: OpenBoard) -> None:
     board = open_board()
     page = board.page
     asked = posted(board)

@@ -174,9 +174,7 @@ def test_scenes_of_the_page_stay_in_the_browser(open_board: OpenBoard, tmp_path:
     assert board.page.evaluate("Object.keys(localStorage)") == []
 
 
-def test_each_alarm_needs_a_confirmation(
-    open_board: OpenBoard, recorded: Path, tmp_path: Path
-) -> None:
+def test_alarms_need_a_confirmation(open_board: OpenBoard, recorded: Path, tmp_path: Path) -> None:
     board = open_board()
     misplace(board, "track_0", "left", "track_1")
     choose(board, recorded, 2)
@@ -216,9 +214,7 @@ def test_the_list_of_scenes_marks_alarms(open_board: OpenBoard, recorded: Path) 
     assert any("confirmed" in row for row in board.rows("outliers") if "toilet" in row)
 
 
-def test_additions_to_a_confirmed_scene(
-    open_board: OpenBoard, recorded: Path, tmp_path: Path
-) -> None:
+def test_additions_are_confirmed(open_board: OpenBoard, recorded: Path, tmp_path: Path) -> None:
     board = open_board()
     choose(board, recorded, 1)
     board.add("oven")
@@ -238,9 +234,7 @@ def test_additions_to_a_confirmed_scene(
     assert sum("confirmed" in row for row in board.rows("outliers")) == 4
 
 
-def test_a_download_has_the_scenes_of_one_file(
-    open_board: OpenBoard, recorded: Path, tmp_path: Path
-) -> None:
+def test_a_download_has_one_file(open_board: OpenBoard, recorded: Path, tmp_path: Path) -> None:
     first, second = tmp_path / "flat.jsonl", tmp_path / "office.jsonl"
     first.write_text(recorded.read_text("utf-8"), "utf-8")
     scenes = [{"scene_id": name, "objects": ["desk", "lamp"]} for name in "ab"]

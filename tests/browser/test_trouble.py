@@ -133,9 +133,7 @@ def promote(service: LiveService, model: str) -> None:
 
 # The first test of the service, which moves the alias.
 @pytest.mark.parametrize("has_default", [False, True])
-def test_own_models_open_without_errors(
-    open_board: OpenBoard, own: LiveService, has_default: bool
-) -> None:
+def test_own_models_are_shown(open_board: OpenBoard, own: LiveService, has_default: bool) -> None:
     if has_default:
         promote(own, "basic")
     words = own.client.get("/models/basic/vocabulary").json()["objects"]

@@ -75,9 +75,7 @@ def test_missing_objects_are_a_table(scene: Any, url: str, tmp_path: Path) -> No
         ),
     ],
 )
-def test_json_is_the_answer_of_the_service(
-    scene: Any, url: str, line: str, fields: dict[str, Any]
-) -> None:
+def test_json_is_the_whole_answer(scene: Any, url: str, line: str, fields: dict[str, Any]) -> None:
     question, *arguments = shlex.split(line)
     done = scene(question, *arguments, "--json")
     assert done.exit_code == 0, done.stderr
@@ -182,9 +180,7 @@ def test_exit_status_and_reason_of_a_failure(
     ("status", "body", "code"),
     [(b"503 No", b"{}", 5), (b"429 No", b"{}", 5), (b"500 No", b"{}", 6), (b"200 OK", b"{}", 6)],
 )
-def test_exit_status_of_error_answers(
-    scene: Any, peer: Any, status: bytes, body: bytes, code: int
-) -> None:
+def test_status_of_errors(scene: Any, peer: Any, status: bytes, body: bytes, code: int) -> None:
     done = scene("models", "--url", peer(answering(body, status, b"60")).url)
     assert (done.exit_code, done.stdout) == (code, "")
 

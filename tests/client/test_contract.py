@@ -59,9 +59,7 @@ def test_each_scene_of_a_batch_has_its_answer_or_problem(caller: Caller, live: L
 
 
 @every_client
-def test_unknown_labels_are_a_problem(
-    caller: Caller,
-) -> None:
+def test_unknown_labels_are_a_problem(caller: Caller) -> None:
     with pytest.raises(ProblemError) as raised:
         caller("missing", {"objects": ["nightstnad", *(f"nonsuch {n}" for n in range(11))]})
     problem, text = raised.value, str(raised.value)

@@ -143,9 +143,7 @@ def test_the_cpp_block_compiles_and_runs(url: str, tmp_path: Path, find_tool: Fi
 
 @pytest.mark.slow
 @pytest.mark.system
-def test_the_cpp_example_asks_all_questions(
-    url: str, tmp_path: Path, bridge: Path, find_tool: FindTool
-) -> None:
+def test_the_cpp_example(url: str, tmp_path: Path, bridge: Path, find_tool: FindTool) -> None:
     # Asking for `bridge` leaves this test out where the libraries are missing.
     folder = shutil.copytree(REPOSITORY / "clients" / "cpp", tmp_path / "cpp")
     make = find_tool("make")

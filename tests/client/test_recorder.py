@@ -71,9 +71,7 @@ def labels(file: Path) -> list[list[str]]:
 
 
 @pytest.mark.parametrize("kind", ["sync", "async", "offline"])
-def test_all_questions_about_a_scene_are_one_line(
-    url: str, shared_store: Path, file: Path, kind: str
-) -> None:
+def test_a_scene_is_recorded_once(url: str, shared_store: Path, file: Path, kind: str) -> None:
     if kind == "async":
 
         async def ask() -> None:

@@ -138,9 +138,7 @@ def bed(**fields: Any) -> dict[str, Any]:
         ],
     ],
 )
-def test_values_of_a_detection(
-    detection: Any, expected: dict[str, Any], reason: str | None
-) -> None:
+def test_detection_values(detection: Any, expected: dict[str, Any], reason: str | None) -> None:
     fields = from_detection3d_array(array(detection))
     assert only(fields) == expected | {"id": "bed_1"}
     assert reasons(fields) == ([(0, reason)] if reason else [])

@@ -205,9 +205,7 @@ def test_the_network_policy_opens_the_ports_in_use(overlay: Overlay) -> None:
     assert out == (dns | {(443, "TCP")} if has_bucket else dns)
 
 
-def test_the_sidecar_copies_whole_versions(
-    folder: Path, find_tool: FindTool, tmp_path: Path
-) -> None:
+def test_the_sidecar_copies_versions(folder: Path, find_tool: FindTool, tmp_path: Path) -> None:
     """A version arrives whole, without its upload's leftovers, and aliases follow the bucket."""
     rclone, rounds = find_tool("rclone"), tmp_path / "rounds"
     (tmp_path / "bin").mkdir()

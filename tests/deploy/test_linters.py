@@ -31,9 +31,7 @@ pytestmark = pytest.mark.system
         "check-jsonschema --builtin-schema=vendor.gitlab-ci .gitlab-ci.yml",
     ],
 )
-def test_a_configuration_has_no_lint(
-    find_tool: FindTool, monkeypatch: pytest.MonkeyPatch, command: str
-) -> None:
+def test_linters(find_tool: FindTool, monkeypatch: pytest.MonkeyPatch, command: str) -> None:
     # Debian installs haproxy into a folder that is in the PATH of administrators only.
     monkeypatch.setenv("PATH", f"{os.environ['PATH']}{os.pathsep}/usr/sbin")
     monkeypatch.setenv("PROXY_BACKEND", "127.0.0.1:8000")

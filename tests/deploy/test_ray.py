@@ -42,9 +42,7 @@ def pods(cluster: dict[str, Any]) -> list[dict[str, Any]]:
     return [group["template"]["spec"] for group in groups]
 
 
-def test_the_manifest_has_the_same_configuration(
-    config: dict[str, Any], cluster: dict[str, Any]
-) -> None:
+def test_manifest_and_configuration_agree(config: dict[str, Any], cluster: dict[str, Any]) -> None:
     copy = yaml.safe_load(cluster["serveConfigV2"])
     assert config["http_options"]["host"] == "127.0.0.1"
     assert copy["http_options"]["host"] == "0.0.0.0"
@@ -144,8 +142,6 @@ def service(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Itera
 
 
 @pytest.mark.slow
-def test_answers_equal_those_of_the_plain_service(
-    service: LiveService, shipped: LiveService
-) -> None:
+def test_answers_are_those_of_one_process(service: LiveService, shipped: LiveService) -> None:
     for _ in range(4):
         assert service.control() == shipped.control()

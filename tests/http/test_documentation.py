@@ -52,9 +52,7 @@ async def test_pages_can_be_switched_off(shared_store: Path) -> None:
         assert (await client.get("/problems/not-json")).status_code == 200
 
 
-async def test_only_libraries_are_cached(
-    client: AsyncClient,
-) -> None:
+async def test_only_libraries_are_cached(client: AsyncClient) -> None:
     page = await client.get("/")
     assert page.headers["cache-control"] == "no-cache"
     again = await client.get("/", headers={"If-None-Match": page.headers["etag"]})

@@ -25,9 +25,7 @@ async def document(guarded: AsyncClient) -> Any:
     return (await guarded.get("/openapi.json")).json()
 
 
-async def test_only_health_checks_need_no_key(
-    guarded: AsyncClient, document: dict[str, Any]
-) -> None:
+async def test_only_health_needs_no_key(guarded: AsyncClient, document: dict[str, Any]) -> None:
     schemes = document["components"]["securitySchemes"]
     assert schemes["api-key"] == {"type": "apiKey", "in": "header", "name": "X-API-Key"}
     assert schemes["api-key-as-bearer-token"] == {"type": "http", "scheme": "bearer"}

@@ -142,10 +142,7 @@ async def test_the_store_is_polled(store: Path) -> None:
 
 
 async def test_an_error_keeps_the_served_models(
-    own: AsyncClient,
-    store: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+    own: AsyncClient, store: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     publish(store, "home", "2.0.0", seed=2, alias="default")
     monkeypatch.setattr(Store, "names", defect)

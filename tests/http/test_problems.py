@@ -197,9 +197,7 @@ INVALID: dict[str, list[tuple[Any, ...]]] = {
     [(question, case) for question, cases in INVALID.items() for case in cases],
     ids=lambda value: value if isinstance(value, str) else value[1],
 )
-async def test_invalid_values_are_explained(
-    client: AsyncClient, question: str, case: tuple[Any, ...]
-) -> None:
+async def test_invalid_values(client: AsyncClient, question: str, case: tuple[Any, ...]) -> None:
     changes, pointer, words, *suggestions = case if case[2:] else (*case, "")
     # Infinity is not JSON. A number that is too large for a double is JSON.
     body = json.dumps({"objects": ["bed", "lamp"]} | changes).replace("Infinity", "1e999")
@@ -351,9 +349,7 @@ async def test_query_parameters_and_misspelt_paths_are_refused(client: AsyncClie
         ("BREW", "/generate", {"POST"}),
     ],
 )
-async def test_other_methods_are_refused(
-    client: AsyncClient, method: str, path: str, allowed: set[str]
-) -> None:
+async def test_methods(client: AsyncClient, method: str, path: str, allowed: set[str]) -> None:
     response = await client.request(method, path)
     document = problem(response, 405, "method-not-allowed")
     assert response.headers["allow"] in document["detail"]
@@ -367,9 +363,7 @@ async def test_other_methods_are_refused(
         *((given, False) for given in ("", "x" * 129, "a b", "<script>", "é".encode(), b"a\xff")),
     ],
 )
-async def test_only_valid_request_ids_are_kept(
-    client: AsyncClient, given: Any, is_kept: bool
-) -> None:
+async def test_valid_request_ids_are_kept(client: AsyncClient, given: Any, is_kept: bool) -> None:
     for path in ("/relations", "/nowhere"):
         headers = [(b"X-Request-Id", given)]
         response = await client.post(path, json={"objects": ["bed"]}, headers=headers)

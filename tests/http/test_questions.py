@@ -55,9 +55,7 @@ async def ask(client: AsyncClient, question: str, **request: Any) -> dict[str, A
 
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("question", ANSWERS)
-async def test_every_model_answers_every_question(
-    client: AsyncClient, question: str, model: str
-) -> None:
+async def test_every_model_answers(client: AsyncClient, question: str, model: str) -> None:
     stamp = {"sec": 12, "nanosec": 5}
     answer = await ask(client, question, **SCENE, model=model, frame_id="map", stamp=stamp)
     name = {"home": "home@1.1.0", "candidate": "home@1.1.0", "plain": "plain@1.0.0"}.get(model)
@@ -88,9 +86,7 @@ async def test_observed_relations_are_returned(client: AsyncClient, question: st
         ("rooms", {"because"}),
     ],
 )
-async def test_scores_leave_out_details(
-    client: AsyncClient, question: str, details: set[str]
-) -> None:
+async def test_scores_and_details(client: AsyncClient, question: str, details: set[str]) -> None:
     entries, name = {}, {"rooms": "room_types"}.get(question, question)
     for detail in ("full", "scores"):
         body = {**SCENE, "detail": detail}

@@ -53,9 +53,7 @@ async def test_labels_are_ids_of_objects(
     assert (await read(client, objects=objects))[0] == expected
 
 
-async def test_ids_come_before_labels(
-    client: AsyncClient,
-) -> None:
+async def test_ids_come_before_labels(client: AsyncClient) -> None:
     objects = [{"id": "lamp", "label": "bed"}, {"id": "x", "label": "lamp"}, "trash can"]
     stated = [relation("lamp", "left", "x"), relation("Garbage_Bins", "behind", "beds")]
     answer = await ask(client, "relations", objects=objects, relations=stated, top_k=4096)
@@ -269,9 +267,7 @@ def words_of(entries: list[dict[str, Any]]) -> Words:
     return {(entry["label"], entry.get("listed_as")) for entry in entries}
 
 
-async def test_entries_have_class_and_word(
-    client: AsyncClient,
-) -> None:
+async def test_entries_have_class_and_word(client: AsyncClient) -> None:
     """A word that is a class stays this class, also with a broader class, such as desk."""
     objects = ["bed", "TV", "Chairs", {"id": "s", "label": "couch"}, "desk", "table"]
     answer = await ask(client, "outliers", objects=objects)
@@ -292,9 +288,7 @@ async def test_entries_have_class_and_word(
     assert words_of(answer["missing"]) == expected
 
 
-async def test_sampled_scenes_have_classes(
-    client: AsyncClient,
-) -> None:
+async def test_sampled_scenes_have_classes(client: AsyncClient) -> None:
     objects = ["bed", "couch", {"id": "s", "label": "Sofas"}]
     relations = [["couch", "left", "bed"]]
     answer = await ask(client, "generate", objects=objects, relations=relations, steps=1)

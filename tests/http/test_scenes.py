@@ -33,9 +33,7 @@ async def refusal(client: AsyncClient, text: str, **fields: Any) -> str:
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-async def test_files_are_read_as_by_the_client(
-    client: AsyncClient, tmp_path: Path, name: str
-) -> None:
+async def test_files_become_scenes(client: AsyncClient, tmp_path: Path, name: str) -> None:
     example = EXAMPLES[name]
     labels = {"label_map": example.labels} if example.labels else {}
     answer = await read(client, example.text, name, **labels)

@@ -25,9 +25,7 @@ def no_environment(monkeypatch: pytest.MonkeyPatch) -> None:
             monkeypatch.delenv(name)
 
 
-def test_settings_come_from_the_environment(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_settings_of_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SCENE_STORE", str(tmp_path))
     monkeypatch.setenv("SCENE_PORT", "9000")
     monkeypatch.setenv("SCENE_API_KEY", "0123456789abcdef")
@@ -106,9 +104,7 @@ def test_unknown_names_stop_the_start(
     assert line.startswith(f"{name.upper()}: {message}")
 
 
-def test_help_lists_the_settings(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_help_lists_the_settings(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(["--port", "9000"])
     assert (

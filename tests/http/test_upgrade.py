@@ -56,9 +56,7 @@ async def answering(client: AsyncClient, **fields: Any) -> str:
 
 
 @pytest.mark.parametrize("is_copied", [True, False], ids=["volume", "own folder"])
-async def test_the_shipped_default_answers_instead(
-    volume: Store, release: Store, is_copied: bool
-) -> None:
+async def test_the_shipped_default_answers(volume: Store, release: Store, is_copied: bool) -> None:
     if is_copied:
         copy(release, volume)
     assert str(volume.aliases()["default"]) == "home@1.0.0", "an own model keeps the alias"
@@ -92,9 +90,7 @@ async def test_a_damaged_own_model_is_not_replaced(volume: Store, release: Store
 
 
 @pytest.mark.parametrize("store", ["volume", "release"])
-async def test_replaced_names_are_errors(
-    store: str, request: pytest.FixtureRequest, release: Store
-) -> None:
+async def test_replaced_names(store: str, request: pytest.FixtureRequest, release: Store) -> None:
     async with serve(request.getfixturevalue(store).root) as client:
         for name in ("old", "old@3.5.0"):
             asked = OBJECTS | {"model": name}

@@ -31,9 +31,7 @@ def stages(repository: Path) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("name", ["runtime", "ray", "train"])
-def test_stages_run_without_privileges(
-    stages: dict[str, str], compose: dict[str, Any], name: str
-) -> None:
+def test_stages_have_no_root(stages: dict[str, str], compose: dict[str, Any], name: str) -> None:
     (user,) = re.findall(r"^USER ([1-9]\d{3,}:[1-9]\d{3,})$", stages[name], re.MULTILINE)
     built = [service for service in compose["services"].values() if "build" in service]
     assert [service["user"] for service in built] == [user] * 3

@@ -78,9 +78,7 @@ def test_questions_and_pages_are_answered(proxy: Proxy) -> None:
         assert other_host.json()["type"] == "/problems/host-refused"
 
 
-def test_incomplete_heads_are_closed(
-    behind: StartProxy, service: LiveService, tmp_path: Path
-) -> None:
+def test_incomplete_heads(behind: StartProxy, service: LiveService, tmp_path: Path) -> None:
     with behind(service, tmp_path / "log", PROXY_HEAD_TIMEOUT="1s") as proxy:
         for part, statuses in ((b"", ([], [408])), (LIVE[:-2], ([408],))):
             answers, is_closed = exchange(proxy.port, Wire("", [part], None))
@@ -107,9 +105,7 @@ def test_requests_below_http_are_refused(proxy: Proxy, service: LiveService) -> 
 
 
 @pytest.mark.slow
-def test_silent_connections_block_no_client(
-    behind: StartProxy, shared_store: Path, tmp_path: Path
-) -> None:
+def test_silent_connections(behind: StartProxy, shared_store: Path, tmp_path: Path) -> None:
     """300 silent connections from ten addresses; the service may open 256 files."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
@@ -133,9 +129,7 @@ def test_silent_connections_block_no_client(
 
 
 @pytest.mark.slow
-def test_crashing_requests_are_not_repeated(
-    haproxy: StartProxy, configuration: Path, tmp_path: Path
-) -> None:
+def test_crashes_are_not_repeated(haproxy: StartProxy, configuration: Path, tmp_path: Path) -> None:
     """Three replicas close the connection of each question, as if it had crashed them."""
     questions = []
 
@@ -183,9 +177,7 @@ def test_slow_bodies_are_ended_by_the_service(proxy: Proxy) -> None:
     assert b"/problems/request-timeout" in received
 
 
-def test_connections_per_address_are_limited(
-    behind: StartProxy, service: LiveService, tmp_path: Path
-) -> None:
+def test_limit_of_connections(behind: StartProxy, service: LiveService, tmp_path: Path) -> None:
     variables = {"PROXY_CONNECTIONS": str(CONNECTIONS), "PROXY_HEAD_TIMEOUT": "60s"}
     with behind(service, tmp_path / "log", **variables) as proxy:
         with ExitStack() as held:
@@ -202,9 +194,7 @@ def test_connections_per_address_are_limited(
         wait_until(lambda: is_ready(proxy.port))
 
 
-def test_requests_per_address_are_limited(
-    behind: StartProxy, service: LiveService, tmp_path: Path
-) -> None:
+def test_limit_of_requests(behind: StartProxy, service: LiveService, tmp_path: Path) -> None:
     with (
         behind(service, tmp_path / "log", PROXY_REQUESTS=str(REQUESTS)) as proxy,
         httpx.Client(base_url=proxy.address, timeout=PATIENCE) as client,
@@ -267,9 +257,7 @@ def test_the_log_has_no_secrets(behind: StartProxy, shared_store: Path, tmp_path
 
 
 @pytest.mark.slow
-def test_without_a_service_the_status_is_503(
-    behind: StartProxy, shared_store: Path, tmp_path: Path
-) -> None:
+def test_no_service_gives_503(behind: StartProxy, shared_store: Path, tmp_path: Path) -> None:
     with (
         launch(shared_store, tmp_path / "service") as service,
         behind(service, tmp_path / "log") as proxy,
