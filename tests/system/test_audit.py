@@ -1,6 +1,7 @@
 """The audit never takes silence for a clean bill of health."""
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +21,14 @@ def report(*entries: dict[str, Any]) -> str:
     return json.dumps({"dependencies": list(entries), "fixes": []})
 
 
-def sound(name: str) -> dict[str, Any]:
-    return {"name": name, "version": "1.0", "vulns": []}
+def package(kind: str, name: str) -> dict[str, Any]:
+    """The entry of a package that is sound, flawed or skipped."""
+    if kind == "skipped":
+        return {"name": name, "skip_reason": f"Dependency not found on PyPI: {name} (1.0)"}
+    return {"name": name, "version": "2.10", "vulns": [FLAW] if kind == "flawed" else []}
 
 
-def flawed(name: str) -> dict[str, Any]:
-    return {"name": name, "version": "2.10", "vulns": [FLAW]}
-
-
-def skipped(name: str) -> dict[str, Any]:
-    return {"name": name, "skip_reason": f"Dependency not found on PyPI: {name} (1.0)"}
+sound, flawed, skipped = (partial(package, kind) for kind in ("sound", "flawed", "skipped"))
 
 
 def test_flaws_have_a_fixed_version() -> None:
