@@ -6,11 +6,11 @@ import os
 import stat
 import sys
 import threading
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import anyio
 import numpy as np
 import pytest
 from hypothesis import given
@@ -20,7 +20,6 @@ from typer.testing import CliRunner
 from app.questions.reading import Limits, read_scene
 from app.scene import CANONICAL
 from scene_client import (
-    AsyncClient,
     Client,
     OfflineClient,
     ProblemError,
@@ -30,6 +29,7 @@ from scene_client import (
 from scene_client.command import app
 from scene_client.recorded_scene import scene_of
 from scene_client.schemas import MissingRequest
+from tests.client.callers import async_caller, sync_caller
 from tests.conftest import run_program
 from tests.http.stores import VOCABULARY
 from tests.services import PATIENCE
@@ -48,8 +48,9 @@ def request(*objects: Any, **fields: Any) -> MissingRequest:
     return MissingRequest.model_validate({"objects": list(objects), **fields})
 
 
-def write(file: Path, requests: list[MissingRequest]) -> None:
-    writer = Recorder(file)
+def write(writer: Recorder | Path, requests: list[MissingRequest]) -> None:
+    """Record requests with a recorder, or with a new one for a file."""
+    writer = Recorder(writer) if isinstance(writer, Path) else writer
     writer.record(requests)
     writer.flush()
 
@@ -70,25 +71,14 @@ def labels(file: Path) -> list[list[str]]:
     return [[thing["label"] for thing in scene["objects"]] for scene in lines(file)]
 
 
-@pytest.mark.parametrize("kind", ["sync", "async", "offline"])
-def test_a_scene_is_recorded_once(url: str, shared_store: Path, file: Path, kind: str) -> None:
-    if kind == "async":
+OFFLINE = partial(sync_caller, kind=OfflineClient)
 
-        async def ask() -> None:
-            async with AsyncClient(url, record=file) as scene:
-                for question in QUESTIONS:
-                    await getattr(scene, question)(["bed", "lamp"])
 
-        anyio.run(ask)
-    else:
-        opened = (
-            Client(url, record=file)
-            if kind == "sync"
-            else OfflineClient(shared_store, record=str(file))
-        )
-        with opened as scene:
-            for question in QUESTIONS:
-                getattr(scene, question)(["bed", "lamp"])
+@pytest.mark.parametrize("caller", [sync_caller, async_caller, OFFLINE])
+def test_a_scene_is_recorded_once(url: str, shared_store: Path, file: Path, caller: Any) -> None:
+    with caller(shared_store if caller is OFFLINE else url, record=str(file)) as call:
+        for question in QUESTIONS:
+            call(question, ["bed", "lamp"])
     assert labels(file) == [["bed", "lamp"]]
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
 
@@ -111,7 +101,7 @@ def test_new_evidence_is_written(file: Path) -> None:
     writer = Recorder(file)
     lamp, bed = {"id": "track_7", "label": "lamp"}, {"id": "track_9", "label": "bed"}
     on_top = [("track_7", "on-top", "track_9")]
-    said = [
+    stated = [
         request("bed", "lamp"),
         request(lamp, bed),  # ids change from frame to frame
         request(lamp, bed, room_type="bedroom"),
@@ -122,8 +112,7 @@ def test_new_evidence_is_written(file: Path) -> None:
         request("bed", "lamp", stamp={"sec": 7200, "nanosec": 5}),
     ]
     for _ in range(3):
-        writer.record(said)
-        writer.flush()
+        write(writer, stated)
     assert [(one.get("room_type"), len(one["objects"])) for one in lines(file)] == [
         (None, 2), ("bedroom", 2), (None, 2), (None, 3), (None, 2)
     ]  # fmt: skip
@@ -139,8 +128,7 @@ def test_moved_objects_wait_for_the_pause(file: Path, monkeypatch: pytest.Monkey
     desk = box("desk", 2, 0, 0.25)
 
     def see(x: float) -> int:
-        writer.record([request(desk, box("lamp", x, 1.1, 0.25))])
-        writer.flush()
+        write(writer, [request(desk, box("lamp", x, 1.1, 0.25))])
         return len(lines(file))
 
     assert [see(1.2), see(1.3), see(2.8)] == [1, 1, 1]
@@ -192,7 +180,7 @@ FRAMES = [
     st.lists(st.tuples(*[st.integers(-20, 20)] * 3), min_size=3, max_size=3),
     st.sampled_from([{}, {"yaw": 0.7}, {"orientation": {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8}}]),
 )
-def test_training_derives_the_relations_of_the_service(
+def test_the_training_derives_the_relations_of_the_service(
     frame: dict[str, Any], places: list[tuple[int, int, int]], turn: dict[str, Any]
 ) -> None:
     names = VOCABULARY.labels[:3]
@@ -402,12 +390,10 @@ def test_a_locked_file_is_left_alone(file: Path, caplog: pytest.LogCaptureFixtur
     writer = Recorder(file)
     with file.open("w") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
-        writer.record([request("bed", "lamp")])
-        writer.flush()
+        write(writer, [request("bed", "lamp")])
     assert "another program has locked the file" in caplog.text
     assert lines(file) == []
-    writer.record([request("bed", "lamp")])
-    writer.flush()
+    write(writer, [request("bed", "lamp")])
     assert labels(file) == [["bed", "lamp"]]
 
 
