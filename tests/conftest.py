@@ -63,7 +63,9 @@ def find_tool() -> FindTool:
 
     def find(name: str) -> Path:
         # Programs from wheels are in the interpreter's folder, which may be missing in PATH.
-        search = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
+        # Debian has some programs in a folder of administrators.
+        folders = (str(Path(sys.executable).parent), os.environ.get("PATH", ""), "/usr/sbin")
+        search = os.pathsep.join(folders)
         if program := shutil.which(name, path=search):
             return Path(program)
         if os.environ.get("REQUIRE_SYSTEM") == "1":

@@ -269,9 +269,10 @@ def launch(
 
 
 @contextmanager
-def http_server(handler: Callable[..., BaseHTTPRequestHandler]) -> Iterator[str]:
-    """Run a server of the standard library in a thread, and yield its URL."""
-    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+def http_server(handler: type[BaseHTTPRequestHandler], **options: Any) -> Iterator[str]:
+    """Run a server of the standard library in a thread without a log, and yield its URL."""
+    quiet = type("Quiet", (handler,), {"log_message": lambda *_: None})
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(quiet, **options))
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
     yield f"http://127.0.0.1:{server.server_port}"
@@ -311,6 +312,12 @@ def live(shared_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     log, program = tmp_path_factory.mktemp("live") / "log", ("-c", WITHOUT_TRAINING)
     with launch(shared_store, log, program=program) as service:
         yield service
+
+
+@pytest.fixture(scope="session")
+def url(live: LiveService) -> str:
+    """The URL of the shared service."""
+    return live.url
 
 
 @pytest.fixture(scope="session")

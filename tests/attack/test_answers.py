@@ -23,7 +23,6 @@ LABELS = [entry.label for entry in VOCABULARY.objects if not entry.structure]
 LIMIT = 4 * 2**20
 SMALL = 2**16
 
-
 limited = client_of_service(max_answer_bytes=SMALL)
 
 

@@ -27,7 +27,6 @@ HEALTH = b"GET /health/live HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
 
 service = live_service()
 
-
 SINGLE = prepared("/missing", SCENE, LONG)
 BATCHES = [prepared("/missing/batch", {"scenes": [{"objects": LABELS[:3]}] * 256}, LONG)]
 DRAWS = [prepared("/generate", {**SCENE, "count": 16, "steps": 500}, LONG)]

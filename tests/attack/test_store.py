@@ -172,7 +172,6 @@ def test_hostile_alias_tables_are_refused(published: Path, spoil: Callable[[Path
 @pytest.mark.slow
 @pytest.mark.parametrize("place", ["metrics", "vocabulary.objects", "training.x"])
 def test_a_manifest_of_a_million_objects(published: Path, place: str) -> None:
-    """Listing what is wrong with each of them took 8 GB."""
     folder, (*path, last) = hostile(published), place.split(".")
     rewrite_manifest(folder, lambda members: reduce(getitem, path, members).update({last: "@"}))
     body = json.loads((folder / "manifest.json").read_bytes())

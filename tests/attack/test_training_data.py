@@ -27,7 +27,6 @@ def bomb(path: Path, megabytes: int) -> Path:
 
 
 def test_a_compressed_line_has_a_limit(tmp_path: Path) -> None:
-    """292 kB took 1.5 GB."""
     path = bomb(tmp_path / "scenes.jsonl.gz", 300)
     assert path.stat().st_size < 320_000
     message, memory = refused(path)
@@ -53,7 +52,6 @@ def refused(path: Path) -> tuple[str, int]:
 
 @pytest.mark.parametrize("name", ["scenes.jsonl.gz", "instances.json"])
 def test_text_files_are_limited(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Short lines too: 1 GB of blank lines fits into a megabyte."""
     monkeypatch.setattr(files, "MAX_BYTES", 2**20)
     path = tmp_path / name
     content = b" " * 99 + b"\n"
@@ -116,7 +114,6 @@ def test_the_size_of_a_mat_file_is_limited(
 
 
 def test_a_newer_mat_file_is_refused_unread(tmp_path: Path) -> None:
-    """Version 7.3 is HDF5, which unpacks chunks as it likes."""
     path = tmp_path / "SUNRGBDMeta3DBB_v2.mat"
     path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\0\2IM" + bytes(512))
     assert refused(path)[0] == (f"{path}: is not a MATLAB 5 file: its header names another version")
@@ -127,7 +124,6 @@ def test_a_newer_mat_file_is_refused_unread(tmp_path: Path) -> None:
 )
 @pytest.mark.parametrize("field", ["position", "size"])
 def test_coordinates_that_no_float_holds(tmp_path: Path, coordinate: str, field: str) -> None:
-    """400 digits ended the program with a traceback."""
     path = tmp_path / "scenes.jsonl.gz"
     thing = f'{{"id": "a", "label": "bed", "{field}": [{coordinate}, 1, 1]}}'
     line = f'{{"scene_id": "b", "objects": [{thing}]}}\n'

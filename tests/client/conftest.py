@@ -13,12 +13,6 @@ from tests.client import callers
 from tests.client.callers import Caller
 from tests.client.peers import Peer
 from tests.conftest import FindTool
-from tests.services import LiveService
-
-
-@pytest.fixture(scope="session")
-def url(live: LiveService) -> str:
-    return live.url
 
 
 @pytest.fixture(scope="session")

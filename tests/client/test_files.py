@@ -100,7 +100,6 @@ def corrupted(wrong: Iterable[bytes]) -> list[tuple[str, str]]:
 
 @pytest.mark.slow
 def test_wrong_values_are_left_out_or_refused(tmp_path: Path) -> None:
-    """Only `MessageError` may be raised, whatever a file contains."""
     for name, text in corrupted(WRONG):
         path = tmp_path / name
         path.write_text(text, "utf-8")

@@ -365,7 +365,6 @@ def test_rosbridge_and_cdr_give_one_scene(store: Typestore, kind: str, number: f
 
 @pytest.mark.parametrize("text", [b"null", b"3", b'"x"', b"[]", b"{}", b"[{}]"])
 def test_any_message_is_a_request_or_an_error(text: bytes) -> None:
-    """One value of a message is replaced."""
     for message in (array(seen(result("56"), name="t1")), array(flat("chair", 1.0, 2.0))):
         for place in places(message):
             changed = json.loads(replaced(message, place, text))

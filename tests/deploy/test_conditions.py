@@ -11,7 +11,6 @@ from scene_client import Client
 from scene_client.vision_msgs import SceneFields
 from tests.client import callers
 from tests.conftest import FindTool, run_program
-from tests.services import LiveService
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 
@@ -38,11 +37,6 @@ def tick(program: Path, url: str, kind: str, *ports: Any, timeout: float = 60.0)
     lines = "".join(json.dumps(entry) + "\n" for entry in ports)
     done = run_program(program, url, kind, str(timeout), input=lines)
     return [json.loads(line) for line in done.stdout.splitlines()]
-
-
-@pytest.fixture
-def url(live: LiveService) -> str:
-    return live.url
 
 
 def test_scene_complete(program: Path, url: str, scene: SceneFields) -> None:

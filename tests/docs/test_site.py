@@ -4,7 +4,6 @@ import os
 import re
 import sys
 from collections.abc import Iterator
-from functools import partial
 from http.server import SimpleHTTPRequestHandler
 from pathlib import Path
 
@@ -74,12 +73,7 @@ def test_every_test_that_a_formula_names_exists() -> None:
 @pytest.fixture
 def served(site: Path) -> Iterator[str]:
     """The address of a server of the built files."""
-
-    class Quiet(SimpleHTTPRequestHandler):
-        def log_message(self, *arguments: object) -> None:
-            pass
-
-    with http_server(partial(Quiet, directory=site)) as url:
+    with http_server(SimpleHTTPRequestHandler, directory=site) as url:
         yield url
 
 

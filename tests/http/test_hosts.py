@@ -86,7 +86,6 @@ async def test_a_prefix_in_the_path_names_its_setting(client: AsyncClient) -> No
 LISTED, SECOND, OTHER = "https://panel.example", "http://10.0.0.7:8080", "https://other.example"
 API_KEY = "incorrect-zebra-capacitor-nail"
 
-
 shared = client_of_service(cors_origins=[LISTED, SECOND], max_body_bytes=2048)
 
 

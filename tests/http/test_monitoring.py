@@ -123,7 +123,6 @@ async def test_unknown_paths_and_methods_add_no_metrics(client: AsyncClient) -> 
 
 
 async def test_alarms_unknown_labels_and_warnings_are_counted(tmp_path: Path) -> None:
-    """As the answers list them, to single questions and to batches."""
     publish(tmp_path, "home", "1.0.0", alias="default")
     publish(tmp_path, "unsure", "1.0.0", judges=False)
     labels = ["sofa", "nightstand", "nigthstand", "toilet", "bed lamp", "flux capacitor"]
@@ -250,7 +249,6 @@ def line(service: LiveService, method: str, path: str, **arguments: Any) -> dict
 
 @pytest.mark.system
 def test_a_request_is_one_line(live: LiveService) -> None:
-    """What clients make up reaches no line: test_secrets.py."""
     answered = line(live, "POST", "/missing", json=SCENE)
     assert answered.pop("latency_ms") >= answered.pop("compute_ms") > 0
     assert answered.pop("queue_ms") >= 0
@@ -280,9 +278,6 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[ExportTraceServiceRe
             self.send_response(200)
             self.end_headers()
 
-        def log_message(self, *_: Any) -> None:
-            """Nothing."""
-
     with http_server(Handler) as url:
         monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", url)
         monkeypatch.setenv("OTEL_EXPORTER_OTLP_COMPRESSION", "none")
@@ -293,7 +288,6 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[ExportTraceServiceRe
 def test_spans_have_names_of_routes(
     shared_store: Path, tmp_path: Path, taken: list[ExportTraceServiceRequest]
 ) -> None:
-    """Probes and scrapes are none, and what a client made up is in none."""
     with launch(shared_store, tmp_path / "log", SCENE_OPENTELEMETRY="true") as service:
         service.client.post("/missing", json=SCENE)
         for path in UNTRACED:

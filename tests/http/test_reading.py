@@ -62,7 +62,6 @@ async def test_ids_come_before_labels(client: AsyncClient) -> None:
 
 
 async def test_a_repeated_relation_is_no_contradiction(client: AsyncClient) -> None:
-    """And different relations of one pair may hold together."""
     stated = [relation("bed", "left", "lamp"), relation("lamp", "right", "bed")]
     stated.append(relation("bed", "front", "lamp"))
     _, found = await read(client, objects=["bed", "lamp"], relations=stated)
@@ -174,7 +173,6 @@ async def test_a_candidate_is_read_by_its_meaning(client: AsyncClient) -> None:
 
 
 async def test_words_need_the_treatment_by_meaning(client: AsyncClient) -> None:
-    """The others refuse or ignore it, and answers without such words do not change."""
     for treatment in ("error", "nearest"):
         response = await client.post("/rooms", json=WORDS | {"unknown_labels": treatment})
         assert "#/objects/2" in pointers(response, "unknown-labels")
@@ -189,7 +187,6 @@ async def test_words_need_the_treatment_by_meaning(client: AsyncClient) -> None:
 
 
 async def test_poses_of_words_give_relations(client: AsyncClient) -> None:
-    """A word has no typical size."""
     placed = [
         *LAMP_ON_DESK,
         {"id": "m", "label": "mug", "position": at(2, 0, 0.85), "size": at(0.1, 0.1, 0.1)},
@@ -268,7 +265,6 @@ def words_of(entries: list[dict[str, Any]]) -> Words:
 
 
 async def test_entries_have_class_and_word(client: AsyncClient) -> None:
-    """A word that is a class stays this class, also with a broader class, such as desk."""
     objects = ["bed", "TV", "Chairs", {"id": "s", "label": "couch"}, "desk", "table"]
     answer = await ask(client, "outliers", objects=objects)
     assert {(one["object"], *entry) for one in answer["outliers"] for entry in words_of([one])} == {
@@ -334,7 +330,6 @@ async def test_candidates_of_one_room_type_share_its_probability(client: AsyncCl
 
 
 async def test_a_training_scene_is_a_request(client: AsyncClient) -> None:
-    """Arrays, whole numbers as ids, supports, and fields that only the training uses."""
     bed = {"id": 0, "label": "bed", "position": [2, 1, 0.2], "size": [2, 1.5, 0.4], "yaw": 0.5}
     scene = {
         "scene_id": "bench-3",

@@ -141,7 +141,6 @@ def test_other_variables_are_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 @pytest.mark.system
 def test_the_start_names_invalid_settings(tmp_path: Path) -> None:
-    """Without a word of the keys."""
     wrong = {
         "SCENE_STORE": str(tmp_path / "none"),
         "SCENE_PORT": "many",

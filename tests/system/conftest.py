@@ -49,8 +49,6 @@ def compose(repository: Path) -> dict[str, Any]:
 @pytest.fixture(scope="session")
 def haproxy(find_tool: FindTool) -> StartProxy:
     """Return a function that starts the proxy; variables as in its configuration."""
-    # Debian keeps it where only administrators look.
-    os.environ["PATH"] += os.pathsep + "/usr/sbin"
     program = find_tool("haproxy")
 
     @contextmanager

@@ -34,7 +34,6 @@ CONNECTIONS, REQUESTS = 30, 100
 SCENE = {"objects": ["bed", "lamp"]}
 HEAD = b"POST /outliers HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
 
-
 service = live_service(SCENE_CLIENT_TIMEOUT="3")
 
 
@@ -88,7 +87,6 @@ def test_incomplete_heads(behind: StartProxy, service: LiveService, tmp_path: Pa
 
 @pytest.mark.slow
 def test_requests_below_http_are_refused(proxy: Proxy, service: LiveService) -> None:
-    """Every refusal is a client's error; no request hides in another."""
     with ThreadPoolExecutor(8) as pool:
         exchanges = [(wire, pool.submit(exchange, proxy.port, wire)) for wire in wires()]
     assert len(exchanges) > 80
@@ -144,9 +142,6 @@ def test_crashes_are_not_repeated(haproxy: StartProxy, configuration: Path, tmp_
         def do_POST(self) -> None:
             questions.append(self.path)
             self.close_connection = True
-
-        def log_message(self, *_: object) -> None:
-            pass
 
     with http_server(Crashing) as url:
         backend = url.removeprefix("http://")
