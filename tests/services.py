@@ -132,33 +132,33 @@ def replace(monkeypatch: pytest.MonkeyPatch) -> Replace:
 
 
 @dataclass(frozen=True)
-class Held:
+class Paused:
     """A question that waits in its worker thread for the event `release`."""
 
     started: threading.Event = field(default_factory=threading.Event)
     release: threading.Event = field(default_factory=threading.Event)
 
 
-Hold = Callable[..., Held]
+Pause = Callable[..., Paused]
 
 
 @pytest.fixture
-def hold(replace: Replace) -> Iterator[Hold]:
-    """Hold a question from the call on, of all models or of some."""
-    held = Held()
+def pause(replace: Replace) -> Iterator[Pause]:
+    """Pause a question from the call on, of all models or of some."""
+    paused = Paused()
 
-    def hold(name: str, of: Callable[[Any], bool] = lambda manifest: True) -> Held:
+    def pause(name: str, of: Callable[[Any], bool] = lambda manifest: True) -> Paused:
         def wait(question: Any, artifact: Any, *args: Any, **parameters: Any) -> Any:
             if of(artifact.manifest):
-                held.started.set()
-                assert held.release.wait(PATIENCE)
+                paused.started.set()
+                assert paused.release.wait(PATIENCE)
             return question(artifact, *args, **parameters)
 
         replace(name, wait)
-        return held
+        return paused
 
-    yield hold
-    held.release.set()
+    yield pause
+    paused.release.set()
 
 
 def defect(*_: Any, **__: Any) -> Any:

@@ -77,9 +77,9 @@ def test_unread_answers_use_bounded_memory(service: LiveService) -> None:
     before, answers = service.memory, service.control()
     scenes = [{"objects": ["bed"] * 23, "top_k": 256}] * 256
     batch = prepared("/relations/batch", {"scenes": scenes}, LONG)
-    with ExitStack() as held:
+    with ExitStack() as stack:
         for _ in range(20):
-            connection = held.enter_context(socket.socket())
+            connection = stack.enter_context(socket.socket())
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
             connection.connect(("127.0.0.1", service.port))
             connection.sendall(batch)

@@ -208,18 +208,18 @@ def test_relations_are_edges(bedroom: Board, api: httpx.Client) -> None:
         assert ("observed" in row) == one["observed"]
         kinds.add("holds" if one["observed"] else "expected")
     assert {kind for kind, _ in bedroom.edges} == kinds >= {"holds", "expected"}
-    said = {
+    texts = {
         f"{SPOKEN[one['relation']]} {percent(one['probability'])}" for one in answer["relations"]
     }
     # Between an object and another one on top of it there is no room for words.
     words = {text for kind, text in bedroom.edges if text and kind != "disagrees"}
     assert words
-    assert words <= said
+    assert words <= texts
 
 
 def test_room_types_are_listed_by_their_probability(bedroom: Board, api: httpx.Client) -> None:
-    page, asked = bedroom.page, list[str]()
-    page.on("request", lambda request: asked.append(request.url.rsplit("/", 1)[-1]))
+    page, routes = bedroom.page, list[str]()
+    page.on("request", lambda request: routes.append(request.url.rsplit("/", 1)[-1]))
     options, likeliest = page.locator("#room option"), page.locator("#room-likely")
 
     def check() -> None:
@@ -232,13 +232,13 @@ def test_room_types_are_listed_by_their_probability(bedroom: Board, api: httpx.C
     page.locator("#room").select_option("kitchen")
     bedroom.settle()
     assert bedroom.body("missing")["room_type"] == "kitchen"
-    assert "missing" in asked
+    assert "missing" in routes
     # The probabilities ignore the room type that a person chooses.
-    assert "rooms" not in asked
+    assert "rooms" not in routes
     check()
     expect(page.locator("#room")).to_have_value("kitchen")
     bedroom.add("toilet")
-    assert "rooms" in asked
+    assert "rooms" in routes
     check()
     bedroom.click("Clear")
     expect(likeliest).to_have_text("")
@@ -265,14 +265,14 @@ def test_the_shown_calls_give_the_shown_answer(
     board = open_board(permissions=["clipboard-read", "clipboard-write"])
     programs = ("sh", board.curl("missing")), (sys.executable, board.python("missing"))
     curl, python = (json.loads(run_program(name, "-c", text).stdout) for name, text in programs)
-    asked = ask(api, "missing", board.body("missing"))
-    assert curl | {"request_id": ""} == asked | {"request_id": ""}
+    expected = ask(api, "missing", board.body("missing"))
+    assert curl | {"request_id": ""} == expected | {"request_id": ""}
     one, other = (
         [(entry["label"], entry["probability"]) for entry in answer["missing"]]
-        for answer in (python, asked)
+        for answer in (python, expected)
     )
     assert one == other
-    assert percent(asked["missing"][0]["probability"]) in board.rows("missing")[0]
+    assert percent(expected["missing"][0]["probability"]) in board.rows("missing")[0]
     board.column("missing").get_by_text("Send this request from a program").click()
     board.column("missing").get_by_role("button", name="Copy the curl call").click()
     expect(board.column("missing").get_by_text("copied")).to_be_visible()

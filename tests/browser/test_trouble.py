@@ -24,10 +24,10 @@ for (let step = 0; step < 8; step += 1)
 @pytest.mark.slow
 def test_a_superseded_question_is_dropped(open_board: OpenBoard) -> None:
     board = open_board()
-    asked, held = list[str](), list[Route]()
+    routes, held = list[str](), list[Route]()
 
     def hold_first(route: Route) -> None:
-        asked.append(route.request.url)
+        routes.append(route.request.url)
         if held:
             route.continue_()
         else:
@@ -40,7 +40,7 @@ def test_a_superseded_question_is_dropped(open_board: OpenBoard) -> None:
     with board.page.expect_event("requestfailed", lambda one: one.url.endswith("/missing")):
         board.page.keyboard.press("ArrowUp")
     board.settle()
-    assert len(asked) == 2
+    assert len(routes) == 2
     assert board.scene["objects"][1]["position"]["x"] == pytest.approx(1.9)
     assert board.rows("missing")
 
@@ -48,11 +48,11 @@ def test_a_superseded_question_is_dropped(open_board: OpenBoard) -> None:
 @pytest.mark.slow
 def test_the_page_retries_after_429(open_board: OpenBoard) -> None:
     board = open_board(allow=("429",))
-    asked = list[Route]()
+    routes = list[Route]()
 
     def refuse_first_and_hold_second(route: Route) -> None:
-        asked.append(route)
-        if len(asked) > 1:
+        routes.append(route)
+        if len(routes) > 1:
             return
         problem = {"type": "/problems/queue-full", "title": "Queue full", "status": 429}
         problem |= {"detail": "The queue is full.", "request_id": "r"}
@@ -65,10 +65,10 @@ def test_the_page_retries_after_429(open_board: OpenBoard) -> None:
     alert = board.column("missing").get_by_role("alert")
     expect(alert).to_contain_text("The queue is full")
     for _ in range(600):
-        if len(asked) == 2:
+        if len(routes) == 2:
             break
         board.page.wait_for_timeout(100)
-    asked[1].continue_()
+    routes[1].continue_()
     expect(alert).to_be_hidden()
     board.settle()
     assert board.rows("missing")

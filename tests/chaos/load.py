@@ -58,22 +58,22 @@ class ConstantLoad:
             assert self.statuses.total() == self.sent
 
     async def _run(self, port: int, requests: Any, judge: Any, connections: int) -> None:
-        asked: dict[Connection, int] = {}
+        pending: dict[Connection, int] = {}
         finished = asyncio.Event()
 
         def send(connection: Connection) -> None:
-            asked[connection] = number = self.sent % len(requests)
+            pending[connection] = number = self.sent % len(requests)
             self.sent += 1
             connection.send(requests[number])
 
         def answered(connection: Connection, status: int, body: bytes) -> None:
-            number = asked.pop(connection)
+            number = pending.pop(connection)
             self.statuses[status] += 1
             if fault := judge(number, status, json.loads(body) if body else None):
                 self.faults.append(fault)
             if status and not self._ending.is_set():
                 send(connection)
-            elif not asked:
+            elif not pending:
                 finished.set()
 
         pool = await connect(port, connections, answered)

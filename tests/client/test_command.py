@@ -219,7 +219,7 @@ def test_the_key_of_the_environment(scene: Any, peer: Any, monkeypatch: pytest.M
     ],
 )
 def test_bash_completes_commands_options_and_values(words: str, expected: str) -> None:
-    asked = {"COMP_WORDS": words, "COMP_CWORD": str(len(words.split()) - 1)}
-    environment = os.environ | asked | {"_SCENE_COMPLETE": "complete_bash"}
+    variables = {"COMP_WORDS": words, "COMP_CWORD": str(len(words.split()) - 1)}
+    environment = os.environ | variables | {"_SCENE_COMPLETE": "complete_bash"}
     done = run_program(sys.executable, "-m", "scene_client", env=environment)
     assert done.stdout.split() == [expected]

@@ -328,7 +328,7 @@ def test_a_line_of_a_crash_is_repaired(file: Path) -> None:
 
 
 def test_a_full_disk_disturbs_no_question(file: Path) -> None:
-    said = run("""
+    printed = run("""
 import logging
 logging.basicConfig(format="%(levelname)s %(message)s", stream=sys.stdout)
 limit = resource.RLIMIT_FSIZE
@@ -346,12 +346,12 @@ writer.record([scene(20)])
 """, file).splitlines()  # fmt: skip
     warning = f"WARNING cannot record scenes in {file}"
     # A part of the first line fits, and no part of the second one.
-    assert said[0] == f"{warning}: [Errno 28] No space left on device"
-    assert said[2] == f"{warning}: [Errno 27] File too large"
-    assert len(said) == 3
+    assert printed[0] == f"{warning}: [Errno 28] No space left on device"
+    assert printed[2] == f"{warning}: [Errno 27] File too large"
+    assert len(printed) == 3
     written = [int(scene[0].split()[0]) for scene in labels(file)]
     assert written == [0, 1, 19]
-    assert 100_000 * 2 / 3 < int(said[1]) < 100_000
+    assert 100_000 * 2 / 3 < int(printed[1]) < 100_000
 
 
 def test_a_missing_folder_disturbs_no_question(

@@ -137,4 +137,4 @@ def test_an_interrupted_condition_uses_the_next_scene(make: Make) -> None:
         assert condition.status is Status.RUNNING
     client.answering.set()
     assert settle(condition) is Status.SUCCESS
-    assert [fields["objects"] for fields in client.asked] == [["bed"], ["lamp"]]
+    assert [fields["objects"] for fields in client.requests] == [["bed"], ["lamp"]]

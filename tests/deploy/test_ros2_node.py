@@ -126,7 +126,7 @@ def test_only_the_newest_detections_are_sent(run: Run, recorded: Any) -> None:
     assert running.published("/diagnostics") == []
     client.answering.set()
     running.wait_for("/diagnostics", 2)
-    assert [fields["stamp"]["sec"] for fields in client.asked] == [0, 3]
+    assert [fields["stamp"]["sec"] for fields in client.requests] == [0, 3]
     first, second_one = (report.status[0] for report in running.published("/diagnostics"))
     assert first.level == second_one.level == 2
     assert first.message == "UnreachableError: gone"
@@ -222,8 +222,8 @@ def test_ghosts_stand_at_the_offset(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_parameter_file_has_the_defaults(run: Run) -> None:
     given = yaml.safe_load((PACKAGE / "config" / "scene.yaml").read_text())
     parameters = given["scene"]["ros__parameters"]
-    asked = run(**parameters).ros.declared
-    assert set(asked) == set(parameters)
+    declared = run(**parameters).ros.declared
+    assert set(declared) == set(parameters)
     defaults = run().ros.declared
     for name, value in defaults.items():
         assert str(parameters[name]) == str(value), name

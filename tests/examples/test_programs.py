@@ -60,15 +60,15 @@ def test_curl_asks_the_five_questions(shipped: LiveService, find_tool: FindTool)
 
 def test_the_python_program_asks_and_branches_on_errors(shipped: LiveService) -> None:
     printed = run_python("ask.py", shipped.url).stdout.splitlines()
-    said = dict(line.split(": ", 1) for line in printed)
-    assert said["read as"] == "{'moniter': 'monitor'}"
-    assert said["left out"] == "['qwzx']"
-    assert said["relations"] == "[('lamp_1', 'on-top', 'desk_1')]"
-    assert "mouse" in said["missing on the desk"]
-    assert said["outliers"] == "['toilet']"
-    assert said["room"] == "office"
-    assert "desk" in said["a whole room"]
-    assert "nightstand" in said["unknown label at #/objects/1"]
+    values = dict(line.split(": ", 1) for line in printed)
+    assert values["read as"] == "{'moniter': 'monitor'}"
+    assert values["left out"] == "['qwzx']"
+    assert values["relations"] == "[('lamp_1', 'on-top', 'desk_1')]"
+    assert "mouse" in values["missing on the desk"]
+    assert values["outliers"] == "['toilet']"
+    assert values["room"] == "office"
+    assert "desk" in values["a whole room"]
+    assert "nightstand" in values["unknown label at #/objects/1"]
 
 
 def test_the_python_program_reports_a_missing_service() -> None:

@@ -11,7 +11,7 @@ import pytest
 from httpx import Client, ConnectError, Response
 
 from tests.http.test_problems import problem
-from tests.services import Hold, Replace, launch, serve, wait_until
+from tests.services import Pause, Replace, launch, serve, wait_until
 
 SCENE = {"objects": ["bed", "chair", "lamp"]}
 LONG = {"X-Request-Timeout-Ms": "60000"}
@@ -35,27 +35,27 @@ async def test_a_deadline_is_a_whole_number_within_the_limit(shared_store: Path)
     assert [p["schema"]["maximum"] for p in parameters if "Timeout" in p["name"]] == [600_000]
 
 
-async def test_generate_past_its_deadline_gets_504(shared_store: Path, hold: Hold) -> None:
+async def test_generate_past_its_deadline_gets_504(shared_store: Path, pause: Pause) -> None:
     async with serve(shared_store) as client:
-        held = hold("generate")
+        paused = pause("generate")
         drawing = asyncio.ensure_future(
             client.post("/generate", json=SCENE, headers={"X-Request-Timeout-Ms": "1000"})
         )
         for question in ("relations", "missing", "outliers"):
             assert (await client.post(f"/{question}", json=SCENE, headers=LONG)).is_success
         problem(await drawing, 504, "deadline-passed")
-        held.release.set()
+        paused.release.set()
         assert (await client.post("/generate", json=SCENE, headers=LONG)).is_success
         assert 'scene_pending{lane="draws"} 0.0' in (await client.get("/metrics")).text
 
 
-async def test_a_client_above_its_share_gets_429(shared_store: Path, hold: Hold) -> None:
+async def test_a_client_above_its_share_gets_429(shared_store: Path, pause: Pause) -> None:
     async with serve(shared_store) as client:
         client.headers.update(LONG)
-        held = hold("generate")
+        paused = pause("generate")
         largest = {**SCENE, "count": 64, "steps": 500}
         drawing = asyncio.ensure_future(client.post("/generate", json=largest))
-        assert await asyncio.to_thread(held.started.wait, 60)
+        assert await asyncio.to_thread(paused.started.wait, 60)
         response = await client.post("/generate", json=SCENE)
         problem(response, 429, "queue-full")
         assert int(response.headers["retry-after"]) >= 1
@@ -63,7 +63,7 @@ async def test_a_client_above_its_share_gets_429(shared_store: Path, hold: Hold)
         assert (await client.post("/missing", json=SCENE)).is_success
         assert (await client.post("/missing/batch", json={"scenes": [SCENE] * 256})).is_success
         assert (await client.get("/health/ready")).is_success
-        held.release.set()
+        paused.release.set()
         assert (await drawing).is_success
         assert (await client.post("/generate", json=SCENE)).is_success
         too_much = await client.post("/generate", json={**largest, "steps": 501})
@@ -91,7 +91,7 @@ async def test_a_batch_stops_at_its_deadline(
     assert [entry["status"] for entry in answer.json()["results"]] == [200] * 2 + [504] * 18
 
 
-HELD = """
+WAITING = """
 import sys, time
 from pathlib import Path
 from app.__main__ import main
@@ -99,14 +99,14 @@ from app.questions.generate import GENERATE
 
 generate, begun, release = GENERATE.answer, Path({begun!r}), Path({release!r})
 
-def held(*args, **parameters):
+def waiting(*args, **parameters):
     if parameters["count"] == 3:
         begun.touch()
         while not release.exists():
             time.sleep(0.01)
     return generate(*args, **parameters)
 
-GENERATE.answer = held
+GENERATE.answer = waiting
 sys.exit(main())
 """
 """A program for `launch`: drawing three scenes takes until the file `release` exists."""
@@ -116,7 +116,7 @@ sys.exit(main())
 @pytest.mark.system
 def test_a_stopping_service_drains(shared_store: Path, tmp_path: Path) -> None:
     begun, release = tmp_path / "begun", tmp_path / "release"
-    program = HELD.format(begun=str(begun), release=str(release))
+    program = WAITING.format(begun=str(begun), release=str(release))
     log = tmp_path / "log"
     with launch(shared_store, log, program=("-c", program), SCENE_DRAIN_SECONDS="3") as service:
         answers: list[Response] = []

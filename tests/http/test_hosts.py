@@ -92,12 +92,12 @@ shared = client_of_service(cors_origins=[LISTED, SECOND], max_body_bytes=2048)
 async def preflight(
     client: AsyncClient, origin: str, method: str = "POST", headers: str = "content-type"
 ) -> Response:
-    asked = {
+    fields = {
         "Origin": origin,
         "Access-Control-Request-Method": method,
         "Access-Control-Request-Headers": headers,
     }
-    return await client.options("/relations", headers=asked)
+    return await client.options("/relations", headers=fields)
 
 
 def allowed(response: Response, origin: str) -> None:

@@ -17,7 +17,7 @@ from app.registry import Store
 from app.scene.relations import CANONICAL, opposite
 from tests.http.stores import PROFILES, VOCABULARY, corrupt, publish
 from tests.http.test_problems import problem
-from tests.services import PATIENCE, Hold, Replace, defect, load_changes, serve
+from tests.services import PATIENCE, Pause, Replace, defect, load_changes, serve
 
 
 async def default(client: AsyncClient) -> str:
@@ -202,24 +202,24 @@ async def test_requests_are_answered_during_a_load(
     assert await default(own) == "home@2.0.0"
 
 
-async def test_a_request_keeps_its_models(own: AsyncClient, store: Path, hold: Hold) -> None:
-    held = hold("missing", lambda manifest: manifest.version == "1.0.0")
+async def test_a_request_keeps_its_models(own: AsyncClient, store: Path, pause: Pause) -> None:
+    paused = pause("missing", lambda manifest: manifest.version == "1.0.0")
     batch = {"scenes": [{"objects": ["bed"] * 33}] * 3}  # so many are not for the event loop
     asking = asyncio.create_task(own.post("/missing/batch", json=batch))
-    assert await asyncio.to_thread(held.started.wait, PATIENCE)
+    assert await asyncio.to_thread(paused.started.wait, PATIENCE)
     publish(store, "home", "2.0.0", seed=2, alias="default")
     await load_changes(own)
     assert await default(own) == "home@2.0.0"
-    held.release.set()
+    paused.release.set()
     results = (await asking).json()["results"]
     assert [entry["result"]["model"]["version"] for entry in results] == ["1.0.0"] * 3
 
 
 async def test_replaced_models_are_freed(own: AsyncClient, store: Path, replace: Replace) -> None:
-    asked: list[weakref.ref[Any]] = []
+    weights: list[weakref.ref[Any]] = []
 
     def note(missing: Any, artifact: Any, *args: Any, **parameters: Any) -> Any:
-        asked.append(weakref.ref(artifact.weights))
+        weights.append(weakref.ref(artifact.weights))
         return missing(artifact, *args, **parameters)
 
     replace("missing", note)
@@ -229,7 +229,7 @@ async def test_replaced_models_are_freed(own: AsyncClient, store: Path, replace:
     await load_changes(own)
     await own.app.state.runtime.check_store(always=True)  # type: ignore[attr-defined]
     await own.post("/missing", json={"objects": ["bed"], "model": "home"})
-    replaced, kept, again = asked
+    replaced, kept, again = weights
     assert replaced() is None
     # An unchanged artifact is verified again and not loaded twice.
     assert again() is kept() is not None

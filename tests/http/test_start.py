@@ -31,7 +31,7 @@ pytestmark = pytest.mark.system
 
 Start = Callable[..., subprocess.Popen[str]]
 IN_USE = "SCENE_PORT: another program uses 127.0.0.1:{}; set SCENE_PORT to a free port\n"
-HELD = """
+WAITING = """
 import sys, time
 from pathlib import Path
 from app.__main__ import main
@@ -39,12 +39,12 @@ from app.registry import Store
 
 load = Store.load
 
-def held(*arguments):
+def waiting(*arguments):
     while not Path({go!r}).exists():
         time.sleep(0.01)
     return load(*arguments)
 
-Store.load = held
+Store.load = waiting
 sys.exit(main())
 """
 """A program for `begin`: it loads models as soon as a file exists."""
@@ -98,7 +98,7 @@ def test_an_invalid_address_ends_the_start(starting: Start, log: Path, host: str
 
 def test_connections_are_refused_until_ready(starting: Start, log: Path, tmp_path: Path) -> None:
     port, go = free_port(), tmp_path / "go"
-    process = starting(HELD.format(go=str(go)), PORT=port)
+    process = starting(WAITING.format(go=str(go)), PORT=port)
     wait_for("Waiting for application startup", log, process)
     with socket.socket() as other, pytest.raises(OSError, match="in use"):
         other.bind(("127.0.0.1", port))

@@ -71,10 +71,9 @@ async def test_the_shipped_default_answers(volume: Store, release: Store, is_cop
             assert f"{own}@1.0.0: manifest.json has format" in failures[alias]["detail"]
             assert f"(python -m training {again})" in failures[alias]["detail"]
             assert failures[alias]["detail"].endswith("; new@4.0.0 answers instead")
-            asked = await client.post("/missing", json=OBJECTS | {"model": own})
-            assert (
-                f"python -m training {again}" in problem(asked, 503, "model-unavailable")["detail"]
-            )
+            response = await client.post("/missing", json=OBJECTS | {"model": own})
+            detail = problem(response, 503, "model-unavailable")["detail"]
+            assert f"python -m training {again}" in detail
         listing = (await client.get("/models")).json()
         assert listing["failures"][:4] == ready.json()["failures"][:4]
         (shipped,) = [model for model in listing["models"] if model["name"] == "new"]
@@ -93,12 +92,12 @@ async def test_a_damaged_own_model_is_not_replaced(volume: Store, release: Store
 async def test_replaced_names(store: str, request: pytest.FixtureRequest, release: Store) -> None:
     async with serve(request.getfixturevalue(store).root) as client:
         for name in ("old", "old@3.5.0"):
-            asked = OBJECTS | {"model": name}
-            document = problem(await client.post("/missing", json=asked), 404, "model-replaced")
+            body = OBJECTS | {"model": name}
+            document = problem(await client.post("/missing", json=body), 404, "model-replaced")
             assert document["detail"].startswith("The model new replaces the model old.")
             (error,) = document["errors"]
             assert (error["pointer"], error["suggestions"]) == ("#/model", ["new"])
-            batch = {"scenes": [OBJECTS, asked]}
+            batch = {"scenes": [OBJECTS, body]}
             answer, refused = (await client.post("/missing/batch", json=batch)).json()["results"]
             assert answer["result"]["model"]["name"] == "new"
             assert refused["problem"]["type"] == document["type"]

@@ -61,7 +61,7 @@ def test_missing_answers_are_not_run(output: str, trouble: str, reason: str) -> 
 
 
 @pytest.mark.parametrize(
-    ("answers", "verdict", "locks_asked"),
+    ("answers", "verdict", "lock_services"),
     [
         # Only a service that knows the canary's flaw is asked about the locks.
         ({"pypi": flawed, "osv": flawed}, Verdict.OK, ["pypi"]),
@@ -75,17 +75,17 @@ def test_a_database_needs_the_canary(
     tmp_path: Path,
     answers: dict[str, Any],
     verdict: Verdict,
-    locks_asked: list[str],
+    lock_services: list[str],
 ) -> None:
-    asked = []
+    services = []
 
     def ask(service: str, *arguments: str) -> tuple[str, str]:
         if any("canary" in argument for argument in arguments):
             return report(answers[service]("jinja2")), ""
-        asked.append(service)
+        services.append(service)
         return report(*map(sound, audit.names(*audit.LOCKS))), ""
 
     monkeypatch.setattr(audit, "ask", ask)
     monkeypatch.setattr(audit, "BILLS", tmp_path)
     assert audit.advisories().verdict is verdict
-    assert asked == locks_asked
+    assert services == lock_services

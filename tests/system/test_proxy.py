@@ -112,10 +112,10 @@ def test_silent_connections(behind: StartProxy, shared_store: Path, tmp_path: Pa
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     variables = {"PROXY_HEAD_TIMEOUT": "2s", "PROXY_REQUESTS": "1000000"}
-    with service, behind(service, tmp_path / "log", **variables) as proxy, ExitStack() as held:
+    with service, behind(service, tmp_path / "log", **variables) as proxy, ExitStack() as stack:
         address, clients = ("127.0.0.1", proxy.port), [(f"127.0.0.{10 + k}", 0) for k in range(10)]
         opened = (socket.create_connection(address, 30, client) for client in clients * 30)
-        silent = [held.enter_context(connection) for connection in opened]
+        silent = [stack.enter_context(connection) for connection in opened]
         for _ in range(20):
             assert httpx.get(f"{proxy.address}/health/live").status_code == 200
             assert service.client.get("/health/live").status_code == 200
@@ -175,13 +175,13 @@ def test_slow_bodies_are_ended_by_the_service(proxy: Proxy) -> None:
 def test_limit_of_connections(behind: StartProxy, service: LiveService, tmp_path: Path) -> None:
     variables = {"PROXY_CONNECTIONS": str(CONNECTIONS), "PROXY_HEAD_TIMEOUT": "60s"}
     with behind(service, tmp_path / "log", **variables) as proxy:
-        with ExitStack() as held:
+        with ExitStack() as stack:
             answered = 0
             for _ in range(CONNECTIONS + 10):
                 with suppress(ConnectionError):
                     place = ("127.0.0.1", proxy.port)
                     connection = socket.create_connection(place, timeout=PATIENCE)
-                    held.enter_context(connection)
+                    stack.enter_context(connection)
                     # The begun second request keeps the connection.
                     connection.sendall(LIVE + b"GET ")
                     answered += connection.recv(4096).startswith(b"HTTP/1.1 200 ")
