@@ -1,4 +1,4 @@
-"""Small requests for huge answers: refused by name before the answer is built."""
+"""Small requests for large answers are refused before the answer is built."""
 
 import string
 from collections import Counter

@@ -1,4 +1,4 @@
-"""Bodies and headers that cost much or pretend to be others: refused before the work begins."""
+"""Costly bodies are refused before the service parses or validates them."""
 
 import json
 import threading

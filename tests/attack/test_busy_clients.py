@@ -1,4 +1,4 @@
-"""One client that asks as fast as it can: others are served."""
+"""One client with many costly requests: the service answers other clients."""
 
 import asyncio
 import json

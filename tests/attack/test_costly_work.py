@@ -1,4 +1,4 @@
-"""Costly questions: health and other models answer meanwhile, and unwanted work ends."""
+"""Costly questions delay no quick ones, and work for departed clients ends."""
 
 import asyncio
 import gc

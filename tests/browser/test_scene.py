@@ -1,4 +1,4 @@
-"""Objects come onto the board, move there and leave it, and the service is asked about them."""
+"""Objects on the board: additions, moves, imports, and links to scenes."""
 
 import base64
 import json
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.system
 
 
 def place(board: Board, name: str, question: str = "missing") -> tuple[float, float, float]:
-    """Centre of an object as the service is told."""
+    """The centre of an object in the request."""
     (found,) = [thing for thing in board.body(question)["objects"] if thing["id"] == name]
     return tuple(found["position"][axis] for axis in "xyz")
 

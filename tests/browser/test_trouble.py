@@ -1,4 +1,4 @@
-"""Large scenes, superseded questions, refusals, keys, and a service that goes away."""
+"""Superseded questions, refusals, keys, restarts, and unknown labels."""
 
 import re
 import signal

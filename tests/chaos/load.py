@@ -1,4 +1,4 @@
-"""Requests in progress on many connections while something else happens to the service."""
+"""Constant load on the service during a test."""
 
 from __future__ import annotations
 

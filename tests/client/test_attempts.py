@@ -1,4 +1,4 @@
-"""Attempts, pauses and deadlines of a call, on a clock that only the test moves."""
+"""Attempts, pauses and deadlines of a call, with a simulated clock."""
 
 import json
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""What every client promises, asked of each of them: the service's answers, and its problems."""
+"""The answers and problems of each client, compared with those of the service."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""What a robot installs: one package, whose blocking client is written from the other."""
+"""The package of the Python client, generated clients, and the C++ client."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""The file of recorded scenes: which scenes it has, and that it survives crashes and full disks."""
+"""The file of recorded scenes: its scenes, and crashes and full disks."""
 
 import json
 import logging

@@ -1,4 +1,4 @@
-"""What the clients send: the body, the headers, and what is not sent at all."""
+"""Requests of the clients: bodies, headers, and errors before a request is sent."""
 
 import json
 from collections.abc import Callable

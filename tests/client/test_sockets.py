@@ -1,4 +1,4 @@
-"""The clients over real sockets: one connection for many calls, and deadlines that hold."""
+"""The clients on real sockets: shared connections and deadlines."""
 
 import socket
 import ssl

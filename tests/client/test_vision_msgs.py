@@ -1,4 +1,4 @@
-"""Detections to requests: what is taken over, what is left out, and that both routes agree."""
+"""Conversion of ROS detections to requests, from JSON and from ROS messages."""
 
 import json
 import math

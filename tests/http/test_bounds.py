@@ -1,4 +1,4 @@
-"""Requests that wait: in order, bounded, until their deadline; and what ending does to them."""
+"""Deadlines, queues, and the requests in progress at the end of the service."""
 
 import asyncio
 import math

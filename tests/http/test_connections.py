@@ -1,4 +1,4 @@
-"""Clients that are slow, leave, or do not read: bounded without a proxy too."""
+"""Slow and incomplete requests to the service without a proxy."""
 
 import json
 import select

@@ -1,4 +1,4 @@
-"""The same request gives the same bytes, alone and under load of every kind."""
+"""Equal requests have equal answers, alone and under load."""
 
 import pytest
 

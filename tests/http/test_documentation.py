@@ -1,4 +1,4 @@
-"""The pages work without internet, and the OpenAPI document tells the truth."""
+"""Pages without internet, and the OpenAPI document compared with the service."""
 
 import json
 import re

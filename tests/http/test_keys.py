@@ -1,4 +1,4 @@
-"""The API key: all routes except listed ones need it, before the body is read."""
+"""The API key: which routes need it, and when the service checks it."""
 
 from collections.abc import AsyncIterator
 from typing import Any

@@ -1,4 +1,4 @@
-"""Every failure is a problem document with its cause, and without secrets or input."""
+"""Each error is a problem document with its cause, and without secrets or input."""
 
 import json
 import uuid
@@ -22,7 +22,7 @@ POINT = {"x": 1.0, "y": 1.0, "z": 1.0}
 
 
 def problem(response: Response, status: int, slug: str) -> dict[str, Any]:
-    """The problem of a response, checked for everything that every problem must be."""
+    """Return the problem of a response after the checks of every problem."""
     assert response.status_code == status, response.text
     assert response.headers["content-type"] == "application/problem+json"
     document: dict[str, Any] = response.json()
@@ -39,7 +39,7 @@ def problem(response: Response, status: int, slug: str) -> dict[str, Any]:
 
 
 def pointers(response: Response, slug: str = "invalid-request") -> list[str]:
-    """The places of the errors that a response with status 422 points at."""
+    """The pointers of the errors of a response with status 422."""
     return [error["pointer"] for error in problem(response, 422, slug)["errors"]]
 
 
@@ -380,7 +380,7 @@ async def test_a_defect_is_a_problem_without_details(
     response = await client.post(f"/{question}", json={"objects": ["bed"]})
     document = problem(response, 500, "internal-error")
     assert "secret" not in response.text
-    # The log has what the client is not told, under the same id.
+    # The log has the error under the same id.
     (record,) = [record for record in caplog.records if record.name == "app.api"]
     assert record.exc_info is not None
     assert record.entry["request_id"] == document["request_id"]

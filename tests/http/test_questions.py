@@ -44,7 +44,7 @@ def triples(listed: list[dict[str, Any]]) -> set[tuple[str, str, str]]:
 
 
 async def ask(client: AsyncClient, question: str, **request: Any) -> dict[str, Any]:
-    """The answer, which must be one, validated against its schema and free of anything else."""
+    """Return the answer, which must match its schema without further fields."""
     response = await client.post(f"/{question}", json=request)
     assert response.status_code == 200, response.text
     assert response.headers["content-type"] == "application/json"

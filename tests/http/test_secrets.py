@@ -1,4 +1,4 @@
-"""Keys and payloads reach no log, whatever the level and however a request fails."""
+"""The log has no keys and no payloads, at any level and for any error."""
 
 import socket
 from collections.abc import Iterator

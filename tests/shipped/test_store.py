@@ -1,4 +1,4 @@
-"""What the shipped store promises: which models, how large, how quickly loaded, which words."""
+"""The shipped store: models, sizes, words, and answers to known facts."""
 
 import re
 from pathlib import Path

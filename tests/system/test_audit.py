@@ -1,4 +1,4 @@
-"""The audit never takes silence for a clean bill of health."""
+"""The audit reports databases that give no answer."""
 
 import json
 from functools import partial

@@ -1,4 +1,4 @@
-"""HAProxy with the shipped configuration in front of the service: attacked, and asked as usual."""
+"""HAProxy with the shipped configuration in front of the service: normal and hostile requests."""
 
 import json
 import resource
