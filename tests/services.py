@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import gc
 import os
-import socket
 import subprocess
 import sys
 import threading
@@ -23,6 +22,8 @@ from typing import Any
 
 import httpx
 import pytest
+
+from benchmarks.load.servers import free_port
 
 PATIENCE = 120.0
 """Seconds after which a wait is a hang. A busy machine needs many, and no test measures them."""
@@ -183,10 +184,8 @@ class LiveService:
     @property
     def memory(self) -> int:
         """Resident memory in bytes."""
-        for line in Path(f"/proc/{self.process.pid}/status").read_text("ascii").splitlines():
-            if line.startswith("VmRSS:"):
-                return int(line.split()[1]) * 1024
-        raise ProcessLookupError(self.process.pid)
+        pages = Path(f"/proc/{self.process.pid}/statm").read_text("ascii").split()[1]
+        return int(pages) * os.sysconf("SC_PAGE_SIZE")
 
     @property
     def descriptors(self) -> int:
@@ -279,12 +278,6 @@ def http_server(handler: type[BaseHTTPRequestHandler], **options: Any) -> Iterat
     server.shutdown()
     thread.join()
     server.server_close()
-
-
-def free_port() -> int:
-    """Return a port of 127.0.0.1 that no program uses now."""
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        return int(probe.getsockname()[1])
 
 
 def is_ready(port: int) -> bool:

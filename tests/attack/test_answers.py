@@ -176,8 +176,15 @@ async def test_unknown_ends_cost_little(client: AsyncClient, calls: Counter[str]
     assert calls["spelt_alike"] <= MAX_SUGGESTED
 
 
-async def test_unknown_labels_stop_early(client: AsyncClient, calls: Counter[str]) -> None:
-    objects = [f"a/{'b/' * 40}{number}" for number in range(256)]
-    answer = await client.post("/missing", json={"objects": objects})
-    assert len(answer.json()["errors"]) == MAX_ERRORS
-    assert calls["read"] == MAX_ERRORS
+@pytest.mark.parametrize(
+    ("question", "field", "count"),
+    [("missing", "objects", 256), ("missing", "candidates", 4096), ("rooms", "candidates", 4096)],
+)
+async def test_unknown_labels_stop_early(
+    client: AsyncClient, calls: Counter[str], question: str, field: str, count: int
+) -> None:
+    name = "a/" + "b/" * (40 if field == "objects" else 3)
+    body = {"objects": ["bed"]} | {field: [f"{name}{number}" for number in range(count)]}
+    document = problem(await client.post(f"/{question}", json=body), 422, "unknown-labels")
+    assert len(document["errors"]) == MAX_ERRORS
+    assert calls["read"] <= MAX_ERRORS + 1

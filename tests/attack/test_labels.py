@@ -26,7 +26,6 @@ from app.scene.vocabulary import Vocabulary
 from app.serving.request import QUICK_LABELS, is_quick
 from scene_client.schemas import MissingRequest, RoomsRequest
 from scene_client.schemas.requests import MAX_LABEL
-from scene_client.validation import MAX_ERRORS
 from tests.http.stores import VOCABULARY
 from tests.http.test_problems import problem
 
@@ -217,13 +216,6 @@ def test_the_memory_for_labels_is_bounded(monkeypatch: pytest.MonkeyPatch) -> No
         vocabulary.read(word)
     assert 1 <= sum(vocabulary.remembers(word, ("read",)) for word in words) <= 8
     assert not vocabulary.remembers("z" * 101, ("read",))
-
-
-async def test_a_list_of_unknown_candidates_stops_early(client: AsyncClient) -> None:
-    body = {"objects": ["bed"], "candidates": [f"zxqv {k}" for k in range(4096)]}
-    for question in ("missing", "rooms"):
-        document = problem(await client.post(f"/{question}", json=body), 422, "unknown-labels")
-        assert len(document["errors"]) == MAX_ERRORS
 
 
 async def test_a_long_word_in_a_path_is_refused(client: AsyncClient) -> None:
