@@ -86,37 +86,27 @@ async def test_only_strict_json_is_accepted(client: AsyncClient, body: bytes) ->
     problem(await post(client, body.ljust(2**18 + 1), "/missing/batch"), 400, "not-json")
 
 
-@pytest.mark.parametrize(
-    ("content_type", "encoding", "named"),
-    [
-        *(
-            (kind, None, None)
-            for kind in (
-                "application/json; charset=utf-8",
-                "Application/JSON",
-                "application/a+json",
-            )
-        ),
-        *(
-            (kind, None, "application/json")
-            for kind in (None, "text/plain", "application/x-www-form-urlencoded", "json", "", "*/*")
-        ),
-        ("application/json; charset=utf-16", None, "charset"),
-        ("application/a+json; charset=latin-1", None, "charset"),
-        ("application/json", "gzip", "Content-Encoding"),
-        ("application/json", "identity, br", "compressed"),
-    ],
-)
-async def test_only_plain_json_is_accepted(
-    client: AsyncClient, content_type: str | None, encoding: str | None, named: str | None
-) -> None:
-    fields = {"Content-Type": content_type, "Content-Encoding": encoding}
-    headers = {name: value for name, value in fields.items() if value is not None}
-    response = await client.post("/relations", content=b'{"objects": ["bed"]}', headers=headers)
-    if named is None:
-        assert response.status_code == 200
-    else:
-        assert named in problem(response, 415, "unsupported-media-type")["detail"]
+ACCEPTED_TYPES = ("application/json; charset=utf-8", "Application/JSON", "application/a+json")
+REFUSED_TYPES = {
+    "application/json": ("text/plain", "application/x-www-form-urlencoded", "json", "", "*/*"),
+    "charset": ("application/json; charset=utf-16", "application/a+json; charset=latin-1"),
+}
+REFUSED_HEADERS = [
+    *(({"Content-Type": kind}, name) for name, kinds in REFUSED_TYPES.items() for kind in kinds),
+    ({}, "application/json"),
+    ({"Content-Type": "application/json", "Content-Encoding": "gzip"}, "Content-Encoding"),
+    ({"Content-Type": "application/json", "Content-Encoding": "identity, br"}, "compressed"),
+]
+
+
+async def test_only_plain_json_is_accepted(client: AsyncClient) -> None:
+    content = b'{"objects": ["bed"]}'
+    for kind in ACCEPTED_TYPES:
+        headers = {"Content-Type": kind}
+        assert (await client.post("/relations", content=content, headers=headers)).is_success, kind
+    for headers, name in REFUSED_HEADERS:
+        response = await client.post("/relations", content=content, headers=headers)
+        assert name in problem(response, 415, "unsupported-media-type")["detail"], headers
 
 
 LEFT = {"subject": "bed", "relation": "left", "object": "lamp"}

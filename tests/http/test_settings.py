@@ -107,17 +107,14 @@ def test_unknown_names_stop_the_start(
 def test_help_lists_the_settings(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(["--port", "9000"])
-    assert (
-        "unknown arguments: --port 9000; settings are environment variables"
-        in capsys.readouterr().err
-    )
+    refusal = "unknown arguments: --port 9000; settings are environment variables"
+    assert refusal in capsys.readouterr().err
     with pytest.raises(SystemExit, match="0"):
         main(["--help"])
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     shown = [line for line in lines if line and line[0].startswith("SCENE_")]
-    assert [name for name, *_ in shown] == [
-        f"SCENE_{name.upper()}" for name in Settings.model_fields
-    ]
+    names = [f"SCENE_{name.upper()}" for name in Settings.model_fields]
+    assert [name for name, *_ in shown] == names
     assert ["SCENE_PORT", "8000"] in shown
 
 
