@@ -64,6 +64,18 @@ def array(*detections: dict[str, Any], frame: str = "base_link", **header: Any) 
     return {"header": {"stamp": stamp, "frame_id": frame, **header}, "detections": list(detections)}
 
 
+def in_space(
+    *detections: Any, label_map: Any = None, frame: str = "base_link", **options: Any
+) -> Any:
+    """The fields of detections with poses."""
+    return from_detection3d_array(array(*detections, frame=frame), label_map, **options)
+
+
+def in_image(*detections: Any, frame: str = "base_link") -> SceneFields:
+    """The fields of detections in an image."""
+    return from_detection2d_array(array(*detections, frame=frame))
+
+
 def only(fields: SceneFields) -> dict[str, Any]:
     (thing,) = fields["objects"]
     assert isinstance(thing, dict)
@@ -97,6 +109,8 @@ def test_messages_of_other_packages_may_be_objects(name: str) -> None:
 BED = {"label": "bed", "confidence": 0.9, "position": {"x": 1.0, "y": 0.0, "z": 0.5}}
 SIZED = BED | {"size": {"x": 0.5, "y": 0.5, "z": 0.5}}
 UPRIGHT = {"orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
+TURNED = {"orientation": {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8}}
+SCORES = (0.2, 0.9, math.nan, None)
 
 
 def bed(**fields: Any) -> dict[str, Any]:
@@ -107,11 +121,7 @@ def bed(**fields: Any) -> dict[str, Any]:
     ("detection", "expected", "reason"),
     [
         # The hypothesis of the highest score counts, wherever it stands in the list.
-        (
-            seen(*map(result, ("cat", "bed", "cow", "ant"), (0.2, 0.9, math.nan, None))),
-            SIZED | UPRIGHT,
-            None,
-        ),
+        (seen(*map(result, ("cat", "bed", "cow", "ant"), SCORES)), SIZED | UPRIGHT, None),
         # Scores in per cent are clipped.
         (seen(result("bed", 87.0)), SIZED | UPRIGHT | {"confidence": 1.0}, "high-score"),
         # A flat box has a size.
@@ -123,11 +133,7 @@ def bed(**fields: Any) -> dict[str, Any]:
         ],
         # Quaternions get the length 1.
         (bed(turn=(0, 0, 0, 2)), SIZED | UPRIGHT, None),
-        (
-            bed(turn=(0, 0, 3, 4)),
-            SIZED | {"orientation": {"x": 0, "y": 0, "z": 0.6, "w": 0.8}},
-            None,
-        ),
+        (bed(turn=(0, 0, 3, 4)), SIZED | TURNED, None),
         *[
             (bed(turn=turn), SIZED, None)
             for turn in ((0, 0, 0, 0), (1e-9, 0, 0, 0), (0, 0, 0, math.nan), (1e308,) * 4)
@@ -139,7 +145,7 @@ def bed(**fields: Any) -> dict[str, Any]:
     ],
 )
 def test_detection_values(detection: Any, expected: dict[str, Any], reason: str | None) -> None:
-    fields = from_detection3d_array(array(detection))
+    fields = in_space(detection)
     assert only(fields) == expected | {"id": "bed_1"}
     assert reasons(fields) == ([(0, reason)] if reason else [])
 
@@ -155,9 +161,8 @@ def test_detection_values(detection: Any, expected: dict[str, Any], reason: str 
     ],
 )
 def test_detections_without_a_label_are_left_out(results: Any, reason: str) -> None:
-    fields = from_detection3d_array(
-        array(seen(*results), seen(result("lamp"))), {"7": None}, min_score=0.3
-    )
+    lamp = seen(result("lamp"))
+    fields = in_space(seen(*results), lamp, label_map={"7": None}, min_score=0.3)
     assert only(fields)["label"] == "lamp"
     assert reasons(fields) == [(0, reason)]
 
@@ -165,12 +170,10 @@ def test_detections_without_a_label_are_left_out(results: Any, reason: str) -> N
 def test_an_empty_box_has_the_pose_of_the_hypothesis() -> None:
     where = pose((1, 2, 3))
     empty = {"at": (0, 0, 0), "size": (0, 0, 0)}
-    fields = from_detection3d_array(
-        array(
-            seen(result("cup", 0.1, pose((9, 9, 9))), result("bed", 0.8, where), **empty),
-            seen(result("bed"), **empty),
-            seen(result("bed", 0.8, where), at=(0, 0, 0)),
-        )
+    fields = in_space(
+        seen(result("cup", 0.1, pose((9, 9, 9))), result("bed", 0.8, where), **empty),
+        seen(result("bed"), **empty),
+        seen(result("bed", 0.8, where), at=(0, 0, 0)),
     )
     positions = [thing.get("position") for thing in fields["objects"]]
     # A box with a size was filled in, wherever it lies.
@@ -182,7 +185,7 @@ def test_ids_of_detections() -> None:
     labels = ("chair", "lamp", "chair", "lamp", "bed", "bed")
     names = ("", "chair_1", "", "chair_1", " \n ", "a\nb")
     detections = (seen(result(label), name=name) for label, name in zip(labels, names, strict=True))
-    fields = from_detection3d_array(array(*detections))
+    fields = in_space(*detections)
     ids = [thing["id"] for thing in fields["objects"]]
     assert ids == ["chair_2", "chair_1", "chair_3", "lamp_1", "bed_1", "bed_2"]
     assert reasons(fields) == [(3, "renamed"), (5, "renamed")]
@@ -192,7 +195,7 @@ def test_the_most_confident_objects_are_kept() -> None:
     n = MAX_OBJECTS + 40
     scores = [0.1 + 0.8 * (k * 101 % n) / n for k in range(n)]
     cups = (seen(result("cup", score), name=str(k)) for k, score in enumerate(scores))
-    fields = from_detection3d_array(array(*cups))
+    fields = in_space(*cups)
     kept = [int(thing["id"]) for thing in fields["objects"]]
     floor = sorted(scores)[-MAX_OBJECTS]
     assert kept == [k for k in range(n) if scores[k] >= floor]
@@ -222,7 +225,7 @@ def test_frame_and_stamp_of_the_header(header: dict[str, Any], field: str, sent:
 
 def test_the_frame_of_the_detections() -> None:
     detections = (bed(frame="/odom"), bed(), bed(frame="base_link"))
-    fields = from_detection3d_array(array(*detections, frame=""))
+    fields = in_space(*detections, frame="")
     assert fields["frame_id"] == "odom"
     assert ["position" in thing for thing in fields["objects"]] == [True, True, False]
     assert reasons(fields) == [(2, "no-position")]
@@ -241,7 +244,7 @@ def test_the_frame_of_the_detections() -> None:
 )
 def test_wrong_arguments_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(MessageError):
-        from_detection3d_array(array(seen(result("bed"))), **wrong)
+        in_space(seen(result("bed")), **wrong)
 
 
 @pytest.mark.parametrize(
@@ -316,15 +319,13 @@ def lefts(fields: SceneFields) -> set[tuple[str, str]]:
 
 
 def test_image_boxes_give_left_and_right_of_neighbours() -> None:
-    fields = from_detection2d_array(
-        array(
-            flat("cup", 100, 100),
-            flat("bed", 160, 110),  # right of the cup
-            flat("lamp", 165, 30),  # above both: says nothing
-            flat("door", 900, 100),  # far off
-            flat("rug", 102, 101),  # where the cup is
-            frame="camera_optical_frame",
-        )
+    fields = in_image(
+        flat("cup", 100, 100),
+        flat("bed", 160, 110),  # right of the cup
+        flat("lamp", 165, 30),  # above both: no relation
+        flat("door", 900, 100),  # far away
+        flat("rug", 102, 101),  # at the place of the cup
+        frame="camera_optical_frame",
     )
     assert lefts(fields) == {("cup_1", "bed_1"), ("rug_1", "bed_1")}
     assert fields["frame_id"] == "camera_optical_frame"
@@ -333,13 +334,11 @@ def test_image_boxes_give_left_and_right_of_neighbours() -> None:
 
 
 def test_invalid_boxes_are_reported() -> None:
-    fields = from_detection2d_array(
-        array(
-            flat("cup", 100, 100),
-            flat("bed", math.nan, 100),
-            flat("lamp", 120, 100, 0, 0),
-            flat("rug", 150, 100, frame="other_camera"),
-        )
+    fields = in_image(
+        flat("cup", 100, 100),
+        flat("bed", math.nan, 100),
+        flat("lamp", 120, 100, 0, 0),
+        flat("rug", 150, 100, frame="other_camera"),
     )
     assert lefts(fields) == set()
     assert reasons(fields) == [(1, "no-box"), (2, "no-box"), (3, "no-box")]
