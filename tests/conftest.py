@@ -20,6 +20,8 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 
 pytest_plugins = ["tests.services"]
 
+FindTool = Callable[[str], Path]
+
 # The default profile `ci` draws the same examples on every run. HYPOTHESIS_PROFILE=explore draws
 # more and different examples.
 # No profile measures time, because the machine may be busy.
@@ -52,7 +54,7 @@ def anyio_backend() -> str:
 
 
 @pytest.fixture(scope="session")
-def require_system_tool() -> Callable[[str], Path]:
+def find_tool() -> FindTool:
     """Return a function that finds a program, or skips the test if it is not installed.
 
     With REQUIRE_SYSTEM=1, as in continuous integration, a missing program fails the test. There, a
@@ -61,7 +63,9 @@ def require_system_tool() -> Callable[[str], Path]:
 
     def find(name: str) -> Path:
         # Programs from wheels are in the interpreter's folder, which may be missing in PATH.
-        search = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
+        # Debian has some programs in a folder of administrators.
+        folders = (str(Path(sys.executable).parent), os.environ.get("PATH", ""), "/usr/sbin")
+        search = os.pathsep.join(folders)
         if program := shutil.which(name, path=search):
             return Path(program)
         if os.environ.get("REQUIRE_SYSTEM") == "1":

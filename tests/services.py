@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import gc
 import os
-import socket
 import subprocess
 import sys
 import threading
@@ -23,6 +22,8 @@ from typing import Any
 
 import httpx
 import pytest
+
+from benchmarks.load.servers import free_port
 
 PATIENCE = 120.0
 """Seconds after which a wait is a hang. A busy machine needs many, and no test measures them."""
@@ -132,33 +133,33 @@ def replace(monkeypatch: pytest.MonkeyPatch) -> Replace:
 
 
 @dataclass(frozen=True)
-class Held:
+class Paused:
     """A question that waits in its worker thread for the event `release`."""
 
     started: threading.Event = field(default_factory=threading.Event)
     release: threading.Event = field(default_factory=threading.Event)
 
 
-Hold = Callable[..., Held]
+Pause = Callable[..., Paused]
 
 
 @pytest.fixture
-def hold(replace: Replace) -> Iterator[Hold]:
-    """Hold a question from the call on, of all models or of some."""
-    held = Held()
+def pause(replace: Replace) -> Iterator[Pause]:
+    """Pause a question from the call on, of all models or of some."""
+    paused = Paused()
 
-    def hold(name: str, of: Callable[[Any], bool] = lambda model: True) -> Held:
+    def pause(name: str, of: Callable[[Any], bool] = lambda model: True) -> Paused:
         def wait(question: Any, model: Any, *args: Any, **parameters: Any) -> Any:
             if of(model):
-                held.started.set()
-                assert held.release.wait(PATIENCE)
+                paused.started.set()
+                assert paused.release.wait(PATIENCE)
             return question(model, *args, **parameters)
 
         replace(name, wait)
-        return held
+        return paused
 
-    yield hold
-    held.release.set()
+    yield pause
+    paused.release.set()
 
 
 def defect(*_: Any, **__: Any) -> Any:
@@ -183,10 +184,8 @@ class LiveService:
     @property
     def memory(self) -> int:
         """Resident memory in bytes."""
-        for line in Path(f"/proc/{self.process.pid}/status").read_text("ascii").splitlines():
-            if line.startswith("VmRSS:"):
-                return int(line.split()[1]) * 1024
-        raise ProcessLookupError(self.process.pid)
+        pages = Path(f"/proc/{self.process.pid}/statm").read_text("ascii").split()[1]
+        return int(pages) * os.sysconf("SC_PAGE_SIZE")
 
     @property
     def descriptors(self) -> int:
@@ -269,21 +268,16 @@ def launch(
 
 
 @contextmanager
-def http_server(handler: Callable[..., BaseHTTPRequestHandler]) -> Iterator[str]:
-    """Run a server of the standard library in a thread, and yield its URL."""
-    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+def http_server(handler: type[BaseHTTPRequestHandler], **options: Any) -> Iterator[str]:
+    """Run a server of the standard library in a thread without a log, and yield its URL."""
+    quiet = type("Quiet", (handler,), {"log_message": lambda *_: None})
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(quiet, **options))
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
     yield f"http://127.0.0.1:{server.server_port}"
     server.shutdown()
     thread.join()
     server.server_close()
-
-
-def free_port() -> int:
-    """Return a port of 127.0.0.1 that no program uses now."""
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        return int(probe.getsockname()[1])
 
 
 def is_ready(port: int) -> bool:
@@ -311,6 +305,12 @@ def live(shared_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     log, program = tmp_path_factory.mktemp("live") / "log", ("-c", WITHOUT_TRAINING)
     with launch(shared_store, log, program=program) as service:
         yield service
+
+
+@pytest.fixture(scope="session")
+def url(live: LiveService) -> str:
+    """The URL of the shared service."""
+    return live.url
 
 
 @pytest.fixture(scope="session")

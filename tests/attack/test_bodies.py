@@ -1,12 +1,12 @@
-"""Bodies and headers that cost much or pretend to be others: refused before the work begins."""
+"""Costly bodies are refused before the service parses or validates them."""
 
 import json
 import threading
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
+from httpx import AsyncClient
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -31,10 +31,10 @@ JSON = {"Content-Type": "application/json"}
         ("outliers/batch", "scenes", {}, 256),
     ],
 )
-async def test_entries_are_counted_before_they_are_validated(
-    client: httpx.AsyncClient, path: str, field: str, entry: Any, most: int
+async def test_entries_are_counted_before_validation(
+    client: AsyncClient, path: str, field: str, entry: Any, most: int
 ) -> None:
-    """All other faults of the body stay unreported, so pydantic has not seen it."""
+    # pydantic would report the unknown field.
     body = {"objects": ["bed"], "unknown": 1, field: [entry] * (most + 1)}
     document = problem(await client.post(f"/{path}", json=body), 422, "invalid-request")
     assert [(error["pointer"], error["message"]) for error in document["errors"]] == [
@@ -60,10 +60,9 @@ def batch(entry: bytes, size: int = 2**21) -> bytes:
 
 
 @pytest.mark.parametrize("entry", [b"[]", b"{}", b"[" * 99 + b"]" * 99])
-async def test_arrays_and_objects_are_counted_before_they_are_parsed(
-    client: httpx.AsyncClient, parsed: list[int], entry: bytes
+async def test_containers_are_counted_before_parsing(
+    client: AsyncClient, parsed: list[int], entry: bytes
 ) -> None:
-    """They stopped the service for a second."""
     dense = b'{"scenes":[{"objects":["bed"],"candidates":[%b]}]}' % b",".join([entry] * 2**17)
     for body in (batch(entry), dense[: 2**21]):
         response = await client.post("/missing/batch", content=body, headers=JSON)
@@ -73,7 +72,7 @@ async def test_arrays_and_objects_are_counted_before_they_are_parsed(
 
 @pytest.mark.parametrize("entry", [b"1", b'""', b"9" * 4000])
 async def test_a_large_batch_is_parsed_scene_by_scene(
-    client: httpx.AsyncClient, parsed: list[int], entry: bytes
+    client: AsyncClient, parsed: list[int], entry: bytes
 ) -> None:
     response = await client.post("/missing/batch", content=batch(entry), headers=JSON)
     document = problem(response, 422, "invalid-request")
@@ -104,7 +103,7 @@ def test_a_body_in_pieces_is_the_same_body(value: dict[str, Any], indent: Any) -
     assert parse(body, 120) == json.loads(body)
 
 
-async def test_the_body_of_one_scene_has_a_limit_of_its_own(client: httpx.AsyncClient) -> None:
+async def test_the_body_of_one_scene_has_a_limit_of_its_own(client: AsyncClient) -> None:
     scene = b'{"objects":["bed"]}'
     response = await client.post("/missing", content=scene.ljust(2**18), headers=JSON)
     assert response.status_code == 200
@@ -131,9 +130,8 @@ AT = {"x": 1, "y": 0, "z": 0}
     ],
 )
 async def test_a_request_has_at_most_32_errors(
-    client: httpx.AsyncClient, body: dict[str, Any], first: str, last: str
+    client: AsyncClient, body: dict[str, Any], first: str, last: str
 ) -> None:
-    """6,600 unknown fields made health wait 557 ms, 4,096 unknown names 126 ms."""
     document = problem(await client.post("/missing", json=body), 422, "invalid-request")
     pointers = [error["pointer"] for error in document["errors"]]
     assert (len(pointers), pointers[0], pointers[-1]) == (32, f"#/{first}", f"#/{last}")
@@ -152,7 +150,7 @@ async def test_a_request_has_at_most_32_errors(
     ],
 )
 @pytest.mark.parametrize("question", ["outliers", "generate"])
-async def test_large_scenes_are_read_off_the_event_loop(
+async def test_large_scenes_leave_the_event_loop(
     shared_store: Path,
     monkeypatch: pytest.MonkeyPatch,
     question: str,
@@ -171,8 +169,8 @@ async def test_large_scenes_are_read_off_the_event_loop(
     assert (threads[0] is not threading.main_thread()) == is_large
 
 
-async def test_a_client_may_hold_one_body_above_its_share(shared_store: Path) -> None:
-    """A quarter of this budget is less than the batch."""
+async def test_one_body_may_exceed_the_share(shared_store: Path) -> None:
+    # A quarter of this budget is less than the batch.
     batch = b'{"scenes":[{"objects":["bed"]}]}'.ljust(2**19)
     async with serve(shared_store, held_body_bytes=2**20) as client:
         answer = await client.post("/missing/batch", content=batch, headers=JSON)

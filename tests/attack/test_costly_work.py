@@ -1,4 +1,4 @@
-"""Costly questions: health and other models answer meanwhile, and unwanted work ends."""
+"""Costly questions delay no quick ones, and work for departed clients ends."""
 
 import asyncio
 import gc
@@ -10,40 +10,38 @@ from pathlib import Path
 from typing import Any
 
 import anyio
-import httpx
 import pytest
+from httpx import AsyncClient
 from pydantic import ValidationError
 
 from app.settings import Settings
 from tests.http.stores import VOCABULARY
 from tests.http.test_problems import problem
-from tests.services import Hold, Replace, serve
+from tests.services import Pause, Replace, serve
 
 LABELS = [entry.label for entry in VOCABULARY.objects if not entry.structure]
 HOME = {"objects": LABELS[:4]}
 LONG = {"X-Request-Timeout-Ms": "60000"}
 
 
-async def test_quick_questions_pass_large_scenes_batches_and_documents(
-    shared_store: Path, hold: Hold
-) -> None:
+async def test_quick_questions_pass_costly_ones(shared_store: Path, pause: Pause) -> None:
     async with serve(shared_store) as client:
         client.headers.update(LONG)
-        held = hold("outliers")
+        paused = pause("outliers")
         large = {"objects": [LABELS[0]] * 33, "model": "general"}
         costly = [
             *(asyncio.ensure_future(client.post("/outliers", json=large)) for _ in range(4)),
             asyncio.ensure_future(client.post("/outliers/batch", json={"scenes": [large] * 4})),
             *(asyncio.ensure_future(client.get("/openapi.json")) for _ in range(24)),
         ]
-        assert await asyncio.to_thread(held.started.wait, 60)
+        assert await asyncio.to_thread(paused.started.wait, 60)
         for size in range(1, 14):
             body = {"objects": LABELS[:size]}
             assert (await client.post("/missing", json=body)).is_success
             assert (await client.post("/relations", json=body)).is_success
             assert (await client.get("/health/live")).is_success
         assert not any(job.done() for job in costly)
-        held.release.set()
+        paused.release.set()
         assert all(answer.is_success for answer in await asyncio.gather(*costly))
 
 
@@ -70,7 +68,7 @@ async def test_work_of_a_departed_client_ends(shared_store: Path, replace: Repla
         assert await asyncio.to_thread(ended.wait, 60)
 
 
-async def test_a_request_without_enough_memory_gets_503(
+async def test_a_memory_error_gets_503(
     shared_store: Path, replace: Replace, caplog: pytest.LogCaptureFixture
 ) -> None:
     def fail(*_: Any, **__: Any) -> Any:
@@ -135,7 +133,7 @@ async def status(app: Any, path: str, body: bytes) -> int:
 
 
 @pytest.mark.parametrize("case", CASES)
-async def test_no_cycle_keeps_a_request(client: httpx.AsyncClient, case: str) -> None:
+async def test_no_cycle_keeps_a_request(client: AsyncClient, case: str) -> None:
     path, content, expected = CASES[case]
     body = content if isinstance(content, bytes) else json.dumps(content).encode()
     app: Any = client.app  # type: ignore[attr-defined]

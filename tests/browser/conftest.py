@@ -10,56 +10,29 @@ import pytest
 from playwright.sync_api import Browser, Page, Route, expect, sync_playwright
 
 from tests.browser.driving import Board, link_to
-from tests.conftest import REPOSITORY
+from tests.conftest import REPOSITORY, FindTool
 from tests.services import PATIENCE, LiveService
 
 expect.set_options(timeout=1000 * PATIENCE)
 
 DESK = {
     "objects": [
-        {
-            "id": "desk",
-            "label": "desk",
-            "position": {"x": 2, "y": 0, "z": 0.37},
-            "size": {"x": 0.8, "y": 1.6, "z": 0.74},
-        },
-        {
-            "id": "chair",
-            "label": "chair",
-            "position": {"x": 1, "y": 0, "z": 0.45},
-            "size": {"x": 0.5, "y": 0.5, "z": 0.9},
-        },
+        {"id": "desk", "label": "desk", "position": [2, 0, 0.37], "size": [0.8, 1.6, 0.74]},
+        {"id": "chair", "label": "chair", "position": [1, 0, 0.45], "size": [0.5, 0.5, 0.9]},
     ]
 }
 
 EXAMPLES = json.loads((REPOSITORY / "training/runs/examples/indoor.json").read_text("utf-8"))
 """Example scenes of the shipped vocabulary."""
 
-# Whatever a policy forbids is told to the page that tried it. `quiet` waits until no short timer is
-# pending: the page asks the service some time after the last change.
-_WITNESS = """
-window.violations = [];
-addEventListener('securitypolicyviolation', (event) =>
-  window.violations.push(`${event.violatedDirective} ${event.blockedURI}`));
-const pending = new Set();
-const { setTimeout: start, clearTimeout: stop } = window;
-window.setTimeout = (run, after = 0, ...rest) => {
-  const timer = start(() => { pending.delete(timer); run(...rest); }, after);
-  if (after < 200) pending.add(timer);
-  return timer;
-};
-window.clearTimeout = (timer) => { pending.delete(timer); stop(timer); };
-window.quiet = () => new Promise((done) => {
-  const look = () => (pending.size ? start(look, 10) : done());
-  look();
-});
-"""
+WITNESS = Path(__file__).parent / "witness.js"
+"""A script in each page: `violations` of the policy, and `quiet`, which waits for short timers."""
 
 
 @pytest.fixture(scope="package")
-def chromium(require_system_tool: Callable[[str], Path]) -> Iterator[Browser]:
+def chromium(find_tool: FindTool) -> Iterator[Browser]:
     """One browser for all tests of this folder; its event loop must not outlive them."""
-    program = require_system_tool("chromium")
+    program = find_tool("chromium")
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(
             executable_path=str(program), args=["--headless", "--no-sandbox"]
@@ -90,7 +63,7 @@ def open_board(chromium: Browser, shipped: LiveService) -> Iterator[Callable[...
     ) -> Board:
         context = chromium.new_context(viewport={"width": 1300, "height": 900}, **options)
         context.set_default_timeout(1000 * PATIENCE)
-        context.add_init_script(_WITNESS)
+        context.add_init_script(path=WITNESS)
         root = home or str(shipped.client.base_url)
         wrong: list[str] = []
 

@@ -1,4 +1,4 @@
-"""What a person does on the page, and what the page shows."""
+"""Actions of a person on the page, and the content of the page."""
 
 import base64
 import json
@@ -12,13 +12,13 @@ from playwright.sync_api import Locator, Page, Route, expect
 
 
 class Board:
-    """The page. Everything goes through what people see: roles, names, texts."""
+    """The page, used by roles, names and texts, as people do."""
 
     def __init__(self, page: Page) -> None:
         self.page = page
 
     def settle(self) -> None:
-        """Wait until everything that changed has been asked and answered."""
+        """Wait for the answers to all changes."""
         expect(self.page.locator("main[aria-busy=true], #import:disabled")).to_have_count(0)
         self.page.evaluate("window.quiet()")
         busy = self.page.locator("article:not([hidden])[aria-busy=true], #drawn[aria-busy=true]")
@@ -106,7 +106,7 @@ class Board:
 
     @property
     def announced(self) -> str:
-        """What a screen reader was told last."""
+        """The last text for screen readers."""
         return plain(self.page.locator("#live").text_content())
 
     def column(self, question: str) -> Locator:
@@ -128,7 +128,7 @@ class Board:
 
     @property
     def scene(self) -> dict[str, Any]:
-        """The scene of the shown question's command: what any question can be asked about."""
+        """The scene in the command of the shown question."""
         shown = self.page.locator("article:visible pre").first.text_content() or ""
         fields = ("objects", "relations", "room_type", "frame_id", "viewpoint")
         return {name: value for name, value in body_of(shown).items() if name in fields}

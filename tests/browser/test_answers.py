@@ -3,8 +3,6 @@
 import json
 import re
 import sys
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -12,7 +10,7 @@ import pytest
 from playwright.sync_api import expect
 
 from tests.browser.driving import Board, OpenBoard, body_of, percent
-from tests.conftest import run_program
+from tests.conftest import FindTool, run_program
 
 pytestmark = pytest.mark.system
 
@@ -88,9 +86,7 @@ def test_a_ghost_becomes_an_object_where_it_was_drawn(bedroom: Board) -> None:
     assert all(label != row.split(" ")[0] for row in bedroom.rows("missing"))
 
 
-def test_the_menu_of_an_object_asks_what_is_missing_there(
-    bedroom: Board, api: httpx.Client
-) -> None:
+def test_the_menu_of_an_object(bedroom: Board, api: httpx.Client) -> None:
     bedroom.click("Actions for nightstand")
     bedroom.page.get_by_role("menuitem", name="What is missing on top of it?").click()
     bedroom.settle()
@@ -117,9 +113,7 @@ def test_the_menu_of_an_object_asks_what_is_missing_there(
     assert all("no likely place" in row for row in bedroom.rows("missing"))
 
 
-def test_a_model_of_labels_alone_shows_a_scene_and_says_what_it_does_not_judge(
-    open_board: OpenBoard,
-) -> None:
+def test_a_model_of_labels_alone(open_board: OpenBoard) -> None:
     objects = ["bed", "lamp", "desk"]
     board = open_board(scene=None, examples=[{"name": "A room", "scene": {"objects": objects}}])
     board.settle()
@@ -178,9 +172,7 @@ def test_outliers_are_marked_with_reasons_in_words(bedroom: Board, api: httpx.Cl
     expect(outliers).to_have_count(sum(one["is_outlier"] for one in answer["outliers"]))
 
 
-def test_the_robots_own_words_are_shown_with_their_classes(
-    open_board: OpenBoard, api: httpx.Client
-) -> None:
+def test_words_are_shown_with_their_classes(open_board: OpenBoard, api: httpx.Client) -> None:
     board = open_board({"objects": ["counter", "air fryer", "Plates"]})
     answer = ask(api, "outliers", board.scene)
     classes = {one["object"]: one["label"] for one in answer["outliers"]}
@@ -199,9 +191,7 @@ def test_the_robots_own_words_are_shown_with_their_classes(
         assert (f"class: {listed}" in row) == (listed != word)
 
 
-def test_relations_are_edges_and_those_that_hold_are_told_apart(
-    bedroom: Board, api: httpx.Client
-) -> None:
+def test_relations_are_edges(bedroom: Board, api: httpx.Client) -> None:
     bedroom.page.get_by_label("Positions count as evidence").check()
     bedroom.add("lamp")  # its position does not count
     bedroom.tab("Relations")
@@ -218,18 +208,18 @@ def test_relations_are_edges_and_those_that_hold_are_told_apart(
         assert ("observed" in row) == one["observed"]
         kinds.add("holds" if one["observed"] else "expected")
     assert {kind for kind, _ in bedroom.edges} == kinds >= {"holds", "expected"}
-    said = {
+    texts = {
         f"{SPOKEN[one['relation']]} {percent(one['probability'])}" for one in answer["relations"]
     }
     # Between an object and another one on top of it there is no room for words.
     words = {text for kind, text in bedroom.edges if text and kind != "disagrees"}
     assert words
-    assert words <= said
+    assert words <= texts
 
 
 def test_room_types_are_listed_by_their_probability(bedroom: Board, api: httpx.Client) -> None:
-    page, asked = bedroom.page, list[str]()
-    page.on("request", lambda request: asked.append(request.url.rsplit("/", 1)[-1]))
+    page, routes = bedroom.page, list[str]()
+    page.on("request", lambda request: routes.append(request.url.rsplit("/", 1)[-1]))
     options, likeliest = page.locator("#room option"), page.locator("#room-likely")
 
     def check() -> None:
@@ -242,13 +232,13 @@ def test_room_types_are_listed_by_their_probability(bedroom: Board, api: httpx.C
     page.locator("#room").select_option("kitchen")
     bedroom.settle()
     assert bedroom.body("missing")["room_type"] == "kitchen"
-    assert "missing" in asked
+    assert "missing" in routes
     # The probabilities ignore the room type that a person chooses.
-    assert "rooms" not in asked
+    assert "rooms" not in routes
     check()
     expect(page.locator("#room")).to_have_value("kitchen")
     bedroom.add("toilet")
-    assert "rooms" in asked
+    assert "rooms" in routes
     check()
     bedroom.click("Clear")
     expect(likeliest).to_have_text("")
@@ -256,9 +246,7 @@ def test_room_types_are_listed_by_their_probability(bedroom: Board, api: httpx.C
     expect(options).to_have_text(["unknown", *names])
 
 
-def test_another_name_of_a_room_type_has_its_probability(
-    open_board: OpenBoard, api: httpx.Client
-) -> None:
+def test_aliases_of_room_types(open_board: OpenBoard, api: httpx.Client) -> None:
     board = open_board({"objects": ["desk", "chair"], "room_type": "hall"})
     (answer,) = ask(api, "rooms", board.scene, candidates=["hall", "office"], top_k=4096)["mapped"]
     assert (answer["label"], answer["class"]) == ("hall", "corridor")
@@ -270,21 +258,21 @@ def test_another_name_of_a_room_type_has_its_probability(
     expect(board.page.locator("#room option:checked")).to_have_text(re.compile(r"Living Room \d"))
 
 
-def test_the_calls_shown_give_the_answer_shown_and_can_be_copied(
-    open_board: OpenBoard, api: httpx.Client, require_system_tool: Callable[[str], Path]
+def test_the_shown_calls_give_the_shown_answer(
+    open_board: OpenBoard, api: httpx.Client, find_tool: FindTool
 ) -> None:
-    require_system_tool("curl")
+    find_tool("curl")
     board = open_board(permissions=["clipboard-read", "clipboard-write"])
     programs = ("sh", board.curl("missing")), (sys.executable, board.python("missing"))
     curl, python = (json.loads(run_program(name, "-c", text).stdout) for name, text in programs)
-    asked = ask(api, "missing", board.body("missing"))
-    assert curl | {"request_id": ""} == asked | {"request_id": ""}
+    expected = ask(api, "missing", board.body("missing"))
+    assert curl | {"request_id": ""} == expected | {"request_id": ""}
     one, other = (
         [(entry["label"], entry["probability"]) for entry in answer["missing"]]
-        for answer in (python, asked)
+        for answer in (python, expected)
     )
     assert one == other
-    assert percent(asked["missing"][0]["probability"]) in board.rows("missing")[0]
+    assert percent(expected["missing"][0]["probability"]) in board.rows("missing")[0]
     board.column("missing").get_by_text("Send this request from a program").click()
     board.column("missing").get_by_role("button", name="Copy the curl call").click()
     expect(board.column("missing").get_by_text("copied")).to_be_visible()
@@ -302,9 +290,7 @@ def request(board: Board) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_a_drawn_scene_is_the_service_s_and_can_be_kept(
-    open_board: OpenBoard, api: httpx.Client
-) -> None:
+def test_a_drawn_scene_can_be_kept(open_board: OpenBoard, api: httpx.Client) -> None:
     board = open_board()
     board.page.locator("#room").select_option("kitchen")
     board.tab("Generate")
@@ -340,18 +326,24 @@ def test_a_drawn_scene_shows_the_words_of_the_board(open_board: OpenBoard) -> No
     assert len(board.things) == len(chips)
 
 
+def suggest(board: Board, relation: str, anchor: str, *labels: str) -> dict[str, Any]:
+    """Let the page receive these missing objects at one place, which the caller may change."""
+    place: dict[str, Any] = {"relation": relation, "object": anchor, "probability": 0.9}
+
+    def suggested(answer: Any) -> Any:
+        first = answer["missing"][0]
+        missing = [first | {"label": label, "placements": [place]} for label in labels]
+        return answer | {"more": [], "missing": missing}
+
+    board.alter("missing", suggested)
+    return place
+
+
 def test_a_suggestion_at_another_place_or_none_says_so(open_board: OpenBoard) -> None:
     far = {"mean": {"x": 9.0, "y": 0.0, "z": 0.5}, "std": dict.fromkeys("xyz", 0.2), "scenes": 9}
-    place = {"relation": "on-top", "object": "desk", "probability": 0.9, "offset": far}
     board = open_board()
-    board.alter(
-        "missing",
-        lambda answer: (
-            answer
-            | {"more": []}
-            | {"missing": [answer["missing"][0] | {"label": "cup", "placements": [place]}]}
-        ),
-    )
+    place = suggest(board, "on-top", "desk", "cup")
+    place["offset"] = far
     board.add("laptop")
     assert "drawn at the nearest free place" in board.rows("missing")[0]
     ghost = board.page.locator("#board .ghost").first
@@ -371,20 +363,7 @@ def test_a_suggestion_at_another_place_or_none_says_so(open_board: OpenBoard) ->
 
 def test_other_suggestions_lie_on_a_sheet(open_board: OpenBoard) -> None:
     board = open_board({"objects": ["bed", "nightstand"]})
-    place = {"relation": "on-top", "object": "bed", "probability": 0.9}
-    board.alter(
-        "missing",
-        lambda answer: (
-            answer
-            | {
-                "more": [],
-                "missing": [
-                    answer["missing"][0] | {"label": label, "placements": [place]}
-                    for label in ("sheet", "pillow")
-                ],
-            }
-        ),
-    )
+    suggest(board, "on-top", "bed", "sheet", "pillow")
     board.add("wardrobe")
     assert board.ghosts == ["sheet", "pillow"]
 
@@ -392,11 +371,7 @@ def test_other_suggestions_lie_on_a_sheet(open_board: OpenBoard) -> None:
 def test_no_suggestion_stands_at_an_outlier(open_board: OpenBoard) -> None:
     board = open_board({"objects": ["bed", "nightstand", "lamp", "toilet"]})
     (toilet,) = [thing["id"] for thing in board.scene["objects"] if thing["label"] == "toilet"]
-    place = {"relation": "above", "object": toilet, "probability": 0.9}
-    board.alter(
-        "missing",
-        lambda answer: answer | {"missing": [answer["missing"][0] | {"placements": [place]}]},
-    )
+    suggest(board, "above", toilet, "plunger")
     board.add("wardrobe")
     assert board.ghosts == []
     assert not any(re.search(rf"{toilet} \d+ %", row) for row in board.rows("missing"))

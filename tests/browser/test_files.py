@@ -12,7 +12,7 @@ from tests.client.scene_files import EXAMPLES
 
 pytestmark = pytest.mark.system
 
-ASKED = {"missing", "outliers", "relations", "rooms"}
+QUESTIONS = {"missing", "outliers", "relations", "rooms"}
 
 
 def choose(board: Board, path: Path) -> None:
@@ -37,25 +37,29 @@ LINE = {"scene_id": "a", "objects": [{"id": 0, "label": "bed"}], "counts": {"bed
 @pytest.mark.parametrize(
     ("name", "content", "routes"),
     [
-        ("request.json", json.dumps(REQUEST, indent=1), ASKED),
-        ("labels.json", '["bed", "lamp"]', ASKED),
-        ("scenes.jsonl", json.dumps(LINE) + "\n\n", ASKED),
-        ("scenes.jsonl", f"{json.dumps(LINE)}\n{json.dumps(LINE)}\n", ASKED | {"outliers/batch"}),
+        ("request.json", json.dumps(REQUEST, indent=1), QUESTIONS),
+        ("labels.json", '["bed", "lamp"]', QUESTIONS),
+        ("scenes.jsonl", json.dumps(LINE) + "\n\n", QUESTIONS),
+        (
+            "scenes.jsonl",
+            f"{json.dumps(LINE)}\n{json.dumps(LINE)}\n",
+            QUESTIONS | {"outliers/batch"},
+        ),
         # A recording whose last line is cut off, and a broken request.
-        ("scenes.jsonl", f"{json.dumps(LINE)}\n{json.dumps(LINE)[:-9]}", ASKED),
+        ("scenes.jsonl", f"{json.dumps(LINE)}\n{json.dumps(LINE)[:-9]}", QUESTIONS),
         ("request.json", json.dumps(REQUEST)[:-1], set()),
     ],
 )
-def test_requests_and_recordings_stay_in_the_browser(
+def test_requests_stay_in_the_browser(
     open_board: OpenBoard, tmp_path: Path, name: str, content: str, routes: set[str]
 ) -> None:
     board = open_board()
-    asked = posted(board)
+    sent = posted(board)
     (tmp_path / name).write_text(content)
     choose(board, tmp_path / name)
     expect(board.page.locator("#travels")).to_be_hidden()
     board.click("Put on the board")
-    assert set(asked) == routes
+    assert set(sent) == routes
     if routes:
         assert board.things[0].startswith("bed")
     else:
@@ -65,29 +69,25 @@ def test_requests_and_recordings_stay_in_the_browser(
 @pytest.mark.parametrize(
     "name", ["detections.csv", "labels.txt", "detection3d.json", "moveit.json"]
 )
-def test_the_service_reads_another_format_once(
-    open_board: OpenBoard, tmp_path: Path, name: str
-) -> None:
+def test_the_service_reads_other_formats(open_board: OpenBoard, tmp_path: Path, name: str) -> None:
     board = open_board()
-    asked = posted(board)
+    sent = posted(board)
     (tmp_path / name).write_text(EXAMPLES[name].text, "utf-8")
     choose(board, tmp_path / name)
     expect(board.page.locator("#travels")).to_contain_text("sends the text to it")
-    assert asked == []
+    assert sent == []
     board.click("Put on the board")
-    assert asked.count("scenes") == 1
-    assert set(asked) == {"scenes", *ASKED}
-    expected = EXAMPLES[name].expected["objects"]
+    assert sent.count("scenes") == 1
+    assert set(sent) == {"scenes", *QUESTIONS}
+    expected = EXAMPLES[name].request["objects"]
     names = [one if isinstance(one, str) else one["id"] for one in expected]
     assert [thing["id"] for thing in board.exported()["objects"]] == names
 
 
-def test_a_scene_of_a_file_and_the_labels_of_its_class_ids_are_chosen(
-    open_board: OpenBoard,
-) -> None:
+def test_scenes_and_class_ids_of_a_file(open_board: OpenBoard) -> None:
     board = open_board()
     page = board.page
-    asked = posted(board)
+    sent = posted(board)
     results = json.loads(EXAMPLES["coco_results.json"].text)
     several = [*results, results[0] | {"image_id": 43}, results[1] | {"category_id": 12}]
     page.get_by_role("button", name="Import, export").click()
@@ -99,7 +99,7 @@ def test_a_scene_of_a_file_and_the_labels_of_its_class_ids_are_chosen(
     board.click("Put on the board")
     assert board.things == ["chair_1", "dining table_1"]
     expect(page.locator("#note")).to_contain_text("class '12' has no label")
-    assert asked.count("scenes") == 1
+    assert sent.count("scenes") == 1
     page.get_by_role("button", name="Import, export").click()
     page.get_by_label("Scene, JSON").fill(json.dumps(several))
     page.get_by_label("Labels of numeric class ids").select_option("own names")

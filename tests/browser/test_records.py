@@ -71,12 +71,18 @@ def lines(file: Path) -> list[Any]:
     return [json.loads(line) for line in file.read_text("utf-8").splitlines()]
 
 
-def test_a_corrected_file_differs_only_in_the_confirmation(
-    open_board: OpenBoard, recorded: Path, tmp_path: Path
-) -> None:
+def misplace(board: Board, subject: str, relation: str, other: str) -> None:
+    """Let the page receive one misplaced relation."""
+    wrong = {"subject": subject, "relation": relation, "object": other, "log_odds": -3.0}
+    wrong |= {"probability": 0.9, "is_misplaced": True, "moved": None, "expected": None}
+    board.alter("outliers", lambda found: found | {"misplaced": [wrong]})
+
+
+def test_a_confirmed_scene_is_marked(open_board: OpenBoard, recorded: Path, tmp_path: Path) -> None:
     board = open_board()
     choose(board, recorded, 2)
     board.tab("Wrong")
+    confirmed = board.page.get_by_text("Confirmed scene.")
     confirm = board.page.get_by_role("button", name="Belongs here: toilet")
     confirm.focus()
     board.page.keyboard.press("Enter")
@@ -85,13 +91,12 @@ def test_a_corrected_file_differs_only_in_the_confirmation(
     expect(confirm).to_have_count(0)
     assert any("confirmed" in row for row in board.rows("outliers") if "toilet" in row)
     expect(board.page.locator("#board .object.outlier")).to_have_count(0)
-    assert "does not belong here" not in (
-        board.thing("toilet (track_5)").get_attribute("aria-label") or ""
-    )
-    expect(board.page.get_by_text("Confirmed scene.")).to_be_hidden()
+    spoken = board.thing("toilet (track_5)").get_attribute("aria-label")
+    assert "does not belong here" not in (spoken or "")
+    expect(confirmed).to_be_hidden()
     board.click("Stands right: toilet (track_5) above floor")
     assert "adapt learns" in next(row for row in board.rows("outliers") if "above floor" in row)
-    expect(board.page.get_by_text("Confirmed scene.")).to_be_visible()
+    expect(confirmed).to_be_visible()
     file = downloaded(board, tmp_path, 1)
     before, after = lines(recorded), lines(file)
     assert after == [before[0], before[1] | {"confirmed": True}, before[2]]
@@ -102,9 +107,7 @@ def test_a_corrected_file_differs_only_in_the_confirmation(
     assert downloaded(board, tmp_path, 1).read_text("utf-8") == file.read_text("utf-8")
 
 
-def test_an_intruder_is_removed_and_the_next_scene_follows(
-    open_board: OpenBoard, recorded: Path, tmp_path: Path
-) -> None:
+def test_an_intruder_is_removed(open_board: OpenBoard, recorded: Path, tmp_path: Path) -> None:
     board = open_board()
     choose(board, recorded, 2)
     board.press("toilet (track_5)", "Delete")
@@ -139,25 +142,11 @@ def test_missing_objects_are_added(open_board: OpenBoard, recorded: Path, tmp_pa
     expect(board.page.get_by_role("button", name="Download scenes.jsonl")).to_be_hidden()
 
 
-def test_confirmed_scenes_of_the_page_stay_in_the_browser(
-    open_board: OpenBoard, tmp_path: Path
-) -> None:
-    lamp = {
-        "label": "lamp",
-        "position": {"x": 2, "y": 0.5, "z": 0.94},
-        "size": {"x": 0.2, "y": 0.2, "z": 0.4},
-    }
-    desk = {
-        "objects": [DESK["objects"][0], lamp],
-        "frame_id": "map",
-        "viewpoint": {"x": 1, "y": 0, "yaw": 0},
-        "room_type": "office",
-    }
-    board = open_board(desk)
-    wrong = {"subject": "lamp", "relation": "on-top", "object": "desk", "log_odds": -3.0}
-    board.alter("outliers", lambda found: found | {"misplaced": [
-        wrong | {"probability": 0.9, "is_misplaced": True, "moved": None, "expected": None}
-    ]})  # fmt: skip
+def test_scenes_of_the_page_stay_in_the_browser(open_board: OpenBoard, tmp_path: Path) -> None:
+    lamp = {"label": "lamp", "position": [2, 0.5, 0.94], "size": [0.2, 0.2, 0.4]}
+    scene = {"objects": [DESK["objects"][0], lamp], "frame_id": "map", "room_type": "office"}
+    board = open_board(scene | {"viewpoint": {"x": 1, "y": 0, "yaw": 0}})
+    misplace(board, "lamp", "on-top", "desk")
     board.add("cup")
     board.tab("Wrong")
     assert ("misplaced", "on top of?") in board.edges
@@ -168,8 +157,7 @@ def test_confirmed_scenes_of_the_page_stay_in_the_browser(
     board.settle()
     file = downloaded(board, tmp_path, 1)
     (scene,) = lines(file)
-    assert scene["confirmed"] is True
-    assert scene["viewer_frame"] is True
+    assert scene["confirmed"] is scene["viewer_frame"] is True
     assert scene["room_type"] == "office"
     assert scene["objects"] == [
         {"id": "desk", "label": "desk", "position": [1, 0, 0.37], "size": [0.8, 1.6, 0.74]},
@@ -186,14 +174,9 @@ def test_confirmed_scenes_of_the_page_stay_in_the_browser(
     assert board.page.evaluate("Object.keys(localStorage)") == []
 
 
-def test_a_verdict_on_one_alarm_does_not_confirm_another(
-    open_board: OpenBoard, recorded: Path, tmp_path: Path
-) -> None:
-    wrong = {"subject": "track_0", "relation": "left", "object": "track_1", "log_odds": -3.0}
+def test_alarms_need_a_confirmation(open_board: OpenBoard, recorded: Path, tmp_path: Path) -> None:
     board = open_board()
-    board.alter("outliers", lambda found: found | {"misplaced": [
-        wrong | {"probability": 0.9, "is_misplaced": True, "moved": None, "expected": None}
-    ]})  # fmt: skip
+    misplace(board, "track_0", "left", "track_1")
     choose(board, recorded, 2)
     board.tab("Wrong")
     board.click("Stands right: oven (track_0) left of refrigerator (track_1)")
@@ -231,9 +214,7 @@ def test_the_list_of_scenes_marks_alarms(open_board: OpenBoard, recorded: Path) 
     assert any("confirmed" in row for row in board.rows("outliers") if "toilet" in row)
 
 
-def test_an_object_added_to_a_confirmed_scene_is_confirmed_too(
-    open_board: OpenBoard, recorded: Path, tmp_path: Path
-) -> None:
+def test_additions_are_confirmed(open_board: OpenBoard, recorded: Path, tmp_path: Path) -> None:
     board = open_board()
     choose(board, recorded, 1)
     board.add("oven")
@@ -253,9 +234,7 @@ def test_an_object_added_to_a_confirmed_scene_is_confirmed_too(
     assert sum("confirmed" in row for row in board.rows("outliers")) == 4
 
 
-def test_a_download_has_the_scenes_of_one_file(
-    open_board: OpenBoard, recorded: Path, tmp_path: Path
-) -> None:
+def test_a_download_has_one_file(open_board: OpenBoard, recorded: Path, tmp_path: Path) -> None:
     first, second = tmp_path / "flat.jsonl", tmp_path / "office.jsonl"
     first.write_text(recorded.read_text("utf-8"), "utf-8")
     scenes = [{"scene_id": name, "objects": ["desk", "lamp"]} for name in "ab"]

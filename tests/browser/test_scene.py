@@ -1,4 +1,4 @@
-"""Objects come onto the board, move there and leave it, and the service is asked about them."""
+"""Objects on the board: additions, moves, imports, and links to scenes."""
 
 import base64
 import json
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.system
 
 
 def place(board: Board, name: str, question: str = "missing") -> tuple[float, float, float]:
-    """Centre of an object as the service is told."""
+    """The centre of an object in the request."""
     (found,) = [thing for thing in board.body(question)["objects"] if thing["id"] == name]
     return tuple(found["position"][axis] for axis in "xyz")
 
@@ -141,9 +141,7 @@ def test_a_link_holds_the_scene(open_board: OpenBoard) -> None:
 
 
 @pytest.mark.parametrize("is_bomb", [False, True])
-def test_a_link_that_cannot_be_read_says_so(
-    open_board: OpenBoard, api: httpx.Client, is_bomb: bool
-) -> None:
+def test_unreadable_links(open_board: OpenBoard, api: httpx.Client, is_bomb: bool) -> None:
     """300 MB of blanks in a link of 400 kB: the page neither hangs nor fills the memory."""
     link, words = "nonsense", "cannot be read"
     if is_bomb:

@@ -1,4 +1,4 @@
-"""Large scenes, superseded questions, refusals, keys, and a service that goes away."""
+"""Superseded questions, refusals, keys, restarts, and unknown labels."""
 
 import re
 import signal
@@ -22,12 +22,12 @@ for (let step = 0; step < 8; step += 1)
 
 
 @pytest.mark.slow
-def test_a_question_that_is_overtaken_is_dropped(open_board: OpenBoard) -> None:
+def test_a_superseded_question_is_dropped(open_board: OpenBoard) -> None:
     board = open_board()
-    asked, held = list[str](), list[Route]()
+    routes, held = list[str](), list[Route]()
 
     def hold_first(route: Route) -> None:
-        asked.append(route.request.url)
+        routes.append(route.request.url)
         if held:
             route.continue_()
         else:
@@ -40,19 +40,19 @@ def test_a_question_that_is_overtaken_is_dropped(open_board: OpenBoard) -> None:
     with board.page.expect_event("requestfailed", lambda one: one.url.endswith("/missing")):
         board.page.keyboard.press("ArrowUp")
     board.settle()
-    assert len(asked) == 2
+    assert len(routes) == 2
     assert board.scene["objects"][1]["position"]["x"] == pytest.approx(1.9)
     assert board.rows("missing")
 
 
 @pytest.mark.slow
-def test_a_full_service_is_asked_again_when_it_says(open_board: OpenBoard) -> None:
+def test_the_page_retries_after_429(open_board: OpenBoard) -> None:
     board = open_board(allow=("429",))
-    asked = list[Route]()
+    routes = list[Route]()
 
     def refuse_first_and_hold_second(route: Route) -> None:
-        asked.append(route)
-        if len(asked) > 1:
+        routes.append(route)
+        if len(routes) > 1:
             return
         problem = {"type": "/problems/queue-full", "title": "Queue full", "status": 429}
         problem |= {"detail": "The queue is full.", "request_id": "r"}
@@ -65,19 +65,17 @@ def test_a_full_service_is_asked_again_when_it_says(open_board: OpenBoard) -> No
     alert = board.column("missing").get_by_role("alert")
     expect(alert).to_contain_text("The queue is full")
     for _ in range(600):
-        if len(asked) == 2:
+        if len(routes) == 2:
             break
         board.page.wait_for_timeout(100)
-    asked[1].continue_()
+    routes[1].continue_()
     expect(alert).to_be_hidden()
     board.settle()
     assert board.rows("missing")
 
 
 @pytest.mark.slow
-def test_the_page_outlives_the_service(
-    open_board: OpenBoard, repository: Path, tmp_path: Path
-) -> None:
+def test_the_service_restarts(open_board: OpenBoard, repository: Path, tmp_path: Path) -> None:
     store = repository / "model_store"
     with launch(store, tmp_path / "log") as mortal:
         board = open_board(home=mortal.url, allow=("ERR_", "503"))
@@ -94,9 +92,7 @@ def test_the_page_outlives_the_service(
 
 
 @pytest.mark.slow
-def test_a_service_with_a_key_is_asked_with_it(
-    open_board: OpenBoard, repository: Path, tmp_path: Path
-) -> None:
+def test_the_page_sends_the_key(open_board: OpenBoard, repository: Path, tmp_path: Path) -> None:
     key = "a-key-of-sixteen-letters"
     with launch(repository / "model_store", tmp_path / "log", SCENE_API_KEY=key) as guarded:
         home = f"http://127.0.0.1:{guarded.port}"
@@ -137,9 +133,7 @@ def promote(service: LiveService, model: str) -> None:
 
 # The first test of the service, which moves the alias.
 @pytest.mark.parametrize("has_default", [False, True])
-def test_a_model_of_one_s_own_opens_without_errors(
-    open_board: OpenBoard, own: LiveService, has_default: bool
-) -> None:
+def test_own_models_are_shown(open_board: OpenBoard, own: LiveService, has_default: bool) -> None:
     if has_default:
         promote(own, "basic")
     words = own.client.get("/models/basic/vocabulary").json()["objects"]

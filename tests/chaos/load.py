@@ -1,4 +1,4 @@
-"""Requests in progress on many connections while something else happens to the service."""
+"""Constant load on the service during a test."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import json
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import httpx
@@ -16,33 +15,20 @@ from benchmarks.load.connections import Connection, connect, prepared
 from tests.services import PATIENCE
 
 
-@dataclass
-class Tally:
-    """The answers.
-
-    Attributes:
-        sent: number of requests.
-        statuses: statuses of the answers; 0 stands for a connection that broke.
-        faults: the complaints of the judge.
-    """
-
-    sent: int = 0
-    statuses: Counter[int] = field(default_factory=Counter)
-    faults: list[str] = field(default_factory=list)
-
-    def check(self) -> None:
-        """Assert that each request has an answer, and that the judge has no complaint."""
-        assert self.faults == [], self.faults[:3]
-        assert self.statuses.total() == self.sent
-
-
 class ConstantLoad:
     """Connections that always have a request in progress, in a thread of their own.
+
+    The end of the context checks that each request has an answer without a complaint.
 
     Args:
         port: port of the service.
         requests: sent in turn.
         judge: called with (number of the request, status, answer); returns a complaint or None.
+
+    Attributes:
+        sent: number of requests.
+        statuses: statuses of the answers; 0 stands for a connection that broke.
+        faults: the complaints of the judge.
     """
 
     def __init__(
@@ -52,7 +38,9 @@ class ConstantLoad:
         judge: Callable[[int, int, Any], str | None],
         connections: int = 8,
     ) -> None:
-        self.tally = Tally()
+        self.sent = 0
+        self.statuses = Counter[int]()
+        self.faults: list[str] = []
         self._arguments = port, requests, judge, connections
         self._ending = threading.Event()
         self._thread = threading.Thread(target=lambda: asyncio.run(self._run(*self._arguments)))
@@ -64,25 +52,28 @@ class ConstantLoad:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._ending.set()
         self._thread.join(timeout=PATIENCE)
-        assert kind is not None or not self._thread.is_alive(), "an answer is lost"
+        if kind is None:
+            assert not self._thread.is_alive(), "an answer is lost"
+            assert self.faults == [], self.faults[:3]
+            assert self.statuses.total() == self.sent
 
     async def _run(self, port: int, requests: Any, judge: Any, connections: int) -> None:
-        asked: dict[Connection, int] = {}
+        pending: dict[Connection, int] = {}
         finished = asyncio.Event()
 
         def send(connection: Connection) -> None:
-            asked[connection] = number = self.tally.sent % len(requests)
-            self.tally.sent += 1
+            pending[connection] = number = self.sent % len(requests)
+            self.sent += 1
             connection.send(requests[number])
 
         def answered(connection: Connection, status: int, body: bytes) -> None:
-            number = asked.pop(connection)
-            self.tally.statuses[status] += 1
+            number = pending.pop(connection)
+            self.statuses[status] += 1
             if fault := judge(number, status, json.loads(body) if body else None):
-                self.tally.faults.append(fault)
+                self.faults.append(fault)
             if status and not self._ending.is_set():
                 send(connection)
-            elif not asked:
+            elif not pending:
                 finished.set()
 
         pool = await connect(port, connections, answered)

@@ -1,4 +1,4 @@
-"""Every client behind one interface: a method and a request as JSON in, the answer as JSON out."""
+"""One interface for all clients: a method and a request as JSON in, the answer as JSON out."""
 
 import asyncio
 import json

@@ -12,22 +12,15 @@ from scene_client import OfflineClient
 from tests.client import callers
 from tests.client.callers import Caller
 from tests.client.peers import Peer
-from tests.services import LiveService
+from tests.conftest import FindTool
 
 
 @pytest.fixture(scope="session")
-def url(live: LiveService) -> str:
-    return live.url
-
-
-@pytest.fixture(scope="session")
-def bridge(
-    tmp_path_factory: pytest.TempPathFactory, require_system_tool: Callable[[str], Path]
-) -> Path:
+def bridge(tmp_path_factory: pytest.TempPathFactory, find_tool: FindTool) -> Path:
     """The program that calls the C++ client."""
     source = Path(__file__).parent / "bridge.cpp"
     program = tmp_path_factory.mktemp("bridge") / "bridge"
-    return callers.compiled(require_system_tool, source, program)
+    return callers.compiled(find_tool, source, program)
 
 
 @pytest.fixture

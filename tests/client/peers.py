@@ -1,4 +1,4 @@
-"""Servers that misbehave, over real sockets."""
+"""Defective servers on real sockets."""
 
 import socket
 import threading

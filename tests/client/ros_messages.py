@@ -1,65 +1,29 @@
 """ROS messages for tests: the published layouts, read by the parser that reads bags.
 
-`Layout.current` is that of vision_msgs from Humble on, `Layout.former` that of
-Foxy. Messages are plain dataclasses; `blank` makes one with ROS's defaults, as rclpy's constructors
-do, and `to_json` writes one as rosbridge does.
+`Layout.current` is vision_msgs from Humble on, and `Layout.former` is that of Foxy. Messages are
+plain dataclasses. `blank` fills in ROS's defaults, and `to_json` writes as rosbridge does.
 """
 
 import math
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from itertools import count
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-_COMMON = {
-    "vision_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
-    "vision_msgs/msg/Detection3DArray": "std_msgs/Header header\nDetection3D[] detections",
-    "vision_msgs/msg/Detection2DArray": "std_msgs/Header header\nDetection2D[] detections",
-    "vision_msgs/msg/VisionClass": "uint16 class_id\nstring class_name",
-    "vision_msgs/msg/LabelInfo": (
-        "std_msgs/Header header\nvision_msgs/VisionClass[] class_map\nfloat32 threshold"
-    ),
-}
-_CURRENT = _COMMON | {
-    "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score",
-    "vision_msgs/msg/ObjectHypothesisWithPose": (
-        "ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose"
-    ),
-    "vision_msgs/msg/Point2D": "float64 x\nfloat64 y",
-    "vision_msgs/msg/Pose2D": "vision_msgs/Point2D position\nfloat64 theta",
-    "vision_msgs/msg/BoundingBox2D": "vision_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y",
-    "vision_msgs/msg/Detection3D": (
-        "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox3D bbox\nstring id"
-    ),
-    "vision_msgs/msg/Detection2D": (
-        "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox2D bbox\nstring id"
-    ),
-}
-_FORMER = _COMMON | {
-    "vision_msgs/msg/ObjectHypothesisWithPose": (
-        "string id\nfloat64 score\ngeometry_msgs/PoseWithCovariance pose"
-    ),
-    "vision_msgs/msg/BoundingBox2D": "geometry_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y",
-    "vision_msgs/msg/Detection3D": (
-        "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox3D bbox\n"
-        "sensor_msgs/PointCloud2 source_cloud\nbool is_tracking\nstring tracking_id"
-    ),
-    "vision_msgs/msg/Detection2D": (
-        "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox2D bbox\n"
-        "sensor_msgs/Image source_img\nbool is_tracking\nstring tracking_id"
-    ),
-}
+MESSAGES = Path(__file__).parent / "msg"
 
 
-def _store(definitions: dict[str, str]) -> Typestore:
+def _store(layout: str) -> Typestore:
     store = get_typestore(Stores.ROS2_HUMBLE)
     types: dict[str, Any] = {}
-    for name, definition in definitions.items():
-        types.update(get_types_from_msg(definition, name))
+    for folder in (MESSAGES / "common", MESSAGES / layout):
+        for path in folder.glob("*.msg"):
+            types |= get_types_from_msg(path.read_text("utf-8"), f"vision_msgs/msg/{path.stem}")
     store.register(types)
     return store
 
@@ -67,8 +31,8 @@ def _store(definitions: dict[str, str]) -> Typestore:
 class Layout:
     """The message types of two generations of vision_msgs."""
 
-    current = _store(_CURRENT)
-    former = _store(_FORMER)
+    current = _store("current")
+    former = _store("former")
 
 
 _NUMBERS = count(1)

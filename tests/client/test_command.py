@@ -75,9 +75,7 @@ def test_missing_objects_are_a_table(scene: Any, url: str, tmp_path: Path) -> No
         ),
     ],
 )
-def test_json_is_the_service_s_answer(
-    scene: Any, url: str, line: str, fields: dict[str, Any]
-) -> None:
+def test_json_is_the_whole_answer(scene: Any, url: str, line: str, fields: dict[str, Any]) -> None:
     question, *arguments = shlex.split(line)
     done = scene(question, *arguments, "--json")
     assert done.exit_code == 0, done.stderr
@@ -160,7 +158,7 @@ FILES = {
         ("generate --count 64 --steps 500 --timeout 0.01", 4, []),
     ],
 )
-def test_the_exit_status_and_the_reason_of_a_failure(
+def test_exit_status_and_reason_of_a_failure(
     scene: Any,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -182,9 +180,7 @@ def test_the_exit_status_and_the_reason_of_a_failure(
     ("status", "body", "code"),
     [(b"503 No", b"{}", 5), (b"429 No", b"{}", 5), (b"500 No", b"{}", 6), (b"200 OK", b"{}", 6)],
 )
-def test_exit_status_of_a_busy_and_of_a_defective_service(
-    scene: Any, peer: Any, status: bytes, body: bytes, code: int
-) -> None:
+def test_status_of_errors(scene: Any, peer: Any, status: bytes, body: bytes, code: int) -> None:
     done = scene("models", "--url", peer(answering(body, status, b"60")).url)
     assert (done.exit_code, done.stdout) == (code, "")
 
@@ -206,9 +202,7 @@ def test_exit_status_of_ready(scene: Any, peer: Any) -> None:
     assert starting.connections == 1
 
 
-def test_the_key_is_taken_from_the_environment(
-    scene: Any, peer: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_key_of_the_environment(scene: Any, peer: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     heads: list[bytes] = []
     monkeypatch.setenv("SCENE_API_KEY", "k" * 16)
     started = peer(answering(b'{"models":[],"aliases":{}}', heads=heads))
@@ -225,7 +219,7 @@ def test_the_key_is_taken_from_the_environment(
     ],
 )
 def test_bash_completes_commands_options_and_values(words: str, expected: str) -> None:
-    asked = {"COMP_WORDS": words, "COMP_CWORD": str(len(words.split()) - 1)}
-    environment = os.environ | asked | {"_SCENE_COMPLETE": "complete_bash"}
+    variables = {"COMP_WORDS": words, "COMP_CWORD": str(len(words.split()) - 1)}
+    environment = os.environ | variables | {"_SCENE_COMPLETE": "complete_bash"}
     done = run_program(sys.executable, "-m", "scene_client", env=environment)
     assert done.stdout.split() == [expected]

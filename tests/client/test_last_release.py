@@ -60,11 +60,9 @@ def contains(answer: Any, part: Any) -> bool:
     return part == answer
 
 
-def test_the_client_of_the_last_release_reads_the_answers(
-    shipped: LiveService, repository: Path
-) -> None:
-    asked = [*QUESTIONS, *(entry[:2] for entry in UNREADABLE)]
-    calls = [(path[1:].replace("/", "_"), [request]) for path, request in asked]
+def test_the_last_release_reads_the_answers(shipped: LiveService, repository: Path) -> None:
+    requests = [*QUESTIONS, *(entry[:2] for entry in UNREADABLE)]
+    calls = [(path[1:].replace("/", "_"), [request]) for path, request in requests]
     done = run_program(
         *(sys.executable, "-c", RELEASED, shipped.url),
         env=os.environ | {"PYTHONPATH": str(WHEEL)},

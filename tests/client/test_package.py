@@ -1,4 +1,4 @@
-"""What a robot installs: one package, whose blocking client is written from the other."""
+"""The package of the Python client, generated clients, and the C++ client."""
 
 import json
 import os
@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,7 @@ import app
 from app.registry.manifest import FORMAT
 from scripts import sync_client
 from tests.client import callers
-from tests.conftest import REPOSITORY, run_program
+from tests.conftest import REPOSITORY, FindTool, run_program
 from tests.services import LiveService
 
 
@@ -36,15 +35,13 @@ def test_the_blocking_client_is_up_to_date():
         ("CHANGELOG.md", r"^## (\d\S*)"),
     ],
 )
-def test_every_file_states_the_version_of_the_service(
-    repository: Path, path: str, pattern: str
-) -> None:
+def test_every_file_states_the_version(repository: Path, path: str, pattern: str) -> None:
     match = re.search(pattern, (repository / path).read_text("utf-8"), re.MULTILINE)
     assert match is not None
     assert match[1] == app.__version__
 
 
-def test_the_wheel_holds_the_client_alone(repository: Path, tmp_path: Path):
+def test_the_wheel_has_only_the_client(repository: Path, tmp_path: Path):
     # A copy: pip leaves its build folder in the source, and takes old modules from it.
     ignored = shutil.ignore_patterns("build", "*.egg-info")
     source = shutil.copytree(repository / "clients" / "python", tmp_path / "source", ignore=ignored)
@@ -81,7 +78,7 @@ except ImportError as error:
 """
 
 
-def test_the_client_works_where_nothing_of_the_service_is_installed() -> None:
+def test_the_client_needs_no_package_of_the_service() -> None:
     done = run_program(sys.executable, "-W", "error", "-c", PROGRAM)
     # An offline client says which packages it needs.
     assert "pip install '.[service]' in the repository" in done.stdout
@@ -134,13 +131,11 @@ GUIDE = (REPOSITORY / "docs" / "clients.md").read_text(encoding="utf-8")
 
 @pytest.mark.slow
 @pytest.mark.system
-def test_the_cpp_block_compiles_and_runs(
-    url: str, tmp_path: Path, require_system_tool: Callable[[str], Path]
-) -> None:
+def test_the_cpp_block_compiles_and_runs(url: str, tmp_path: Path, find_tool: FindTool) -> None:
     (program,) = re.findall(r"^```cpp\n(.*?)^```$", GUIDE, flags=re.MULTILINE | re.DOTALL)
     source = tmp_path / "block.cpp"
     source.write_text(program)
-    block = callers.compiled(require_system_tool, source, tmp_path / "block")
+    block = callers.compiled(find_tool, source, tmp_path / "block")
     assert run_program(block, url).stdout.strip().strip('"')
     done = run_program(block, "robot:8000", status=2)
     assert (done.stdout, bool(done.stderr)) == ("", True)
@@ -148,12 +143,10 @@ def test_the_cpp_block_compiles_and_runs(
 
 @pytest.mark.slow
 @pytest.mark.system
-def test_the_cpp_example_is_made_and_asks_all_five_questions(
-    url: str, tmp_path: Path, bridge: Path, require_system_tool: Callable[[str], Path]
-) -> None:
+def test_the_cpp_example(url: str, tmp_path: Path, bridge: Path, find_tool: FindTool) -> None:
     # Asking for `bridge` leaves this test out where the libraries are missing.
     folder = shutil.copytree(REPOSITORY / "clients" / "cpp", tmp_path / "cpp")
-    make = require_system_tool("make")
+    make = find_tool("make")
     run_program(make, "-C", folder, "CXXFLAGS=-O0")
     example = folder / "example"
     answered = run_program(example, url, "30").stdout

@@ -73,7 +73,6 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_clients_command_and_parts_of_the_node_work(python: Path, live: LiveService) -> None:
-    """With all modules imported. test_contract.py compares the answers."""
     scene = ("-m", "scene_client", "missing", "bed", "lamp", "--json", "--url", live.url)
     done = run_program(python, *scene)
     assert json.loads(done.stdout)["missing"]

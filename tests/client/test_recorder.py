@@ -1,4 +1,4 @@
-"""The file of recorded scenes: which scenes it has, and that it survives crashes and full disks."""
+"""The file of recorded scenes: its scenes, and crashes and full disks."""
 
 import json
 import logging
@@ -6,11 +6,11 @@ import os
 import stat
 import sys
 import threading
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import anyio
 import numpy as np
 import pytest
 from hypothesis import given
@@ -20,9 +20,7 @@ from typer.testing import CliRunner
 from app.questions.reading import Limits, read_scene
 from app.scene import CANONICAL
 from scene_client import (
-    AsyncClient,
     Client,
-    InvalidRequestError,
     OfflineClient,
     ProblemError,
     Recorder,
@@ -31,6 +29,7 @@ from scene_client import (
 from scene_client.command import app
 from scene_client.recorded_scene import scene_of
 from scene_client.schemas import MissingRequest
+from tests.client.callers import async_caller, sync_caller
 from tests.conftest import run_program
 from tests.http.stores import VOCABULARY
 from tests.services import PATIENCE
@@ -49,8 +48,9 @@ def request(*objects: Any, **fields: Any) -> MissingRequest:
     return MissingRequest.model_validate({"objects": list(objects), **fields})
 
 
-def write(file: Path, requests: list[MissingRequest]) -> None:
-    writer = Recorder(file)
+def write(writer: Recorder | Path, requests: list[MissingRequest]) -> None:
+    """Record requests with a recorder, or with a new one for a file."""
+    writer = Recorder(writer) if isinstance(writer, Path) else writer
     writer.record(requests)
     writer.flush()
 
@@ -71,32 +71,19 @@ def labels(file: Path) -> list[list[str]]:
     return [[thing["label"] for thing in scene["objects"]] for scene in lines(file)]
 
 
-@pytest.mark.parametrize("kind", ["sync", "async", "offline"])
-def test_all_questions_about_a_scene_are_one_line(
-    url: str, shared_store: Path, file: Path, kind: str
-) -> None:
-    if kind == "async":
+OFFLINE = partial(sync_caller, kind=OfflineClient)
 
-        async def ask() -> None:
-            async with AsyncClient(url, record=file) as scene:
-                for question in QUESTIONS:
-                    await getattr(scene, question)(["bed", "lamp"])
 
-        anyio.run(ask)
-    else:
-        opened = (
-            Client(url, record=file)
-            if kind == "sync"
-            else OfflineClient(shared_store, record=str(file))
-        )
-        with opened as scene:
-            for question in QUESTIONS:
-                getattr(scene, question)(["bed", "lamp"])
+@pytest.mark.parametrize("caller", [sync_caller, async_caller, OFFLINE])
+def test_a_scene_is_recorded_once(url: str, shared_store: Path, file: Path, caller: Any) -> None:
+    with caller(shared_store if caller is OFFLINE else url, record=str(file)) as call:
+        for question in QUESTIONS:
+            call(question, ["bed", "lamp"])
     assert labels(file) == [["bed", "lamp"]]
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
 
 
-def test_only_observed_scenes_that_the_service_answers_are_written(url: str, file: Path) -> None:
+def test_only_answered_scenes_are_written(url: str, file: Path) -> None:
     with Client(url, record=file) as scene:
         scene.generate(["bed", "lamp"], steps=1)
         scene.missing(["bed"])
@@ -110,11 +97,11 @@ def test_only_observed_scenes_that_the_service_answers_are_written(url: str, fil
     assert labels(file) == [["bed", "desk"], ["lamp", "desk"]]
 
 
-def test_a_scene_is_written_again_if_the_request_says_more(file: Path) -> None:
+def test_new_evidence_is_written(file: Path) -> None:
     writer = Recorder(file)
     lamp, bed = {"id": "track_7", "label": "lamp"}, {"id": "track_9", "label": "bed"}
     on_top = [("track_7", "on-top", "track_9")]
-    said = [
+    stated = [
         request("bed", "lamp"),
         request(lamp, bed),  # ids change from frame to frame
         request(lamp, bed, room_type="bedroom"),
@@ -125,8 +112,7 @@ def test_a_scene_is_written_again_if_the_request_says_more(file: Path) -> None:
         request("bed", "lamp", stamp={"sec": 7200, "nanosec": 5}),
     ]
     for _ in range(3):
-        writer.record(said)
-        writer.flush()
+        write(writer, stated)
     assert [(one.get("room_type"), len(one["objects"])) for one in lines(file)] == [
         (None, 2), ("bedroom", 2), (None, 2), (None, 3), (None, 2)
     ]  # fmt: skip
@@ -135,17 +121,14 @@ def test_a_scene_is_written_again_if_the_request_says_more(file: Path) -> None:
     assert lines(file)[-1]["group"] == lines(file)[-1]["scene_id"][:13]
 
 
-def test_moved_objects_are_written_after_a_pause(
-    file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_moved_objects_wait_for_the_pause(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = 1000.0
     monkeypatch.setattr(recorder, "monotonic", lambda: now)
     writer = Recorder(file)
     desk = box("desk", 2, 0, 0.25)
 
     def see(x: float) -> int:
-        writer.record([request(desk, box("lamp", x, 1.1, 0.25))])
-        writer.flush()
+        write(writer, [request(desk, box("lamp", x, 1.1, 0.25))])
         return len(lines(file))
 
     assert [see(1.2), see(1.3), see(2.8)] == [1, 1, 1]
@@ -155,7 +138,7 @@ def test_moved_objects_are_written_after_a_pause(
     assert [see(2.8), see(2.8), see(1.2)] == [2, 2, 2]
 
 
-def test_another_run_does_not_repeat_the_last_scenes(file: Path) -> None:
+def test_another_run_repeats_no_scene(file: Path) -> None:
     stated = request("bed", {"label": "lamp", "supported_by": "bed"}, room_type="bedroom")
     complete = request("bed", "desk", relations=[("bed", "left", "desk")], relations_complete=True)
     write(file, [stated, complete])
@@ -219,7 +202,7 @@ def test_the_training_derives_the_relations_of_the_service(
     }
 
 
-def test_in_a_map_without_a_viewpoint_the_viewer_is_unknown() -> None:
+def test_a_map_without_a_viewpoint() -> None:
     boxes = box("bed", 1, 2, 0.25), box("lamp", 3, 2, 0.25)
     scene = scene_of(request(*boxes, frame_id="robot/map"))
     assert scene["viewer_frame"] is False
@@ -247,9 +230,7 @@ def run(program: str, *arguments: object) -> str:
     return done.stdout + done.stderr
 
 
-def test_several_processes_and_threads_share_the_file(
-    file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_processes_and_threads_share_the_file(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recorder, "_LONGEST_WAIT", 30.0)
     writers = [
         threading.Thread(target=run, args=("""
@@ -347,7 +328,7 @@ def test_a_line_of_a_crash_is_repaired(file: Path) -> None:
 
 
 def test_a_full_disk_disturbs_no_question(file: Path) -> None:
-    said = run("""
+    printed = run("""
 import logging
 logging.basicConfig(format="%(levelname)s %(message)s", stream=sys.stdout)
 limit = resource.RLIMIT_FSIZE
@@ -365,15 +346,15 @@ writer.record([scene(20)])
 """, file).splitlines()  # fmt: skip
     warning = f"WARNING cannot record scenes in {file}"
     # A part of the first line fits, and no part of the second one.
-    assert said[0] == f"{warning}: [Errno 28] No space left on device"
-    assert said[2] == f"{warning}: [Errno 27] File too large"
-    assert len(said) == 3
+    assert printed[0] == f"{warning}: [Errno 28] No space left on device"
+    assert printed[2] == f"{warning}: [Errno 27] File too large"
+    assert len(printed) == 3
     written = [int(scene[0].split()[0]) for scene in labels(file)]
     assert written == [0, 1, 19]
-    assert 100_000 * 2 / 3 < int(said[1]) < 100_000
+    assert 100_000 * 2 / 3 < int(printed[1]) < 100_000
 
 
-def test_a_folder_that_comes_and_goes_disturbs_no_question(
+def test_a_missing_folder_disturbs_no_question(
     url: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     file = tmp_path / "later" / "scenes.jsonl"
@@ -398,7 +379,7 @@ def test_a_folder_that_comes_and_goes_disturbs_no_question(
     ] * 2
 
 
-def test_a_pipe_is_no_file(file: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_pipe_is_refused(file: Path, caplog: pytest.LogCaptureFixture) -> None:
     os.mkfifo(file)
     write(file, [request("bed", "lamp")])
     assert "not a regular file" in caplog.text
@@ -409,12 +390,10 @@ def test_a_locked_file_is_left_alone(file: Path, caplog: pytest.LogCaptureFixtur
     writer = Recorder(file)
     with file.open("w") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
-        writer.record([request("bed", "lamp")])
-        writer.flush()
+        write(writer, [request("bed", "lamp")])
     assert "another program has locked the file" in caplog.text
     assert lines(file) == []
-    writer.record([request("bed", "lamp")])
-    writer.flush()
+    write(writer, [request("bed", "lamp")])
     assert labels(file) == [["bed", "lamp"]]
 
 
@@ -439,18 +418,9 @@ def test_the_command_records(url: str, file: Path) -> None:
     assert scene("missing", "bed", "lamp", "--record", str(file)).exit_code == 0
     assert scene(f"--record={file}", "outliers", "bed", "lamp").exit_code == 0
     assert labels(file) == [["bed", "lamp"]]
+    # The service accepts recorded and confirmed scenes.
+    file.write_text(file.read_text().replace("{", '{"confirmed":true,', 1))
     assert scene("missing", f"{file}:1").exit_code == 0
     done = scene("missing", "bed", "lamp", "--record", "scenes.txt")
     assert done.exit_code == 2
     assert done.stderr.strip() == "the name of a file with recorded scenes must end in .jsonl"
-
-
-def test_the_service_accepts_recorded_scenes(url: str, file: Path) -> None:
-    write(file, [request(box("bed", 2, 0, 0.25), box("lamp", 2, 1, 0.25))])
-    (scene,) = lines(file)
-    with Client(url) as client:
-        answer = client.outliers(scene | {"confirmed": True})
-    assert answer.stamp is not None
-    assert answer.stamp.sec == scene["stamp"]["sec"]
-    with pytest.raises(InvalidRequestError):
-        Recorder("scenes.json")

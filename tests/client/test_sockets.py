@@ -1,4 +1,4 @@
-"""The clients over real sockets: one connection for many calls, and deadlines that hold."""
+"""The clients on real sockets: shared connections and deadlines."""
 
 import socket
 import ssl
@@ -22,6 +22,7 @@ from scene_client import (
 )
 from tests.client.conftest import OVER_HTTP
 from tests.client.peers import answer, answering, read_head, say_nothing
+from tests.conftest import FindTool
 
 
 def serve(connection: socket.socket, heads: list[bytes] | None = None) -> None:
@@ -77,7 +78,7 @@ def test_many_calls_share_one_connection(peer: Any, open_caller: Any) -> None:
 
 @every_client
 @pytest.mark.parametrize("behave", [drip, drip_head, say_nothing, flood])
-def test_no_service_holds_a_call_beyond_the_deadline(
+def test_a_call_ends_at_the_deadline(
     peer: Any,
     open_caller: Any,
     behave: Callable[[socket.socket], None],
@@ -95,7 +96,7 @@ def test_no_service_holds_a_call_beyond_the_deadline(
 
 
 @every_client
-def test_a_connection_that_breaks_is_unreachable_in_the_end(peer: Any, open_caller: Any) -> None:
+def test_a_broken_connection_is_unreachable(peer: Any, open_caller: Any) -> None:
     started = peer(break_off)
     with open_caller(started.url, retries=2) as call, pytest.raises(UnreachableError):
         call("models")
@@ -103,7 +104,7 @@ def test_a_connection_that_breaks_is_unreachable_in_the_end(peer: Any, open_call
 
 
 @every_client
-def test_a_refused_connection_is_unreachable_and_not_ready(open_caller: Any) -> None:
+def test_a_refused_connection_is_unreachable(open_caller: Any) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
     with open_caller(f"http://127.0.0.1:{port}", retries=1) as call:
@@ -129,16 +130,16 @@ def test_the_key_and_the_time_left_are_sent(peer: Any, open_caller: Any) -> None
 
 @pytest.mark.system
 @every_client
-def test_over_tls_certificates_are_verified_and_deadlines_hold(
+def test_tls(
     peer: Any,
     open_caller: Any,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    require_system_tool: Callable[[str], Path],
+    find_tool: FindTool,
 ) -> None:
     key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
     command = [
-        *(require_system_tool("openssl"), "req", "-x509", "-newkey", "ec"),
+        *(find_tool("openssl"), "req", "-x509", "-newkey", "ec"),
         *("-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2"),
         *("-subj", "/CN=robot", "-addext", "subjectAltName=IP:127.0.0.1"),
         *("-keyout", key, "-out", certificate),
@@ -164,9 +165,7 @@ def test_over_tls_certificates_are_verified_and_deadlines_hold(
         call("models")
 
 
-async def test_an_answer_without_end_is_not_kept(
-    peer: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_an_endless_answer_is_an_error(peer: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sync, "MAX_ANSWER", 1000)
     monkeypatch.setattr(asynchronous, "MAX_ANSWER", 1000)
     started = peer(answering(b" " * 2000))
@@ -179,7 +178,7 @@ async def test_an_answer_without_end_is_not_kept(
 
 @pytest.mark.system
 @pytest.mark.parametrize("key", ["secret-key\n", "sécret-key"])
-def test_the_cpp_client_refuses_keys_that_no_header_can_carry(bridge: Path, key: str) -> None:
+def test_the_cpp_client_refuses_invalid_keys(bridge: Path, key: str) -> None:
     command = [bridge, "http://127.0.0.1:1", "1", "0", key]
     done = subprocess.run(command, capture_output=True, text=True)
     assert "InvalidRequestError" in done.stderr

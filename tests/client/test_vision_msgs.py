@@ -1,4 +1,4 @@
-"""Detections to requests: what is taken over, what is left out, and that both routes agree."""
+"""Conversion of ROS detections to requests, from JSON and from ROS messages."""
 
 import json
 import math
@@ -64,6 +64,18 @@ def array(*detections: dict[str, Any], frame: str = "base_link", **header: Any) 
     return {"header": {"stamp": stamp, "frame_id": frame, **header}, "detections": list(detections)}
 
 
+def in_space(
+    *detections: Any, label_map: Any = None, frame: str = "base_link", **options: Any
+) -> Any:
+    """The fields of detections with poses."""
+    return from_detection3d_array(array(*detections, frame=frame), label_map, **options)
+
+
+def in_image(*detections: Any, frame: str = "base_link") -> SceneFields:
+    """The fields of detections in an image."""
+    return from_detection2d_array(array(*detections, frame=frame))
+
+
 def only(fields: SceneFields) -> dict[str, Any]:
     (thing,) = fields["objects"]
     assert isinstance(thing, dict)
@@ -97,6 +109,8 @@ def test_messages_of_other_packages_may_be_objects(name: str) -> None:
 BED = {"label": "bed", "confidence": 0.9, "position": {"x": 1.0, "y": 0.0, "z": 0.5}}
 SIZED = BED | {"size": {"x": 0.5, "y": 0.5, "z": 0.5}}
 UPRIGHT = {"orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
+TURNED = {"orientation": {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8}}
+SCORES = (0.2, 0.9, math.nan, None)
 
 
 def bed(**fields: Any) -> dict[str, Any]:
@@ -107,11 +121,7 @@ def bed(**fields: Any) -> dict[str, Any]:
     ("detection", "expected", "reason"),
     [
         # The hypothesis of the highest score counts, wherever it stands in the list.
-        (
-            seen(*map(result, ("cat", "bed", "cow", "ant"), (0.2, 0.9, math.nan, None))),
-            SIZED | UPRIGHT,
-            None,
-        ),
+        (seen(*map(result, ("cat", "bed", "cow", "ant"), SCORES)), SIZED | UPRIGHT, None),
         # Scores in per cent are clipped.
         (seen(result("bed", 87.0)), SIZED | UPRIGHT | {"confidence": 1.0}, "high-score"),
         # A flat box has a size.
@@ -123,11 +133,7 @@ def bed(**fields: Any) -> dict[str, Any]:
         ],
         # Quaternions get the length 1.
         (bed(turn=(0, 0, 0, 2)), SIZED | UPRIGHT, None),
-        (
-            bed(turn=(0, 0, 3, 4)),
-            SIZED | {"orientation": {"x": 0, "y": 0, "z": 0.6, "w": 0.8}},
-            None,
-        ),
+        (bed(turn=(0, 0, 3, 4)), SIZED | TURNED, None),
         *[
             (bed(turn=turn), SIZED, None)
             for turn in ((0, 0, 0, 0), (1e-9, 0, 0, 0), (0, 0, 0, math.nan), (1e308,) * 4)
@@ -138,10 +144,8 @@ def bed(**fields: Any) -> dict[str, Any]:
         ],
     ],
 )
-def test_values_of_a_detection_are_taken_corrected_or_left_out(
-    detection: Any, expected: dict[str, Any], reason: str | None
-) -> None:
-    fields = from_detection3d_array(array(detection))
+def test_detection_values(detection: Any, expected: dict[str, Any], reason: str | None) -> None:
+    fields = in_space(detection)
     assert only(fields) == expected | {"id": "bed_1"}
     assert reasons(fields) == ([(0, reason)] if reason else [])
 
@@ -156,25 +160,20 @@ def test_values_of_a_detection_are_taken_corrected_or_left_out(
         ([result("7")], "unwanted"),
     ],
 )
-def test_a_detection_without_a_sure_label_is_left_out_and_reported(
-    results: Any, reason: str
-) -> None:
-    fields = from_detection3d_array(
-        array(seen(*results), seen(result("lamp"))), {"7": None}, min_score=0.3
-    )
+def test_detections_without_a_label_are_left_out(results: Any, reason: str) -> None:
+    lamp = seen(result("lamp"))
+    fields = in_space(seen(*results), lamp, label_map={"7": None}, min_score=0.3)
     assert only(fields)["label"] == "lamp"
     assert reasons(fields) == [(0, reason)]
 
 
-def test_an_empty_box_is_replaced_by_the_pose_of_the_hypothesis() -> None:
+def test_an_empty_box_has_the_pose_of_the_hypothesis() -> None:
     where = pose((1, 2, 3))
     empty = {"at": (0, 0, 0), "size": (0, 0, 0)}
-    fields = from_detection3d_array(
-        array(
-            seen(result("cup", 0.1, pose((9, 9, 9))), result("bed", 0.8, where), **empty),
-            seen(result("bed"), **empty),
-            seen(result("bed", 0.8, where), at=(0, 0, 0)),
-        )
+    fields = in_space(
+        seen(result("cup", 0.1, pose((9, 9, 9))), result("bed", 0.8, where), **empty),
+        seen(result("bed"), **empty),
+        seen(result("bed", 0.8, where), at=(0, 0, 0)),
     )
     positions = [thing.get("position") for thing in fields["objects"]]
     # A box with a size was filled in, wherever it lies.
@@ -182,21 +181,21 @@ def test_an_empty_box_is_replaced_by_the_pose_of_the_hypothesis() -> None:
     assert reasons(fields) == [(1, "no-position")]
 
 
-def test_ids_are_the_detectors_own_or_numbered_labels() -> None:
+def test_ids_of_detections() -> None:
     labels = ("chair", "lamp", "chair", "lamp", "bed", "bed")
     names = ("", "chair_1", "", "chair_1", " \n ", "a\nb")
     detections = (seen(result(label), name=name) for label, name in zip(labels, names, strict=True))
-    fields = from_detection3d_array(array(*detections))
+    fields = in_space(*detections)
     ids = [thing["id"] for thing in fields["objects"]]
     assert ids == ["chair_2", "chair_1", "chair_3", "lamp_1", "bed_1", "bed_2"]
     assert reasons(fields) == [(3, "renamed"), (5, "renamed")]
 
 
-def test_the_most_confident_of_too_many_are_kept_in_their_order() -> None:
+def test_the_most_confident_objects_are_kept() -> None:
     n = MAX_OBJECTS + 40
     scores = [0.1 + 0.8 * (k * 101 % n) / n for k in range(n)]
     cups = (seen(result("cup", score), name=str(k)) for k, score in enumerate(scores))
-    fields = from_detection3d_array(array(*cups))
+    fields = in_space(*cups)
     kept = [int(thing["id"]) for thing in fields["objects"]]
     floor = sorted(scores)[-MAX_OBJECTS]
     assert kept == [k for k in range(n) if scores[k] >= floor]
@@ -224,9 +223,9 @@ def test_frame_and_stamp_of_the_header(header: dict[str, Any], field: str, sent:
     assert reasons(fields) == ([(None, "no-stamp")] if field == "stamp" and sent is None else [])
 
 
-def test_the_frame_of_the_detections_serves_where_the_message_names_none() -> None:
+def test_the_frame_of_the_detections() -> None:
     detections = (bed(frame="/odom"), bed(), bed(frame="base_link"))
-    fields = from_detection3d_array(array(*detections, frame=""))
+    fields = in_space(*detections, frame="")
     assert fields["frame_id"] == "odom"
     assert ["position" in thing for thing in fields["objects"]] == [True, True, False]
     assert reasons(fields) == [(2, "no-position")]
@@ -245,7 +244,7 @@ def test_the_frame_of_the_detections_serves_where_the_message_names_none() -> No
 )
 def test_wrong_arguments_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(MessageError):
-        from_detection3d_array(array(seen(result("bed"))), **wrong)
+        in_space(seen(result("bed")), **wrong)
 
 
 @pytest.mark.parametrize(
@@ -261,7 +260,7 @@ def test_wrong_arguments_are_refused(wrong: dict[str, Any]) -> None:
         {"header": {"frame_id": "a\nb"}, "detections": []},
     ],
 )
-def test_other_values_than_messages_are_refused(message: Any) -> None:
+def test_other_values_are_refused(message: Any) -> None:
     with pytest.raises(MessageError):
         from_message(message)
 
@@ -290,7 +289,7 @@ def test_numbers_become_labels(label_map: Any, class_id: Any) -> None:
     assert [thing["label"] for thing in fields["objects"]] == ["chair", "lamp"]
 
 
-def test_numbers_without_a_label_map_are_an_error_that_says_what_to_do() -> None:
+def test_numbers_without_a_label_map_are_an_error() -> None:
     with pytest.raises(MessageError, match="label_map"):
         from_detection3d_array(array(seen(result("56")), seen(), seen(result("3", 0.0))))
     # With one, a class that it lacks is left out.
@@ -298,7 +297,7 @@ def test_numbers_without_a_label_map_are_an_error_that_says_what_to_do() -> None
     assert reasons(fields) == [(0, "no-label")]
 
 
-def test_the_default_model_knows_most_of_cocos_indoor_classes(repository: Path) -> None:
+def test_the_default_model_has_indoor_classes_of_coco(repository: Path) -> None:
     store = Store(repository / "model_store")
     vocabulary = store.load(*store.resolve("default")).model.vocabulary
     known = {label for label in COCO if vocabulary.index(label) is not None}
@@ -320,15 +319,13 @@ def lefts(fields: SceneFields) -> set[tuple[str, str]]:
 
 
 def test_image_boxes_give_left_and_right_of_neighbours() -> None:
-    fields = from_detection2d_array(
-        array(
-            flat("cup", 100, 100),
-            flat("bed", 160, 110),  # right of the cup
-            flat("lamp", 165, 30),  # above both: says nothing
-            flat("door", 900, 100),  # far off
-            flat("rug", 102, 101),  # where the cup is
-            frame="camera_optical_frame",
-        )
+    fields = in_image(
+        flat("cup", 100, 100),
+        flat("bed", 160, 110),  # right of the cup
+        flat("lamp", 165, 30),  # above both: no relation
+        flat("door", 900, 100),  # far away
+        flat("rug", 102, 101),  # at the place of the cup
+        frame="camera_optical_frame",
     )
     assert lefts(fields) == {("cup_1", "bed_1"), ("rug_1", "bed_1")}
     assert fields["frame_id"] == "camera_optical_frame"
@@ -337,13 +334,11 @@ def test_image_boxes_give_left_and_right_of_neighbours() -> None:
 
 
 def test_invalid_boxes_are_reported() -> None:
-    fields = from_detection2d_array(
-        array(
-            flat("cup", 100, 100),
-            flat("bed", math.nan, 100),
-            flat("lamp", 120, 100, 0, 0),
-            flat("rug", 150, 100, frame="other_camera"),
-        )
+    fields = in_image(
+        flat("cup", 100, 100),
+        flat("bed", math.nan, 100),
+        flat("lamp", 120, 100, 0, 0),
+        flat("rug", 150, 100, frame="other_camera"),
     )
     assert lefts(fields) == set()
     assert reasons(fields) == [(1, "no-box"), (2, "no-box"), (3, "no-box")]
@@ -352,9 +347,7 @@ def test_invalid_boxes_are_reported() -> None:
 @pytest.mark.parametrize("store", [Layout.current, Layout.former], ids=["current", "former"])
 @pytest.mark.parametrize("kind", ["3D", "2D"])
 @pytest.mark.parametrize("number", [7.25, -1.0, 0.0, math.nan, math.inf, 1e300])
-def test_rosbridge_and_the_wire_of_ros_give_one_scene_that_is_a_request(
-    store: Typestore, kind: str, number: float
-) -> None:
+def test_rosbridge_and_cdr_give_one_scene(store: Typestore, kind: str, number: float) -> None:
     """The first of two detections has this number in every field of a floating-point type."""
     name = f"vision_msgs/msg/Detection{kind}Array"
     message = filled(store, name, repeat(number), 2)
@@ -370,8 +363,7 @@ def test_rosbridge_and_the_wire_of_ros_give_one_scene_that_is_a_request(
 
 
 @pytest.mark.parametrize("text", [b"null", b"3", b'"x"', b"[]", b"{}", b"[{}]"])
-def test_any_message_is_a_request_or_an_error_of_this_module(text: bytes) -> None:
-    """One value of a message is replaced."""
+def test_any_message_is_a_request_or_an_error(text: bytes) -> None:
     for message in (array(seen(result("56"), name="t1")), array(flat("chair", 1.0, 2.0))):
         for place in places(message):
             changed = json.loads(replaced(message, place, text))

@@ -142,11 +142,11 @@ class Slow:
 
     def __init__(self, outcome: Any) -> None:
         self.outcome = outcome
-        self.asked: list[dict[str, Any]] = []
+        self.requests: list[dict[str, Any]] = []
         self.started, self.answering = threading.Semaphore(0), threading.Event()
 
     def missing(self, **fields: Any) -> Any:
-        self.asked.append(fields)
+        self.requests.append(fields)
         self.started.release()
         assert self.answering.wait(PATIENCE)
         if isinstance(self.outcome, Exception):

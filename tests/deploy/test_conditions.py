@@ -2,7 +2,6 @@
 
 import json
 import socket
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,7 @@ import pytest
 from scene_client import Client
 from scene_client.vision_msgs import SceneFields
 from tests.client import callers
-from tests.conftest import run_program
-from tests.services import LiveService
+from tests.conftest import FindTool, run_program
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 
@@ -21,12 +19,12 @@ pytestmark = [pytest.mark.system, pytest.mark.slow]
 def program(
     repository: Path,
     tmp_path_factory: pytest.TempPathFactory,
-    require_system_tool: Callable[[str], Path],
+    find_tool: FindTool,
 ) -> Path:
     """Ticks one condition as a tree does."""
     here = Path(__file__).parent
     return callers.compiled(
-        require_system_tool,
+        find_tool,
         here / "conditions.cpp",
         tmp_path_factory.mktemp("conditions") / "conditions",
         repository / "clients" / "ros2" / "behaviortree_cpp",
@@ -41,14 +39,7 @@ def tick(program: Path, url: str, kind: str, *ports: Any, timeout: float = 60.0)
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 
-@pytest.fixture
-def url(live: LiveService) -> str:
-    return live.url
-
-
-def test_a_scene_is_complete_if_nothing_missing_is_rather_there_than_not(
-    program: Path, url: str, scene: SceneFields
-) -> None:
+def test_scene_complete(program: Path, url: str, scene: SceneFields) -> None:
     with Client(url, timeout=60.0) as client:
         missing = client.missing(**scene).missing
     highest = max(missing, key=lambda thing: thing.log_odds)
@@ -68,9 +59,7 @@ def test_a_scene_is_complete_if_nothing_missing_is_rather_there_than_not(
     assert own["because"] == "missing: couch"
 
 
-def test_a_thing_belongs_unless_it_is_an_outlier(
-    program: Path, url: str, scene: SceneFields
-) -> None:
+def test_object_belongs(program: Path, url: str, scene: SceneFields) -> None:
     with Client(url, timeout=60.0) as client:
         outliers = client.outliers(**scene).outliers
     (toilet,) = (thing for thing in outliers if thing.label == "toilet")
@@ -96,7 +85,7 @@ def test_a_thing_belongs_unless_it_is_an_outlier(
     assert found["because"] == "desk belongs"
 
 
-def test_a_service_that_does_not_answer_fails_the_condition(program: Path) -> None:
+def test_an_unreachable_service_fails_the_condition(program: Path) -> None:
     scene = {"scene": '{"objects": ["bed"]}'}
     with socket.create_server(("127.0.0.1", 0)) as server:  # accepts and never answers
         url = f"http://127.0.0.1:{server.getsockname()[1]}"

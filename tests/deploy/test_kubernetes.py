@@ -5,7 +5,6 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,14 +16,13 @@ import yaml
 from app.main import create_app
 from app.registry import AliasTarget, Store, load_model_set
 from app.settings import Settings
-from tests.conftest import run_program
+from tests.conftest import FindTool, run_program
 from tests.http.stores import make_store
 from tests.services import PATIENCE, wait_until
 from tests.system.test_container import split_stages
 
 pytestmark = pytest.mark.system
 
-FindTool = Callable[[str], Path]
 Manifests = dict[tuple[str, str], dict[str, Any]]
 
 OVERLAYS = ("local", "bucket", "autoscaled", "everything")
@@ -40,10 +38,10 @@ def folder(repository: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def rendered(
-    folder: Path, require_system_tool: FindTool, tmp_path_factory: pytest.TempPathFactory
+    folder: Path, find_tool: FindTool, tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, str]:
     """Each overlay, and `everything`: bucket, autoscaled and monitoring together."""
-    kubectl = require_system_tool("kubectl")
+    kubectl = find_tool("kubectl")
     copy = tmp_path_factory.mktemp("kubernetes") / "copy"
     shutil.copytree(folder, copy)
     shutil.copytree(copy / "overlays" / "autoscaled", copy / "overlays" / "everything")
@@ -129,7 +127,7 @@ def test_ports_are_those_of_the_image(repository: Path, overlay: Overlay) -> Non
         assert (port["port"], port["targetPort"]) == (exposed, opened["name"])
 
 
-def test_variables_are_settings_with_valid_values(
+def test_variables_are_valid_settings(
     monkeypatch: pytest.MonkeyPatch, repository: Path, overlay: Overlay
 ) -> None:
     assert set(re.findall(r"\bSCENE_[A-Z0-9_]+", overlay.text)) <= SETTINGS
@@ -207,11 +205,9 @@ def test_the_network_policy_opens_the_ports_in_use(overlay: Overlay) -> None:
     assert out == (dns | {(443, "TCP")} if has_bucket else dns)
 
 
-def test_the_sidecar_copies_what_the_service_loads(
-    folder: Path, require_system_tool: FindTool, tmp_path: Path
-) -> None:
+def test_the_sidecar_copies_versions(folder: Path, find_tool: FindTool, tmp_path: Path) -> None:
     """A version arrives whole, without its upload's leftovers, and aliases follow the bucket."""
-    rclone, rounds = require_system_tool("rclone"), tmp_path / "rounds"
+    rclone, rounds = find_tool("rclone"), tmp_path / "rounds"
     (tmp_path / "bin").mkdir()
     counting = tmp_path / "bin" / "rclone"
     counting.write_text(f'#!/bin/sh\necho >>{rounds}\nexec {rclone} "$@"\n')

@@ -4,7 +4,6 @@ import json
 import os
 import re
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,7 @@ import yaml
 
 from app.registry import Store
 from app.settings import Settings
-from tests.conftest import run_program
+from tests.conftest import FindTool, run_program
 
 pytestmark = pytest.mark.system
 
@@ -32,25 +31,21 @@ pytestmark = pytest.mark.system
         "check-jsonschema --builtin-schema=vendor.gitlab-ci .gitlab-ci.yml",
     ],
 )
-def test_a_configuration_has_no_lint(
-    require_system_tool: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch, command: str
-) -> None:
-    # Debian installs haproxy into a folder that is in the PATH of administrators only.
-    monkeypatch.setenv("PATH", f"{os.environ['PATH']}{os.pathsep}/usr/sbin")
+def test_linters(find_tool: FindTool, monkeypatch: pytest.MonkeyPatch, command: str) -> None:
     monkeypatch.setenv("PROXY_BACKEND", "127.0.0.1:8000")
     program, *arguments = command.split()
-    run_program(require_system_tool(program), *arguments)
+    run_program(find_tool(program), *arguments)
 
 
 def test_the_queries_of_the_dashboard_can_be_parsed(
-    require_system_tool: Callable[[str], Path], repository: Path, tmp_path: Path
+    find_tool: FindTool, repository: Path, tmp_path: Path
 ) -> None:
     dashboard = (repository / "deploy/monitoring/grafana/dashboards/scene.json").read_text("utf-8")
     panels = json.loads(dashboard.replace("$__rate_interval", "1m"))["panels"]
     queries = [target["expr"] for panel in panels for target in panel.get("targets", ())]
     rules = [{"record": f"query{n}", "expr": query} for n, query in enumerate(queries)]
     (tmp_path / "rules.yml").write_text(yaml.dump({"groups": [{"name": "all", "rules": rules}]}))
-    run_program(require_system_tool("promtool"), "check", "rules", tmp_path / "rules.yml")
+    run_program(find_tool("promtool"), "check", "rules", tmp_path / "rules.yml")
 
 
 def test_workflows_run_every_python_of_the_packages(repository: Path) -> None:
@@ -75,10 +70,8 @@ def unit(repository: Path, tmp_path: Path) -> Path:
     return unit
 
 
-def test_the_unit_is_valid_and_confined(
-    require_system_tool: Callable[[str], Path], unit: Path
-) -> None:
-    systemd = require_system_tool("systemd-analyze")
+def test_the_unit_is_valid_and_confined(find_tool: FindTool, unit: Path) -> None:
+    systemd = find_tool("systemd-analyze")
     verified = run_program(systemd, "verify", "--man=no", unit)
     assert verified.stdout + verified.stderr == ""
     # The threshold is in tenths: at most 2.0 of 10.

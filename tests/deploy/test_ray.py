@@ -5,7 +5,6 @@ import re
 import signal
 import subprocess
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -42,9 +41,7 @@ def pods(cluster: dict[str, Any]) -> list[dict[str, Any]]:
     return [group["template"]["spec"] for group in groups]
 
 
-def test_the_manifest_has_the_same_configuration_for_another_host(
-    config: dict[str, Any], cluster: dict[str, Any]
-) -> None:
+def test_manifest_and_configuration_agree(config: dict[str, Any], cluster: dict[str, Any]) -> None:
     copy = yaml.safe_load(cluster["serveConfigV2"])
     assert config["http_options"]["host"] == "127.0.0.1"
     assert copy["http_options"]["host"] == "0.0.0.0"
@@ -99,26 +96,27 @@ def test_the_manifest_has_the_settings_of_the_local_start(pods: list[dict[str, A
         assert {name: settings[name] for name in shared} == {name: local[name] for name in shared}
 
 
-@contextmanager
-def running(repository: Path, log: Path, *arguments: str | Path) -> Iterator[LiveService]:
-    """Run `deploy/ray/run.py` on a free port, and check that no process remains after it."""
+@pytest.fixture(scope="module")
+def service(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
+    """Two replicas of `deploy/ray/run.py` on a free port. No process remains after them."""
     python = repository / ".venv-ray" / "bin" / "python"
     if not python.with_name("ray").exists():
         pytest.skip("Ray is not installed; make ray installs it")
-    port = free_port()
+    port, log = free_port(), tmp_path_factory.mktemp("ray") / "log"
     inherited = {k: v for k, v in os.environ.items() if not k.startswith(("SCENE_", "RAY_"))}
+    command = [python, repository / "deploy" / "ray" / "run.py", f"--port={port}", "--replicas=2"]
     with log.open("w") as stream:
-        process = subprocess.Popen(
-            [python, repository / "deploy" / "ray" / "run.py", f"--port={port}", *arguments],
-            env=inherited,
-            stdout=stream,
-            stderr=stream,
-            text=True,
-        )
+        process = subprocess.Popen(command, env=inherited, stdout=stream, stderr=stream, text=True)
+
+    def replicas() -> int:
+        commands = descendants(process.pid).values()
+        return sum(command.startswith("ray::ServeReplica") for command in commands)
+
     started: dict[int, str] = {}
     try:
         wait_until(lambda: "ready:" in log.read_text() or process.poll() is not None, seconds=600)
         assert process.poll() is None, log.read_text()
+        wait_until(lambda: replicas() == 2)
         with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=PATIENCE) as client:
             yield LiveService(process, client, port, log)
     finally:
@@ -130,22 +128,7 @@ def running(repository: Path, log: Path, *arguments: str | Path) -> Iterator[Liv
     assert not [command for pid, command in started.items() if Path(f"/proc/{pid}").exists()]
 
 
-def replicas(service: LiveService) -> set[int]:
-    found = descendants(service.process.pid).items()
-    return {pid for pid, command in found if command.startswith("ray::ServeReplica")}
-
-
-@pytest.fixture(scope="module")
-def service(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
-    log = tmp_path_factory.mktemp("ray") / "log"
-    with running(repository, log, "--replicas=2") as service:
-        wait_until(lambda: len(replicas(service)) == 2)
-        yield service
-
-
 @pytest.mark.slow
-def test_answers_equal_those_of_the_plain_service(
-    service: LiveService, shipped: LiveService
-) -> None:
+def test_answers_are_those_of_one_process(service: LiveService, shipped: LiveService) -> None:
     for _ in range(4):
         assert service.control() == shipped.control()

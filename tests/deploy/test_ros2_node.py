@@ -79,9 +79,7 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
         assert running.ros.destroyed
 
 
-def test_detections_become_answers_markers_and_a_diagnosis(
-    run: Run, live: LiveService, recorded: Any
-) -> None:
+def test_detections_are_answered(run: Run, live: LiveService, recorded: Any) -> None:
     running = run(url=live.url, timeout=60.0)
     answer = running.answer(recorded)
     assert answer["frame_id"] == "base_link"
@@ -115,9 +113,7 @@ def test_the_api_key_comes_from_a_file(run: Run, recorded: Any, tmp_path: Path) 
         assert (key in heads[0].lower()) is bool(file)
 
 
-def test_no_callback_waits_and_only_the_newest_detections_are_asked_about(
-    run: Run, recorded: Any
-) -> None:
+def test_only_the_newest_detections_are_sent(run: Run, recorded: Any) -> None:
     running = run()
     client = running.node.advisor.client = Slow(UnreachableError("gone"))
     for second in range(4):
@@ -130,7 +126,7 @@ def test_no_callback_waits_and_only_the_newest_detections_are_asked_about(
     assert running.published("/diagnostics") == []
     client.answering.set()
     running.wait_for("/diagnostics", 2)
-    assert [fields["stamp"]["sec"] for fields in client.asked] == [0, 3]
+    assert [fields["stamp"]["sec"] for fields in client.requests] == [0, 3]
     first, second_one = (report.status[0] for report in running.published("/diagnostics"))
     assert first.level == second_one.level == 2
     assert first.message == "UnreachableError: gone"
@@ -138,7 +134,7 @@ def test_no_callback_waits_and_only_the_newest_detections_are_asked_about(
     assert running.published("~/answers") == []
 
 
-def test_numbers_wait_for_their_labels(run: Run, live: LiveService, recorded: Any) -> None:
+def test_class_ids_need_a_label_map(run: Run, live: LiveService, recorded: Any) -> None:
     numbers = {"desk": "0", "chair": "1"}
     for detection in recorded.detections:
         for result in detection.results:
@@ -157,9 +153,7 @@ def test_numbers_wait_for_their_labels(run: Run, live: LiveService, recorded: An
     assert {entry["label"] for entry in answer["outliers"]["outliers"]} == {"desk", "chair"}
 
 
-def test_a_pose_in_the_frame_of_the_detections_is_their_viewpoint(
-    run: Run, live: LiveService, recorded: Any
-) -> None:
+def test_a_pose_is_the_viewpoint(run: Run, live: LiveService, recorded: Any) -> None:
     def horizontal() -> list[dict[str, str]]:
         relations = running.answer(recorded)["missing"]["observed_relations"]
         return [entry for entry in relations if entry["relation"] in {"left", "front"}]
@@ -182,7 +176,7 @@ def test_a_pose_in_the_frame_of_the_detections_is_their_viewpoint(
     assert horizontal() == []
 
 
-def test_images_are_heard_where_the_parameters_say_so(run: Run, live: LiveService) -> None:
+def test_detections_in_images_are_answered(run: Run, live: LiveService) -> None:
     def detection(name: str, x: float) -> Any:
         hypothesis = new("ObjectHypothesis", class_id=name, score=0.9)
         found = new("Detection2D", results=[new("ObjectHypothesisWithPose", hypothesis=hypothesis)])
@@ -197,7 +191,7 @@ def test_images_are_heard_where_the_parameters_say_so(run: Run, live: LiveServic
     assert [*entry.values()][:3] == ["bed_1", "left", "lamp_1"]
 
 
-def test_a_ghost_stands_off_its_anchor_by_the_offset(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ghosts_stand_at_the_offset(monkeypatch: pytest.MonkeyPatch) -> None:
     load_package(monkeypatch)
     advisor = importlib.import_module("scene_reasoning.advisor")
     ghosts = importlib.import_module("scene_reasoning.ghosts").ghosts
@@ -225,11 +219,11 @@ def test_a_ghost_stands_off_its_anchor_by_the_offset(monkeypatch: pytest.MonkeyP
     assert (pen.text, pen.position, pen.extent) == ("pen? inside desk", (1.0, 2.0, 0.4), None)
 
 
-def test_the_parameter_file_is_the_nodes_parameters_and_its_defaults(run: Run) -> None:
+def test_the_parameter_file_has_the_defaults(run: Run) -> None:
     given = yaml.safe_load((PACKAGE / "config" / "scene.yaml").read_text())
     parameters = given["scene"]["ros__parameters"]
-    asked = run(**parameters).ros.declared
-    assert set(asked) == set(parameters)
+    declared = run(**parameters).ros.declared
+    assert set(declared) == set(parameters)
     defaults = run().ros.declared
     for name, value in defaults.items():
         assert str(parameters[name]) == str(value), name

@@ -4,12 +4,12 @@ import os
 import shutil
 import sys
 import tomllib
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
+from tests.conftest import FindTool
 from tests.services import LiveService
 
 _LEFT_OUT = shutil.ignore_patterns(
@@ -37,14 +37,14 @@ def workplace(
     repository: Path,
     shipped: LiveService,
     tmp_path_factory: pytest.TempPathFactory,
-    require_system_tool: Callable[[str], Path],
+    find_tool: FindTool,
 ) -> Workplace:
     """The shipped models as a service, and a fresh copy of the repository for the pages' commands.
 
     All in the copy is as in a checkout but for `.venv`, see `install`.
     """
     for tool in ("make", "curl", "bash"):
-        require_system_tool(tool)
+        find_tool(tool)
     folder = tmp_path_factory.mktemp("checkout") / "scene"
     shutil.copytree(repository, folder, ignore=_LEFT_OUT, symlinks=True)
     install(folder)

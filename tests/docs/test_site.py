@@ -3,8 +3,7 @@
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 from http.server import SimpleHTTPRequestHandler
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import pytest
 from playwright.sync_api import sync_playwright
 
 from scripts.site import DIRECTIVE, checks
-from tests.conftest import REPOSITORY, run_program
+from tests.conftest import REPOSITORY, FindTool, run_program
 from tests.services import http_server
 
 pytestmark = pytest.mark.slow
@@ -74,20 +73,13 @@ def test_every_test_that_a_formula_names_exists() -> None:
 @pytest.fixture
 def served(site: Path) -> Iterator[str]:
     """The address of a server of the built files."""
-
-    class Quiet(SimpleHTTPRequestHandler):
-        def log_message(self, *arguments: object) -> None:
-            pass
-
-    with http_server(partial(Quiet, directory=site)) as url:
+    with http_server(SimpleHTTPRequestHandler, directory=site) as url:
         yield url
 
 
 @pytest.mark.system
-def test_a_browser_loads_only_the_site_and_shows_the_formulas(
-    served: str, require_system_tool: Callable[[str], Path]
-) -> None:
-    chromium = require_system_tool("chromium")
+def test_the_browser_shows_the_site(served: str, find_tool: FindTool) -> None:
+    chromium = find_tool("chromium")
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(
             executable_path=str(chromium), args=["--no-sandbox", "--disable-dev-shm-usage"]

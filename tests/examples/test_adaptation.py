@@ -5,14 +5,13 @@ import inspect
 import json
 import os
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from scene_client import Client
-from tests.conftest import REPOSITORY, run_program
+from tests.conftest import REPOSITORY, FindTool, run_program
 from tests.services import launch
 
 pytestmark = [
@@ -40,10 +39,8 @@ def outputs(notebook: Any) -> list[list[str]]:
     return [[output["output_type"] for output in cell["outputs"]] for cell in cells]
 
 
-def test_the_shell_program_adapts_a_model_that_a_service_serves(
-    tmp_path: Path, require_system_tool: Callable[[str], Path]
-) -> None:
-    bash, home = require_system_tool("bash"), tmp_path / "home"
+def test_the_shell_program_adapts_a_model(tmp_path: Path, find_tool: FindTool) -> None:
+    bash, home = find_tool("bash"), tmp_path / "home"
     script = REPOSITORY / "examples/adapt.sh"
     done = run_program(bash, script, home, env=environment(), timeout=1800)
     assert "promoted: default → home@1.0.0" in done.stdout

@@ -1,4 +1,4 @@
-"""Requests that wait: in order, bounded, until their deadline; and what ending does to them."""
+"""Deadlines, queues, and the requests in progress at the end of the service."""
 
 import asyncio
 import math
@@ -7,11 +7,11 @@ import threading
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
+from httpx import Client, ConnectError, Response
 
 from tests.http.test_problems import problem
-from tests.services import Hold, Replace, launch, serve, wait_until
+from tests.services import Pause, Replace, launch, serve, wait_until
 
 SCENE = {"objects": ["bed", "chair", "lamp"]}
 LONG = {"X-Request-Timeout-Ms": "60000"}
@@ -35,29 +35,27 @@ async def test_a_deadline_is_a_whole_number_within_the_limit(shared_store: Path)
     assert [p["schema"]["maximum"] for p in parameters if "Timeout" in p["name"]] == [600_000]
 
 
-async def test_generate_past_its_deadline_gets_504_and_delays_no_request(
-    shared_store: Path, hold: Hold
-) -> None:
+async def test_generate_past_its_deadline_gets_504(shared_store: Path, pause: Pause) -> None:
     async with serve(shared_store) as client:
-        held = hold("generate")
+        paused = pause("generate")
         drawing = asyncio.ensure_future(
             client.post("/generate", json=SCENE, headers={"X-Request-Timeout-Ms": "1000"})
         )
         for question in ("relations", "missing", "outliers"):
             assert (await client.post(f"/{question}", json=SCENE, headers=LONG)).is_success
         problem(await drawing, 504, "deadline-passed")
-        held.release.set()
+        paused.release.set()
         assert (await client.post("/generate", json=SCENE, headers=LONG)).is_success
         assert 'scene_pending{lane="draws"} 0.0' in (await client.get("/metrics")).text
 
 
-async def test_a_client_with_a_quarter_of_a_queue_gets_429(shared_store: Path, hold: Hold) -> None:
+async def test_a_client_above_its_share_gets_429(shared_store: Path, pause: Pause) -> None:
     async with serve(shared_store) as client:
         client.headers.update(LONG)
-        held = hold("generate")
+        paused = pause("generate")
         largest = {**SCENE, "count": 64, "steps": 500}
         drawing = asyncio.ensure_future(client.post("/generate", json=largest))
-        assert await asyncio.to_thread(held.started.wait, 60)
+        assert await asyncio.to_thread(paused.started.wait, 60)
         response = await client.post("/generate", json=SCENE)
         problem(response, 429, "queue-full")
         assert int(response.headers["retry-after"]) >= 1
@@ -65,7 +63,7 @@ async def test_a_client_with_a_quarter_of_a_queue_gets_429(shared_store: Path, h
         assert (await client.post("/missing", json=SCENE)).is_success
         assert (await client.post("/missing/batch", json={"scenes": [SCENE] * 256})).is_success
         assert (await client.get("/health/ready")).is_success
-        held.release.set()
+        paused.release.set()
         assert (await drawing).is_success
         assert (await client.post("/generate", json=SCENE)).is_success
         too_much = await client.post("/generate", json={**largest, "steps": 501})
@@ -73,7 +71,7 @@ async def test_a_client_with_a_quarter_of_a_queue_gets_429(shared_store: Path, h
         assert "`steps` must be at most 32000" in document["errors"][0]["message"]
 
 
-async def test_a_batch_stops_where_its_deadline_passes(
+async def test_a_batch_stops_at_its_deadline(
     shared_store: Path, replace: Replace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each entry that was not begun says so itself. The deadline passes during the third entry."""
@@ -93,7 +91,7 @@ async def test_a_batch_stops_where_its_deadline_passes(
     assert [entry["status"] for entry in answer.json()["results"]] == [200] * 2 + [504] * 18
 
 
-HELD = """
+WAITING = """
 import sys, time
 from pathlib import Path
 from app.__main__ import main
@@ -101,14 +99,14 @@ from app.questions.generate import GENERATE
 
 generate, begun, release = GENERATE.answer, Path({begun!r}), Path({release!r})
 
-def held(*args, **parameters):
+def waiting(*args, **parameters):
     if parameters["count"] == 3:
         begun.touch()
         while not release.exists():
             time.sleep(0.01)
     return generate(*args, **parameters)
 
-GENERATE.answer = held
+GENERATE.answer = waiting
 sys.exit(main())
 """
 """A program for `launch`: drawing three scenes takes until the file `release` exists."""
@@ -116,17 +114,15 @@ sys.exit(main())
 
 @pytest.mark.slow
 @pytest.mark.system
-def test_a_stopping_service_answers_requests_in_progress(
-    shared_store: Path, tmp_path: Path
-) -> None:
+def test_a_stopping_service_drains(shared_store: Path, tmp_path: Path) -> None:
     begun, release = tmp_path / "begun", tmp_path / "release"
-    program = HELD.format(begun=str(begun), release=str(release))
+    program = WAITING.format(begun=str(begun), release=str(release))
     log = tmp_path / "log"
     with launch(shared_store, log, program=("-c", program), SCENE_DRAIN_SECONDS="3") as service:
-        answers: list[httpx.Response] = []
+        answers: list[Response] = []
 
         def draw() -> None:
-            with httpx.Client(base_url=service.client.base_url, timeout=60) as client:
+            with Client(base_url=service.client.base_url, timeout=60) as client:
                 answers.append(client.post("/generate", json={**SCENE, "count": 3}, headers=LONG))
 
         def is_draining() -> bool:
@@ -150,5 +146,5 @@ def test_a_stopping_service_answers_requests_in_progress(
         assert answers[0].status_code == 200
         service.process.wait(timeout=30)
         assert service.process.returncode == -signal.SIGTERM
-        with pytest.raises(httpx.ConnectError):
+        with pytest.raises(ConnectError):
             service.client.get("/health/live")

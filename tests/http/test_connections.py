@@ -1,4 +1,4 @@
-"""Clients that are slow, leave, or do not read: bounded without a proxy too."""
+"""Slow and incomplete requests to the service without a proxy."""
 
 import json
 import select
@@ -6,8 +6,8 @@ import socket
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-import httpx
 import pytest
+from httpx import Response
 
 from tests.chaos.wire import BODY, LIVE, Wire, exchange
 from tests.http.test_problems import problem
@@ -39,9 +39,7 @@ def test_an_unfinished_body_gets_408(service: LiveService, part: bytes) -> None:
 @pytest.mark.parametrize(
     ("path", "status"), [(b"/health/live", 200), (b"/missing", 405), (b"/stream", 404)]
 )
-def test_an_upgrade_request_gets_a_plain_answer(
-    service: LiveService, path: bytes, status: int
-) -> None:
+def test_upgrade_requests_get_plain_answers(service: LiveService, path: bytes, status: int) -> None:
     upgrade = (
         b"Host: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
         b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="
@@ -61,12 +59,12 @@ def test_unfinished_bodies_use_bounded_memory(shared_store: Path, tmp_path: Path
     """Sixty bodies of 2 MiB less one byte: the service holds as many as its budget allows."""
     settings = {"SCENE_CLIENT_TIMEOUT": "60", "SCENE_HELD_BODY_BYTES": str(8 * 2**20)}
     size = 2 * 2**20
-    with launch(shared_store, tmp_path / "log", **settings) as service, ExitStack() as held:
+    with launch(shared_store, tmp_path / "log", **settings) as service, ExitStack() as stack:
         before, answers = service.memory, service.control()
         waiting, head = list[socket.socket](), HEAD.replace(b"outliers", b"missing/batch") % size
         for _ in range(60):
             connection = socket.create_connection(("127.0.0.1", service.port), timeout=PATIENCE)
-            waiting.append(held.enter_context(connection))
+            waiting.append(stack.enter_context(connection))
             with suppress(ConnectionError):  # refused before the end of the body
                 waiting[-1].sendall(head + b" " * (size - 1))
         while len(waiting) > 4:
@@ -80,14 +78,14 @@ def test_unfinished_bodies_use_bounded_memory(shared_store: Path, tmp_path: Path
         assert service.control() == answers
         batch = {"scenes": [{"objects": ["bed"] * 60}] * 256}
 
-        def asked() -> httpx.Response:
+        def post_batch() -> Response:
             return service.client.post("/missing/batch", json=batch)
 
         # The service reads the last bytes of the held bodies after the client sent them.
-        wait_until(lambda: asked().status_code == 503)
-        refused = asked()
+        wait_until(lambda: post_batch().status_code == 503)
+        refused = post_batch()
         problem(refused, 503, "bodies-full")
         assert int(refused.headers["retry-after"]) > 0
-        held.close()
+        stack.close()
         # The service notices the end of the connections after the client.
-        wait_until(lambda: asked().status_code == 200)
+        wait_until(lambda: post_batch().status_code == 200)

@@ -1,4 +1,4 @@
-"""The OpenAPI document against a live service: generated requests get the answers it promises."""
+"""The OpenAPI document: a live service answers generated requests as documented."""
 
 import json
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""The pages work without internet, and the OpenAPI document tells the truth."""
+"""Pages without internet, and the OpenAPI document compared with the service."""
 
 import json
 import re
@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urljoin, urlsplit
 
-import httpx
 import pytest
+from httpx import AsyncClient, Response
 
 from app.api.examples import REQUESTS
 from app.errors import ERRORS
@@ -21,15 +21,20 @@ PAGES = ["/", "/docs", "/redoc", "/problems", "/problems/not-json"]
 # Digest of app/static/vendor, so that a change of a library's file is seen.
 LIBRARIES = "72a2b522c7b27658feb43c3d5bb8c11eb1bebd51df2ee3e734934ae37c728e86"
 
-
 INLINE = r"""(?s)<(script|style)[^>]*>\s*[^\s<]|<[^>]*\s(on\w+|style)\s*="""
 """A script, a style sheet, a handler of events or a style in a page."""
 
 
 @pytest.mark.parametrize("page", PAGES)
-async def test_pages_load_from_the_service_alone(client: httpx.AsyncClient, page: str) -> None:
+async def test_pages_load_only_from_the_service(client: AsyncClient, page: str) -> None:
     response = await client.get(page)
     assert response.status_code == 200
+    check(response)
+    policy = response.headers["content-security-policy"]
+    directives = dict(part.strip().split(" ", 1) for part in policy.split(";"))
+    assert (directives["default-src"], directives["script-src"]) == ("'none'", "'self'")
+    assert not re.search(r"https?:|\*", policy)
+    assert page != "/" or "unsafe" not in policy
     assert not re.search(INLINE, response.text)
     links = re.findall(r'\s(?:src|href)="([^"]+)"', response.text)
     assert len(links) >= 2
@@ -47,9 +52,7 @@ async def test_pages_can_be_switched_off(shared_store: Path) -> None:
         assert (await client.get("/problems/not-json")).status_code == 200
 
 
-async def test_files_are_asked_for_again_and_those_of_libraries_are_kept(
-    client: httpx.AsyncClient,
-) -> None:
+async def test_only_libraries_are_cached(client: AsyncClient) -> None:
     page = await client.get("/")
     assert page.headers["cache-control"] == "no-cache"
     again = await client.get("/", headers={"If-None-Match": page.headers["etag"]})
@@ -62,7 +65,7 @@ async def test_files_are_asked_for_again_and_those_of_libraries_are_kept(
     assert "immutable" in library.headers["cache-control"]
 
 
-def test_libraries_lie_here_as_they_were_published(repository: Path) -> None:
+def test_libraries_are_unchanged(repository: Path) -> None:
     """The sha256 of what `sha256sum` prints of their files, each beside its licence."""
     folder = repository / "app" / "static" / "vendor"
     files = sorted(path for path in folder.rglob("*") if path.is_file())
@@ -75,7 +78,7 @@ def test_libraries_lie_here_as_they_were_published(repository: Path) -> None:
 
 
 @pytest.fixture
-async def document(client: httpx.AsyncClient) -> Any:
+async def document(client: AsyncClient) -> Any:
     return (await client.get("/openapi.json")).json()
 
 
@@ -87,7 +90,7 @@ def operations(document: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]
     ]
 
 
-async def test_errors_are_problems_and_nothing_else(document: dict[str, Any]) -> None:
+async def test_errors_are_problems(document: dict[str, Any]) -> None:
     documented = set()
     assert not {"HTTPValidationError", "ValidationError"} & set(document["components"]["schemas"])
     for method, path, operation in operations(document):
@@ -117,8 +120,8 @@ QUESTIONS = [(operation, name) for operation, cases in REQUESTS.items() for name
 
 
 @pytest.mark.parametrize(("operation", "name"), QUESTIONS)
-async def test_an_example_is_answered_or_refused_as_it_says(
-    client: httpx.AsyncClient, document: dict[str, Any], operation: str, name: str
+async def test_examples_are_answered_as_documented(
+    client: AsyncClient, document: dict[str, Any], operation: str, name: str
 ) -> None:
     case = REQUESTS[operation][name]
     address = "/" + operation.replace("_", "/")
@@ -166,8 +169,8 @@ COMPUTED = [
 ]
 
 
-def check(response: httpx.Response) -> None:
-    """What holds for every answer."""
+def check(response: Response) -> None:
+    """Check the headers that every answer has."""
     assert response.headers["x-content-type-options"] == "nosniff"
     assert response.headers["referrer-policy"] == "no-referrer"
     assert "frame-ancestors 'none'" in response.headers["content-security-policy"]
@@ -179,26 +182,14 @@ def check(response: httpx.Response) -> None:
 
 
 @pytest.mark.parametrize(("method", "path", "body"), COMPUTED)
-async def test_computed_answers_are_not_cached_and_load_nothing(
-    client: httpx.AsyncClient, replace: Replace, method: str, path: str, body: Any
+async def test_computed_answers_are_not_cached(
+    client: AsyncClient, replace: Replace, method: str, path: str, body: Any
 ) -> None:
     replace("missing", defect)
     response = await client.request(method, path, json=body)
     check(response)
     assert response.headers["cache-control"] == "no-store"
     assert response.headers["content-security-policy"] == NOTHING
-
-
-@pytest.mark.parametrize("path", PAGES)
-async def test_pages_keep_their_own_policy(client: httpx.AsyncClient, path: str) -> None:
-    response = await client.get(path)
-    check(response)
-    policy = response.headers["content-security-policy"]
-    directives = dict(part.strip().split(" ", 1) for part in policy.split(";"))
-    assert directives["default-src"] == "'none'"
-    assert directives["script-src"] == "'self'"
-    assert not re.search(r"https?:|\*", policy)
-    assert path != "/" or "unsafe" not in policy
 
 
 @pytest.mark.system

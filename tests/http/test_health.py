@@ -3,8 +3,8 @@
 import shutil
 from pathlib import Path
 
-import httpx
 import pytest
+from httpx import ASGITransport, AsyncClient
 
 from app import __version__
 from app.main import create_app
@@ -14,7 +14,7 @@ from tests.http.test_problems import problem
 from tests.services import NAMED, load_changes, serve
 
 
-async def test_health_of_a_ready_service(client: httpx.AsyncClient) -> None:
+async def test_health_of_a_ready_service(client: AsyncClient) -> None:
     answers = {
         "/health/live": {"status": "live", "version": __version__},
         "/health/ready": {"status": "ready"},
@@ -26,8 +26,8 @@ async def test_health_of_a_ready_service(client: httpx.AsyncClient) -> None:
 
 async def test_before_its_start_a_service_is_live_and_not_ready(shared_store: Path) -> None:
     app = create_app(Settings(store=shared_store, **NAMED))
-    transport = httpx.ASGITransport(app, raise_app_exceptions=False)
-    async with httpx.AsyncClient(transport=transport, base_url="http://service") as client:
+    transport = ASGITransport(app, raise_app_exceptions=False)
+    async with AsyncClient(transport=transport, base_url="http://service") as client:
         assert (await client.get("/health/live")).status_code == 200
         for path in ("/health/ready", "/models"):
             problem(await client.get(path), 503, "not-ready")
@@ -36,9 +36,7 @@ async def test_before_its_start_a_service_is_live_and_not_ready(shared_store: Pa
 
 
 @pytest.mark.parametrize("is_removed", [False, True])
-async def test_the_newest_good_version_replaces_a_broken_default(
-    store: Path, is_removed: bool
-) -> None:
+async def test_the_newest_usable_version_is_the_default(store: Path, is_removed: bool) -> None:
     publish(store, "home", "0.9.0", seed=3)
     publish(store, "home", "2.0.0", seed=2, alias="default")
     corrupt(store, "home", "1.1.0")

@@ -20,7 +20,7 @@ service = live_service(SCENE_CLIENT_TIMEOUT="5")
 
 # A prime, so that each wrong value comes to stand at many places.
 @pytest.mark.parametrize("every", [37, pytest.param(5, marks=pytest.mark.slow)])
-def test_requests_of_the_corpus_are_refused_in_order(service: LiveService, every: int) -> None:
+def test_hostile_requests(service: LiveService, every: int) -> None:
     before = service.control()
     requests = list(corpus.requests())[::every]
     # The first round takes some eighty megabytes, the later ones next to nothing.
@@ -37,7 +37,7 @@ def test_requests_of_the_corpus_are_refused_in_order(service: LiveService, every
     assert corpus.MARKER.split()[0] not in service.log.read_text()
 
 
-def test_bodies_are_read_without_a_proxy_too(service: LiveService) -> None:
+def test_framing_without_a_proxy(service: LiveService) -> None:
     for wire in framing():
         answers, closed = exchange(service.port, wire)
         for answer in answers:
@@ -48,7 +48,7 @@ def test_bodies_are_read_without_a_proxy_too(service: LiveService) -> None:
         assert closed or not wire.closes, wire.name
 
 
-def test_every_field_of_every_request_is_attacked() -> None:
+def test_the_corpus_has_every_field() -> None:
     forms = {f"/{question.name}": question.request for question in QUESTIONS}
     for path, form in forms.items():
         assert set(corpus.VALID[path]) == set(form.model_fields)

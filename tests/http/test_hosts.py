@@ -5,8 +5,8 @@ from pathlib import Path
 from socket import gethostname
 from typing import Any
 
-import httpx
 import pytest
+from httpx import AsyncClient, Response
 
 from app.api.gateway import HEALTH
 from app.settings import Settings
@@ -27,7 +27,7 @@ LOCAL = {"localhost", "pc-7.lab", "pc-7.local"}
         ({"allowed_hosts": "scene,*"}, None),
     ],
 )
-def test_names_are_those_of_this_machine_or_listed(
+def test_accepted_hosts(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     settings: dict[str, Any],
@@ -58,7 +58,7 @@ async def test_requests_for_another_host_are_refused(shared_store: Path) -> None
         problem(await client.get("/models", headers=twice), 421, "host-refused")
 
 
-async def test_only_health_checks_take_no_turn_and_accept_every_host(shared_store: Path) -> None:
+async def test_only_health_checks_accept_every_host(shared_store: Path) -> None:
     """A path is matched whole: no route below another one becomes a health check."""
     async with serve(shared_store) as client:
         paths = client.app.state.paths  # type: ignore[attr-defined]
@@ -78,7 +78,7 @@ async def test_only_health_checks_take_no_turn_and_accept_every_host(shared_stor
             assert (await client.get(word)).status_code in (200, 404)
 
 
-async def test_a_prefix_that_stays_in_the_path_names_its_setting(client: httpx.AsyncClient) -> None:
+async def test_a_prefix_in_the_path_names_its_setting(client: AsyncClient) -> None:
     document = problem(await client.post("/scene/missing", json=SCENE), 404, "not-found")
     assert "SCENE_ROOT_PATH" in document["detail"]
 
@@ -86,35 +86,34 @@ async def test_a_prefix_that_stays_in_the_path_names_its_setting(client: httpx.A
 LISTED, SECOND, OTHER = "https://panel.example", "http://10.0.0.7:8080", "https://other.example"
 API_KEY = "incorrect-zebra-capacitor-nail"
 
-
 shared = client_of_service(cors_origins=[LISTED, SECOND], max_body_bytes=2048)
 
 
 async def preflight(
-    client: httpx.AsyncClient, origin: str, method: str = "POST", headers: str = "content-type"
-) -> httpx.Response:
-    asked = {
+    client: AsyncClient, origin: str, method: str = "POST", headers: str = "content-type"
+) -> Response:
+    fields = {
         "Origin": origin,
         "Access-Control-Request-Method": method,
         "Access-Control-Request-Headers": headers,
     }
-    return await client.options("/relations", headers=asked)
+    return await client.options("/relations", headers=fields)
 
 
-def allowed(response: httpx.Response, origin: str) -> None:
+def allowed(response: Response, origin: str) -> None:
     assert response.headers["access-control-allow-origin"] == origin
     assert "access-control-allow-credentials" not in response.headers
     assert "Origin" in response.headers["vary"]
 
 
-async def test_by_default_no_origin_is_allowed(client: httpx.AsyncClient) -> None:
+async def test_by_default_no_origin_is_allowed(client: AsyncClient) -> None:
     problem(await preflight(client, LISTED), 405, "method-not-allowed")
     response = await client.post("/relations", json=SCENE, headers={"Origin": LISTED})
     assert response.status_code == 200
     assert not [name for name in response.headers if name.startswith("access-control")]
 
 
-async def test_only_listed_origins_ask_and_read_answers(shared: httpx.AsyncClient) -> None:
+async def test_only_listed_origins_ask_and_read_answers(shared: AsyncClient) -> None:
     for origin in (LISTED, SECOND):
         response = await shared.post("/relations", json=SCENE, headers={"Origin": origin})
         assert response.status_code == 200
@@ -143,8 +142,8 @@ async def test_only_listed_origins_ask_and_read_answers(shared: httpx.AsyncClien
         (LISTED, "POST", "x-anything"),
     ],
 )
-async def test_preflight_requests_of_other_origins_are_refused(
-    shared: httpx.AsyncClient, origin: str, method: str, headers: str
+async def test_other_preflight_requests_are_refused(
+    shared: AsyncClient, origin: str, method: str, headers: str
 ) -> None:
     response = await preflight(shared, origin, method, headers)
     assert response.status_code == 400
@@ -153,7 +152,7 @@ async def test_preflight_requests_of_other_origins_are_refused(
     assert "Origin" in response.headers["vary"]
 
 
-async def test_errors_can_be_read_too(shared: httpx.AsyncClient, replace: Replace) -> None:
+async def test_errors_can_be_read_too(shared: AsyncClient, replace: Replace) -> None:
     replace("missing", defect)
     origin = {"Origin": LISTED}
     media = origin | {"Content-Type": "application/json"}
@@ -171,7 +170,7 @@ async def test_errors_can_be_read_too(shared: httpx.AsyncClient, replace: Replac
         assert response.json()["request_id"] == response.headers["x-request-id"]
 
 
-async def test_browsers_ask_beforehand_without_a_key(shared_store: Path) -> None:
+async def test_preflight_requests_need_no_key(shared_store: Path) -> None:
     async with serve(shared_store, cors_origins=[LISTED], api_key=API_KEY) as client:
         assert (await preflight(client, LISTED)).status_code == 200
         response = await client.post("/relations", json=SCENE, headers={"Origin": LISTED})

@@ -1,10 +1,10 @@
-"""The API key: all routes except listed ones need it, before the body is read."""
+"""The API key: which routes need it, and when the service checks it."""
 
 from collections.abc import AsyncIterator
 from typing import Any
 
-import httpx
 import pytest
+from httpx import ASGITransport, AsyncClient
 
 from tests.http.test_documentation import operations
 from tests.http.test_problems import problem
@@ -21,50 +21,49 @@ guarded = client_of_service(api_key=API_KEY)
 
 
 @pytest.fixture(scope="module")
-async def document(guarded: httpx.AsyncClient) -> Any:
+async def document(guarded: AsyncClient) -> Any:
     return (await guarded.get("/openapi.json")).json()
 
 
-async def test_every_operation_but_health_needs_a_key(
-    guarded: httpx.AsyncClient, document: dict[str, Any]
-) -> None:
+async def test_only_health_needs_no_key(guarded: AsyncClient, document: dict[str, Any]) -> None:
+    schemes = document["components"]["securitySchemes"]
+    assert schemes["api-key"] == {"type": "apiKey", "in": "header", "name": "X-API-Key"}
+    assert schemes["api-key-as-bearer-token"] == {"type": "http", "scheme": "bearer"}
     assert len(document["paths"]) > len(OPEN_OPERATIONS)
-    for method, path, _ in operations(document):
+    for method, path, operation in operations(document):
         response = await guarded.request(method, path)
+        named = {name for entry in operation.get("security", ()) for name in entry}
         if path in OPEN_OPERATIONS:
             assert response.status_code == 200, path
-        else:
-            problem(response, 401, "unauthorized")
-            assert response.headers["www-authenticate"] == "Bearer"
+            assert named == set()
+            assert "401" not in operation["responses"]
+            continue
+        problem(response, 401, "unauthorized")
+        assert response.headers["www-authenticate"] == "Bearer"
+        assert named == schemes.keys(), path
+        (content,) = operation["responses"]["401"]["content"].values()
+        assert "unauthorized" in content["examples"]
 
 
-@pytest.mark.parametrize(
-    ("status", "paths"),
-    [
-        (
-            200,
-            "/ /docs /docs/swagger-ui.css /redoc /redoc/redoc.standalone.js /openapi.json "
-            "/problems /problems/unauthorized /static/pages.css",
-        ),
-        (
-            401,
-            "/nowhere /metrics //health/live /health/live/ /health/live/../../models /health "
-            "/Health/live /models/default/vocabulary /static /docsx /openapi.json/x",
-        ),
-        # Dots are encoded, or the client would resolve them before it asks.
-        (
-            404,
-            " ".join(
-                f"{folder}/{path}"
-                for folder in ("/static/%2e%2e", "/docs/%2e%2e", "/problems/%2e%2e", "/static//")
-                for path in ("models", "relations", "models/default")
-            ),
-        ),
-        (404, "/redoc/./models"),
-    ],
-)
-async def test_only_pages_need_no_key(guarded: httpx.AsyncClient, status: int, paths: str) -> None:
-    for path in paths.split():
+# Dots are encoded, or the client would resolve them.
+FOLDERS = ("/static/%2e%2e", "/docs/%2e%2e", "/problems/%2e%2e", "/static//")
+PATHS = {
+    200: "/ /docs /docs/swagger-ui.css /redoc /redoc/redoc.standalone.js /openapi.json "
+    "/problems /problems/unauthorized /static/pages.css",
+    401: "/nowhere /metrics //health/live /health/live/ /health/live/../../models /health "
+    "/Health/live /models/default/vocabulary /static /docsx /openapi.json/x",
+    404: "/redoc/./models "
+    + " ".join(
+        f"{folder}/{path}"
+        for folder in FOLDERS
+        for path in ("models", "relations", "models/default")
+    ),
+}
+
+
+@pytest.mark.parametrize("status", PATHS)
+async def test_only_pages_need_no_key(guarded: AsyncClient, status: int) -> None:
+    for path in PATHS[status].split():
         assert (await guarded.get(path)).status_code == status, path
 
 
@@ -83,13 +82,13 @@ async def test_only_pages_need_no_key(guarded: httpx.AsyncClient, status: int, p
         {"Cookie": f"X-API-Key={API_KEY}"},
     ],
 )
-async def test_other_keys_are_refused(guarded: httpx.AsyncClient, headers: Any) -> None:
+async def test_other_keys_are_refused(guarded: AsyncClient, headers: Any) -> None:
     # A key in the query does not count: addresses end up in histories and in logs of proxies.
     for path in ("/relations", f"/relations?api_key={API_KEY}"):
         problem(await guarded.post(path, json=SCENE, headers=headers), 401, "unauthorized")
 
 
-async def test_the_key_opens_questions(guarded: httpx.AsyncClient) -> None:
+async def test_the_key_opens_questions(guarded: AsyncClient) -> None:
     for name, value in (
         ("X-API-Key", ""),
         ("Authorization", "Bearer "),
@@ -101,7 +100,7 @@ async def test_the_key_opens_questions(guarded: httpx.AsyncClient) -> None:
         assert (await guarded.get("/models", headers=headers)).status_code == 200
 
 
-async def test_a_body_without_a_key_is_not_read(guarded: httpx.AsyncClient) -> None:
+async def test_a_body_without_a_key_is_not_read(guarded: AsyncClient) -> None:
     async def body() -> AsyncIterator[bytes]:
         nonlocal read
         read = True
@@ -117,24 +116,9 @@ async def test_a_body_without_a_key_is_not_read(guarded: httpx.AsyncClient) -> N
     problem(response, 401, "unauthorized")
 
 
-async def test_behind_a_prefix_the_same_is_open(guarded: httpx.AsyncClient) -> None:
+async def test_a_prefix_opens_no_route(guarded: AsyncClient) -> None:
     app: Any = guarded.app  # type: ignore[attr-defined]
-    transport = httpx.ASGITransport(app, raise_app_exceptions=False, root_path="/robot")
-    async with httpx.AsyncClient(transport=transport, base_url="http://service") as behind:
+    transport = ASGITransport(app, raise_app_exceptions=False, root_path="/robot")
+    async with AsyncClient(transport=transport, base_url="http://service") as behind:
         for path, status in (("health/live", 200), ("models", 401), ("static", 401)):
             assert (await behind.get(f"/robot/{path}")).status_code == status
-
-
-async def test_the_document_tells_where_a_key_is_needed(document: dict[str, Any]) -> None:
-    schemes = document["components"]["securitySchemes"]
-    assert schemes["api-key"] == {"type": "apiKey", "in": "header", "name": "X-API-Key"}
-    assert schemes["api-key-as-bearer-token"] == {"type": "http", "scheme": "bearer"}
-    for _, path, operation in operations(document):
-        named = {name for entry in operation.get("security", ()) for name in entry}
-        if path in OPEN_OPERATIONS:
-            assert named == set()
-            assert "401" not in operation["responses"]
-            continue
-        assert named == {"api-key", "api-key-as-bearer-token"}, path
-        (content,) = operation["responses"]["401"]["content"].values()
-        assert "unauthorized" in content["examples"]

@@ -10,24 +10,24 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import httpx
 import pytest
+from httpx import AsyncClient
 
 from app.registry import Store
 from app.scene.spatial_relations import CANONICAL, opposite
 from tests.http.stores import PROFILES, VOCABULARY, corrupt, publish
 from tests.http.test_problems import problem
-from tests.services import PATIENCE, Hold, Replace, defect, load_changes, serve
+from tests.services import PATIENCE, Pause, Replace, defect, load_changes, serve
 
 
-async def default(client: httpx.AsyncClient) -> str:
+async def default(client: AsyncClient) -> str:
     response = await client.post("/relations", json={"objects": ["bed", "lamp"]})
     assert response.status_code == 200, response.text
     model = response.json()["model"]
     return f"{model['name']}@{model['version']}"
 
 
-async def test_models_versions_and_aliases_are_listed(client: httpx.AsyncClient) -> None:
+async def test_models_versions_and_aliases_are_listed(client: AsyncClient) -> None:
     listing = (await client.get("/models")).json()
     assert listing["aliases"] == {"candidate": "home@1.1.0", "default": "home@1.0.0"}
     assert listing["failures"] == []
@@ -42,7 +42,7 @@ async def test_models_versions_and_aliases_are_listed(client: httpx.AsyncClient)
         assert model == {"name": "home", "versions": models["home"]}
 
 
-async def test_the_vocabulary_tells_every_word(client: httpx.AsyncClient) -> None:
+async def test_the_vocabulary_lists_every_class(client: AsyncClient) -> None:
     words = (await client.get("/models/default/vocabulary")).json()
     assert [entry["label"] for entry in words["objects"]] == list(VOCABULARY.labels)
     for entry, known in zip(words["objects"], VOCABULARY.objects, strict=True):
@@ -72,7 +72,7 @@ async def test_the_vocabulary_tells_every_word(client: httpx.AsyncClient) -> Non
     ],
 )
 async def test_a_word_becomes_a_class(
-    client: httpx.AsyncClient, word: str, label: str, rule: str, certain: bool
+    client: AsyncClient, word: str, label: str, rule: str, certain: bool
 ) -> None:
     answer = (await client.get(f"/models/default/vocabulary/{quote(word)}")).json()
     assert (answer["word"], answer["class"]["label"]) == (word, label)
@@ -92,12 +92,12 @@ async def test_a_word_becomes_a_class(
         *("nobody/vocabulary", "nobody/vocabulary/bed", "home@9.9.9/vocabulary"),
     ],
 )
-async def test_unknown_models_are_not_found(client: httpx.AsyncClient, path: str) -> None:
+async def test_unknown_models_are_not_found(client: AsyncClient, path: str) -> None:
     problem(await client.get(f"/models/{path}"), 404, "model-not-found")
 
 
-async def test_new_and_removed_versions_are_taken_over(
-    own: httpx.AsyncClient, store: Path, caplog: pytest.LogCaptureFixture
+async def test_changes_of_the_store_are_loaded(
+    own: AsyncClient, store: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO", "app.serving")
     await load_changes(own)
@@ -118,8 +118,8 @@ async def test_new_and_removed_versions_are_taken_over(
         assert (await other.get("/models")).json()["generation"] == after != before
 
 
-async def test_a_broken_new_version_keeps_nothing_else_back(
-    own: httpx.AsyncClient, store: Path, caplog: pytest.LogCaptureFixture
+async def test_a_broken_version_is_refused(
+    own: AsyncClient, store: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     publish(store, "plain", "2.0.0", seed=3)
     corrupt(store, "plain", "2.0.0")
@@ -133,7 +133,7 @@ async def test_a_broken_new_version_keeps_nothing_else_back(
     assert answer.json()["model"]["version"] == "1.0.0"
 
 
-async def test_the_store_is_followed(store: Path) -> None:
+async def test_the_store_is_polled(store: Path) -> None:
     async with serve(store, store_poll=0.05) as client:
         publish(store, "home", "2.0.0", seed=2, alias="default")
         async with asyncio.timeout(60):
@@ -141,24 +141,8 @@ async def test_the_store_is_followed(store: Path) -> None:
                 await asyncio.sleep(0.05)
 
 
-async def test_a_request_for_a_check_loads_the_store_at_once(
-    own: httpx.AsyncClient, store: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Also a store without changes, and without a poll."""
-    caplog.set_level("INFO", "app.serving")
-    runtime = own.app.state.runtime  # type: ignore[attr-defined]
-    for loads in (1, 2):
-        runtime.request_check()
-        async with asyncio.timeout(60):
-            while caplog.text.count("has loaded the store") < loads:  # noqa: ASYNC110
-                await asyncio.sleep(0)
-
-
-async def test_an_error_of_a_load_keeps_the_served_models(
-    own: httpx.AsyncClient,
-    store: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+async def test_an_error_keeps_the_served_models(
+    own: AsyncClient, store: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     publish(store, "home", "2.0.0", seed=2, alias="default")
     monkeypatch.setattr(Store, "names", defect)
@@ -170,8 +154,8 @@ async def test_an_error_of_a_load_keeps_the_served_models(
 
 
 @pytest.mark.parametrize("log_odds", [None, math.inf], ids=["raises", "not finite"])
-async def test_a_version_that_cannot_answer_is_refused(
-    own: httpx.AsyncClient,
+async def test_a_version_without_answers_is_refused(
+    own: AsyncClient,
     store: Path,
     replace: Replace,
     caplog: pytest.LogCaptureFixture,
@@ -198,8 +182,8 @@ async def test_a_version_that_cannot_answer_is_refused(
     assert 'scene_reloads_total{outcome="refused"} 1.0' in counted
 
 
-async def test_requests_are_answered_while_the_store_is_read(
-    own: httpx.AsyncClient, store: Path, monkeypatch: pytest.MonkeyPatch
+async def test_requests_are_answered_during_a_load(
+    own: AsyncClient, store: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     started, go_on, load = threading.Event(), threading.Event(), Store.load
 
@@ -220,29 +204,25 @@ async def test_requests_are_answered_while_the_store_is_read(
     assert await default(own) == "home@2.0.0"
 
 
-async def test_a_request_keeps_the_models_it_started_with(
-    own: httpx.AsyncClient, store: Path, hold: Hold
-) -> None:
+async def test_a_request_keeps_its_models(own: AsyncClient, store: Path, pause: Pause) -> None:
     served = own.app.state.runtime.models.served  # type: ignore[attr-defined]
-    held = hold("missing", lambda model: model is served["home", "1.0.0"].model)
+    paused = pause("missing", lambda model: model is served["home", "1.0.0"].model)
     batch = {"scenes": [{"objects": ["bed"] * 33}] * 3}  # so many are not for the event loop
     asking = asyncio.create_task(own.post("/missing/batch", json=batch))
-    assert await asyncio.to_thread(held.started.wait, PATIENCE)
+    assert await asyncio.to_thread(paused.started.wait, PATIENCE)
     publish(store, "home", "2.0.0", seed=2, alias="default")
     await load_changes(own)
     assert await default(own) == "home@2.0.0"
-    held.release.set()
+    paused.release.set()
     results = (await asking).json()["results"]
     assert [entry["result"]["model"]["version"] for entry in results] == ["1.0.0"] * 3
 
 
-async def test_replaced_models_are_freed(
-    own: httpx.AsyncClient, store: Path, replace: Replace
-) -> None:
-    asked: list[weakref.ref[Any]] = []
+async def test_replaced_models_are_freed(own: AsyncClient, store: Path, replace: Replace) -> None:
+    weights: list[weakref.ref[Any]] = []
 
     def note(missing: Any, model: Any, *args: Any, **parameters: Any) -> Any:
-        asked.append(weakref.ref(model.weights))
+        weights.append(weakref.ref(model.weights))
         return missing(model, *args, **parameters)
 
     replace("missing", note)
@@ -252,7 +232,7 @@ async def test_replaced_models_are_freed(
     await load_changes(own)
     await own.app.state.runtime.check_store(always=True)  # type: ignore[attr-defined]
     await own.post("/missing", json={"objects": ["bed"], "model": "home"})
-    replaced, kept, again = asked
+    replaced, kept, again = weights
     assert replaced() is None
     # An unchanged artifact is verified again and not loaded twice.
     assert again() is kept() is not None

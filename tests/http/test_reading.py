@@ -3,8 +3,8 @@
 import math
 from typing import Any
 
-import httpx
 import pytest
+from httpx import AsyncClient
 
 from scene_client.schemas import RoomsAnswer
 from tests.http.test_problems import pointers, problem
@@ -15,7 +15,7 @@ CAMERA = "camera_optical_frame"
 Triples = set[tuple[str, str, str]]
 
 
-async def read(client: httpx.AsyncClient, **scene: Any) -> tuple[dict[str, str], Triples]:
+async def read(client: AsyncClient, **scene: Any) -> tuple[dict[str, str], Triples]:
     """The label of every object by its id, and the relations that the scene states."""
     answer = await ask(client, "outliers", **scene)
     return (
@@ -24,7 +24,7 @@ async def read(client: httpx.AsyncClient, **scene: Any) -> tuple[dict[str, str],
     )
 
 
-async def observed(client: httpx.AsyncClient, **scene: Any) -> Triples:
+async def observed(client: AsyncClient, **scene: Any) -> Triples:
     """The relations that are derived from poses."""
     return triples((await ask(client, "outliers", **scene)).get("observed_relations", []))
 
@@ -47,15 +47,13 @@ def relation(subject: str, name: str, other: str) -> dict[str, str]:
         ([{"label": "lamp"}, {"label": "lamp"}], {"lamp_1": "lamp", "lamp_2": "lamp"}),
     ],
 )
-async def test_objects_without_an_id_are_named_by_their_label(
-    client: httpx.AsyncClient, objects: list[Any], expected: dict[str, str]
+async def test_labels_are_ids_of_objects(
+    client: AsyncClient, objects: list[Any], expected: dict[str, str]
 ) -> None:
     assert (await read(client, objects=objects))[0] == expected
 
 
-async def test_ids_win_over_labels_and_labels_are_read_in_any_spelling(
-    client: httpx.AsyncClient,
-) -> None:
+async def test_ids_come_before_labels(client: AsyncClient) -> None:
     objects = [{"id": "lamp", "label": "bed"}, {"id": "x", "label": "lamp"}, "trash can"]
     stated = [relation("lamp", "left", "x"), relation("Garbage_Bins", "behind", "beds")]
     answer = await ask(client, "relations", objects=objects, relations=stated, top_k=4096)
@@ -63,8 +61,7 @@ async def test_ids_win_over_labels_and_labels_are_read_in_any_spelling(
     assert marked == {("lamp", "left", "x"), ("lamp", "front", "trash can")}
 
 
-async def test_a_repeated_relation_is_no_contradiction(client: httpx.AsyncClient) -> None:
-    """And different relations of one pair may hold together."""
+async def test_a_repeated_relation_is_no_contradiction(client: AsyncClient) -> None:
     stated = [relation("bed", "left", "lamp"), relation("lamp", "right", "bed")]
     stated.append(relation("bed", "front", "lamp"))
     _, found = await read(client, objects=["bed", "lamp"], relations=stated)
@@ -72,7 +69,7 @@ async def test_a_repeated_relation_is_no_contradiction(client: httpx.AsyncClient
     assert len(found) == 2
 
 
-async def test_ignored_labels_remove_their_relations(client: httpx.AsyncClient) -> None:
+async def test_ignored_labels_remove_their_relations(client: AsyncClient) -> None:
     scene = {
         "objects": ["bed", "flux capacitor", {"id": "r2", "label": "droid"}, "lamp"],
         "relations": [
@@ -92,7 +89,7 @@ async def test_ignored_labels_remove_their_relations(client: httpx.AsyncClient) 
     assert pointers(response)[0] == "#/objects"
 
 
-async def test_unknown_labels_can_be_taken_for_the_nearest_class(client: httpx.AsyncClient) -> None:
+async def test_unknown_labels_become_the_nearest_class(client: AsyncClient) -> None:
     scene: dict[str, Any] = {
         "objects": ["bed", "nigthstand", {"id": "x", "label": "big lamp"}, "nigthstand"],
         "relations": [relation("big lamp", "left", "bed"), relation("lamp", "front", "bed")],
@@ -130,9 +127,7 @@ WORDS: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("model", ["home", "candidate", "plain"])
-async def test_a_word_without_a_class_is_read_by_its_meaning(
-    client: httpx.AsyncClient, model: str
-) -> None:
+async def test_words_are_read_by_meaning(client: AsyncClient, model: str) -> None:
     """Two spellings are one word. A spelling is corrected first, and nonsense is left out."""
     scene = WORDS | {"model": model, "relations": [relation("o", "on-top", "bed")]}
     answer = await ask(client, "outliers", **scene)
@@ -157,7 +152,7 @@ async def test_a_word_without_a_class_is_read_by_its_meaning(
     assert all("futon" in one["objects"] for one in drawn["scenes"])
 
 
-async def test_a_candidate_is_read_by_its_meaning(client: httpx.AsyncClient) -> None:
+async def test_a_candidate_is_read_by_its_meaning(client: AsyncClient) -> None:
     body = WORDS | {"objects": ["bed"], "candidates": ["Mugs", "lamp", "zxqvw"], "coverage": 0.5}
     answer = await ask(client, "missing", **body)
     assert answer["ignored"] == ["zxqvw"]
@@ -177,8 +172,7 @@ async def test_a_candidate_is_read_by_its_meaning(client: httpx.AsyncClient) -> 
     }
 
 
-async def test_a_word_needs_its_own_treatment(client: httpx.AsyncClient) -> None:
-    """The others refuse or ignore it, and answers without such words do not change."""
+async def test_words_need_the_treatment_by_meaning(client: AsyncClient) -> None:
     for treatment in ("error", "nearest"):
         response = await client.post("/rooms", json=WORDS | {"unknown_labels": treatment})
         assert "#/objects/2" in pointers(response, "unknown-labels")
@@ -192,8 +186,7 @@ async def test_a_word_needs_its_own_treatment(client: httpx.AsyncClient) -> None
     assert first | {"request_id": ""} == second | {"request_id": ""}
 
 
-async def test_poses_of_words_give_relations(client: httpx.AsyncClient) -> None:
-    """A word has no typical size."""
+async def test_poses_of_words_give_relations(client: AsyncClient) -> None:
     placed = [
         *LAMP_ON_DESK,
         {"id": "m", "label": "mug", "position": at(2, 0, 0.85), "size": at(0.1, 0.1, 0.1)},
@@ -233,7 +226,7 @@ async def test_poses_of_words_give_relations(client: httpx.AsyncClient) -> None:
 )
 @pytest.mark.parametrize("treatment", ["error", "ignore", "nearest-or-ignore"])
 async def test_the_syntax_of_detectors_is_read(
-    client: httpx.AsyncClient, treatment: str, label: str, expected: str | None, rule: str | None
+    client: AsyncClient, treatment: str, label: str, expected: str | None, rule: str | None
 ) -> None:
     scene = {"objects": [{"id": "x", "label": label}, "lamp"], "unknown_labels": treatment}
     response = await client.post("/outliers", json=scene)
@@ -246,7 +239,7 @@ async def test_the_syntax_of_detectors_is_read(
         assert response.json()["mapped"] == [entry]
 
 
-async def test_aliases_of_room_types_and_candidates_are_named(client: httpx.AsyncClient) -> None:
+async def test_aliases_of_room_types_and_candidates_are_named(client: AsyncClient) -> None:
     """Aliases of objects are not mapped, because answers name objects by id."""
     study = {"label": "study", "class": "office", "similarity": 1.0, "rule": "alias"}
     answer = await ask(client, "rooms", objects=["couch"], candidates=["study", "Bedrooms"])
@@ -271,10 +264,7 @@ def words_of(entries: list[dict[str, Any]]) -> Words:
     return {(entry["label"], entry.get("listed_as")) for entry in entries}
 
 
-async def test_an_entry_has_the_class_and_the_word_of_the_request(
-    client: httpx.AsyncClient,
-) -> None:
-    """A word that is a class stays this class, also with a broader class, such as desk."""
+async def test_entries_have_class_and_word(client: AsyncClient) -> None:
     objects = ["bed", "TV", "Chairs", {"id": "s", "label": "couch"}, "desk", "table"]
     answer = await ask(client, "outliers", objects=objects)
     assert {(one["object"], *entry) for one in answer["outliers"] for entry in words_of([one])} == {
@@ -294,9 +284,7 @@ async def test_an_entry_has_the_class_and_the_word_of_the_request(
     assert words_of(answer["missing"]) == expected
 
 
-async def test_a_sampled_scene_has_classes_and_the_answer_their_words(
-    client: httpx.AsyncClient,
-) -> None:
+async def test_sampled_scenes_have_classes(client: AsyncClient) -> None:
     objects = ["bed", "couch", {"id": "s", "label": "Sofas"}]
     relations = [["couch", "left", "bed"]]
     answer = await ask(client, "generate", objects=objects, relations=relations, steps=1)
@@ -308,9 +296,7 @@ async def test_a_sampled_scene_has_classes_and_the_answer_their_words(
 
 
 @pytest.mark.parametrize("treatment", ["ignore", "nearest", "nearest-or-ignore"])
-async def test_unknown_room_types_are_ignored_and_named(
-    client: httpx.AsyncClient, treatment: str
-) -> None:
+async def test_unknown_room_types_are_ignored(client: AsyncClient, treatment: str) -> None:
     """Without a room type that it knows, `/generate` has no question to answer."""
     scene: dict[str, Any] = {"objects": ["bed", "lamp"], "unknown_labels": treatment}
     for question in ("missing", "outliers", "relations", "rooms"):
@@ -328,7 +314,7 @@ async def test_unknown_room_types_are_ignored_and_named(
     ]
 
 
-async def test_candidates_of_one_room_type_share_its_probability(client: httpx.AsyncClient) -> None:
+async def test_candidates_of_one_room_type_share_its_probability(client: AsyncClient) -> None:
     names = ["toilet", "bedroom", "bathroom", "Toilet", "toilet", "study"]
     answer = await ask(client, "rooms", objects=["bed", "lamp"], candidates=names)
     found = {one.room_type: one for one in RoomsAnswer.model_validate(answer).room_types}
@@ -343,8 +329,7 @@ async def test_candidates_of_one_room_type_share_its_probability(client: httpx.A
     assert sum(p.values()) == pytest.approx(1, abs=1e-3)
 
 
-async def test_a_scene_of_the_training_is_a_request(client: httpx.AsyncClient) -> None:
-    """Arrays, whole numbers as ids, supports, and fields that only the training uses."""
+async def test_a_training_scene_is_a_request(client: AsyncClient) -> None:
     bed = {"id": 0, "label": "bed", "position": [2, 1, 0.2], "size": [2, 1.5, 0.4], "yaw": 0.5}
     scene = {
         "scene_id": "bench-3",
@@ -372,7 +357,7 @@ async def test_a_scene_of_the_training_is_a_request(client: httpx.AsyncClient) -
     assert yaw | {"request_id": ""} == orientation | {"request_id": ""}
 
 
-async def test_a_scene_in_three_frames_has_equal_relations(client: httpx.AsyncClient) -> None:
+async def test_a_scene_in_three_frames_has_equal_relations(client: AsyncClient) -> None:
     """A lying board beside a desk with a lamp, by a robot, by its camera, and in a map."""
     robot = (3.0, -1.0, 2.0)
     to_optical: Turn = (0.5, -0.5, 0.5, 0.5)
@@ -451,7 +436,7 @@ BED = {"id": "b", "label": "bed", "position": at(2, 1, 0.3)}
     ],
 )
 async def test_implausible_scenes_get_warnings(
-    client: httpx.AsyncClient, scene: dict[str, Any], code: str | None, named: list[str]
+    client: AsyncClient, scene: dict[str, Any], code: str | None, named: list[str]
 ) -> None:
     found = (await ask(client, "missing", **scene))["warnings"]
     assert [(one["code"], one["objects"]) for one in found] == ([(code, named)] if code else [])

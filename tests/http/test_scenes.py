@@ -5,8 +5,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
+from httpx import AsyncClient
 
 from app.api.scenes import MOST_PARTS
 from scene_client import from_file
@@ -16,14 +16,14 @@ from tests.http.test_problems import problem
 from tests.services import serve
 
 
-async def read(client: httpx.AsyncClient, text: str, name: str = "a.json", **fields: Any) -> Any:
+async def read(client: AsyncClient, text: str, name: str = "a.json", **fields: Any) -> Any:
     response = await client.post("/scenes", json={"text": text, "name": name, **fields})
     assert response.status_code == 200, response.text
     ScenesAnswer.model_validate(response.json(), extra="forbid")
     return response.json()
 
 
-async def refusal(client: httpx.AsyncClient, text: str, **fields: Any) -> str:
+async def refusal(client: AsyncClient, text: str, **fields: Any) -> str:
     """The reason why a file is refused: a short line."""
     response = await client.post("/scenes", json={"text": text, "name": "a.json", **fields})
     detail: str = problem(response, 422, "unreadable-file")["detail"]
@@ -33,9 +33,7 @@ async def refusal(client: httpx.AsyncClient, text: str, **fields: Any) -> str:
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-async def test_a_file_is_read_as_the_client_reads_it(
-    client: httpx.AsyncClient, tmp_path: Path, name: str
-) -> None:
+async def test_files_become_scenes(client: AsyncClient, tmp_path: Path, name: str) -> None:
     example = EXAMPLES[name]
     labels = {"label_map": example.labels} if example.labels else {}
     answer = await read(client, example.text, name, **labels)
@@ -54,9 +52,7 @@ async def test_a_file_is_read_as_the_client_reads_it(
 
 
 @pytest.mark.parametrize("name", REFUSED)
-async def test_a_file_is_refused_with_the_reason_of_the_client(
-    client: httpx.AsyncClient, name: str
-) -> None:
+async def test_files_are_refused_as_by_the_client(client: AsyncClient, name: str) -> None:
     text, words = REFUSED[name]
     if "choose one" in words:
         answer = await read(client, text, name)
@@ -68,7 +64,7 @@ async def test_a_file_is_refused_with_the_reason_of_the_client(
         assert name not in detail
 
 
-async def test_a_scene_that_cannot_be_read_leaves_the_others(client: httpx.AsyncClient) -> None:
+async def test_a_scene_that_cannot_be_read_leaves_the_others(client: AsyncClient) -> None:
     seen = [{"category_id": label, "image_id": label, "bbox": [1, 2, 3, 4]} for label in (5, "bed")]
     answer = await read(client, json.dumps(seen))
     (one,) = answer["scenes"]
@@ -78,7 +74,7 @@ async def test_a_scene_that_cannot_be_read_leaves_the_others(client: httpx.Async
     assert note["detail"].startswith("5: the class ids are numbers")
 
 
-async def test_bytes_are_read_too(client: httpx.AsyncClient) -> None:
+async def test_bytes_are_read_too(client: AsyncClient) -> None:
     def body(content: bytes) -> dict[str, str]:
         return {"base64": base64.b64encode(content).decode(), "name": "a.txt"}
 
@@ -92,18 +88,14 @@ async def test_bytes_are_read_too(client: httpx.AsyncClient) -> None:
 
 
 @pytest.mark.parametrize("content", [{}, {"text": "bed", "base64": "YmVk"}, {"text": 3}])
-async def test_a_file_has_either_text_or_bytes(
-    client: httpx.AsyncClient, content: dict[str, Any]
-) -> None:
+async def test_a_file_is_text_or_bytes(client: AsyncClient, content: dict[str, Any]) -> None:
     problem(await client.post("/scenes", json={"name": "a.txt", **content}), 422, "invalid-request")
 
 
 @pytest.mark.parametrize(
     "names", ["stool\nbed", "names:\n  0: stool\n  1: 'bed'\n", '{"0": "stool", "1": "bed"}']
 )
-async def test_a_label_map_may_be_the_content_of_a_file(
-    client: httpx.AsyncClient, names: str
-) -> None:
+async def test_a_label_map_may_be_a_file(client: AsyncClient, names: str) -> None:
     answer = await read(client, "1 0.5 0.5 0.2 0.2\n", label_map=names)
     assert answer["scenes"][0]["scene"]["objects"][0]["label"] == "bed"
     assert "label map" in await refusal(client, "1 1 1 1 1\n", label_map="[3]")
@@ -136,12 +128,12 @@ ODD = {
 
 
 @pytest.mark.parametrize("name", [*LARGE, *ODD])
-async def test_a_hostile_file_is_refused(client: httpx.AsyncClient, name: str) -> None:
+async def test_a_hostile_file_is_refused(client: AsyncClient, name: str) -> None:
     text, words = (LARGE[name], "more than 32768 entries") if name in LARGE else ODD[name]
     assert words in await refusal(client, text)
 
 
-async def test_a_hostile_label_map_is_read_in_linear_time(client: httpx.AsyncClient) -> None:
+async def test_a_hostile_label_map_is_read_in_linear_time(client: AsyncClient) -> None:
     names = "names:\n- stool" + " " * 60_000 + "b\n- bed\n"
     answer = await read(client, "1 1 1 1 1\n", label_map=names)
     assert answer["scenes"][0]["scene"]["objects"][0]["label"] == "bed"

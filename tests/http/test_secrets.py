@@ -1,4 +1,4 @@
-"""Keys and payloads reach no log, whatever the level and however a request fails."""
+"""The log has no keys and no payloads, at any level and for any error."""
 
 import socket
 from collections.abc import Iterator
@@ -18,22 +18,15 @@ MISTAKEN = "mistaken-walrus-umbrella-fork"
 SECRETS = (API_KEY, MISTAKEN)
 ROOM = {"room_type": "bedroom"}
 
-# A defect whose own words quote a key.
-QUOTING = DEFECTIVE.format(message=f"no class for {API_KEY}")
+# The message of the error quotes a key.
+PROGRAM = ("-c", DEFECTIVE.format(message=f"no class for {API_KEY}"))
+SETTINGS = {"SCENE_API_KEY": API_KEY, "SCENE_LOG_LEVEL": "debug"}
 
 
-@pytest.fixture(scope="module")
-def defective(
-    shared_store: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[LiveService]:
+@pytest.fixture
+def defective(shared_store: Path, tmp_path: Path) -> Iterator[LiveService]:
     """A service that logs everything, and whose question `missing` fails."""
-    with launch(
-        shared_store,
-        tmp_path_factory.mktemp("defective") / "log",
-        program=("-c", QUOTING),
-        SCENE_API_KEY=API_KEY,
-        SCENE_LOG_LEVEL="debug",
-    ) as service:
+    with launch(shared_store, tmp_path / "log", program=PROGRAM, **SETTINGS) as service:
         yield service
 
 
@@ -70,9 +63,7 @@ def test_keys_and_payloads_are_not_in_the_log(defective: LiveService) -> None:
         "X-API-Key: {key}\r\nContent-Length: 99\r\n\r\n{key}"
     )
     for text, key in product((broken, left), SECRETS):
-        with socket.create_connection(
-            ("127.0.0.1", defective.port), timeout=PATIENCE
-        ) as connection:
+        with socket.create_connection(("127.0.0.1", defective.port), PATIENCE) as connection:
             connection.sendall(text.format(key=key).encode())
             connection.shutdown(socket.SHUT_WR)
             with suppress(ConnectionError):

@@ -25,17 +25,7 @@ def no_environment(monkeypatch: pytest.MonkeyPatch) -> None:
             monkeypatch.delenv(name)
 
 
-def test_the_defaults_are_safe(tmp_path: Path) -> None:
-    settings = Settings(store=tmp_path)
-    assert settings.host == "127.0.0.1"
-    assert settings.api_key is None
-    assert settings.cors_origins == ()
-    assert settings.max_objects == 256
-
-
-def test_settings_come_from_the_environment(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_settings_of_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SCENE_STORE", str(tmp_path))
     monkeypatch.setenv("SCENE_PORT", "9000")
     monkeypatch.setenv("SCENE_API_KEY", "0123456789abcdef")
@@ -114,28 +104,21 @@ def test_unknown_names_stop_the_start(
     assert line.startswith(f"{name.upper()}: {message}")
 
 
-def test_arguments_are_refused_and_help_lists_the_settings(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_help_lists_the_settings(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(["--port", "9000"])
-    assert (
-        "unknown arguments: --port 9000; settings are environment variables"
-        in capsys.readouterr().err
-    )
+    refusal = "unknown arguments: --port 9000; settings are environment variables"
+    assert refusal in capsys.readouterr().err
     with pytest.raises(SystemExit, match="0"):
         main(["--help"])
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     shown = [line for line in lines if line and line[0].startswith("SCENE_")]
-    assert [name for name, *_ in shown] == [
-        f"SCENE_{name.upper()}" for name in Settings.model_fields
-    ]
+    names = [f"SCENE_{name.upper()}" for name in Settings.model_fields]
+    assert [name for name, *_ in shown] == names
     assert ["SCENE_PORT", "8000"] in shown
 
 
-def test_variables_of_kubernetes_and_of_clients_are_no_settings(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_variables_are_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     variables = {
         "STORE": str(tmp_path),
         "STOER": "",
@@ -154,8 +137,7 @@ def test_variables_of_kubernetes_and_of_clients_are_no_settings(
 
 
 @pytest.mark.system
-def test_a_misconfigured_service_says_which_variables_and_exits(tmp_path: Path) -> None:
-    """Without a word of the keys."""
+def test_the_start_names_invalid_settings(tmp_path: Path) -> None:
     wrong = {
         "SCENE_STORE": str(tmp_path / "none"),
         "SCENE_PORT": "many",
@@ -203,7 +185,7 @@ def in_words(name: str, default: object) -> str:
     return f"{default:g}" if isinstance(default, float) else str(default)
 
 
-def test_the_documentation_lists_every_setting_once_with_its_default(repository: Path) -> None:
+def test_the_documentation_lists_every_setting(repository: Path) -> None:
     pages = {page.name: page.read_text("utf-8") for page in (repository / "docs").glob("*.md")}
     row = re.compile(r"^\| `SCENE_([A-Z_]+)` \| ([^|]+) \| [^|]+ \|$", re.MULTILINE)
     rows = [(name, *found) for name, page in pages.items() for found in row.findall(page)]

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.system
 
 Start = Callable[..., subprocess.Popen[str]]
 IN_USE = "SCENE_PORT: another program uses 127.0.0.1:{}; set SCENE_PORT to a free port\n"
-HELD = """
+WAITING = """
 import sys, time
 from pathlib import Path
 from app.__main__ import main
@@ -39,12 +39,12 @@ from app.registry import Store
 
 load = Store.load
 
-def held(*arguments):
+def waiting(*arguments):
     while not Path({go!r}).exists():
         time.sleep(0.01)
     return load(*arguments)
 
-Store.load = held
+Store.load = waiting
 sys.exit(main())
 """
 """A program for `begin`: it loads models as soon as a file exists."""
@@ -82,36 +82,23 @@ def starting(shared_store: Path, log: Path) -> Iterator[Start]:
         process.wait(timeout=PATIENCE)
 
 
-@pytest.fixture
-def taken() -> Iterator[socket.socket]:
-    """A socket that is bound, and does not listen."""
-    with socket.socket() as place:
-        place.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        place.bind(("127.0.0.1", 0))
-        yield place
-
-
-def test_a_used_port_ends_the_start_before_models_are_loaded(
-    starting: Start, log: Path, taken: socket.socket
-) -> None:
-    taken.listen()
-    port = taken.getsockname()[1]
-    assert starting(PORT=port).wait(timeout=PATIENCE) == 3
+def test_a_used_port_ends_the_start(starting: Start, log: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert starting(PORT=port).wait(timeout=PATIENCE) == 3
     assert log.read_text() == IN_USE.format(port)
 
 
 @pytest.mark.parametrize("host", ["203.0.113.1", "no-such-host.invalid"])
-def test_an_address_that_the_machine_does_not_have(starting: Start, log: Path, host: str) -> None:
+def test_an_invalid_address_ends_the_start(starting: Start, log: Path, host: str) -> None:
     assert starting(HOST=host, PORT=0).wait(timeout=PATIENCE) == 3
     (line,) = log.read_text().splitlines()
     assert line.startswith(f"SCENE_HOST: the service cannot listen on {host}:0: ")
 
 
-def test_connections_are_refused_until_the_service_is_ready(
-    starting: Start, log: Path, tmp_path: Path
-) -> None:
+def test_connections_are_refused_until_ready(starting: Start, log: Path, tmp_path: Path) -> None:
     port, go = free_port(), tmp_path / "go"
-    process = starting(HELD.format(go=str(go)), PORT=port)
+    process = starting(WAITING.format(go=str(go)), PORT=port)
     wait_for("Waiting for application startup", log, process)
     with socket.socket() as other, pytest.raises(OSError, match="in use"):
         other.bind(("127.0.0.1", port))
@@ -145,9 +132,7 @@ runpy.run_module("app", run_name="__main__")
 
 
 @pytest.mark.parametrize("during", ["imports", "load"])
-def test_an_interrupted_start_ends_without_a_traceback(
-    shared_store: Path, log: Path, during: str
-) -> None:
+def test_an_interrupted_start_has_no_traceback(shared_store: Path, log: Path, during: str) -> None:
     program = ("-c", INTERRUPTED.format(during=during))
     process = begin(shared_store, log, program=program, SCENE_PORT=str(free_port()))
     # A shell reports this as status 130.
@@ -156,7 +141,7 @@ def test_an_interrupted_start_ends_without_a_traceback(
     assert "ready" not in log.read_text()
 
 
-def test_every_address_of_both_families_is_bound_at_one_port() -> None:
+def test_both_address_families_have_one_port() -> None:
     sockets = _bind("::", 0, 1.0)
     try:
         names = [one.getsockname()[:2] for one in sockets]

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
+from httpx import AsyncClient
 
 from app.registry import DEFAULT_STORE, AliasTarget, Store
 from app.registry.__main__ import main
@@ -48,7 +48,7 @@ def copy(source: Store, target: Store) -> None:
     assert main(["copy", "--from", str(source.root), "--to", str(target.root)]) == 0
 
 
-async def answering(client: httpx.AsyncClient, **fields: Any) -> str:
+async def answering(client: AsyncClient, **fields: Any) -> str:
     response = await client.post("/missing", json=OBJECTS | fields)
     assert response.status_code == 200, response.text
     model = response.json()["model"]
@@ -56,9 +56,7 @@ async def answering(client: httpx.AsyncClient, **fields: Any) -> str:
 
 
 @pytest.mark.parametrize("is_copied", [True, False], ids=["volume", "own folder"])
-async def test_the_shipped_default_answers_for_outdated_own_models(
-    volume: Store, release: Store, is_copied: bool
-) -> None:
+async def test_the_shipped_default_answers(volume: Store, release: Store, is_copied: bool) -> None:
     if is_copied:
         copy(release, volume)
     assert str(volume.aliases()["default"]) == "home@1.0.0", "an own model keeps the alias"
@@ -73,25 +71,13 @@ async def test_the_shipped_default_answers_for_outdated_own_models(
             assert f"{own}@1.0.0: manifest.json has format" in failures[alias]["detail"]
             assert f"(python -m training {again})" in failures[alias]["detail"]
             assert failures[alias]["detail"].endswith("; new@4.0.0 answers instead")
-            asked = await client.post("/missing", json=OBJECTS | {"model": own})
-            assert (
-                f"python -m training {again}" in problem(asked, 503, "model-unavailable")["detail"]
-            )
+            response = await client.post("/missing", json=OBJECTS | {"model": own})
+            detail = problem(response, 503, "model-unavailable")["detail"]
+            assert f"python -m training {again}" in detail
         listing = (await client.get("/models")).json()
         assert listing["failures"][:4] == ready.json()["failures"][:4]
         (shipped,) = [model for model in listing["models"] if model["name"] == "new"]
         assert shipped["versions"][0]["aliases"] == ["default", "mine"]
-
-
-async def test_the_default_is_the_own_model_again_once_it_is_adapted_again(
-    volume: Store, release: Store
-) -> None:
-    async with serve(volume.root, store_poll=0) as client:
-        assert await answering(client) == "new@4.0.0"
-        again = description("home", "1.1.0", training=PARENT)
-        publish_as(volume, "default", again, state(seed=5))
-        await client.app.state.runtime.check_store()  # type: ignore[attr-defined]
-        assert await answering(client) == "home@1.1.0"
 
 
 async def test_a_damaged_own_model_is_not_replaced(volume: Store, release: Store) -> None:
@@ -103,17 +89,15 @@ async def test_a_damaged_own_model_is_not_replaced(volume: Store, release: Store
 
 
 @pytest.mark.parametrize("store", ["volume", "release"])
-async def test_a_replaced_name_is_an_error_that_names_the_new_one(
-    store: str, request: pytest.FixtureRequest, release: Store
-) -> None:
+async def test_replaced_names(store: str, request: pytest.FixtureRequest, release: Store) -> None:
     async with serve(request.getfixturevalue(store).root) as client:
         for name in ("old", "old@3.5.0"):
-            asked = OBJECTS | {"model": name}
-            document = problem(await client.post("/missing", json=asked), 404, "model-replaced")
+            body = OBJECTS | {"model": name}
+            document = problem(await client.post("/missing", json=body), 404, "model-replaced")
             assert document["detail"].startswith("The model new replaces the model old.")
             (error,) = document["errors"]
             assert (error["pointer"], error["suggestions"]) == ("#/model", ["new"])
-            batch = {"scenes": [OBJECTS, asked]}
+            batch = {"scenes": [OBJECTS, body]}
             answer, refused = (await client.post("/missing/batch", json=batch)).json()["results"]
             assert answer["result"]["model"]["name"] == "new"
             assert refused["problem"]["type"] == document["type"]
@@ -121,10 +105,3 @@ async def test_a_replaced_name_is_an_error_that_names_the_new_one(
             path = f"/models/{name}/vocabulary"
             assert "errors" not in problem(await client.get(path), 404, "model-replaced")
         problem(await client.get("/models/older/vocabulary"), 404, "model-not-found")
-
-
-async def test_an_old_model_in_a_readable_format_answers(volume: Store, release: Store) -> None:
-    volume.publish(description("old", "3.6.0"), state(seed=6))
-    copy(release, volume)
-    async with serve(volume.root) as client:
-        assert await answering(client, model="old") == "old@3.6.0"

@@ -41,7 +41,7 @@ def flagged(request, client):
 BOUNDS = {False: (0, 34), True: (2, 38)}
 
 
-def test_normal_lists_raise_few_alarms_and_intruders_are_flagged(flagged):
+def test_alarms_of_homes(flagged):
     ask, with_room = flagged
     normal = [bool(ask(room, labels)) for room, labels in HOMES["normal"]]
     found = [

@@ -1,4 +1,4 @@
-"""What the shipped store promises: which models, how large, how quickly loaded, which words."""
+"""The shipped store: models, sizes, words, and answers to known facts."""
 
 import re
 from pathlib import Path
@@ -31,7 +31,7 @@ def test_every_shipped_model_verifies(models):
     assert sorted({name for name, _ in models.entries}) == SHIPPED
 
 
-def test_the_store_states_what_replaces_which_model_of_earlier_releases():
+def test_the_store_states_replaced_models():
     shipped = STORE.shipped()
     assert shipped.default == STORE.aliases()["default"]
     assert {*shipped.names.values()} <= {*SHIPPED}
@@ -69,7 +69,7 @@ def test_the_vocabulary_is_large_enough(artifact):
         assert artifact.model.vocabulary.index(words) is not None
 
 
-def test_it_has_the_examples_of_its_configuration(artifact):
+def test_an_artifact_has_its_examples(artifact):
     from training.runs.example_scenes import accepted_examples, read_examples
 
     examples = read_examples(load_config(artifact.manifest.name).examples, Path())
@@ -119,7 +119,7 @@ def test_every_fact_is_asked(found):
 
 
 @pytest.mark.parametrize("line", LINES)
-def test_no_line_falls_back(found, line):
+def test_facts(found, line):
     hits, _ = found[line]
     if line in AT_LEAST:
         assert hits >= AT_LEAST[line]

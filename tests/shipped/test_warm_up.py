@@ -73,6 +73,5 @@ asyncio.run(main(Path(sys.argv[1])))
 
 
 def test_no_question_compiles_a_loop() -> None:
-    """A drawing with two relations once took ten seconds: their arrays had another layout."""
     store = REPOSITORY / "model_store"
     assert run_program(sys.executable, "-c", _PROGRAM, store, timeout=600).stdout == "[]\n"

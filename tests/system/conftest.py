@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import yaml
 
+from tests.conftest import FindTool
 from tests.services import PATIENCE, free_port, is_ready, wait_until
 
 
@@ -46,11 +47,9 @@ def compose(repository: Path) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="session")
-def haproxy(require_system_tool: Callable[[str], Path]) -> StartProxy:
+def haproxy(find_tool: FindTool) -> StartProxy:
     """Return a function that starts the proxy; variables as in its configuration."""
-    # Debian keeps it where only administrators look.
-    os.environ["PATH"] += os.pathsep + "/usr/sbin"
-    program = require_system_tool("haproxy")
+    program = find_tool("haproxy")
 
     @contextmanager
     def start(configuration: Path, log: Path, **variables: str) -> Iterator[Proxy]:

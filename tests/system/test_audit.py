@@ -1,6 +1,7 @@
-"""The audit never takes silence for a clean bill of health."""
+"""The audit reports databases that give no answer."""
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,19 +21,17 @@ def report(*entries: dict[str, Any]) -> str:
     return json.dumps({"dependencies": list(entries), "fixes": []})
 
 
-def sound(name: str) -> dict[str, Any]:
-    return {"name": name, "version": "1.0", "vulns": []}
+def package(kind: str, name: str) -> dict[str, Any]:
+    """The entry of a package that is sound, flawed or skipped."""
+    if kind == "skipped":
+        return {"name": name, "skip_reason": f"Dependency not found on PyPI: {name} (1.0)"}
+    return {"name": name, "version": "2.10", "vulns": [FLAW] if kind == "flawed" else []}
 
 
-def flawed(name: str) -> dict[str, Any]:
-    return {"name": name, "version": "2.10", "vulns": [FLAW]}
+sound, flawed, skipped = (partial(package, kind) for kind in ("sound", "flawed", "skipped"))
 
 
-def skipped(name: str) -> dict[str, Any]:
-    return {"name": name, "skip_reason": f"Dependency not found on PyPI: {name} (1.0)"}
-
-
-def test_answers_are_sound_packages_or_flaws_with_their_cure() -> None:
+def test_flaws_have_a_fixed_version() -> None:
     outcome = judge(report(sound("a"), sound("b")), "", {"a", "b"})
     assert outcome == Outcome(Verdict.OK, ("no known vulnerability in 2 packages",))
     outcome = judge(report(sound("a"), flawed("b"), skipped("c")), "", {"a", "b", "c"})
@@ -62,7 +61,7 @@ def test_missing_answers_are_not_run(output: str, trouble: str, reason: str) -> 
 
 
 @pytest.mark.parametrize(
-    ("answers", "verdict", "locks_asked"),
+    ("answers", "verdict", "lock_services"),
     [
         # Only a service that knows the canary's flaw is asked about the locks.
         ({"pypi": flawed, "osv": flawed}, Verdict.OK, ["pypi"]),
@@ -71,22 +70,22 @@ def test_missing_answers_are_not_run(output: str, trouble: str, reason: str) -> 
         ({"pypi": skipped, "osv": sound}, Verdict.NOT_RUN, []),
     ],
 )
-def test_a_database_without_the_canary_is_not_used(
+def test_a_database_needs_the_canary(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
     answers: dict[str, Any],
     verdict: Verdict,
-    locks_asked: list[str],
+    lock_services: list[str],
 ) -> None:
-    asked = []
+    services = []
 
     def ask(service: str, *arguments: str) -> tuple[str, str]:
         if any("canary" in argument for argument in arguments):
             return report(answers[service]("jinja2")), ""
-        asked.append(service)
+        services.append(service)
         return report(*map(sound, audit.names(*audit.LOCKS))), ""
 
     monkeypatch.setattr(audit, "ask", ask)
     monkeypatch.setattr(audit, "BILLS", tmp_path)
     assert audit.advisories().verdict is verdict
-    assert asked == locks_asked
+    assert services == lock_services

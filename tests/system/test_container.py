@@ -31,24 +31,20 @@ def stages(repository: Path) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("name", ["runtime", "ray", "train"])
-def test_final_stages_run_as_a_fixed_unprivileged_user(
-    stages: dict[str, str], compose: dict[str, Any], name: str
-) -> None:
+def test_stages_have_no_root(stages: dict[str, str], compose: dict[str, Any], name: str) -> None:
     (user,) = re.findall(r"^USER ([1-9]\d{3,}:[1-9]\d{3,})$", stages[name], re.MULTILINE)
     built = [service for service in compose["services"].values() if "build" in service]
     assert [service["user"] for service in built] == [user] * 3
 
 
-def test_the_default_stage_serves_and_knows_nothing_of_training(stages: dict[str, str]) -> None:
+def test_the_default_stage_serves(stages: dict[str, str]) -> None:
     assert list(stages)[-1] == "runtime"
     assert '&& exec python -m app"]' in stages["runtime"]
     assert "/health/ready" in stages["runtime"].split("HEALTHCHECK")[1]
     assert "training" not in stages["runtime"]
 
 
-def test_every_variable_given_to_the_service_is_one_it_reads(
-    stages: dict[str, str], compose: dict[str, Any]
-) -> None:
+def test_variables_are_settings(stages: dict[str, str], compose: dict[str, Any]) -> None:
     known = {f"SCENE_{field.upper()}" for field in Settings.model_fields}
     in_image = set(re.findall(r"\bSCENE_\w+(?==)", stages["runtime"]))
     assert {"SCENE_HOST", "SCENE_PORT", "SCENE_STORE"} <= in_image <= known
@@ -69,9 +65,7 @@ def test_services_are_confined(compose: dict[str, Any], name: str) -> None:
     assert all("/var/run" not in volume for volume in service["volumes"])
 
 
-def test_training_works_in_volumes_that_belong_to_its_user(
-    stages: dict[str, str], compose: dict[str, Any]
-) -> None:
+def test_training_writes_to_its_volumes(stages: dict[str, str], compose: dict[str, Any]) -> None:
     """Under a read-only root, a command can write to volumes and to /tmp only."""
     stage = stages["train"]
     volumes = compose["services"]["train"]["volumes"]
@@ -85,9 +79,7 @@ def test_training_works_in_volumes_that_belong_to_its_user(
     assert settings["PYTHONPATH"] == "/srv/scene"  # `python -m training` from another folder
 
 
-def test_the_context_has_every_file_that_a_stage_copies(
-    stages: dict[str, str], repository: Path
-) -> None:
+def test_the_context_has_every_copied_file(stages: dict[str, str], repository: Path) -> None:
     ignored, *included = (repository / ".dockerignore").read_text("utf-8").split("\n!")
     included[-1] = included[-1].partition("\n")[0]
     assert ignored.endswith("*")
@@ -104,7 +96,7 @@ def test_ports_are_published_on_this_machine_only(compose: dict[str, Any]) -> No
     assert all(ports[name][0].startswith("127.0.0.1:") for name in ("prometheus", "grafana"))
 
 
-def test_an_upgrade_copies_the_shipped_models_into_the_volume_of_the_service(
+def test_an_upgrade_copies_the_shipped_models(
     stages: dict[str, str], compose: dict[str, Any], tmp_path: Path, repository: Path
 ) -> None:
     """The command of the compose file, on the paths of the image."""

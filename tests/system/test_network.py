@@ -5,13 +5,13 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
-from tests.conftest import REPOSITORY, run_program
+from tests.conftest import REPOSITORY, FindTool, run_program
 from tests.services import wait_until
 
 pytestmark = pytest.mark.system
@@ -23,10 +23,10 @@ ADDRESSES = {PC: ("192.168.1.20/24", "fd00::20/64"), ROBOT: ("192.168.1.30/24", 
 
 
 @pytest.fixture(scope="module", autouse=True)
-def network(require_system_tool: Callable[[str], Path]) -> Iterator[None]:
+def network(find_tool: FindTool) -> Iterator[None]:
     """Two machines with one cable. No packet leaves the two namespaces."""
     os.environ["PATH"] += os.pathsep + "/usr/sbin"
-    ip = require_system_tool("ip")
+    ip = find_tool("ip")
     if os.geteuid() != 0 and os.environ.get("REQUIRE_SYSTEM") != "1":
         pytest.skip("only root can make network namespaces")
     with ExitStack() as stack:

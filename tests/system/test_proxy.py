@@ -1,4 +1,4 @@
-"""HAProxy with the shipped configuration in front of the service: attacked, and asked as usual."""
+"""HAProxy with the shipped configuration in front of the service: normal and hostile requests."""
 
 import json
 import resource
@@ -34,7 +34,6 @@ CONNECTIONS, REQUESTS = 30, 100
 SCENE = {"objects": ["bed", "lamp"]}
 HEAD = b"POST /outliers HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
 
-
 service = live_service(SCENE_CLIENT_TIMEOUT="3")
 
 
@@ -60,18 +59,6 @@ def proxy(
         yield proxy
 
 
-def send(proxy: Proxy, *parts: bytes) -> tuple[list[Any], bool]:
-    return exchange(proxy.port, Wire("", parts, None))
-
-
-def refused(proxy: Proxy, request: bytes, status: int) -> Any:
-    """The answer to a request that the proxy refuses."""
-    answers, is_closed = send(proxy, request)
-    assert [answer.status for answer in answers] == [status]
-    assert is_closed
-    return answers[0]
-
-
 def test_questions_and_pages_are_answered(proxy: Proxy) -> None:
     with Client(proxy.address, timeout=60) as scene:
         assert scene.missing(SCENE["objects"]).missing
@@ -90,19 +77,16 @@ def test_questions_and_pages_are_answered(proxy: Proxy) -> None:
         assert other_host.json()["type"] == "/problems/host-refused"
 
 
-def test_connections_without_a_whole_head_are_closed(
-    behind: StartProxy, service: LiveService, tmp_path: Path
-) -> None:
+def test_incomplete_heads(behind: StartProxy, service: LiveService, tmp_path: Path) -> None:
     with behind(service, tmp_path / "log", PROXY_HEAD_TIMEOUT="1s") as proxy:
         for part, statuses in ((b"", ([], [408])), (LIVE[:-2], ([408],))):
-            answers, is_closed = send(proxy, part)
+            answers, is_closed = exchange(proxy.port, Wire("", [part], None))
             assert is_closed
             assert [answer.status for answer in answers] in statuses
 
 
 @pytest.mark.slow
 def test_requests_below_http_are_refused(proxy: Proxy, service: LiveService) -> None:
-    """Every refusal is a client's error; no request hides in another."""
     with ThreadPoolExecutor(8) as pool:
         exchanges = [(wire, pool.submit(exchange, proxy.port, wire)) for wire in wires()]
     assert len(exchanges) > 80
@@ -118,22 +102,8 @@ def test_requests_below_http_are_refused(proxy: Proxy, service: LiveService) -> 
     assert '"smuggled"' not in service.log.read_text()
 
 
-def test_trailers_reach_no_service(proxy: Proxy, service: LiveService) -> None:
-    """The service would read them as headers: a key, a host, a media type."""
-    before = lines(service)
-    trailers = b"X-API-Key: 0123456789abcdef\r\nHost: evil.example\r\n"
-    request = HEAD + b"Transfer-Encoding: chunked\r\n\r\n2\r\n{}\r\n0\r\n" + trailers + b"\r\n"
-    (answer,), _ = exchange(proxy.port, Wire("", [request], (411,)))
-    assert answer.status == 411
-    assert answer.headers["content-type"] == "application/problem+json"
-    added = service.log.read_text().splitlines()[before:]
-    assert all("/health/" in line for line in added)
-
-
 @pytest.mark.slow
-def test_silent_connections_do_not_keep_others_out(
-    behind: StartProxy, shared_store: Path, tmp_path: Path
-) -> None:
+def test_silent_connections(behind: StartProxy, shared_store: Path, tmp_path: Path) -> None:
     """300 silent connections from ten addresses; the service may open 256 files."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
@@ -142,15 +112,10 @@ def test_silent_connections_do_not_keep_others_out(
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     variables = {"PROXY_HEAD_TIMEOUT": "2s", "PROXY_REQUESTS": "1000000"}
-    with service, behind(service, tmp_path / "log", **variables) as proxy, ExitStack() as held:
-        silent = [
-            held.enter_context(
-                socket.create_connection(
-                    ("127.0.0.1", proxy.port), 30, source_address=(f"127.0.0.{10 + k % 10}", 0)
-                )
-            )
-            for k in range(300)
-        ]
+    with service, behind(service, tmp_path / "log", **variables) as proxy, ExitStack() as stack:
+        address, clients = ("127.0.0.1", proxy.port), [(f"127.0.0.{10 + k}", 0) for k in range(10)]
+        opened = (socket.create_connection(address, 30, client) for client in clients * 30)
+        silent = [stack.enter_context(connection) for connection in opened]
         for _ in range(20):
             assert httpx.get(f"{proxy.address}/health/live").status_code == 200
             assert service.client.get("/health/live").status_code == 200
@@ -161,15 +126,8 @@ def test_silent_connections_do_not_keep_others_out(
                 assert b"408" in part or b"request-timeout" in part
 
 
-def lines(service: LiveService) -> int:
-    """Lines of its log."""
-    return len(service.log.read_text().splitlines())
-
-
 @pytest.mark.slow
-def test_a_request_that_crashes_a_replica_reaches_no_other(
-    haproxy: StartProxy, configuration: Path, tmp_path: Path
-) -> None:
+def test_crashes_are_not_repeated(haproxy: StartProxy, configuration: Path, tmp_path: Path) -> None:
     """Three replicas close the connection of each question, as if it had crashed them."""
     questions = []
 
@@ -185,9 +143,6 @@ def test_a_request_that_crashes_a_replica_reaches_no_other(
             questions.append(self.path)
             self.close_connection = True
 
-        def log_message(self, *_: object) -> None:
-            pass
-
     with http_server(Crashing) as url:
         backend = url.removeprefix("http://")
         variables = {"PROXY_BACKEND": backend, "PROXY_REPLICAS": "3"}
@@ -197,7 +152,7 @@ def test_a_request_that_crashes_a_replica_reaches_no_other(
     assert questions == ["/outliers"]
 
 
-def test_a_body_that_trickles_in_is_ended_by_the_service(proxy: Proxy) -> None:
+def test_slow_bodies_are_ended_by_the_service(proxy: Proxy) -> None:
     """Every byte restarts the proxy's time-out; the service bounds the time of the whole body."""
     received = b""
     with socket.create_connection(("127.0.0.1", proxy.port)) as connection:
@@ -217,18 +172,16 @@ def test_a_body_that_trickles_in_is_ended_by_the_service(proxy: Proxy) -> None:
     assert b"/problems/request-timeout" in received
 
 
-def test_connections_per_address_are_limited(
-    behind: StartProxy, service: LiveService, tmp_path: Path
-) -> None:
+def test_limit_of_connections(behind: StartProxy, service: LiveService, tmp_path: Path) -> None:
     variables = {"PROXY_CONNECTIONS": str(CONNECTIONS), "PROXY_HEAD_TIMEOUT": "60s"}
     with behind(service, tmp_path / "log", **variables) as proxy:
-        with ExitStack() as held:
+        with ExitStack() as stack:
             answered = 0
             for _ in range(CONNECTIONS + 10):
                 with suppress(ConnectionError):
                     place = ("127.0.0.1", proxy.port)
                     connection = socket.create_connection(place, timeout=PATIENCE)
-                    held.enter_context(connection)
+                    stack.enter_context(connection)
                     # The begun second request keeps the connection.
                     connection.sendall(LIVE + b"GET ")
                     answered += connection.recv(4096).startswith(b"HTTP/1.1 200 ")
@@ -236,9 +189,7 @@ def test_connections_per_address_are_limited(
         wait_until(lambda: is_ready(proxy.port))
 
 
-def test_requests_per_address_are_limited(
-    behind: StartProxy, service: LiveService, tmp_path: Path
-) -> None:
+def test_limit_of_requests(behind: StartProxy, service: LiveService, tmp_path: Path) -> None:
     with (
         behind(service, tmp_path / "log", PROXY_REQUESTS=str(REQUESTS)) as proxy,
         httpx.Client(base_url=proxy.address, timeout=PATIENCE) as client,
@@ -252,31 +203,42 @@ def test_requests_per_address_are_limited(
     assert int(refusal.headers["retry-after"]) > 0
 
 
-@pytest.mark.parametrize("path", ["/metrics", "/metric%73", "/metrics/", "//metrics"])
-def test_metrics_are_hidden_by_the_proxy(proxy: Proxy, service: LiveService, path: str) -> None:
-    before = lines(service)
-    request = f"GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
-    answer = refused(proxy, request.encode(), 404)
+METRICS = b"GET %b HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
+# The service would read trailers as headers: a key, a host, a media type.
+CHUNKED = HEAD + b"Transfer-Encoding: chunked\r\n\r\n2\r\n{}\r\n0\r\n"
+TRAILERS = CHUNKED + b"X-API-Key: 0123456789abcdef\r\nHost: evil.example\r\n\r\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "status"),
+    [
+        *(
+            (METRICS % path, 404)
+            for path in (b"/metrics", b"/metric%73", b"/metrics/", b"//metrics")
+        ),
+        (TRAILERS, 411),
+    ],
+)
+def test_metrics_and_trailers_reach_no_service(
+    proxy: Proxy, service: LiveService, text: bytes, status: int
+) -> None:
+    before = len(service.log.read_text().splitlines())
+    (answer,), is_closed = exchange(proxy.port, Wire("", [text], (status,), closes=status == 404))
+    assert (answer.status, is_closed) == (status, status == 404)
     assert answer.headers["content-type"] == "application/problem+json"
-    assert json.loads(answer.body)["type"] == "/problems/not-found"
+    assert status == 411 or json.loads(answer.body)["type"] == "/problems/not-found"
     added = service.log.read_text().splitlines()[before:]
     assert all("/health/" in line for line in added)
 
 
 @pytest.mark.slow
-def test_the_log_holds_no_key_no_path_and_the_id_of_the_request(
-    behind: StartProxy, shared_store: Path, tmp_path: Path
-) -> None:
+def test_the_log_has_no_secrets(behind: StartProxy, shared_store: Path, tmp_path: Path) -> None:
     with (
         launch(shared_store, tmp_path / "service", SCENE_API_KEY=API_KEY) as service,
         behind(service, tmp_path / "log") as proxy,
         httpx.Client(base_url=proxy.address, timeout=PATIENCE) as client,
     ):
-        keys = {
-            "X-API-Key": API_KEY,
-            "Authorization": f"Bearer {API_KEY}",
-        }
-        for headers in ({name: key} for name, key in keys.items()):
+        for headers in ({"X-API-Key": API_KEY}, {"Authorization": f"Bearer {API_KEY}"}):
             known = headers | {"X-Request-Id": "find-me"}
             # The service refuses a query, so a key in a query is of no use.
             answer = client.post(f"/missing?key={API_KEY}", json=SCENE, headers=known)
@@ -290,9 +252,7 @@ def test_the_log_holds_no_key_no_path_and_the_id_of_the_request(
 
 
 @pytest.mark.slow
-def test_the_proxy_answers_503_without_a_ready_service(
-    behind: StartProxy, shared_store: Path, tmp_path: Path
-) -> None:
+def test_no_service_gives_503(behind: StartProxy, shared_store: Path, tmp_path: Path) -> None:
     with (
         launch(shared_store, tmp_path / "service") as service,
         behind(service, tmp_path / "log") as proxy,
@@ -306,7 +266,7 @@ def test_the_proxy_answers_503_without_a_ready_service(
         assert int(answer.headers["retry-after"]) > 0
 
 
-def test_the_proxy_leaves_the_service_room_for_health_checks(configuration: Path) -> None:
+def test_the_proxy_leaves_room_for_health_checks(configuration: Path) -> None:
     text = configuration.read_text("utf-8")
     (most,) = [int(line.split(" maxconn ")[1].split()[0])
                for line in text.splitlines() if "default-server" in line]  # fmt: skip

@@ -260,7 +260,7 @@ def missing(
     request = scene | _named(
         top_k=top_k, coverage=coverage, at=place, candidates=candidates or None, detail=detail
     )
-    shown = partial(tables.missing, asked_place=request.get("at") is not None)
+    shown = partial(tables.missing, is_at_place=request.get("at") is not None)
     _show(context, lambda client: client.missing(request), shown)
 
 
@@ -429,7 +429,8 @@ def _exit_on_error() -> Iterator[None]:
     try:
         yield
     except ProblemError as problem:
-        _fail(str(problem), _status(problem))
+        is_busy, is_refused = problem.status in (429, 503), 400 <= problem.status < 500
+        _fail(str(problem), BUSY if is_busy else REFUSED if is_refused else FAILED)
     except UnreachableError as error:
         _fail(f"the service cannot be reached: {error}", UNREACHABLE)
     except DeadlineError as error:
@@ -438,12 +439,6 @@ def _exit_on_error() -> Iterator[None]:
         _fail(str(error))
     except ClientError as error:
         _fail(str(error), FAILED)
-
-
-def _status(problem: ProblemError) -> int:
-    if problem.status in (429, 503):
-        return BUSY
-    return REFUSED if 400 <= problem.status < 500 else FAILED
 
 
 def _fail(message: str, status: int = MEANINGLESS) -> NoReturn:

@@ -117,8 +117,6 @@ class Options:
         return UnreachableError(f"{parts.scheme}://{host}: {str(error) or type(error).__name__}")
 
 
-# ---------------------------------------------------------------------------------- coroutines
-
 async_deadline = anyio.fail_after
 
 
@@ -128,26 +126,23 @@ def async_transport(ssl_context: ssl.SSLContext) -> httpx.AsyncHTTPTransport:
     return httpx.AsyncHTTPTransport(verify=ssl_context, limits=limits)
 
 
-# ------------------------------------------------------------------------------ blocking calls
-
-
 # The deadline of the current call as a value of `time.monotonic`. Each thread has its own context.
-_ENDS: Final = ContextVar("ends", default=float("inf"))
+_DEADLINE: Final = ContextVar("deadline", default=float("inf"))
 
 
 @contextmanager
 def deadline(seconds: float) -> Iterator[None]:
     """Limit the total time for which this thread waits on connections of `DeadlineTransport`."""
-    token = _ENDS.set(monotonic() + seconds)
+    token = _DEADLINE.set(monotonic() + seconds)
     try:
         yield
     finally:
-        _ENDS.reset(token)
+        _DEADLINE.reset(token)
 
 
 def _seconds_left(timeout: float | None) -> float:
     """Return the maximum time of the next wait in seconds."""
-    seconds = _ENDS.get() - monotonic()
+    seconds = _DEADLINE.get() - monotonic()
     if seconds <= 0:  # else a read of data that have already arrived would succeed
         raise httpcore.TimeoutException("the timeout of the call has expired")
     return seconds if timeout is None else min(timeout, seconds)

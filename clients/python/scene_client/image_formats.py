@@ -134,19 +134,19 @@ def is_roboflow(data: Any) -> bool:
 
 
 def _is_roboflow_answer(data: Any) -> bool:
-    found = data.get("predictions") if isinstance(data, dict) else None
-    if isinstance(found, dict):  # the output of a workflow
-        found = found.get("predictions")
-    return are_dicts(found, "x", "width", "class") or (found == [] and "image" in data)
+    entries = data.get("predictions") if isinstance(data, dict) else None
+    if isinstance(entries, dict):  # the output of a workflow
+        entries = entries.get("predictions")
+    return are_dicts(entries, "x", "width", "class") or (entries == [] and "image" in data)
 
 
 def roboflow_parts(data: Any) -> Parts:
     """Return the predictions of each image, by their number from 1."""
     answers = data if isinstance(data, list) else [data]
-    found = [answer["predictions"] for answer in answers]
+    predictions = [answer["predictions"] for answer in answers]
     return {
         str(number): one["predictions"] if isinstance(one, dict) else one
-        for number, one in enumerate(found, 1)
+        for number, one in enumerate(predictions, 1)
     }
 
 

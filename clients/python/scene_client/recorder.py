@@ -219,7 +219,7 @@ class Recorder:
 @contextmanager
 def _locked(path: Path) -> Iterator[int]:
     """Open the file for appending, create it if necessary, and lock it for other writers."""
-    ends = monotonic() + _LONGEST_WAIT
+    deadline = monotonic() + _LONGEST_WAIT
     while True:
         file = os.open(path, _FLAGS, 0o600)
         try:
@@ -230,7 +230,7 @@ def _locked(path: Path) -> Iterator[int]:
             if fcntl is not None:  # a fork in another thread may keep a copy of the open file
                 fcntl.flock(file, fcntl.LOCK_UN)
             os.close(file)
-        if monotonic() >= ends:
+        if monotonic() >= deadline:
             raise OSError(errno.EWOULDBLOCK, "another program has locked the file")
         sleep(_LONGEST_WAIT / 10)
 
@@ -272,9 +272,6 @@ def _write(file: int, size: int, line: bytes) -> None:
     if os.write(file, line) < len(line):
         os.ftruncate(file, size)
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
-# ------------------------------------------------------------------------------ known scenes
 
 
 def _hashes(

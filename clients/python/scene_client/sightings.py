@@ -79,9 +79,9 @@ def excluded(count: int, what: str) -> tuple[Note, ...]:
 
 def _span(values: Iterable[Any]) -> tuple[float, float]:
     """Return the minimum and the maximum, or NaN if a value is not a finite number."""
-    known = [number(value) for value in values]
-    finite = [value for value in known if value is not None]
-    if not finite or len(finite) < len(known):
+    every = [number(value) for value in values]
+    finite = [value for value in every if value is not None]
+    if not finite or len(finite) < len(every):
         return math.nan, math.nan
     return min(finite), max(finite)
 

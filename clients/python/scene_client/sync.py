@@ -66,8 +66,6 @@ class Client:
         self._http = httpx.Client(transport=transport, trust_env=False)
         self._recorder = Recorder(record) if isinstance(record, str | Path) else record
 
-    # ------------------------------------------------------------------------------ questions
-
     def relations(
         self,
         objects: Scene[schemas.RelationsRequest],
@@ -118,8 +116,6 @@ class Client:
         """Sample scenes from the model. Each sampled scene contains the given objects."""
         return self._call(calls.GENERATE.call(objects, fields, self.options.model), timeout)
 
-    # -------------------------------------------------------------------------------- batches
-
     def relations_batch(
         self, scenes: Iterable[Scene[schemas.RelationsRequest]], *, timeout: float | None = None
     ) -> schemas.BatchAnswer[schemas.RelationsAnswer]:
@@ -143,8 +139,6 @@ class Client:
     ) -> schemas.BatchAnswer[schemas.RoomsAnswer]:
         """Ask `rooms` about up to 256 scenes. Each scene has its own answer or problem."""
         return self._call(calls.ROOMS.batch(scenes, self.options.model), timeout)
-
-    # --------------------------------------------------------------------------------- models
 
     def models(self, *, timeout: float | None = None) -> schemas.ModelList:
         """Return the models of the service, their versions and their aliases."""
@@ -182,8 +176,6 @@ class Client:
         path = calls.model_path(name or self.options.model or "default", "vocabulary", word)
         return self._call(Call("GET", path, schemas.WordAnswer), timeout)
 
-    # --------------------------------------------------------------------------------- health
-
     def is_live(self, *, timeout: float | None = None) -> bool:
         """Return whether the service answers a health check. The client does not retry."""
         return self._is("live", timeout)
@@ -211,15 +203,13 @@ class Client:
             return False
         return True
 
-    # ----------------------------------------------------------------------------------- a call
-
     def _call(self, call: Call[T], timeout: float | None, retries: int | None = None) -> T:
         """Return the answer of a call. Retry as long as the timeout allows."""
         retries = self.options.retries if retries is None else retries
         limit = self.options.limit(timeout)
         message = f"The answer did not arrive within {limit:g} s."
-        ends, attempt = monotonic() + limit, 0
-        while (left := ends - monotonic()) > 0:
+        end, attempt = monotonic() + limit, 0
+        while (left := end - monotonic()) > 0:
             try:
                 answer = self._attempt(call, left)
             except (TimeoutError, httpx.TimeoutException):
@@ -228,13 +218,13 @@ class Client:
                 raise DeadlineError(f"{message} {error}", error.request_id) from None
             except (ProblemError, UnreachableError) as error:
                 pause = call.retry_pause(error, attempt)
-                if pause is None or attempt == retries or pause >= ends - monotonic():
+                if pause is None or attempt == retries or pause >= end - monotonic():
                     raise
                 attempt += 1
                 time.sleep(pause)
             else:
                 # If the client has read the answer only after the deadline, the call fails.
-                if monotonic() < ends:
+                if monotonic() < end:
                     if self._recorder is not None:
                         self._recorder.record(call.answered(answer))
                     return answer
@@ -261,8 +251,6 @@ class Client:
             except httpx.TransportError as error:
                 raise options.unreachable(error) from error
         return call.read(response.status_code, response.headers, bytes(body))
-
-    # ------------------------------------------------------------------------------- lifetime
 
     def close(self) -> None:
         """Close all connections, and wait until the recorder has written its scenes."""

@@ -56,13 +56,13 @@ def relations(answer: schemas.RelationsAnswer) -> RenderableType:
     )
 
 
-def missing(answer: schemas.MissingAnswer, *, asked_place: bool = False) -> RenderableType:
+def missing(answer: schemas.MissingAnswer, *, is_at_place: bool = False) -> RenderableType:
     """Return a table of missing objects with places and reasons, and a table of counts.
 
     Args:
-        asked_place: True if the request names a place.
+        is_at_place: True if the request names a place.
     """
-    least = 0.0 if asked_place else LIKELY_PLACE
+    least = 0.0 if is_at_place else LIKELY_PLACE
     rows = [
         (
             *(_class(entry), f"{entry.probability:.3f}", f"{entry.log_odds:+.2f}"),

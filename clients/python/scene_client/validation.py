@@ -102,11 +102,9 @@ def _all_errors(error: ValidationError, body: Any, form: type[Request]) -> list[
 
 
 def _invalid_object(errors: list[ErrorDetails]) -> Any:
-    for details in filter(_is_of_objects, errors):
-        # An error of the whole list has the location ("objects",), without an index.
-        if len(details["loc"]) > 1:
-            return details["loc"][1]
-    return None
+    # An error of the whole list has the location ("objects",), without an index.
+    locations = (details["loc"] for details in filter(_is_of_objects, errors))
+    return next((location[1] for location in locations if len(location) > 1), None)
 
 
 def _is_of_objects(details: ErrorDetails) -> bool:

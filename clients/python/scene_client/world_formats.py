@@ -140,9 +140,9 @@ def hydra_parts(data: Any) -> Parts:
     nodes = {node["id"]: node for node in data["nodes"]}
     parents: dict[Any, Any] = {}
     for edge in data["edges"]:
-        ends = [nodes[edge[end]] for end in ("source", "target") if edge[end] in nodes]
-        if len(ends) == 2 and ends[0]["layer"] != ends[1]["layer"]:
-            low, high = sorted(ends, key=lambda node: node["layer"])
+        pair = [nodes[edge[name]] for name in ("source", "target") if edge[name] in nodes]
+        if len(pair) == 2 and pair[0]["layer"] != pair[1]["layer"]:
+            low, high = sorted(pair, key=lambda node: node["layer"])
             parents[low["id"]] = high["id"]
     objects = [node for node in data["nodes"] if "Object" in str(node["attributes"].get("type"))]
     parts: Parts = {}
@@ -158,7 +158,7 @@ def read_hydra(part: Any) -> Message:
     spaces = (data.get("metadata") or {}).get("labelspaces") or {}
     names = next((spaces[key] for key in sorted(spaces) if key.startswith("_l2")), None)
     labels = dict(names) if names else {}
-    found = []
+    detections = []
     for node in nodes:
         thing = node["attributes"]
         box = thing.get("bounding_box") or {}
@@ -171,8 +171,8 @@ def read_hydra(part: Any) -> Message:
             centre, size = thing.get("position"), None
         label = labels.get(thing["semantic_label"], thing["semantic_label"])
         solid = solid_box(vector(centre), vector(size), turn)
-        found.append(detection(label, 1.0, thing.get("name", ""), **solid))
-    return Message(found, _FIXED)
+        detections.append(detection(label, 1.0, thing.get("name", ""), **solid))
+    return Message(detections, _FIXED)
 
 
 def _room_of(node: Any, parents: Mapping[Any, Any], nodes: Mapping[Any, Any]) -> str:
@@ -245,7 +245,7 @@ def read_moveit(data: Any) -> Message:
     """Convert the collision objects, also those that the robot holds."""
     objects = list(_collision_objects(data) or ())
     state = take(take(data, "scene") or data, "robot_state", "attached_collision_objects")
-    objects += [take(held, "object") for held in items(state, "attached_collision_objects")]
+    objects += [take(entry, "object") for entry in items(state, "attached_collision_objects")]
     kept = [thing for thing in objects if take(thing, "operation") not in _REMOVE]
     return Message(
         [
@@ -264,8 +264,8 @@ def read_moveit(data: Any) -> Message:
 
 def _collision_objects(data: Any) -> Sequence[Any] | None:
     scene = take(data, "scene") or data
-    found = take(take(scene, "world") or scene, "collision_objects")
-    return found if isinstance(found, list | tuple) else None
+    objects = take(take(scene, "world") or scene, "collision_objects")
+    return objects if isinstance(objects, list | tuple) else None
 
 
 def _collision_box(thing: Any) -> dict[str, Any]:

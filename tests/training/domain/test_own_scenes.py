@@ -45,12 +45,12 @@ class Workplace:
 
 
 @pytest.fixture(scope="module")
-def workplace(tmp_path_factory, repository, require_system_tool) -> Workplace:
+def workplace(tmp_path_factory, repository, find_tool) -> Workplace:
     """The folder of a user who took the walk, on a machine without a network."""
     record = tmp_path_factory.mktemp("walk") / "record"
     for tool in ("chromium", "ip"):
-        require_system_tool(tool)
-    isolated = [require_system_tool("unshare"), "--net", *([] if os.geteuid() == 0 else ["-r"])]
+        find_tool(tool)
+    isolated = [find_tool("unshare"), "--net", *([] if os.geteuid() == 0 else ["-r"])]
     shell = ["sh", "-c", 'ip link set lo up && exec "$@"', "sh"]
     walk = [sys.executable, "scripts/walk.py", record]
     subprocess.run([*isolated, *shell, *walk], cwd=repository, check=True)
