@@ -244,7 +244,8 @@ def _select_consistent(relation, ends, order, fixed, count):
         # Each class that leads to x now also leads to y and to all classes after y.
         for k in range(count):
             if k == x or reached[k, x]:
-                reached[k] |= reached[y]
+                for z in range(count):  # numba compiles an assignment of arrays in seconds
+                    reached[k, z] |= reached[y, z]
                 reached[k, y] = True
     return stay
 
