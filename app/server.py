@@ -160,11 +160,11 @@ def _lan_addresses() -> list[str]:
     Without such an address, and on other systems than Linux, the list contains the machine's name
     in multicast DNS.
     """
-    found = []
+    addresses = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         for _, name in socket.if_nameindex():
             with suppress(OSError):  # the interface has no address
                 answer = fcntl.ioctl(probe, _SIOCGIFADDR, struct.pack("256s", name.encode()))
-                found.append(socket.inet_ntoa(answer[20:24]))
+                addresses.append(socket.inet_ntoa(answer[20:24]))
     name = f"{socket.gethostname().partition('.')[0]}.local"
-    return [address for address in found if not address.startswith("127.")] or [name]
+    return [address for address in addresses if not address.startswith("127.")] or [name]

@@ -87,9 +87,8 @@ def route_path(scope: Scope) -> str:
 class Recorded:
     """Complete the headers of each response, and record the request in metrics and access log.
 
-    The header `X-Request-Id` of the response and the access log contain the id of the request. The
-    client may choose an id of 1 to 128 unreserved URI characters or colons. The application
-    ``other`` gets everything but requests, such as the start of the service.
+    The client may choose the request id: 1 to 128 unreserved URI characters or colons. The
+    application ``other`` gets everything but requests, such as the start of the service.
     """
 
     def __init__(self, app: ASGIApp, other: ASGIApp, settings: Settings, runtime: Runtime) -> None:
@@ -168,9 +167,6 @@ class HostCheck:
 
     This check prevents DNS rebinding, where an attacker points the host name of a web page at this
     machine. That attack needs a name, so every IP address is accepted.
-
-    Args:
-        names: accepted host names, in lower case, without ports.
     """
 
     def __init__(self, app: ASGIApp, names: frozenset[str]) -> None:
@@ -202,8 +198,7 @@ class Failures:
         """Answer a request.
 
         Raises:
-            Exception: a part of the response has been sent already. The error makes the server
-                close the connection.
+            Exception: a part of the response has been sent, so the server closes the connection.
         """
         try:
             await self._app(scope, receive, send)

@@ -75,36 +75,22 @@ VARIANTS: Final[dict[str, type[RBM | Triway]]] = {"rbm": RBM, "gbm": GBM, "triwa
 class MachineSpec:
     """Sizes of one Boltzmann machine.
 
-    Attributes:
-        variant: ``rbm``, ``gbm`` or ``triway``.
-        V: number of object classes (visible units v).
-        A: number of canonical relations.
-        units: number of hidden units.
-        states: number of states of a hidden unit. 2 means a binary unit.
-        C: number of room types.
-        K: rank of the weights that relation units share (Triway).
-        G: rank of the effect of h1 on implications between relations (Triway). An implication is a
-            change of a relation's logit by other relations. 0 means no implications.
-        T: number of relation triples with an own weight. In RBM and GBM, each relation unit has
-            such a weight. In the Triway, only the triples of the sparse residual have own weights.
-        N: number of stored samples from Gibbs chains. New chains start at these samples. 0 means no
-            stored samples.
-        profiles: number of data sources with own base rates of the classes.
-        coupled: True if the machine has couplings L between classes.
+    An implication is a change of a relation's logit by other relations. In RBM and GBM, each
+    relation unit has an own weight; in the Triway, only the triples of the sparse residual.
     """
 
     variant: Variant
-    V: int
-    A: int
-    units: int
-    states: int = 2
-    C: int = 0
-    K: int = 0
-    T: int = 0
-    G: int = 0
-    N: int = 0
-    profiles: int = 0
-    coupled: bool = False
+    V: int  # object classes (visible units v)
+    A: int  # canonical relations
+    units: int  # hidden units
+    states: int = 2  # states of a hidden unit; 2: binary
+    C: int = 0  # room types
+    K: int = 0  # rank of the weights that relation units share (Triway)
+    T: int = 0  # triples (relation, subject class, object class) with an own weight
+    G: int = 0  # rank of the effect of h1 on implications (Triway); 0: no implications
+    N: int = 0  # stored samples of Gibbs chains, where new chains start
+    profiles: int = 0  # data sources with own base rates of the classes
+    coupled: bool = False  # whether the machine has couplings L between classes
 
     @property
     def judges_relations(self) -> bool:

@@ -30,11 +30,8 @@ def pack(
 ) -> tuple[bytes, dict[str, TensorEntry]]:
     """Return the contents of a safetensors file, and the manifest entries of its tensors.
 
-    Args:
-        state: maps names to numpy arrays or CPU tensors. Arrays of integers and booleans keep their
-            dtype.
-        storage_dtype: dtype of floating-point arrays with two or more axes. float16 has a relative
-            error of at most 2^-11 per weight. Biases are stored as float32.
+    Floating-point arrays with two or more axes get the ``storage_dtype``, others float32. Integers
+    and booleans keep their dtype. float16 has a relative error of at most 2^-11 per weight.
 
     Raises:
         ArtifactError: `not_finite` for NaN, infinity or a weight above the float16 maximum of
@@ -49,13 +46,7 @@ def pack(
 
 
 def unpack(data: bytes, entries: Mapping[str, TensorEntry]) -> dict[str, NDArray[Any]]:
-    """Return writable copies of the tensors of a safetensors file.
-
-    The function converts floating-point tensors to float32.
-
-    Args:
-        data: contents of the file.
-        entries: maps the name of each expected tensor to its dtype and shape in the manifest.
+    """Return writable copies of the tensors of a safetensors file, with floats as float32.
 
     Raises:
         ArtifactError: `not_safetensors` for another file format; `too_large` for a header with more
@@ -97,10 +88,6 @@ def read_group(
     group: type[GroupT], tensors: Mapping[str, NDArray[Any]], A: int, V: int, C: int
 ) -> GroupT | None:
     """Return the tables of a model with A relations, V classes and C room types, or None.
-
-    Args:
-        group: class of the tables.
-        tensors: the stored tensors of the group. Without any, the result is None.
 
     Raises:
         ArtifactError: `wrong_shape` if a tensor is missing, unexpected or of a wrong shape;
