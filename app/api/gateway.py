@@ -195,11 +195,7 @@ class Failures:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request.
-
-        Raises:
-            Exception: a part of the response has been sent, so the server closes the connection.
-        """
+        """Answer a request. If its response has begun, raise the error to close the connection."""
         try:
             await self._app(scope, receive, send)
         except Exception as error:  # noqa: BLE001 - _fail() answers and logs every error
@@ -227,11 +223,7 @@ class KeyCheck:
         self._app, self._key = app, key.get_secret_value().encode()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on.
-
-        Raises:
-            UnauthorizedError: the request lacks the key.
-        """
+        """Pass a request on, or raise UnauthorizedError if it lacks the key."""
         path, headers = route_path(scope), Headers(scope=scope)
         scheme, _, token = headers.get("authorization", "").partition(" ")
         key = headers.get(API_KEY) or (token.strip() if scheme.lower() == "bearer" else "")
@@ -276,10 +268,8 @@ class Deadline:
 
     def _seconds_of(self, value: bytes) -> float:
         if not _TIMEOUT.fullmatch(value) or int(value) > self._longest:
-            detail = (
-                f"{TIMEOUT_HEADER} must be a whole number from 1 to {self._longest} (milliseconds)."
-            )
-            raise errors.BadRequestError(detail)
+            valid = f"a whole number from 1 to {self._longest} (milliseconds)"
+            raise errors.BadRequestError(f"{TIMEOUT_HEADER} must be {valid}.")
         return int(value) / 1e3
 
 

@@ -15,8 +15,7 @@ requested room type, it keeps that of its start.
 
 The base rates are those of whole scenes (`Weights.scene_bias`). They stay the same in all sweeps.
 
-A sweep takes microseconds and releases the interpreter's lock. The result of a chain depends only
-on its conditions and its random stream.
+The result of a chain depends only on its conditions and its random stream.
 
 Source: Gordon, Salmond and Smith, "Novel approach to nonlinear/non-Gaussian Bayesian state
 estimation" (1993), for resampling and moving.

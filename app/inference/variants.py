@@ -121,10 +121,7 @@ class MachineSpec:
 
     @property
     def H1(self) -> int:  # noqa: N802 - the symbol of docs/models.md
-        """Number of states of the hidden units that have weights: units · (states - 1).
-
-        The first state of each unit has the energy 0, so it has no weights.
-        """
+        """Number of hidden states with weights: all but the first of each unit."""
         return self.units * (self.states - 1)
 
     def to_dict(self) -> dict[str, Any]:
@@ -133,11 +130,7 @@ class MachineSpec:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:
-        """Build a specification from the result of `to_dict`.
-
-        Raises:
-            ValueError: a name is unknown or missing, or a value is invalid.
-        """
+        """Build a specification from the result of `to_dict`; ValueError if it is invalid."""
         try:
             return cls(**values)
         except TypeError as error:

@@ -183,7 +183,6 @@ def _load(
     except Exception as error:
         # This includes MemoryError, because other versions may need less memory.
         _logger.exception("%s@%s could not be loaded", name, version)
-        return ArtifactError(
-            "unexpected_error",
-            f"loading failed with {type(error).__name__}; see the traceback in the service's log",
-        )
+        kind = type(error).__name__
+        reason = f"loading failed with {kind}; see the traceback in the service's log"
+        return ArtifactError("unexpected_error", reason)

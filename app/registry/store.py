@@ -69,11 +69,7 @@ class Store:
         self._max_weights_bytes = max_weights_bytes
 
     def names(self) -> list[str]:
-        """Return the names of the models in alphabetical order.
-
-        Raises:
-            StoreError: `unreadable` if the root is not a readable directory.
-        """
+        """Return the model names in alphabetical order, or raise StoreError `unreadable`."""
         try:
             return sorted(entry.name for entry in self.root.iterdir() if NAME.fits(entry.name))
         except OSError as error:
@@ -99,19 +95,11 @@ class Store:
         return tuple(sorted(filter(VERSION.fits, entries), key=version_key))
 
     def aliases(self) -> Mapping[str, AliasTarget]:
-        """Return the target of each alias.
-
-        Raises:
-            StoreError: `invalid_aliases`.
-        """
+        """Return the target of each alias, or raise StoreError `invalid_aliases`."""
         return MappingProxyType(read_table(self.root / ALIASES).aliases)
 
     def shipped(self) -> Shipped:
-        """Return what the store states about shipped models; `NOTHING` without a statement.
-
-        Raises:
-            StoreError: `invalid_aliases`.
-        """
+        """Return the statement about shipped models, or raise StoreError `invalid_aliases`."""
         return read_table(self.root / ALIASES).shipped
 
     def digest(self, name: str, version: str) -> str | None:

@@ -55,10 +55,8 @@ def unpack(data: bytes, entries: Mapping[str, TensorEntry]) -> dict[str, NDArray
     """
     # The file begins with the length of its header: 64 bits, little-endian.
     if MAX_HEADER_BYTES < int.from_bytes(data[:8], "little") <= len(data):
-        raise ArtifactError(
-            "too_large",
-            f"the header of {WEIGHTS} has more than the maximum of {MAX_HEADER_BYTES} bytes",
-        )
+        reason = f"the header of {WEIGHTS} has more than the maximum of {MAX_HEADER_BYTES} bytes"
+        raise ArtifactError("too_large", reason)
     try:
         stored = dict(deserialize(data))  # type: ignore[no-untyped-call]
     except SafetensorError:
@@ -130,9 +128,8 @@ def _stored(name: str, value: ArrayLike, storage_dtype: StorageDtype) -> NDArray
             array = array.astype(storage_dtype if array.ndim > 1 else np.float32)
         _require_finite(name, array, f" in {array.dtype.name}")
     elif array.dtype.name not in _DTYPES.values():
-        raise ArtifactError(
-            "invalid_tensor", f"tensor '{name}' has the unsupported dtype {array.dtype.name}"
-        )
+        reason = f"tensor '{name}' has the unsupported dtype {array.dtype.name}"
+        raise ArtifactError("invalid_tensor", reason)
     return array
 
 

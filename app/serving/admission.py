@@ -178,10 +178,7 @@ class Admission:
         self.drawing = ThreadPoolExecutor(1, "drawing", _lower_priority)
 
     async def in_worker(self, ticket: Ticket, call: Callable[[Callable[[], bool]], T]) -> T:
-        """Run a computation in a turn of the lane `slow`, in its thread; see `in_thread`.
-
-        The errors are those of `Lane.enter` and `in_thread`.
-        """
+        """Run a computation in a turn of the lane `slow`; see `Lane.enter` and `in_thread`."""
         if ticket.lane is not self.slow:
             await ticket.enter(self.slow, 1)
         return await in_thread(call, ticket, self.worker)
@@ -202,11 +199,9 @@ def _lower_priority() -> None:
 async def in_thread(
     call: Callable[[Callable[[], bool]], T], ticket: Ticket, executor: Executor
 ) -> T:
-    """Run a computation on an executor and return its result.
+    """Run a computation in a thread until its end, the deadline or a disconnect of the client.
 
-    The call ends at the end of the computation, at the deadline or at a disconnect of the client.
-    The argument of ``call`` is a function that returns whether the request has ended. A long
-    computation should call this function regularly.
+    A long computation should regularly call its argument: it returns whether the request has ended.
 
     Raises:
         DeadlinePassedError: the deadline passed before the end of the computation.

@@ -154,10 +154,7 @@ class Metrics:
     def computed(
         self, key: Key, question: str, waited: float, seconds: float, objects: int, answer: Fields
     ) -> None:
-        """Record one question about a number of objects that a model has answered.
-
-        ``waited`` and ``seconds`` are times before and of the computation.
-        """
+        """Record one answered question: its waiting time, computing time, objects and answer."""
         questions = self._of_model.get(key)
         if questions is None:  # the model is no longer served, and its series are removed
             return
