@@ -67,7 +67,7 @@ class Conditions:
 
     classes: Int[NDArray, " n"]  # classes that stay present, distinct and ascending
     observed: ObservedRelations | None  # relations between these classes
-    room: int | None = None  # None: the room type is unknown
+    room: int | None = None  # room type; None if unknown
     profile: int | None = None  # data source whose base rates apply
 
 
@@ -76,7 +76,7 @@ class ChainState:
     """The final state of a chain."""
 
     classes: Int[NDArray, " n"]  # present classes, ascending
-    room: int | None  # None: the room type is unknown
+    room: int | None  # room type; None if unknown
     logits: Float[NDArray, "A n n"]  # of the relations, at temperature 1
     r: Bool[NDArray, "A n n"]  # relations that hold; those of a class to itself only if observed
 

@@ -341,7 +341,7 @@ def _source_effects(
     """Return the effect of the unknown data source on N target classes, and its changes.
 
     The effect on a class i is the mean base rate sum_q p_q a_qi over the Q data sources. p_q is the
-    probability of source q given the listed classes. The changes are those by the first n of them.
+    probability of source q given the listed classes. The changes are those by the first n classes.
     """
     Q = len(f)
     # Part of each listed class in the logit of each source, and e^-part.

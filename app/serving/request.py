@@ -12,6 +12,7 @@ from app.questions.generate import STEPS
 from app.questions.names import LookUps, new_labels
 from app.questions.question import Question
 from app.questions.reading import Reading, read_scene
+from app.registry import Artifact
 from app.scene.vocabulary import Vocabulary
 from app.serving.admission import Ticket, in_thread
 from app.serving.models import Key, ServedModels
@@ -73,25 +74,12 @@ class Request:
             QueueFullError, DeadlinePassedError, DisconnectedError: see `admission`.
         """
         artifact, record = self.models.resolve(scene.model), self.record
-        model = artifact.model
         record.models.add(artifact.key)
-        limits, admission, ticket = self.runtime.limits, self.runtime.admission, self.ticket
-        most = limits.answer_bytes if most_bytes is None else most_bytes
+        admission, ticket = self.runtime.admission, self.ticket
+        most = self.runtime.limits.answer_bytes if most_bytes is None else most_bytes
 
         def read(_: object) -> tuple[Reading, partial[Fields]]:
-            reading = read_scene(
-                scene,
-                model.vocabulary,
-                limits,
-                self.look_ups,
-                roles=None if model.places is None else model.places.roles,
-                profiles=artifact.manifest.vocabulary.profiles,
-                may_be_empty=question.samples,
-            )
-            options = question.read(scene, model, reading)
-            words = list(reading.unknown.words.values())
-            enlarged = model.with_words(words) if words else model
-            return reading, partial(question.answer, enlarged, reading.scene, **options)
+            return self._read(question, scene, artifact)
 
         def finish(reading: Reading, ask: Callable[[], Fields], began: float) -> _Computed:
             fields = ask()
@@ -108,7 +96,7 @@ class Request:
             began = monotonic()
             return finish(*read(None), began)
 
-        is_fast = is_quick(scene, model.vocabulary)
+        is_fast = is_quick(scene, artifact.model.vocabulary)
         if question.samples:
             reading, ask = read(None) if is_fast else await admission.in_worker(ticket, read)
             weight = ask.keywords["count"] * (ask.keywords["steps"] or STEPS)
@@ -130,6 +118,25 @@ class Request:
             artifact.key, question.name, waited, seconds, len(scene.objects), answer
         )
         return body
+
+    def _read(
+        self, question: Question[RequestT], scene: RequestT, artifact: Artifact
+    ) -> tuple[Reading, partial[Fields]]:
+        """Return the scene as the model reads it, and the call that computes the answer."""
+        model = artifact.model
+        reading = read_scene(
+            scene,
+            model.vocabulary,
+            self.runtime.limits,
+            self.look_ups,
+            roles=None if model.places is None else model.places.roles,
+            profiles=artifact.manifest.vocabulary.profiles,
+            may_be_empty=question.samples,
+        )
+        options = question.read(scene, model, reading)
+        words = list(reading.unknown.words.values())
+        enlarged = model.with_words(words) if words else model
+        return reading, partial(question.answer, enlarged, reading.scene, **options)
 
 
 def _too_large(question: Question[Any], most: int) -> AnswerTooLargeError:
