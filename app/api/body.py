@@ -78,9 +78,9 @@ def parse(body: bytes, most: int) -> Any:
     A body of more than ``most`` bytes must be an object. It is parsed value by value.
 
     Raises:
-        NotJSONError: the text is not UTF-8, or has a byte order mark, NaN, Infinity, a lone
-            surrogate, nesting deeper than 200, an integer of more than 4,300 digits, or duplicate
-            names in an object.
+        NotJSONError: the text is not JSON in UTF-8, or nests deeper than 200 levels. Also for a
+            byte order mark, NaN, Infinity, lone surrogates, integers of more than 4,300 digits, and
+            duplicate names in an object.
         InvalidRequestError: the body has too many arrays or objects, an object has more than
             `MAX_MEMBERS` members, or a list of a large body has more than `MAX_BATCH` entries.
     """
