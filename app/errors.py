@@ -33,7 +33,7 @@ Step = Literal[
 ]
 """A step of a request. The steps of a route determine the errors in its documentation."""
 
-_MOST_NAMED: Final = 50  # known names in the message of an error
+_MOST_NAMED: Final = 50  # names in the message of an error
 
 ERRORS: Final[dict[str, type["ServiceError"]]] = {}
 """All problem types by slug, in the order of this module."""
@@ -48,28 +48,18 @@ def some_of(names: Iterable[str]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class LocatedError:
-    """One error in a request.
+    """One error in a request."""
 
-    Attributes:
-        location: path to the invalid value in the request.
-        message: description of the error, without a copy of the input.
-        suggestions: known names that are similar to an unknown name, most similar name first.
-    """
-
-    location: Location
-    message: str
-    suggestions: tuple[str, ...] = ()
+    location: Location  # of the invalid value
+    message: str  # without a copy of the input
+    suggestions: tuple[str, ...] = ()  # names similar to an unknown name, most similar name first
 
 
 class ServiceError(HTTPException):
     """Base class of all errors that the service answers with.
 
-    A subclass without a slug has the problem type of its base class.
-
-    Args:
-        detail: cause of this error. Clients receive it. The default is the title.
-        errors: the errors in the request. The first `MAX_ERRORS` are kept.
-        headers: further headers of the response.
+    A subclass without a slug has the problem type of its base class. Clients receive ``detail``, by
+    default the title, and the first `MAX_ERRORS` of ``errors``.
     """
 
     slug: ClassVar[str]  # stable name, which clients can compare
@@ -140,9 +130,7 @@ class RequestError(ServiceError):
     def locate(self, body: Any, at: Location = ()) -> None:
         """Convert the located errors to `errors` with JSON pointers. A second call has no effect.
 
-        Args:
-            body: the scene as the client sent it, for the pointers; see `pointer`.
-            at: location of the scene in a batch request. It is empty for other requests.
+        ``body`` is the scene as the client sent it; see `pointer`. ``at`` is its place in a batch.
         """
         self.errors += [
             FieldError(

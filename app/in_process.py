@@ -22,9 +22,6 @@ class _FixedSettings(Settings):
 class InProcess(httpx.BaseTransport):
     """Transport that runs the application on its own event loop in its own thread.
 
-    Args:
-        store: directory of published models.
-
     Raises:
         InvalidRequestError: the store is not a directory.
     """

@@ -32,9 +32,9 @@ _logger = logging.getLogger("app.server")
 class Server(uvicorn.Server):
     """A server that shuts down in three steps on SIGTERM.
 
-    1. The server answers readiness checks with 503 and closes each connection after its answer.
-       This step takes ``drain_seconds``, so that load balancers notice the failing readiness check.
-       A second signal, or Ctrl-C, ends this step at once.
+    1. For ``drain_seconds``, the server answers readiness checks with 503, so that load balancers
+       notice, and closes each connection after its answer. A second signal, or Ctrl-C, ends this
+       step at once.
     2. The server closes the listening socket.
     3. The server finishes the requests in progress.
 
@@ -155,16 +155,15 @@ def _page(host: str, port: int) -> str:
 
 
 def _lan_addresses() -> list[str]:
-    """Return the IPv4 addresses of this machine's network interfaces, except the loopback.
+    """Return the IPv4 addresses of this machine, except the loopback.
 
-    Without such an address, and on other systems than Linux, the list contains the machine's name
-    in multicast DNS.
+    Without one, and on other systems than Linux, return the machine's name in multicast DNS.
     """
-    found = []
+    addresses = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         for _, name in socket.if_nameindex():
             with suppress(OSError):  # the interface has no address
                 answer = fcntl.ioctl(probe, _SIOCGIFADDR, struct.pack("256s", name.encode()))
-                found.append(socket.inet_ntoa(answer[20:24]))
+                addresses.append(socket.inet_ntoa(answer[20:24]))
     name = f"{socket.gethostname().partition('.')[0]}.local"
-    return [address for address in found if not address.startswith("127.")] or [name]
+    return [address for address in addresses if not address.startswith("127.")] or [name]

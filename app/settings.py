@@ -79,11 +79,11 @@ class _Environment(EnvSettingsSource):
     def __call__(self) -> dict[str, Any]:
         """Return the settings in the environment. Unknown ones raise pydantic.ValidationError."""
         names = [name.upper() for name in self.settings_cls.model_fields]
-        known = {*names, *_OF_CLIENTS, *_WITHOUT_USE}
+        accepted = {*names, *_OF_CLIENTS, *_WITHOUT_USE}
         errors: list[InitErrorDetails] = []
         for variable, value in sorted(os.environ.items()):
             name = variable.upper().removeprefix(_PREFIX)
-            if name == variable.upper() or not value or name in known:
+            if name == variable.upper() or not value or name in accepted:
                 continue
             if _SERVICE_LINK.fullmatch(f"{name}={value}"[:256]):
                 continue

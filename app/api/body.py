@@ -40,9 +40,7 @@ _PART: Final = 64 * 1024
 
 
 def validated(value: Any, form: type[FormT], *, at: errors.Location = ()) -> FormT:
-    """Validate a JSON value. Refuse lists with too many entries before their validation.
-
-    ``at`` is the location of the value in a batch request. It is empty for other requests.
+    """Validate the JSON value at a location. Refuse too long lists before their validation.
 
     Raises:
         InvalidRequestError: the value does not match the schema.
@@ -79,12 +77,10 @@ def parse(body: bytes, most: int) -> Any:
 
     A body of more than ``most`` bytes must be an object. It is parsed value by value.
 
-    The function refuses encodings other than UTF-8, a byte order mark, NaN and Infinity, lone
-    surrogates, nesting deeper than 200 levels, integers of more than 4,300 digits, and duplicate
-    names in an object.
-
     Raises:
-        NotJSONError: the function refuses the text.
+        NotJSONError: the text is not JSON in UTF-8, or nests deeper than 200 levels. Also for a
+            byte order mark, NaN, Infinity, lone surrogates, integers of more than 4,300 digits, and
+            duplicate names in an object.
         InvalidRequestError: the body has too many arrays or objects, an object has more than
             `MAX_MEMBERS` members, or a list of a large body has more than `MAX_BATCH` entries.
     """
@@ -108,10 +104,9 @@ def parse(body: bytes, most: int) -> Any:
 
 
 def _check_density(body: bytes, most: int) -> None:
-    """Check that a large body has at most one array or object for every five bytes.
+    """Check that each part of a large body has at most one array or object for every five bytes.
 
-    The shortest sensible one is the array of a pair, such as `[1,2],`. The check applies to each
-    part of ``most`` bytes.
+    The shortest sensible one is the array of a pair, such as `[1,2],`.
     """
     for start in range(0, len(body), most) if len(body) > SMALL else ():
         part = body[start : start + most]

@@ -87,9 +87,8 @@ def route_path(scope: Scope) -> str:
 class Recorded:
     """Complete the headers of each response, and record the request in metrics and access log.
 
-    The header `X-Request-Id` of the response and the access log contain the id of the request. The
-    client may choose an id of 1 to 128 unreserved URI characters or colons. The application
-    ``other`` gets everything but requests, such as the start of the service.
+    The client may choose the request id: 1 to 128 unreserved URI characters or colons. The
+    application ``other`` gets everything but requests, such as the start of the service.
     """
 
     def __init__(self, app: ASGIApp, other: ASGIApp, settings: Settings, runtime: Runtime) -> None:
@@ -168,9 +167,6 @@ class HostCheck:
 
     This check prevents DNS rebinding, where an attacker points the host name of a web page at this
     machine. That attack needs a name, so every IP address is accepted.
-
-    Args:
-        names: accepted host names, in lower case, without ports.
     """
 
     def __init__(self, app: ASGIApp, names: frozenset[str]) -> None:
@@ -199,12 +195,7 @@ class Failures:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request.
-
-        Raises:
-            Exception: a part of the response has been sent already. The error makes the server
-                close the connection.
-        """
+        """Answer a request. If its response has begun, raise the error to close the connection."""
         try:
             await self._app(scope, receive, send)
         except Exception as error:  # noqa: BLE001 - _fail() answers and logs every error
@@ -232,11 +223,7 @@ class KeyCheck:
         self._app, self._key = app, key.get_secret_value().encode()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on.
-
-        Raises:
-            UnauthorizedError: the request lacks the key.
-        """
+        """Pass a request on, or raise UnauthorizedError if it lacks the key."""
         path, headers = route_path(scope), Headers(scope=scope)
         scheme, _, token = headers.get("authorization", "").partition(" ")
         key = headers.get(API_KEY) or (token.strip() if scheme.lower() == "bearer" else "")
@@ -281,10 +268,8 @@ class Deadline:
 
     def _seconds_of(self, value: bytes) -> float:
         if not _TIMEOUT.fullmatch(value) or int(value) > self._longest:
-            detail = (
-                f"{TIMEOUT_HEADER} must be a whole number from 1 to {self._longest} (milliseconds)."
-            )
-            raise errors.BadRequestError(detail)
+            valid = f"a whole number from 1 to {self._longest} (milliseconds)"
+            raise errors.BadRequestError(f"{TIMEOUT_HEADER} must be {valid}.")
         return int(value) / 1e3
 
 

@@ -1,8 +1,4 @@
-"""Liveness and readiness.
-
-The process is ready if its default model has answered a question during the warm-up. The module
-also has the route of the metrics.
-"""
+"""Liveness, readiness (the default model has answered in the warm-up) and metrics."""
 
 from functools import partial
 

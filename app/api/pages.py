@@ -1,7 +1,6 @@
 """HTML pages: the scene editor (board), the API documentation and a page for each problem type.
 
-With the Content-Security-Policy of these pages, a browser loads files only from this service. So a
-page cannot contact another host by mistake.
+Their Content-Security-Policy lets a browser load files only from this service.
 """
 
 from html import escape

@@ -65,7 +65,7 @@ async def handle(request: Request, error: Exception) -> Response:
         path, paths = request.scope["path"][:64].lower(), request.app.state.paths
         if similar := get_close_matches(path, paths):
             problem.detail += f" Similar paths: {', '.join(similar)}."
-        if any(path.endswith(known) for known in paths if len(known) > 1):
+        if any(path.endswith(route) for route in paths if len(route) > 1):
             problem.detail += (
                 " If a proxy adds a prefix to paths, the proxy must strip it, and SCENE_ROOT_PATH "
                 "must name it."

@@ -78,8 +78,7 @@ async def _validated(
 def _failed(error: Exception, number: int, scene: Any, request_id: str) -> tuple[str, bytes]:
     """Return the outcome for the metrics and the answer's entry of a failed scene.
 
-    This is a separate function, because an error refers to the frame of `_answer_each`. A local
-    variable of that frame must not refer to the error, to avoid a reference cycle.
+    This is a separate function to avoid a reference cycle; see `gateway._fail`.
     """
     if isinstance(error, RequestError):
         error.locate(scene, ("scenes", number))

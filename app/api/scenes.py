@@ -53,7 +53,7 @@ async def scenes(data: ScenesRequest, http: Request) -> bytes:
 
 
 def _read(data: ScenesRequest, request_id: str, limit: int, stop: Callable[[], bool]) -> bytes:
-    """Return the answer as JSON. Its scenes have at most ``limit`` bytes in total.
+    """Return the answer as JSON, with at most ``limit`` bytes of scenes.
 
     ``stop`` returns whether the request has ended.
     """
@@ -76,8 +76,8 @@ def _read(data: ScenesRequest, request_id: str, limit: int, stop: Callable[[], b
 
     for number, (name, read) in enumerate(readers.items()):
         if number == MAX_BATCH or size > limit or stop():
-            left = f"the answer leaves out {len(readers) - number} of {len(readers)} scenes"
-            note(None, None, "too-many", left)
+            omitted = f"the answer leaves out {len(readers) - number} of {len(readers)} scenes"
+            note(None, None, "too-many", omitted)
             break
         try:
             fields = read()
@@ -89,8 +89,8 @@ def _read(data: ScenesRequest, request_id: str, limit: int, stop: Callable[[], b
             words = str(error) if isinstance(error, MessageError) else "a value is not valid JSON"
             note(None, None, "refused", f"{name}: {words}" if name else words)
             continue
-        for place, reason, detail in fields.notes[:_MOST_NOTES]:
-            note(len(converted), place, reason, detail)
+        for detection, reason, detail in fields.notes[:_MOST_NOTES]:
+            note(len(converted), detection, reason, detail)
         converted.append(scene)
     if not converted:
         raise UnreadableFileError(detail=notes[0].detail if notes else "The file is empty.")
@@ -112,6 +112,6 @@ def _content(data: ScenesRequest) -> bytes:
 
 
 def _in_one_line(message: str) -> str:
-    """Return the begin of a message, without line breaks and other unprintable characters."""
+    """Return the start of a message, without line breaks and other unprintable characters."""
     words = " ".join(message[:_MOST_CHARACTERS].split())
     return "".join(letter if letter.isprintable() else "\ufffd" for letter in words)

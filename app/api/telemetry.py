@@ -1,8 +1,7 @@
 """OpenTelemetry traces. FastAPI creates the spans. Traces are off by default.
 
-The service sends only traces to OpenTelemetry. Prometheus reads the metrics
-(`app/serving/metrics.py`). The service does not send log records, because these contain exception
-messages.
+Prometheus reads the metrics (`app/serving/metrics.py`). The service does not send log records,
+because these contain exception messages.
 """
 
 import os
@@ -16,13 +15,12 @@ from app import __version__
 # So spans of these requests would be more numerous than all other spans.
 _UNTRACED: Final = ("/health", "/metrics", "/static")
 # FastAPI copies these span attributes from the request, so they may contain private data.
-_MADE_UP: Final = ("url.path", "url.query", "http.request.method_original")
+_REDACTED: Final = ("url.path", "url.query", "http.request.method_original")
 
 
 def configuration(*, enabled: bool) -> TelemetryConfig:
     """Return the telemetry configuration for `FastAPI`.
 
-    Environment variables such as ``OTEL_EXPORTER_OTLP_ENDPOINT`` set the destination of the spans.
     `Settings` has already checked that the OpenTelemetry packages are installed.
     """
     if not enabled:
@@ -35,7 +33,7 @@ def configuration(*, enabled: bool) -> TelemetryConfig:
         """Redact the span attributes that contain text from the client."""
 
         def on_start(self, span: Span, parent_context: Context | None = None) -> None:
-            for name in _MADE_UP:
+            for name in _REDACTED:
                 if name in (span.attributes or {}):
                     span.set_attribute(name, "REDACTED")
 

@@ -15,8 +15,7 @@ requested room type, it keeps that of its start.
 
 The base rates are those of whole scenes (`Weights.scene_bias`). They stay the same in all sweeps.
 
-A sweep takes microseconds and releases the interpreter's lock. The result of a chain depends only
-on its conditions and its random stream.
+The result of a chain depends only on its conditions and its random stream.
 
 Source: Gordon, Salmond and Smith, "Novel approach to nonlinear/non-Gaussian Bayesian state
 estimation" (1993), for resampling and moving.
@@ -64,60 +63,35 @@ def random_stream(seed: int, number: int) -> np.random.Generator:
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """The fixed conditions of a chain.
+    """The fixed conditions of a chain."""
 
-    Attributes:
-        classes: distinct indices of the classes that stay present, ascending.
-        observed: observed relations between these classes, or None without observed relations.
-        room: index of the room type, or None if unknown.
-        profile: index of the data source whose base rates apply, or None.
-    """
-
-    classes: Int[NDArray, " n"]
-    observed: ObservedRelations | None
-    room: int | None = None
-    profile: int | None = None
+    classes: Int[NDArray, " n"]  # classes that stay present, distinct and ascending
+    observed: ObservedRelations | None  # relations between these classes
+    room: int | None = None  # room type; None if unknown
+    profile: int | None = None  # data source whose base rates apply
 
 
 @dataclass(frozen=True, slots=True)
 class ChainState:
-    """The final state of a chain.
+    """The final state of a chain."""
 
-    Attributes:
-        classes: indices of the present classes, ascending.
-        room: index of the room type, or None if unknown.
-        logits: logits of the relations between the classes at temperature 1.
-        r: relations that are on. Relations of a class to itself are on only if observed.
-    """
-
-    classes: Int[NDArray, " n"]
-    room: int | None
-    logits: Float[NDArray, "A n n"]
-    r: Bool[NDArray, "A n n"]
+    classes: Int[NDArray, " n"]  # present classes, ascending
+    room: int | None  # room type; None if unknown
+    logits: Float[NDArray, "A n n"]  # of the relations, at temperature 1
+    r: Bool[NDArray, "A n n"]  # relations that hold; those of a class to itself only if observed
 
 
 class ChainArrays(NamedTuple):
-    """Weights for Gibbs sweeps. `weights.layout` explains W.
-
-    Attributes:
-        WT: transpose of W.
-        L: couplings, or no rows for a machine without couplings.
-        b: biases of the classes.
-    """
+    """Weights for Gibbs sweeps; see `weights.layout`."""
 
     W: Float[NDArray, "V H1"]
-    WT: Float[NDArray, "H1 V"]
-    L: Float[NDArray, "V|0 V"]
+    WT: Float[NDArray, "H1 V"]  # transpose of W
+    L: Float[NDArray, "V|0 V"]  # without rows for a machine without couplings
     b: Float[NDArray, " V"]
 
 
 class SceneChains:
-    """Gibbs chains of a machine.
-
-    Args:
-        units: relation units of the machine. With None, the class builds them.
-        excluded: room types of stored scenes that start a chain only on request.
-    """
+    """Gibbs chains of a machine. Scenes of `excluded` room types start a chain only on request."""
 
     def __init__(
         self,
@@ -149,22 +123,14 @@ class SceneChains:
         steps: int,
         stream: np.random.Generator,
     ) -> Bits:
-        """Return the presence of each class after ``steps`` sweeps of a chain from a scene.
-
-        Args:
-            present: presence of each class in the scene.
-            room: index of the room type that the chain keeps, or None.
-        """
+        """Return the presence of each class after ``steps`` sweeps of a chain from a scene."""
         conditions = Conditions(np.zeros(0, np.int64), None, room)
         on = (present > 0).astype(np.uint8)
         self.under(conditions).sweep(on, steps, stream)
         return on
 
     def sample_weights(self, conditions: Conditions) -> Float[NDArray, " N"]:
-        """Return the probability of each stored scene as the start of a chain.
-
-        The log weight has a term of its room type and one of the required classes; see the module.
-        """
+        """Return the probability of each stored scene as the start of a chain; see the module."""
         machine, classes = self.machine, conditions.classes
         logits = machine["b"][classes] + self.mean @ machine["W"][classes].T
         if machine.spec.coupled:
@@ -176,8 +142,7 @@ class SceneChains:
     def _room_log_weights(self, room: int | None) -> Float[NDArray, " N"]:
         """Return the log weight of each stored scene for a requested room type.
 
-        Without a requested room type, the excluded room types have a low weight. If no stored
-        scene has the requested room type, Q and Y of this room type give the log weight.
+        Without a requested room type, the excluded room types have a low weight.
         """
         machine = self.machine
         stored_rooms = machine["fantasy_rooms"]
@@ -194,10 +159,7 @@ class SceneChains:
 
 
 class ConditionedChains:
-    """Chains under the same conditions. Each chain has its own random stream.
-
-    `SceneChains.under` creates this object.
-    """
+    """Chains under the same conditions; see `SceneChains.under`."""
 
     def __init__(self, chains: SceneChains, conditions: Conditions, temperature: float) -> None:
         self._chains, self._machine = chains, chains.machine
@@ -228,8 +190,7 @@ class ConditionedChains:
     def draw(self, steps: int, stream: np.random.Generator) -> ChainState:
         """Run ``steps`` sweeps of one chain with its random stream and return its final state.
 
-        The chain starts at a random stored scene; see `SceneChains.sample_weights`. If the machine
-        stores no scenes, the start has only the required classes.
+        If the machine stores no scenes, the start has only the required classes.
         """
         on, room = np.zeros(self._machine.spec.V, np.uint8), self._room
         if self._machine.spec.N:
@@ -249,11 +210,7 @@ class ConditionedChains:
         return ChainState(classes, self._room, logits, r)
 
     def sweep(self, on: Bits, steps: int, stream: np.random.Generator) -> Int[NDArray, " units"]:
-        """Run ``steps`` sweeps from the classes ``on``, which change in place.
-
-        Returns:
-            The state of each hidden unit.
-        """
+        """Run sweeps that change the classes ``on`` in place. Return the states of the units."""
         on |= self._required_classes
         h1 = np.zeros(self._machine.spec.units, np.int64)
         while steps > 0:
@@ -282,10 +239,9 @@ class ConditionedChains:
         logits: Float[NDArray, "A n n"],
         stream: np.random.Generator,
     ) -> Bool[NDArray, "A n n"]:
-        """Sample the relations r between different classes.
+        """Sample the relations r between different classes. Observed relations keep their value.
 
-        Observed units keep their value. Relations of a class to itself are off unless observed,
-        because other units do not depend on them.
+        Relations of a class to itself are off unless observed: other units do not depend on them.
         """
         r = np.zeros(logits.shape, np.bool_)
         free = ~np.broadcast_to(np.eye(len(classes), dtype=np.bool_), r.shape)
@@ -317,12 +273,7 @@ class ConditionedChains:
 
         b contains the base rates, which depend on the profile or on the listed classes. The first
         terms are log p(v, t) + log Z, where t is the room type. An unknown room type has e_t = 0
-        and Y_t = 0. The last term is the log-probability of the relations given the sampled h1.
-
-        Args:
-            state: final state of a chain.
-            shown: True for classes that count as present.
-            kept: True for relations that count as on.
+        and Y_t = 0. Only `shown` classes count as present, and only `kept` relations as on.
         """
         if state.room != self._room:
             return self._in_room(state.room).log_score(state, shown, kept)
@@ -353,13 +304,7 @@ def sweeps(
     """Run Gibbs sweeps that change the presence `on` of the classes and the states `h1` in place.
 
     A sweep draws h1 given the classes, and then the classes. Coupled classes are drawn one after
-    another, each given all others.
-
-    Args:
-        bias: bias of h1.
-        required: 1 for classes that stay present.
-        beta: 1 / temperature.
-        uniform: random numbers in [0, 1).
+    another, each given all others. `required` classes stay present. beta is 1 / temperature.
     """
     (V, H1), units, coupled = w.W.shape, len(h1), len(w.L) > 0
     others = H1 // units  # states of a unit but the first, whose logit is 0

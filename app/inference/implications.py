@@ -92,13 +92,9 @@ def draw_in_groups(
 ) -> None:
     """Sample the free relations of r, which are off before, group after group.
 
-    Each group is sampled given the relations of all earlier groups. The function assigns relations
-    to groups at random. But a(i, j) and a(j, i) are always in different groups.
-
-    Args:
-        logits: logits of the relations without the changes by other relations.
-        uniform: random numbers in [0, 1) that decide whether each relation holds.
-        group_numbers: random numbers in [0, 1) that select the group of each relation.
+    Each group is sampled given the relations of all earlier groups. `group_numbers`, random numbers
+    in [0, 1), select the groups. a(i, j) and a(j, i) are always in different groups. `logits` lack
+    the changes by other relations.
     """
     A, n, _ = r.shape
     group = np.empty(r.shape, np.int64)

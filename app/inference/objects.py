@@ -59,10 +59,6 @@ class HiddenLogOdds:
     The object computes each row of a result separately with the same operations. So the bits of a
     row do not depend on the other rows.
 
-    Args:
-        weights: weights between h1 and each class or room type.
-        states: number of states of a hidden unit.
-
     Raises:
         ValueError: a weight is NaN, or its absolute value is above `LARGEST_WEIGHT`.
     """
@@ -90,10 +86,6 @@ class HiddenLogOdds:
 class ObjectScorer:
     """The log-odds of classes and room types of a machine with constant weights.
 
-    Attributes:
-        hidden, hidden_of_rooms: contributions of the hidden units to the log-odds of the classes,
-            and of the room types.
-
     Raises:
         ValueError: a weight is NaN or too large; see `HiddenLogOdds`.
     """
@@ -116,16 +108,10 @@ class ObjectScorer:
         coverage: float,
         room: int | None = None,
     ) -> Float[NDArray, " V"]:
-        """Return the log-odds of each class given the listed classes.
+        """Return the log-odds of each class given the listed classes and the logits x of h1.
 
-        Entries of listed classes have no meaning.
-
-        Args:
-            x: logits of h1 given the listed classes.
-            classes, presence: the listed classes, and the probabilities that they are present.
-            profile: index of a data source, whose base rates apply, or None.
-            coverage: listed share of the scene. 1 means that all classes but one are listed.
-            room: index of the room type, or None if unknown.
+        Entries of listed classes have no meaning. `coverage` is the listed share of the scene; 1
+        means all classes but one. The base rates of the data source `profile` apply, if any.
         """
         weights, log_odds = self._weights, self.hidden(x[None])[0]
         bias = self._biases.get((coverage, room))
@@ -161,9 +147,6 @@ class ObjectScorer:
 
         If `explained`, the second result is how much each listed class j changes them: the log-odds
         of i with class j, minus the log-odds of i without class j. An entry with i = j is 0.
-
-        Args:
-            profile, room: see `absent`. The room type is that of the scene.
         """
         weights, rows = self._weights, np.arange(len(scene.classes))
         bias = weights["b"] + weights.room_couplings(room) + weights["kappa"][-1]
@@ -172,11 +155,7 @@ class ObjectScorer:
     def reasons_for_absent(
         self, scene: EncodedScene, profile: int | None, candidates: Int[NDArray, " N"]
     ) -> Float[NDArray, "N n"]:
-        """Return how much each listed class changes the log-odds of unlisted candidates.
-
-        An entry is the log-odds of a candidate with the listed class, minus its log-odds without
-        this class.
-        """
+        """Return the change of the log-odds of unlisted candidates by each listed class."""
         bias, rows = self._weights["b"], candidates[:0]
         return self._explained(bias, scene, profile, rows, candidates, explained=True)[1]
 
@@ -192,13 +171,8 @@ class ObjectScorer:
     ) -> tuple[Float[NDArray, " N"], Float[NDArray, "N n|0"]]:
         """Return the log-odds of N target classes given the listed classes, and their changes.
 
-        The change by class j is the log-odds minus their value without class j. The result has no
-        changes if not `explained`.
-
-        Args:
-            bias: biases of all classes.
-            rows: index of each target among the listed classes. A class is not evidence for itself.
-                `rows` is empty if the targets are not listed.
+        The change by class j is the log-odds minus their value without class j. `rows` are the
+        indices of listed targets among the listed classes: a class is not evidence for itself.
         """
         weights, classes, presence = self._weights, scene.classes, scene.presence
         n, others = len(classes) if explained else 0, self._states - 1
@@ -230,9 +204,9 @@ class ObjectScorer:
 
             increase_ij = hidden(W_j) at x = c1 + W_i - hidden(W_j) at x = c1 + L_ij
 
-        The increase is symmetric in i and j. It leaves out the room type, and what the classes tell
-        about the data source. The second result is the increase multiplied by the probability of
-        each class in this scene. The scorer keeps both results of each class, at most 8 V² bytes.
+        The increase is symmetric in i and j. It leaves out room type and data source. The second
+        result is the increase times the probability of each class in this scene. The scorer keeps
+        both results of each class, at most 8 V² bytes.
         """
         kept = self._increases.get(i)
         if kept is None:
@@ -250,14 +224,7 @@ class ObjectScorer:
         classes: Int[NDArray, " n"],
         presence: Float[NDArray, "N n"],
     ) -> Float[NDArray, "N C"]:
-        """Return log p(v | t) of the listed classes v of N scenes for each room type t.
-
-        The values of a room type have a constant of their own.
-
-        Args:
-            x: logits of h1 given the listed classes.
-            presence: probabilities that the classes are present.
-        """
+        """Return log p(v | t) of the listed classes v of N scenes, up to a constant of each t."""
         # The sum has float64 digits, so that listed structure, whose terms are 0, changes none.
         evidence = self.hidden_of_rooms(x).astype(np.float64)
         if self._weights.spec.coupled:
@@ -272,10 +239,7 @@ class ObjectScorer:
         presence: Float[NDArray, "N n"],
         profile: int | None,
     ) -> Float[NDArray, "N C"]:
-        """Return log p(t | listed classes) of each room type t.
-
-        `room_evidence` and `absent` describe the arguments.
-        """
+        """Return log p(t | listed classes) of each room type t; see `absent`."""
         weights = self._weights
         logits = weights["e"] + self.room_evidence(x, classes, presence)
         if not weights.spec.profiles:
@@ -294,13 +258,9 @@ def _hidden_log_odds(
 ) -> Float[NDArray, "B rows"]:
     """Return the result of `HiddenLogOdds`.
 
-    After each group of sums, the function splits the product into mantissa and exponent, and adds
-    the exponent to an integer. So one log at the end is enough.
-
-    Args:
-        p: probabilities of the states of h1.
-        factors: exponentials of the weights, in tiles of `width` rows.
-        group: maximum number of sums in a product.
+    After each `group` of sums, the function splits the product into mantissa and exponent, and adds
+    the exponent to an integer. So one log at the end is enough. `factors` are exponentials of the
+    weights, in tiles of `width` rows.
     """
     tiles, units, others, width = factors.shape
     log_odds = np.empty((len(p), rows), np.float32)
@@ -341,10 +301,7 @@ def _hidden_changes(
 ) -> tuple[Float[NDArray, " N"], Float[NDArray, "N n"]]:
     """Return hidden(W_i) of N classes i, and its changes by n listed classes.
 
-    Args:
-        p: probabilities of the states of h1.
-        raised: exponentials of the weights of the N classes.
-        removed: exponentials of the contributions of the n classes, negated.
+    `raised` is exp(W_i). `removed` is exp(-contribution) of each listed class.
     """
     (N, units, others), n = raised.shape, len(removed)
     total, change = np.zeros(N, np.float32), np.zeros((N, n), np.float32)
@@ -384,8 +341,7 @@ def _source_effects(
     """Return the effect of the unknown data source on N target classes, and its changes.
 
     The effect on a class i is the mean base rate sum_q p_q a_qi over the Q data sources. p_q is the
-    probability of source q given the listed classes. The changes are those by the first n listed
-    classes. `ObjectScorer._explained` describes the other arguments.
+    probability of source q given the listed classes. The changes are those by the first n classes.
     """
     Q = len(f)
     # Part of each listed class in the logit of each source, and e^-part.

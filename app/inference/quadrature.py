@@ -30,11 +30,7 @@ _TAIL: Final = np.exp(-0.5 * (0.25 * np.arange(1, 21)) ** 2).astype(np.float32)
 
 
 def to_log_odds(mean: Float[NDArray, "*E"], spread: Float[NDArray, "*E"]) -> Float[NDArray, "*E"]:
-    """Return the log-odds of the mean of sigmoid(ℓ) for normal logits ℓ, at least `NO_UNIT`.
-
-    Args:
-        spread: √3 σ of the logits.
-    """
+    """Return the log-odds of the mean of sigmoid(ℓ), at least `NO_UNIT`. `spread` is √3 σ of ℓ."""
     log_odds = mean.ravel().astype(np.float32)
     # ravel() makes the arrays contiguous. For another layout, numba would compile the loop again.
     _to_log_odds(log_odds, spread.ravel())

@@ -31,8 +31,7 @@ from app.inference.weights import Weights, state_means
 Means = Float[NDArray, "B H1"]
 """B different means of h1."""
 Moments = tuple[Float[NDArray, "B R P"], Float[NDArray, "B R P"]]
-"""Means and √3 σ of the logits of R relations for P pairs. σ is the standard deviation of a logit.
-"""
+"""Means and √3 σ of the logits of R relations for P pairs; σ is the standard deviation."""
 
 NEVER: Final = np.float32(-1e4)
 """Logit of a relation for which the machine has no unit. Such a relation never holds."""
@@ -51,38 +50,23 @@ _LEFT_OUT: Final = 1.6e-2
 
 @dataclass(frozen=True, slots=True)
 class ObservedRelations:
-    """E observed relations between the n classes of a scene. Each relation holds or does not hold.
+    """E observed relations between the n classes of a scene, which hold or do not hold."""
 
-    Attributes:
-        a: number of the relation (left, on top, ...) of each unit.
-        i, j: indices of the subject classes and of the object classes, from 0 to n - 1.
-        r: 1 if the relation holds, else 0.
-    """
-
-    a: Int[NDArray, " E"]
-    i: Int[NDArray, " E"]
-    j: Int[NDArray, " E"]
-    r: Float[NDArray, " E"]
+    a: Int[NDArray, " E"]  # relation (left, on top, ...)
+    i: Int[NDArray, " E"]  # subject class, from 0 to n - 1
+    j: Int[NDArray, " E"]  # object class, from 0 to n - 1
+    r: Float[NDArray, " E"]  # 1 if the relation holds, else 0
 
 
 @dataclass(frozen=True, slots=True)
 class EncodedScene:
-    """The n distinct classes of a scene, their effect on the hidden units, and observed relations.
-
-    Attributes:
-        classes: indices of the classes.
-        presence: probability that each class is present.
-        log_counts: log of the number of instances of each class.
-        x: logits of h1 given the classes and the room type.
-        contributions: contribution of each class to x.
-        observed: observed relations, or None if the scene has no observed relations.
-    """
+    """The n distinct classes of a scene, their effect on h1, and observed relations."""
 
     classes: Int[NDArray, " n"]
-    presence: Float[NDArray, " n"]
-    log_counts: Float[NDArray, " n"]
-    x: Float[NDArray, " H1"]
-    contributions: Float[NDArray, "n H1"]
+    presence: Float[NDArray, " n"]  # probability that each class is present
+    log_counts: Float[NDArray, " n"]  # log of the number of instances
+    x: Float[NDArray, " H1"]  # logits of h1 given the classes and the room type
+    contributions: Float[NDArray, "n H1"]  # of each class to x
     observed: ObservedRelations | None
 
 
@@ -94,31 +78,20 @@ def encode(
     room: int | None = None,
     observed: ObservedRelations | None = None,
 ) -> EncodedScene:
-    """Compute the logits of h1 given the classes of a scene and its room type; see `EncodedScene`.
-
-    Args:
-        room: index of the room type, or None if the room type is unknown.
-    """
+    """Compute the logits of h1 given the classes of a scene and its room type."""
     contributions = presence[:, None] * weights["W"][classes]
     x = weights.room_bias(room) + contributions.sum(0)
     return EncodedScene(classes, presence, log_counts, x, contributions, observed)
 
 
 class Pairs(NamedTuple):
-    """Ordered pairs of classes.
-
-    Attributes:
-        classes: indices of the classes.
-        log_counts: log of the number of instances of each class.
-        presence: probability that each class is present.
-        i, j: positions of the subject and object class of each pair in `classes`.
-    """
+    """Ordered pairs of classes; see `EncodedScene`."""
 
     classes: Int[NDArray, " n"]
     log_counts: Float[NDArray, " n"]
     presence: Float[NDArray, " n"]
-    i: Int[NDArray, "B P"]
-    j: Int[NDArray, "B P"]
+    i: Int[NDArray, "B P"]  # position of the subject class in `classes`
+    j: Int[NDArray, "B P"]  # position of the object class in `classes`
 
 
 @lru_cache(maxsize=128)
@@ -129,19 +102,12 @@ def all_pairs(n: int) -> tuple[Int[NDArray, "1 P"], Int[NDArray, "1 P"]]:
 
 
 class RelationLogits(NamedTuple):
-    """The logits of all relations between the n classes of a scene.
+    """The logits of all relations between the n classes of a scene."""
 
-    Attributes:
-        mean: means of the logits given the classes alone.
-        spread: √3 σ, where σ is the standard deviation of each logit.
-        shift: change of each logit by the observed relations that hold.
-        shift_by_others: the same change without the observed relations of the same two classes.
-    """
-
-    mean: Float[NDArray, "A n n"]
-    spread: Float[NDArray, "A n n"]
-    shift: Float[NDArray, "A n n"]
-    shift_by_others: Float[NDArray, "A n n"]
+    mean: Float[NDArray, "A n n"]  # given the classes alone
+    spread: Float[NDArray, "A n n"]  # √3 σ; σ is the standard deviation
+    shift: Float[NDArray, "A n n"]  # change by the observed relations that hold
+    shift_by_others: Float[NDArray, "A n n"]  # without the relations of the same two classes
 
 
 class RelationUnits(ABC):
@@ -155,11 +121,10 @@ class RelationUnits(ABC):
     def moments(
         self, means: Means, pairs: Pairs, only: int | None = None, *, sampled: bool = False
     ) -> Moments:
-        """Return the moments of logits. A relation without a unit has the mean `NEVER`.
+        """Return the moments of the relation `only`, or of all A relations.
 
-        Args:
-            only: index of one relation (R = 1), or None for all relations (R = A).
-            sampled: True if h1 is a sample: its means are 0 or 1, so all variances are 0.
+        A relation without a unit has the mean `NEVER`. A `sampled` h1 has the means 0 or 1, so all
+        variances are 0.
         """
 
     def logits(self, scene: EncodedScene) -> RelationLogits:
@@ -188,11 +153,7 @@ class RelationUnits(ABC):
         """Return how much each of F features of the relations that hold changes a logit.
 
         `training/machines/triway.py` defines the features. The result is None for machines in which
-        relations do not change each other's logits directly.
-
-        Args:
-            x: logits of h1 given the classes.
-            beta: 1 / temperature.
+        relations do not change each other's logits directly. beta is 1 / temperature.
         """
         return None
 
@@ -201,8 +162,7 @@ class RelationUnits(ABC):
     ) -> Float[NDArray, "A n n"]:
         """Return the log-odds of all relations between the n classes of a scene.
 
-        With `leave_out_pair`, the observed relations of a pair are not evidence for its other
-        relations.
+        With `leave_out_pair`, relations of a pair are not evidence for its other relations.
         """
         shift = logits.shift_by_others if leave_out_pair else logits.shift
         return to_log_odds(logits.mean + shift, logits.spread)
@@ -216,15 +176,8 @@ class RelationUnits(ABC):
     ) -> tuple[Float[NDArray, "N R m"], Float[NDArray, "N R m"]]:
         """Return the log-odds of relations between absent candidate classes and anchor classes.
 
-        The method computes the log-odds of each candidate as if the candidate were present.
-
-        Args:
-            candidates: indices of the candidate classes.
-            anchors: positions of the anchor classes among the classes of the scene.
-            only: index of one relation (R = 1), or None for all relations (R = A).
-
-        Returns:
-            Log-odds with the candidate as subject, and log-odds with the anchor as subject.
+        The candidate is the subject in the first result, the anchor in the second. Each candidate
+        counts as present. `anchors` are positions among the classes of the scene.
         """
         N, m = len(candidates), len(anchors)
         i, j = np.empty((N, 2 * m), np.int64), np.empty((N, 2 * m), np.int64)
@@ -364,13 +317,7 @@ class SharedUnits(RelationUnits):
 
 
 class StandIns(RelationUnits):
-    """The relation units of a model with further classes, in which other classes stand in for them.
-
-    Args:
-        weights: weights with the further classes.
-        units: relation units of the other classes.
-        stand_in: class that stands in for each class.
-    """
+    """Relation units of a model with further classes. Each class uses those of its `stand_in`."""
 
     def __init__(
         self, weights: Weights, units: RelationUnits, stand_in: Int[NDArray, " V"]
@@ -452,15 +399,10 @@ def _mean_covariance(means: Float[NDArray, "N H1"], states: int) -> Float[NDArra
 
 
 class _PairTable(NamedTuple):
-    """Hash table of pairs of classes, whose rows are sorted by bucket.
+    """Hash table of pairs of classes, whose rows are sorted by bucket."""
 
-    Attributes:
-        start: first row of each bucket, and the end of the last bucket.
-        keys: key i V + j of the pair (i, j) of each row.
-    """
-
-    start: Int[NDArray, " buckets+1"]
-    keys: Int[NDArray, " pairs"]
+    start: Int[NDArray, " buckets+1"]  # first row of each bucket, and the end of the last
+    keys: Int[NDArray, " pairs"]  # i V + j of the pair (i, j) of each row
 
 
 def _pair_table(
@@ -497,23 +439,15 @@ def _pair_rows(table: _PairTable, pairs: Int[NDArray, " P"]) -> Int[NDArray, " P
 
 
 class _SharedArrays(NamedTuple):
-    """Weights of `SharedUnits`.
-
-    Attributes:
-        S, O: factors of each class as subject and as object. The last column is 1.
-        s, o: weights of each class as subject and as object of each relation.
-        n: weights of the log number of instances of subject and object class.
-        table: pairs of classes with a residual.
-        residual: residual weight w' of each pair of classes and each relation. The last row is 0.
-    """
+    """Weights of `SharedUnits`; see `Triway`. The last column of S and O is 1."""
 
     S: Float[NDArray, "V K+1"]
     O: Float[NDArray, "V K+1"]  # noqa: E741
     s: Float[NDArray, "V A"]
     o: Float[NDArray, "V A"]
     n: Float[NDArray, "A 2"]
-    table: _PairTable
-    residual: Float[NDArray, "pairs+1 A"]
+    table: _PairTable  # pairs of classes with a residual
+    residual: Float[NDArray, "pairs+1 A"]  # w' of each pair and relation; the last row is 0
 
 
 @compiled_in_any_order
@@ -530,11 +464,8 @@ def _shared_moments(
 
     The mean of a logit is base + U z, and its variance σ² is q'C q - sum_u (f_u'q)² with q = Y z.
     base are the terms that do not depend on the hidden units; see `SharedUnits`. σ is 0 if r is 0.
-
-    Args:
-        first: index of the first of the R consecutive relations.
-        C: lower half of each symmetric r x r matrix C. Entries off the diagonal are doubled. The
-            function subtracts the products of f from C, in place.
+    `first` is the first of the R consecutive relations. C has the lower half of each symmetric
+    r x r matrix, with doubled entries off the diagonal. It changes in place.
     """
     # Local names are faster: each access through the tuple would change a reference count.
     S, O, s, o, n, residual = w.S, w.O, w.s, w.o, w.n, w.residual  # noqa: E741

@@ -75,36 +75,22 @@ VARIANTS: Final[dict[str, type[RBM | Triway]]] = {"rbm": RBM, "gbm": GBM, "triwa
 class MachineSpec:
     """Sizes of one Boltzmann machine.
 
-    Attributes:
-        variant: ``rbm``, ``gbm`` or ``triway``.
-        V: number of object classes (visible units v).
-        A: number of canonical relations.
-        units: number of hidden units.
-        states: number of states of a hidden unit. 2 means a binary unit.
-        C: number of room types.
-        K: rank of the weights that relation units share (Triway).
-        G: rank of the effect of h1 on implications between relations (Triway). An implication is a
-            change of a relation's logit by other relations. 0 means no implications.
-        T: number of relation triples with an own weight. In RBM and GBM, each relation unit has
-            such a weight. In the Triway, only the triples of the sparse residual have own weights.
-        N: number of stored samples from Gibbs chains. New chains start at these samples. 0 means no
-            stored samples.
-        profiles: number of data sources with own base rates of the classes.
-        coupled: True if the machine has couplings L between classes.
+    An implication is a change of a relation's logit by other relations. In RBM and GBM, each
+    relation unit has an own weight; in the Triway, only the triples of the sparse residual.
     """
 
     variant: Variant
-    V: int
-    A: int
-    units: int
-    states: int = 2
-    C: int = 0
-    K: int = 0
-    T: int = 0
-    G: int = 0
-    N: int = 0
-    profiles: int = 0
-    coupled: bool = False
+    V: int  # object classes (visible units v)
+    A: int  # canonical relations
+    units: int  # hidden units
+    states: int = 2  # states of a hidden unit; 2: binary
+    C: int = 0  # room types
+    K: int = 0  # rank of the weights that relation units share (Triway)
+    T: int = 0  # triples (relation, subject class, object class) with an own weight
+    G: int = 0  # rank of the effect of h1 on implications (Triway); 0: no implications
+    N: int = 0  # stored samples of Gibbs chains, where new chains start
+    profiles: int = 0  # data sources with own base rates of the classes
+    coupled: bool = False  # whether the machine has couplings L between classes
 
     @property
     def judges_relations(self) -> bool:
@@ -135,10 +121,7 @@ class MachineSpec:
 
     @property
     def H1(self) -> int:  # noqa: N802 - the symbol of docs/models.md
-        """Number of states of the hidden units that have weights: units · (states - 1).
-
-        The first state of each unit has the energy 0, so it has no weights.
-        """
+        """Number of hidden states with weights: all but the first of each unit."""
         return self.units * (self.states - 1)
 
     def to_dict(self) -> dict[str, Any]:
@@ -147,11 +130,7 @@ class MachineSpec:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:
-        """Build a specification from the result of `to_dict`.
-
-        Raises:
-            ValueError: a name is unknown or missing, or a value is invalid.
-        """
+        """Build a specification from the result of `to_dict`; ValueError if it is invalid."""
         try:
             return cls(**values)
         except TypeError as error:

@@ -71,12 +71,7 @@ def layout(spec: MachineSpec) -> dict[str, tuple[type, tuple[int, ...]]]:
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """The constant arrays of a machine. `layout` lists their names.
-
-    Attributes:
-        spec: sizes of the machine.
-        arrays: maps names to arrays. All float arrays have the same precision. Integer arrays are
-            int32.
+    """The constant arrays of a machine.
 
     Raises:
         ValueError: an array is missing, unexpected or of a wrong shape, a triple has an invalid
@@ -84,7 +79,7 @@ class Weights:
     """
 
     spec: MachineSpec
-    arrays: Mapping[str, NDArray[Any]]
+    arrays: Mapping[str, NDArray[Any]]  # those of `layout`: floats of one precision, and int32
 
     def __post_init__(self) -> None:
         expected = {name: shape for name, (_, shape) in layout(self.spec).items()}
@@ -127,11 +122,7 @@ class Weights:
         return state_means(self["c1"] + self.chain_samples @ self["W"], self.spec.states)
 
     def enlarged(self, V: int, C: int) -> "Weights":
-        """Return the weights with further classes and room types at the end, whose weights are 0.
-
-        Args:
-            V, C: numbers of classes and room types.
-        """
+        """Return the weights for V classes and C room types. The new ones at the end have 0."""
         spec = replace(self.spec, V=V, C=C)
         arrays = {name: _padded(self[name], shape) for name, (_, shape) in layout(spec).items()}
         return Weights(spec, arrays)
@@ -151,11 +142,7 @@ class Weights:
     ) -> Float[NDArray, "N profiles"]:
         """Return p(q | listed classes) of each data source q in N scenes.
 
-        It is softmax(f + a v), or 1 for the source of a profile.
-
-        Args:
-            presence: probabilities that the listed classes are present.
-            profile: index of the data source whose base rates apply, or None.
+        It is softmax(f + a v), or 1 for the source `profile` whose base rates apply.
         """
         if profile is not None:
             one = np.zeros((len(presence), self.spec.profiles))
@@ -169,12 +156,8 @@ class Weights:
         """Return the biases of whole scenes for Gibbs chains: of each class, and of the room.
 
         The bias of a class is b + sum_q p(q) (a[q] + u[q]) + Y[t], and that of the room type t is
-        e[t] + sum_q p(q) y[q, t]; see `source_weights`. Without a required class and without a
+        e[t] + sum_q p(q) y[q, t]; see `source_weights`. Without required `classes` and without a
         profile, the mix of data sources determines them.
-
-        Args:
-            classes: indices of the required classes.
-            profile, room: index of the data source and of the room type, or None.
         """
         bias: NDArray[Any] = self["b"] + self.room_couplings(room)
         of_room = self["e"] if self.spec.C else np.zeros(1)
@@ -244,7 +227,7 @@ def _source_weights(
     classes: Int[NDArray, " n"],
     presence: Float[NDArray, "N n"],
 ) -> Float[NDArray, "N profiles"]:
-    """Return softmax(f + a v) of the data sources in N scenes; see `Weights.source_weights`.
+    """Return softmax(f + a v); see `Weights.source_weights`.
 
     The sums have float64 digits, so that listed structure, whose terms are 0, changes none.
     """

@@ -51,8 +51,7 @@ def _point(store: Store, alias: str, target: AliasTarget, expected: str | None) 
     """Point an alias at a usable version; see `Store.set_alias`."""
     load_model_set(store, release=Store(DEFAULT_STORE)).resolve(str(target))
     before = store.aliases().get(alias)
-    condition = before if expected is None else _target(expected)
-    store.set_alias(alias, target, expected=condition)
+    store.set_alias(alias, target, expected=before if expected is None else _target(expected))
     _print(f"alias '{alias}' points at {target}" + (f", before at {before}" if before else ""))
 
 
@@ -102,8 +101,7 @@ def _replacement(
 ) -> AliasTarget | None:
     """Return the target that replaces a shipped model of an earlier release, if an alias moves.
 
-    An alias of an own version stays. An alias that somebody moved back stays as long as this
-    release can load the old model.
+    An alias of an own version stays. So does one that was moved back, while the old model loads.
     """
     versions = target.versions(old.name) if old.version is None else (old.version,)
     shipped = source.shipped()

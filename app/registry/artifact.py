@@ -37,21 +37,13 @@ _DTYPES: Final = {float: "float32", int: "int32"}
 
 @dataclass(frozen=True, eq=False)
 class Artifact:
-    """The verified files of one version of a model, and the model that they contain.
-
-    Attributes:
-        manifest: description of the model and its files.
-        model: the model.
-        digest: SHA-256 of the manifest in hexadecimal. It depends on all files of the artifact.
-        card: model card in Markdown.
-        path: directory of the artifact.
-    """
+    """The verified files of one version of a model, and the model that they contain."""
 
     manifest: Manifest
     model: SceneModel
-    digest: str
-    card: str
-    path: Path
+    digest: str  # SHA-256 of the manifest in hexadecimal; it depends on all files
+    card: str  # Markdown
+    path: Path  # directory
 
     @cached_property
     def key(self) -> tuple[str, str]:
@@ -60,7 +52,7 @@ class Artifact:
 
     @cached_property
     def reference(self) -> ModelReference:
-        """Name, version, variant and digest of the model, in the form of the field `model`."""
+        """The field `model` of answers."""
         name, version = self.key
         return ModelReference(
             name=name, version=version, variant=self.manifest.variant, digest=self.digest
@@ -76,10 +68,8 @@ def write_artifact(
 ) -> Manifest:
     """Write an artifact into a new directory, whose parent exists, and sync it to disk.
 
-    Args:
-        state: maps names to arrays. It contains the arrays of `layout`, and optionally those of
-            `Offsets.tensors()`, `Counts.tensors()` and `Places.tensors()`.
-        storage_dtype: dtype of floating-point tensors with two or more axes; see `pack`.
+    ``state`` has the arrays of `layout`, and optionally those of `Offsets.tensors()`,
+    `Counts.tensors()` and `Places.tensors()`; see `pack` for ``storage_dtype``.
 
     Raises:
         ArtifactError: the artifact format cannot store a tensor; see `pack`.
@@ -121,12 +111,7 @@ def _write_files(directory: Path, weights: bytes, card: bytes, manifest: bytes) 
 def load_artifact(
     directory: Path, previous: Artifact | None = None, max_weights_bytes: int = MAX_WEIGHTS_BYTES
 ) -> Artifact:
-    """Read and verify an artifact.
-
-    Args:
-        directory: directory with exactly the three files of an artifact.
-        previous: an earlier artifact, which the function returns if its digest is unchanged.
-        max_weights_bytes: maximum size of the weights file, checked before the file is read.
+    """Read and verify an artifact. Return ``previous`` if its digest is unchanged.
 
     Raises:
         ArtifactError: the artifact is invalid. The exception describes the first error found.

@@ -74,11 +74,7 @@ _LIMITS = """\
 
 
 def render_card(description: Description, tensors: Mapping[str, TensorEntry]) -> str:
-    """Return the model card in Markdown.
-
-    Args:
-        tensors: maps the name of each stored tensor to its dtype and shape.
-    """
+    """Return the model card in Markdown."""
     words, parent = description.vocabulary, description.training.get("parent")
     bound = [_cell(source.source) for source in description.data if source.research_only]
     proposed = sum(not entry.structure for entry in words.objects)

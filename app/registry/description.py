@@ -57,39 +57,27 @@ class VocabularyEntry(Frozen):
 
 
 class DataSource(Frozen):
-    """One source of training scenes. ``digest`` is the SHA-256 of the data.
-
-    Attributes:
-        share: share of the weight of all scenes that teach objects; None if it is not recorded.
-        written: True for scenes drawn from written places. Other scenes were seen.
-    """
+    """One source of training scenes."""
 
     source: Text
     scenes: Count
-    digest: Sha256
+    digest: Sha256  # of the data
     terms: Text
     research_only: bool
-    share: float | None = None
-    written: bool = False
+    share: float | None = None  # of the weight of all scenes that teach objects; None: not recorded
+    written: bool = False  # True: the scenes are drawn from written places; False: they were seen
 
 
 class Metric(Frozen):
-    """One measured figure of the model's quality.
+    """One measured figure of the model's quality, with its 95 % confidence interval."""
 
-    Attributes:
-        task: name of the measured task, such as "T2 missing".
-        source: name of the source of the test scenes.
-        low, high: limits of the 95 % confidence interval.
-        n: number of measured cases, such as scenes or removed objects.
-    """
-
-    task: Text
-    source: Text
+    task: Text  # such as "T2 missing"
+    source: Text  # of the test scenes
     metric: Text
     value: float
     low: float
     high: float
-    n: Annotated[int, Field(ge=1)]
+    n: Annotated[int, Field(ge=1)]  # measured cases, such as scenes or removed objects
 
 
 MAX_EXAMPLES: Final = 8
@@ -141,34 +129,20 @@ Examples = Annotated[Many[Example], Field(max_length=MAX_EXAMPLES), AfterValidat
 
 
 class Description(Frozen):
-    """The description of a model: its manifest without the entries about files.
-
-    Attributes:
-        name, version: name and version of the model in the store.
-        created: time of creation in UTC.
-        spec: sizes of the machine, as returned by `MachineSpec.to_dict`.
-        vocabulary: V object classes, A relations and C room types, in the order of their indices.
-        calibration: conversion of log-odds into probabilities.
-        training: configuration and seed of the training, as JSON without a fixed schema.
-        data: sources of the training scenes.
-        metrics: figures measured on scenes that training did not use.
-        terms: terms of use of the weights.
-        libraries: maps the name of each library used in training to its version.
-        examples: example scenes for the visual page.
-    """
+    """The description of a model: its manifest without the entries about files."""
 
     name: ModelName
     version: Version
-    created: Timestamp
-    spec: dict[str, JsonValue]
+    created: Timestamp  # UTC
+    spec: dict[str, JsonValue]  # `MachineSpec.to_dict`
     vocabulary: VocabularyEntry
     calibration: Calibration
-    training: dict[str, JsonValue]
+    training: dict[str, JsonValue]  # configuration and seed, without a fixed schema
     data: Many[DataSource]
-    metrics: Many[Metric]
-    terms: Text
-    libraries: dict[str, str]
-    examples: Examples = ()
+    metrics: Many[Metric]  # measured on scenes that training did not use
+    terms: Text  # of use of the weights
+    libraries: dict[str, str]  # name and version of each library used in training
+    examples: Examples = ()  # for the scene editor
 
     @field_validator("spec", "training", "libraries", "terms")
     @classmethod

@@ -22,17 +22,12 @@ OUTDATED: Final[frozenset[Code]] = frozenset({"outdated_format", "replaced_model
 
 
 class RegistryError(Exception):
-    """Base class of the registry's errors. The code and the reason never contain absolute paths.
-
-    Attributes:
-        code: machine-readable kind of failure.
-        reason: description of the failure. It may name a file or a tensor, but not the folder.
-    """
+    """Base class of the registry's errors. The code and the reason never contain absolute paths."""
 
     def __init__(self, code: Code, reason: str) -> None:
         super().__init__(code, reason)
         self.code: Code = code
-        self.reason = reason
+        self.reason = reason  # may name a file or a tensor, but not the folder
 
     def __str__(self) -> str:
         return f"{self.code}: {self.reason}"
@@ -47,10 +42,7 @@ class StoreError(RegistryError):
 
 
 def cause(error: OSError) -> str:
-    """Return the message of the operating system for an error.
-
-    Unlike str(error), the message contains no path.
-    """
+    """Return the message of the operating system. Unlike str(error), it contains no path."""
     if error.errno == errno.ELOOP:
         return "the path contains a symbolic link, which the store does not follow"
     return error.strerror or "input/output error"

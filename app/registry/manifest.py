@@ -1,9 +1,8 @@
 """The manifest of an artifact: the description of the model and the checksums of its files.
 
-A manifest is a JSON object with one top-level member per line. The last member is a checksum: the
-SHA-256 of all bytes before this member. The checksum reveals a truncated or altered manifest before
-the manifest is parsed. The manifest contains the checksums of the other files, so its checksum also
-protects them.
+A manifest is a JSON object with one top-level member per line. The last member is the SHA-256 of
+all bytes before it. It reveals a truncated or altered manifest before the manifest is parsed. It
+also protects the other files, whose checksums the manifest contains.
 """
 
 import hashlib

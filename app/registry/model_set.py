@@ -25,22 +25,14 @@ _logger = logging.getLogger("app.registry")
 
 @dataclass(frozen=True, eq=False)
 class ModelSet:
-    """The state of a store at one moment.
-
-    Attributes:
-        entries: maps each published (name, version) to its artifact, or to the error that makes
-            the version unusable.
-        aliases: maps each alias to its target.
-        failure: reason why the store or its aliases could not be read. None means that they could
-            be read.
-        shipped: what the release states about its shipped models.
+    """The state of a store at one moment, by the (name, version) of each published model.
 
     The errors were never raised, so they keep no stack frames or weights in memory.
     """
 
     entries: Mapping[tuple[str, str], Artifact | ArtifactError]
     aliases: Mapping[str, AliasTarget]
-    failure: StoreError | None = None
+    failure: StoreError | None = None  # why the store or its aliases could not be read
     shipped: Shipped = NOTHING
 
     @cached_property
@@ -109,11 +101,8 @@ def load_model_set(
     """Load and verify every version of a store. The result contains all errors.
 
     An artifact of the previous snapshot is verified again, and reused if its digest is unchanged.
-
-    Args:
-        check: further check of each new artifact. It raises `ArtifactError`.
-        release: store with the models of this release. It states which models it replaces; without
-            it, the store itself does.
+    ``check`` raises `ArtifactError` for an unusable new artifact. The store ``release``, or without
+    it the store itself, states which models this release replaces.
     """
     failure: StoreError | None = None
     aliases: Mapping[str, AliasTarget]
@@ -194,7 +183,6 @@ def _load(
     except Exception as error:
         # This includes MemoryError, because other versions may need less memory.
         _logger.exception("%s@%s could not be loaded", name, version)
-        return ArtifactError(
-            "unexpected_error",
-            f"loading failed with {type(error).__name__}; see the traceback in the service's log",
-        )
+        kind = type(error).__name__
+        reason = f"loading failed with {kind}; see the traceback in the service's log"
+        return ArtifactError("unexpected_error", reason)

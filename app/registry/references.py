@@ -82,31 +82,20 @@ class AliasTarget(BaseModel):
 
 
 class Replacement(BaseModel):
-    """What replaces a shipped model of an earlier release.
-
-    Attributes:
-        by: name of the new model.
-        digests: digest of each replaced version. Other versions of the name are not shipped ones.
-    """
+    """The model that replaces a shipped model of an earlier release."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     by: ModelName
-    digests: dict[Version, Sha256] = {}
+    digests: dict[Version, Sha256] = {}  # of the replaced versions; other versions are own models
 
 
 class Shipped(BaseModel):
-    """What a release states about its shipped models.
-
-    Attributes:
-        default: the version that answers instead of an outdated own model; None in stores without
-            a statement.
-        replaced: maps the name of each replaced model to its replacement.
-    """
+    """The statement of a release about its shipped models."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    default: AliasTarget | None = None
+    default: AliasTarget | None = None  # the version that answers instead of an outdated own model
     replaced: dict[ModelName, Replacement] = {}
 
     @property
@@ -150,10 +139,8 @@ def resolve_reference(
 ) -> tuple[str, str]:
     """Return the (name, version) that an alias, `name` or `name@version` points at.
 
-    Args:
-        aliases: the target of each alias. An alias takes precedence over a model of its name.
-        versions: returns the versions of a known model. Without a version, the last one is meant.
-        replaced: maps the names of replaced models to those of the new models.
+    An alias takes precedence over a model of its name. A name points at the last of its
+    ``versions``. ``replaced`` maps the names of replaced models to those of the new models.
 
     Raises:
         StoreError: `invalid_reference`, `unknown_model`, `replaced_model`, `unknown_version`, or

@@ -55,19 +55,13 @@ StoreState: TypeAlias = tuple[tuple[str | int, ...], ...]
 
 
 class Store:
-    """A directory of published models.
-
-    Args:
-        root: directory of the store. The first publication creates it.
-        lock_timeout: seconds that a writer waits for another writer.
-        max_weights_bytes: maximum size of a version's weights file.
-    """
+    """A directory of published models. The first publication creates it."""
 
     def __init__(
         self,
         root: str | os.PathLike[str],
         *,
-        lock_timeout: float = 60.0,
+        lock_timeout: float = 60.0,  # seconds that a writer waits for another writer
         max_weights_bytes: int = MAX_WEIGHTS_BYTES,
     ) -> None:
         self.root = Path(root)
@@ -75,11 +69,7 @@ class Store:
         self._max_weights_bytes = max_weights_bytes
 
     def names(self) -> list[str]:
-        """Return the names of the models in alphabetical order.
-
-        Raises:
-            StoreError: `unreadable` if the root is not a readable directory.
-        """
+        """Return the model names in alphabetical order, or raise StoreError `unreadable`."""
         try:
             return sorted(entry.name for entry in self.root.iterdir() if NAME.fits(entry.name))
         except OSError as error:
@@ -105,26 +95,15 @@ class Store:
         return tuple(sorted(filter(VERSION.fits, entries), key=version_key))
 
     def aliases(self) -> Mapping[str, AliasTarget]:
-        """Return the target of each alias.
-
-        Raises:
-            StoreError: `invalid_aliases`.
-        """
+        """Return the target of each alias, or raise StoreError `invalid_aliases`."""
         return MappingProxyType(read_table(self.root / ALIASES).aliases)
 
     def shipped(self) -> Shipped:
-        """Return what the store states about shipped models; `NOTHING` without a statement.
-
-        Raises:
-            StoreError: `invalid_aliases`.
-        """
+        """Return the statement about shipped models, or raise StoreError `invalid_aliases`."""
         return read_table(self.root / ALIASES).shipped
 
     def digest(self, name: str, version: str) -> str | None:
-        """Return the digest of a version of any format, or None if it cannot be read.
-
-        The files are not verified.
-        """
+        """Return the unverified digest of a version of any format, or None if it is unreadable."""
         return manifest_digest(self.root / NAME.check(name, "model name") / version)
 
     def resolve(self, reference: str) -> tuple[str, str]:
@@ -188,10 +167,7 @@ class Store:
         *,
         storage_dtype: StorageDtype = "float32",
     ) -> Artifact:
-        """Publish a version permanently, and return the artifact.
-
-        The method writes and loads the artifact in a temporary folder, and renames the folder. See
-        `write_artifact` for the arguments.
+        """Publish a version permanently, and return the artifact; see `write_artifact`.
 
         Raises:
             ArtifactError: the artifact is not valid.
@@ -262,9 +238,7 @@ class Store:
     ) -> None:
         """Point an alias at a version, or at the newest usable version of a model.
 
-        Args:
-            expected: target that the alias must have before the change. None means that the alias
-                must not exist. "any" accepts every target.
+        Before the change, the alias must have the ``expected`` target; None: it must not exist.
 
         Raises:
             StoreError: `alias_conflict` if the current target is not ``expected``; `not_writable`,

@@ -30,11 +30,8 @@ def pack(
 ) -> tuple[bytes, dict[str, TensorEntry]]:
     """Return the contents of a safetensors file, and the manifest entries of its tensors.
 
-    Args:
-        state: maps names to numpy arrays or CPU tensors. Arrays of integers and booleans keep their
-            dtype.
-        storage_dtype: dtype of floating-point arrays with two or more axes. float16 has a relative
-            error of at most 2^-11 per weight. Biases are stored as float32.
+    Floating-point arrays with two or more axes get the ``storage_dtype``, others float32. Integers
+    and booleans keep their dtype. float16 has a relative error of at most 2^-11 per weight.
 
     Raises:
         ArtifactError: `not_finite` for NaN, infinity or a weight above the float16 maximum of
@@ -49,13 +46,7 @@ def pack(
 
 
 def unpack(data: bytes, entries: Mapping[str, TensorEntry]) -> dict[str, NDArray[Any]]:
-    """Return writable copies of the tensors of a safetensors file.
-
-    The function converts floating-point tensors to float32.
-
-    Args:
-        data: contents of the file.
-        entries: maps the name of each expected tensor to its dtype and shape in the manifest.
+    """Return writable copies of the tensors of a safetensors file, with floats as float32.
 
     Raises:
         ArtifactError: `not_safetensors` for another file format; `too_large` for a header with more
@@ -64,10 +55,8 @@ def unpack(data: bytes, entries: Mapping[str, TensorEntry]) -> dict[str, NDArray
     """
     # The file begins with the length of its header: 64 bits, little-endian.
     if MAX_HEADER_BYTES < int.from_bytes(data[:8], "little") <= len(data):
-        raise ArtifactError(
-            "too_large",
-            f"the header of {WEIGHTS} has more than the maximum of {MAX_HEADER_BYTES} bytes",
-        )
+        reason = f"the header of {WEIGHTS} has more than the maximum of {MAX_HEADER_BYTES} bytes"
+        raise ArtifactError("too_large", reason)
     try:
         stored = dict(deserialize(data))  # type: ignore[no-untyped-call]
     except SafetensorError:
@@ -97,10 +86,6 @@ def read_group(
     group: type[GroupT], tensors: Mapping[str, NDArray[Any]], A: int, V: int, C: int
 ) -> GroupT | None:
     """Return the tables of a model with A relations, V classes and C room types, or None.
-
-    Args:
-        group: class of the tables.
-        tensors: the stored tensors of the group. Without any, the result is None.
 
     Raises:
         ArtifactError: `wrong_shape` if a tensor is missing, unexpected or of a wrong shape;
@@ -143,9 +128,8 @@ def _stored(name: str, value: ArrayLike, storage_dtype: StorageDtype) -> NDArray
             array = array.astype(storage_dtype if array.ndim > 1 else np.float32)
         _require_finite(name, array, f" in {array.dtype.name}")
     elif array.dtype.name not in _DTYPES.values():
-        raise ArtifactError(
-            "invalid_tensor", f"tensor '{name}' has the unsupported dtype {array.dtype.name}"
-        )
+        reason = f"tensor '{name}' has the unsupported dtype {array.dtype.name}"
+        raise ArtifactError("invalid_tensor", reason)
     return array
 
 

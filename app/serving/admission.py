@@ -53,18 +53,10 @@ _NICE: Final = 5
 
 
 class Lane:
-    """A bounded queue in which clients take turns.
-
-    Args:
-        slots: number of requests that run at a time.
-        limit: maximum total weight of the waiting and running requests.
-
-    Attributes:
-        weight: total weight of the waiting and running requests.
-    """
+    """A bounded queue in which clients take turns. At most ``slots`` requests run at a time."""
 
     def __init__(self, slots: int, limit: int) -> None:
-        self.limit, self.weight = limit, 0
+        self.limit, self.weight = limit, 0  # total weight of the waiting and running requests
         self._free_slots = slots
         self._weights: dict[str, int] = {}  # by client
         # One queue of waiting requests for each key (`line`). The first queue has the next turn.
@@ -83,13 +75,10 @@ class Lane:
             await asyncio.sleep(0)
 
     async def enter(self, client: str, weight: int, deadline: float, line: Hashable = None) -> None:
-        """Wait for the turn of a request. `leave` ends the turn.
+        """Wait for the turn of a request, until a ``deadline`` of `time.monotonic`.
 
-        Args:
-            client: name of the client.
-            weight: weight of the request. A weight of 0 is never refused.
-            deadline: deadline of the request, as a value of `time.monotonic`.
-            line: key of the queue; the keys take turns. The default is the client.
+        `leave` ends the turn. A weight of 0 is never refused. The keys ``line`` of the queues, by
+        default the clients, take turns.
 
         Raises:
             QueueFullError: the lane or the client's share of it is full.
@@ -144,22 +133,14 @@ class Lane:
 # The dataclass is not frozen, because the creation of a frozen object takes three times as long.
 @dataclass(slots=True)
 class Ticket:
-    """The place of a request in a lane, and its deadline.
+    """The place of a request in a lane, and its deadline."""
 
-    Attributes:
-        client: name of the client: its address.
-        deadline: deadline of the request, as a value of `time.monotonic`.
-        is_gone: function that returns whether the client has disconnected.
-        lane, weight: lane in which the request has its turn, or None, and its weight.
-        waited: total time in seconds that the request has waited so far.
-    """
-
-    client: str
-    deadline: float
-    is_gone: Callable[[], Awaitable[bool]] | None = None
-    lane: Lane | None = None
+    client: str  # address
+    deadline: float  # as a value of `time.monotonic`
+    is_gone: Callable[[], Awaitable[bool]] | None = None  # whether the client has disconnected
+    lane: Lane | None = None  # in which the request has its turn
     weight: int = 0
-    waited: float = 0.0
+    waited: float = 0.0  # total seconds so far
 
     async def enter(self, lane: Lane, weight: int, line: Hashable = None) -> None:
         """Leave the lane of the request and wait for a turn in another; see `Lane.enter`."""
@@ -187,11 +168,7 @@ class Ticket:
 
 
 class Admission:
-    """The lanes and the worker threads of a process.
-
-    Args:
-        requests, rows: limits of the lanes `quick` and `slow`.
-    """
+    """The lanes and the worker threads of a process."""
 
     def __init__(self, requests: int, rows: int) -> None:
         self.quick = Lane(8, requests)
@@ -201,10 +178,7 @@ class Admission:
         self.drawing = ThreadPoolExecutor(1, "drawing", _lower_priority)
 
     async def in_worker(self, ticket: Ticket, call: Callable[[Callable[[], bool]], T]) -> T:
-        """Run a computation in a turn of the lane `slow`, in its thread; see `in_thread`.
-
-        The errors are those of `Lane.enter` and `in_thread`.
-        """
+        """Run a computation in a turn of the lane `slow`; see `Lane.enter` and `in_thread`."""
         if ticket.lane is not self.slow:
             await ticket.enter(self.slow, 1)
         return await in_thread(call, ticket, self.worker)
@@ -225,11 +199,9 @@ def _lower_priority() -> None:
 async def in_thread(
     call: Callable[[Callable[[], bool]], T], ticket: Ticket, executor: Executor
 ) -> T:
-    """Run a computation on an executor and return its result.
+    """Run a computation in a thread until its end, the deadline or a disconnect of the client.
 
-    The call ends at the end of the computation, at the deadline or at a disconnect of the client.
-    The argument of ``call`` is a function that returns whether the request has ended. A long
-    computation should call this function regularly.
+    A long computation should regularly call its argument: it returns whether the request has ended.
 
     Raises:
         DeadlinePassedError: the deadline passed before the end of the computation.
@@ -269,17 +241,13 @@ class Bodies:
     """The bodies of all requests and answers in progress. Their total size is bounded.
 
     One client holds at most a quarter of the budget, or a single body.
-
-    Attributes:
-        total: total size of the bodies in bytes.
-        patience: maximum time in seconds to receive a body or to send an answer.
     """
 
     def __init__(self, settings: Settings) -> None:
         self._budget = settings.held_body_bytes
-        self.patience = settings.client_timeout
+        self.patience = settings.client_timeout  # seconds to receive a body or to send an answer
         self._of_clients: dict[str, int] = {}
-        self.total = 0
+        self.total = 0  # bytes
 
     @contextmanager
     def hold(self, client: str, size: int) -> Iterator[None]:
@@ -298,8 +266,7 @@ class Bodies:
     async def read(self, receive: Receive, client: str, limit: int, length: bytes) -> bytes:
         """Read a whole body of at most ``limit`` bytes. The caller must `release` it.
 
-        Args:
-            length: the header Content-Length, or an empty text.
+        ``length`` is the header Content-Length, or empty.
 
         Raises:
             ServiceError: the body is too large, too slow or incomplete, or the budget is full.

@@ -36,12 +36,7 @@ def _json(record: logging.LogRecord) -> str:
 
 
 class Masked(logging.Formatter):
-    """Write log records, and mask the keys. An exception message may contain a key.
-
-    Args:
-        style: `json` for one JSON object per line, or `plain` for text.
-        secrets: the keys.
-    """
+    """Write log records, and mask the secrets, which exception messages may contain."""
 
     def __init__(self, style: Literal["json", "plain"], secrets: Sequence[str] = ()) -> None:
         super().__init__()

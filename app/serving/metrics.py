@@ -39,11 +39,7 @@ disable_created_metrics()  # type: ignore[no-untyped-call]
 
 
 class Metrics:
-    """The metrics of one application. Call the methods only on the thread of the event loop.
-
-    Attributes:
-        max_age: maximum age in seconds of the text that `exposition` returns.
-    """
+    """The metrics of one application. Call the methods only on the thread of the event loop."""
 
     def __init__(self, admission: Admission) -> None:
         self._registry = registry = CollectorRegistry()  # a process may have several applications
@@ -99,7 +95,7 @@ class Metrics:
         self._ready = gauge(
             "scene_ready_time_seconds", "Unix time when the default model first answered; 0 before"
         )
-        self.max_age = 1.0
+        self.max_age = 1.0  # maximum age in seconds of the text that `exposition` returns
         self._written_at = 0.0
         self._text: asyncio.Future[bytes] | None = None
         self._infos: set[tuple[str, str, str, str, str]] = set()
@@ -158,10 +154,7 @@ class Metrics:
     def computed(
         self, key: Key, question: str, waited: float, seconds: float, objects: int, answer: Fields
     ) -> None:
-        """Record one question about a number of objects that a model has answered.
-
-        ``waited`` and ``seconds`` are times before and of the computation.
-        """
+        """Record one answered question: its waiting time, computing time, objects and answer."""
         questions = self._of_model.get(key)
         if questions is None:  # the model is no longer served, and its series are removed
             return

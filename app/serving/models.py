@@ -1,7 +1,6 @@
 """The served models: the registry has verified them, and the service has warmed them up.
 
-A snapshot of the models never changes, so a request uses the same models from beginning to end. A
-name without a version means the newest usable version.
+A snapshot of the models never changes, so a request uses the same models from beginning to end.
 """
 
 import hashlib
@@ -93,9 +92,8 @@ class ServedModels:
         target = self.store.aliases.get(name)
         versions = self.store.versions.get(name if target is None else target.name)
         if versions:
-            return errors.UnknownModelError(
-                f"This model has no such version. Its versions: {errors.some_of(versions)}."
-            )
+            detail = f"This model has no such version. Its versions: {errors.some_of(versions)}."
+            return errors.UnknownModelError(detail)
         if name in self.store.shipped.replaced:
             return self._replaced(name)
         similar = spelt_alike(name, sorted({*self.store.aliases, *self.store.versions}))

@@ -12,6 +12,7 @@ from app.questions.generate import STEPS
 from app.questions.names import LookUps, new_labels
 from app.questions.question import Question
 from app.questions.reading import Reading, read_scene
+from app.registry import Artifact
 from app.scene.vocabulary import Vocabulary
 from app.serving.admission import Ticket, in_thread
 from app.serving.models import Key, ServedModels
@@ -28,21 +29,13 @@ _Computed = tuple[bytes, Fields, float, float]
 
 @dataclass(slots=True)
 class Record:
-    """Values of a request for log and metrics. The gateway reads these values after the response.
+    """Values of a request for log and metrics. The gateway reads them after the response."""
 
-    Attributes:
-        outcome: `SUCCESS`, or the slug (short name) of the problem type in the response.
-        status: HTTP status of the response, or 0 before the response starts.
-        models: pairs (name, version) of the models that the request used.
-        queue_seconds, compute_seconds: total times that the scenes of the request waited, and that
-            models computed. None if the request used no model.
-    """
-
-    outcome: str = SUCCESS
-    status: int = 0
-    models: set[Key] = field(default_factory=set)
-    queue_seconds: float | None = None
-    compute_seconds: float | None = None
+    outcome: str = SUCCESS  # or the slug of the problem type in the response
+    status: int = 0  # HTTP status; 0 before the response starts
+    models: set[Key] = field(default_factory=set)  # models that the request used
+    queue_seconds: float | None = None  # total time that scenes waited; None without a model
+    compute_seconds: float | None = None  # total time that models computed; None without a model
 
     def log_fields(self) -> dict[str, str | float]:
         """Return the fields for the access log line, and the model if the request used only one."""
@@ -58,32 +51,21 @@ class Record:
 
 @dataclass(slots=True)
 class Request:
-    """One request. It uses the same snapshot of the models from beginning to end.
+    """One request. It uses the same snapshot of the models from beginning to end."""
 
-    Attributes:
-        id: request id. Every answer contains it.
-        ticket: place of the request in a lane, and its deadline.
-        record: values for the log and the metrics.
-        runtime: lanes, threads, limits and metrics of the service.
-        models: snapshot of the models.
-        look_ups: searches for classes similar to unknown labels, shared by all scenes of the
-            request.
-    """
-
-    id: str
+    id: str  # part of every answer
     ticket: Ticket
     record: Record
     runtime: Runtime
     models: ServedModels
-    look_ups: LookUps = field(default_factory=LookUps)
+    look_ups: LookUps = field(default_factory=LookUps)  # shared by all scenes of the request
 
     async def answer(
         self, question: Question[RequestT], scene: RequestT, most_bytes: int | None = None
     ) -> bytes:
         """Ask the model in the field `model` of a scene one question. Return the answer as JSON.
 
-        The answer has the fields of `scene_client.schemas.Answer` and of the question, and at most
-        ``most_bytes`` bytes. By default, this limit is the limit of the service.
+        The answer has at most ``most_bytes`` bytes, by default the limit of the service.
 
         Raises:
             UnknownModelError: the model does not exist.
@@ -92,25 +74,12 @@ class Request:
             QueueFullError, DeadlinePassedError, DisconnectedError: see `admission`.
         """
         artifact, record = self.models.resolve(scene.model), self.record
-        model = artifact.model
         record.models.add(artifact.key)
-        limits, admission, ticket = self.runtime.limits, self.runtime.admission, self.ticket
-        most = limits.answer_bytes if most_bytes is None else most_bytes
+        admission, ticket = self.runtime.admission, self.ticket
+        most = self.runtime.limits.answer_bytes if most_bytes is None else most_bytes
 
         def read(_: object) -> tuple[Reading, partial[Fields]]:
-            reading = read_scene(
-                scene,
-                model.vocabulary,
-                limits,
-                self.look_ups,
-                roles=None if model.places is None else model.places.roles,
-                profiles=artifact.manifest.vocabulary.profiles,
-                may_be_empty=question.samples,
-            )
-            options = question.read(scene, model, reading)
-            words = list(reading.unknown.words.values())
-            asked = model.with_words(words) if words else model
-            return reading, partial(question.answer, asked, reading.scene, **options)
+            return self._read(question, scene, artifact)
 
         def finish(reading: Reading, ask: Callable[[], Fields], began: float) -> _Computed:
             fields = ask()
@@ -127,7 +96,7 @@ class Request:
             began = monotonic()
             return finish(*read(None), began)
 
-        is_fast = is_quick(scene, model.vocabulary)
+        is_fast = is_quick(scene, artifact.model.vocabulary)
         if question.samples:
             reading, ask = read(None) if is_fast else await admission.in_worker(ticket, read)
             weight = ask.keywords["count"] * (ask.keywords["steps"] or STEPS)
@@ -149,6 +118,25 @@ class Request:
             artifact.key, question.name, waited, seconds, len(scene.objects), answer
         )
         return body
+
+    def _read(
+        self, question: Question[RequestT], scene: RequestT, artifact: Artifact
+    ) -> tuple[Reading, partial[Fields]]:
+        """Return the scene as the model reads it, and the call that computes the answer."""
+        model = artifact.model
+        reading = read_scene(
+            scene,
+            model.vocabulary,
+            self.runtime.limits,
+            self.look_ups,
+            roles=None if model.places is None else model.places.roles,
+            profiles=artifact.manifest.vocabulary.profiles,
+            may_be_empty=question.samples,
+        )
+        options = question.read(scene, model, reading)
+        words = list(reading.unknown.words.values())
+        enlarged = model.with_words(words) if words else model
+        return reading, partial(question.answer, enlarged, reading.scene, **options)
 
 
 def _too_large(question: Question[Any], most: int) -> AnswerTooLargeError:

@@ -27,21 +27,12 @@ _SWITCH_INTERVAL = 1e-4
 
 
 class Runtime:
-    """The runtime of the service. It contains the current snapshot of the models.
-
-    Attributes:
-        admission: lanes of requests, and worker threads.
-        bodies: bodies of the requests and answers in progress.
-        draining: whether the service is shutting down. Readiness checks then fail, and connections
-            close after their answers.
-        limits: limits on scenes and answers.
-        metrics: metrics of the service.
-        models: current snapshot of the models; `NO_MODELS` before the start.
-    """
+    """The runtime of the service. It contains the current snapshot of the models."""
 
     def __init__(self, settings: Settings) -> None:
         self.admission = Admission(settings.queue_requests, settings.queue_rows)
         self.bodies = Bodies(settings)
+        # At shutdown, readiness checks fail, and connections close after their answers.
         self.draining = False
         self.metrics = Metrics(self.admission)
         self._store = Store(settings.store, max_weights_bytes=settings.max_weights_bytes)
@@ -52,7 +43,7 @@ class Runtime:
         self._poll = settings.store_poll
         self._requested = asyncio.Event()
         self._following: asyncio.Task[None] | None = None
-        self.models = NO_MODELS
+        self.models = NO_MODELS  # until the start
         self._loaded_state: StoreState | None = None
 
     def check_ready(self) -> None:
