@@ -41,9 +41,9 @@ def outliers(
     model: SceneModel,
     scene: Scene,
     *,
-    sensitivity: Sensitivity = "medium",
-    threshold: float | None = None,
-    details: bool = True,
+    sensitivity: Sensitivity = "medium",  # one of the model's thresholds
+    threshold: float | None = None,  # minimum probability of an outlier, instead of `sensitivity`
+    details: bool = True,  # whether the answer contains `because` and `usually_with`
 ) -> Fields:
     """Judge every object and every stated relation of a scene.
 
@@ -64,12 +64,6 @@ def outliers(
     sensitivity, an object of such a class is never an outlier. If its probability reaches the
     threshold, a warning names the object. A stated threshold applies to all classes, but a word
     that is read by its meaning never is an outlier.
-
-    Args:
-        scene: the objects and stated relations to judge.
-        sensitivity: name of one of the model's thresholds.
-        threshold: minimum probability of an outlier. None means the threshold of `sensitivity`.
-        details: whether the answer contains `because` and `usually_with`.
 
     Returns:
         The fields `threshold`, `outliers` and `misplaced` of `scene_client.schemas.OutliersAnswer`.
@@ -120,8 +114,8 @@ def _judged(
 ) -> tuple[list[Fields], list[SceneObject]]:
     """Return the fields of `scene_client.schemas.Outlier` for every object of a scene.
 
-    The second result lists the objects that reach the threshold, but whose class raises no alarm.
-    `can_alarm` is True for the classes that raise an alarm.
+    The second result lists the objects that reach the threshold, but whose class `can_alarm` does
+    not contain.
 
     `because` lists up to three other objects, in order of their effect on `log_odds`. For an
     outlier, these objects raise its log-odds. For other objects, they lower the log-odds.
@@ -194,10 +188,7 @@ def intruders(model: SceneModel, scene: Scene) -> NDArray[np.int64]:
 
 
 def _intruder_odds(
-    model: SceneModel,
-    entry: CountSlope,
-    posterior: Posterior,
-    log_odds: Float[Floats, "n"],
+    model: SceneModel, entry: CountSlope, posterior: Posterior, log_odds: Float[Floats, "n"]
 ) -> tuple[Float[Floats, "n"], Float[Floats, "n"]]:
     """Return logit and probability that each class is an intruder.
 

@@ -66,22 +66,16 @@ _AMBIGUOUS: Final = frozenset(
 
 
 class Match(NamedTuple):
-    """A known entry that is similar to the unknown name.
-
-    Attributes:
-        entry: index of the entry.
-        similarity: similarity of the entry's name and the unknown name, from 0 to 1.
-    """
+    """A known entry that is similar to the unknown name."""
 
     entry: int
-    similarity: float
+    similarity: float  # of both names, from 0 to 1
 
 
 class NameIndex:
     """Search for entries, such as object classes, with names similar to an unknown name.
 
-    Args:
-        names: pairs (name, index of the entry). An entry may have several names.
+    ``names`` has pairs (name, index of the entry). An entry may have several names.
     """
 
     def __init__(self, names: Sequence[tuple[str, int]]) -> None:
@@ -98,10 +92,7 @@ class NameIndex:
             self._lexicon.setdefault(len(word), []).append(word)
 
     def guess(self, name: str) -> LookUp | None:
-        """Return the entry that a name probably stands for, or None.
-
-        The function first compares the spelling of the whole name, and then its last words.
-        """
+        """Return the entry whose name or last words a name probably stands for, or None."""
         words = split_words(head_of(name) or name)
         if len("".join(words)) > LONGEST or len(words) > _MOST_WORDS or _SEVERAL & {*words}:
             return None

@@ -20,7 +20,6 @@ from app.compiling import compiled
 LEFT, FRONT, ON_TOP, ABOVE, INSIDE = 0, 1, 2, 3, 4
 """Indices of the canonical relations."""
 
-
 CANONICAL: Final[tuple[str, ...]] = ("left", "front", "on-top", "above", "inside")
 OPPOSITES: Final[dict[str, str]] = {
     "left": "right",
@@ -106,11 +105,7 @@ def pool_relations(
 ) -> tuple[Bool[NDArray, "A n n"], Bool[NDArray, "A n n"]]:
     """Pool the relations of N instances into relations of n classes; see `app.scene.scene`.
 
-    Args:
-        row: number of each instance's class, from 0 to n - 1.
-
-    Returns:
-        The pooled `holds` and `observed`.
+    ``row`` is the number of each instance's class, from 0 to n - 1.
     """
     A, size, _ = holds.shape
     class_holds, class_observed = np.zeros((A, n, n), np.bool_), np.zeros((A, n, n), np.bool_)
