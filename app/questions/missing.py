@@ -115,12 +115,7 @@ def missing(
     further: list[Fields] = []
     if at is None:
         further = more(
-            model,
-            scene,
-            posterior.present,
-            top_k=top_k,
-            candidates=candidates,
-            coverage=coverage,
+            model, scene, posterior.present, top_k=top_k, candidates=candidates, coverage=coverage
         )
     used_coverage = calibration.coverage if coverage is None else coverage
     return {"coverage": used_coverage, "missing": entries, "more": further}

@@ -20,14 +20,7 @@ from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, best, significant
 from app.questions.posterior import Posterior, exclusive, relation_probability
 from app.scene.scene import Scene, SceneObject, boxes_of
-from app.scene.spatial_relations import (
-    INSIDE,
-    ON_TOP,
-    RELATIONS,
-    SUPPORTS,
-    canonicalise,
-    opposite,
-)
+from app.scene.spatial_relations import INSIDE, ON_TOP, RELATIONS, SUPPORTS, canonicalise, opposite
 from app.scene.vocabulary import do_not_fit
 from scene_client.frames import Axes
 
