@@ -22,7 +22,7 @@ Floats = NDArray[np.floating[Any]]
 class CountSlope(Frozen):
     """Calibration of a logit z: log-odds = intercept + slope·z + log_count·log n.
 
-    The attributes of `Calibration` define n for each question.
+    `Calibration` and `PAIR_CALIBRATIONS` define n.
     """
 
     intercept: float = 0.0
@@ -47,8 +47,7 @@ class CoverageFit(Frozen):
     last: float = 0.0
 
 
-LEAST_COVERAGE: Final = 0.15
-"""Least share of a scene that the base rates of `/missing` tell apart."""
+LEAST_COVERAGE: Final = 0.15  # least share of a scene that the base rates of `/missing` tell apart
 
 PairSlopes = Annotated[Many[CountSlope], Field(max_length=len(CANONICAL))]
 

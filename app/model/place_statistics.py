@@ -38,10 +38,7 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Places(TensorGroup):
-    """Counts of relations between classes, of the roles of boxes, and of objects on the floor.
-
-    `RoleCounts` describes `role_pair`, `role_counts` and `role_anchor`.
-    """
+    """Counts of relations between classes, of the roles of boxes, and of objects on the floor."""
 
     prefix: ClassVar[str] = "places."
     integers = ("triple", "role_pair")
@@ -49,7 +46,7 @@ class Places(TensorGroup):
     triple: Annotated[NDArray[np.int32], "N"]  # keys (a V + i) V + j of a(i, j), ascending
     held: Annotated[NDArray[np.float32], "N"]  # number of training scenes with each triple
     frequency: Annotated[NDArray[np.float32], "V"]  # share of the listed classes in training
-    role_pair: Annotated[NDArray[np.int32], "P"]
+    role_pair: Annotated[NDArray[np.int32], "P"]  # this and the next two: see `RoleCounts`
     role_counts: Annotated[NDArray[np.float32], "P", 3]
     role_anchor: Annotated[NDArray[np.float32], "V", 3]
     stands: Annotated[NDArray[np.float32], "V", 3]  # shares: on the floor, hanging, supported
@@ -107,7 +104,7 @@ class Places(TensorGroup):
         is_support = np.isin(self.triple // (V * V), SUPPORTS)
         subject, other = np.divmod(self.triple[is_support] % (V * V), V)
         held = self.held[is_support]
-        total, count = (np.bincount(end, held, V).astype(float) for end in (subject, other))
+        total, count = (np.bincount(role, held, V).astype(float) for role in (subject, other))
         return total, (count + _SEEN) / (count + _SEEN).sum()
 
     @cached_property
@@ -176,10 +173,7 @@ def add_unseen(
     forward: Float[NDArray, "N A m"],  # log-odds with the candidate as subject
     backward: Float[NDArray, "N A m"],  # log-odds with the other class as subject
 ) -> None:
-    """Add the changes of stacked relations that training never shows to log-odds, in place.
-
-    The last A - 2 relations are the stacked ones.
-    """
+    """Add the changes of stacked relations that training never shows to log-odds, in place."""
     for c in range(len(candidates)):
         for a in range(forward.shape[1] - ON_TOP):
             for k in range(len(classes)):

@@ -22,14 +22,12 @@ from scene_client.schemas import ModelReference, SceneRequest
 Fields: TypeAlias = dict[str, Any]
 """Fields of an answer, or of a part of an answer."""
 
-DIGITS: Final = 6
-"""Significant digits of probabilities, log-odds and metres."""
+DIGITS: Final = 6  # significant digits of probabilities, log-odds and metres
 # Doubles represent these powers of ten exactly. So an integer divided by such a power is the double
 # that is nearest to the decimal number.
 _POWERS: Final = np.array([10.0**power for power in range(23)])
 
-REASONS: Final = 3
-"""Maximum number of reasons for one entry of an answer."""
+REASONS: Final = 3  # maximum number of reasons for one entry of an answer
 
 EXPLAINED: Final = 32
 """Maximum number of entries with reasons in an answer. The first entries have reasons."""

@@ -69,11 +69,8 @@ from app.scene.stands import (
     stands_of,
 )
 
-BESIDE, SUPPORT, OVER, BELOW, STAND = range(len(KINDS))
-"""Indices of the kinds in `KINDS`."""
-
-TERMS: Final = 4
-"""Number of terms of an entry."""
+BESIDE, SUPPORT, OVER, BELOW, STAND = range(len(KINDS))  # indices of the kinds in `KINDS`
+TERMS: Final = 4  # number of terms of an entry
 
 THE_FLOOR: Final = "floor"
 """Name of the floor in an entry about an object that stands on the floor or hangs above it."""

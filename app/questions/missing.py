@@ -34,15 +34,13 @@ from app.scene.spatial_relations import CANONICAL, opposite
 from scene_client.frames import Axes, viewer_axes
 from scene_client.schemas import Anchor, MissingAnswer, MissingRequest
 
-VIEWER = viewer_axes()
-"""Axes of a viewer who looks along the x axis of the frame."""
+VIEWER = viewer_axes()  # axes of a viewer who looks along the x axis of the frame
 
 Indices = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-LIKELY: Final = 0.5
-"""Minimum probability of further instances at which an answer contains a class."""
+LIKELY: Final = 0.5  # minimum probability of further instances at which an answer contains a class
 
 _BLOCK: Final = 32
 _OUTSIDE: Final = 0.1  # probability of a count below `low`, and of a count above `high`

@@ -228,10 +228,7 @@ class Unknown:
 
 
 class Names:
-    """Look-up of the objects of a scene by id, or by label if only one object has the label.
-
-    ``left_out`` has pairs (id, label) of the ignored objects.
-    """
+    """Look-up of the objects of a scene by id, or by label if only one object has the label."""
 
     def __init__(
         self, objects: Sequence[SceneObject], unknown: Unknown, left_out: Sequence[tuple[str, str]]

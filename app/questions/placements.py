@@ -27,8 +27,7 @@ from scene_client.frames import Axes
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-PLACES: Final = 3
-"""Maximum number of placements in the answer for one class."""
+PLACES: Final = 3  # maximum number of placements in the answer for one class
 
 LEAST_SHARE: Final = 0.75  # least probability of a placement, as a share of the first placement
 LEAST_LIKELY: Final = 0.05  # least probability of a placement

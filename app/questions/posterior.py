@@ -74,10 +74,7 @@ def present(scene: Scene, spec: MachineSpec) -> Present:
 
 
 def given_relations(scene: Scene, present: Present, A: int) -> ObservedRelations | None:
-    """Return the observed relations between the classes of a scene, or None without observations.
-
-    The machine knows the first A canonical relations.
-    """
+    """Return the observed relations between the classes of a scene, or None without any."""
     if scene.relations is None:
         return None
     columns = scene.relations.of_classes(present.row, len(present.classes), A)
@@ -149,10 +146,7 @@ class Posterior:
         return (log_odds_of(self.room_log_p()) - log_odds_of(without)).T
 
     def relation_log_odds(self) -> Float[Floats, "A n n"]:
-        """Return the log-odds of every relation between the classes of the scene.
-
-        The observation of a relation is not evidence for the same relation.
-        """
+        """Return the log-odds of every relation of the scene's classes, without its observation."""
         return self._units.log_odds(self._between)
 
     def alone_log_odds(self) -> Float[Floats, "A n n"]:
@@ -232,13 +226,10 @@ def calibrated_at_coverage(
 @compiled
 def relation_probability(
     slopes: Float[NDArray, "A 3"],  # table of `RelationSlopes`
-    log_odds: Float[NDArray, "B A N"],  # between classes
+    log_odds: Float[NDArray, "B A N"],  # between classes; B is 1 without candidates
     log_count: Float[NDArray, " N"],  # of the pairs of objects with these two classes
 ) -> Float[NDArray, "B A N"]:
-    """Return the probability that each of A relations holds between N pairs of objects.
-
-    B is the number of candidate classes, or 1 without candidates.
-    """
+    """Return the probability of each relation between N pairs of objects, for B candidates."""
     p = np.empty_like(log_odds)
     for a in range(p.shape[1]):
         intercept, slope, weight = slopes[a, 0], slopes[a, 1], slopes[a, 2]

@@ -117,9 +117,8 @@ def read_scene(
                 ObservedRelation(objects[i].id, CANONICAL[a], objects[j].id)  # type: ignore[arg-type]
                 for a, i, j in reading.scene.triples
             ]
-        derived = reading.observed is not None
         reading.warnings = scene_warnings(
-            in_frame, detections, vocabulary, request, derived=derived
+            in_frame, detections, vocabulary, request, derived=reading.scene.has_boxes
         )
     return reading
 
@@ -131,10 +130,7 @@ def _objects(
     left_out: list[tuple[str, str]],
     errors: ErrorList,
 ) -> tuple[tuple[SceneObject, ...], dict[int, Detection]]:
-    """Return the objects of known classes, and the detection of those that are not bare labels.
-
-    Ignored objects are added to ``left_out``.
-    """
+    """Return the objects of known classes, and the detections. Add ignored ones to ``left_out``."""
     optical = is_optical(request.frame_id)
     objects: list[SceneObject] = []
     detections: dict[int, Detection] = {}

@@ -50,10 +50,8 @@ EXPECTED = 0.5
 If all relations of a pair are unlikely, the likeliest relation is not a meaningful expectation.
 """
 
-_EXCLUDED = np.float32(-1.0)
-"""Evidence that a relation cannot hold."""
-_MOST_EXCLUDED = np.float32(0.01)
-"""Maximum probability of a relation that cannot hold."""
+_EXCLUDED = np.float32(-1.0)  # evidence that a relation cannot hold
+_MOST_EXCLUDED = np.float32(0.01)  # maximum probability of a relation that cannot hold
 
 
 def relations(

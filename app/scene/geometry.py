@@ -244,10 +244,7 @@ def _stack(
     holds: Bool[NDArray, "A n n"],
     observed: Bool[NDArray, "A n n"],
 ) -> bool:
-    """Write the stacked relations of two boxes by rules 1 to 3. Return whether a rule applies.
-
-    The footprints must overlap.
-    """
+    """Apply rules 1 to 3 to two boxes with overlapping footprints. Return whether one applies."""
     smaller, larger, is_nested, is_deep = -1, -1, False, True
     for one, other in ((i, j), (j, i)):
         if is_smaller(extents[one], extents[other]):

@@ -64,12 +64,9 @@ class RelationTable:
         cls,
         holds: Bool[Array, "A N N"],
         observed: Bool[Array, "A N N"],
-        excluded: Bool[Array, "A N N"],
+        excluded: Bool[Array, "A N N"],  # relations that cannot hold, observed or not
     ) -> "RelationTable":
-        """Return the table of the relations between N boxes.
-
-        ``excluded`` relations cannot hold, whether ``observed`` or not.
-        """
+        """Return the table of the relations between N boxes."""
         a, i, j = _between_two(observed | excluded)
         origin = np.where(observed[a, i, j], BOXES, EXCLUDED)
         p = holds[a, i, j].astype(np.float32)

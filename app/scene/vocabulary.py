@@ -264,12 +264,8 @@ class Vocabulary:
     def guess(self, label: str, *, is_room: bool = False) -> LookUp | None:
         """Return the class or room type that an unknown label probably stands for, or None."""
         names = self._room_names if is_room else self._names
-        pairs = list(readings(label))
-        alternatives = [name for rule, name in pairs if rule == "alternative"]
-        for name in alternatives[:_MOST_GUESSED] or [name for _, name in pairs][-1:] or [label]:
-            if (guess := names.guess(name)) is not None:
-                return guess
-        return None
+        guesses = (names.guess(name) for name in _names_to_guess(label))
+        return next((guess for guess in guesses if guess is not None), None)
 
     @cached_property
     def vectors(self) -> tuple[Vectors, NDArray[np.bool_]]:
@@ -283,9 +279,7 @@ class Vocabulary:
         The method is for labels that `read` and `guess` do not know. It compares the label with all
         classes. The result is None for a label without a word vector.
         """
-        pairs = list(readings(label))
-        alternatives = [name for rule, name in pairs if rule == "alternative"]
-        for text in alternatives[:_MOST_GUESSED] or [name for _, name in pairs][-1:] or [label]:
+        for text in _names_to_guess(label):
             name = " ".join(split_words(text))
             vector, (vectors, has_vector) = word_vectors().of(name), self.vectors
             # Structure has no weights, so it cannot predict those of a word.
@@ -353,8 +347,7 @@ class _WithWords(Vocabulary):
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
-        new = self.objects[self.trained :]
-        return (*self._base.labels, *(entry.label for entry in new))
+        return (*self._base.labels, *(entry.label for entry in self.objects[self.trained :]))
 
     @cached_property
     def structure(self) -> NDArray[np.bool_]:
@@ -390,6 +383,13 @@ _SHARED: Final = (
     *("room_types", "room_aliases", "_by_spelling", "_by_key", "_bare"),
     *("_room_by_spelling", "_room_by_key", "_memory"),
 )
+
+
+def _names_to_guess(label: str) -> list[str]:
+    """Return the alternatives of an unknown label, else its last reading, else the label."""
+    pairs = list(readings(label))
+    alternatives = [name for rule, name in pairs if rule == "alternative"]
+    return alternatives[:_MOST_GUESSED] or [name for _, name in pairs][-1:] or [label]
 
 
 def do_not_fit(
