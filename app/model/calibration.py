@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Final, NamedTuple, Self
 
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
@@ -21,7 +22,7 @@ Floats = NDArray[np.floating[Any]]
 class CountSlope(Frozen):
     """Calibration of a logit z: log-odds = intercept + slope·z + log_count·log n.
 
-    The attributes of `Calibration` define n for each question.
+    `Calibration` and `PAIR_CALIBRATIONS` define n.
     """
 
     intercept: float = 0.0
@@ -46,8 +47,7 @@ class CoverageFit(Frozen):
     last: float = 0.0
 
 
-LEAST_COVERAGE: Final = 0.15
-"""Least share of a scene that the base rates of `/missing` tell apart."""
+LEAST_COVERAGE: Final = 0.15  # least share of a scene that the base rates of `/missing` tell apart
 
 PairSlopes = Annotated[Many[CountSlope], Field(max_length=len(CANONICAL))]
 
@@ -90,10 +90,7 @@ class Sharpness(Frozen):
 
 
 class FitLimit(Frozen):
-    """Minimum of `app.questions.generate.room_fit` for a scene of n classes.
-
-    It is intercept + log_count·log n.
-    """
+    """Minimum of `app.questions.generate.room_fit`: intercept + log_count·log n for n classes."""
 
     intercept: float
     log_count: float = 0.0
@@ -114,10 +111,7 @@ permitted share of alarms alone would flag objects that probably belong."""
 
 
 class AlarmLine(Frozen):
-    """Minimum log-odds of an alarm in a list of n entries.
-
-    They are intercept + log_count·log n + curve·log² n.
-    """
+    """Minimum log-odds of an alarm in n entries: intercept + log_count·log n + curve·log² n."""
 
     intercept: float
     log_count: float = 0.0
@@ -145,9 +139,8 @@ KINDS: Final = ("lateral", "support", "above", "under", "stand")
 class Judgement(Frozen):
     """The log-odds that an entry of `misplaced` is wrong, and the lines of an alarm.
 
-    The log-odds are intercept + relation·z + change·d + stand·s + supporter·q; see
-    `app.questions.misplaced`.
-    n of the lines is the number of entries of the kind in the scene.
+    The log-odds are intercept + relation·z + change·d + stand·s + supporter·q, with the terms of
+    `app.questions.misplaced`. n of the lines is the number of entries of the kind in the scene.
     """
 
     intercept: float
@@ -159,18 +152,14 @@ class Judgement(Frozen):
 
 
 class Misplaced(Frozen):
-    """The judgement of each kind of entry. None: training had too few scenes for the fit.
-
-    Attributes:
-        usual: indices (relation, subject, object) of relations between classes that a person has
-            confirmed.
-    """
+    """The judgement of each kind of entry. None: training had too few scenes for the fit."""
 
     lateral: Judgement | None = None
     support: Judgement | None = None
     above: Judgement | None = None
     under: Judgement | None = None
     stand: Judgement | None = None
+    # Relations (relation, subject, object) between classes that a person has confirmed.
     usual: Many[tuple[Count, Count, Count]] = ()
 
     @property
@@ -185,55 +174,38 @@ class Calibration(Frozen):
     With the default values, the calibration changes nothing, and the model judges neither objects
     nor relations. An intruder is an object that does not belong to the scene. Tuples of the V
     classes or C room types may be empty: all classes are equally popular, or there is no minimum.
-
-    Attributes:
-        coverage: share of the classes of a scene that the base rates of `/missing` assume if a
-            request states no coverage.
-        missing: calibration of the log-odds that an unlisted class is present, if a request states
-            no coverage. n is the number of listed classes without structure.
-        covered: the same if a request states the coverage.
-        popularity: (V,) log-odds that a training scene has each class; None for a class that no
-            source shows in training.
-        popularity_weight: exponent alpha. The prior probability of an intruder's class is
-            proportional to popularity^alpha, where popularity is the odds of the class.
-        outlier_lines: minimum log-odds of an outlier, by the number of listed classes without
-            structure. None exactly if `outlier` is None.
-        room_lines: the same if a request states the room type; None: as `outlier_lines`.
-        rooms: calibration of the probabilities of the room types.
-        rare_rooms: indices of the room types with too few training scenes for `/generate`.
-        written_rooms: indices of the room types that written scenes alone show.
-        smallest: (C + 1,) minimum number of classes in a generated scene of each room type. The
-            last entry is for scenes without a room type.
-        room_fit: (C,) minimum fit of a generated scene of each room type. About 95 % of the lists
-            of whole rooms reach both limits (`training.fit.calibrate_rooms`).
-        outlier: calibration that converts a class's log-odds of presence to the log-odds that its
-            object is an intruder. n is the number of classes in the scene without structure. None:
-            training had too few scenes for the fit, so the model judges no object.
-        relation, relation_given: calibrations of each canonical relation in scenes without and with
-            observed relations.
-        placement, at: calibrations of each canonical relation for a missing object at its most
-            probable places, and at the place that a request names.
-        misplaced: calibration of the observed relations, and of objects on the floor or on a wall.
+    For `missing` and `outlier`, n is the number of listed classes without structure.
     """
 
+    # Share of the classes of a scene that the base rates of `/missing` assume by default.
     coverage: Annotated[float, Field(ge=0, le=1)] = 0.5
-    missing: CountSlope = CountSlope()
-    covered: CoverageFit = CoverageFit()
+    missing: CountSlope = CountSlope()  # log-odds of presence, if a request states no coverage
+    covered: CoverageFit = CoverageFit()  # the same if a request states the coverage
+    # (V,) log-odds that a training scene has each class; None: no source shows it in training.
     popularity: Many[float | None] = ()
+    # alpha: the prior probability of an intruder's class is proportional to popularity^alpha, where
+    # popularity is the odds of the class.
     popularity_weight: Annotated[float, Field(ge=0, le=1)] = 0.0
-    outlier_lines: AlarmLines | None = None
-    room_lines: AlarmLines | None = None
+    outlier_lines: AlarmLines | None = None  # by n; None exactly if `outlier` is None
+    room_lines: AlarmLines | None = None  # with a stated room type; None: as `outlier_lines`
     rooms: Sharpness = Sharpness()
-    rare_rooms: Many[Count] = ()
-    written_rooms: Many[Count] = ()
+    rare_rooms: Many[Count] = ()  # room types with too few training scenes for `/generate`
+    written_rooms: Many[Count] = ()  # room types that written scenes alone show
+    # (C + 1,) minimum number of classes in a generated scene of each room type, then of none.
     smallest: Many[Count] = ()
+    # (C,) minimum fit of a generated scene of each room type. About 95 % of the lists of whole
+    # rooms reach both limits (`training.fit.calibrate_rooms`).
     room_fit: Many[FitLimit] = ()
+    # From log-odds of presence to log-odds of an intruder. None: training had too few scenes for
+    # the fit, so the model judges no object.
     outlier: CountSlope | None = None
+    # Calibrations of each canonical relation: without and with observed relations, and for a
+    # missing object at its most probable places, and at the place that a request names.
     relation: PairSlopes
     relation_given: PairSlopes
     placement: PairSlopes
     at: PlaceFits
-    misplaced: Misplaced = Misplaced()
+    misplaced: Misplaced = Misplaced()  # observed relations, and objects on the floor or a wall
 
     @model_validator(mode="after")
     def _check_outlier_lines(self) -> Self:
@@ -260,15 +232,14 @@ class Calibration(Frozen):
 
 
 class RelationSlopes(NamedTuple):
-    """Calibration tables of the A canonical relations, each (A, 3).
+    """Calibration tables of the A canonical relations, named as the fields of `Calibration`.
 
-    Each row of a table is the `CountSlope` of one relation: intercept, slope, log_count. The tables
-    have the names of their fields in `Calibration`.
+    Each row is the `CountSlope` of one relation: intercept, slope, log_count.
     """
 
-    relation: Floats
-    relation_given: Floats
-    placement: Floats
+    relation: Float[Floats, "A 3"]
+    relation_given: Float[Floats, "A 3"]
+    placement: Float[Floats, "A 3"]
 
     @classmethod
     def of(cls, calibration: Calibration) -> Self:

@@ -31,7 +31,6 @@ Floats = NDArray[np.float64]
 Table = NDArray[np.float32]
 Ints = NDArray[np.integer[Any]]
 
-
 EXPONENTS: Final = 2
 """Exponents of the formula: the first raises large numbers, and the second numbers between 1 and M.
 """
@@ -48,22 +47,17 @@ _MOST: Final = 256
 class Counts(TensorGroup):
     """Counts of K of a model's V classes.
 
-    Attributes:
-        classes: (K,) indices of the classes with statistics, in ascending order.
-        most: (K,) maximum listed number, from 1 to M - 1. Too few groups of training scenes have
-            more instances.
-        log_share: (K, M) log of the share of scenes with 1, 2, ... instances, of the scenes with
-            the class. The last column stands for M or more instances.
-        weights: (K, 2, 3 + C + V) effects of the scene on the two exponents. A class has no effect
-            on itself.
+    Too few groups of training scenes have more than `most` instances. The last column of
+    `log_share` stands for M or more instances. `weights` are the effects of the scene, (3 + C + V),
+    on the two exponents. A class has no effect on itself.
     """
 
     prefix: ClassVar[str] = "counts."
     integers = ("classes", "most")
 
-    classes: Annotated[Ints, "K"]
-    most: Annotated[Ints, "K"]
-    log_share: Annotated[Table, "K", "M"]
+    classes: Annotated[Ints, "K"]  # ascending
+    most: Annotated[Ints, "K"]  # maximum listed number, from 1 to M - 1
+    log_share: Annotated[Table, "K", "M"]  # of scenes with 1, 2, ... instances, of those with any
     weights: Annotated[Table, "K", EXPONENTS, "features"]
 
     def check(self, A: int, V: int, C: int) -> None:
@@ -84,23 +78,15 @@ class Counts(TensorGroup):
     def distribution(
         self,
         V: int,
-        classes: Int[Ints, "n"],
-        listed: Int[Ints, "n"],
+        classes: Int[Ints, "n"],  # without structure, ascending
+        listed: Int[Ints, "n"],  # number of objects of each class
         room: int | None = None,
-        unlisted: float = 1.0,
+        unlisted: float = 1.0,  # ρ of the formula
     ) -> tuple[Int[Ints, "k"], Float[Floats, "k M"]]:
         """Return the distributions of the numbers of instances of the listed classes.
 
-        Args:
-            V: number of classes of the model.
-            classes: indices of the listed classes, without structure, in ascending order.
-            listed: number of listed objects of each class.
-            room: index of the room type, or None.
-            unlisted: ρ of the formula.
-
-        Returns:
-            Indices into `classes` of the classes with statistics that cover the listed number, and
-            the probability of 1, 2, ... M instances of each.
+        The first result has indices into `classes`: those with statistics that cover the listed
+        number. The second one has the probabilities of 1, 2, ... M instances.
         """
         tables = self.classes, self.most, self.log_share, self.weights
         scene = classes, listed, -1 if room is None else room
@@ -109,21 +95,24 @@ class Counts(TensorGroup):
 
 
 @compiled
-def _distributions(known, most, log_share, weights, classes, listed, room, first, log_unlisted):
-    """Return the rows and distributions of `Counts.distribution`, (k,) and (k, M).
-
-    Args:
-        known, most, log_share, weights: see `Counts`. Column `first` of the weights is class 0.
-        classes, listed: (n,) listed classes, and numbers of listed objects.
-        room: index of the room type, or -1.
-        log_unlisted: log ρ of the formula.
-    """
+def _distributions(
+    with_statistics: Int[NDArray, " K"],
+    most: Int[NDArray, " K"],
+    log_share: Float[NDArray, "K M"],
+    weights: Float[NDArray, "K 2 features"],
+    classes: Int[NDArray, " n"],
+    listed: Int[NDArray, " n"],
+    room: int,  # -1: unknown
+    first: int,  # column of class 0 in `weights`
+    log_unlisted: float,  # log ρ of the formula
+) -> tuple[Int[NDArray, " k"], Float[NDArray, "k M"]]:
+    """Return the rows and distributions of `Counts.distribution`."""
     n, M = len(classes), log_share.shape[1]
     p, rows, k = np.empty((n, M), np.float64), np.empty(n, np.int64), 0
     exponents, several, entry = np.empty(2), 0, np.empty(n, np.int64)
     for i in range(n):
         several += listed[i] > 1
-        entry[i] = find_row(known, classes[i])
+        entry[i] = find_row(with_statistics, classes[i])
         if entry[i] >= 0 and listed[i] <= most[entry[i]]:
             rows[k] = i
             k += 1

@@ -11,7 +11,7 @@ from functools import cached_property
 from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled
@@ -31,28 +31,20 @@ _PER_METRE: Final = 1000.0  # offsets are rounded to millimetres
 class Offsets(TensorGroup):
     """Normal distributions of offsets, for A canonical relations, V classes and P observed pairs.
 
-    Attributes:
-        relation: (A, 6) mean (3) and variance (3) of the offset along x, y and z for each relation,
-            for any two classes.
-        relation_scenes: (A,) number of training scenes with each relation.
-        subject: (A, V, 6) terms that each class adds to `relation` if it is the subject.
-        object: (A, V, 6) terms that each class adds to `relation` if it is the object.
-        pair: (P,) keys of the pairs of classes in the training scenes, in ascending order. The key
-            of a pair in relation a is (a V + subject) V + object.
-        pair_offset: (P, 6) mean (3) and standard deviation (3) of the offset of each pair.
-        pair_scenes: (P,) number of training scenes with each pair in its relation.
+    Six numbers are three means along x, y and z, then three variances. The terms of the subject's
+    and the object's class add to those of the relation, which are for any two classes.
     """
 
     prefix: ClassVar[str] = "offsets."
     integers = ("relation_scenes", "pair", "pair_scenes")
 
     relation: Annotated[Table, "A", 6]
-    relation_scenes: Annotated[Ints, "A"]
+    relation_scenes: Annotated[Ints, "A"]  # number of training scenes with each relation
     subject: Annotated[Table, "A", "V", 6]
     object: Annotated[Table, "A", "V", 6]
-    pair: Annotated[Ints, "P"]
-    pair_offset: Annotated[Table, "P", 6]
-    pair_scenes: Annotated[Ints, "P"]
+    pair: Annotated[Ints, "P"]  # keys (a V + subject) V + object in relation a, ascending
+    pair_offset: Annotated[Table, "P", 6]  # means, then standard deviations
+    pair_scenes: Annotated[Ints, "P"]  # number of training scenes with each pair in its relation
 
     def check(self, A: int, V: int, C: int) -> None:
         """Check the values for a machine with A relations and V classes."""
@@ -67,12 +59,10 @@ class Offsets(TensorGroup):
     def find(
         self, relation: Int[Ints, "n"], subject: Int[Ints, "n"], other: Int[Ints, "n"]
     ) -> tuple[Float[NDArray[np.float64], "n 6"], Int[NDArray[np.int64], "n"]]:
-        """Return the offsets of pairs: relation, subject class and object class.
+        """Return the offsets of pairs of classes, and the number of training scenes of each pair.
 
-        Returns:
-            Offsets: mean (3) and standard deviation (3). Then the number of training scenes that
-            contain each pair. If it is 0, the offset is the sum of a term of the relation and one
-            term of each class. `UNOBSERVED`: training lacks the relation.
+        An offset is mean (3) and standard deviation (3). If the number is 0, it is the sum of a
+        term of the relation and one term of each class. `UNOBSERVED`: training lacks the relation.
         """
         return _look_up_offsets(self.tables, relation, subject, other)
 
@@ -83,22 +73,20 @@ class Offsets(TensorGroup):
 
 
 @compiled
-def rotated_offsets(tables, relation, missing, anchor, outgoing, axes, has_axes):
-    """Return the offset from each of n anchors to its missing object, in metres.
+def rotated_offsets(
+    tables: tuple[NDArray[Any], ...],  # `Offsets.tables`
+    relation: Int[NDArray, " n"],
+    missing: Int[NDArray, " n"],  # classes of the missing objects
+    anchor: Int[NDArray, " n"],  # classes of the anchors
+    outgoing: Bool[NDArray, " n"],  # whether the missing object is the relation's subject
+    axes: Float[NDArray, "3 3"],  # of the viewer, in the frame of the offsets
+    has_axes: bool,
+) -> tuple[Float[NDArray, "n 3"], Float[NDArray, "n 3"], Int[NDArray, " n"]]:
+    """Return mean and standard deviation of the offset from each anchor to its missing object.
 
-    Args:
-        tables: `Offsets.tables`.
-        relation, missing, anchor: (n,) indices of the canonical relations, of the classes of the
-            missing objects, and of the classes of the anchors.
-        outgoing: (n,) bool, True if the missing object is the relation's subject.
-        axes: (3, 3) float64, the viewer's axes in the frame of the offsets.
-        has_axes: False if the viewing direction is unknown. The relations left and front then have
-            no offset. The means of other offsets are then vertical.
-
-    Returns:
-        Mean (n, 3) and standard deviation (n, 3) along x, y and z. Then the number of training
-        scenes that contain the two classes in this relation, (n,). It is `UNOBSERVED` for an
-        unknown offset.
+    Lengths are in metres. The third result is the number of training scenes with the two classes in
+    this relation, or `UNOBSERVED` for an unknown offset. Without axes, the viewing direction is
+    unknown: left and front have no offset, and the means of other offsets are vertical.
     """
     n = len(relation)
     subject, object_ = np.empty(n, np.int64), np.empty(n, np.int64)
@@ -134,15 +122,19 @@ def rotated_offsets(tables, relation, missing, anchor, outgoing, axes, has_axes)
 
 
 @compiled
-def _look_up_offsets(tables, relation, subject, other):
+def _look_up_offsets(
+    tables: tuple[NDArray[Any], ...],
+    relation: Int[NDArray, " n"],
+    subject: Int[NDArray, " n"],
+    other: Int[NDArray, " n"],
+) -> tuple[Float[NDArray, "n 6"], Int[NDArray, " n"]]:
     """Return the offsets and the numbers of scenes of `Offsets.find`."""
     relation_offset, relation_scenes, subjects, objects, pair, pair_offset, pair_scenes = tables
     n, V = len(relation), subjects.shape[1]
     offset, scenes = np.empty((n, 6)), np.empty(n, np.int64)
     for k in range(n):
         a, i, j = relation[k], subject[k], other[k]
-        key = (a * V + i) * V + j
-        row = find_row(pair, key)
+        row = find_row(pair, (a * V + i) * V + j)
         if row >= 0:
             for axis in range(6):
                 offset[k, axis] = pair_offset[row, axis]

@@ -15,7 +15,7 @@ from functools import cached_property
 from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy.typing import NDArray
 
 from app.compiling import compiled
@@ -38,27 +38,18 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Places(TensorGroup):
-    """Counts of relations between classes, of the roles of boxes, and of objects on the floor.
-
-    Attributes:
-        triple: keys (a V + i) V + j of relations a from class i to class j, ascending.
-        held: number of training scenes with each triple.
-        frequency: share of each class among the listed classes of the training scenes.
-        role_pair, role_counts, role_anchor: see `RoleCounts`.
-        stands: shares of the objects of each class that stand on the floor, hang, and stand on or
-            in an object.
-    """
+    """Counts of relations between classes, of the roles of boxes, and of objects on the floor."""
 
     prefix: ClassVar[str] = "places."
     integers = ("triple", "role_pair")
 
-    triple: Annotated[NDArray[np.int32], "N"]
-    held: Annotated[NDArray[np.float32], "N"]
-    frequency: Annotated[NDArray[np.float32], "V"]
-    role_pair: Annotated[NDArray[np.int32], "P"]
+    triple: Annotated[NDArray[np.int32], "N"]  # keys (a V + i) V + j of a(i, j), ascending
+    held: Annotated[NDArray[np.float32], "N"]  # number of training scenes with each triple
+    frequency: Annotated[NDArray[np.float32], "V"]  # share of the listed classes in training
+    role_pair: Annotated[NDArray[np.int32], "P"]  # this and the next two: see `RoleCounts`
     role_counts: Annotated[NDArray[np.float32], "P", 3]
     role_anchor: Annotated[NDArray[np.float32], "V", 3]
-    stands: Annotated[NDArray[np.float32], "V", 3]
+    stands: Annotated[NDArray[np.float32], "V", 3]  # shares: on the floor, hanging, supported
 
     def check(self, A: int, V: int, C: int) -> None:
         """Check the values for a machine with A relations and V classes."""
@@ -75,12 +66,9 @@ class Places(TensorGroup):
         return RoleCounts(self.role_pair.astype(np.int64), self.role_counts, self.role_anchor)
 
     def log_ratio(self, relation: int, anchor: int, *, outgoing: bool) -> Float[Floats, "V"]:
-        """Return log p(i at a, j) - log p(i) of each class i at a place.
+        """Return log p(i at a, j) - log p(i) of each class i, with relation a and anchor class j.
 
-        Args:
-            relation: index a of the canonical relation of the place.
-            anchor: index j of the class of the place's object.
-            outgoing: True if the class i is the subject of the relation, False if the anchor is.
+        ``outgoing`` means that the class i is the subject of the relation, and not the anchor.
         """
         start, classes, counts, back_off = self._by_anchor[int(outgoing)]
         V = len(self.frequency)
@@ -92,17 +80,14 @@ class Places(TensorGroup):
     def shows(
         self, relation: int, subject: Int[Indices, "N"], other: Int[Indices, "M"]
     ) -> Bool[NDArray[np.bool_], "N M"]:
-        """Return whether training shows the relation from each subject class to each other class.
-
-        A single scene may be an error.
-        """
+        """Return whether training shows a relation of classes. A single scene may be an error."""
         V = len(self.frequency)
         return _triple_counts(self.triple, self.held, V, relation, subject, other) >= _SHOWN
 
     def supporters(
         self, subject: Int[Indices, "N"], other: Int[Indices, "M"]
     ) -> Float[Floats, "N M"]:
-        """Return the share of each other class among the supporters of each subject class.
+        """Return the share of each class among the supporters of each subject class.
 
         A supporter is an object on or in which the subject is.
         """
@@ -119,19 +104,16 @@ class Places(TensorGroup):
         is_support = np.isin(self.triple // (V * V), SUPPORTS)
         subject, other = np.divmod(self.triple[is_support] % (V * V), V)
         held = self.held[is_support]
-        total, count = (np.bincount(end, held, V).astype(float) for end in (subject, other))
+        total, count = (np.bincount(role, held, V).astype(float) for role in (subject, other))
         return total, (count + _SEEN) / (count + _SEEN).sum()
 
     @cached_property
-    def unseen(self) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Change of the log-odds of stacked relations that training never shows.
+    def unseen(self) -> tuple[UInt8[NDArray, "V V"], Float[NDArray, "3 V"]]:
+        """Stacked relations that training shows, and the change of the log-odds of the others.
 
         The change is the log share of the subject's stand, at most `USUAL`: on a wall for above, on
-        or in an object for on-top and inside. So a blackboard does not stand on a chair.
-
-        Returns:
-            Relations of `STACKED` that training shows, (V, V): bit a is relation a. Then the change
-            for each subject class, (3, V); see `add_unseen`.
+        or in an object for on-top and inside. So a blackboard does not stand on a chair. The values
+        are the first two arguments of `add_unseen`.
         """
         shares = np.log(np.minimum(np.maximum(self.stands, _LEAST_STAND) / USUAL, 1.0))
         every = np.arange(len(shares))
@@ -183,16 +165,15 @@ class Places(TensorGroup):
 
 
 @compiled
-def add_unseen(shown, change, candidates, classes, forward, backward):
-    """Add the changes of stacked relations that training never shows to log-odds, in place.
-
-    Args:
-        shown: (V, V) stacked relations of two classes that training shows. Bit a is relation a.
-        change: (3, V) change for each subject class.
-        candidates, classes: (N,) and (m,) classes.
-        forward, backward: (N, A, m) log-odds with the candidate and with the other class as
-            subject. The last A - 2 relations are the stacked ones.
-    """
+def add_unseen(
+    shown: UInt8[NDArray, "V V"],  # bit a: training shows relation a of `STACKED`
+    change: Float[NDArray, "3 V"],  # for each subject class
+    candidates: Int[NDArray, " N"],
+    classes: Int[NDArray, " m"],
+    forward: Float[NDArray, "N A m"],  # log-odds with the candidate as subject
+    backward: Float[NDArray, "N A m"],  # log-odds with the other class as subject
+) -> None:
+    """Add the changes of stacked relations that training never shows to log-odds, in place."""
     for c in range(len(candidates)):
         for a in range(forward.shape[1] - ON_TOP):
             for k in range(len(classes)):
@@ -204,8 +185,15 @@ def add_unseen(shown, change, candidates, classes, forward, backward):
 
 
 @compiled
-def _triple_counts(triple, held, V, relation, subject, other):
-    """Return the counts of the triples (relation, subject, other), (N, M); 0 without an entry."""
+def _triple_counts(
+    triple: Int[NDArray, " R"],
+    held: Float[NDArray, " R"],
+    V: int,
+    relation: int,
+    subject: Int[NDArray, " N"],
+    other: Int[NDArray, " M"],
+) -> Float[NDArray, "N M"]:
+    """Return the counts of the triples (relation, subject, other), 0 without an entry."""
     counts = np.zeros((len(subject), len(other)))
     for i in range(len(subject)):
         for j in range(len(other)):

@@ -29,24 +29,14 @@ RARELY: Final = 1 / 500
 
 @dataclass(frozen=True, eq=False)
 class SceneModel:
-    """A model, ready to answer questions.
-
-    Attributes:
-        weights: weights of the machine.
-        vocabulary: names of the model's V object classes and C room types.
-        calibration: conversion of log-odds into probabilities.
-        offsets: vectors in metres between the centres of related objects; None without poses in the
-            training scenes.
-        counts: statistics of the numbers of instances; None without such numbers.
-        places: counts of where objects stand; None without relations in the training scenes.
-    """
+    """A model, ready to answer questions."""
 
     weights: Weights
     vocabulary: Vocabulary
     calibration: Calibration
-    offsets: Offsets | None = None
-    counts: Counts | None = None
-    places: Places | None = None
+    offsets: Offsets | None = None  # None: no training scene has poses
+    counts: Counts | None = None  # None: training has no numbers of instances
+    places: Places | None = None  # None: no training scene has relations
 
     @cached_property
     def spec(self) -> MachineSpec:

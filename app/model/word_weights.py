@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import Any, Final, Self
 
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import NDArray
 
 from app.inference import Weights
@@ -38,26 +39,16 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class RowMap:
-    """The regression from word vectors to the weights of a class.
+    """The regression from D components of word vectors to M weights, fitted to K classes."""
 
-    Attributes:
-        centre: (dimensions,) mean of the word vectors of the classes.
-        vectors: (K, dimensions) centred word vectors of the K classes of the regression.
-        coefficients: (K, M) product of the inverse and the centred rows of these classes.
-        mean: (M,) mean of the rows. M is the number of predicted weights of a class.
-    """
-
-    centre: Floats
-    vectors: Floats
-    coefficients: Floats
-    mean: Floats
+    centre: Float[Floats, " D"]  # mean of the word vectors
+    vectors: Float[Floats, "K D"]  # without the mean, of length 1
+    coefficients: Float[Floats, "K M"]  # (K + λ I)^-1 (rows - mean)
+    mean: Float[Floats, " M"]  # of the rows
 
     @classmethod
     def fit(cls, weights: Weights, vocabulary: Vocabulary, left_out: Sequence[int] = ()) -> Self:
-        """Fit the map to the classes of a model with word vectors, without structure.
-
-        Args:
-            left_out: indices of classes that the map must not know.
+        """Fit the map to the classes with word vectors, except structure and ``left_out`` indices.
 
         Raises:
             ValueError: no class has a word vector.
@@ -80,15 +71,10 @@ class RowMap:
         vectors = np.stack([word.vector for word in words])
         return with_rows(weights, self.rows(weights, vectors))
 
-    def rows(self, weights: Weights, vectors: Floats) -> dict[str, NDArray[np.float32]]:
-        """Return the predicted weights of N words by the names of their arrays.
-
-        Each array has N entries in its first axis.
-
-        Args:
-            weights: weights of the model.
-            vectors: (N, dimensions) word vectors of length 1.
-        """
+    def rows(
+        self, weights: Weights, vectors: Float[Floats, "N D"]
+    ) -> dict[str, Float[NDArray[np.float32], "N ..."]]:
+        """Return the predicted weights of N words by the names of their arrays."""
         k = np.exp(_directions(vectors - self.centre) @ self.vectors.T - 1)
         change, start = k @ self.coefficients, 0
         rows: dict[str, Floats] = {}
@@ -102,10 +88,7 @@ class RowMap:
 
 
 def with_rows(weights: Weights, rows: Mapping[str, Floats]) -> Weights:
-    """Return the weights with further classes at the end, one for each of N predicted rows.
-
-    Weights that are not predicted are 0.
-    """
+    """Return the weights with a further class for each predicted row. Other weights are 0."""
     V, more = weights.spec.V, len(rows["W"])
     larger = weights.enlarged(V + more, weights.spec.C)
     for name, values in _parts(larger).items():
@@ -119,6 +102,6 @@ def _parts(weights: Weights) -> dict[str, NDArray[Any]]:
     return parts | {name: weights[name].T for name in _COLUMNS if name in weights.arrays}
 
 
-def _directions(vectors: Floats) -> Floats:
-    """Return vectors (N, dimensions) scaled to length 1. A vector of 0 stays 0."""
+def _directions(vectors: Float[Floats, "N D"]) -> Float[Floats, "N D"]:
+    """Return vectors scaled to length 1. A vector of 0 stays 0."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.float32(1e-9))

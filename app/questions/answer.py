@@ -22,14 +22,12 @@ from scene_client.schemas import ModelReference, SceneRequest
 Fields: TypeAlias = dict[str, Any]
 """Fields of an answer, or of a part of an answer."""
 
-DIGITS: Final = 6
-"""Significant digits of probabilities, log-odds and metres."""
+DIGITS: Final = 6  # significant digits of probabilities, log-odds and metres
 # Doubles represent these powers of ten exactly. So an integer divided by such a power is the double
 # that is nearest to the decimal number.
 _POWERS: Final = np.array([10.0**power for power in range(23)])
 
-REASONS: Final = 3
-"""Maximum number of reasons for one entry of an answer."""
+REASONS: Final = 3  # maximum number of reasons for one entry of an answer
 
 EXPLAINED: Final = 32
 """Maximum number of entries with reasons in an answer. The first entries have reasons."""
@@ -56,40 +54,24 @@ def envelope(
 
 
 def named(label: str, word: str | None) -> Fields:
-    """Return the field `label`, and `listed_as` if the request has another word for the class.
-
-    Args:
-        label: label of the class.
-        word: word of the request for the class. None means that the request has no word for it.
-    """
-    if word is None or word == label:
-        return {"label": label}
-    return {"label": label, "listed_as": word}
+    """Return the field `label`, and `listed_as` if the request has another word for the class."""
+    return {"label": label} if word in {None, label} else {"label": label, "listed_as": word}
 
 
 def reasons(
     scene: Scene,
     present: Present,
     change: Float[NDArray[np.floating[Any]], "N n"],
-    rows: Int[NDArray[np.int64], "N"] | None = None,
+    rows: Int[NDArray[np.int64], "N"] | None = None,  # in the scene; None: they are absent
     *,
-    least: float = 0.0,
-    scale: float = 1.0,
+    least: float = 0.0,  # minimum absolute change
+    scale: float = 1.0,  # slope of the calibration, so that changes are those of `log_odds`
 ) -> list[list[Fields]]:
     """Return the strongest reasons for the log-odds of each of N explained classes.
 
-    A reason is a class of the scene and its change of these log-odds. The reasons with the largest
-    absolute changes come first. The answer names the first object of the class.
-
-    Args:
-        change: change of each explained class's log-odds by each class of the scene.
-        rows: index of each explained class among the classes of the scene; None: they are absent.
-        least: minimum absolute value of a change. Rounding errors of a change of 0 are left out.
-        scale: slope of the calibration, so that an answer's changes are those of its `log_odds`.
-
-    Returns:
-        For each explained class, a list of reasons with the fields of
-        `scene_client.schemas.Because`.
+    A reason is a class of the scene and its change of these log-odds. The largest absolute changes
+    come first. `scene_client.schemas.Because` defines the fields; the object is the first of its
+    class.
     """
     columns, values = _strongest(change, np.zeros(0, np.int64) if rows is None else rows, REASONS)
     values = scale * values
@@ -117,8 +99,7 @@ def rounded_number(number: float) -> float:
 def written_within(answer: Fields, most: int) -> bytes | None:
     """Return an answer as JSON, or None if it has more than ``most`` bytes.
 
-    The longest lists could have 64 MiB. So the function writes parts of them first, and stops when
-    these have more than ``most`` bytes.
+    The longest lists could have 64 MiB, so parts of them are written and measured first.
     """
     size = 0
     for entries in answer.values():
@@ -151,21 +132,16 @@ def written(answer: Any) -> bytes:
 
 
 @compiled
-def _strongest(change, rows, count):
-    """Return the indices and values of the k <= `count` largest absolute changes, each (N, k).
+def _strongest(
+    change: Float[NDArray, "N n"], rows: Int[NDArray, " N"], count: int
+) -> tuple[Int[NDArray, "N k"], Float[NDArray, "N k"]]:
+    """Return the indices and values of the k <= `count` largest absolute changes by other classes.
 
-    The result leaves out the change of a class by itself.
-
-    Args:
-        change: (N, n) change of each explained class's log-odds by each of the n classes of the
-            scene.
-        rows: (N,) index of each explained class among the n classes. It is empty if the explained
-            classes are absent.
-        count: maximum of k.
+    `rows` has the index of each explained class in the scene; it is empty if they are absent.
     """
     N, n = change.shape
     kept = min(count, n - (len(rows) > 0))
-    places, values = np.empty((N, kept), np.int64), np.empty((N, kept), np.float64)
+    columns, values = np.empty((N, kept), np.int64), np.empty((N, kept), np.float64)
     usable = np.ones(n, np.bool_)
     for c in range(N):
         if len(rows):
@@ -174,17 +150,15 @@ def _strongest(change, rows, count):
         if len(rows):
             usable[rows[c]] = True
         for k in range(kept):
-            places[c, k], values[c, k] = indices[k], change[c, indices[k]]
-    return places, values
+            columns[c, k], values[c, k] = indices[k], change[c, indices[k]]
+    return columns, values
 
 
 @compiled
-def _round_to_digits(values):
-    """Round float64 numbers (n,) to `DIGITS` significant digits in place.
+def _round_to_digits(values: Float[NDArray, " n"]) -> bool:
+    """Round float64 numbers to `DIGITS` significant digits in place.
 
-    Returns:
-        False if a number is too small or too large for exact powers of ten. Such numbers stay
-        unchanged.
+    Numbers too small or too large for exact powers of ten stay unchanged; the result is then False.
     """
     exact = True
     for k in range(len(values)):
@@ -208,8 +182,8 @@ def best(
     Of equal values, the value with the lower index comes first. The time is O(N log count).
     """
     size, rest, kept = 0, 0, min(count, len(values))
-    # The heap contains the best indices so far. Its root is the worst of these indices: the index
-    # with the smallest value, and of several equal values the largest index.
+    # A heap of the best indices so far. Its root is the worst: the smallest value, and of equal
+    # values the largest index.
     heap = np.empty(kept, np.int64)
     while size < kept and rest < len(values):
         if usable[rest]:

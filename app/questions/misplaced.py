@@ -69,11 +69,8 @@ from app.scene.stands import (
     stands_of,
 )
 
-BESIDE, SUPPORT, OVER, BELOW, STAND = range(len(KINDS))
-"""Indices of the kinds in `KINDS`."""
-
-TERMS: Final = 4
-"""Number of terms of an entry."""
+BESIDE, SUPPORT, OVER, BELOW, STAND = range(len(KINDS))  # indices of the kinds in `KINDS`
+TERMS: Final = 4  # number of terms of an entry
 
 THE_FLOOR: Final = "floor"
 """Name of the floor in an entry about an object that stands on the floor or hangs above it."""
@@ -88,19 +85,12 @@ Floats = NDArray[np.float64]
 
 
 class Entries(NamedTuple):
-    """The n judged entries of a scene of N objects.
+    """The n judged entries of a scene of N objects."""
 
-    Attributes:
-        triple: relation, subject and object. The object is -1 for the floor.
-        kind: index of the kind in `KINDS`.
-        terms: terms z, d, s and q; see the module.
-        mover: object that would have moved if the entry is wrong.
-    """
-
-    triple: Int[Indices, "n 3"]
-    kind: Int[Indices, "n"]
-    terms: Float[Floats, "n 4"]
-    mover: Int[Indices, "n"]
+    triple: Int[Indices, "n 3"]  # relation, subject and object, which is -1 for the floor
+    kind: Int[Indices, "n"]  # index in `KINDS`
+    terms: Float[Floats, "n 4"]  # z, d, s and q; see the module
+    mover: Int[Indices, "n"]  # object that would have moved if the entry is wrong
 
 
 _NO_ENTRIES: Final = Entries(
@@ -184,11 +174,8 @@ def _stands(
 ) -> tuple[Int[Indices, "N"], Float[Floats, "N"], Float[Floats, "N"]]:
     """Return the stand of each object, its log p, and log q of its supporter.
 
-    The values are 0 for an unknown stand, and log p without poses.
-
-    Args:
-        supports: pairs of objects (i, j) with i on or in j.
-        heights: heights of the boxes, or None for a scene without poses.
+    The values are 0 for an unknown stand, and log p without poses. `supports` has pairs (i, j) of
+    objects with i on or in j. `heights` is None without poses.
     """
     present, places = posterior.present, model.places
     stands, zeros = np.full(len(present.row), UNKNOWN), np.zeros(len(present.row))
@@ -258,21 +245,15 @@ def _judged(model: SceneModel, entries: Entries) -> Iterator[tuple[Judgement, In
 
 
 def misplaced_fields(
-    model: SceneModel,
-    posterior: Posterior,
-    scene: Scene,
-    sensitivity: Sensitivity,
+    model: SceneModel, posterior: Posterior, scene: Scene, sensitivity: Sensitivity
 ) -> list[Fields]:
     """Judge the observed relations, and the objects that nothing supports.
 
-    The answer lists every observed relation of a kind that the model judges, without those of
-    structure. An object on the floor, or hanging above it, is listed only if it reaches the most
-    sensitive alarm line. The entry that is most probably wrong comes first. Entries with equal
-    probabilities keep the order of `Scene.triples`. An object under another object is the subject
-    of its entry.
-
-    Returns:
-        The fields of `scene_client.schemas.MisplacedRelation`.
+    Every relation of a kind that the model judges is listed, without structure. An object on the
+    floor, or hanging above it, is listed only if it reaches the most sensitive alarm line. The most
+    probably wrong entry comes first. Equal probabilities keep the order of `Scene.triples`. An
+    object under another object is the subject of its entry.
+    `scene_client.schemas.MisplacedRelation` defines the fields.
     """
     entries = entries_of(model, posterior, scene)
     n = len(entries.kind)

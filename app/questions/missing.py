@@ -34,15 +34,13 @@ from app.scene.spatial_relations import CANONICAL, opposite
 from scene_client.frames import Axes, viewer_axes
 from scene_client.schemas import Anchor, MissingAnswer, MissingRequest
 
-VIEWER = viewer_axes()
-"""Axes of a viewer who looks along the x axis of the frame."""
+VIEWER = viewer_axes()  # axes of a viewer who looks along the x axis of the frame
 
 Indices = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-LIKELY: Final = 0.5
-"""Minimum probability of further instances at which an answer contains a class."""
+LIKELY: Final = 0.5  # minimum probability of further instances at which an answer contains a class
 
 _BLOCK: Final = 32
 _OUTSIDE: Final = 0.1  # probability of a count below `low`, and of a count above `high`
@@ -53,13 +51,13 @@ def missing(
     model: SceneModel,
     scene: Scene,
     *,
-    top_k: int = 10,
-    candidates: Sequence[int] | None = None,
-    listed_as: Mapping[int, str] = MappingProxyType({}),
+    top_k: int = 10,  # maximum of classes in each list
+    candidates: Sequence[int] | None = None,  # class indices; None: all classes
+    listed_as: Mapping[int, str] = MappingProxyType({}),  # the request's words for candidates
     at: tuple[str, int] | None = None,
     coverage: float | None = None,
-    axes: Axes | None = VIEWER,
-    details: bool = True,
+    axes: Axes | None = VIEWER,  # see `viewer_axes`; None: the viewing direction is unknown
+    details: bool = True,  # whether the answer contains `placements` and `because`
 ) -> Fields:
     """Rank the unlisted classes by the probability that they are present, likeliest first.
 
@@ -71,20 +69,12 @@ def missing(
     listed chair itself. Of two classes of one family, the list has the likelier.
 
     Args:
-        scene: the listed objects, their relations and the room type.
-        top_k: maximum number of classes in each list of the answer.
-        candidates: indices of the classes to rank; the list `more` contains listed candidates at
-            any probability. None means all classes.
-        listed_as: the word of the request for each candidate, by class index.
         at: a place, as (relation, index of the anchor object). If set, `probability` is the
             probability that the class is present *and* has this relation to the anchor: the
             probability of the class, multiplied by that of the place if the class is present.
         coverage: listed share of the classes of the scene. At 1, at most one class is missing. None
             means an unknown share: the base rates are those of the model's coverage, and the
             calibration is that of lists of any share.
-        axes: viewer's axes in the frame of the offsets; see `viewer_axes`. None means that the
-            viewing direction is unknown.
-        details: whether the answer contains `placements` and `because`.
 
     Returns:
         The fields `coverage`, `missing` and `more` of `scene_client.schemas.MissingAnswer`.
@@ -123,12 +113,7 @@ def missing(
     further: list[Fields] = []
     if at is None:
         further = more(
-            model,
-            scene,
-            posterior.present,
-            top_k=top_k,
-            candidates=candidates,
-            coverage=coverage,
+            model, scene, posterior.present, top_k=top_k, candidates=candidates, coverage=coverage
         )
     used_coverage = calibration.coverage if coverage is None else coverage
     return {"coverage": used_coverage, "missing": entries, "more": further}
@@ -149,18 +134,14 @@ def more(
     classes, classes without statistics, or classes with more listed objects than these cover.
 
     Args:
-        scene: the listed objects and the room type. The first object of a class is its name in
-            the request.
-        listing: the classes of the listed objects.
-        top_k: maximum number of classes in the answer.
-        candidates: indices of classes. The answer then contains these classes at any probability,
-            and no others. None means all classes with a probability of at least `LIKELY`.
+        candidates: class indices; the answer contains these classes at any probability. None means
+            all classes with a probability of at least `LIKELY`.
         coverage: probability that the request lists an object of the scene. Only values above the
             model's coverage change the answer. At 1, the scene has no further instances.
 
     Returns:
-        The fields of `scene_client.schemas.MoreInstances`. `low` and `high` are limits of the
-        number of instances, which is between them with a probability of at least 0.8.
+        The fields of `scene_client.schemas.MoreInstances`. The number of instances is from `low` to
+        `high` with a probability of at least 0.8.
     """
     if model.counts is None:
         return []
@@ -209,9 +190,8 @@ def _ranked(
 ) -> tuple[Int[Indices, "k"], Float[Floats, "k"], Float[Floats, "k"]]:
     """Return the likeliest candidates, likeliest first.
 
-    Returns:
-        The class indices, the log-odds that they are present (and at the place), and the
-        probabilities of the place if they are present (1 without a place).
+    The results are class indices, log-odds that the classes are present (and at the place), and
+    probabilities of the place if they are present (1 without a place).
     """
     vocabulary, listed = model.vocabulary, posterior.present.classes
     usable = ~vocabulary.structure
@@ -244,18 +224,12 @@ def _ranked(
     first = first[chosen[:top_k]]
     if place is None:
         return first, log_odds[first], np.ones(len(first))
-    return (
-        first,
-        log_odds_of(score[first]),
-        np.exp(score[first] + np.logaddexp(0, -log_odds[first])),
-    )
+    placed = np.exp(score[first] + np.logaddexp(0, -log_odds[first]))
+    return first, log_odds_of(score[first]), placed
 
 
 def _one_of_a_family(related: Bool[Mask, "N N"]) -> Int[Indices, "k"]:
-    """Return the indices of ranked classes without relatives of a better class.
-
-    ``related`` is True for classes of one family.
-    """
+    """Return the indices of ranked classes without relatives (same family) of a better class."""
     left_out = np.zeros(len(related), np.bool_)
     for k in np.flatnonzero(related.any(1)):
         if not left_out[k]:
@@ -273,10 +247,9 @@ def _log_p_at(
 ) -> Float[Floats, "V"]:
     """Return log p(present and at the place): log p(present) + log p(place | present).
 
-    The log probability of the relation is at most 0. So the other terms of `PlaceFit` give an upper
-    bound. The function scores candidates in blocks, in descending order of this bound. It stops
-    when the bound of the next candidate is below the `top_k` largest values. The remaining
-    candidates get the value -inf. ``log_odds`` are those that each class is present.
+    log p of the relation is at most 0, so the other terms of `PlaceFit` are an upper bound. Blocks
+    of candidates are scored in descending order of this bound, until it is below the `top_k`
+    largest values. The remaining candidates get -inf. ``log_odds`` are those of presence.
     """
     entry, log_p = model.calibration.at[place.relation], -np.logaddexp(0.0, -log_odds)
     at_most = np.full_like(log_p, entry.intercept)

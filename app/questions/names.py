@@ -27,7 +27,7 @@ from scene_client.validation import MAX_ERRORS, PLAIN
 MAX_SUGGESTED: Final = 32
 """Maximum number of unknown labels that the service maps or reads by meaning, per scene.
 
-The same number limits the errors with suggestions, per request.
+It also limits the errors with suggestions, per request.
 """
 MAX_MAPPED: Final = 256
 """Maximum number of unknown labels that the service maps or reads by meaning, per request."""
@@ -62,11 +62,7 @@ def new_labels(request: SceneRequest, vocabulary: Vocabulary) -> int:
 
 @dataclass(slots=True)
 class ErrorList:
-    """The errors of a request found so far.
-
-    Attributes:
-        by_class: dictionary from each class of exception to its errors.
-    """
+    """The errors of a request found so far, by class of exception."""
 
     by_class: dict[type[RequestError], list[LocatedError]] = field(default_factory=dict)
 
@@ -78,9 +74,8 @@ class ErrorList:
         suggestions: Sequence[str] = (),
     ) -> None:
         """Add an error without raising it."""
-        self.by_class.setdefault(kind, []).append(
-            LocatedError(location, message, tuple(suggestions))
-        )
+        error = LocatedError(location, message, tuple(suggestions))
+        self.by_class.setdefault(kind, []).append(error)
 
     @property
     def are_many(self) -> bool:
@@ -91,8 +86,7 @@ class ErrorList:
         """Raise an exception if the request has errors.
 
         Raises:
-            RequestError: the request has errors. The exception contains all errors of one class,
-                the first class in `app.errors` with errors.
+            RequestError: all errors of one class, the first class in `app.errors` with errors.
         """
         for kind in RequestError.__subclasses__() if self.by_class else ():
             if kind in self.by_class:
@@ -106,60 +100,35 @@ _Key = tuple[int, str, bool]
 
 @dataclass(slots=True)
 class LookUps:
-    """Searches for names similar to unknown labels. The scenes of a request share their limits.
+    """Searches for names similar to unknown labels. The scenes of a request share their limits."""
 
-    Attributes:
-        suggestions: number of errors that already have suggestions, or for which the service has
-            searched similar ids.
-        searched: labels for which the service has searched similar names.
-        guessed: labels for which the service has searched the nearest class.
-    """
-
-    suggestions: int = 0
-    searched: set[_Key] = field(default_factory=set)
-    guessed: set[_Key] = field(default_factory=set)
+    suggestions: int = 0  # errors with suggestions or with a search for similar ids
+    searched: set[_Key] = field(default_factory=set)  # for similar names
+    guessed: set[_Key] = field(default_factory=set)  # for the nearest class
 
 
 @dataclass(slots=True)
 class Unknown:
-    """The labels of one scene that the vocabulary does not list, and their treatment.
-
-    Attributes:
-        vocabulary: classes and room types of the model.
-        treatment: value of the field `unknown_labels` of the request.
-        look_ups: searches for similar classes, shared by all scenes of the request.
-        ignored: names of the ignored objects, candidates and room type.
-        mapped: the class that replaces each label, also for aliases of candidates and room types. A
-            key consists of the label and whether it is a room type.
-        guessed: labels for which the service has searched the nearest class.
-        words: the words that are read by their meaning, by name. Their classes follow those of the
-            vocabulary.
-    """
+    """The labels of one scene that the vocabulary does not list, and their treatment."""
 
     vocabulary: Vocabulary
-    treatment: UnknownLabels
-    look_ups: LookUps
-    ignored: list[str] = field(default_factory=list)
+    treatment: UnknownLabels  # the field `unknown_labels` of the request
+    look_ups: LookUps  # shared by all scenes of the request
+    ignored: list[str] = field(default_factory=list)  # objects, candidates and room type
+    # The class for each (label, is a room type), also for aliases of candidates and room types.
     mapped: dict[tuple[str, bool], Mapped] = field(default_factory=dict)
-    guessed: set[_Key] = field(default_factory=set)
+    guessed: set[_Key] = field(default_factory=set)  # labels with a search for the nearest class
+    # Words that are read by their meaning. Their classes follow those of the vocabulary.
     words: dict[str, Word] = field(default_factory=dict)
 
     def resolve(
         self, label: str, name: str, location: Location, errors: ErrorList, *, is_room: bool = False
     ) -> int | None:
-        """Return the class or room type that a label names or that replaces it.
+        """Return the index of the class or room type that a label names or that replaces it.
 
-        Each treatment accepts the syntax of detectors, such as "chair_12".
-
-        Args:
-            name: name of the object with this label. The list of ignored names contains it if the
-                label is ignored.
-            location: location of the label in the request, for an error message.
-            errors: list of errors. If the method refuses the label, it adds an error to this list.
-            is_room: whether the label is the name of a room type.
-
-        Returns:
-            Index of the class or room type. None means that the label is ignored or refused.
+        Each treatment accepts the syntax of detectors, such as "chair_12". An ignored label adds
+        ``name``, the name of its object, to `ignored`. A refused label adds an error. The result is
+        then None.
         """
         match = self.vocabulary.read(label, is_room=is_room)
         if match is None and self._may_guess(label, is_room=is_room):
@@ -259,12 +228,7 @@ class Unknown:
 
 
 class Names:
-    """Look-up of the objects of a scene by id, or by label if only one object has the label.
-
-    Args:
-        unknown: unknown labels of the request and their treatment.
-        left_out: pairs (id, label) of the ignored objects.
-    """
+    """Look-up of the objects of a scene by id, or by label if only one object has the label."""
 
     def __init__(
         self, objects: Sequence[SceneObject], unknown: Unknown, left_out: Sequence[tuple[str, str]]
@@ -273,8 +237,7 @@ class Names:
         self._ignored_ids = {name for name, _ in left_out}
         self._ignored_labels = {label_key(label) for _, label in left_out}
 
-    # The first access builds each table. Most requests never need the tables, because most requests
-    # do not refer to objects by name.
+    # The first access builds each table, because most requests do not refer to objects by name.
 
     @cached_property
     def _by_id(self) -> dict[str, int]:
@@ -297,8 +260,7 @@ class Names:
     def find(self, name: str, location: Location, errors: ErrorList) -> int | None:
         """Return the index of the object with a name. On failure, add an error and return None.
 
-        The name is an id or a label. Ids take precedence over labels. A label may have any spelling
-        that the vocabulary accepts for its class.
+        Ids take precedence over labels. A label may have any spelling of its class.
         """
         if (index := self._by_id.get(name)) is not None:
             return index
@@ -308,18 +270,17 @@ class Names:
             indices = [] if of_class is None else self._by_name.get(of_class, [])
         if len(indices) == 1:
             return indices[0]
+        similar: list[str] = []
         if indices:
             message = (
                 f"{len(indices)} objects have this label; use the id of one of them. The service "
                 "numbers objects without an id, such as chair_1 and chair_2"
             )
-            errors.add(InvalidRequestError, location, message)
         elif self.is_ignored(name):
             message = "the service ignored this object, because the model does not know its label"
-            errors.add(InvalidRequestError, location, message)
         else:
-            message = "no entry of `objects` has this id or label"
-            errors.add(InvalidRequestError, location, message, self._similar(name))
+            message, similar = "no entry of `objects` has this id or label", self._similar(name)
+        errors.add(InvalidRequestError, location, message, similar)
         return None
 
     def _similar(self, name: str) -> list[str]:

@@ -31,8 +31,7 @@ from scene_client.schemas import OutliersAnswer, OutliersRequest, SceneWarning
 
 Floats = NDArray[np.floating[Any]]
 
-COMPANIONS: Final = 3
-"""Maximum number of companions in the answer for one outlier."""
+COMPANIONS: Final = 3  # maximum number of companions in the answer for one outlier
 
 _LEAST_SHARE: Final = 0.5  # smallest increase of a companion, as a share of the largest
 
@@ -41,35 +40,29 @@ def outliers(
     model: SceneModel,
     scene: Scene,
     *,
-    sensitivity: Sensitivity = "medium",
-    threshold: float | None = None,
-    details: bool = True,
+    sensitivity: Sensitivity = "medium",  # one of the model's thresholds
+    threshold: float | None = None,  # minimum probability of an outlier, instead of `sensitivity`
+    details: bool = True,  # whether the answer contains `because` and `usually_with`
 ) -> Fields:
     """Judge every object and every stated relation of a scene.
 
     Probable intruders and probably false relations come first. Objects and relations with equal
     scores keep the order of the request.
 
-    The score of an object is the log-odds of its class given the rest of the scene. The rest does
-    not contain the instances of the class and their relations. So all instances of a class have the
-    same score. Intruders are often common objects in the wrong room. The prior of an intruder is
-    therefore proportional to popularity^alpha. The popularity of a class is the odds that a
-    training scene has the class. So the function subtracts alpha times the log of the popularity.
-    A class that no training scene shows counts as the rarest other class. Structural classes, such
-    as wall, and classes that belong anywhere, such as cat or bag, always have the probability 0. A
-    scene with few objects gives little evidence, so its threshold is higher. A single class without
-    structure is never an outlier, because no other object says whether it belongs.
+    The score of an object is the log-odds of its class given the rest of the scene, without the
+    instances of the class and their relations. So all instances of a class have the same score.
+    Intruders are often common objects in the wrong room. So the prior of an intruder is
+    proportional to popularity^alpha. The popularity of a class is the odds that a training scene
+    has the class. A class that no training scene shows counts as the rarest other class. Structural
+    classes, such as wall, and classes that belong anywhere, such as cat or bag, always have the
+    probability 0. A scene with few objects gives little evidence, so its threshold is higher. A
+    single class without structure is never an outlier, because no other object says whether it
+    belongs.
 
     The model knows little about a class that few training scenes show (`rarely_shown`). At a
     sensitivity, an object of such a class is never an outlier. If its probability reaches the
     threshold, a warning names the object. A stated threshold applies to all classes, but a word
     that is read by its meaning never is an outlier.
-
-    Args:
-        scene: the objects and stated relations to judge.
-        sensitivity: name of one of the model's thresholds.
-        threshold: minimum probability of an outlier. None means the threshold of `sensitivity`.
-        details: whether the answer contains `because` and `usually_with`.
 
     Returns:
         The fields `threshold`, `outliers` and `misplaced` of `scene_client.schemas.OutliersAnswer`.
@@ -84,9 +77,7 @@ def outliers(
         'toilet'
     """
     entry = model.calibration.outlier
-    can_alarm = ~model.rarely_shown
-    if threshold is not None:
-        can_alarm = np.ones_like(can_alarm)
+    can_alarm = ~model.rarely_shown if threshold is None else np.ones_like(model.rarely_shown)
     can_alarm[model.vocabulary.trained :] = False
     judged: list[Fields] = []
     wrong: list[Fields] = []
@@ -121,10 +112,8 @@ def _judged(
     """Return the fields of `scene_client.schemas.Outlier` for every object of a scene.
 
     The second result lists the objects that reach the threshold, but whose class raises no alarm.
-    `can_alarm` is True for the classes that raise an alarm.
-
-    `because` lists up to three other objects, in order of their effect on `log_odds`. For an
-    outlier, these objects raise its log-odds. For other objects, they lower the log-odds.
+    `because` lists the other objects with the strongest effects. These raise the `log_odds` of an
+    outlier, and lower those of other objects.
     """
     present, vocabulary = posterior.present, model.vocabulary
     labels, broader = vocabulary.labels, vocabulary.broader_labels
@@ -194,15 +183,9 @@ def intruders(model: SceneModel, scene: Scene) -> NDArray[np.int64]:
 
 
 def _intruder_odds(
-    model: SceneModel,
-    entry: CountSlope,
-    posterior: Posterior,
-    log_odds: Float[Floats, "n"],
+    model: SceneModel, entry: CountSlope, posterior: Posterior, log_odds: Float[Floats, "n"]
 ) -> tuple[Float[Floats, "n"], Float[Floats, "n"]]:
-    """Return logit and probability that each class is an intruder.
-
-    They are -inf and 0 for a class that is not judged. `entry` is `Calibration.outlier`.
-    """
+    """Return logit and probability that each class is an intruder; -inf and 0 if not judged."""
     classes = posterior.present.classes
     adjusted = log_odds - model.intruder_prior[classes]
     logits = calibrated(entry, adjusted, max(1, posterior.listed))
@@ -212,10 +195,7 @@ def _intruder_odds(
 
 
 def _companions(model: SceneModel, present: Int[NDArray[np.int64], "n"], flagged: int) -> list[str]:
-    """Return the labels of the companions of an outlier, best first; see the module.
-
-    The classes in ``present``, those of the scene, and structural classes are never companions.
-    """
+    """Return the labels of the companions of an outlier, best first; see the module."""
     usable = ~model.vocabulary.structure
     usable[present] = False
     increase, rank = model.objects.increases(flagged)

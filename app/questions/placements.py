@@ -20,22 +20,14 @@ from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, best, significant
 from app.questions.posterior import Posterior, exclusive, relation_probability
 from app.scene.scene import Scene, SceneObject, boxes_of
-from app.scene.spatial_relations import (
-    INSIDE,
-    ON_TOP,
-    RELATIONS,
-    SUPPORTS,
-    canonicalise,
-    opposite,
-)
+from app.scene.spatial_relations import INSIDE, ON_TOP, RELATIONS, SUPPORTS, canonicalise, opposite
 from app.scene.vocabulary import do_not_fit
 from scene_client.frames import Axes
 
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-PLACES: Final = 3
-"""Maximum number of placements in the answer for one class."""
+PLACES: Final = 3  # maximum number of placements in the answer for one class
 
 LEAST_SHARE: Final = 0.75  # least probability of a placement, as a share of the first placement
 LEAST_LIKELY: Final = 0.05  # least probability of a placement
@@ -44,17 +36,11 @@ _UNTURNED: Final = np.eye(3)
 
 
 class Place(NamedTuple):
-    """A place in canonical form.
+    """A place in canonical form."""
 
-    Attributes:
-        relation: index of a canonical relation.
-        anchor: index of the anchor in `Scene.objects`.
-        outgoing: True if the missing object is the relation's subject, False if the anchor is.
-    """
-
-    relation: int
-    anchor: int
-    outgoing: bool
+    relation: int  # canonical
+    anchor: int  # index in `Scene.objects`
+    outgoing: bool  # whether the missing object is the subject, and not the anchor
 
     @classmethod
     def of(cls, name: str, anchor: int) -> Self:
@@ -77,9 +63,9 @@ def placements(
     model: SceneModel,
     posterior: Posterior,
     scene: Scene,
-    candidates: Int[Indices, "N"],
-    axes: Axes | None,
-    at: Place | None = None,
+    candidates: Int[Indices, "N"],  # absent classes
+    axes: Axes | None,  # of the viewer; None: the viewing direction is unknown
+    at: Place | None = None,  # the requested place, which comes first in each result
 ) -> list[list[Fields]]:
     """Return the likeliest relations of each candidate to the listed objects, likeliest first.
 
@@ -87,16 +73,8 @@ def placements(
     anchors. If a class has several instances, the first instance is the anchor. If an object stands
     on or in another object, no candidate holds it. A further place has at least `LEAST_SHARE` of
     the probability of the first place. Without a place of probability `LEAST_LIKELY`, the list is
-    empty. An offset needs an anchor with a position.
-
-    Args:
-        candidates: indices of absent classes.
-        axes: viewer's axes, or None if the viewing direction is unknown; see `rotated_offsets`.
-        at: the place in the request, or None. It comes first in each result, even if other places
-            are likelier.
-
-    Returns:
-        For each candidate, the fields of `scene_client.schemas.Placement`.
+    empty. An offset needs an anchor with a position. `scene_client.schemas.Placement` defines the
+    fields.
     """
     present = posterior.present
     anchors = (~model.vocabulary.structure[present.classes]).nonzero()[0]
@@ -176,10 +154,7 @@ def _too_large(
     candidates: Int[Indices, "N"],
     classes: Int[Indices, "m"],
 ) -> tuple[Bool[Mask, "N m"], Bool[Mask, "N m"]]:
-    """Return which candidates do not fit into each object, and which objects not into candidates.
-
-    Candidates have the typical size of their class.
-    """
+    """Return which candidates do not fit into each object, and which objects into candidates."""
     rows, vocabulary = candidates[:, None], model.vocabulary
     if all(thing.size is None for thing in things):
         return vocabulary.too_large[rows, classes], vocabulary.too_large[classes, rows]
@@ -205,30 +180,25 @@ def _offset_fields(
 
 
 @compiled
-def _likeliest_places(slopes, forward, backward, log_counts, count, first, share, least):
+def _likeliest_places(
+    slopes: Float[NDArray, "A 3"],  # table of `RelationSlopes`
+    forward: Float[NDArray, "N A m"],  # log-odds of relations from candidates to anchors
+    backward: Float[NDArray, "N A m"],  # log-odds of relations from anchors to candidates
+    log_counts: Float[NDArray, " m"],  # of the instances of each anchor's class
+    count: int,  # maximum number of places of a candidate
+    first: int,  # number of a place that comes first at any probability, or -1
+    share: float,  # minimum probability, as a share of the candidate's first place
+    least: float,  # minimum probability
+) -> tuple[
+    Int[NDArray, " k"], Int[NDArray, " k"], Bool[NDArray, " k"], Int[NDArray, " k"],
+    Float[NDArray, " k"],
+]:  # fmt: skip
     """Return the likeliest places of each of N candidate classes, likeliest first.
 
     A place is a relation a to an anchor j, which is a class of the scene. The number of the place
     is (d A + a) m + j. The candidate is the relation's subject if d = 0, and the anchor is the
-    subject if d = 1.
-
-    Args:
-        slopes: (A, 3) table of `RelationSlopes`.
-        forward: (N, A, m) log-odds of relations with a candidate as subject and an anchor as
-            object.
-        backward: (N, A, m) log-odds of relations with an anchor as subject and a candidate as
-            object.
-        log_counts: (m,) log of the number of instances of each anchor's class.
-        count: maximum number of places of a candidate.
-        first: number of a place that comes first even if other places are likelier, or if it is
-            unlikely. -1 means that the order depends only on the probabilities.
-        share, least: minimum probability of a place, as a share of the candidate's first place, and
-            as a number.
-
-    Returns:
-        Five arrays (k,) with the places of candidate 0, then of candidate 1 and so on: index of the
-        candidate, relation, True if the candidate is the subject, index of the anchor, and
-        probability.
+    subject if d = 1. The results are the candidate, in ascending order, the relation, True if the
+    candidate is the subject, the anchor, and the probability.
     """
     N, A, m = forward.shape
     size = A * m

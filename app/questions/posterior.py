@@ -39,24 +39,13 @@ LEAST_CHANGE: Final = math.log(3)
 
 
 class Present(NamedTuple):
-    """The n distinct classes of a scene of N objects.
+    """The n distinct classes of a scene of N objects. Models compute log-odds for classes."""
 
-    Models compute log-odds for classes, but answers list objects.
-
-    Attributes:
-        classes: class indices in ascending order.
-        counts: number of objects of each class.
-        row: index into `classes` of each object's class.
-        first: index of the first object of each class in `Scene.objects`.
-        presence: probability that at least one instance of the class is present.
-        log_counts: log of `counts`.
-    """
-
-    classes: Int[Indices, "n"]
-    counts: Int[Indices, "n"]
-    row: Int[Indices, "N"]
-    first: Int[Indices, "n"]
-    presence: Float[Singles, "n"]
+    classes: Int[Indices, "n"]  # ascending
+    counts: Int[Indices, "n"]  # objects of each class
+    row: Int[Indices, "N"]  # index in `classes` of each object's class
+    first: Int[Indices, "n"]  # first object of each class in `Scene.objects`
+    presence: Float[Singles, "n"]  # probability that at least one instance is present
     log_counts: Float[Singles, "n"]
 
 
@@ -85,10 +74,7 @@ def present(scene: Scene, spec: MachineSpec) -> Present:
 
 
 def given_relations(scene: Scene, present: Present, A: int) -> ObservedRelations | None:
-    """Return the observed relations between the classes of a scene, or None without observations.
-
-    The machine knows the first A canonical relations.
-    """
+    """Return the observed relations between the classes of a scene, or None without any."""
     if scene.relations is None:
         return None
     columns = scene.relations.of_classes(present.row, len(present.classes), A)
@@ -102,12 +88,7 @@ class Posterior:
     scene). With a profile and without observed relations, the log-odds of objects are exact.
     Without a profile, they have the mean base rates of the sources (docs/models.md, An unknown
     source). The logits of relations are approximated by normal variables. The smallest log-odds of
-    a relation is `NO_UNIT`.
-
-    Attributes:
-        present: the classes of the scene.
-        listed: number of distinct classes of the scene, without structural classes.
-        context: hidden units of the scene, given its objects.
+    a relation is `NO_UNIT`. `listed` is the number of classes of the scene without structure.
 
     Raises:
         ValueError: the machine does not know the class of an object, the room type or the profile.
@@ -143,10 +124,7 @@ class Posterior:
     def given_rest(
         self, *, explained: bool = False
     ) -> tuple[Float[Floats, "n"], Float[Floats, "n n"]]:
-        """Return the log-odds of each listed class given the others, and their changes by each.
-
-        `ObjectScorer.given_rest` describes the results.
-        """
+        """Return the log-odds of each listed class given the others, and their changes by each."""
         return self._objects.given_rest(
             self.context, self._profile, self._room, explained=explained
         )
@@ -161,21 +139,14 @@ class Posterior:
         return self._objects.room_log_p(x, self.present.classes, presence, self._profile)
 
     def room_reasons(self) -> Float[Doubles, "C n"]:
-        """Return how much each class changes the log-odds of each room type.
-
-        An entry is the log-odds of the room type given all n classes, minus its log-odds given the
-        scene without the class.
-        """
+        """Return the log-odds of each room type minus its log-odds without each class."""
         # Row k has the logits of h1 and the presence of the classes in the scene without class k.
         x, presence = self.context.x - self.context.contributions, self.present.presence
         without = self._room_log_p(x, presence * (1 - np.eye(len(presence), dtype=np.float32)))
         return (log_odds_of(self.room_log_p()) - log_odds_of(without)).T
 
     def relation_log_odds(self) -> Float[Floats, "A n n"]:
-        """Return the log-odds of every relation between the classes of the scene.
-
-        The observation of a relation is not evidence for the same relation.
-        """
+        """Return the log-odds of every relation of the scene's classes, without its observation."""
         return self._units.log_odds(self._between)
 
     def alone_log_odds(self) -> Float[Floats, "A n n"]:
@@ -201,10 +172,7 @@ class Posterior:
     def placement_log_odds(
         self, candidates: Int[Indices, "N"], anchors: Int[Indices, "m"], only: int | None = None
     ) -> tuple[Float[Floats, "N R m"], Float[Floats, "N R m"]]:
-        """Return the log-odds of R relations from the candidates to the anchors, and back.
-
-        `RelationUnits.placement_log_odds` describes the arguments.
-        """
+        """Return the log-odds of R relations from the candidates to the anchors, and back."""
         return self._units.placement_log_odds(self.context, candidates, anchors, only)
 
     @cached_property
@@ -234,10 +202,7 @@ def calibrated_missing(
 ) -> Float[Floats, "N"]:
     """Return the calibrated log-odds that unlisted classes are present.
 
-    Args:
-        z: log-odds of the classes at the coverage.
-        n: number of listed classes without structure.
-        coverage: share of the scene that the request states; None if it states none.
+    n is the number of listed classes without structure. A `coverage` of None is not stated.
     """
     n = max(1, n)
     if coverage is None:
@@ -259,16 +224,12 @@ def calibrated_at_coverage(
 
 
 @compiled
-def relation_probability(slopes, log_odds, log_count):
-    """Return the probability that each relation holds between two objects, (B, A, N).
-
-    The shape is (B candidate classes, A relations, N pairs of classes). B is 1 without candidates.
-
-    Args:
-        slopes: (A, 3) table of `RelationSlopes`.
-        log_odds: (B, A, N) log-odds of the relation between classes.
-        log_count: (N,) log of the number of object pairs with these two classes.
-    """
+def relation_probability(
+    slopes: Float[NDArray, "A 3"],  # table of `RelationSlopes`
+    log_odds: Float[NDArray, "B A N"],  # between classes; B is 1 without candidates
+    log_count: Float[NDArray, " N"],  # of the pairs of objects with these two classes
+) -> Float[NDArray, "B A N"]:
+    """Return the probability of each relation between N pairs of objects, for B candidates."""
     p = np.empty_like(log_odds)
     for a in range(p.shape[1]):
         intercept, slope, weight = slopes[a, 0], slopes[a, 1], slopes[a, 2]
@@ -285,9 +246,6 @@ def relation_probability(slopes, log_odds, log_count):
 
 @inlined
 def exclusive(forward, backward):
-    """Scale p(a(x,y)) and p(a(y,x)) so that their sum is at most 1.
-
-    The reason is that a relation a cannot hold in both directions between the same two objects.
-    """
+    """Scale p(a(x,y)) and p(a(y,x)) to a sum of at most 1: a relation holds in one direction."""
     total = np.maximum(forward + backward, np.float32(1.0))
     return forward / total, backward / total

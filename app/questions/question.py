@@ -19,49 +19,34 @@ Options: TypeAlias = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """An example request for the documentation.
-
-    Attributes:
-        summary: title of the example.
-        value: the request body.
-        problem: slug (short name) of the problem in the response. None means that the request is
-            valid.
-    """
+    """An example request for the documentation."""
 
     summary: str
-    value: dict[str, Any]
-    problem: str | None = None
+    value: dict[str, Any]  # the request body
+    problem: str | None = None  # slug of the problem in the response; None: a valid request
 
 
 @dataclass(eq=False)
 class Question(Generic[RequestT]):
     """One question about a scene. Routes, documentation, warm-up and metrics use this record.
 
-    Attributes:
-        answer: function of a model, a scene and keyword arguments. It returns the fields of the
-            answer that are not common to all answers. The name of this function is the name of the
-            question.
-        read: function that returns the keyword arguments of ``answer`` for a request. It raises
-            `RequestError` if a field of the request is wrong.
-        request, response: schemas of the request and of the answer.
-        examples: dictionary from names to example requests. The default model knows all labels of
-            the examples.
-        example_answer: an answer with illustrative figures, without the common fields of answers.
-        description: description of the route, for the API documentation.
-        ask_all: function that asks a model about scenes with all options that need kernels of
-            their own, and yields the answers. None: the question has no such options.
-        samples: whether the question samples scenes. Then the scene of a request may be empty, the
-            request has a field ``count``, and ``answer`` has an argument ``stop``, a function that
-            returns True after the end of the request. There is no route for batches.
+    The name of the function ``answer`` is the name of the question. The function takes a model, a
+    scene and keyword arguments. It returns the fields of the answer that are not common to all
+    answers. ``read`` returns its keyword arguments for a request, or raises `RequestError`.
+
+    If the question ``samples`` scenes, the scene of a request may be empty, the request has a field
+    ``count``, and ``answer`` has an argument ``stop``, a function that returns True after the end
+    of the request. There is no route for batches.
     """
 
     answer: Callable[..., Fields]
     read: Callable[[RequestT, SceneModel, Reading], Options]
     request: type[RequestT]
     response: type[schemas.Answer]
-    examples: Mapping[str, Example]
-    example_answer: Fields
-    description: str
+    examples: Mapping[str, Example]  # by name; the default model knows their labels
+    example_answer: Fields  # with illustrative figures, without the common fields
+    description: str  # of the route
+    # Asks a model about scenes with all options that need kernels of their own.
     ask_all: Callable[[SceneModel, tuple[Scene, ...]], Iterable[Fields]] | None = None
     samples: bool = False
 

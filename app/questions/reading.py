@@ -29,13 +29,7 @@ from scene_client.schemas import (
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits on one scene and on its answer. The values come from the settings of the service.
-
-    Attributes:
-        objects: maximum number of objects in a scene.
-        relations: maximum number of relations in a scene.
-        answer_bytes: maximum size of an answer in bytes.
-    """
+    """Limits on one scene and on its answer. The values come from the settings of the service."""
 
     objects: int = 256
     relations: int = 4096
@@ -44,20 +38,12 @@ class Limits:
 
 @dataclass
 class Reading:
-    """The scene of a request, with the class indices of a model.
+    """The scene of a request, with the class indices of a model."""
 
-    Attributes:
-        scene: objects of known classes, their relations and the room type.
-        unknown: unknown labels of the request and their treatment.
-        left_out: pairs (id, label) of the ignored objects.
-        observed: relations that the service has derived from poses, or None without poses.
-        warnings: warnings about probable mistakes in the scene.
-    """
-
-    scene: Scene
+    scene: Scene  # without ignored objects
     unknown: Unknown
-    left_out: list[tuple[str, str]]
-    observed: list[ObservedRelation] | None = None
+    left_out: list[tuple[str, str]]  # id and label of the ignored objects
+    observed: list[ObservedRelation] | None = None  # derived from poses; None: without poses
     warnings: list[SceneWarning] = field(default_factory=list)
 
     @property
@@ -76,22 +62,13 @@ def read_scene(
     request: SceneRequest,
     vocabulary: Vocabulary,
     limits: Limits,
-    look_ups: LookUps | None = None,
+    look_ups: LookUps | None = None,  # shared by all scenes of a batch
     *,
-    roles: RoleCounts | None = None,
-    profiles: Sequence[str] = (),
-    may_be_empty: bool = False,
+    roles: RoleCounts | None = None,  # see `derive_relations`
+    profiles: Sequence[str] = (),  # names of the model's profiles
+    may_be_empty: bool = False,  # whether a scene without objects of known classes is valid
 ) -> Reading:
     """Convert the scene of a request: find the class of each label, and derive relations.
-
-    Args:
-        vocabulary: classes and room types of the model.
-        limits: limits on the scene.
-        look_ups: searches for similar classes, shared by all scenes of a batch. None means that the
-            request has only this scene.
-        roles: counts that decide between on-top, under and inside; see `derive_relations`.
-        profiles: names of the model's profiles.
-        may_be_empty: whether a scene without objects of known classes is valid.
 
     Raises:
         RequestError: the scene is invalid; see `ErrorList.raise_any`.
@@ -140,9 +117,8 @@ def read_scene(
                 ObservedRelation(objects[i].id, CANONICAL[a], objects[j].id)  # type: ignore[arg-type]
                 for a, i, j in reading.scene.triples
             ]
-        derived = reading.observed is not None
         reading.warnings = scene_warnings(
-            in_frame, detections, vocabulary, request, derived=derived
+            in_frame, detections, vocabulary, request, derived=reading.scene.has_boxes
         )
     return reading
 
@@ -154,10 +130,7 @@ def _objects(
     left_out: list[tuple[str, str]],
     errors: ErrorList,
 ) -> tuple[tuple[SceneObject, ...], dict[int, Detection]]:
-    """Return the objects of known classes, and the detection of those that are not bare labels.
-
-    The function adds the ignored objects to ``left_out``.
-    """
+    """Return the objects of known classes, and the detections. Add ignored ones to ``left_out``."""
     optical = is_optical(request.frame_id)
     objects: list[SceneObject] = []
     detections: dict[int, Detection] = {}
@@ -198,11 +171,7 @@ def _check_fields(request: SceneRequest, limits: Limits, errors: ErrorList) -> N
 
 
 def _ids(entries: Sequence[str | Detection], errors: ErrorList) -> list[str]:
-    """Return the ids of the objects in a request.
-
-    An object without an id has its label as id. If several objects have this label, a number at the
-    end makes the id unique.
-    """
+    """Return the ids. The default is the label, with a number if the label is not unique."""
     names = [
         entry if isinstance(entry, str) else entry.label if entry.id is None else entry.id
         for entry in entries

@@ -26,12 +26,7 @@ from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, best, significant
 from app.questions.names import ErrorList
 from app.questions.placements import supported_objects
-from app.questions.posterior import (
-    Posterior,
-    Present,
-    exclusive,
-    relation_probability,
-)
+from app.questions.posterior import Posterior, Present, exclusive, relation_probability
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
 from app.questions.reading import Reading
 from app.scene.relation_table import RelationTable
@@ -55,20 +50,18 @@ EXPECTED = 0.5
 If all relations of a pair are unlikely, the likeliest relation is not a meaningful expectation.
 """
 
-_EXCLUDED = np.float32(-1.0)
-"""Evidence that a relation cannot hold."""
-_MOST_EXCLUDED = np.float32(0.01)
-"""Maximum probability of a relation that cannot hold."""
+_EXCLUDED = np.float32(-1.0)  # evidence that a relation cannot hold
+_MOST_EXCLUDED = np.float32(0.01)  # maximum probability of a relation that cannot hold
 
 
 def relations(
     model: SceneModel,
     scene: Scene,
     *,
-    top_k: int = 20,
-    min_probability: float = 0.0,
-    pairs: Sequence[tuple[int, int]] | None = None,
-    include_opposites: bool = False,
+    top_k: int = 20,  # maximum of relations, and of disagreements
+    min_probability: float = 0.0,  # of a relation, and of the expected one of a disagreement
+    pairs: Sequence[tuple[int, int]] | None = None,  # ordered (subject, object); None: all pairs
+    include_opposites: bool = False,  # whether to add right(y, x) for left(x, y)
 ) -> Fields:
     """Return the likeliest relations between the objects of a scene, and the disagreements.
 
@@ -77,16 +70,6 @@ def relations(
     the probability of the model without this observation. The probability is at most .01 if the
     relation is observed not to hold, or if the boxes or other relations exclude it. Structural
     classes (floor, wall) are left out unless `pairs` contains them.
-
-    Args:
-        scene: the objects, their observed relations and the room type.
-        top_k: maximum number of relations in the answer. The same limit applies to disagreements.
-        min_probability: minimum probability of a relation in the answer. The same limit applies to
-            the expected relation of a disagreement.
-        pairs: ordered pairs (subject, object) to judge, as indices in `scene.objects`. None means
-            all pairs.
-        include_opposites: whether the answer also lists opposite relations, such as right(y, x) for
-            left(x, y).
 
     Returns:
         The fields `relations` and `disagreements` of `scene_client.schemas.RelationsAnswer`. The
@@ -197,10 +180,9 @@ def _disagreements(
 ) -> list[Fields]:
     """Return the fields of `scene_client.schemas.Disagreement` for each disagreement.
 
-    Disagreements with the largest ratio of `probability` to `observed_probability` come first. The
-    observed probability is that of the likeliest observed relation. A relation is never expected if
-    the machine has no unit for it, or if two objects of the same classes have it. The function
-    judges a pair of objects if one of its two orders is True in ``judged``.
+    The largest ratio of `probability` to `observed_probability`, that of the likeliest observed
+    relation, comes first. A relation is never expected if the machine has no unit for it, or if two
+    objects of the same classes have it. A pair is judged if one of its orders is in ``judged``.
     """
     A, row = model.spec.A, posterior.present.row
     if scene.relations is None or not scene.triples:
@@ -320,9 +302,8 @@ def _pairs(request: RelationsRequest, reading: Reading) -> list[tuple[int, int]]
         if subject is None or other is None:
             continue
         if subject == other:
-            errors.add(
-                InvalidRequestError, location, "subject and object must be two different objects"
-            )
+            message = "subject and object must be two different objects"
+            errors.add(InvalidRequestError, location, message)
             continue
         pairs[subject, other] = None
     errors.raise_any()
@@ -331,26 +312,23 @@ def _pairs(request: RelationsRequest, reading: Reading) -> list[tuple[int, int]]
 
 @compiled
 def _likeliest_relations(
-    slopes, log_odds, log_counts, row, judged, evidence, least, opposites, count
-):
-    """Return the `count` likeliest relations between N objects, likeliest first.
+    slopes: Float[NDArray, "A 3"],  # table of `RelationSlopes`
+    log_odds: Float[NDArray, "A n n"],  # between the n classes of the scene
+    log_counts: Float[NDArray, " n"],  # of the instances of each class
+    row: Int[NDArray, " N"],  # class of each object, below n
+    judged: Bool[NDArray, "N N"],
+    # Probability of each observed relation, `_EXCLUDED` for one that cannot hold, NaN for others.
+    evidence: Float[NDArray, "A N N"],  # empty without relations
+    least: float,  # minimum probability of a relation in the result
+    opposites: bool,  # whether to add opposites: A + a is that of relation a
+    count: int,  # maximum number k of relations
+) -> tuple[
+    Int[NDArray, " k"], Int[NDArray, " k"], Int[NDArray, " k"], Float[NDArray, " k"],
+    Float[NDArray, " k"],
+]:  # fmt: skip
+    """Return the likeliest relations between N objects, likeliest first.
 
-    Args:
-        slopes: (A, 3) table of `RelationSlopes`.
-        log_odds: (A, n, n) log-odds of the A relations between the n classes of the scene.
-        log_counts: (n,) log of the number of instances of each class.
-        row: (N,) index of each object's class among the n classes.
-        judged: (N, N) bool, True for the ordered pairs of objects to judge.
-        evidence: (A, N, N) probability of each observed relation, `_EXCLUDED` for a relation that
-            cannot hold, and NaN for other relations. It is empty if the scene shows no relations.
-        least: minimum probability of a relation in the result.
-        opposites: whether the result also contains opposite relations. The opposite of relation a
-            has the number A + a.
-        count: maximum number k of relations.
-
-    Returns:
-        Five arrays (k,): subjects, objects, relations, probabilities, and the probabilities without
-        the evidence.
+    The results are subjects, objects, relations, probabilities, and probabilities without evidence.
     """
     (A, n), size = log_odds.shape[:2], len(row)
     counts = np.empty((n, n), log_counts.dtype)
@@ -400,9 +378,7 @@ def with_evidence(p, evidence, opposite):
 
 
 _NO_RELATIONS: Final = SceneWarning(
-    code="not-judged",
-    message="the training scenes of this model have no relations",
-    objects=[],
+    code="not-judged", message="the training scenes of this model have no relations", objects=[]
 )
 
 _EXAMPLES: Final = {

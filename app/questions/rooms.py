@@ -28,21 +28,14 @@ def rooms(
     scene: Scene,
     *,
     top_k: int = 5,
-    candidates: Mapping[int, Sequence[str]] | None = None,
-    details: bool = True,
+    candidates: Mapping[int, Sequence[str]] | None = None,  # names by index; None: all room types
+    details: bool = True,  # whether the answer contains `because`
 ) -> Fields:
     """Rank the room types by their probability, likeliest first.
 
-    Args:
-        scene: the listed objects. Its relations and its room type are not used.
-        top_k: maximum number of room types in the answer.
-        candidates: names of the possible room types in the request, by the index of the room type;
-            the probabilities of these types sum to 1. None means all room types.
-        details: whether the answer contains `because`.
-
-    Returns:
-        The field `room_types` of `scene_client.schemas.RoomsAnswer`. The list is empty if the model
-        has no room types. Then the field `warnings` says so.
+    The relations and the room type of the scene are not used. The probabilities of the candidates
+    sum to 1. `scene_client.schemas.RoomsAnswer` defines the fields. If the model has no room types,
+    the list is empty, with a warning.
 
     Example:
         >>> scene = Scene(model.vocabulary.bare_objects(["bed", "nightstand"]))
@@ -78,17 +71,12 @@ def _read(request: RoomsRequest, _: SceneModel, reading: Reading) -> Options:
         names = request.candidates
         candidates = reading.unknown.resolve_all(names, "candidates", errors, is_room=True)
         errors.raise_any()
-    return {
-        "top_k": request.top_k,
-        "candidates": candidates,
-        "details": request.detail == "full",
-    }
+    details = request.detail == "full"
+    return {"top_k": request.top_k, "candidates": candidates, "details": details}
 
 
 _NO_ROOM_TYPES: Final = SceneWarning(
-    code="not-judged",
-    message="the training scenes of this model have no room types",
-    objects=[],
+    code="not-judged", message="the training scenes of this model have no room types", objects=[]
 )
 
 _EXAMPLES: Final[dict[str, Any]] = {

@@ -55,20 +55,15 @@ _UNSIZED: Final = (
 
 def scene_warnings(
     scene: Scene,
-    detections: Mapping[int, Detection],
+    detections: Mapping[int, Detection],  # by index in the scene, without bare labels
     vocabulary: Vocabulary,
     request: SceneRequest,
     *,
-    derived: bool,
+    derived: bool,  # whether relations were derived from the poses
 ) -> list[SceneWarning]:
-    """Return the warnings about a scene.
+    """Return the warnings about a scene in the request's frame, with axes of REP-103.
 
-    Args:
-        scene: the scene in the request's frame, in axes of REP-103 (x forward, y left, z up).
-        detections: detection of each object that is not a bare label, by its index in the scene.
-        vocabulary: classes of the model, with their typical sizes.
-        request: the request that contains the scene.
-        derived: whether relations were derived from the poses.
+    x points forward, y left and z up.
     """
     # Python loops are fast enough, because most scenes have no poses or pass all checks.
     placed = [thing for thing in scene.objects if thing.position is not None]

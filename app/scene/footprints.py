@@ -16,8 +16,7 @@ Pair = tuple[float, float]
 # Maximum deviation in radians from a multiple of 90 degrees at which two rectangles count as
 # parallel. Parallel rectangles can share an edge, and clipping would count such an edge twice.
 _PARALLEL: Final = 1e-6
-# This length replaces an edge length of 0, to avoid division by zero.
-_SHORTEST: Final = 1e-150
+_SHORTEST: Final = 1e-150  # replaces an edge length of 0, to avoid division by zero
 _QUARTER: Final = math.pi / 2
 
 
@@ -113,11 +112,7 @@ def _skew(offset: Pair, half_a: Pair, cos: float, sin: float, half_b: Pair) -> P
 def _clipped(
     start: Float[NDArray, " 2"], end: Float[NDArray, " 2"], half: Pair
 ) -> tuple[float, float, float, float]:
-    """Clip an edge to a rectangle around the origin (Liang & Barsky 1984).
-
-    The function returns both ends of the clipped edge. They are equal if the edge lies outside the
-    rectangle.
-    """
+    """Clip an edge to a rectangle around the origin (Liang & Barsky 1984); outside, to a point."""
     # Edges are never parallel to the axes of the rectangle. So x or y is 0 only if rounding has
     # reduced the edge to a point. Such an edge adds no area.
     x, y = end[0] - start[0] or _SHORTEST, end[1] - start[1] or _SHORTEST

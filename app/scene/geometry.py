@@ -86,26 +86,19 @@ class Viewpoint(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseRelations:
-    """Relations between n objects, derived from poses.
-
-    Attributes:
-        holds: ``holds[a, i, j]`` means that object i has relation a to object j.
-        observed: ``observed[a, i, j]`` means that relation a between objects i and j was observed,
-            whether it holds or not. The array is symmetric in i and j, except for undecided roles.
-    """
+    """Relations a(i, j) between n objects, derived from poses, at [a, i, j]."""
 
     holds: Bool[NDArray, "A n n"]
+    # Whether it was observed if a relation holds. Symmetric in i and j, except for undecided roles.
     observed: Bool[NDArray, "A n n"]
 
 
 def to_viewer_frame(
     positions: Rows, viewpoint: Viewpoint, yaws: ArrayLike | None = None
 ) -> tuple[Float[NDArray, "n 3"], Float[NDArray, " n"]]:
-    """Convert positions and yaws of n boxes from a frame to the axes of a viewer.
+    """Convert positions (metres) and yaws (radians, 0 by default) of n boxes to viewer axes.
 
-    Args:
-        positions: centres in the frame, in metres. The heights do not change.
-        yaws: rotations about z in radians; all 0 by default.
+    Heights do not change.
 
     Raises:
         ValueError: a shape is wrong.
@@ -119,23 +112,15 @@ def to_viewer_frame(
 
 
 def derive_relations(
-    positions: Rows,
-    sizes: Rows,
-    yaws: ArrayLike | None = None,
+    positions: Rows,  # centres in viewer axes, in metres; a row with NaN where unknown
+    sizes: Rows,  # extents before the rotation, in metres; 0 for flat boxes, NaN where unknown
+    yaws: ArrayLike | None = None,  # rotations about z in radians; all 0 by default
     *,
-    horizontal: bool = True,
-    classes: Int[NDArray, " n"] | None = None,
-    roles: RoleCounts | None = None,
+    horizontal: bool = True,  # whether the viewer is known; if not, left and front are unobserved
+    classes: Int[NDArray, " n"] | None = None,  # -1 where unknown
+    roles: RoleCounts | None = None,  # for rule 3; None leaves all roles undecided
 ) -> PoseRelations:
     """Derive the relations between n boxes by the rules of this module.
-
-    Args:
-        positions: centres in viewer axes, in metres; a row with NaN where unknown.
-        sizes: extents before the rotation, in metres; 0 for flat boxes, NaN where unknown.
-        yaws: rotation of each box about z in radians; all 0 by default.
-        horizontal: whether the viewer is known. Otherwise, left and front stay unobserved.
-        classes: index of the class of each box, -1 where unknown.
-        roles: counts that decide between the roles of rule 3. None leaves all roles undecided.
 
     Raises:
         ValueError: a shape is wrong, a value is infinite, a size is negative, or the counts lack a
@@ -169,8 +154,7 @@ def excluded_by_centres(
 ) -> Bool[NDArray, "A n n"]:
     """Return the relations that the centres of n boxes exclude.
 
-    `derive_relations` explains the arguments. Unknown centres exclude no relation. A footprint of
-    unknown size has a radius of `UNKNOWN_REACH`.
+    Unknown centres exclude no relation. A footprint of unknown size has the radius `UNKNOWN_REACH`.
     """
     x, y = points[:, 0], points[:, 1]
     dx, dy = x[:, None] - x, y[:, None] - y
@@ -260,10 +244,7 @@ def _stack(
     holds: Bool[NDArray, "A n n"],
     observed: Bool[NDArray, "A n n"],
 ) -> bool:
-    """Write the stacked relations of two boxes by rules 1 to 3. Return whether a rule applies.
-
-    The footprints must overlap.
-    """
+    """Apply rules 1 to 3 to two boxes with overlapping footprints. Return whether one applies."""
     smaller, larger, is_nested, is_deep = -1, -1, False, True
     for one, other in ((i, j), (j, i)):
         if is_smaller(extents[one], extents[other]):

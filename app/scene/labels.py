@@ -25,14 +25,10 @@ Rule = Literal[
 
 
 class LookUp(NamedTuple):
-    """The index of the class or room type that a label becomes, and the rule.
-
-    Attributes:
-        similarity: similarity of both names, from 0 to 1.
-    """
+    """The index of the class or room type that a label becomes, and the rule."""
 
     entry: int
-    similarity: float
+    similarity: float  # of both names, from 0 to 1
     rule: Rule
 
     @property
@@ -96,10 +92,7 @@ _COLLECTIONS: Final = frozenset({"bunch", "pair", "piece", "pile", "row", "slice
 
 
 def head_of(label: str) -> str | None:
-    """Return the object in a phrase: "bottle" for "bottle of milk", "books" for "pile of books".
-
-    The result is None if the label is not such a phrase.
-    """
+    """Return "bottle" for "bottle of milk", "books" for "pile of books", None for other labels."""
     parts = _OF.split(label, maxsplit=1)
     if len(parts) != 2:
         return None

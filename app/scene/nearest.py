@@ -66,22 +66,16 @@ _AMBIGUOUS: Final = frozenset(
 
 
 class Match(NamedTuple):
-    """A known entry that is similar to the unknown name.
-
-    Attributes:
-        entry: index of the entry.
-        similarity: similarity of the entry's name and the unknown name, from 0 to 1.
-    """
+    """A known entry that is similar to the unknown name."""
 
     entry: int
-    similarity: float
+    similarity: float  # of both names, from 0 to 1
 
 
 class NameIndex:
     """Search for entries, such as object classes, with names similar to an unknown name.
 
-    Args:
-        names: pairs (name, index of the entry). An entry may have several names.
+    ``names`` has pairs (name, index of the entry). An entry may have several names.
     """
 
     def __init__(self, names: Sequence[tuple[str, int]]) -> None:
@@ -92,20 +86,17 @@ class NameIndex:
         self._by_head: dict[str, list[int]] = {}
         for row, words in enumerate(self._words):
             self._by_head.setdefault(words[-1], []).append(row)
-        self._known_words = {word for words in self._words for word in words}
+        self._entry_words = {word for words in self._words for word in words}
         self._lexicon: dict[int, list[str]] = {}  # by length
-        for word in sorted({*self._known_words, *self._keys}):
+        for word in sorted({*self._entry_words, *self._keys}):
             self._lexicon.setdefault(len(word), []).append(word)
 
     def guess(self, name: str) -> LookUp | None:
-        """Return the entry that a name probably stands for, or None.
-
-        The function first compares the spelling of the whole name, and then its last words.
-        """
+        """Return the entry whose name or last words a name probably stands for, or None."""
         words = split_words(head_of(name) or name)
         if len("".join(words)) > LONGEST or len(words) > _MOST_WORDS or _SEVERAL & {*words}:
             return None
-        unknown = {*words} - self._known_words
+        unknown = {*words} - self._entry_words
         corrections = {word: [(word, 0)] for word in words}
         if len(unknown) <= _MOST_MISSPELT:
             corrections |= {word: self._corrections(word) for word in unknown}
@@ -142,11 +133,11 @@ class NameIndex:
         """
         costs: dict[int, tuple[int, int]] = {}  # by entry: cost and maximum cost
         for spelling in itertools.product(*(corrections[word] for word in words)):
-            entry = self._by_key.get("".join(known for known, _ in spelling))
+            entry = self._by_key.get("".join(word for word, _ in spelling))
             if entry is None:
                 continue
             cost = sum(cost for _, cost in spelling)
-            max_cost = sum(_max_cost(known) for known, cost in spelling if cost)
+            max_cost = sum(_max_cost(word) for word, cost in spelling if cost)
             if max_cost and len(words) > 1:
                 max_cost += _BY_PHRASE
             costs[entry] = min((cost, max_cost), costs.get(entry, (cost, max_cost)))
@@ -159,21 +150,21 @@ class NameIndex:
         return LookUp(entry, round(1 - cost / 2 / len("".join(words)), 3), "spelling")
 
     def _corrections(self, word: str) -> list[tuple[str, int]]:
-        """Return at most `_MOST_CORRECTIONS` pairs (known word, cost of the edits), cheapest first.
+        """Return at most `_MOST_CORRECTIONS` pairs (word of the lexicon, cost), cheapest first.
 
         A short word, or a word without similar words, stands for itself: [(word, 0)].
         """
         if len(word) < _SHORTEST:
             return [(word, 0)]
         lengths = range(max(_SHORTEST, len(word) - _MOST_EDITS), len(word) + _MOST_EDITS + 1)
-        candidates = [known for length in lengths for known in self._lexicon.get(length, ())]
+        candidates = [other for length in lengths for other in self._lexicon.get(length, ())]
         most = _MOST_EDITS + _BY_PHRASE
         matches = process.extract(
             word, candidates, scorer=Indel.distance, limit=None, score_cutoff=most
         )
         corrections = [
-            (known, cost + (known[0] != word[0]) + (known[-1] != word[-1]))
-            for known, cost, _ in matches
+            (other, cost + (other[0] != word[0]) + (other[-1] != word[-1]))
+            for other, cost, _ in matches
         ]
         cheapest = sorted(corrections, key=lambda correction: correction[1])[:_MOST_CORRECTIONS]
         return cheapest or [(word, 0)]
@@ -198,15 +189,15 @@ class NameIndex:
         """Yield the entries whose names have a spelling similar to ``key``, a name in one word."""
         if len(key) > LONGEST:
             return
-        for known_key, similarity, row in _alike(key, self._keys):
-            factor = 1 if known_key[:1] == key[:1] else _BY_REST
+        for similar_key, similarity, row in _alike(key, self._keys):
+            factor = 1 if similar_key[:1] == key[:1] else _BY_REST
             yield Match(self._entries[row], similarity * factor)
 
     def _by_last_word(self, words: Sequence[str]) -> Iterator[Match]:
         """Yield the entries whose names have the same last word."""
         for row in self._by_head.get(words[-1], ()) if words else ():
-            known_words = self._words[row]
-            shared = len({*words} & {*known_words}) / len({*words, *known_words})
+            entry_words = self._words[row]
+            shared = len({*words} & {*entry_words}) / len({*words, *entry_words})
             yield Match(self._entries[row], _SAME_HEAD + (1 - _SAME_HEAD) * shared)
 
 
@@ -224,6 +215,6 @@ def _alike(
     return process.extract(name, names, scorer=similarity, limit=limit, score_cutoff=_LEAST)
 
 
-def _max_cost(known: str) -> int:
-    """Return the maximum cost of the edits that lead to a known word."""
-    return 1 if len(known) < 5 else _MOST_EDITS
+def _max_cost(word: str) -> int:
+    """Return the maximum cost of the edits that lead to a word of the lexicon."""
+    return 1 if len(word) < 5 else _MOST_EDITS

@@ -30,42 +30,26 @@ _COLUMNS: Final = ("relation", "subject", "object", "probability", "origin", "is
 
 @dataclass(frozen=True, eq=False)
 class RelationTable:
-    """R relations between different objects of a scene.
-
-    Attributes:
-        relation: indices of the canonical relations.
-        subject, object: indices of the objects.
-        probability: probabilities that the relations hold.
-        origin: `STATED`, `BOXES` or `EXCLUDED`.
-        is_opposite: True for relations that the request states by their opposite, for example right
-            instead of left.
-        of_boxes: whether the observations come from boxes.
-    """
+    """R relations between different objects of a scene."""
 
     relation: Int[Array, "R"]
     subject: Int[Array, "R"]
     object: Int[Array, "R"]
     probability: Float32[Array, "R"]
-    origin: Int[Array, "R"]
-    is_opposite: Bool[Array, "R"]
+    origin: Int[Array, "R"]  # `STATED`, `BOXES` or `EXCLUDED`
+    is_opposite: Bool[Array, "R"]  # whether the request states the opposite, such as right for left
     _: KW_ONLY
-    of_boxes: bool = False
+    of_boxes: bool = False  # whether the observations come from boxes
 
     @classmethod
     def stated(
         cls,
         triples: Iterable[Triple],
-        is_opposite: Sequence[bool] | None = None,
+        is_opposite: Sequence[bool] | None = None,  # by default, none
         *,
-        complete_for: int | None = None,
+        complete_for: int | None = None,  # number of objects, if no other relations hold
     ) -> "RelationTable":
-        """Return the table of the relations that a request states.
-
-        Args:
-            triples: the relations, which hold.
-            is_opposite: whether the request states each relation by its opposite; by default, none.
-            complete_for: number of objects, if no other relations between them hold.
-        """
+        """Return the table of the relations that a request states."""
         relation, subject, object_ = np.array(list(triples), np.int64).reshape(-1, 3).T
         n = len(relation)
         flags = np.zeros(n, np.bool_) if is_opposite is None else np.array(is_opposite, np.bool_)
@@ -80,15 +64,9 @@ class RelationTable:
         cls,
         holds: Bool[Array, "A N N"],
         observed: Bool[Array, "A N N"],
-        excluded: Bool[Array, "A N N"],
+        excluded: Bool[Array, "A N N"],  # relations that cannot hold, observed or not
     ) -> "RelationTable":
-        """Return the table of the relations between N boxes.
-
-        Args:
-            holds: relations that hold.
-            observed: relations that hold or do not hold.
-            excluded: relations that cannot hold, observed or not.
-        """
+        """Return the table of the relations between N boxes."""
         a, i, j = _between_two(observed | excluded)
         origin = np.where(observed[a, i, j], BOXES, EXCLUDED)
         p = holds[a, i, j].astype(np.float32)
@@ -145,16 +123,10 @@ class RelationTable:
     ) -> tuple[Int[Array, "E"], Int[Array, "E"], Int[Array, "E"], Float32[Array, "E"]] | None:
         """Return the observed relations between n classes, in the order of their indices.
 
-        A relation of classes has the largest probability of the relations between their objects.
-        Unobserved relations have no influence.
-
-        Args:
-            row: index of the class of each object, from 0 to n - 1.
-            A: number of relations that the machine knows.
-
-        Returns:
-            Relation, subject class, object class and probability of each observation; None without
-            observations. Boxes observe something even if they show no relation.
+        The results are relation, subject class, object class, and the largest probability of the
+        relations between their objects; None without observations. Boxes observe something even if
+        they show no relation. ``row`` is the class of each object, below n. The machine knows the
+        first A relations.
         """
         is_observed = self.origin != EXCLUDED
         if not (self.of_boxes or is_observed.any()):

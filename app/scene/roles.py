@@ -29,17 +29,11 @@ _OF_ANCHOR: Final = 2.0
 
 
 class RoleCounts(NamedTuple):
-    """How often classes have each role, as sources state it in words or by support links.
+    """How many scenes show each role, as sources state it in words or by support links."""
 
-    Attributes:
-        pair: keys i V + j of pairs of smaller class i and larger class j, in ascending order.
-        counts: number of scenes in which i has each role at j.
-        anchor: number of scenes in which any class has each role at class j.
-    """
-
-    pair: Int[NDArray, " P"]
+    pair: Int[NDArray, " P"]  # keys i V + j of smaller class i and larger class j, ascending
     counts: Float[NDArray, "P 3"]
-    anchor: Float[NDArray, "V 3"]
+    anchor: Float[NDArray, "V 3"]  # any smaller class at each larger class
 
 
 def role_counts(roles: RoleCounts, i: int, j: int) -> Float[NDArray, " 3"]:
@@ -50,10 +44,9 @@ def role_counts(roles: RoleCounts, i: int, j: int) -> Float[NDArray, " 3"]:
 
 @compiled
 def is_smaller(size_i: Float[NDArray, " 3"], size_j: Float[NDArray, " 3"]) -> bool:
-    """Return whether box i is smaller than box j.
+    """Return whether box i has the smaller footprint, or at the same footprint the smaller volume.
 
-    The function compares the areas of the footprints. If these are equal up to the share `SAME`, it
-    compares the volumes. If the volumes are also equal, no box is smaller than the other.
+    Extents that differ by at most the share `SAME` are equal.
     """
     extent_i, extent_j = size_i[0] * size_i[1], size_j[0] * size_j[1]  # areas in m²
     if abs(extent_i - extent_j) <= SAME * max(extent_i, extent_j):
@@ -65,8 +58,7 @@ def is_smaller(size_i: Float[NDArray, " 3"], size_j: Float[NDArray, " 3"]) -> bo
 def possible_roles(rise: float, height: float, larger_height: float) -> Bool[NDArray, " 3"]:
     """Return which roles the heights of two boxes in metres allow.
 
-    Args:
-        rise: bottom of the smaller box above the bottom of the larger box.
+    ``rise`` is the bottom of the smaller box above the bottom of the larger box.
     """
     possible = np.empty(3, np.bool_)
     possible[ON] = rise >= LEAST_RISE * larger_height
@@ -79,12 +71,8 @@ def possible_roles(rise: float, height: float, larger_height: float) -> Bool[NDA
 def likely_role(roles: RoleCounts, i: int, j: int, possible: Bool[NDArray, " 3"]) -> int:
     """Return the role of a smaller object of class i at a larger object of class j, or -1.
 
-    The result is -1 if no role has `LEAST_SHARE` of the smoothed counts, and at least
-    `LEAST_WEIGHT`.
-
-    Args:
-        i, j: class indices. -1 means an unknown class.
-        possible: the roles that the boxes allow.
+    A role needs `LEAST_SHARE` of the smoothed counts of the possible roles, and at least
+    `LEAST_WEIGHT`. A class index of -1 means an unknown class.
     """
     pair, counts, anchor = roles
     if i < 0 or j < 0:

@@ -32,43 +32,25 @@ Point = tuple[float, float, float]
 # have dozens of objects.
 @dataclass(slots=True, unsafe_hash=True)
 class SceneObject:
-    """One object in a scene. Do not change its attributes.
-
-    Attributes:
-        id: name of the object in this scene.
-        label: label of the object in the request.
-        class_index: index of the object's class in the model's vocabulary; None if the vocabulary
-            does not contain the label.
-        confidence: probability in (0, 1] that the object exists.
-        position: centre (x, y, z) in metres in viewer axes (x away, y left, z up), if known.
-        size: extents (x, y, z) in metres before the rotation, if known.
-        yaw: rotation of the object about z in radians.
-    """
+    """One object in a scene. Do not change its attributes. Lengths are in metres."""
 
     id: str
-    label: str
-    class_index: int | None
-    confidence: float = 1.0
-    position: Point | None = None
-    size: Point | None = None
-    yaw: float = 0.0
+    label: str  # in the request
+    class_index: int | None  # None: the vocabulary does not contain the label
+    confidence: float = 1.0  # probability in (0, 1] that the object exists
+    position: Point | None = None  # centre (x, y, z) in viewer axes: x away, y left, z up
+    size: Point | None = None  # extents (x, y, z) before the rotation
+    yaw: float = 0.0  # rotation about z in radians
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Objects and their relations.
-
-    Attributes:
-        objects: objects of the scene. ``relations`` refers to their indices in this tuple.
-        relations: observed and excluded relations. None: nothing states or shows a relation.
-        room_type: index of the room type in the model's vocabulary, if known.
-        profile: index of the data source whose base rates apply. None: inferred from the objects.
-    """
+    """Objects and their relations."""
 
     objects: tuple[SceneObject, ...]
-    relations: RelationTable | None = None
+    relations: RelationTable | None = None  # None: nothing states or shows a relation
     room_type: int | None = None
-    profile: int | None = None
+    profile: int | None = None  # source whose base rates apply. None: inferred from the objects
 
     @property
     def triples(self) -> tuple[Triple, ...]:
@@ -94,26 +76,18 @@ _UNKNOWN = (math.nan, math.nan, math.nan)
 def observe(
     scene: Scene,
     *,
-    viewpoint: Viewpoint | None = None,
-    has_viewer: bool = True,
-    typical_sizes: Float[NDArray[np.float64], "V 3"] | None = None,
-    stand_in: Int[NDArray[np.int64], "V"] | None = None,
-    roles: RoleCounts | None = None,
+    viewpoint: Viewpoint | None = None,  # None: at the origin, looking along x
+    has_viewer: bool = True,  # False: left and front are undefined
+    typical_sizes: Float[NDArray[np.float64], "V 3"] | None = None,  # `Vocabulary.sizes`
+    stand_in: Int[NDArray[np.int64], "V"] | None = None,  # `Vocabulary.stand_in`; None: itself
+    roles: RoleCounts | None = None,  # see `derive_relations`
 ) -> Scene:
     """Derive the relations of a scene from the poses of its objects.
 
     Positions and yaws must be in body axes (x forward, y left, z up). The result has viewer axes.
     If the scene states relations, the function only adds those that the boxes exclude. It returns a
-    scene without positions unchanged.
-
-    Args:
-        viewpoint: position and heading of the viewer in this frame. By default, the viewer is at
-            the origin and looks along x.
-        has_viewer: whether the viewer's pose is known. Otherwise, left and front are undefined.
-        typical_sizes: typical extents of each class in metres (`Vocabulary.sizes`). They
-            replace missing sizes of objects, and sizes below `SMALLEST`. NaN means an unknown size.
-        stand_in: class whose roles each class has (`Vocabulary.stand_in`); None means itself.
-        roles: counts that decide between on-top, under and inside; see `derive_relations`.
+    scene without positions unchanged. Typical extents in metres replace missing sizes of objects,
+    and sizes below `SMALLEST`. NaN means an unknown size.
     """
     if all(thing.position is None for thing in scene.objects):
         return scene
@@ -178,14 +152,10 @@ def pool_classes(
     Int[NDArray, " n"], Int[NDArray, " n"], Int[NDArray, " N"], Int[NDArray, " n"],
     Float[NDArray, " n"],
 ]:  # fmt: skip
-    """Return the n distinct classes of N instances.
+    """Return the n distinct classes of N instances, ascending.
 
-    Returns:
-        Class indices in ascending order.
-        Index of the first instance of each class.
-        For each instance, index of its class in the first array.
-        Number of instances of each class.
-        Probability that at least one instance of each class exists.
+    The other results are the index of the first instance of each class, the row of each instance's
+    class, the number of instances of each class, and the probability that at least one exists.
     """
     N = len(classes)
     distinct, first, counts = np.empty(N, np.int64), np.empty(N, np.int64), np.zeros(N, np.int64)

@@ -17,9 +17,7 @@ from numpy.typing import NDArray
 
 from app.compiling import compiled
 
-LEFT, FRONT, ON_TOP, ABOVE, INSIDE = 0, 1, 2, 3, 4
-"""Indices of the canonical relations."""
-
+LEFT, FRONT, ON_TOP, ABOVE, INSIDE = 0, 1, 2, 3, 4  # indices of the canonical relations
 
 CANONICAL: Final[tuple[str, ...]] = ("left", "front", "on-top", "above", "inside")
 OPPOSITES: Final[dict[str, str]] = {
@@ -31,14 +29,11 @@ OPPOSITES: Final[dict[str, str]] = {
 }
 RELATIONS: Final[tuple[str, ...]] = CANONICAL + tuple(OPPOSITES[name] for name in CANONICAL)
 
-LATERAL: Final = (LEFT, FRONT)
-"""Indices of the relations of neighbours that stand beside each other."""
-VERTICAL: Final = (ON_TOP, ABOVE)
-"""Indices of the relations of an object to an object under it."""
-SUPPORTS: Final = (ON_TOP, INSIDE)
-"""Indices of the relations of an object to the object that it stands on or in."""
-STACKED: Final = (ON_TOP, ABOVE, INSIDE)
-"""Indices of the relations of two objects with overlapping footprints."""
+# Indices of groups of relations:
+LATERAL: Final = (LEFT, FRONT)  # of neighbours that stand beside each other
+VERTICAL: Final = (ON_TOP, ABOVE)  # of an object to an object under it
+SUPPORTS: Final = (ON_TOP, INSIDE)  # of an object to the object that it stands on or in
+STACKED: Final = (ON_TOP, ABOVE, INSIDE)  # of two objects with overlapping footprints
 
 _NUMBER: Final = {name: number for number, name in enumerate(RELATIONS)}
 
@@ -104,14 +99,7 @@ def support_cycle(triples: Iterable[tuple[int, End, End]]) -> list[End] | None:
 def pool_relations(
     row: Int[NDArray, " N"], n: int, holds: Bool[NDArray, "A N N"], observed: Bool[NDArray, "A N N"]
 ) -> tuple[Bool[NDArray, "A n n"], Bool[NDArray, "A n n"]]:
-    """Pool the relations of N instances into relations of n classes; see `app.scene.scene`.
-
-    Args:
-        row: number of each instance's class, from 0 to n - 1.
-
-    Returns:
-        The pooled `holds` and `observed`.
-    """
+    """Pool the relations of N instances into relations of n classes; see `app.scene.scene`."""
     A, size, _ = holds.shape
     class_holds, class_observed = np.zeros((A, n, n), np.bool_), np.zeros((A, n, n), np.bool_)
     for a in range(A):

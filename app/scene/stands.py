@@ -68,12 +68,8 @@ def stands_of(
     """Return the stand of each of n boxes.
 
     A low object stands on the floor, also if it is on a rug. The value is `UNKNOWN` if a bottom or
-    the floor is unknown, if a box reaches into another box and its relation to this box is open, or
-    if a box is closely above another box.
-
-    Args:
-        holds, observed: relations between the boxes; see `PoseRelations`.
-        floor: height of the floor in metres, or NaN.
+    the floor (in metres, or NaN) is unknown, if a box reaches into another box and its relation to
+    this box is open, or if a box is closely above another box.
     """
     bottoms, tops, has_floor = heights.bottoms, heights.tops, not math.isnan(floor)
     is_known = np.isfinite(bottoms)

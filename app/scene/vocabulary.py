@@ -24,19 +24,12 @@ _MOST_GUESSED: Final = 3  # alternatives of a label
 
 
 class Word(NamedTuple):
-    """A word without a class, and its meaning.
+    """A word without a class, and its meaning."""
 
-    Attributes:
-        name: the word in lower case and in the singular.
-        vector: (dimensions,) word vector of length 1.
-        nearest: index of the class with the most similar word vector.
-        similarity: cosine of the angle between both vectors, from 0 to 1.
-    """
-
-    name: str
-    vector: Vectors
-    nearest: int
-    similarity: float
+    name: str  # in lower case and in the singular
+    vector: Vectors  # word vector of length 1
+    nearest: int  # class with the most similar word vector
+    similarity: float  # cosine of the angle between both vectors, from 0 to 1
 
 
 SearchT = TypeVar("SearchT", bound=Callable[..., Any])
@@ -64,14 +57,8 @@ def _remembered(search: SearchT) -> SearchT:
 class ObjectClass:
     """An object class.
 
-    Attributes:
-        label: canonical name.
-        aliases: synonyms of the label. Other spellings and plurals do not need an alias.
-        structure: True for a structural class: a part of the building (floor, wall) or a vague name
-            (object). Scenes may contain structural classes, but a model never proposes them.
-        size: typical extents (x, y, z) in metres, with z vertical, if known.
-        parent: label of the broader class, such as "lamp" for "floor lamp".
-        anywhere: True if objects of the class belong in every room (pets, people, bags, toys).
+    A structural class is a part of the building (floor, wall) or a vague name (object). Scenes may
+    contain structural classes, but a model never proposes them.
 
     Raises:
         ValueError: the size is not three positive finite numbers.
@@ -80,11 +67,11 @@ class ObjectClass:
     __pydantic_config__: ClassVar = {"extra": "forbid"}  # for classes in JSON
 
     label: str
-    aliases: tuple[str, ...] = ()
+    aliases: tuple[str, ...] = ()  # synonyms; other spellings and plurals do not need an alias
     structure: bool = False
-    size: Extents | None = None
-    parent: str | None = None
-    anywhere: bool = False
+    size: Extents | None = None  # typical extents (x, y, z) in metres, z vertical
+    parent: str | None = None  # label of the broader class, such as "lamp" for "floor lamp"
+    anywhere: bool = False  # whether its objects belong in every room (pets, people, bags, toys)
 
     def __post_init__(self) -> None:
         sides: Sequence[float] = (1.0, 1.0, 1.0) if self.size is None else self.size
@@ -98,14 +85,9 @@ class ObjectClass:
 class Vocabulary:
     """The V object classes and C room types of a model, in a fixed order. Do not change it.
 
-    Attributes:
-        objects: object classes. Their order defines the class indices.
-        room_types: canonical names of the room types. Their order defines the room indices.
-        room_aliases: maps room types to their synonyms.
-        parents: (V,) index of the parent of each class, -1 without a parent.
-        trained: number of classes without those of words (`with_words`), which come last.
-        stand_in: (V,) class whose counts and relations each class has: itself, or the nearest class
-            for a word of `with_words`.
+    `parents` has the index of the parent of each class, -1 without a parent. The first `trained`
+    classes are not those of words (`with_words`). `stand_in` is the class whose counts and
+    relations each class has: itself, or the nearest class for a word.
 
     Raises:
         ValueError: the list of classes is empty, a name is empty, a key of `room_aliases` is not a
@@ -274,7 +256,7 @@ class Vocabulary:
     def nearest(self, label: str, *, is_room: bool = False) -> tuple[Match, ...]:
         """Return up to three plausible classes or room types, most similar name first.
 
-        The method compares ``label`` with every label and alias, so it is much slower than `index`.
+        The search compares every label and alias, so it is much slower than `index`.
         """
         return (self._room_names if is_room else self._names).nearest(label, 3)
 
@@ -282,12 +264,8 @@ class Vocabulary:
     def guess(self, label: str, *, is_room: bool = False) -> LookUp | None:
         """Return the class or room type that an unknown label probably stands for, or None."""
         names = self._room_names if is_room else self._names
-        pairs = list(readings(label))
-        alternatives = [name for rule, name in pairs if rule == "alternative"]
-        for name in alternatives[:_MOST_GUESSED] or [name for _, name in pairs][-1:] or [label]:
-            if (guess := names.guess(name)) is not None:
-                return guess
-        return None
+        guesses = (names.guess(name) for name in _names_to_guess(label))
+        return next((guess for guess in guesses if guess is not None), None)
 
     @cached_property
     def vectors(self) -> tuple[Vectors, NDArray[np.bool_]]:
@@ -301,9 +279,7 @@ class Vocabulary:
         The method is for labels that `read` and `guess` do not know. It compares the label with all
         classes. The result is None for a label without a word vector.
         """
-        pairs = list(readings(label))
-        alternatives = [name for rule, name in pairs if rule == "alternative"]
-        for text in alternatives[:_MOST_GUESSED] or [name for _, name in pairs][-1:] or [label]:
+        for text in _names_to_guess(label):
             name = " ".join(split_words(text))
             vector, (vectors, has_vector) = word_vectors().of(name), self.vectors
             # Structure has no weights, so it cannot predict those of a word.
@@ -371,8 +347,7 @@ class _WithWords(Vocabulary):
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
-        new = self.objects[self.trained :]
-        return (*self._base.labels, *(entry.label for entry in new))
+        return (*self._base.labels, *(entry.label for entry in self.objects[self.trained :]))
 
     @cached_property
     def structure(self) -> NDArray[np.bool_]:
@@ -408,6 +383,13 @@ _SHARED: Final = (
     *("room_types", "room_aliases", "_by_spelling", "_by_key", "_bare"),
     *("_room_by_spelling", "_room_by_key", "_memory"),
 )
+
+
+def _names_to_guess(label: str) -> list[str]:
+    """Return the alternatives of an unknown label, else its last reading, else the label."""
+    pairs = list(readings(label))
+    alternatives = [name for rule, name in pairs if rule == "alternative"]
+    return alternatives[:_MOST_GUESSED] or [name for _, name in pairs][-1:] or [label]
 
 
 def do_not_fit(

@@ -77,11 +77,8 @@ def class_vectors(
 
     The vector of a class is the mean of two vectors, scaled to length 1: the vector of its label,
     and the mean over its aliases. The aliases tell a saw from the past tense of "see". A class
-    without either has the vector of its parent, or zero.
-
-    Args:
-        names: label of each class, then its aliases.
-        parents: index of the parent of each class, -1 without a parent.
+    without either has the vector of its parent, or zero. ``names`` has the label of each class,
+    then its aliases. ``parents`` is -1 without a parent.
     """
     vectors = np.zeros((len(names), words.dimensions), dtype=np.float32)
     for index, (label, *aliases) in enumerate(names):
