@@ -30,10 +30,8 @@ from training.runs.pipeline import prepare
 from training.runs.publish import calibrated_draft
 
 BASELINES = "baselines"
-"""Name of the baselines as a candidate: EASE for objects, and a frequency table for relations.
-
-Objects at a place are scored by the product of EASE and a frequency table of places.
-"""
+"""Name of the baselines as a candidate: EASE for objects, a frequency table for relations, and
+the product of EASE and a frequency table of places for objects at a place."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,9 +61,9 @@ class Candidate:
 
 
 def run_candidate(folder: Path, data: Path | None, say: Progress) -> Candidate:
-    """Load a finished run as a candidate, and calibrate its model as for publication.
+    """Load a finished run, and calibrate its model as for publication.
 
-    `data` is the folder with the scene files. None means the folder that the run records.
+    `data` is the folder with the scene files; None means the folder that the run records.
     """
     run = load_run(folder)
     root = data or run.data_folder
@@ -129,18 +127,13 @@ def _baselines(data: TrainingData, say: Progress) -> Model:
     )
 
 
-Sources = Mapping[str, Sequence[AnnotatedScene]]
-
-
+Sources = Mapping[str, Sequence[AnnotatedScene]]  # scenes of a configuration, by source name
 HeldOut = tuple[list[AnnotatedScene], tuple[str, ...]]
 """Scenes held out from models, and remarks on their choice."""
 
 
 def held_out(a: Candidate, b: Candidate, sources: Sources) -> HeldOut:
-    """Return the first model's test scenes without scenes that the second model learnt from.
-
-    The sources have the current scenes of the first model's configuration, by name.
-    """
+    """Return the first model's test scenes without scenes that the second model learnt from."""
     if a.config is None:
         raise ConfigError(
             f"{a.title} does not record the split of its scenes, so its test scenes are unknown"

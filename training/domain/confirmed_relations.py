@@ -32,10 +32,9 @@ Triple = tuple[int, int, int]
 
 
 def reported_relations(model: SceneModel, recorded: Sequence[AnnotatedScene]) -> set[Triple]:
-    """Return the relations (a, i, j) of classes that the model reports in confirmed scenes.
+    """Return the stacked relations (a, i, j) of classes that the model reports in confirmed scenes.
 
-    They are stacked relations, such as on-top. The model judges each scene as stated and with its
-    boxes. Boxes also show the stand of each object, so it reports other relations with boxes.
+    The model judges each scene as stated and with its boxes, which also show where objects stand.
     """
     if model.places is None:
         return set()

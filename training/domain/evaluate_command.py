@@ -25,8 +25,7 @@ from training.fit.configuration import ConfigError, source_name
 from training.runs.config_files import stored_config
 from training.runs.pipeline import prepare
 
-Figures = dict[str, list[Metric]]
-"""Metrics by model."""
+Figures = dict[str, list[Metric]]  # metrics by model
 
 
 def evaluate_command(

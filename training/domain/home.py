@@ -33,8 +33,7 @@ from training.domain.confirmed_relations import Triple, reported_relations
 from training.fit.adapt import HomeScenes, TrainedOn
 from training.fit.extend import extended
 
-JUDGED = 3
-"""Number of scenes with a new class from which its objects are judged."""
+JUDGED = 3  # number of scenes with a new class from which its objects are judged
 
 
 @dataclass(frozen=True)
@@ -69,10 +68,7 @@ class Home:
 
     @classmethod
     def of(
-        cls,
-        model: SceneModel,
-        recorded: Sequence[AnnotatedScene],
-        places: Sequence[Place] = (),
+        cls, model: SceneModel, recorded: Sequence[AnnotatedScene], places: Sequence[Place] = ()
     ) -> Home:
         """Read recorded scenes and written places in the classes of a model.
 
@@ -159,9 +155,9 @@ class Home:
 
 def with_exceptions(artifact: SceneModel, labels: Iterable[str]) -> SceneModel:
     """Return the model, which never reports objects of these classes."""
-    excused, vocabulary = set(labels), artifact.vocabulary
+    exceptions, vocabulary = set(labels), artifact.vocabulary
     objects = [
-        replace(entry, anywhere=entry.anywhere or entry.label in excused)
+        replace(entry, anywhere=entry.anywhere or entry.label in exceptions)
         for entry in vocabulary.objects
     ]
     return replace(artifact, vocabulary=replace(vocabulary, objects=objects))
@@ -173,10 +169,8 @@ def _with_new_words(model: SceneModel, recorded: Sequence[AnnotatedScene]) -> Sc
     scenes_of: Counter[str] = Counter()
     rooms: dict[str, str] = {}
     for scene in recorded:
-        labels = {label_key(thing.label): thing.label for thing in scene.objects}
-        scenes_of.update(
-            {names.canonical(x) for x in labels.values() if vocabulary.look_up(x) is None}
-        )
+        labels = {label_key(thing.label): thing.label for thing in scene.objects}.values()
+        scenes_of.update({names.canonical(x) for x in labels if vocabulary.look_up(x) is None})
         room = names.canonical_room(scene.room_type)
         if room is not None and names.room_index(scene.room_type, vocabulary) is None:
             rooms.setdefault(label_key(room), room)

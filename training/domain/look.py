@@ -18,8 +18,7 @@ from training.datasets import AnnotatedScene, EncodedScene
 from training.datasets.sources import source_of
 from training.datasets.vocabulary import curated_names, most_frequent
 
-# Maximum number of examples in a finding. Further cases are only counted.
-SHOWN = 5
+SHOWN = 5  # maximum number of examples in a finding; further cases are only counted
 
 
 @dataclass(frozen=True)
@@ -197,12 +196,9 @@ def _duplicates(scenes: Sequence[AnnotatedScene]) -> Iterator[str]:
             yield f"{earlier.scene_id} and {scene.scene_id}"
 
 
-# Maximum number of names that are compared with each other, most frequent names first.
-_COMPARED = 2000
-# Minimum number of letters of two similar names that differ by one edit, or by two edits.
-_ONE_SLIP, _TWO_SLIPS = 5, 10
-# Maximum number of labels in the text of `outside_vocabulary`. Further labels are only counted.
-_SHOWN = 8
+_COMPARED = 2000  # maximum number of compared names, most frequent first
+_ONE_SLIP, _TWO_SLIPS = 5, 10  # minimum letters of names that differ by one edit, or by two
+_SHOWN = 8  # labels in the text of `outside_vocabulary`; further labels are only counted
 
 
 @dataclass(frozen=True)

@@ -37,12 +37,9 @@ _COVERED: Final = 0.97
 FEWEST_SCENES: Final = 20
 FEW_SCENES: Final = 80
 _SPLIT_SEEDS: Final = 50
-# Accepted relative deviation of a part of the split from its target share of scenes.
-_TOLERANCE: Final = 0.2
-# Number of training scenes from which a larger machine is proposed (docs/decisions/own-scenes.md).
-_MANY_SCENES: Final = 1000
-# Least numbers of scenes that are drawn of all written places together, and of each place.
-_DRAWN, _OF_PLACE = 800, 30
+_TOLERANCE: Final = 0.2  # relative deviation of a part of the split from its target share
+_MANY_SCENES: Final = 1000  # training scenes for a larger machine (docs/decisions/own-scenes.md)
+_DRAWN, _OF_PLACE = 800, 30  # least scenes drawn of all written places together, and of each
 
 
 @dataclass(frozen=True)

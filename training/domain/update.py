@@ -29,8 +29,7 @@ from training.domain.proposal import Proposal, propose, use_frequent_names
 from training.fit.configuration import ConfigError, DataConfig, is_file
 from training.runs.config_files import load_config, read_toml
 
-PROPOSED: Final = "proposed.json"
-"""The file with the names of all proposals."""
+PROPOSED: Final = "proposed.json"  # the file with the names of all proposals
 _NOTHING: Final[Mapping[str, set[str]]] = {}
 
 
@@ -197,10 +196,7 @@ def _has(vocabulary: Vocabulary, label: Label) -> bool:
 
 
 def _with_sources(path: Path, sources: Sequence[str], written: int) -> str:
-    """Return the text of a configuration with other sources. All other entries stay.
-
-    `written` is the new value of `data.written`; 0 keeps the entry.
-    """
+    """Return the text of a configuration with new sources, and `data.written` unless it is 0."""
     expected = read_toml(path)
     expected["data"]["sources"] = list(sources)
     array = json.dumps(list(sources), ensure_ascii=False)

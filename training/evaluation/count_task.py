@@ -89,8 +89,7 @@ def _ask_counts(
     part, is_candidate = listed_cases(scene, counted, artifact.vocabulary.structure, seed)
     request = of_classes(np.repeat(part.classes, part.listed).tolist())
     request = replace(request, room_type=part.room if part.room >= 0 else None)
-    candidates = part.classes[is_candidate].tolist()
-    labels = artifact.vocabulary.labels
+    candidates, labels = part.classes[is_candidate].tolist(), artifact.vocabulary.labels
     pairs = zip(part.classes.tolist(), part.number.tolist(), strict=True)
     number_of = {labels[index]: (index, number) for index, number in pairs}
     listing = present(request, artifact.spec)
@@ -111,10 +110,7 @@ def _mean_counts(scenes: Sequence[EncodedScene], artifact: SceneModel) -> Float[
 def class_mean(
     counts: Counts, row: Int[NDArray, " k"], listed: Int[NDArray, " k"]
 ) -> Float[NDArray, " k"]:
-    """Return the mean number in training scenes with at least the listed number.
-
-    `row` are the rows of the classes in `counts`.
-    """
+    """Return the mean number in training scenes with at least `listed`, for rows of `counts`."""
     numbers = np.arange(1, counts.log_share.shape[1] + 1)
     p = np.exp(counts.log_share[row].astype(np.float64)) * (numbers >= listed[:, None])
     return p @ numbers / p.sum(axis=1)

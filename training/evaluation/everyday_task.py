@@ -45,10 +45,7 @@ LINES = (
     "generate: the scene has what never belongs",
     "generate: scenes of fewer than three classes",
 )
-"""Names of the eleven counts of the report.
-
-Lower is better for the alarms in plain scenes (without intruder) and for the last two names.
-"""
+"""Counts of the report. Lower is better for alarms in plain scenes, and for the last two."""
 
 _VERTICAL = {"on-top", "under", "above", "below"}
 _NEWER = ("inside", "contains")

@@ -35,24 +35,17 @@ from training.evaluation.relation_tasks import expected_hits
 from training.evaluation.room_task import with_room_type
 from training.evaluation.setting import Outcome, Setting
 
-OF_RELATIONS = ("relations", "poses")
-OF_OBJECTS = ("room type",)
-"""Kinds of evidence for relations (T1) and for objects (T2)."""
+OF_RELATIONS = ("relations", "poses")  # kinds of evidence for relations (T1)
+OF_OBJECTS = ("room type",)  # kinds of evidence for objects (T2)
 
 
 class Case(NamedTuple):
-    """One question of T1.
-
-    Attributes:
-        scene_index: index of the scene in its set.
-        scene: the scene with the evidence.
-        queried, truth: the queried relations, and those of them that hold.
-    """
+    """One question of T1."""
 
     scene_index: int
-    scene: Scene
+    scene: Scene  # with the evidence
     queried: Bool[NDArray, "A objects objects"]
-    truth: Bool[NDArray, "A objects objects"]
+    truth: Bool[NDArray, "A objects objects"]  # queried relations that hold
 
 
 def missing_evidence_task(artifact: SceneModel, setting: Setting) -> Outcome | None:

@@ -32,11 +32,8 @@ from training.datasets.batches import SceneTensors
 from training.datasets.cases import scene_rng
 from training.evaluation.setting import Structure
 
-LAWS = ("uniform", "by popularity", "signature")
-"""Distributions of intruders."""
-
-SIGNATURE = 10
-"""Maximum number of signature classes of a room type."""
+LAWS = ("uniform", "by popularity", "signature")  # distributions of intruders
+SIGNATURE = 10  # maximum number of signature classes of a room type
 
 _SCENES = 20
 _LIFT = 5.0
@@ -55,10 +52,7 @@ def draw_intruders(
     weights: Float[Tensor, "scenes V"] | None = None,
     seed: int = 0,
 ) -> Int[Tensor, " scenes"]:
-    """Draw the class of an intruder for each scene; -1 skips the scene.
-
-    `weights` are sampling weights. None means equal weights.
-    """
+    """Draw the class of an intruder for each scene by sampling weights; -1 skips the scene."""
     present = scenes.v > 0
     absent = (~present & ~structure).double()
     if weights is not None:
@@ -73,10 +67,7 @@ def draw_intruders(
 
 
 def signatures(train: SceneTensors) -> tuple[Bool[NDArray, "C V"], Float[NDArray, "C V"]]:
-    """Return a mask of the signature classes of every room type, and p(class | room type).
-
-    The frequencies of a room type with too few scenes are NaN.
-    """
+    """Return the signature classes, and p(class | room type): NaN with too few scenes."""
     has_room = (train.room >= 0).numpy()
     v, room = train.v.numpy()[has_room] > 0, train.room.numpy()[has_room]
     share = np.full((int(room.max(initial=-1)) + 1, v.shape[1]), np.nan)
@@ -119,10 +110,7 @@ def intruder_weights(
 def draw_intruder_choices(
     scenes: SceneTensors, structure: Structure, train: SceneTensors | None, seed: int = 0
 ) -> dict[tuple[str, str], Int[NDArray, " choices"]]:
-    """Draw up to three classes for each scene, by (source, scene id), for `ask_outliers`.
-
-    They are a uniform, a popular and a signature intruder; without `train`, only a uniform one.
-    """
+    """Draw an intruder of each law for each scene, by (source, scene id), for `ask_outliers`."""
     weights = intruder_weights(scenes, train).values()
     # `ask_outliers` uses `seed` itself. Another seed keeps the draws independent.
     columns = [draw_intruders(scenes, structure, weight, seed + 1) for weight in weights]

@@ -67,18 +67,11 @@ class Figure:
 
 
 class Metric:
-    """A metric over a set of scenes that can be resampled.
+    """A metric over a set of scenes that can be resampled."""
 
-    Attributes:
-        groups: ids of the groups of scenes, with groups that could not be scored. A metric per
-            scene has one group for each scene.
-        n: number of scored items.
-        draws: the metric over resampled groups; NaN where undefined.
-    """
-
-    groups: Int[NDArray, " G"]
-    n: int
-    draws: Float[NDArray, " resamples"]
+    groups: Int[NDArray, " G"]  # ids of all groups of scenes; one per scene before `by`
+    n: int  # number of scored items
+    draws: Float[NDArray, " resamples"]  # NaN where undefined
 
     def at(self, weight: Float[NDArray, " G"]) -> float:
         """Return the metric with group k counted weight[k] times; NaN if undefined."""
@@ -240,15 +233,12 @@ class Scored(Metric):
 
     For items of equal score, the statistic is the expectation under random order.
 
-    Attributes:
-        unit: position of the scene or group of each item in `groups`.
-
     Raises:
         ValueError: there are no items.
     """
 
     statistic: str
-    unit: Int[NDArray, " N"]
+    unit: Int[NDArray, " N"]  # position of the scene or group of each item in `groups`
     score: Float[NDArray, " N"]
     truth: Bool[NDArray, " N"]
     groups: Int[NDArray, " G"]
@@ -350,15 +340,12 @@ STATISTICS: dict[str, Callable[[Levels], float]] = {
 
 @dataclass(frozen=True, eq=False)
 class Resampled(Metric):
-    """A metric of which only its value and its resamples are kept, such as one of whole sets.
-
-    `items` is the number of scored items, such as scenes in the other set of a comparison.
-    """
+    """A metric of which only its value and its resamples are kept, such as one of whole sets."""
 
     point: float
     drawn: Float[NDArray, " resamples"]
     groups: Int[NDArray, " G"]
-    items: int
+    items: int  # scored items, such as scenes in the other set of a comparison
 
     @classmethod
     def of(

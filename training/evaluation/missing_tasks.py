@@ -39,14 +39,12 @@ from training.evaluation.parts import (
 )
 from training.evaluation.setting import Outcome, Setting, Structure
 
-SEEDS: Final = (0, 1, 2)
-"""Seeds of the draws of a question, for each scene."""
+SEEDS: Final = (0, 1, 2)  # seeds of the draws of a question, for each scene
 
 SIZES: Final[dict[str, Size]] = {"one removed": all_but_one, "25 % shown": one_quarter}
 """Parts that T2 lists, by name."""
 
-TOP: Final = (1, 3, 5, 10)
-"""Values of k for top-k accuracy."""
+TOP: Final = (1, 3, 5, 10)  # values of k for top-k accuracy
 
 
 def rank_missing(

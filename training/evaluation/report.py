@@ -41,19 +41,13 @@ def silent(_: str) -> None:
 
 @dataclass
 class SourceReport:
-    """Results of one model or baseline on one data source.
+    """Results of one model or baseline on one data source."""
 
-    Attributes:
-        source: name of the data source, or "pooled".
-        scenes: digest of the questions, see `digest`.
-        outcomes: metrics of each task, by task name; None if the model does not support the task.
-        parameters: number of trained weights of the model, if any.
-    """
-
-    source: str
-    scenes: str
+    source: str  # name of the data source, or "pooled"
+    scenes: str  # `digest` of the questions
+    # By task; None if the model does not support the task.
     outcomes: dict[str, Outcome | None] = field(default_factory=dict)
-    parameters: int | None = None
+    parameters: int | None = None  # number of trained weights
 
     def write(self, path: Path) -> None:
         """Write the report into a JSON file."""
@@ -152,14 +146,9 @@ def evaluate(
     tasks: Collection[str] | None = None,
     progress: Progress = silent,
 ) -> list[CardMetric]:
-    """Measure the metrics of a model card on every data source.
+    """Measure the metrics of a model card on every data source, for `tasks` or for all tasks.
 
     Generated scenes are compared with the scenes of all data sources together.
-
-    Args:
-        train: training scenes, see `Setting`.
-        limit: maximum number of scenes per data source in slow tasks, see `Setting`.
-        tasks: names of the tasks to measure. None means all tasks of a model card.
     """
     model = artifact_model(artifact)
     selected = [

@@ -38,9 +38,7 @@ from training.evaluation.parts import (
 )
 from training.evaluation.setting import Outcome, Setting, Structure
 
-LEAST: Final = 1e-4
-"""Least probability of a room type in the log-loss."""
-
+LEAST: Final = 1e-4  # least probability of a room type in the log-loss
 
 LISTS: Final[dict[str, tuple[Size, tuple[int, ...]]]] = {
     "all classes": (lambda classes, _: classes, SEEDS[:1]),

@@ -41,18 +41,12 @@ _SCENES = 300  # maximum scenes that choose a weight or a shift
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """One model of an experiment, with one training seed.
-
-    Attributes:
-        identity: text with all settings that affect the results. Reports on disk with another
-            identity are rejected.
-        make: function that trains the model, or reads the trained model from its folder.
-    """
+    """One model of an experiment, with one training seed."""
 
     name: str
     seed: int
-    identity: str
-    make: Callable[[TrainingData, Path, Progress], Model]
+    identity: str  # all settings that affect the results; part of the names of reports on disk
+    make: Callable[[TrainingData, Path, Progress], Model]  # train it, or read it from its folder
 
 
 def baseline_entries(
@@ -64,11 +58,8 @@ def baseline_entries(
 ) -> Iterator[Entry]:
     """Generate the entries of the baselines in `names`; None means all baselines.
 
-    Deterministic baselines have an entry for seed 0 only.
-
-    Args:
-        related: False leaves out relation baselines.
-        learning: settings of the machines for objects, see `object_scenes`.
+    Deterministic baselines have an entry for seed 0 only. `related=False` leaves out relation
+    baselines. `learning` are settings of the machines for objects, see `object_scenes`.
 
     Raises:
         ValueError: a name is not in `BASELINES`.

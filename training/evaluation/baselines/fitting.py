@@ -63,13 +63,9 @@ def halving(
 ) -> Proposals[Score]:
     """Yield short fits of all settings, and longer fits of the best settings.
 
-    Source: K. Jamieson and A. Talwalkar, "Non-stochastic best arm identification and hyperparameter
-    optimization", AISTATS 2016.
-
-    Args:
-        fit: function of a setting and the share of the full length of the training. It yields
-            scores, with parameters in addition to the setting.
-        rungs: number of settings, and share of the full length, of each round.
+    `fit` yields scores of a setting for a share of the full length. A rung is a number of settings
+    and a share. Source: K. Jamieson and A. Talwalkar, "Non-stochastic best arm identification and
+    hyperparameter optimization", AISTATS 2016.
     """
     for count, share in rungs:
         best: list[float] = []
@@ -126,17 +122,11 @@ def named_moved(scenes: SceneTensors, structure: Structure, score: MisplacedScor
 
 
 class Answer(NamedTuple):
-    """What a score answers.
-
-    Attributes:
-        fields: fields of `Model` that the score fills.
-        judge: function of validation scenes, structure classes and score; higher is better.
-        of_relations: True if the score learns from scenes with annotated relations.
-    """
+    """The fields of `Model` that a score fills, and its validation metric."""
 
     fields: tuple[str, ...]
-    judge: Callable[[SceneTensors, Tensor, Any], float]
-    of_relations: bool = True
+    judge: Callable[[SceneTensors, Tensor, Any], float]  # of validation scenes; higher is better
+    of_relations: bool = True  # True if the score learns from annotated relations
 
 
 OBJECTS: Final = Answer(("missing",), missing_mrr, of_relations=False)
@@ -149,17 +139,12 @@ MISPLACED: Final = Answer(("misplaced",), named_moved)
 
 @dataclass(frozen=True)
 class Baseline:
-    """One baseline, shown as one row of a result table.
-
-    Attributes:
-        propose: function of training scenes, structure classes and seed, see the module.
-        stochastic: True if the fit depends on the seed.
-    """
+    """One baseline, shown as one row of a result table."""
 
     name: str
-    propose: Callable[[SceneTensors, Tensor, int], Proposals[Any]]
+    propose: Callable[[SceneTensors, Tensor, int], Proposals[Any]]  # scenes, structure, seed
     answer: Answer = OBJECTS
-    stochastic: bool = False
+    stochastic: bool = False  # True if the fit depends on the seed
 
     def fit(
         self,

@@ -59,8 +59,7 @@ class NetworkScore:
     @torch.no_grad()
     def __call__(self, v: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
         """Return the score of each class; -inf for present and structure classes."""
-        listed = v * ~self.structure
-        values: Tensor = self.network(listed)
+        values: Tensor = self.network(v * ~self.structure)
         values = values.masked_fill((v > 0) | self.structure, -torch.inf)
         return values.log_softmax(1) if self.softmax else values
 
@@ -163,9 +162,8 @@ def autoencoder(train: SceneTensors, structure: Structure, seed: int) -> Proposa
     lists = dict(training_lists(train, structure))
 
     def fit(setting: dict[str, Any], share: float) -> Iterator[tuple[Parameters, ObjectScore]]:
-        """Train one setting for a share of the steps."""
-        chosen, options = lists[setting["scenes"]], setting.copy()
-        options.pop("scenes")
+        options = setting.copy()
+        chosen = lists[options.pop("scenes")]
         sizes = {name: options.pop(name) for name in ("width", "dropout")}
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)

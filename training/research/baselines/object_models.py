@@ -72,7 +72,6 @@ def nearest_score(lists: Lists, *, neighbours: int, sharpness: float) -> ObjectS
     index = normalize(lists.v, dim=1).T.contiguous()
 
     def score(query: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
-        """Let the nearest scenes of each list vote for their classes."""
         cosine = normalize(query, dim=1) @ index
         similarity, neighbour = cosine.topk(min(neighbours, len(v)), dim=1)
         # The vote of a training scene without a class of the query is 0.

@@ -120,10 +120,8 @@ _PENALTY = (0.0, 1.0, 3.0)
 
 
 def closure_score(table: RelationScore, bonus: float, penalty: float) -> RelationScore:
-    """Return the score of a table, changed by logical rules.
-
-    The log-odds of implied relations get the bonus. Those of the reverse of observed or implied
-    relations lose the penalty.
+    """Return a score: a table, plus a bonus for implied relations, minus a penalty for reverses of
+    observed or implied ones.
     """
 
     def score(batch: Batch) -> Float[Tensor, "B A n n"]:
