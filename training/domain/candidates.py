@@ -61,10 +61,7 @@ class Candidate:
 
 
 def run_candidate(folder: Path, data: Path | None, say: Progress) -> Candidate:
-    """Load a finished run, and calibrate its model as for publication.
-
-    `data` is the folder with the scene files; None means the folder that the run records.
-    """
+    """Load a finished run and the scenes in `data` or its own folder, and calibrate its model."""
     run = load_run(folder)
     root = data or run.data_folder
     say("reading scenes")

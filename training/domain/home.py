@@ -1,12 +1,11 @@
 """The recorded scenes of a home, in the classes of the model that adapts to it.
 
-A robot also records objects that do not belong there. Only a person can tell a habit of the home
-from a fault. So an unconfirmed scene does not teach the objects that the model reports as outliers:
-they are neither present nor absent there. A confirmed scene teaches all its objects.
+Only a person can tell a habit of the home from a fault. So an unconfirmed scene does not teach the
+objects that the model reports as outliers: they are neither present nor absent there. A confirmed
+scene teaches all its objects.
 
-A person can also write down the things of a room (`training.datasets.inventories`). Each written
-place is one confirmed scene. A thing that most such places lack teaches nothing there, but the
-model never reports it.
+Each written place (`training.datasets.inventories`) is one confirmed scene. A thing that most such
+places lack teaches nothing there, but the model never reports it.
 
 A label that the model cannot read becomes a new class. It is judged once `JUDGED` scenes show it.
 """

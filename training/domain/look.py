@@ -85,9 +85,8 @@ def _findings(
         examples = list(cases)
         return Finding(what, advice, len(examples), examples[:SHOWN])
 
-    listed = [
-        (scene, {canonicalise(*triple) for triple in scene.relations or ()}) for scene in scenes
-    ]
+    triples_of = [{canonicalise(*triple) for triple in s.relations or ()} for s in scenes]
+    listed = list(zip(scenes, triples_of, strict=True))
     yield finding(
         "Scenes have fewer than two different objects, so they do not show co-occurrence.",
         "Training reads them. Questions that need more objects skip them.",

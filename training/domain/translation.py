@@ -86,13 +86,9 @@ class Translation:
             scores = torch.full_like(places.v, self.unknown)
             rows = (anchor >= 0).nonzero().squeeze(1)
             if len(rows):
-                model_places = Places(
-                    v=self.presence(places.v[rows]),
-                    counts=self.presence(places.counts[rows]),
-                    relation=places.relation[rows],
-                    anchor=anchor[rows],
-                    outgoing=places.outgoing[rows],
-                )
+                part = replace(places, anchor=anchor).rows(rows)
+                v, counts = self.presence(part.v), self.presence(part.counts)
+                model_places = replace(part, v=v, counts=counts)
                 # Other present classes may map to the anchor's model class; the score is then -inf.
                 scores[rows] = self.scores(score(model_places).clamp(min=-BEYOND))
             return scores

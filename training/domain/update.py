@@ -46,9 +46,7 @@ class Update:
 
 
 def update(name: str, folder: Path, files: Sequence[Path]) -> Update:
-    """Extend the proposal in a folder with the scenes and inventories of files.
-
-    The sources of the configuration are read again, together with new files.
+    """Extend the proposal in a folder with files. The sources of the proposal are read again.
 
     Raises:
         ConfigError: the folder has no proposal, or one of its files cannot be read or extended.

@@ -67,10 +67,9 @@ class Alarms:
 
 
 def untouched_alarms(artifact: SceneModel, scenes: Sequence[EncodedScene]) -> Iterator[Alarms]:
-    """Ask about an untouched part of each scene, and count the scenes with an alarm.
+    """Count the scenes with an alarm about an untouched part, one random scene of each group.
 
-    One random scene of each group takes part, because its scenes are not independent. Objects
-    count only if the object list is complete. Sources of few groups count together.
+    Objects count only if the object list is complete. Sources of few groups count together.
     """
     rng = np.random.default_rng(0)
     scene_of_group: dict[tuple[str, str], EncodedScene] = {}

@@ -51,8 +51,7 @@ class Case(NamedTuple):
 def missing_evidence_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
     """Measure T2 (missing objects) with labels only and with the room type."""
     scenes, structure = with_room_type(setting.some()), setting.structure
-    # With one question per scene, the random choice of the class changes the result of a small data
-    # source by about 0.01.
+    # With one question per scene, chance changes the result of a small data source by about 0.01.
     parts = draw_parts(scenes, structure, all_but_one, (setting.seed, setting.seed + 1))
     if not len(parts.v):
         return None

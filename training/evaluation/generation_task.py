@@ -120,8 +120,7 @@ def scene_sampler(scenes: SceneTensors) -> Sampler:
 def machine_sampler(artifact: SceneModel) -> Sampler:
     """Return a sampler that draws scenes as the service does, and also samples relations.
 
-    Of two contradictory relations a(x, y) and a(y, x), the service keeps only one. This sampler
-    keeps both.
+    The sampler keeps both of two contradictory relations; the service keeps only one.
     """
     chains = artifact.scene_chains
 

@@ -14,10 +14,9 @@ known room type. The signature of a room type contains the ten classes with the 
 fewer. A signature class has a lift of at least 5 and occurs in at least 20 % of the scenes of the
 room type. Room types with fewer than 20 training scenes are left out.
 
-In a scene of room type r, a signature intruder must be a signature class of another room type. It
-must also occur in less than 1 % of the training scenes of room type r. The intruder is drawn in two
-steps. The first step draws one of the room types that have such a class. The second step draws one
-of these classes. Both draws are uniform.
+In a scene of room type r, a signature intruder is a signature class of another room type, which
+occurs in less than 1 % of the training scenes of r. One uniform draw chooses among the room types
+with such a class, and another among these classes.
 """
 
 from __future__ import annotations

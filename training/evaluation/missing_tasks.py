@@ -119,10 +119,7 @@ def removed_places(
 def leave_one_out_at(
     scenes: SceneTensors, structure: Structure, score: PlacedScore, *, seed: int = 0
 ) -> tuple[Ranking, Int[NDArray, " N"]]:
-    """Return the rank of every removed class among the absent classes, and its relation.
-
-    Classes of one family with a listed class are neither ranked nor candidates.
-    """
+    """Return the rank of every removed class, as of `rank_hidden`, and its relation."""
     row, target, places = removed_places(scenes, structure, seed)
     related = scenes.relatives_of(places.v)
     kept = ~related.gather(1, target.unsqueeze(1)).squeeze(1)

@@ -1,11 +1,10 @@
 """Test the placement offsets of a model on held-out scenes.
 
 An offset is the position of a relation's subject minus the position of its object, in metres. The
-model has a distribution of offsets for each relation and pair of classes. The distribution gives an
-ellipse in the horizontal plane and an ellipsoid in space. Each of these regions should contain 80 %
-of the offsets. The task measures the share of held-out offsets in these regions. It also measures
-the distance from an offset to two means of the model: the mean for the relation and classes, and
-the mean for the relation alone.
+model has a distribution of offsets for each relation and pair of classes. It gives an ellipse in
+the horizontal plane and an ellipsoid in space, which should contain 80 % of the offsets each. The
+task measures the shares of held-out offsets in them. It also measures the distance of offsets to
+the mean for the relation and classes, and to the mean for the relation alone.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Reports: the metrics of a model or baseline on one data source, or pooled over data sources.
 
-A `SourceReport` holds the results of one model, training seed and data source. It stores the values
-of each group of near-duplicate scenes. Reports can therefore be pooled over data sources, and
-compared by paired resampling, without the models.
+A `SourceReport` stores the values of each group of near-duplicate scenes. So reports can be pooled
+over data sources, and compared by paired resampling, without the models.
 """
 
 from __future__ import annotations
@@ -146,10 +145,7 @@ def evaluate(
     tasks: Collection[str] | None = None,
     progress: Progress = silent,
 ) -> list[CardMetric]:
-    """Measure the metrics of a model card on every data source, for `tasks` or for all tasks.
-
-    Generated scenes are compared with the scenes of all data sources together.
-    """
+    """Measure the metrics of a model card, on every data source or, for T4, on all together."""
     model = artifact_model(artifact)
     selected = [
         name for name, task in EVERY_TASK.items() if task.card and (tasks is None or name in tasks)

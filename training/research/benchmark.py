@@ -83,8 +83,7 @@ def read_configs(references: Sequence[str]) -> list[Config]:
     """Read the configurations to compare.
 
     Raises:
-        ConfigError: a configuration cannot be read, a name occurs twice, or the data sections
-            differ.
+        ConfigError: a configuration is unreadable, a name occurs twice, or data sections differ.
     """
     configs = [load_config(reference) for reference in references]
     first, *others = configs

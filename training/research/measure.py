@@ -8,9 +8,7 @@ An entry is one model of an experiment: a machine, a baseline or a reference.
                                                           of `WHOLE_SET`)
 
 The digests cover the settings and training scenes, and the questions. So another experiment has
-other folders and files.
-
-Several processes fill these files in parallel. One process with one thread measures each entry.
+other folders and files. One process with one thread measures each entry.
 """
 
 from __future__ import annotations

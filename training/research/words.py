@@ -1,10 +1,9 @@
 """`python -m training words`: how well a model reads words that it has no class for.
 
 The classes of `words.csv` are left out in five parts. Each becomes a word, whose weights are
-predicted from the other classes (`app.model.word_weights`). The real permissive scenes of the
-validation and test parts are listed in part, three times each. A score of a class is its log-odds
-given such a list. The AUC of a class compares the lists that hide the class with those of scenes
-without it. The command measures the mean AUC over the classes of these scores:
+predicted from the other classes (`app.model.word_weights`). The scenes of `REAL` in the validation
+and test parts are listed in part, three times each. The AUC of a class compares the lists that hide
+the class with those of scenes without it. The command measures the mean AUC of these scores:
 
 - predicted: the log-odds of the word,
 - nearest class: the log-odds of the class with the most similar word vector,

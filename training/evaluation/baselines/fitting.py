@@ -1,10 +1,9 @@
 """Common interface of all baselines: fit on training scenes, select on validation scenes.
 
 A baseline is a generator function. It fits a model on the training scenes for each point of a
-hyperparameter grid, and yields pairs (parameters, score). A neural network yields a pair for each
-candidate number of steps. `Baseline.fit` evaluates each score on the validation scenes: objects by
-`validation_score`, others by the primary metric of the task. It sends the value back to the
-generator function, which never sees the validation scenes.
+hyperparameter grid, or each candidate number of steps, and yields pairs (parameters, score).
+`Baseline.fit` evaluates each score on the validation scenes, and sends the value back to the
+generator function, which never sees these scenes.
 """
 
 from __future__ import annotations
@@ -110,8 +109,6 @@ def _precision(scored: list[Candidates], scenes: SceneTensors) -> float:
 def named_moved(scenes: SceneTensors, structure: Structure, score: MisplacedScore) -> float:
     """Return the share of moved objects that are named first (T3c); 0 if no object can move.
 
-    At most `_SCENES` scenes take part.
-
     Raises:
         ValueError: no scene has a relation.
     """
@@ -155,9 +152,7 @@ class Baseline:
         seed: int = 0,
         progress: Callable[[str], None] = lambda _: None,
     ) -> Model:
-        """Fit on training scenes, and select the best grid point on validation scenes.
-
-        If two grid points have the same metric, the first is the best.
+        """Fit on training scenes, and select the first best grid point on validation scenes.
 
         Raises:
             ValueError: scenes needed for fit or metric are missing.

@@ -121,10 +121,7 @@ _CORRECTIONS = (0.0, 0.25, 0.5, 1.0)
 
 
 def place_score(log_p: Float[Tensor, "2 A V V"]) -> PlacedScore:
-    """Return the score log p(i | a, j) of class i at the place (a, j).
-
-    `log_p` is a table over `Places.outgoing`, relation a, class j and class i.
-    """
+    """Return the score log p(i | a, j) of a table over `outgoing`, relation a, class j, class i."""
     return lambda places: log_p[places.outgoing.long(), places.relation, places.anchor]
 
 

@@ -75,9 +75,7 @@ def train_network(
     loss: str,
     steps: int,
 ) -> Iterator[tuple[int, NetworkScore]]:
-    """Train a network. At each candidate step, yield the step and the score of averaged weights.
-
-    Scenes with fewer than two classes are left out.
+    """Train a network on scenes with two classes. Yield candidate steps, and averaged weights.
 
     Raises:
         ValueError: all scenes have fewer than two classes.
