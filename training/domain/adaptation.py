@@ -187,5 +187,4 @@ def _change(home: Home, weights: Weights, recorded: torch.Tensor, seed: int) -> 
     other = ~recorded & torch.from_numpy(~home.parent.vocabulary.structure)
     other[home.parent_classes :] = False
     counted = (other & (parts.listed == 0) & (torch.maximum(before, after) > 0.01)).float()
-    change = ((after - before).abs() * counted).sum() / counted.sum().clamp(min=1)
-    return float(change)
+    return float(((after - before).abs() * counted).sum() / counted.sum().clamp(min=1))

@@ -176,8 +176,7 @@ def _drop_learnt(candidate: Candidate, scenes: list[AnnotatedScene], sources: So
     data = None if candidate.config is None else candidate.config.data
     if data is not None and data.split == "stable":
         seed = data.split_seed
-        test = [s for s in scenes if s.source not in shared or stable_part(s, seed) == "test"]
-        return test, ()
+        return [s for s in scenes if s.source not in shared or stable_part(s, seed) == "test"], ()
     names = [] if data is None else list(map(source_name, data.sources))
     if data is None or any(candidate.learnt.get(x) != digests.get(x, "") for x in names):
         note = (

@@ -107,8 +107,7 @@ def compare_command(
             a = find(new, models, data, say)
             served = "default" if "default" in models.aliases() else BASELINES
             b = find(old or served, models, data, say)
-            root = data or a.data or b.data or DATA
-            comparison = compare(a, b, root, say=say)
+            comparison = compare(a, b, data or a.data or b.data or DATA, say=say)
     except (ConfigError, DatasetError, RegistryError, RunError) as error:
         fail(error)
     if output is not None:

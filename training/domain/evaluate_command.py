@@ -114,13 +114,9 @@ def _measure(
     test = subset(tensors.test, torch.tensor(index, dtype=torch.int64))
     with console.status(reference) as status:
         return evaluate(
-            artifact.model,
-            test,
-            tensors.structure,
-            tensors.train,
-            everyday=EVERYDAY,
-            progress=status.update,
-        )
+            artifact.model, test, tensors.structure, tensors.train,
+            everyday=EVERYDAY, progress=status.update,
+        )  # fmt: skip
 
 
 def _show(tables: Figures, title: str | None = None) -> None:

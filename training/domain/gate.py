@@ -105,13 +105,14 @@ def measure_usefulness(artifact: SceneModel, data: TrainingData, *, say: Progres
             raise ValueError("the model has no score of missing objects")
         return rank_missing(scenes, data.structure, score).mrr().by(scenes.group_ids)
 
-    ours, gaps = mrr(partial(score_missing, artifact)), {}
-    values = {NEW: ours.value}
+    of_new, differences = mrr(partial(score_missing, artifact)), {}
+    values = {NEW: of_new.value}
     for baseline in (POPULARITY, EASE):
         say(f"fitting {baseline.name}")
-        theirs = mrr(baseline.fit(data.train, data.validation, data.structure).missing)
-        values[baseline.name], gaps[baseline.name] = theirs.value, paired_difference(ours, theirs)
-    return replace(usefulness, mrr=values, differences=gaps)
+        other = mrr(baseline.fit(data.train, data.validation, data.structure).missing)
+        values[baseline.name] = other.value
+        differences[baseline.name] = paired_difference(of_new, other)
+    return replace(usefulness, mrr=values, differences=differences)
 
 
 class ServedModel(NamedTuple):

@@ -206,8 +206,7 @@ def _written(parent: SceneModel, place: Place) -> HomeScene:
     largest_share: dict[int, float] = defaultdict(float)
     for group, item in place.items:
         if (match := parent.vocabulary.look_up(item.label)) is not None:
-            share = group.share * item.share
-            largest_share[match.entry] = max(largest_share[match.entry], share)
+            largest_share[match.entry] = max(largest_share[match.entry], group.share * item.share)
     rare = [c for c in scene.classes.tolist() if largest_share[c] < SHARE]
     return replace(scene, left_out=np.array(rare, dtype=np.int64), written=True)
 

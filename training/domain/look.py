@@ -260,9 +260,8 @@ def similar_labels(labels: Sequence[Label]) -> Iterator[tuple[Label, Label]]:
     curated = {label_key(name) for name in (*names.base, *names.aliases, *names.structure)}
     for i, key in enumerate(keys):
         slips = 2 if len(key) >= _TWO_SLIPS else 1
-        later = keys[i + 1 :]
         for other, _, offset in process.extract(
-            key, later, scorer=OSA.distance, limit=None, score_cutoff=slips
+            key, keys[i + 1 :], scorer=OSA.distance, limit=None, score_cutoff=slips
         ):
             digits = {"".join(filter(str.isdigit, text)) for text in (key, other)}
             if len(digits) == 1 and not {key, other} <= curated:

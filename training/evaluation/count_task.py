@@ -66,20 +66,19 @@ def counts_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
     row = np.searchsorted(artifact.counts.classes, index)
     of_class = mean(np.abs(class_mean(artifact.counts, row, listed_number) - number))
     source_mean = np.maximum(_mean_counts(train.scenes, artifact)[index], listed)
-    ours = mean(np.abs(expected - number))
+    error = mean(np.abs(expected - number))
     metrics: dict[str, Metric] = {
-        "error of the expected count": ours,
+        "error of the expected count": error,
         "error of the class mean": of_class,
-        "change of error, class mean": ours - of_class,
-        "change of error, mean of the source": ours - mean(np.abs(source_mean - number)),
+        "change of error, class mean": error - of_class,
+        "change of error, mean of the source": error - mean(np.abs(source_mean - number)),
         "count in the interval": mean((low <= number) & (number <= high)),
     }
     if (is_likely := p >= LIKELY).any():
         is_right = (number > listed)[is_likely]
-        metrics["proposals that are right"] = Ratio.of_items(
-            scene[is_likely], is_right, len(scenes)
-        )
-    return Outcome.over(scenes, metrics, ours.skipped)
+        precision = Ratio.of_items(scene[is_likely], is_right, len(scenes))
+        metrics["proposals that are right"] = precision
+    return Outcome.over(scenes, metrics, error.skipped)
 
 
 def _ask_counts(

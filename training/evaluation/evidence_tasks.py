@@ -56,13 +56,11 @@ def missing_evidence_task(artifact: SceneModel, setting: Setting) -> Outcome | N
     if not len(parts.v):
         return None
     score = partial(score_missing, artifact)
-    room = scenes.room[parts.scene]
     without, informed = (
         rank_hidden(parts, structure, ask_rows(score, *columns)).mrr()
-        for columns in ((parts.v,), (parts.v, room))
+        for columns in ((parts.v,), (parts.v, scenes.room[parts.scene]))
     )
-    metrics = _changes("MRR", "room type", without, informed)
-    return Outcome.over(scenes, metrics, parts.skipped)
+    return Outcome.over(scenes, _changes("MRR", "room type", without, informed), parts.skipped)
 
 
 def evidence_cases(
@@ -79,14 +77,14 @@ def evidence_cases(
         between = in_half[:, None] & in_half
         pair = is_thing[:, None] & is_thing & ~between & ~np.eye(len(instances), dtype=np.bool_)
         queried = np.broadcast_to(pair, encoded.instance_holds.shape)
-        truth, given = encoded.instance_holds & queried, encoded.instance_holds & between
-        if not truth.any() or not given.any():
+        truth, evidence = encoded.instance_holds & queried, encoded.instance_holds & between
+        if not truth.any() or not evidence.any():
             continue
-        triples = [(int(a), int(i), int(j)) for a, i, j in np.argwhere(given)]
+        triples = [(int(a), int(i), int(j)) for a, i, j in np.argwhere(evidence)]
         scene = replace(scene_of(encoded, range(len(instances)), triples), room_type=None)
         if kind == "poses":
             observed = encoded.instance_observed & between
-            table = RelationTable.shown_by_boxes(given, observed, np.zeros_like(observed))
+            table = RelationTable.shown_by_boxes(evidence, observed, np.zeros_like(observed))
             scene = replace(scene, relations=table)
         yield Case(index, scene, queried, truth)
 

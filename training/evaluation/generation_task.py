@@ -101,10 +101,8 @@ def scene_sampler(scenes: SceneTensors) -> Sampler:
     Without given classes, sample k is scene k, which has the given room type in `generation_task`.
     Otherwise it is a random scene with the given classes.
     """
-    blocks = torch.arange(len(scenes)).split(64)
-    contradictions = torch.cat(
-        [count_contradictions(scenes.batch(index).holds) for index in blocks]
-    )
+    batches = map(scenes.batch, torch.arange(len(scenes)).split(64))
+    contradictions = torch.cat([count_contradictions(batch.holds) for batch in batches])
 
     def sample(given: Bool[Tensor, "B V"], room: Int[Tensor, " B"], seed: int) -> Drawn:  # noqa: ARG001
         if not given.any():
@@ -145,9 +143,10 @@ def held_out_halves(setting: Setting) -> tuple[SceneTensors, SceneTensors]:
     """Split held-out scenes by groups: reference scenes, and those of an ideal sampler."""
     scenes = setting.scenes
     is_odd = torch.from_numpy(scenes.group_ids % 2 > 0)
-    first, second = (subset(scenes, mask.nonzero().squeeze(1)) for mask in (~is_odd, is_odd))
-    limit, seed = setting.limit, setting.seed
-    return some_scenes(first, limit, seed), some_scenes(second, limit, seed)
+    first, second = (
+        some_scenes(subset(scenes, mask), setting.limit, setting.seed) for mask in (~is_odd, is_odd)
+    )
+    return first, second
 
 
 def hamming(x: Float[Tensor, "N V"], y: Float[Tensor, "M V"]) -> Float[Tensor, "N M"]:
@@ -185,8 +184,7 @@ def discrepancy(
         if not pairs_weight > 0:
             return float("nan")
         mean_yy = weight @ yy @ weight / pairs_weight
-        mean_xy = weight @ xy / weight.sum()
-        return float(mean_xx + mean_yy - 2 * mean_xy)
+        return float(mean_xx + mean_yy - 2 * (weight @ xy / weight.sum()))
 
     return squared_mmd
 
@@ -199,8 +197,7 @@ def marginal_error(held_out: Float[NDArray, "scenes V"], drawn: Float[NDArray, "
         count = weight @ held_out  # total weight of the held-out scenes with each class
         if not count.sum() > 0:
             return float("nan")
-        q = count / weight.sum()
-        return float(np.abs(p - q).sum() / count.sum() * weight.sum())
+        return float(np.abs(p - count / weight.sum()).sum() / count.sum() * weight.sum())
 
     return error
 
@@ -255,7 +252,7 @@ def generation_metrics(
 ) -> dict[str, Metric]:
     """Compute all metrics of T4 over the classes in the mask; `emphasis` weighs held-out scenes."""
     x, y, training = drawn.v[:, mask], held_out[:, mask], train[:, mask]
-    ours, theirs = x.double().numpy(), y.double().numpy()
+    drawn_v, held_out_v = x.double().numpy(), y.double().numpy()
     base = np.ones(len(y)) if emphasis is None else emphasis.double().numpy()
 
     def resampled(statistic: Statistic) -> Resampled:
@@ -263,11 +260,11 @@ def generation_metrics(
 
     metrics: dict[str, Metric] = {
         "MMD²": resampled(discrepancy(y, x, bandwidth)),
-        "marginal error": resampled(marginal_error(theirs, ours)),
-        "classes per scene": Ratio.of_scenes(ours.sum(1)),
+        "marginal error": resampled(marginal_error(held_out_v, drawn_v)),
+        "classes per scene": Ratio.of_scenes(drawn_v.sum(1)),
         "copies of training scenes": Ratio.of_scenes(copies(x, training)),
     }
-    pairs = resampled(pair_correlation(theirs, ours))
+    pairs = resampled(pair_correlation(held_out_v, drawn_v))
     if np.isfinite(pairs.value):
         metrics["pair correlation"] = pairs
     return metrics | contradiction_metrics(drawn.contradictions)

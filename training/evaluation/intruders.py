@@ -60,8 +60,7 @@ def draw_intruders(
     intruders = torch.full((len(scenes),), -1, dtype=torch.int64)
     for k in is_usable.nonzero().squeeze(1).tolist():
         p = absent[k].numpy()
-        rng = scene_rng(scenes.scenes[k], seed)
-        intruders[k] = int(rng.choice(len(p), p=p / p.sum()))
+        intruders[k] = int(scene_rng(scenes.scenes[k], seed).choice(len(p), p=p / p.sum()))
     return intruders
 
 
@@ -83,8 +82,7 @@ def signatures(train: SceneTensors) -> tuple[Bool[NDArray, "C V"], Float[NDArray
 def by_signature(scenes: SceneTensors, train: SceneTensors) -> Float[Tensor, "scenes V"]:
     """Return the sampling probability of each signature intruder of each scene; else 0."""
     typical, share = signatures(train)
-    weights = np.zeros(scenes.v.shape)
-    absent = scenes.v.numpy() == 0
+    weights, absent = np.zeros(scenes.v.shape), scenes.v.numpy() == 0
     for k, room in enumerate(scenes.room.tolist()):
         if not 0 <= room < len(typical) or np.isnan(share[room]).any():
             continue

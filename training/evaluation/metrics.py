@@ -119,8 +119,7 @@ def _widening(groups: int) -> float:
     Source: Cameron, Gelbach and Miller, "Bootstrap-based improvements for inference with clustered
     errors" (2008), on the problem of few clusters.
     """
-    quantiles = stdtrit(groups - 1, 0.975) / ndtri(0.975)
-    return float(quantiles * np.sqrt(groups / (groups - 1)))
+    return float(stdtrit(groups - 1, 0.975) / ndtri(0.975) * np.sqrt(groups / (groups - 1)))
 
 
 @lru_cache(maxsize=4)  # many metrics resample the same groups one after the other

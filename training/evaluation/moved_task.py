@@ -96,10 +96,9 @@ def flagged(
     """Return whether each suspicion exceeds the threshold of its source; see `ask_moved`."""
     is_flagged = np.zeros(len(source), dtype=np.bool_)
     for name in np.unique(source):
-        mine = source == name
-        alarms = int(ALARMS * mine.sum())
-        threshold = np.sort(untouched[mine])[-1 - alarms]
-        is_flagged[mine] = suspicion[mine] > threshold
+        in_source = source == name
+        threshold = np.sort(untouched[in_source])[-1 - int(ALARMS * in_source.sum())]
+        is_flagged[in_source] = suspicion[in_source] > threshold
     return is_flagged
 
 

@@ -57,5 +57,4 @@ def offsets_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
     for name, vectors in (("distance (m)", deviation), ("distance (m), relation alone", residual)):
         distance = np.linalg.norm(vectors, axis=1)
         metrics[name] = Ratio.of_items(observed.scene, distance, len(scenes))
-    skipped = len(scenes) - len(np.unique(observed.scene))
-    return Outcome.over(setting.scenes, metrics, skipped)
+    return Outcome.over(setting.scenes, metrics, len(scenes) - len(np.unique(observed.scene)))

@@ -110,8 +110,7 @@ def draw_parts(
     for row, classes in enumerate(hidden):
         mask[row, torch.from_numpy(classes)] = True
     v = scenes.v[index].masked_fill(mask | structure, 0.0)
-    related = scenes.relatives_of(v) & (v == 0)
-    return Parts(index, v, mask, related, len(scenes))
+    return Parts(index, v, mask, scenes.relatives_of(v) & (v == 0), len(scenes))
 
 
 def share_bin(listed: Float[Tensor, " B"], classes: Float[Tensor, " B"]) -> Int[Tensor, " B"]:
@@ -188,7 +187,7 @@ def real_sources(scenes: SceneTensors) -> Iterator[tuple[str, SceneTensors]]:
     """Generate `REAL_SOURCES` by name, with their scenes; all sources if there are no real ones."""
     names = np.array([scene.source for scene in scenes.scenes], dtype=np.str_)
     for name in [x for x in REAL_SOURCES if x in names] or np.unique(names).tolist():
-        yield name, subset(scenes, torch.from_numpy(np.flatnonzero(names == name)))
+        yield name, subset(scenes, torch.from_numpy(names == name))
 
 
 @torch.no_grad()
@@ -207,7 +206,7 @@ def validation_score(
     """
     values = []
     some = scenes.complete if bool(scenes.complete.any()) else ~scenes.complete
-    for _, own in real_sources(subset(scenes, some.nonzero().squeeze(1))):
+    for _, own in real_sources(subset(scenes, some)):
         sample = some_scenes(own, _SCENES)
         for size in (up_to_longest, all_but_one):
             parts = draw_parts(sample, structure, size)

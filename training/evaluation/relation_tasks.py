@@ -124,10 +124,10 @@ def complete_scenes(
 
     def ask(batch: Batch, index: list[int]) -> tuple[Tensor, Tensor]:
         mask = scorable(batch, structure)
-        given = random_half((batch.holds > 0) & mask, scenes, index, seed)
+        observed = random_half((batch.holds > 0) & mask, scenes, index, seed)
         # With a single triple the observed half is empty: the scene is left out.
-        has_evidence = given.flatten(1).any(1)[:, None, None, None]
-        return score(with_observed(batch, given)), mask & ~given & ~given.mT & has_evidence
+        has_evidence = observed.flatten(1).any(1)[:, None, None, None]
+        return score(with_observed(batch, observed)), mask & ~observed & ~observed.mT & has_evidence
 
     return _scored(scenes, 2, ask)
 

@@ -155,11 +155,10 @@ def evaluate(
     whole = [task for task in selected if task in WHOLE_SET and task not in ONCE]
     by_name = dict(settings_by_source(scenes, structure, train, None, limit=limit))
     together = next(iter(by_name)) if len(by_name) == 1 else "pooled"
-    everyday_setting = Setting(scenes, structure, limit=limit, everyday=everyday)
     questions = [
         *((source, setting, of_source) for source, setting in by_name.items()),
         (together, Setting(scenes, structure, train, limit=limit), whole),
-        (SOURCE, everyday_setting, once),
+        (SOURCE, Setting(scenes, structure, limit=limit, everyday=everyday), once),
     ]
     return [
         row

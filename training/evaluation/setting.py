@@ -57,9 +57,7 @@ def with_relations(scenes: SceneTensors) -> SceneTensors:
 
 
 def _complete(scenes: SceneTensors) -> SceneTensors:
-    if bool(scenes.complete.all()):
-        return scenes
-    return subset(scenes, scenes.complete.nonzero().squeeze(1))
+    return scenes if bool(scenes.complete.all()) else subset(scenes, scenes.complete)
 
 
 @dataclass(frozen=True, eq=False)

@@ -139,21 +139,20 @@ def object_scenes(train: SceneTensors, structure: Structure, config: ObjectsConf
     learnt = ObjectScenes.of(train, structure, config)
     shows = torch.zeros_like(train.annotated_classes)
     shows[[train.source_names.index(name) for name in learnt.sources]] = learnt.shows
-    weights = [config.source_weights.get(scene.source, 1.0) for scene in train.scenes]
+    weight_of = config.source_weights
     weighted = [
-        replace(scene, weight=scene.weight * weight)
-        for scene, weight in zip(train.scenes, weights, strict=True)
+        replace(scene, weight=scene.weight * weight_of.get(scene.source, 1.0))
+        for scene in train.scenes
     ]
     v = train.v * shows[train.source]
     kept = (v.sum(1) >= 2) & torch.tensor([scene.weight > 0 for scene in weighted])
     masked = replace(train, scenes=weighted, v=v, annotated_classes=shows)
-    return subset(masked, kept.nonzero().squeeze(1))
+    return subset(masked, kept)
 
 
 def tuned_suspicion(score: ObjectScore, data: TrainingData, seed: int) -> ObjectScore:
     """Return the suspicion with the weight of popularity that finds most validation intruders."""
-    complete = subset(data.validation, data.validation.complete.nonzero().squeeze(1))
-    scenes = some_scenes(complete, _SCENES, seed)
+    scenes = some_scenes(subset(data.validation, data.validation.complete), _SCENES, seed)
     log_popularity = frequency(data.train.v, data.train.weight).logit()
     hits = dict.fromkeys(_WEIGHTS, 0.0)
     for weights in intruder_weights(scenes, data.train).values():

@@ -81,12 +81,12 @@ def change_by_relations(
     x = machine.by_unit(machine.hidden_logits(v))[0]
     states = torch.cat([torch.zeros_like(x[:, :1]), x], 1).softmax(1)
     drawn = torch.multinomial(states, draws, replacement=True, generator=generator).T
-    one = torch.nn.functional.one_hot(drawn, machine.spec.states)[..., 1:]
-    h1 = one.flatten(1).to(v.dtype)
+    one_hot = torch.nn.functional.one_hot(drawn, machine.spec.states)
+    h1 = one_hot[..., 1:].flatten(1).to(v.dtype)
     logits = machine.relation_logits(edges, v, h1.unsqueeze(1)).squeeze(1)
     is_unit = observed[0] & (machine.gate(edges, v)[0] > 0)
-    log_weight = (r[0] * logits - torch.nn.functional.softplus(logits))[:, is_unit].sum(1)
-    weight = log_weight.softmax(0)
+    log_p = (r[0] * logits - torch.nn.functional.softplus(logits))[:, is_unit].sum(1)
+    weight = log_p.softmax(0)
     raised = (h1 @ machine.W.T).exp()
     return (weight @ raised).log() - raised.mean(0).log()
 

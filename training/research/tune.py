@@ -271,11 +271,11 @@ def _write_best(
     if max(values, default=-math.inf) > sum(metric.value for metric in unchanged.values()):
         settings, best = study.best_params, search.metrics_of(study.best_params)
     figures = ", ".join(f"{name} {metric.figure()}" for name, metric in best.items())
-    gains = (f"{name} {paired_difference(best[name], unchanged[name])}" for name in best)
+    differences = (f"{name} {paired_difference(best[name], unchanged[name])}" for name in best)
     comment = [
         f"{original.name}, {shown(settings)}.",
         f"Metrics on validation scenes, {search.config.objects.steps} steps: {figures}.",
-        f"Paired difference from {original.name}, optimistic: {', '.join(gains)}.",
+        f"Paired difference from {original.name}, optimistic: {', '.join(differences)}.",
     ]
     tuned = with_settings(original, settings).model_copy(update={"name": f"{original.name}-tuned"})
     path = search.folder / "best.toml"

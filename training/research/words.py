@@ -162,9 +162,8 @@ def words(
             reader = _trained_without(left_out, artifact, settings, root) if train else artifact
             labels += [artifact.vocabulary.labels[index] for index in left_out.tolist()]
             vectors = vectors_of(artifact.vocabulary, left_out, aliases=aliases)
-            for total, part in zip(
-                (auc, mrr), measure(artifact, reader, lists, left_out, vectors), strict=True
-            ):
+            tables = measure(artifact, reader, lists, left_out, vectors)
+            for total, part in zip((auc, mrr), tables, strict=True):
                 for name, values in part.items():
                     total.setdefault(name, []).extend(values)
         folder.mkdir(parents=True, exist_ok=True)
@@ -217,11 +216,11 @@ def measure(
     own = np.array([index_of.get(label, -1) for label in labels])
     unseen = own[left_out][own[left_out] >= 0].tolist()
     words = [labels[index] for index in left_out.tolist()]
-    read = [_word(*word, vocabulary, unseen) for word in zip(words, vectors, strict=True)]
-    weights = RowMap.fit(reader.weights, vocabulary, unseen).with_words(reader.weights, read)
+    new = [_word(*word, vocabulary, unseen) for word in zip(words, vectors, strict=True)]
+    weights = RowMap.fit(reader.weights, vocabulary, unseen).with_words(reader.weights, new)
     listed = [own[classes][own[classes] >= 0] for classes in lists.listed]
-    columns = np.arange(len(vocabulary), len(vocabulary) + len(read))
-    nearest = np.array([word.nearest for word in read])
+    columns = np.arange(len(vocabulary), len(vocabulary) + len(new))
+    nearest = np.array([word.nearest for word in new])
     of_words = log_odds(weights, listed, np.concatenate([columns, nearest]))
     trained = log_odds(artifact.weights, lists.listed, left_out)
     length = np.repeat([[float(len(one))] for one in lists.listed], len(left_out), axis=1)

@@ -138,8 +138,7 @@ def smoothed_log_p(
     # The second table is of outgoing places. The transpose puts the class j of the place first.
     holds = torch.stack([counts.holds, counts.holds.mT])
     share = popularity / popularity.sum()
-    any_anchor = holds.sum(2)
-    back_off = any_anchor + relation * share
+    back_off = holds.sum(2) + relation * share
     back_off = back_off / back_off.sum(-1, keepdim=True)
     table = holds + place * back_off.unsqueeze(2)
     return (table / (holds.sum(-1, keepdim=True) + place)).log()

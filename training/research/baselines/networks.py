@@ -170,5 +170,4 @@ def autoencoder(train: SceneTensors, structure: Structure, seed: int) -> Proposa
         for step, score in train_network(network, chosen, structure, seed, **options, steps=steps):
             yield {"steps": step}, score
 
-    settings = drawn_settings(scenes=tuple(lists), loss=LOSSES, **_AUTOENCODER)
-    return halving(settings, fit, _RUNGS)
+    return halving(drawn_settings(scenes=tuple(lists), loss=LOSSES, **_AUTOENCODER), fit, _RUNGS)

@@ -189,8 +189,7 @@ class RbmScore:
         return torch.cat(blocks) + self.b
 
     def _hidden_log_odds(self, x: Float[Tensor, "B H1"]) -> Float[Tensor, "B V"]:
-        with_class = softplus(x.unsqueeze(2) + self.W)
-        return (with_class - softplus(x).unsqueeze(2)).sum(1)
+        return (softplus(x.unsqueeze(2) + self.W) - softplus(x).unsqueeze(2)).sum(1)
 
 
 def fit_annealed(
