@@ -1,15 +1,15 @@
 """Test the expected numbers of instances of a model on held-out scenes.
 
 A robot lists a part of each scene (`datasets.cases.some_instances`) and asks for the expected
-number of instances of each listed class. The task measures the mean absolute error of this number.
-It compares the error with the errors of two means:
+number of instances of each listed class. The task compares the mean absolute error of this number
+with the errors of two means:
 
-- the class mean: the mean number in the training scenes of the model that have at least the listed
-  number;
-- the mean of the source: the mean number in the training scenes of the same data source. If it is
-  smaller than the listed number, the listed number takes its place.
+- the class mean: over the training scenes of the model with at least the listed number;
+- the mean of the source: over the training scenes of the same data source, and at least the listed
+  number.
 
-Classes without statistics, and classes whose instances the source does not count, are left out."""
+Classes without statistics, and classes whose instances the source does not count, are left out.
+"""
 
 from __future__ import annotations
 

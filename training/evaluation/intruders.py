@@ -65,7 +65,7 @@ def draw_intruders(
 
 
 def signatures(train: SceneTensors) -> tuple[Bool[NDArray, "C V"], Float[NDArray, "C V"]]:
-    """Return the signature classes, and p(class | room type): NaN with too few scenes."""
+    """Return a mask of signature classes, and p(class | room type): NaN with too few scenes."""
     has_room = (train.room >= 0).numpy()
     v, room = train.v.numpy()[has_room] > 0, train.room.numpy()[has_room]
     share = np.full((int(room.max(initial=-1)) + 1, v.shape[1]), np.nan)

@@ -1,7 +1,5 @@
 """Metrics that keep their values per scene or group of scenes, with bootstrap intervals.
 
-The values allow resampling, pairing with another model, pooling over sources, and storage as JSON.
-
 The scenes of a group are near-duplicates. So a task counts a metric per scene, and `by` sums it per
 group. A resample draws groups with replacement, as many as the set has. It is stored as the number
 of times that each group was drawn. The draws depend only on the number of groups. So two metrics of

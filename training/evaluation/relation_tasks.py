@@ -184,8 +184,7 @@ def draw_false_triple(
     """Draw a true triple (relation, subject, object) of a scene and a false replacement.
 
     The replacement changes the relation (probability 1/2), the subject (1/4) or the object (1/4).
-    It is usable, and the scene lists neither it nor its mirror image. The result is None with fewer
-    than two usable true triples, or if `_TRIES` draws give no false triple.
+    Return None with fewer than two usable true triples, or if all `_TRIES` draws fail.
     """
     true_triples = np.argwhere(holds & usable)
     if len(true_triples) < 2:
