@@ -43,7 +43,7 @@ _LEAVE_ONE_OUT = 0.0
 
 @dataclass(frozen=True)
 class Measured:
-    """The columns parent and adapted weights, on N scenes of folds that the fit did not see."""
+    """The parent (column 0) and the adapted weights (1) on N scenes that their fit did not see."""
 
     loss: Float[NDArray, "N 2"]  # log loss of hidden objects
     rank: Float[NDArray, "M 2"]  # reciprocal rank of a hidden object

@@ -63,10 +63,10 @@ def misplaced(**entries: float) -> Callable[[SceneModel], SceneModel]:
     """Return a function that changes the weights of the scores of misplaced entries."""
 
     def change(artifact: SceneModel) -> SceneModel:
-        misplaced = artifact.calibration.misplaced
-        fits = {kind: getattr(misplaced, kind) for kind in KINDS}
+        original = artifact.calibration.misplaced
+        fits = {kind: getattr(original, kind) for kind in KINDS}
         update = {kind: fit and fit.model_copy(update=entries) for kind, fit in fits.items()}
-        return _recalibrated(artifact, misplaced=misplaced.model_copy(update=update))
+        return _recalibrated(artifact, misplaced=original.model_copy(update=update))
 
     return change
 

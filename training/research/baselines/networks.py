@@ -75,7 +75,7 @@ def train_network(
     loss: str,
     steps: int,
 ) -> Iterator[tuple[int, NetworkScore]]:
-    """Train a network on scenes with two classes. Yield candidate steps, and averaged weights.
+    """Train on scenes with two classes. Yield candidate steps, and scores of averaged weights.
 
     Raises:
         ValueError: all scenes have fewer than two classes.

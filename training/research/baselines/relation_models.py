@@ -118,8 +118,9 @@ _PENALTY = (0.0, 1.0, 3.0)
 
 
 def closure_score(table: RelationScore, bonus: float, penalty: float) -> RelationScore:
-    """Return a score: a table, plus a bonus for implied relations, minus a penalty for reverses of
-    observed or implied ones.
+    """Return the score of a table, changed by logical rules.
+
+    Implied relations get the bonus. Reverses of observed or implied relations lose the penalty.
     """
 
     def score(batch: Batch) -> Float[Tensor, "B A n n"]:
