@@ -77,8 +77,7 @@ class Adapted:
     objections: tuple[str, ...]  # reasons of the gate against new weights
     # Classes that the new model never reports, and in how many confirmed scenes it would.
     exceptions: Counter[str]
-    # Confirmed relations of classes that the parent reports, in words.
-    relations: tuple[str, ...] = ()
+    relations: tuple[str, ...] = ()  # confirmed relations that the parent reports, in words
 
 
 def adapted(

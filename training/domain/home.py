@@ -62,8 +62,7 @@ class Home:
     recorded: int  # number of recorded scenes, with the repeated ones
     # Ids of the unconfirmed scenes in which each label is left out.
     left_out: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    # Confirmed relations of classes that the parent reports as misplaced.
-    relations: frozenset[Triple] = frozenset()
+    relations: frozenset[Triple] = frozenset()  # confirmed, but misplaced for the parent
 
     @classmethod
     def of(

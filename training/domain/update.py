@@ -79,7 +79,9 @@ def update(name: str, folder: Path, files: Sequence[Path]) -> Update:
         written = proposal.config.data.written if not data.written else 0
         texts[config_file] = _with_sources(config_file, [*data.sources, *added], written)
     without = [label for label in proposal.labels if not _has(extended, label)]
-    removed = tuple(label for label in without if _keys(label) & proposed["objects"])
+    removed = tuple(
+        x for x in without if proposed["objects"] & set(map(label_key, (x.name, *x.spellings)))
+    )
     dropped = tuple(label for label in without if label not in removed)
     covered = coverage(extended, scenes)
     result = replace(proposal, vocabulary=extended, coverage=covered, dropped=dropped)
@@ -183,10 +185,6 @@ def _new_classes(
         )
         for entry in new
     )
-
-
-def _keys(label: Label) -> set[str]:
-    return set(map(label_key, (label.name, *label.spellings)))
 
 
 def _has(vocabulary: Vocabulary, label: Label) -> bool:

@@ -54,8 +54,7 @@ _LISTED = 5
 _DRAWN = 8
 _FEW = 3
 
-# Maps each name in `LINES` to a list of (number of hits, number of questions), one pair per fact.
-Lines = dict[str, list[tuple[int, int]]]
+Lines = dict[str, list[tuple[int, int]]]  # (hits, questions) of each fact, by name in `LINES`
 
 
 def facts_file(folder: Path = EVERYDAY) -> Path | None:

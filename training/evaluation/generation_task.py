@@ -41,9 +41,8 @@ from training.evaluation.model import Drawn, Sampler, SamplerOf
 from training.evaluation.setting import Outcome, Setting
 
 _RESAMPLES = 200
-# Maximum number of held-out scenes for the bandwidth, and of classes for the covariances.
-_BANDWIDTH_SCENES = 1000
-_COMMON_CLASSES = 200
+_BANDWIDTH_SCENES = 1000  # maximum number of held-out scenes for the bandwidth
+_COMMON_CLASSES = 200  # maximum number of classes for the covariances
 _ON_TOP = CANONICAL.index("on-top")
 
 

@@ -39,8 +39,7 @@ from training.evaluation.setting import Outcome, Setting, Structure
 RARE = 10  # A class is rare if training relates it to at most this many classes
 SHIFTS = (0.0, -0.4, -0.8, -1.2)  # tested changes of the log-odds of left and front
 
-# Lower bound of the listed relations' share, so that the log-loss of a pair is at most 21 nats.
-_LEAST = 1e-9
+_LEAST = 1e-9  # least share of the listed relations: the log-loss of a pair is at most 21 nats
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,8 +25,7 @@ Shown = Mapping[str, tuple[str, ...]]
 SHOWN: Shown = {name: task.shown for name, task in TASKS.items()}
 """Names of the metrics in tables, by task."""
 
-# Annotators list only a part of the relations that hold.
-UNLISTED = "An unlisted relation counts as wrong"
+UNLISTED = "An unlisted relation counts as wrong"  # annotators list only a part of the true ones
 
 _RELATION_TASKS = ("T1a", "T1b", "T1 with")
 

@@ -66,9 +66,8 @@ FIGURES = {
 
 # Trials are comparable only with the same scenes and seed.
 _FIXED = ("data.", "training.seed", "training.threads")
-# Pruning needs this number of finished trials, and starts after this percentage of the first phase.
-_RIVALS = 4
-_WARM_UP = 33
+_RIVALS = 4  # finished trials before pruning starts
+_WARM_UP = 33  # percentage of the first phase before pruning starts
 
 console = Console()
 
