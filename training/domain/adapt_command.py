@@ -110,9 +110,8 @@ def _parent(store: Store, reference: str, name: str) -> Artifact:
     origin = artifact.manifest.training.get("parent")
     if isinstance(origin, dict):
         artifact = store.load(str(origin["name"]), str(origin["version"]))
-        console.print(
-            f"{reference} is itself adapted; adapting its parent {_reference(artifact)} again"
-        )
+        parent = _reference(artifact)
+        console.print(f"{reference} is itself adapted; adapting its parent {parent} again")
     if artifact.manifest.name == name:
         raise ConfigError(f"--name {name} is the name of the model itself: choose another name")
     return artifact
@@ -196,15 +195,12 @@ def _description(
     parent: Artifact,
     result: Adapted,
     recorded: Sequence[AnnotatedScene],
-    written: Sequence[AnnotatedScene],
+    written: Sequence[AnnotatedScene],  # of written places
     name: str,
     version: str,
     seed: int,
 ) -> Description:
-    """Return the description of the adapted model. Its terms are those of the parent.
-
-    The written scenes are those of written places.
-    """
+    """Return the description of the adapted model. Its terms are those of the parent."""
     manifest, model = parent.manifest, result.model or parent.model
     own = next((scene.source for scene in recorded if scene.source != "jsonl"), name)
     sources = [

@@ -32,8 +32,7 @@ from training.fit.adapt import adapt, part_loss
 from training.fit.objects import random_parts
 from training.machines.arrays import machine_of
 
-FEWEST = 20
-"""Number of distinct recorded scenes from which the weights adapt."""
+FEWEST = 20  # number of distinct recorded scenes from which the weights adapt
 
 _FOLDS = 5
 _LEAST_T = 2.0
@@ -44,10 +43,7 @@ _LEAVE_ONE_OUT = 0.0
 
 @dataclass(frozen=True)
 class Measured:
-    """The parent and the adapted weights on N scenes of the folds that their fit did not see.
-
-    The columns are those of the parent, and of the adapted weights.
-    """
+    """The parent (column 0) and the adapted weights (1) on N scenes that their fit did not see."""
 
     loss: Float[NDArray, "N 2"]  # log loss of hidden objects
     rank: Float[NDArray, "M 2"]  # reciprocal rank of a hidden object
@@ -81,8 +77,7 @@ class Adapted:
     objections: tuple[str, ...]  # reasons of the gate against new weights
     # Classes that the new model never reports, and in how many confirmed scenes it would.
     exceptions: Counter[str]
-    # Confirmed relations of classes that the parent reports, in words.
-    relations: tuple[str, ...] = ()
+    relations: tuple[str, ...] = ()  # confirmed relations that the parent reports, in words
 
 
 def adapted(
@@ -110,10 +105,9 @@ def adapted(
 
 
 def measure(home: Home, seed: int, progress: Callable[[str], None]) -> Measured:
-    """Compare the parent with adapted weights in folds of groups.
+    """Compare the parent with adapted weights in folds of groups, or of scenes if groups are few.
 
-    Scenes with fewer than two classes have no part in it. Written places take part in each fit, and
-    never in a fold. With fewer groups than folds, the folds are made of scenes.
+    Scenes need two classes. Written places take part in each fit, and never in a fold.
     """
     index = home.measurable
     names, group = np.unique([home.scenes[k].group for k in index], return_inverse=True)
@@ -137,8 +131,7 @@ def measure(home: Home, seed: int, progress: Callable[[str], None]) -> Measured:
     )
 
 
-Sides = tuple[SceneModel, SceneModel]
-"""The parent, and the model with adapted weights."""
+Sides = tuple[SceneModel, SceneModel]  # the parent, and the model with adapted weights
 
 
 @torch.no_grad()
@@ -193,5 +186,4 @@ def _change(home: Home, weights: Weights, recorded: torch.Tensor, seed: int) -> 
     other = ~recorded & torch.from_numpy(~home.parent.vocabulary.structure)
     other[home.parent_classes :] = False
     counted = (other & (parts.listed == 0) & (torch.maximum(before, after) > 0.01)).float()
-    change = ((after - before).abs() * counted).sum() / counted.sum().clamp(min=1)
-    return float(change)
+    return float(((after - before).abs() * counted).sum() / counted.sum().clamp(min=1))

@@ -30,10 +30,8 @@ from training.runs.pipeline import prepare
 from training.runs.publish import calibrated_draft
 
 BASELINES = "baselines"
-"""Name of the baselines as a candidate: EASE for objects, and a frequency table for relations.
-
-Objects at a place are scored by the product of EASE and a frequency table of places.
-"""
+"""Name of the baselines as a candidate: EASE for objects, a frequency table for relations, and
+the product of EASE and a frequency table of places for objects at a place."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,10 +61,7 @@ class Candidate:
 
 
 def run_candidate(folder: Path, data: Path | None, say: Progress) -> Candidate:
-    """Load a finished run as a candidate, and calibrate its model as for publication.
-
-    `data` is the folder with the scene files. None means the folder that the run records.
-    """
+    """Load a finished run and the scenes in `data` or its own folder, and calibrate its model."""
     run = load_run(folder)
     root = data or run.data_folder
     say("reading scenes")
@@ -129,18 +124,13 @@ def _baselines(data: TrainingData, say: Progress) -> Model:
     )
 
 
-Sources = Mapping[str, Sequence[AnnotatedScene]]
-
-
+Sources = Mapping[str, Sequence[AnnotatedScene]]  # scenes of a configuration, by source name
 HeldOut = tuple[list[AnnotatedScene], tuple[str, ...]]
 """Scenes held out from models, and remarks on their choice."""
 
 
 def held_out(a: Candidate, b: Candidate, sources: Sources) -> HeldOut:
-    """Return the first model's test scenes without scenes that the second model learnt from.
-
-    The sources have the current scenes of the first model's configuration, by name.
-    """
+    """Return the first model's test scenes without scenes that the second model learnt from."""
     if a.config is None:
         raise ConfigError(
             f"{a.title} does not record the split of its scenes, so its test scenes are unknown"
@@ -186,8 +176,7 @@ def _drop_learnt(candidate: Candidate, scenes: list[AnnotatedScene], sources: So
     data = None if candidate.config is None else candidate.config.data
     if data is not None and data.split == "stable":
         seed = data.split_seed
-        test = [s for s in scenes if s.source not in shared or stable_part(s, seed) == "test"]
-        return test, ()
+        return [s for s in scenes if s.source not in shared or stable_part(s, seed) == "test"], ()
     names = [] if data is None else list(map(source_name, data.sources))
     if data is None or any(candidate.learnt.get(x) != digests.get(x, "") for x in names):
         note = (

@@ -40,14 +40,12 @@ COMPARED: dict[str, tuple[str, ...]] = {
     "T1b completion": ("R-precision",),
     "T3b placement": ("hit@1",),
 }
-"""Metrics to compare, by task. The first metric of a task is its primary metric. For all metrics,
-higher is better."""
+"""Metrics to compare, by task; the first is its primary metric. Higher is better for all."""
 
 RELATIONAL = ("T1a relations", "T1b completion", "T2-at missing at a place", "T3b placement")
 """Tasks that need scenes with relations."""
 
-SCENES = 300
-"""Maximum number of compared scenes."""
+SCENES = 300  # maximum number of compared scenes
 
 _COLOURS = {"better": "green", "worse": "red"}
 
@@ -61,8 +59,7 @@ class Comparison:
     scenes: int
     groups: int  # groups of near-duplicates among the compared scenes
     notes: tuple[str, ...]
-    # Relation tasks that were measured for the second model before its publication, but not in this
-    # comparison. Empty if this comparison measures any such task.
+    # Relation tasks on the card of the second model, if this comparison measures no relation task.
     unmeasured: tuple[str, ...] = ()
 
     @property
@@ -110,8 +107,7 @@ def compare_command(
             a = find(new, models, data, say)
             served = "default" if "default" in models.aliases() else BASELINES
             b = find(old or served, models, data, say)
-            root = data or a.data or b.data or DATA
-            comparison = compare(a, b, root, say=say)
+            comparison = compare(a, b, data or a.data or b.data or DATA, say=say)
     except (ConfigError, DatasetError, RegistryError, RunError) as error:
         fail(error)
     if output is not None:
@@ -157,10 +153,7 @@ def difference_text(figure: Figure) -> str:
 
 
 def compare(a: Candidate, b: Candidate, root: Path, *, say: Progress) -> Comparison:
-    """Measure both models on the tasks of `COMPARED`. The questions use the first model's classes.
-
-    `root` is the folder with the scene files of the first model's configuration.
-    """
+    """Measure both models on the scene files in `root`, in the classes of the first model."""
     if a.config is None or a.vocabulary is None:
         raise ConfigError(
             f"{a.title} does not record its training configuration, so its held-out scenes are "

@@ -25,8 +25,7 @@ from training.fit.configuration import ConfigError, source_name
 from training.runs.config_files import stored_config
 from training.runs.pipeline import prepare
 
-Figures = dict[str, list[Metric]]
-"""Metrics by model."""
+Figures = dict[str, list[Metric]]  # metrics by model
 
 
 def evaluate_command(
@@ -115,13 +114,9 @@ def _measure(
     test = subset(tensors.test, torch.tensor(index, dtype=torch.int64))
     with console.status(reference) as status:
         return evaluate(
-            artifact.model,
-            test,
-            tensors.structure,
-            tensors.train,
-            everyday=EVERYDAY,
-            progress=status.update,
-        )
+            artifact.model, test, tensors.structure, tensors.train,
+            everyday=EVERYDAY, progress=status.update,
+        )  # fmt: skip
 
 
 def _show(tables: Figures, title: str | None = None) -> None:

@@ -29,9 +29,7 @@ from training.evaluation.model import ObjectScore
 from training.evaluation.report import Progress
 from training.evaluation.tasks import in_words
 
-# Accepted loss of a primary metric when a new version replaces the served version.
-MARGIN = 0.02
-
+MARGIN = 0.02  # accepted loss of a primary metric when a new version replaces the served version
 LEAST_LEAD = 0.02
 """Minimum lead of a new version over popularity, in MRR. A smaller lead is of no use, even if it is
 certain: a model that is trained on shuffled labels can lead by 0.006."""
@@ -90,16 +88,14 @@ class Usefulness:
 
 
 def measure_usefulness(artifact: SceneModel, data: TrainingData, *, say: Progress) -> Usefulness:
-    """Compare a new version with popularity and EASE on the test scenes of its run.
+    """Compare a new version with popularity and EASE on the scenes of its run.
 
-    The baselines learn from the training scenes of the run. Scenes with incomplete object lists are
-    left out, unless all test scenes are such scenes.
+    Test scenes with incomplete object lists are left out, unless all lists are incomplete.
     """
     complete = data.test.complete
     scenes = some_scenes(subset(data.test, complete) if complete.any() else data.test, SCENES)
     # A question hides one class and lists the others.
-    has_two_classes = ((scenes.v > 0) & ~data.structure).sum(1) > 1
-    scenes = subset(scenes, has_two_classes)
+    scenes = subset(scenes, ((scenes.v > 0) & ~data.structure).sum(1) > 1)
     usefulness = Usefulness(scenes=len(scenes), groups=len(np.unique(scenes.group_ids)))
     if usefulness.groups < FEWEST_GROUPS:
         return usefulness
@@ -109,13 +105,14 @@ def measure_usefulness(artifact: SceneModel, data: TrainingData, *, say: Progres
             raise ValueError("the model has no score of missing objects")
         return rank_missing(scenes, data.structure, score).mrr().by(scenes.group_ids)
 
-    ours, gaps = mrr(partial(score_missing, artifact)), {}
-    values = {NEW: ours.value}
+    of_new, differences = mrr(partial(score_missing, artifact)), {}
+    values = {NEW: of_new.value}
     for baseline in (POPULARITY, EASE):
         say(f"fitting {baseline.name}")
-        theirs = mrr(baseline.fit(data.train, data.validation, data.structure).missing)
-        values[baseline.name], gaps[baseline.name] = theirs.value, paired_difference(ours, theirs)
-    return replace(usefulness, mrr=values, differences=gaps)
+        other = mrr(baseline.fit(data.train, data.validation, data.structure).missing)
+        values[baseline.name] = other.value
+        differences[baseline.name] = paired_difference(of_new, other)
+    return replace(usefulness, mrr=values, differences=differences)
 
 
 class ServedModel(NamedTuple):

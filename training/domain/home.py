@@ -1,12 +1,11 @@
 """The recorded scenes of a home, in the classes of the model that adapts to it.
 
-A robot also records objects that do not belong there. Only a person can tell a habit of the home
-from a fault. So an unconfirmed scene does not teach the objects that the model reports as outliers:
-they are neither present nor absent there. A confirmed scene teaches all its objects.
+Only a person can tell a habit of the home from a fault. So an unconfirmed scene does not teach the
+objects that the model reports as outliers: they are neither present nor absent there. A confirmed
+scene teaches all its objects.
 
-A person can also write down the things of a room (`training.datasets.inventories`). Each written
-place is one confirmed scene. A thing that most such places lack teaches nothing there, but the
-model never reports it.
+Each written place (`training.datasets.inventories`) is one confirmed scene. A thing that most such
+places lack teaches nothing there, but the model never reports it.
 
 A label that the model cannot read becomes a new class. It is judged once `JUDGED` scenes show it.
 """
@@ -33,8 +32,7 @@ from training.domain.confirmed_relations import Triple, reported_relations
 from training.fit.adapt import HomeScenes, TrainedOn
 from training.fit.extend import extended
 
-JUDGED = 3
-"""Number of scenes with a new class from which its objects are judged."""
+JUDGED = 3  # number of scenes with a new class from which its objects are judged
 
 
 @dataclass(frozen=True)
@@ -64,15 +62,11 @@ class Home:
     recorded: int  # number of recorded scenes, with the repeated ones
     # Ids of the unconfirmed scenes in which each label is left out.
     left_out: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    # Confirmed relations of classes that the parent reports as misplaced.
-    relations: frozenset[Triple] = frozenset()
+    relations: frozenset[Triple] = frozenset()  # confirmed, but misplaced for the parent
 
     @classmethod
     def of(
-        cls,
-        model: SceneModel,
-        recorded: Sequence[AnnotatedScene],
-        places: Sequence[Place] = (),
+        cls, model: SceneModel, recorded: Sequence[AnnotatedScene], places: Sequence[Place] = ()
     ) -> Home:
         """Read recorded scenes and written places in the classes of a model.
 
@@ -159,9 +153,9 @@ class Home:
 
 def with_exceptions(artifact: SceneModel, labels: Iterable[str]) -> SceneModel:
     """Return the model, which never reports objects of these classes."""
-    excused, vocabulary = set(labels), artifact.vocabulary
+    exceptions, vocabulary = set(labels), artifact.vocabulary
     objects = [
-        replace(entry, anywhere=entry.anywhere or entry.label in excused)
+        replace(entry, anywhere=entry.anywhere or entry.label in exceptions)
         for entry in vocabulary.objects
     ]
     return replace(artifact, vocabulary=replace(vocabulary, objects=objects))
@@ -173,10 +167,8 @@ def _with_new_words(model: SceneModel, recorded: Sequence[AnnotatedScene]) -> Sc
     scenes_of: Counter[str] = Counter()
     rooms: dict[str, str] = {}
     for scene in recorded:
-        labels = {label_key(thing.label): thing.label for thing in scene.objects}
-        scenes_of.update(
-            {names.canonical(x) for x in labels.values() if vocabulary.look_up(x) is None}
-        )
+        labels = {label_key(thing.label): thing.label for thing in scene.objects}.values()
+        scenes_of.update({names.canonical(x) for x in labels if vocabulary.look_up(x) is None})
         room = names.canonical_room(scene.room_type)
         if room is not None and names.room_index(scene.room_type, vocabulary) is None:
             rooms.setdefault(label_key(room), room)
@@ -213,8 +205,7 @@ def _written(parent: SceneModel, place: Place) -> HomeScene:
     largest_share: dict[int, float] = defaultdict(float)
     for group, item in place.items:
         if (match := parent.vocabulary.look_up(item.label)) is not None:
-            share = group.share * item.share
-            largest_share[match.entry] = max(largest_share[match.entry], share)
+            largest_share[match.entry] = max(largest_share[match.entry], group.share * item.share)
     rare = [c for c in scene.classes.tolist() if largest_share[c] < SHARE]
     return replace(scene, left_out=np.array(rare, dtype=np.int64), written=True)
 

@@ -18,8 +18,7 @@ from training.datasets import AnnotatedScene, EncodedScene
 from training.datasets.sources import source_of
 from training.datasets.vocabulary import curated_names, most_frequent
 
-# Maximum number of examples in a finding. Further cases are only counted.
-SHOWN = 5
+SHOWN = 5  # maximum number of examples in a finding; further cases are only counted
 
 
 @dataclass(frozen=True)
@@ -86,9 +85,8 @@ def _findings(
         examples = list(cases)
         return Finding(what, advice, len(examples), examples[:SHOWN])
 
-    listed = [
-        (scene, {canonicalise(*triple) for triple in scene.relations or ()}) for scene in scenes
-    ]
+    triples_of = [{canonicalise(*triple) for triple in s.relations or ()} for s in scenes]
+    listed = list(zip(scenes, triples_of, strict=True))
     yield finding(
         "Scenes have fewer than two different objects, so they do not show co-occurrence.",
         "Training reads them. Questions that need more objects skip them.",
@@ -197,12 +195,9 @@ def _duplicates(scenes: Sequence[AnnotatedScene]) -> Iterator[str]:
             yield f"{earlier.scene_id} and {scene.scene_id}"
 
 
-# Maximum number of names that are compared with each other, most frequent names first.
-_COMPARED = 2000
-# Minimum number of letters of two similar names that differ by one edit, or by two edits.
-_ONE_SLIP, _TWO_SLIPS = 5, 10
-# Maximum number of labels in the text of `outside_vocabulary`. Further labels are only counted.
-_SHOWN = 8
+_COMPARED = 2000  # maximum number of compared names, most frequent first
+_ONE_SLIP, _TWO_SLIPS = 5, 10  # minimum letters of names that differ by one edit, or by two
+_SHOWN = 8  # labels in the text of `outside_vocabulary`; further labels are only counted
 
 
 @dataclass(frozen=True)
@@ -265,9 +260,8 @@ def similar_labels(labels: Sequence[Label]) -> Iterator[tuple[Label, Label]]:
     curated = {label_key(name) for name in (*names.base, *names.aliases, *names.structure)}
     for i, key in enumerate(keys):
         slips = 2 if len(key) >= _TWO_SLIPS else 1
-        later = keys[i + 1 :]
         for other, _, offset in process.extract(
-            key, later, scorer=OSA.distance, limit=None, score_cutoff=slips
+            key, keys[i + 1 :], scorer=OSA.distance, limit=None, score_cutoff=slips
         ):
             digits = {"".join(filter(str.isdigit, text)) for text in (key, other)}
             if len(digits) == 1 and not {key, other} <= curated:

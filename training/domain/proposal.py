@@ -1,10 +1,8 @@
 """Propose a vocabulary and a training configuration, with a reason for each entry.
 
-The material are scenes, written inventories, or both. Scenes are drawn of each written place, at
-least as many in all as there are seen scenes. Every written thing becomes a class.
-
-Few scenes get a small machine, and many scenes a larger one (docs/decisions/own-scenes.md). The
-command `training tune` searches for a better configuration.
+Scenes are drawn of each written place, at least as many in all as there are seen scenes. Every
+written thing becomes a class. Few scenes get a small machine, and many scenes a larger one
+(docs/decisions/own-scenes.md).
 """
 
 from __future__ import annotations
@@ -29,20 +27,16 @@ from training.fit.configuration import Config, ConfigError
 from training.runs.config_files import sections_toml
 from training.runs.example_scenes import choose_examples
 
-# Possible minimum numbers of objects of a class. A class with few objects is hardly trained. Few
-# scenes need a small minimum, so that the vocabulary covers enough objects.
+# Possible minimum numbers of objects of a class. Few scenes need a small one to cover enough.
 _MINIMA: Final = (8, 5, 3, 2)
 _COVERED: Final = 0.97
 # docs/decisions/own-scenes.md gives the measurement behind these two numbers of scenes.
 FEWEST_SCENES: Final = 20
 FEW_SCENES: Final = 80
 _SPLIT_SEEDS: Final = 50
-# Accepted relative deviation of a part of the split from its target share of scenes.
-_TOLERANCE: Final = 0.2
-# Number of training scenes from which a larger machine is proposed (docs/decisions/own-scenes.md).
-_MANY_SCENES: Final = 1000
-# Least numbers of scenes that are drawn of all written places together, and of each place.
-_DRAWN, _OF_PLACE = 800, 30
+_TOLERANCE: Final = 0.2  # relative deviation of a part of the split from its target share
+_MANY_SCENES: Final = 1000  # training scenes for a larger machine (docs/decisions/own-scenes.md)
+_DRAWN, _OF_PLACE = 800, 30  # least scenes drawn of all written places together, and of each
 
 
 @dataclass(frozen=True)
@@ -104,8 +98,8 @@ def propose(name: str, material: Material, sources: Sequence[str], *, terms: str
     """Analyse scenes and inventories, and propose a vocabulary and a configuration.
 
     Raises:
-        ConfigError: without an inventory, there are fewer than `FEWEST_SCENES` scenes; or no label
-            occurs often enough, or the scenes cannot be split.
+        ConfigError: the scenes are too few without an inventory, cannot be split, or lack a
+            frequent label.
     """
     seen, places = material.scenes, material.places
     if len(seen) < FEWEST_SCENES and not places:
@@ -186,11 +180,7 @@ def _choose_vocabulary(
 
 
 def use_frequent_names(vocabulary: Vocabulary, scenes: Sequence[AnnotatedScene]) -> Vocabulary:
-    """Rename each class to the alias that more than half of its objects have as label.
-
-    A class of "plastic bottle", "glass bottle" and "bottle" stays "bottle", unless one of these
-    names has more than half of the objects.
-    """
+    """Rename each class to the alias that more than half of its objects have as label, if any."""
     key_counts: defaultdict[int | None, Counter[str]] = defaultdict(Counter)
     for thing in (thing for scene in scenes for thing in scene.objects):
         key_counts[vocabulary.index(thing.label)][label_key(thing.label)] += 1

@@ -12,8 +12,7 @@ from rich.markup import escape
 from app.registry import RegistryError
 from training.datasets.records import InvalidLinesError
 
-ROWS: Final = 12
-"""Maximum number of entries of a printed list."""
+ROWS: Final = 12  # maximum number of entries of a printed list
 
 StorePath = Annotated[
     str, typer.Option("--store", envvar="SCENE_STORE", help="folder of the model store")
@@ -35,10 +34,7 @@ def listing(title: str, entries: Sequence[str]) -> list[str]:
 
 
 def fail(error: Exception) -> NoReturn:
-    """Print the error, without the code of a registry error, and exit with code 1.
-
-    Of invalid lines, the first ones are listed.
-    """
+    """Print the error, without the code of a registry error, and exit with code 1."""
     reason = error.reason if isinstance(error, RegistryError) else str(error)
     further: list[str] = []
     if isinstance(error, InvalidLinesError):

@@ -19,9 +19,7 @@ from app.scene import Vocabulary
 from training.datasets.batches import Batch
 from training.evaluation.model import Model, ObjectScore, PlacedScore, Places, RelationScore
 
-# Absolute score of unknown classes. The score is finite and larger than all log-odds, so that
-# unknown classes rank last.
-BEYOND = 1e9
+BEYOND = 1e9  # absolute score of unknown classes: finite, and larger than all log-odds
 
 
 def same_classes(a: Vocabulary, b: Vocabulary) -> bool:
@@ -68,10 +66,7 @@ class Translation:
         return Model(**scores, parameters=model.parameters)
 
     def presence(self, v: Float[Tensor, "B V"]) -> Float[Tensor, "B W"]:
-        """Map presence or counts of scene classes to model classes.
-
-        If several scene classes map to one model class, the result is their maximum.
-        """
+        """Map presence or counts of scene classes to model classes, by their maximum."""
         is_mapped = self.model_class >= 0
         index = self.model_class[is_mapped].expand(len(v), -1)
         return torch.zeros(len(v), self.size).scatter_reduce(1, index, v[:, is_mapped], "amax")
@@ -85,21 +80,15 @@ class Translation:
         return lambda v: self.scores(score(self.presence(v)))
 
     def _placed(self, score: PlacedScore) -> PlacedScore:
-        """Return a score of places in the scene classes."""
-
         def score_scene_classes(places: Places) -> Tensor:
             """Score the places whose anchor class the model has; the others get `unknown`."""
             anchor = self.model_class[places.anchor]
             scores = torch.full_like(places.v, self.unknown)
             rows = (anchor >= 0).nonzero().squeeze(1)
             if len(rows):
-                model_places = Places(
-                    v=self.presence(places.v[rows]),
-                    counts=self.presence(places.counts[rows]),
-                    relation=places.relation[rows],
-                    anchor=anchor[rows],
-                    outgoing=places.outgoing[rows],
-                )
+                part = replace(places, anchor=anchor).rows(rows)
+                v, counts = self.presence(part.v), self.presence(part.counts)
+                model_places = replace(part, v=v, counts=counts)
                 # Other present classes may map to the anchor's model class; the score is then -inf.
                 scores[rows] = self.scores(score(model_places).clamp(min=-BEYOND))
             return scores
@@ -107,8 +96,6 @@ class Translation:
         return score_scene_classes
 
     def _relations(self, score: RelationScore) -> RelationScore:
-        """Return a score of relations in the scene classes."""
-
         def score_scene_classes(batch: Batch) -> Tensor:
             scores = torch.full(batch.holds.shape, self.unknown)
             for row in range(len(batch)):

@@ -29,8 +29,7 @@ from training.domain.proposal import Proposal, propose, use_frequent_names
 from training.fit.configuration import ConfigError, DataConfig, is_file
 from training.runs.config_files import load_config, read_toml
 
-PROPOSED: Final = "proposed.json"
-"""The file with the names of all proposals."""
+PROPOSED: Final = "proposed.json"  # the file with the names of all proposals
 _NOTHING: Final[Mapping[str, set[str]]] = {}
 
 
@@ -47,9 +46,7 @@ class Update:
 
 
 def update(name: str, folder: Path, files: Sequence[Path]) -> Update:
-    """Extend the proposal in a folder with the scenes and inventories of files.
-
-    The sources of the configuration are read again, together with new files.
+    """Extend the proposal in a folder with files. The sources of the proposal are read again.
 
     Raises:
         ConfigError: the folder has no proposal, or one of its files cannot be read or extended.
@@ -82,7 +79,9 @@ def update(name: str, folder: Path, files: Sequence[Path]) -> Update:
         written = proposal.config.data.written if not data.written else 0
         texts[config_file] = _with_sources(config_file, [*data.sources, *added], written)
     without = [label for label in proposal.labels if not _has(extended, label)]
-    removed = tuple(label for label in without if _keys(label) & proposed["objects"])
+    removed = tuple(
+        x for x in without if proposed["objects"] & set(map(label_key, (x.name, *x.spellings)))
+    )
     dropped = tuple(label for label in without if label not in removed)
     covered = coverage(extended, scenes)
     result = replace(proposal, vocabulary=extended, coverage=covered, dropped=dropped)
@@ -188,19 +187,12 @@ def _new_classes(
     )
 
 
-def _keys(label: Label) -> set[str]:
-    return set(map(label_key, (label.name, *label.spellings)))
-
-
 def _has(vocabulary: Vocabulary, label: Label) -> bool:
     return any(vocabulary.index(x) is not None for x in (label.name, *label.spellings))
 
 
 def _with_sources(path: Path, sources: Sequence[str], written: int) -> str:
-    """Return the text of a configuration with other sources. All other entries stay.
-
-    `written` is the new value of `data.written`; 0 keeps the entry.
-    """
+    """Return the text of a configuration with new sources, and `data.written` unless it is 0."""
     expected = read_toml(path)
     expected["data"]["sources"] = list(sources)
     array = json.dumps(list(sources), ensure_ascii=False)

@@ -1,10 +1,8 @@
 """Alarms of `/outliers` in untouched parts of scenes, against the promise of each sensitivity.
 
-A part lists two to twelve random classes without structure, and their relations. Every object and
-relation of an untouched scene is right, so each alarm is false. A sensitivity promises a maximum
-share of parts with an alarm about an object, and the same share of parts with an alarm about a
-relation (`ALARMS`). A model is refused only if its share is certainly too large: the exact 95 %
-lower bound must exceed `EXCESS` times the promise.
+A part lists two to twelve random classes without structure, and their relations. Each alarm in it
+is false. A model is refused only if its share of parts with an alarm is certainly too large: the
+exact 95 % lower bound must exceed `EXCESS` times the promise.
 
 Source: Clopper and Pearson, "The use of confidence or fiducial limits illustrated in the case of
 the binomial" (1934).
@@ -32,7 +30,7 @@ from training.evaluation.asking import thing_instances
 from training.evaluation.parts import LONGEST
 
 ALARMS: dict[Sensitivity, float] = {"low": 0.02, "medium": 0.1, "high": 0.2}
-"""Maximum shares of unaltered scenes with an alarm."""
+"""Promised maximum share of parts with an alarm about an object, and about a relation."""
 
 EXCESS = 1.5
 
@@ -41,13 +39,10 @@ _GROUPS = 30  # minimum number of groups of a source with its own count of alarm
 
 @dataclass(frozen=True)
 class Alarms:
-    """The scenes of a source, one of each group, and those with an alarm about `about`.
-
-    `about` is "objects" or "relations".
-    """
+    """Number of scenes of a source, one of each group, and of those with an alarm."""
 
     source: str
-    about: str
+    about: str  # "objects" or "relations"
     sensitivity: Sensitivity
     scenes: int
     alarms: int
@@ -72,10 +67,9 @@ class Alarms:
 
 
 def untouched_alarms(artifact: SceneModel, scenes: Sequence[EncodedScene]) -> Iterator[Alarms]:
-    """Ask about an untouched part of each scene, and count the scenes with an alarm.
+    """Count the scenes with an alarm about an untouched part, one random scene of each group.
 
-    One random scene of each group takes part, because its scenes are not independent. Objects
-    count only if the object list is complete. Sources of few groups count together.
+    Objects count only if the object list is complete. Sources of few groups count together.
     """
     rng = np.random.default_rng(0)
     scene_of_group: dict[tuple[str, str], EncodedScene] = {}

@@ -59,8 +59,7 @@ def artifact_model(artifact: SceneModel, *, profiles: Sequence[str] = ()) -> Mod
 def score_relations(artifact: SceneModel, batch: Batch, *, given: bool) -> Float[Tensor, "B A n n"]:
     """Return the log-odds of each relation between two present classes.
 
-    With `given`, the other observed relations that hold are evidence. The log-odds of a relation
-    never use the observed value of this relation.
+    With `given`, the other observed relations that hold are evidence, never the relation itself.
     """
     log_odds = torch.full(batch.holds.shape, -torch.inf)
     for row, (scene, _) in enumerate(_scenes(batch, given)):
@@ -71,10 +70,7 @@ def score_relations(artifact: SceneModel, batch: Batch, *, given: bool) -> Float
 
 
 def score_false_relations(artifact: SceneModel, batch: Batch) -> Float[Tensor, "B A n n"]:
-    """Return the log-odds that observed relations hold; others are -inf.
-
-    `/outliers` ranks the observed relations by these log-odds.
-    """
+    """Return the log-odds by which `/outliers` ranks observed relations; other relations: -inf."""
     log_odds = torch.full(batch.holds.shape, -torch.inf)
     for row, (scene, triples) in enumerate(_scenes(batch)):
         wrong = wrong_relations(artifact, scene)
@@ -84,11 +80,10 @@ def score_false_relations(artifact: SceneModel, batch: Batch) -> Float[Tensor, "
 
 
 def _scenes(batch: Batch, given: bool = True) -> Iterator[tuple[Scene, dict[Triple, Triple]]]:
-    """Generate the scenes of a batch, with instances of its classes.
+    """Generate the scenes of a batch, and a map from relations of classes to those of instances.
 
     With `given`, a scene has the observed relations that hold. a(x, y) and a(y, x) can both hold
-    between classes, but for different instances. The second result maps the relations of classes to
-    those of instances.
+    between classes, but for different instances.
     """
     evidence = batch.holds * batch.observed * given
     for classes, counts, holds in zip(batch.classes, batch.counts, evidence, strict=True):

@@ -115,10 +115,7 @@ def index_of_ids(scene: Scene) -> dict[str, int]:
 
 
 def canonical_triple(index: Mapping[str, int], entry: Mapping[str, Any]) -> tuple[int, int, int]:
-    """Return (canonical relation, subject, object) of a relation in an answer about a scene.
-
-    `index` is the object index by id, as from `index_of_ids`.
-    """
+    """Return (canonical relation, subject, object) of an answer, with `index_of_ids` as index."""
     return canonicalise(index[entry["subject"]], entry["relation"], index[entry["object"]])
 
 
@@ -140,10 +137,7 @@ def missing_log_p(artifact: SceneModel, scene: Scene) -> Float[NDArray, " V"]:
 def missing_log_p_at(
     artifact: SceneModel, scene: Scene, relation: str, anchor: int
 ) -> Float[NDArray, " V"]:
-    """Return the log-probability of `/missing` that each class is missing at a place; else -inf.
-
-    The missing object has the relation to the object with the index `anchor`.
-    """
+    """Return log p of `/missing` for each class with the relation to object `anchor`; else -inf."""
     vocabulary, place = artifact.vocabulary, (relation, anchor)
     every = range(len(vocabulary))
     answer = questions.missing(
@@ -158,11 +152,7 @@ def missing_log_p_at(
 def judge(
     artifact: SceneModel, scene: Scene, sensitivity: Sensitivity = "medium"
 ) -> Float[NDArray, "objects 2"]:
-    """Return the answers of `/outliers` about the objects of a scene.
-
-    The columns are the probability that the object is an outlier, and 1 if the service reports the
-    object as an outlier.
-    """
+    """Return the probability of `/outliers` for each object, and 1 if it reports the object."""
     columns = np.zeros((len(scene.objects), 2))
     index = index_of_ids(scene)
     answer = questions.outliers(artifact, scene, sensitivity=sensitivity, details=False)
@@ -183,10 +173,7 @@ def score_missing(
 def score_rooms(
     artifact: SceneModel, profiles: Sequence[str], v: Float[Tensor, "B V"], profile: str
 ) -> Float[Tensor, "B C"]:
-    """Return the log-probabilities of `/rooms` for lists.
-
-    The requests name the profile if it is one of the `profiles` of the model.
-    """
+    """Return log p of `/rooms` for lists. The requests name the profile if the model has it."""
     index = profiles.index(profile) if profile in profiles else None
     log_p = np.zeros((len(v), artifact.spec.C))
     for row, scene in zip(log_p, _scenes(v), strict=True):
@@ -219,10 +206,7 @@ def _scenes(v: Float[Tensor, "B V"]) -> Iterator[Scene]:
 
 
 def score_misplaced(artifact: SceneModel, scene: Scene) -> list[dict[str, Any]]:
-    """Return the misplaced relations of a scene.
-
-    Relations of scenes with poses follow from the poses, as in a request in viewer axes.
-    """
+    """Return the misplaced relations of a scene; poses are read as in viewer axes."""
     roles = None if artifact.places is None else artifact.places.roles
     observed = observe(scene, typical_sizes=artifact.vocabulary.sizes, roles=roles)
     return questions.misplaced(artifact, observed)
@@ -231,10 +215,7 @@ def score_misplaced(artifact: SceneModel, scene: Scene) -> list[dict[str, Any]]:
 def relation_probabilities(
     artifact: SceneModel, scene: Scene, pairs: Sequence[tuple[int, int]] | None = None
 ) -> Float[NDArray, "A objects objects"]:
-    """Return the probability of each canonical relation.
-
-    The value is 0 outside `pairs`, ordered pairs of object indices. None means all pairs.
-    """
+    """Return the probability of each canonical relation; 0 outside `pairs` of object indices."""
     n = len(scene.objects)
     p = np.zeros((len(CANONICAL), n, n))
     answer = questions.relations(artifact, scene, top_k=max(1, p.size), pairs=pairs)

@@ -79,23 +79,19 @@ from training.evaluation.setting import Outcome, Setting
 # With one per scene, chance alone gives a calibration error (ECE) of .02 to .03.
 _REMOVALS = 4
 _NO_ALARM = AlarmLine(intercept=1e3)
-Answers = list[tuple[float, bool]]
-"""Probability and truth value of each answer about one scene."""
+Answers = list[tuple[float, bool]]  # probability and truth value of each answer about one scene
 Ask = Callable[[SceneModel, EncodedScene, Rng], Answers | None]
 
 
 @dataclass(frozen=True, eq=False)
 class Items:
-    """N scored items of some scenes, such as answers.
-
-    `skipped` is the number of scenes that could not be scored.
-    """
+    """N scored items of some scenes, such as answers."""
 
     scene: Int[NDArray, " N"]
     score: Float[NDArray, " N"]
     truth: Bool[NDArray, " N"]
     scenes: int
-    skipped: int = 0
+    skipped: int = 0  # scenes that could not be scored
 
     @classmethod
     def of(cls, answers: list[tuple[int, float, bool]], scenes: int, skipped: int) -> Items:
@@ -134,11 +130,7 @@ def collect(artifact: SceneModel, scenes: SceneTensors, ask: Ask, seed: int = 0)
     return Items.of(items, len(scenes), answers.count(None))
 
 
-def ask_relations(
-    artifact: SceneModel,
-    encoded: EncodedScene,
-    rng: Rng,  # noqa: ARG001
-) -> Answers | None:
+def ask_relations(artifact: SceneModel, encoded: EncodedScene, rng: Rng) -> Answers | None:  # noqa: ARG001
     """Ask for all relations of a scene. The request contains only the labels of the objects."""
     mask = annotated_relations(encoded)
     return _answers_on(artifact, encoded, labels_alone(encoded), mask) or None
@@ -213,17 +205,12 @@ def collect_missing(
 
 
 class PlaceQuestion(NamedTuple):
-    """A question about the hidden classes at a place of a scene.
-
-    Attributes:
-        placed: the hidden classes at the place.
-        usable: the classes that may be queried: neither structure, nor listed, nor hidden with an
-            unknown relation to the anchor.
-    """
+    """A question about the hidden classes at a place of a scene."""
 
     scene: Scene
     place: Place
-    placed: Bool[NDArray, " V"]
+    placed: Bool[NDArray, " V"]  # hidden classes at the place
+    # Neither structure, nor listed, nor hidden with an unknown relation to the anchor.
     usable: Bool[NDArray, " V"]
 
 
@@ -273,11 +260,11 @@ def ask_outliers(
 ) -> Answers | None:
     """Ask for the outliers of a random part. Half of the parts contain an intruder.
 
-    The intruder is drawn from `draw_intruder_choices`. Without these, it is any absent class.
+    `intruders` is the result of `draw_intruder_choices`; None allows any absent class.
     """
-    structure = artifact.vocabulary.structure
-    classes = encoded.evidence.classes
-    if not encoded.complete or (~structure[classes]).sum() < 3:
+    structure, classes = artifact.vocabulary.structure, encoded.evidence.classes
+    things = classes[~structure[classes]]
+    if not encoded.complete or len(things) < 3:
         return None
     if intruders is None:
         candidates = np.setdiff1d(np.flatnonzero(~structure), classes)
@@ -285,7 +272,7 @@ def ask_outliers(
         candidates = intruders[encoded.source, encoded.scene_id]
     if not len(candidates):
         return None
-    order = rng.permutation(classes[~structure[classes]])
+    order = rng.permutation(things)
     hidden = order[up_to_longest(len(order), rng) :]
     scene, intruder = labels_alone(encoded, thing_instances(encoded, structure, hidden)), -1
     if rng.random() < 0.5:
@@ -327,8 +314,7 @@ QUESTIONS: dict[str, Ask] = {
     "misplaced": ask_misplaced,
 }
 
-NAMES = (*QUESTIONS, *LISTED)
-"""Names of all questions in the metrics of the task."""
+NAMES = (*QUESTIONS, *LISTED)  # names of all questions in the metrics of the task
 
 
 def calibration_task(artifact: SceneModel, setting: Setting) -> Outcome | None:

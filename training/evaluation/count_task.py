@@ -1,15 +1,15 @@
 """Test the expected numbers of instances of a model on held-out scenes.
 
 A robot lists a part of each scene (`datasets.cases.some_instances`) and asks for the expected
-number of instances of each listed class. The task measures the mean absolute error of this number.
-It compares the error with the errors of two means:
+number of instances of each listed class. The task compares the mean absolute error of this number
+with the errors of two means:
 
-- the class mean: the mean number in the training scenes of the model that have at least the listed
-  number;
-- the mean of the source: the mean number in the training scenes of the same data source. If it is
-  smaller than the listed number, the listed number takes its place.
+- the class mean: over the training scenes of the model with at least the listed number;
+- the mean of the source: over the training scenes of the same data source, and at least the listed
+  number.
 
-Classes without statistics, and classes whose instances the source does not count, are left out."""
+Classes without statistics, and classes whose instances the source does not count, are left out.
+"""
 
 from __future__ import annotations
 
@@ -66,20 +66,19 @@ def counts_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
     row = np.searchsorted(artifact.counts.classes, index)
     of_class = mean(np.abs(class_mean(artifact.counts, row, listed_number) - number))
     source_mean = np.maximum(_mean_counts(train.scenes, artifact)[index], listed)
-    ours = mean(np.abs(expected - number))
+    error = mean(np.abs(expected - number))
     metrics: dict[str, Metric] = {
-        "error of the expected count": ours,
+        "error of the expected count": error,
         "error of the class mean": of_class,
-        "change of error, class mean": ours - of_class,
-        "change of error, mean of the source": ours - mean(np.abs(source_mean - number)),
+        "change of error, class mean": error - of_class,
+        "change of error, mean of the source": error - mean(np.abs(source_mean - number)),
         "count in the interval": mean((low <= number) & (number <= high)),
     }
     if (is_likely := p >= LIKELY).any():
         is_right = (number > listed)[is_likely]
-        metrics["proposals that are right"] = Ratio.of_items(
-            scene[is_likely], is_right, len(scenes)
-        )
-    return Outcome.over(scenes, metrics, ours.skipped)
+        precision = Ratio.of_items(scene[is_likely], is_right, len(scenes))
+        metrics["proposals that are right"] = precision
+    return Outcome.over(scenes, metrics, error.skipped)
 
 
 def _ask_counts(
@@ -89,8 +88,7 @@ def _ask_counts(
     part, is_candidate = listed_cases(scene, counted, artifact.vocabulary.structure, seed)
     request = of_classes(np.repeat(part.classes, part.listed).tolist())
     request = replace(request, room_type=part.room if part.room >= 0 else None)
-    candidates = part.classes[is_candidate].tolist()
-    labels = artifact.vocabulary.labels
+    candidates, labels = part.classes[is_candidate].tolist(), artifact.vocabulary.labels
     pairs = zip(part.classes.tolist(), part.number.tolist(), strict=True)
     number_of = {labels[index]: (index, number) for index, number in pairs}
     listing = present(request, artifact.spec)
@@ -111,10 +109,7 @@ def _mean_counts(scenes: Sequence[EncodedScene], artifact: SceneModel) -> Float[
 def class_mean(
     counts: Counts, row: Int[NDArray, " k"], listed: Int[NDArray, " k"]
 ) -> Float[NDArray, " k"]:
-    """Return the mean number in training scenes with at least the listed number.
-
-    `row` are the rows of the classes in `counts`.
-    """
+    """Return the mean number in training scenes with at least `listed`, for rows of `counts`."""
     numbers = np.arange(1, counts.log_share.shape[1] + 1)
     p = np.exp(counts.log_share[row].astype(np.float64)) * (numbers >= listed[:, None])
     return p @ numbers / p.sum(axis=1)

@@ -45,10 +45,7 @@ LINES = (
     "generate: the scene has what never belongs",
     "generate: scenes of fewer than three classes",
 )
-"""Names of the eleven counts of the report.
-
-Lower is better for the alarms in plain scenes (without intruder) and for the last two names.
-"""
+"""Counts of the report. Lower is better for alarms in plain scenes, and for the last two."""
 
 _VERTICAL = {"on-top", "under", "above", "below"}
 _NEWER = ("inside", "contains")
@@ -57,8 +54,7 @@ _LISTED = 5
 _DRAWN = 8
 _FEW = 3
 
-# Maps each name in `LINES` to a list of (number of hits, number of questions), one pair per fact.
-Lines = dict[str, list[tuple[int, int]]]
+Lines = dict[str, list[tuple[int, int]]]  # (hits, questions) of each fact, by name in `LINES`
 
 
 def facts_file(folder: Path = EVERYDAY) -> Path | None:

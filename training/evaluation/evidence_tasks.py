@@ -35,42 +35,32 @@ from training.evaluation.relation_tasks import expected_hits
 from training.evaluation.room_task import with_room_type
 from training.evaluation.setting import Outcome, Setting
 
-OF_RELATIONS = ("relations", "poses")
-OF_OBJECTS = ("room type",)
-"""Kinds of evidence for relations (T1) and for objects (T2)."""
+OF_RELATIONS = ("relations", "poses")  # kinds of evidence for relations (T1)
+OF_OBJECTS = ("room type",)  # kinds of evidence for objects (T2)
 
 
 class Case(NamedTuple):
-    """One question of T1.
-
-    Attributes:
-        scene_index: index of the scene in its set.
-        scene: the scene with the evidence.
-        queried, truth: the queried relations, and those of them that hold.
-    """
+    """One question of T1."""
 
     scene_index: int
-    scene: Scene
+    scene: Scene  # with the evidence
     queried: Bool[NDArray, "A objects objects"]
-    truth: Bool[NDArray, "A objects objects"]
+    truth: Bool[NDArray, "A objects objects"]  # queried relations that hold
 
 
 def missing_evidence_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
     """Measure T2 (missing objects) with labels only and with the room type."""
     scenes, structure = with_room_type(setting.some()), setting.structure
-    # With one question per scene, the random choice of the class changes the result of a small data
-    # source by about 0.01.
+    # With one question per scene, chance changes the result of a small data source by about 0.01.
     parts = draw_parts(scenes, structure, all_but_one, (setting.seed, setting.seed + 1))
     if not len(parts.v):
         return None
     score = partial(score_missing, artifact)
-    room = scenes.room[parts.scene]
     without, informed = (
         rank_hidden(parts, structure, ask_rows(score, *columns)).mrr()
-        for columns in ((parts.v,), (parts.v, room))
+        for columns in ((parts.v,), (parts.v, scenes.room[parts.scene]))
     )
-    metrics = _changes("MRR", "room type", without, informed)
-    return Outcome.over(scenes, metrics, parts.skipped)
+    return Outcome.over(scenes, _changes("MRR", "room type", without, informed), parts.skipped)
 
 
 def evidence_cases(
@@ -87,14 +77,14 @@ def evidence_cases(
         between = in_half[:, None] & in_half
         pair = is_thing[:, None] & is_thing & ~between & ~np.eye(len(instances), dtype=np.bool_)
         queried = np.broadcast_to(pair, encoded.instance_holds.shape)
-        truth, given = encoded.instance_holds & queried, encoded.instance_holds & between
-        if not truth.any() or not given.any():
+        truth, evidence = encoded.instance_holds & queried, encoded.instance_holds & between
+        if not truth.any() or not evidence.any():
             continue
-        triples = [(int(a), int(i), int(j)) for a, i, j in np.argwhere(given)]
+        triples = [(int(a), int(i), int(j)) for a, i, j in np.argwhere(evidence)]
         scene = replace(scene_of(encoded, range(len(instances)), triples), room_type=None)
         if kind == "poses":
             observed = encoded.instance_observed & between
-            table = RelationTable.shown_by_boxes(given, observed, np.zeros_like(observed))
+            table = RelationTable.shown_by_boxes(evidence, observed, np.zeros_like(observed))
             scene = replace(scene, relations=table)
         yield Case(index, scene, queried, truth)
 

@@ -41,18 +41,16 @@ from training.evaluation.model import Drawn, Sampler, SamplerOf
 from training.evaluation.setting import Outcome, Setting
 
 _RESAMPLES = 200
-# Maximum number of held-out scenes for the bandwidth, and of classes for the covariances.
-_BANDWIDTH_SCENES = 1000
-_COMMON_CLASSES = 200
+_BANDWIDTH_SCENES = 1000  # maximum number of held-out scenes for the bandwidth
+_COMMON_CLASSES = 200  # maximum number of classes for the covariances
 _ON_TOP = CANONICAL.index("on-top")
 
 
 def count_contradictions(holds: Float[Tensor, "B A n n"]) -> Int[Tensor, "B 4"]:
     """Count contradictory relations between different classes of each scene.
 
-    The columns are, summed over the canonical relations: the pairs of classes with a relation in
-    both directions, and the pairs with a relation in at least one direction. Then two truth values
-    follow: the on-top relations form a cycle, and the scene has an on-top relation.
+    The columns are the numbers of pairs with a relation in both directions, and in at least one,
+    summed over the relations, and two truth values: an on-top cycle, and an on-top relation.
     """
     n = holds.shape[-1]
     edges = (holds > 0) & ~torch.eye(n, dtype=torch.bool)
@@ -68,10 +66,7 @@ def count_contradictions(holds: Float[Tensor, "B A n n"]) -> Int[Tensor, "B 4"]:
 
 
 def contradiction_metrics(counts: Int[Tensor, "B 4"]) -> dict[str, Metric]:
-    """Return the share of mirrored relations and the share of scenes with an on-top cycle.
-
-    A share is left out if no scene has a relation for it. `counts` are `count_contradictions`.
-    """
+    """Return the shares of mirrored relations and of on-top cycles; none without relations."""
     mirrored, related, cyclic, stacked = counts.double().numpy().T
     parts = {"mirrored relations": (mirrored, related), "on-top cycles": (cyclic, stacked)}
     return {name: Ratio(part, whole) for name, (part, whole) in parts.items() if whole.any()}
@@ -92,7 +87,6 @@ def independent_sampler(train: SceneTensors) -> Sampler:
     frequency = train.v.mean(0)
 
     def sample(given: Bool[Tensor, "B V"], room: Int[Tensor, " B"], seed: int) -> Drawn:  # noqa: ARG001
-        """Add independent classes to the given classes."""
         generator = torch.Generator().manual_seed(seed)
         v = torch.rand(given.shape, generator=generator) < frequency
         return Drawn((v | given).to(train.v.dtype), torch.zeros(len(v), 4))
@@ -106,13 +100,10 @@ def scene_sampler(scenes: SceneTensors) -> Sampler:
     Without given classes, sample k is scene k, which has the given room type in `generation_task`.
     Otherwise it is a random scene with the given classes.
     """
-    blocks = torch.arange(len(scenes)).split(64)
-    contradictions = torch.cat(
-        [count_contradictions(scenes.batch(index).holds) for index in blocks]
-    )
+    batches = map(scenes.batch, torch.arange(len(scenes)).split(64))
+    contradictions = torch.cat([count_contradictions(batch.holds) for batch in batches])
 
     def sample(given: Bool[Tensor, "B V"], room: Int[Tensor, " B"], seed: int) -> Drawn:  # noqa: ARG001
-        """Return all scenes, or a random scene with the given classes for each row."""
         if not given.any():
             return Drawn(scenes.v, contradictions)
         rng = np.random.default_rng(seed)
@@ -126,13 +117,11 @@ def scene_sampler(scenes: SceneTensors) -> Sampler:
 def machine_sampler(artifact: SceneModel) -> Sampler:
     """Return a sampler that draws scenes as the service does, and also samples relations.
 
-    Of two contradictory relations a(x, y) and a(y, x), the service keeps only one. This sampler
-    keeps both.
+    The sampler keeps both of two contradictory relations; the service keeps only one.
     """
     chains = artifact.scene_chains
 
     def sample(given: Bool[Tensor, "B V"], room: Int[Tensor, " B"], seed: int) -> Drawn:
-        """Draw a scene for each row by the chains of the service."""
         objects, contradictions = torch.zeros(given.shape), []
         for row, (classes, room_type) in enumerate(zip(given, room.tolist(), strict=True)):
             index = classes.nonzero().squeeze(1)
@@ -150,15 +139,13 @@ def machine_sampler(artifact: SceneModel) -> Sampler:
 
 
 def held_out_halves(setting: Setting) -> tuple[SceneTensors, SceneTensors]:
-    """Split held-out scenes into reference scenes and scenes of an ideal sampler, by groups.
-
-    The limit of the setting applies to each half.
-    """
+    """Split held-out scenes by groups: reference scenes, and those of an ideal sampler."""
     scenes = setting.scenes
     is_odd = torch.from_numpy(scenes.group_ids % 2 > 0)
-    first, second = (subset(scenes, mask.nonzero().squeeze(1)) for mask in (~is_odd, is_odd))
-    limit, seed = setting.limit, setting.seed
-    return some_scenes(first, limit, seed), some_scenes(second, limit, seed)
+    first, second = (
+        some_scenes(subset(scenes, mask), setting.limit, setting.seed) for mask in (~is_odd, is_odd)
+    )
+    return first, second
 
 
 def hamming(x: Float[Tensor, "N V"], y: Float[Tensor, "M V"]) -> Float[Tensor, "N M"]:
@@ -176,7 +163,7 @@ def median_distance(v: Float[Tensor, "scenes V"]) -> float:
 def discrepancy(
     held_out: Float[Tensor, "scenes V"], drawn: Float[Tensor, "B V"], bandwidth: float
 ) -> Statistic:
-    """Return MMD² as a function of the weights of the held-out scenes.
+    """Return MMD² as a function of the weights of the held-out scenes; NaN with fewer than two.
 
     The statistic excludes pairs of a scene with itself, or with a copy of itself in a resample.
     """
@@ -192,28 +179,24 @@ def discrepancy(
     np.fill_diagonal(yy, 0.0)
 
     def squared_mmd(weight: Float[NDArray, " scenes"]) -> float:
-        """Return MMD² with weighted held-out scenes; NaN with fewer than two scenes."""
         pairs_weight = weight.sum() ** 2 - (weight**2).sum()
         if not pairs_weight > 0:
             return float("nan")
         mean_yy = weight @ yy @ weight / pairs_weight
-        mean_xy = weight @ xy / weight.sum()
-        return float(mean_xx + mean_yy - 2 * mean_xy)
+        return float(mean_xx + mean_yy - 2 * (weight @ xy / weight.sum()))
 
     return squared_mmd
 
 
 def marginal_error(held_out: Float[NDArray, "scenes V"], drawn: Float[NDArray, "B V"]) -> Statistic:
-    """Return the marginal error as a function of the weights of the held-out scenes."""
+    """Return the marginal error as a function of scene weights; NaN without a class."""
     p = drawn.mean(0)
 
     def error(weight: Float[NDArray, " scenes"]) -> float:
-        """Return the marginal error with weighted held-out scenes; NaN without a class."""
         count = weight @ held_out  # total weight of the held-out scenes with each class
         if not count.sum() > 0:
             return float("nan")
-        q = count / weight.sum()
-        return float(np.abs(p - q).sum() / count.sum() * weight.sum())
+        return float(np.abs(p - count / weight.sum()).sum() / count.sum() * weight.sum())
 
     return error
 
@@ -232,7 +215,6 @@ def pair_correlation(
     def covariances(
         v: Float[NDArray, "scenes common"], weight: Float[NDArray, " scenes"]
     ) -> Float[NDArray, " pairs"]:
-        """Return the weighted covariance of each pair of common classes."""
         total = weight.sum()
         mean = weight @ v / total
         return ((v.T * weight) @ v / total - np.outer(mean, mean))[pairs]
@@ -241,7 +223,6 @@ def pair_correlation(
     held_out_common = held_out[:, common]
 
     def correlation(weight: Float[NDArray, " scenes"]) -> float:
-        """Return the correlation of both covariances; NaN if it is undefined."""
         if not weight.sum() > 0:
             return float("nan")
         of_held_out = covariances(held_out_common, weight)
@@ -268,12 +249,9 @@ def generation_metrics(
     bandwidth: float,
     emphasis: Float[Tensor, " scenes"] | None = None,
 ) -> dict[str, Metric]:
-    """Compute all metrics of T4 over the classes in the mask, of two or more scenes.
-
-    `emphasis` are weights of the held-out scenes. None means equal weights.
-    """
+    """Compute all metrics of T4 over the classes in the mask; `emphasis` weighs held-out scenes."""
     x, y, training = drawn.v[:, mask], held_out[:, mask], train[:, mask]
-    ours, theirs = x.double().numpy(), y.double().numpy()
+    drawn_v, held_out_v = x.double().numpy(), y.double().numpy()
     base = np.ones(len(y)) if emphasis is None else emphasis.double().numpy()
 
     def resampled(statistic: Statistic) -> Resampled:
@@ -281,11 +259,11 @@ def generation_metrics(
 
     metrics: dict[str, Metric] = {
         "MMD²": resampled(discrepancy(y, x, bandwidth)),
-        "marginal error": resampled(marginal_error(theirs, ours)),
-        "classes per scene": Ratio.of_scenes(ours.sum(1)),
+        "marginal error": resampled(marginal_error(held_out_v, drawn_v)),
+        "classes per scene": Ratio.of_scenes(drawn_v.sum(1)),
         "copies of training scenes": Ratio.of_scenes(copies(x, training)),
     }
-    pairs = resampled(pair_correlation(theirs, ours))
+    pairs = resampled(pair_correlation(held_out_v, drawn_v))
     if np.isfinite(pairs.value):
         metrics["pair correlation"] = pairs
     return metrics | contradiction_metrics(drawn.contradictions)

@@ -14,10 +14,9 @@ known room type. The signature of a room type contains the ten classes with the 
 fewer. A signature class has a lift of at least 5 and occurs in at least 20 % of the scenes of the
 room type. Room types with fewer than 20 training scenes are left out.
 
-In a scene of room type r, a signature intruder must be a signature class of another room type. It
-must also occur in less than 1 % of the training scenes of room type r. The intruder is drawn in two
-steps. The first step draws one of the room types that have such a class. The second step draws one
-of these classes. Both draws are uniform.
+In a scene of room type r, a signature intruder is a signature class of another room type, which
+occurs in less than 1 % of the training scenes of r. One uniform draw chooses among the room types
+with such a class, and another among these classes.
 """
 
 from __future__ import annotations
@@ -32,11 +31,8 @@ from training.datasets.batches import SceneTensors
 from training.datasets.cases import scene_rng
 from training.evaluation.setting import Structure
 
-LAWS = ("uniform", "by popularity", "signature")
-"""Distributions of intruders."""
-
-SIGNATURE = 10
-"""Maximum number of signature classes of a room type."""
+LAWS = ("uniform", "by popularity", "signature")  # distributions of intruders
+SIGNATURE = 10  # maximum number of signature classes of a room type
 
 _SCENES = 20
 _LIFT = 5.0
@@ -55,10 +51,7 @@ def draw_intruders(
     weights: Float[Tensor, "scenes V"] | None = None,
     seed: int = 0,
 ) -> Int[Tensor, " scenes"]:
-    """Draw the class of an intruder for each scene; -1 skips the scene.
-
-    `weights` are sampling weights. None means equal weights.
-    """
+    """Draw the class of an intruder for each scene by sampling weights; -1 skips the scene."""
     present = scenes.v > 0
     absent = (~present & ~structure).double()
     if weights is not None:
@@ -67,16 +60,12 @@ def draw_intruders(
     intruders = torch.full((len(scenes),), -1, dtype=torch.int64)
     for k in is_usable.nonzero().squeeze(1).tolist():
         p = absent[k].numpy()
-        rng = scene_rng(scenes.scenes[k], seed)
-        intruders[k] = int(rng.choice(len(p), p=p / p.sum()))
+        intruders[k] = int(scene_rng(scenes.scenes[k], seed).choice(len(p), p=p / p.sum()))
     return intruders
 
 
 def signatures(train: SceneTensors) -> tuple[Bool[NDArray, "C V"], Float[NDArray, "C V"]]:
-    """Return a mask of the signature classes of every room type, and p(class | room type).
-
-    The frequencies of a room type with too few scenes are NaN.
-    """
+    """Return a mask of signature classes, and p(class | room type): NaN with too few scenes."""
     has_room = (train.room >= 0).numpy()
     v, room = train.v.numpy()[has_room] > 0, train.room.numpy()[has_room]
     share = np.full((int(room.max(initial=-1)) + 1, v.shape[1]), np.nan)
@@ -93,8 +82,7 @@ def signatures(train: SceneTensors) -> tuple[Bool[NDArray, "C V"], Float[NDArray
 def by_signature(scenes: SceneTensors, train: SceneTensors) -> Float[Tensor, "scenes V"]:
     """Return the sampling probability of each signature intruder of each scene; else 0."""
     typical, share = signatures(train)
-    weights = np.zeros(scenes.v.shape)
-    absent = scenes.v.numpy() == 0
+    weights, absent = np.zeros(scenes.v.shape), scenes.v.numpy() == 0
     for k, room in enumerate(scenes.room.tolist()):
         if not 0 <= room < len(typical) or np.isnan(share[room]).any():
             continue
@@ -119,10 +107,7 @@ def intruder_weights(
 def draw_intruder_choices(
     scenes: SceneTensors, structure: Structure, train: SceneTensors | None, seed: int = 0
 ) -> dict[tuple[str, str], Int[NDArray, " choices"]]:
-    """Draw up to three classes for each scene, by (source, scene id), for `ask_outliers`.
-
-    They are a uniform, a popular and a signature intruder; without `train`, only a uniform one.
-    """
+    """Draw an intruder of each law for each scene, by (source, scene id), for `ask_outliers`."""
     weights = intruder_weights(scenes, train).values()
     # `ask_outliers` uses `seed` itself. Another seed keeps the draws independent.
     columns = [draw_intruders(scenes, structure, weight, seed + 1) for weight in weights]

@@ -1,7 +1,5 @@
 """Metrics that keep their values per scene or group of scenes, with bootstrap intervals.
 
-The values allow resampling, pairing with another model, pooling over sources, and storage as JSON.
-
 The scenes of a group are near-duplicates. So a task counts a metric per scene, and `by` sums it per
 group. A resample draws groups with replacement, as many as the set has. It is stored as the number
 of times that each group was drawn. The draws depend only on the number of groups. So two metrics of
@@ -67,18 +65,11 @@ class Figure:
 
 
 class Metric:
-    """A metric over a set of scenes that can be resampled.
+    """A metric over a set of scenes that can be resampled."""
 
-    Attributes:
-        groups: ids of the groups of scenes, with groups that could not be scored. A metric per
-            scene has one group for each scene.
-        n: number of scored items.
-        draws: the metric over resampled groups; NaN where undefined.
-    """
-
-    groups: Int[NDArray, " G"]
-    n: int
-    draws: Float[NDArray, " resamples"]
+    groups: Int[NDArray, " G"]  # ids of all groups of scenes; one per scene before `by`
+    n: int  # number of scored items
+    draws: Float[NDArray, " resamples"]  # NaN where undefined
 
     def at(self, weight: Float[NDArray, " G"]) -> float:
         """Return the metric with group k counted weight[k] times; NaN if undefined."""
@@ -126,8 +117,7 @@ def _widening(groups: int) -> float:
     Source: Cameron, Gelbach and Miller, "Bootstrap-based improvements for inference with clustered
     errors" (2008), on the problem of few clusters.
     """
-    quantiles = stdtrit(groups - 1, 0.975) / ndtri(0.975)
-    return float(quantiles * np.sqrt(groups / (groups - 1)))
+    return float(stdtrit(groups - 1, 0.975) / ndtri(0.975) * np.sqrt(groups / (groups - 1)))
 
 
 @lru_cache(maxsize=4)  # many metrics resample the same groups one after the other
@@ -240,15 +230,12 @@ class Scored(Metric):
 
     For items of equal score, the statistic is the expectation under random order.
 
-    Attributes:
-        unit: position of the scene or group of each item in `groups`.
-
     Raises:
         ValueError: there are no items.
     """
 
     statistic: str
-    unit: Int[NDArray, " N"]
+    unit: Int[NDArray, " N"]  # position of the scene or group of each item in `groups`
     score: Float[NDArray, " N"]
     truth: Bool[NDArray, " N"]
     groups: Int[NDArray, " G"]
@@ -350,15 +337,12 @@ STATISTICS: dict[str, Callable[[Levels], float]] = {
 
 @dataclass(frozen=True, eq=False)
 class Resampled(Metric):
-    """A metric of which only its value and its resamples are kept, such as one of whole sets.
-
-    `items` is the number of scored items, such as scenes in the other set of a comparison.
-    """
+    """A metric of which only its value and its resamples are kept, such as one of whole sets."""
 
     point: float
     drawn: Float[NDArray, " resamples"]
     groups: Int[NDArray, " G"]
-    items: int
+    items: int  # scored items, such as scenes in the other set of a comparison
 
     @classmethod
     def of(

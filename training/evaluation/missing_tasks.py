@@ -39,14 +39,12 @@ from training.evaluation.parts import (
 )
 from training.evaluation.setting import Outcome, Setting, Structure
 
-SEEDS: Final = (0, 1, 2)
-"""Seeds of the draws of a question, for each scene."""
+SEEDS: Final = (0, 1, 2)  # seeds of the draws of a question, for each scene
 
 SIZES: Final[dict[str, Size]] = {"one removed": all_but_one, "25 % shown": one_quarter}
 """Parts that T2 lists, by name."""
 
-TOP: Final = (1, 3, 5, 10)
-"""Values of k for top-k accuracy."""
+TOP: Final = (1, 3, 5, 10)  # values of k for top-k accuracy
 
 
 def rank_missing(
@@ -121,10 +119,7 @@ def removed_places(
 def leave_one_out_at(
     scenes: SceneTensors, structure: Structure, score: PlacedScore, *, seed: int = 0
 ) -> tuple[Ranking, Int[NDArray, " N"]]:
-    """Return the rank of every removed class among the absent classes, and its relation.
-
-    Classes of one family with a listed class are neither ranked nor candidates.
-    """
+    """Return the rank of every removed class, as of `rank_hidden`, and its relation."""
     row, target, places = removed_places(scenes, structure, seed)
     related = scenes.relatives_of(places.v)
     kept = ~related.gather(1, target.unsqueeze(1)).squeeze(1)

@@ -27,19 +27,13 @@ Flagged: TypeAlias = Callable[[Float[Tensor, "B V"], Sensitivity], Bool[Tensor, 
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """B scenes with a removed class, and the place of the removed class.
+    """B scenes with a removed class, and the place of the removed class."""
 
-    Attributes:
-        v, counts: presence and instances of the remaining classes.
-        relation, anchor: canonical relation, and class at its other end.
-        outgoing: True if the removed class is the subject of the relation.
-    """
-
-    v: Float[Tensor, "B V"]
-    counts: Float[Tensor, "B V"]
-    relation: Int[Tensor, " B"]
-    anchor: Int[Tensor, " B"]
-    outgoing: Bool[Tensor, " B"]
+    v: Float[Tensor, "B V"]  # presence of the remaining classes
+    counts: Float[Tensor, "B V"]  # their instances
+    relation: Int[Tensor, " B"]  # canonical
+    anchor: Int[Tensor, " B"]  # class at the other end of the relation
+    outgoing: Bool[Tensor, " B"]  # True if the removed class is the subject
 
     def rows(self, index: Tensor) -> Places:
         """Select the scenes at the given indices."""
@@ -79,35 +73,21 @@ class Model:
     """A trained machine, a baseline or a reference, as the tasks of the evaluation ask it.
 
     Each attribute answers the questions of one task. It is None if the model does not answer them.
-
-    Attributes:
-        missing, at_place: scores of T2 and T2-at, missing objects in a scene and at a place.
-        suspicion: score of T3, the suspicion of each listed class; -inf for other classes. By
-            default `suspicion_of(missing)`.
-        flags: outliers that a published model reports.
-        relations, completion, false_relations: scores of T1a, T1b and T3b. The batch observes no
-            relation, the given triples, or all triples with one false triple.
-        misplaced: score of T3c, moved objects.
-        lateral: change of the log-odds of left and front in T1 pairs, see `lateral_shift`.
-        rooms: log-probabilities of the room types.
-        generate: sampler of T4 for a setting.
-        scene_model: model for Calibration and for all questions to the service.
-        parameters: number of trained weights, or None if this number is not meaningful.
     """
 
-    missing: ObjectScore | None = None
-    at_place: PlacedScore | None = None
-    suspicion: ObjectScore | None = None
-    flags: Flagged | None = None
-    relations: RelationScore | None = None
-    completion: RelationScore | None = None
-    false_relations: RelationScore | None = None
-    misplaced: MisplacedScore | None = None
-    lateral: float = 0.0
+    missing: ObjectScore | None = None  # T2: missing objects in a scene
+    at_place: PlacedScore | None = None  # T2-at: missing objects at a place
+    suspicion: ObjectScore | None = None  # T3; -inf if unlisted; default `suspicion_of(missing)`
+    flags: Flagged | None = None  # outliers that a published model reports
+    relations: RelationScore | None = None  # T1a: no relation is observed
+    completion: RelationScore | None = None  # T1b: the given triples are observed
+    false_relations: RelationScore | None = None  # T3b: all triples are observed, one is false
+    misplaced: MisplacedScore | None = None  # T3c: moved objects
+    lateral: float = 0.0  # T1 pairs: change of the log-odds of left and front, `lateral_shift`
     rooms: RoomScore | None = None
-    generate: SamplerOf | None = None
-    scene_model: SceneModel | None = None
-    parameters: int | None = None
+    generate: SamplerOf | None = None  # T4
+    scene_model: SceneModel | None = None  # for Calibration and all questions to the service
+    parameters: int | None = None  # number of trained weights; None if it has no meaning
 
     def __post_init__(self) -> None:
         if self.suspicion is None and self.missing is not None:
@@ -124,7 +104,6 @@ def suspicion_of(
     """
 
     def suspicion(v: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
-        """Score each listed class given the other classes of its list."""
         row, listed = (v > 0).nonzero(as_tuple=True)
         values = torch.full(v.shape, -torch.inf)
         if len(row):

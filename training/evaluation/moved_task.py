@@ -34,8 +34,7 @@ from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.model import MisplacedScore
 from training.evaluation.setting import Outcome, Setting, Structure
 
-ALARMS: Final = 0.05
-"""Share of untouched scenes with an alarm at the threshold."""
+ALARMS: Final = 0.05  # share of untouched scenes with an alarm at the threshold
 
 METRICS: Final = ("named first", "flagged at 5 % alarms")
 
@@ -44,10 +43,7 @@ _SCENES: Final = 300  # maximum number of scenes of a source
 
 @dataclass(frozen=True, eq=False)
 class MovedCase:
-    """A scene with the moved object `object`, and the same scene without the move.
-
-    `scene_index` is the index of the scene in its set.
-    """
+    """A scene with the moved object `object`, and the same scene without the move."""
 
     scene_index: int
     moved: Scene
@@ -73,7 +69,7 @@ def ask_moved(score: MisplacedScore, cases: Sequence[MovedCase]) -> Float[NDArra
     """Return the answers to N cases.
 
     The columns are 1 if the moved object is named first, the highest probability about the moved
-    object, and the highest probability in the untouched scene. Without an entry, the value is 0.
+    object, and that in the untouched scene; 0 without an entry.
     """
 
     def ask(case: MovedCase) -> Float[NDArray, " 3"]:
@@ -97,17 +93,12 @@ def _highest(entries: Sequence[Mapping[str, Any]], object_: str | None = None) -
 def flagged(
     suspicion: Float[NDArray, " N"], untouched: Float[NDArray, " N"], source: Int[NDArray, " N"]
 ) -> Bool[NDArray, " N"]:
-    """Return whether each suspicion exceeds the threshold of its source.
-
-    `suspicion` is the highest probability about the moved object, `untouched` that in the untouched
-    scene.
-    """
+    """Return whether each suspicion exceeds the threshold of its source; see `ask_moved`."""
     is_flagged = np.zeros(len(source), dtype=np.bool_)
     for name in np.unique(source):
-        mine = source == name
-        alarms = int(ALARMS * mine.sum())
-        threshold = np.sort(untouched[mine])[-1 - alarms]
-        is_flagged[mine] = suspicion[mine] > threshold
+        in_source = source == name
+        threshold = np.sort(untouched[in_source])[-1 - int(ALARMS * in_source.sum())]
+        is_flagged[in_source] = suspicion[in_source] > threshold
     return is_flagged
 
 

@@ -1,11 +1,10 @@
 """Test the placement offsets of a model on held-out scenes.
 
 An offset is the position of a relation's subject minus the position of its object, in metres. The
-model has a distribution of offsets for each relation and pair of classes. The distribution gives an
-ellipse in the horizontal plane and an ellipsoid in space. Each of these regions should contain 80 %
-of the offsets. The task measures the share of held-out offsets in these regions. It also measures
-the distance from an offset to two means of the model: the mean for the relation and classes, and
-the mean for the relation alone.
+model has a distribution of offsets for each relation and pair of classes. It gives an ellipse in
+the horizontal plane and an ellipsoid in space, which should contain 80 % of the offsets each. The
+task measures the shares of held-out offsets in them. It also measures the distance of offsets to
+the mean for the relation and classes, and to the mean for the relation alone.
 """
 
 from __future__ import annotations
@@ -21,8 +20,7 @@ from training.datasets.cases import observed_offsets
 from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.setting import Outcome, Setting
 
-SHARE: Final = 0.8
-"""Share of the offsets that each ellipse or ellipsoid should contain."""
+SHARE: Final = 0.8  # share of the offsets that each ellipse or ellipsoid should contain
 
 _REGIONS: Final = {"the ellipse": 2, "the ellipsoid": 3}
 """Number of axes of each region: two axes are x and y, three axes are x, y and z."""
@@ -35,10 +33,7 @@ METRICS: Final = (
 
 
 def offsets_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
-    """Measure the share of covered offsets for each relation, and the distances for all relations.
-
-    The result is None if the model has no offsets, or no scene has related objects with poses.
-    """
+    """Measure the share of covered offsets for each relation, and the distances for all."""
     if (offsets := artifact.offsets) is None:
         return None
     scenes = setting.scenes.scenes
@@ -51,17 +46,15 @@ def offsets_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
     deviation = observed.offset - values[:, :3]
     squares = np.square(deviation / values[:, 3:])
     metrics: dict[str, Metric] = {}
-    for a, name in enumerate(CANONICAL):
+    for a in np.unique(observed.relation):
         in_relation = observed.relation == a
         for region, axes in _REGIONS.items():
             is_inside = squares[in_relation, :axes].sum(axis=1) <= chdtri(axes, 1 - SHARE)
-            if in_relation.any():
-                metrics[f"in {region}, {name}"] = Ratio.of_items(
-                    observed.scene[in_relation], is_inside.astype(np.float64), len(scenes)
-                )
+            metrics[f"in {region}, {CANONICAL[a]}"] = Ratio.of_items(
+                observed.scene[in_relation], is_inside.astype(np.float64), len(scenes)
+            )
     residual = observed.offset - offsets.relation[observed.relation, :3]
     for name, vectors in (("distance (m)", deviation), ("distance (m), relation alone", residual)):
         distance = np.linalg.norm(vectors, axis=1)
         metrics[name] = Ratio.of_items(observed.scene, distance, len(scenes))
-    skipped = len(scenes) - len(np.unique(observed.scene))
-    return Outcome.over(setting.scenes, metrics, skipped)
+    return Outcome.over(setting.scenes, metrics, len(scenes) - len(np.unique(observed.scene)))

@@ -27,8 +27,7 @@ from training.evaluation.model import Flagged, Model, ObjectScore
 from training.evaluation.parts import draw_parts, exactly
 from training.evaluation.setting import Outcome, Setting, Structure
 
-LENGTHS: Final = (1, 2, 3, 5, 8)
-"""Numbers of listed classes in which alarms are measured."""
+LENGTHS: Final = (1, 2, 3, 5, 8)  # numbers of listed classes in which alarms are measured
 
 
 class Cases(NamedTuple):
@@ -67,11 +66,7 @@ def hit_at_1(scenes: SceneTensors, cases: Cases, suspicion: ObjectScore) -> Rati
 
 
 def outliers_task(model: Model, setting: Setting) -> Outcome | None:
-    """Measure T3. The result is None if the model does not rank classes by suspicion.
-
-    Each distribution of intruders has the metric hit@1. A published model also has the share of
-    intruders that it flags at medium sensitivity.
-    """
+    """Measure hit@1, and the share that a published model flags at medium sensitivity."""
     if model.suspicion is None:
         return None
     scenes, structure = setting.some(), setting.structure

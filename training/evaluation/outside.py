@@ -50,29 +50,19 @@ class RoomList:
     scenes: Sequence[AnnotatedScene]
 
     def tensors(self, vocabulary: Vocabulary) -> SceneTensors:
-        """Return the scenes in the classes of a vocabulary.
-
-        Each room is a group of its own if the file has one group.
-        """
+        """Return the scenes in the classes of a vocabulary; a single group is split into rooms."""
         encoded = encode(self.scenes, vocabulary)
         if len({scene.group for scene in encoded}) == 1:
             encoded = [replace(scene, group=scene.scene_id) for scene in encoded]
         return scene_tensors(encoded, annotated_classes(encoded, vocabulary), vocabulary)
 
     def measure(self, model: SceneModel, progress: Progress = silent) -> list[CardMetric]:
-        """Return the metrics of `ROOM_TASKS` that the scenes support.
-
-        Intervals are over groups. The intruders of T3 have the popularity and the typical rooms of
-        the file itself.
-        """
+        """Return the metrics of `ROOM_TASKS`; T3 intruders have the popularity of the file."""
         scenes = self.tensors(model.vocabulary)
         structure = torch.from_numpy(model.vocabulary.structure.copy())
         setting = Setting(scenes, structure, train=scenes, limit=None)
-        return card_figures(
-            measure(
-                artifact_model(model), setting, self.source, tasks=ROOM_TASKS, progress=progress
-            )
-        )
+        answers, tasks = artifact_model(model), ROOM_TASKS
+        return card_figures(measure(answers, setting, self.source, tasks=tasks, progress=progress))
 
     def trained(self, artifact: Artifact) -> list[str]:
         """Return the source if the model learnt from exactly these scenes."""

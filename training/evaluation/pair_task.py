@@ -36,31 +36,20 @@ from training.evaluation.model import Model, RelationScore
 from training.evaluation.relation_tasks import with_observed
 from training.evaluation.setting import Outcome, Setting, Structure
 
-RARE = 10
-"""A class is rare if training relates it to at most this many classes."""
+RARE = 10  # A class is rare if training relates it to at most this many classes
+SHIFTS = (0.0, -0.4, -0.8, -1.2)  # tested changes of the log-odds of left and front
 
-SHIFTS = (0.0, -0.4, -0.8, -1.2)
-"""Tested changes of the log-odds of left and front."""
-
-# Lower bound of the listed relations' share, so that the log-loss of a pair is at most 21 nats.
-_LEAST = 1e-9
+_LEAST = 1e-9  # least share of the listed relations: the log-loss of a pair is at most 21 nats
 
 
 @dataclass(frozen=True, eq=False)
 class ScenePairs:
-    """The questions about one scene.
-
-    Attributes:
-        scene_index: index of the scene in its set.
-        pairs: indices into the scene's classes, the smaller index first.
-        listed: True for listed relations: the canonical relations of the first class to the second,
-            then of the second to the first.
-    """
+    """The questions about one scene."""
 
     scene_index: int
     scene: EncodedScene
-    pairs: Int[NDArray, "P 2"]
-    listed: Bool[NDArray, "P 2*A"]
+    pairs: Int[NDArray, "P 2"]  # indices into the scene's classes, the smaller index first
+    listed: Bool[NDArray, "P 2*A"]  # listed relations of the first to the second, then reversed
 
 
 PairScore: TypeAlias = Callable[[ScenePairs], Float[NDArray, "P 2*A"]]
@@ -86,7 +75,6 @@ def service_score(artifact: SceneModel) -> PairScore:
     """Return a score: probabilities of `/relations` between the first instances of both classes."""
 
     def score(question: ScenePairs) -> Float[NDArray, "P 2*A"]:
-        """Ask the service about the first instances of the classes of each pair."""
         scene, classes = question.scene, question.scene.evidence.classes
         first = np.array([np.flatnonzero(scene.instance_classes == c)[0] for c in classes])
         pairs = first[question.pairs]
@@ -146,20 +134,15 @@ def both_ways(
 
 
 def accuracy(p: Float[NDArray, "N k"], listed: Bool[NDArray, "N k"]) -> Float[NDArray, " N"]:
-    """Return 1 for each pair whose most probable relation is listed, else 0.
-
-    For ties, the result is the share of listed relations among the most probable ones.
-    """
+    """Return the share of listed relations among the most probable ones: 0 or 1 without ties."""
     is_best = p == p.max(1, keepdims=True)
     return (is_best & listed).sum(1) / is_best.sum(1)
 
 
 def log_loss(p: Float[NDArray, "N k"], listed: Bool[NDArray, "N k"]) -> Float[NDArray, " N"]:
-    """Return the log-loss of each pair in nats.
+    """Return -log(L / T) in nats: sums of p over the listed relations L, and over all relations T.
 
-    The log-loss is -log(L / T). L is the sum of the probabilities of the listed relations, and T is
-    the sum of the probabilities of all k relations. If T is 0, all relations count as equally
-    probable.
+    If T is 0, all relations count as equally probable.
     """
     total = p.sum(1)
     share = np.divide((p * listed).sum(1), total, where=total > 0, out=listed.mean(1))

@@ -32,9 +32,7 @@ REAL_SOURCES: Final = ("sunrgbd", "3dssg", "sunrgbd_bedrooms_3d", "matterport_ro
 ALL_BUT_ONE: Final = len(SHARES)
 """Bin of the listed share, and row of kappa, for lists of all classes but one."""
 
-LONGEST: Final = 12
-"""Maximum number of listed classes of a random part in `validation_score`."""
-
+LONGEST: Final = 12  # maximum number of listed classes of a random part in `validation_score`
 _SCENES = 400  # maximum scenes of each source in `validation_score`
 _BLOCK = 256
 
@@ -47,20 +45,13 @@ ListScore: TypeAlias = Callable[[Float[Tensor, "B V"], Int[Tensor, " B"]], Float
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """N parts of scenes.
-
-    Attributes:
-        scene: index of the scene.
-        v, hidden: 1 for listed classes; True for hidden classes.
-        related: True for unlisted classes of one family with a listed class.
-        scenes: number of scenes of the set, with the scenes without a part.
-    """
+    """N parts of scenes."""
 
     scene: Int[Tensor, " N"]
-    v: Float[Tensor, "N V"]
+    v: Float[Tensor, "N V"]  # 1 for listed classes
     hidden: Bool[Tensor, "N V"]
-    related: Bool[Tensor, "N V"]
-    scenes: int
+    related: Bool[Tensor, "N V"]  # unlisted classes of one family with a listed class
+    scenes: int  # number of scenes of the set, with the scenes without a part
 
     @property
     def skipped(self) -> int:
@@ -119,35 +110,25 @@ def draw_parts(
     for row, classes in enumerate(hidden):
         mask[row, torch.from_numpy(classes)] = True
     v = scenes.v[index].masked_fill(mask | structure, 0.0)
-    related = scenes.relatives_of(v) & (v == 0)
-    return Parts(index, v, mask, related, len(scenes))
+    return Parts(index, v, mask, scenes.relatives_of(v) & (v == 0), len(scenes))
 
 
 def share_bin(listed: Float[Tensor, " B"], classes: Float[Tensor, " B"]) -> Int[Tensor, " B"]:
-    """Return the bin of the listed share of scenes of so many classes.
-
-    `app.inference.weights.SHARES` has the limits of the bins. `ALL_BUT_ONE` is the last bin.
-    """
+    """Return the bin of the listed share of scenes of so many classes, by the limits `SHARES`."""
     bins = torch.bucketize(listed / classes, torch.tensor(SHARES[:-1]))
     return torch.where(listed >= classes - 1, ALL_BUT_ONE, bins)
 
 
 @dataclass(frozen=True, eq=False)
 class Ranking:
-    """Ranks of all hidden classes of a set of scenes.
-
-    Attributes:
-        scene, target: index of the scene in the set, and the hidden class.
-        above, ties: number of candidates with a higher score, and of others with the same.
-        skipped: number of scenes with too few classes.
-    """
+    """Ranks of all hidden classes of a set of scenes."""
 
     scene: Int[NDArray, " N"]
-    target: Int[NDArray, " N"]
-    above: Int[NDArray, " N"]
-    ties: Int[NDArray, " N"]
+    target: Int[NDArray, " N"]  # hidden class
+    above: Int[NDArray, " N"]  # number of candidates with a higher score
+    ties: Int[NDArray, " N"]  # number of other candidates with the same score
     scenes: int
-    skipped: int
+    skipped: int  # scenes with too few classes
 
     @classmethod
     def of(
@@ -206,7 +187,7 @@ def real_sources(scenes: SceneTensors) -> Iterator[tuple[str, SceneTensors]]:
     """Generate `REAL_SOURCES` by name, with their scenes; all sources if there are no real ones."""
     names = np.array([scene.source for scene in scenes.scenes], dtype=np.str_)
     for name in [x for x in REAL_SOURCES if x in names] or np.unique(names).tolist():
-        yield name, subset(scenes, torch.from_numpy(np.flatnonzero(names == name)))
+        yield name, subset(scenes, torch.from_numpy(names == name))
 
 
 @torch.no_grad()
@@ -225,7 +206,7 @@ def validation_score(
     """
     values = []
     some = scenes.complete if bool(scenes.complete.any()) else ~scenes.complete
-    for _, own in real_sources(subset(scenes, some.nonzero().squeeze(1))):
+    for _, own in real_sources(subset(scenes, some)):
         sample = some_scenes(own, _SCENES)
         for size in (up_to_longest, all_but_one):
             parts = draw_parts(sample, structure, size)

@@ -39,28 +39,19 @@ from training.evaluation.model import RelationScore
 from training.evaluation.setting import Outcome, Setting, Structure
 from training.machines.edges import triple_keys
 
-FIRST = (20, 50, 100)
-"""Numbers of predictions per scene for recall."""
+FIRST = (20, 50, 100)  # numbers of predictions per scene for recall
 _TRIES = 50
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """The ranked triples of one scene.
+    """The ranked triples of one scene."""
 
-    Attributes:
-        scene: index of the scene among the scored scenes.
-        relation: index of the canonical relation.
-        key: number of the triple, see `triple_keys`.
-        score: score of each triple. A higher score means more likely true.
-        truth: True if the triple is annotated.
-    """
-
-    scene: int
-    relation: Int[NDArray, " k"]
-    key: Int[NDArray, " k"]
+    scene: int  # index among the scored scenes
+    relation: Int[NDArray, " k"]  # canonical
+    key: Int[NDArray, " k"]  # number of the triple, see `triple_keys`
     score: Float[NDArray, " k"]
-    truth: Bool[NDArray, " k"]
+    truth: Bool[NDArray, " k"]  # True if the triple is annotated
 
     def where(self, mask: Bool[NDArray, " k"]) -> Candidates:
         """Select the triples with a True value in the mask."""
@@ -132,12 +123,11 @@ def complete_scenes(
     """Score the T1b candidates of scenes with at least two triples, given half of the triples."""
 
     def ask(batch: Batch, index: list[int]) -> tuple[Tensor, Tensor]:
-        """Score the triples that neither the given half nor its mirror image contains."""
         mask = scorable(batch, structure)
-        given = random_half((batch.holds > 0) & mask, scenes, index, seed)
+        observed = random_half((batch.holds > 0) & mask, scenes, index, seed)
         # With a single triple the observed half is empty: the scene is left out.
-        has_evidence = given.flatten(1).any(1)[:, None, None, None]
-        return score(with_observed(batch, given)), mask & ~given & ~given.mT & has_evidence
+        has_evidence = observed.flatten(1).any(1)[:, None, None, None]
+        return score(with_observed(batch, observed)), mask & ~observed & ~observed.mT & has_evidence
 
     return _scored(scenes, 2, ask)
 
@@ -157,10 +147,9 @@ def random_half(
 def r_precision(
     ranked: Iterable[Candidates], scenes: int, *, first: int | None = None
 ) -> Ratio | None:
-    """Return the share of annotated triples among the first candidates; None without such triples.
+    """Return the pooled share of annotated triples among the `first` candidates of each scene.
 
-    By default, a scene has as many first candidates as it has annotated triples. The share is
-    pooled over scenes.
+    By default, `first` is the number of annotated triples. Without such triples, return None.
     """
     hits, annotated = np.zeros((2, scenes))
     for scene in ranked:
@@ -194,10 +183,8 @@ def draw_false_triple(
 ) -> tuple[Triple, Triple] | None:
     """Draw a true triple (relation, subject, object) of a scene and a false replacement.
 
-    The replacement changes the relation with probability 1/2, the subject with probability 1/4 and
-    the object with probability 1/4. It is usable, and false if the scene lists neither it nor its
-    mirror image. The result is None if the scene has fewer than two usable true triples, or if
-    `_TRIES` draws give no false triple.
+    The replacement changes the relation (probability 1/2), the subject (1/4) or the object (1/4).
+    Return None with fewer than two usable true triples, or if all `_TRIES` draws fail.
     """
     true_triples = np.argwhere(holds & usable)
     if len(true_triples) < 2:

@@ -1,8 +1,7 @@
 """Reports: the metrics of a model or baseline on one data source, or pooled over data sources.
 
-A `SourceReport` holds the results of one model, training seed and data source. It stores the values
-of each group of near-duplicate scenes. Reports can therefore be pooled over data sources, and
-compared by paired resampling, without the models.
+A `SourceReport` stores the values of each group of near-duplicate scenes. So reports can be pooled
+over data sources, and compared by paired resampling, without the models.
 """
 
 from __future__ import annotations
@@ -41,19 +40,13 @@ def silent(_: str) -> None:
 
 @dataclass
 class SourceReport:
-    """Results of one model or baseline on one data source.
+    """Results of one model or baseline on one data source."""
 
-    Attributes:
-        source: name of the data source, or "pooled".
-        scenes: digest of the questions, see `digest`.
-        outcomes: metrics of each task, by task name; None if the model does not support the task.
-        parameters: number of trained weights of the model, if any.
-    """
-
-    source: str
-    scenes: str
+    source: str  # name of the data source, or "pooled"
+    scenes: str  # `digest` of the questions
+    # By task; None if the model does not support the task.
     outcomes: dict[str, Outcome | None] = field(default_factory=dict)
-    parameters: int | None = None
+    parameters: int | None = None  # number of trained weights
 
     def write(self, path: Path) -> None:
         """Write the report into a JSON file."""
@@ -152,15 +145,7 @@ def evaluate(
     tasks: Collection[str] | None = None,
     progress: Progress = silent,
 ) -> list[CardMetric]:
-    """Measure the metrics of a model card on every data source.
-
-    Generated scenes are compared with the scenes of all data sources together.
-
-    Args:
-        train: training scenes, see `Setting`.
-        limit: maximum number of scenes per data source in slow tasks, see `Setting`.
-        tasks: names of the tasks to measure. None means all tasks of a model card.
-    """
+    """Measure the metrics of a model card, on every data source or, for T4, on all together."""
     model = artifact_model(artifact)
     selected = [
         name for name, task in EVERY_TASK.items() if task.card and (tasks is None or name in tasks)
@@ -170,11 +155,10 @@ def evaluate(
     whole = [task for task in selected if task in WHOLE_SET and task not in ONCE]
     by_name = dict(settings_by_source(scenes, structure, train, None, limit=limit))
     together = next(iter(by_name)) if len(by_name) == 1 else "pooled"
-    everyday_setting = Setting(scenes, structure, limit=limit, everyday=everyday)
     questions = [
         *((source, setting, of_source) for source, setting in by_name.items()),
         (together, Setting(scenes, structure, train, limit=limit), whole),
-        (SOURCE, everyday_setting, once),
+        (SOURCE, Setting(scenes, structure, limit=limit, everyday=everyday), once),
     ]
     return [
         row

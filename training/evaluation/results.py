@@ -25,8 +25,7 @@ Shown = Mapping[str, tuple[str, ...]]
 SHOWN: Shown = {name: task.shown for name, task in TASKS.items()}
 """Names of the metrics in tables, by task."""
 
-# Annotators list only a part of the relations that hold.
-UNLISTED = "An unlisted relation counts as wrong"
+UNLISTED = "An unlisted relation counts as wrong"  # annotators list only a part of the true ones
 
 _RELATION_TASKS = ("T1a", "T1b", "T1 with")
 
@@ -79,20 +78,13 @@ class Difference:
 
 @dataclass(frozen=True)
 class Results:
-    """The results of an experiment, sorted by row, data source and task.
+    """The results of an experiment, sorted by row, data source and task."""
 
-    Attributes:
-        ours: name of the reference row of all comparisons.
-        differences: paired differences from the reference row.
-        parameters: number of trained weights by row name, for rows with weights.
-        asked: number of scenes and of skipped scenes, and notes, by row, seed, source and task.
-    """
-
-    ours: str
+    ours: str  # reference row of all comparisons
     cells: tuple[Cell, ...]
-    differences: tuple[Difference, ...]
-    parameters: Mapping[str, int] = field(default_factory=dict)
-    asked: tuple[dict[str, Any], ...] = ()
+    differences: tuple[Difference, ...]  # from the reference row
+    parameters: Mapping[str, int] = field(default_factory=dict)  # number of trained weights by row
+    asked: tuple[dict[str, Any], ...] = ()  # scenes, skipped, notes by row, seed, source and task
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-serialisable dictionary."""

@@ -38,9 +38,7 @@ from training.evaluation.parts import (
 )
 from training.evaluation.setting import Outcome, Setting, Structure
 
-LEAST: Final = 1e-4
-"""Least probability of a room type in the log-loss."""
-
+LEAST: Final = 1e-4  # least probability of a room type in the log-loss
 
 LISTS: Final[dict[str, tuple[Size, tuple[int, ...]]]] = {
     "all classes": (lambda classes, _: classes, SEEDS[:1]),
@@ -54,7 +52,7 @@ FIGURES: Final = ("top-1", "top-3", "log-loss", "ECE")
 
 def with_room_type(scenes: SceneTensors) -> SceneTensors:
     """Return the scenes with a room type."""
-    return subset(scenes, (scenes.room >= 0).nonzero().squeeze(1))
+    return subset(scenes, scenes.room >= 0)
 
 
 def room_figures(
@@ -69,8 +67,8 @@ def room_figures(
     log_p = torch.nn.functional.pad(log_p, (0, added), value=lowest)
     log_p = torch.where(is_named, log_p, log_p.scatter(1, target.unsqueeze(1), -torch.inf))
     ranking = Ranking.of(parts.scene, target, log_p, count, parts.skipped)
-    p, first = log_p.exp().double().max(1)
-    hit = (first == target).numpy()
+    p, likeliest = log_p.exp().double().max(1)
+    hit = (likeliest == target).numpy()
     loss = -log_p.gather(1, target.unsqueeze(1)).squeeze(1).clamp(min=float(np.log(LEAST)))
     return {
         "top-1": ranking.top(1),

@@ -22,31 +22,20 @@ Structure: TypeAlias = Bool[Tensor, " V"]
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """The questions of an evaluation.
+    """The questions of an evaluation."""
 
-    Attributes:
-        scenes: held-out scenes.
-        train: training scenes of the same sources. If None, tasks that need them are left out.
-        seen: triples that the model may have learnt from.
-        limit: maximum number of scenes for slow tasks, which are all but T1a and T1b. The slowest
-            tasks, T2-at and Calibration, use a third of the limit.
-        seed: random seed of the questions.
-        everyday: folder of the everyday facts. None skips the task.
-    """
-
-    scenes: SceneTensors
+    scenes: SceneTensors  # held out
     structure: Structure
-    train: SceneTensors | None = None
-    seen: Int[Tensor, "triples 3"] | None = None
+    train: SceneTensors | None = None  # of the same sources; None skips tasks that need it
+    seen: Int[Tensor, "triples 3"] | None = None  # triples that the model may have learnt from
+    # Maximum scenes of slow tasks: all but T1a and T1b. T2-at and Calibration use a third of it.
     limit: int | None = 600
     seed: int = 0
-    everyday: Path | None = None
+    everyday: Path | None = None  # folder of the everyday facts; None skips the task
 
     def some(self, related: bool = False, *, share: int = 1) -> SceneTensors:
         """Return at most `limit` / `share` scenes; with `related`, only scenes with relations."""
-        scenes = self.scenes
-        if related:
-            scenes = with_relations(scenes)
+        scenes = with_relations(self.scenes) if related else self.scenes
         limit = None if self.limit is None else max(1, self.limit // share)
         return some_scenes(scenes, limit, self.seed)
 
@@ -68,25 +57,17 @@ def with_relations(scenes: SceneTensors) -> SceneTensors:
 
 
 def _complete(scenes: SceneTensors) -> SceneTensors:
-    if bool(scenes.complete.all()):
-        return scenes
-    return subset(scenes, scenes.complete.nonzero().squeeze(1))
+    return scenes if bool(scenes.complete.all()) else subset(scenes, scenes.complete)
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Metrics of one task.
+    """Metrics of one task."""
 
-    Attributes:
-        metrics: metrics by name; the primary metric comes first.
-        skipped: number of scenes that could not be scored.
-        notes: additional values, such as a bandwidth.
-    """
-
-    metrics: dict[str, Metric]
+    metrics: dict[str, Metric]  # the primary metric comes first
     scenes: int
-    skipped: int
-    notes: dict[str, float] = field(default_factory=dict)
+    skipped: int  # scenes that could not be scored
+    notes: dict[str, float] = field(default_factory=dict)  # further values, such as a bandwidth
 
     @classmethod
     def over(
@@ -95,6 +76,5 @@ class Outcome:
         """Return the metrics per scene, summed by group of near-duplicates; None without any."""
         if not metrics:
             return None
-        groups = scenes.group_ids
-        by_group = {name: metric.by(groups) for name, metric in metrics.items()}
+        by_group = {name: metric.by(scenes.group_ids) for name, metric in metrics.items()}
         return cls(by_group, len(scenes), skipped)

@@ -38,24 +38,14 @@ from training.evaluation.setting import Outcome, Setting
 
 @dataclass(frozen=True)
 class Task:
-    """One task.
+    """One task."""
 
-    Attributes:
-        words: name of the task in the tables of the command line.
-        ask: function of the answers of the model and the questions that returns the metrics.
-        field: attribute of `Model` that answers the questions. "" means the whole model.
-        card: names of the metrics in a model card.
-        tables: names of the metrics in Markdown tables; None means those of a card. JSON files
-            contain all metrics.
-        of_objects: True if the task uses only scenes with complete object lists.
-    """
-
-    words: str
-    ask: Callable[[Any, Setting], Outcome | None]
-    field: str
-    card: tuple[str, ...]
-    tables: tuple[str, ...] | None = None
-    of_objects: bool = True
+    words: str  # name of the task in the tables of the command line
+    ask: Callable[[Any, Setting], Outcome | None]  # function of `field` and the questions
+    field: str  # attribute of `Model` that answers the questions. "" means the whole model
+    card: tuple[str, ...]  # metrics in a model card
+    tables: tuple[str, ...] | None = None  # metrics in Markdown tables; None means those of a card
+    of_objects: bool = True  # True if the task uses only scenes with complete object lists
 
     @property
     def shown(self) -> tuple[str, ...]:
@@ -184,7 +174,4 @@ ONCE = ("Everyday",)
 """Tasks that do not depend on the held-out scenes. They are measured once, not per data source."""
 
 WHOLE_SET = ("T4 generate", *ONCE)
-"""Tasks that are measured on the scenes of all data sources together.
-
-For all other tasks, the results on the data sources are pooled.
-"""
+"""Tasks on the scenes of all data sources together. Results of all other tasks are pooled."""

@@ -84,9 +84,7 @@ class _File(BaseModel, extra="forbid", frozen=True):
 
 
 def load_rows(path: Path, full: Config) -> list[Config]:
-    """Read the ablations in a TOML file: one configuration for each `[[row]]` of the file.
-
-    All ablations use the scenes of the full model.
+    """Read one configuration for each `[[row]]` of a TOML file, with the scenes of the full model.
 
     Raises:
         ConfigError: the file is missing or not TOML, a setting is unknown or invalid, two ablations
@@ -111,8 +109,8 @@ def _config(row: _Change, full: Config, file: str) -> Config:
         changed = with_settings(start, row.changes).model_copy(update={"data": full.data})
         if changed == full:
             raise ConfigError(f"the row has the same settings as {full.name}: change a setting")
-        values = changed.model_dump() | {"name": row.name, "description": row.what}
-        return Config.model_validate(values)
+        names = {"name": row.name, "description": row.what}
+        return Config.model_validate(changed.model_dump() | names)
     except (ConfigError, ValidationError) as error:
         reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
         raise ConfigError(f"{file}: {row.name}: {reason}") from error

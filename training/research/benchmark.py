@@ -83,8 +83,7 @@ def read_configs(references: Sequence[str]) -> list[Config]:
     """Read the configurations to compare.
 
     Raises:
-        ConfigError: a configuration cannot be read, a name occurs twice, or the data sections
-            differ.
+        ConfigError: a configuration is unreadable, a name occurs twice, or data sections differ.
     """
     configs = [load_config(reference) for reference in references]
     first, *others = configs
@@ -119,7 +118,7 @@ def compare_machines(
     configs: Sequence[Config],
     root: Path,
     folder: Path,
-    shown: Shown,
+    shown: Shown,  # the tasks to measure, and their metrics in the tables
     *,
     seeds: int,
     baselines: Sequence[str] | None,
@@ -129,14 +128,9 @@ def compare_machines(
 ) -> None:
     """Measure machines and baselines on test scenes, and write tables and plots into the folder.
 
-    The first configuration is the reference of all differences. A model whose training diverges
-    has its error in the results instead of metrics. The commands describe the other arguments.
-
-    Args:
-        configs: configurations with the same data section.
-        root: folder of the scene files.
-        shown: the tasks to measure, and their metrics in the tables.
-        baselines: names of baselines; None means all.
+    `configs` have the same data section; the first is the reference of all differences. `root` is
+    the folder of the scene files. `baselines` is None for all. A model whose training diverges has
+    its error in the results instead of metrics.
 
     Raises:
         ValueError: a baseline is unknown, or the reference has no metric.

@@ -41,18 +41,12 @@ _SCENES = 300  # maximum scenes that choose a weight or a shift
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """One model of an experiment, with one training seed.
-
-    Attributes:
-        identity: text with all settings that affect the results. Reports on disk with another
-            identity are rejected.
-        make: function that trains the model, or reads the trained model from its folder.
-    """
+    """One model of an experiment, with one training seed."""
 
     name: str
     seed: int
-    identity: str
-    make: Callable[[TrainingData, Path, Progress], Model]
+    identity: str  # all settings that affect the results; part of the names of reports on disk
+    make: Callable[[TrainingData, Path, Progress], Model]  # train it, or read it from its folder
 
 
 def baseline_entries(
@@ -64,11 +58,8 @@ def baseline_entries(
 ) -> Iterator[Entry]:
     """Generate the entries of the baselines in `names`; None means all baselines.
 
-    Deterministic baselines have an entry for seed 0 only.
-
-    Args:
-        related: False leaves out relation baselines.
-        learning: settings of the machines for objects, see `object_scenes`.
+    Deterministic baselines have an entry for seed 0 only. `related=False` leaves out relation
+    baselines. `learning` are settings of the machines for objects, see `object_scenes`.
 
     Raises:
         ValueError: a name is not in `BASELINES`.
@@ -148,21 +139,20 @@ def object_scenes(train: SceneTensors, structure: Structure, config: ObjectsConf
     learnt = ObjectScenes.of(train, structure, config)
     shows = torch.zeros_like(train.annotated_classes)
     shows[[train.source_names.index(name) for name in learnt.sources]] = learnt.shows
-    weights = [config.source_weights.get(scene.source, 1.0) for scene in train.scenes]
+    weight_of = config.source_weights
     weighted = [
-        replace(scene, weight=scene.weight * weight)
-        for scene, weight in zip(train.scenes, weights, strict=True)
+        replace(scene, weight=scene.weight * weight_of.get(scene.source, 1.0))
+        for scene in train.scenes
     ]
     v = train.v * shows[train.source]
     kept = (v.sum(1) >= 2) & torch.tensor([scene.weight > 0 for scene in weighted])
     masked = replace(train, scenes=weighted, v=v, annotated_classes=shows)
-    return subset(masked, kept.nonzero().squeeze(1))
+    return subset(masked, kept)
 
 
 def tuned_suspicion(score: ObjectScore, data: TrainingData, seed: int) -> ObjectScore:
     """Return the suspicion with the weight of popularity that finds most validation intruders."""
-    complete = subset(data.validation, data.validation.complete.nonzero().squeeze(1))
-    scenes = some_scenes(complete, _SCENES, seed)
+    scenes = some_scenes(subset(data.validation, data.validation.complete), _SCENES, seed)
     log_popularity = frequency(data.train.v, data.train.weight).logit()
     hits = dict.fromkeys(_WEIGHTS, 0.0)
     for weights in intruder_weights(scenes, data.train).values():

@@ -45,10 +45,7 @@ _DRAWS = 4000
 
 
 def joint_log_odds(machine: BoltzmannMachine, v: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
-    """Return log p(v_i = 1 | v) - log p(v_i = 0 | v) in the joint with a source unit.
-
-    The entry of a listed class has no meaning.
-    """
+    """Return the log-odds of each unlisted class in the joint with a source unit."""
     if not machine.spec.profiles:
         return machine.object_log_odds(v)
     p = machine.source_weights(v, None)
@@ -57,10 +54,7 @@ def joint_log_odds(machine: BoltzmannMachine, v: Float[Tensor, "B V"]) -> Float[
 
 
 def joint_room_log_p(machine: BoltzmannMachine, v: Float[Tensor, "B V"]) -> Float[Tensor, "B C"]:
-    """Return log p(t | v) of each room type in the joint with a source unit.
-
-    The room type is one of the C types.
-    """
+    """Return log p(t | v) of each room type in the joint with a source unit."""
     logits = machine.e + machine.hidden_log_odds(machine.hidden_logits(v), machine.Q)
     if machine.spec.coupled:
         logits = logits + v @ machine.Y.T
@@ -73,7 +67,7 @@ def joint_room_log_p(machine: BoltzmannMachine, v: Float[Tensor, "B V"]) -> Floa
 def change_by_relations(
     machine: BoltzmannMachine,
     v: Float[Tensor, "1 V"],
-    edges: Edges,
+    edges: Edges,  # the relation units between the listed classes
     r: Float[Tensor, "1 units"],
     observed: Bool[Tensor, "1 units"],
     generator: torch.Generator,
@@ -82,18 +76,17 @@ def change_by_relations(
     """Estimate the change of the log-odds of each unlisted class by observed relations.
 
     The change is log E[exp(W_i h1) | v, r] - log E[exp(W_i h1) | v]. States of h1 are drawn from
-    p(h1 | v), and weighted by p(r | v, h1). `r` are the values of the relation units `edges`
-    between the listed classes.
+    p(h1 | v), and weighted by p(r | v, h1).
     """
     x = machine.by_unit(machine.hidden_logits(v))[0]
     states = torch.cat([torch.zeros_like(x[:, :1]), x], 1).softmax(1)
     drawn = torch.multinomial(states, draws, replacement=True, generator=generator).T
-    one = torch.nn.functional.one_hot(drawn, machine.spec.states)[..., 1:]
-    h1 = one.flatten(1).to(v.dtype)
+    one_hot = torch.nn.functional.one_hot(drawn, machine.spec.states)
+    h1 = one_hot[..., 1:].flatten(1).to(v.dtype)
     logits = machine.relation_logits(edges, v, h1.unsqueeze(1)).squeeze(1)
     is_unit = observed[0] & (machine.gate(edges, v)[0] > 0)
-    log_weight = (r[0] * logits - torch.nn.functional.softplus(logits))[:, is_unit].sum(1)
-    weight = log_weight.softmax(0)
+    log_p = (r[0] * logits - torch.nn.functional.softplus(logits))[:, is_unit].sum(1)
+    weight = log_p.softmax(0)
     raised = (h1 @ machine.W.T).exp()
     return (weight @ raised).log() - raised.mean(0).log()
 
@@ -167,9 +160,8 @@ def main(
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
     machine = machine_of(artifact.weights).double()
     for length in _LENGTHS:
-        _show(
-            f"unknown source, {length} classes", compare_sources(machine, scenes, structure, length)
-        )
+        figures = compare_sources(machine, scenes, structure, length)
+        _show(f"unknown source, {length} classes", figures)
     _show("observed relations", compare_relations(machine, scenes, structure))
 
 

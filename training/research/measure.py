@@ -8,9 +8,7 @@ An entry is one model of an experiment: a machine, a baseline or a reference.
                                                           of `WHOLE_SET`)
 
 The digests cover the settings and training scenes, and the questions. So another experiment has
-other folders and files.
-
-Several processes fill these files in parallel. One process with one thread measures each entry.
+other folders and files. One process with one thread measures each entry.
 """
 
 from __future__ import annotations
@@ -49,8 +47,7 @@ from training.runs.folder import RunError
 # Linear algebra libraries read these variables when a process loads them.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
-POOLED = "pooled"
-"""Name of the union of all data sources."""
+POOLED = "pooled"  # name of the union of all data sources
 
 
 @contextmanager
@@ -72,18 +69,12 @@ def resumable(console: Console) -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The questions of an experiment. All entries get the same questions.
+    """The questions of an experiment. All entries get the same questions."""
 
-    Attributes:
-        folder: folder of the reports.
-        settings: evaluation setting by data source. The key `POOLED` is the union of all sources.
-        tasks: names of the tasks to measure, which are keys of `EVERY_TASK`.
-    """
-
-    folder: Path
+    folder: Path  # of the reports
     data: TrainingData
-    settings: Mapping[str, Setting]
-    tasks: Sequence[str]
+    settings: Mapping[str, Setting]  # by data source. The key `POOLED` is the union of all sources
+    tasks: Sequence[str]  # keys of `EVERY_TASK`
 
     def folder_of(self, entry: Entry) -> Path:
         """Return the folder of an entry with its training seed and scenes."""
@@ -128,14 +119,10 @@ class Plan:
 def measure_entries(
     plan: Plan, entries: Sequence[Entry], console: Console, *, workers: int = 1, fresh: bool = False
 ) -> tuple[Reports, dict[str, str]]:
-    """Measure all entries, and skip finished reports. KeyboardInterrupt stops the processes.
+    """Return the reports by (name, seed), and the error messages of diverged entries by name.
 
-    Args:
-        workers: number of processes with one thread each. 1 measures in this process.
-        fresh: delete earlier reports of these entries.
-
-    Returns:
-        The reports by (name, seed), and the error messages of diverged entries by name.
+    Finished reports are read, unless `fresh` deletes them. `workers` processes with one thread each
+    measure the rest; 1 means this process. KeyboardInterrupt stops the processes.
     """
     if fresh:
         for entry in entries:

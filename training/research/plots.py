@@ -27,10 +27,7 @@ def write_plots(folder: Path, machines: Sequence[str], reports: Reports) -> None
 
 
 def reliability_diagrams(outcome: Outcome, title: str) -> Figure:
-    """Plot reliability diagrams, one per question, with and without calibration.
-
-    The axes are logarithmic because most probabilities are small.
-    """
+    """Plot reliability diagrams, one per question, with and without calibration."""
     from matplotlib.figure import Figure  # slow to import
 
     questions = [name for name in NAMES if f"ECE, {name}" in outcome.metrics]
@@ -46,7 +43,7 @@ def reliability_diagrams(outcome: Outcome, title: str) -> Figure:
             probability, frequency = metric.reliability()
             label = f"{suffix[2:] or 'as published'}, ECE {metric.value:.3f}"
             axis.plot(probability, frequency, marker=marker, linewidth=1, label=label)
-        axis.set_xscale("symlog", linthresh=1e-3)
+        axis.set_xscale("symlog", linthresh=1e-3)  # most probabilities are small
         axis.set_yscale("symlog", linthresh=1e-3)
         axis.set(xlim=(0, 1.1), ylim=(0, 1.1), xlabel="probability", title=name)
         axis.legend(fontsize=7)

@@ -45,8 +45,8 @@ _SHOWN = {
 def without_context(artifact: SceneModel) -> SceneModel:
     """Return the model whose hidden units do not see the objects."""
     arrays = artifact.weights.arrays
-    nothing = np.zeros_like(arrays["W"])
-    return replace(artifact, weights=Weights(artifact.spec, {**arrays, "W": nothing}))
+    W = np.zeros_like(arrays["W"])
+    return replace(artifact, weights=Weights(artifact.spec, {**arrays, "W": W}))
 
 
 def at_a_place(**entries: float) -> Callable[[SceneModel], SceneModel]:
@@ -63,10 +63,10 @@ def misplaced(**entries: float) -> Callable[[SceneModel], SceneModel]:
     """Return a function that changes the weights of the scores of misplaced entries."""
 
     def change(artifact: SceneModel) -> SceneModel:
-        judged = artifact.calibration.misplaced
-        kinds = {kind: getattr(judged, kind) for kind in KINDS}
-        update = {kind: one and one.model_copy(update=entries) for kind, one in kinds.items()}
-        return _recalibrated(artifact, misplaced=judged.model_copy(update=update))
+        original = artifact.calibration.misplaced
+        fits = {kind: getattr(original, kind) for kind in KINDS}
+        update = {kind: fit and fit.model_copy(update=entries) for kind, fit in fits.items()}
+        return _recalibrated(artifact, misplaced=original.model_copy(update=update))
 
     return change
 

@@ -66,9 +66,8 @@ FIGURES = {
 
 # Trials are comparable only with the same scenes and seed.
 _FIXED = ("data.", "training.seed", "training.threads")
-# Pruning needs this number of finished trials, and starts after this percentage of the first phase.
-_RIVALS = 4
-_WARM_UP = 33
+_RIVALS = 4  # finished trials before pruning starts
+_WARM_UP = 33  # percentage of the first phase before pruning starts
 
 console = Console()
 
@@ -198,7 +197,6 @@ class Search:
         scores: dict[str, float] = {}
 
         def report(point: CurvePoint) -> None:
-            """Report the sum of the latest scores, and stop a trial below the median."""
             scores[SCORES[point.phase]] = point.score
             step = round(100 * point.done) + 100 * (point.phase == "relations")
             trial.report(float(np.nansum(list(scores.values()))), step)
@@ -267,18 +265,16 @@ def _write_best(
     search: Search, study: Study, original: Config, unchanged: Mapping[str, Metric]
 ) -> None:
     """Write the best configuration to best.toml, with the original number of steps."""
-    settings: dict[str, Any] = {}
-    best = unchanged
+    settings, best = dict[str, Any](), unchanged
     values = [trial.value for trial in study.trials if trial.value is not None]
     if max(values, default=-math.inf) > sum(metric.value for metric in unchanged.values()):
-        settings = study.best_params
-        best = search.metrics_of(settings)
+        settings, best = study.best_params, search.metrics_of(study.best_params)
     figures = ", ".join(f"{name} {metric.figure()}" for name, metric in best.items())
-    gains = (f"{name} {paired_difference(best[name], unchanged[name])}" for name in best)
+    differences = (f"{name} {paired_difference(best[name], unchanged[name])}" for name in best)
     comment = [
         f"{original.name}, {shown(settings)}.",
         f"Metrics on validation scenes, {search.config.objects.steps} steps: {figures}.",
-        f"Paired difference from {original.name}, optimistic: {', '.join(gains)}.",
+        f"Paired difference from {original.name}, optimistic: {', '.join(differences)}.",
     ]
     tuned = with_settings(original, settings).model_copy(update={"name": f"{original.name}-tuned"})
     path = search.folder / "best.toml"

@@ -1,10 +1,9 @@
 """`python -m training words`: how well a model reads words that it has no class for.
 
 The classes of `words.csv` are left out in five parts. Each becomes a word, whose weights are
-predicted from the other classes (`app.model.word_weights`). The real permissive scenes of the
-validation and test parts are listed in part, three times each. A score of a class is its log-odds
-given such a list. The AUC of a class compares the lists that hide the class with those of scenes
-without it. The command measures the mean AUC over the classes of these scores:
+predicted from the other classes (`app.model.word_weights`). The scenes of `REAL` in the validation
+and test parts are listed in part, three times each. The AUC of a class compares the lists that hide
+the class with those of scenes without it. The command measures the mean AUC of these scores:
 
 - predicted: the log-odds of the word,
 - nearest class: the log-odds of the class with the most similar word vector,
@@ -31,6 +30,8 @@ from typing import Annotated, Final
 
 import numpy as np
 import typer
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from scipy.stats import rankdata
 
 from app.inference.objects import ObjectScorer
@@ -40,9 +41,8 @@ from app.model.word_weights import RowMap
 from app.registry import DEFAULT_STORE, Store
 from app.scene import Vocabulary
 from app.scene.vocabulary import Word
-from app.scene.words import Vectors, word_vectors
+from app.scene.words import word_vectors
 from training.datasets import EncodedScene
-from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.cases import scene_rng
 from training.datasets.files import DATA, write_whole
 from training.domain.terminal import StorePath
@@ -73,22 +73,17 @@ EVIDENCE: Final = ("predicted", "nearest class", "trained", "left out")
 
 @dataclass(frozen=True)
 class Lists:
-    """Lists of parts of scenes.
+    """Lists of parts of scenes."""
 
-    Attributes:
-        listed: indices of the listed classes of each list.
-        hides, shows: True for the classes that a list hides and lists, (lists, V).
-    """
-
-    listed: list[Ints]
-    hides: Flags
-    shows: Flags
+    listed: list[Int[NDArray, " k"]]  # indices of the listed classes of each list
+    hides: Bool[NDArray, "lists V"]
+    shows: Bool[NDArray, "lists V"]
 
     @classmethod
     def draw(cls, scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> Lists:
         """Draw the lists. Structure is neither listed nor hidden."""
-        listed: list[Ints] = []
-        hidden: list[Ints] = []
+        listed: list[Int[NDArray, " k"]] = []
+        hidden: list[Int[NDArray, " k"]] = []
         for scene in scenes:
             classes = scene.evidence.classes[~vocabulary.structure[scene.evidence.classes]]
             for seed in range(_LISTS if len(classes) >= _LEAST else 0):
@@ -102,8 +97,10 @@ class Lists:
                 mask[row, classes] = True
         return cls(listed, *masks)
 
-    def auc(self, scores: Floats, classes: Ints) -> Floats:
-        """Return the AUC of each class, (n,), from scores of the lists, (lists, n)."""
+    def auc(
+        self, scores: Float[NDArray, "lists n"], classes: Int[NDArray, " n"]
+    ) -> Float[NDArray, " n"]:
+        """Return the AUC of each class from scores of the lists."""
         values = []
         for column, index in enumerate(classes.tolist()):
             hides = self.hides[:, index]
@@ -112,15 +109,15 @@ class Lists:
             values.append((ranks.sum() - n * (n + 1) / 2) / (n * (int(used.sum()) - n)))
         return np.array(values)
 
-    def mrr(self, scores: Floats, rows: Ints, classes: Ints) -> float:
-        """Return the mean reciprocal rank of the classes that some lists hide, NaN without any.
+    def mrr(
+        self,
+        scores: Float[NDArray, "rows candidates"],
+        rows: Int[NDArray, " rows"],  # indices of the lists
+        classes: Int[NDArray, " candidates"],
+    ) -> float:
+        """Return the MRR of the candidates that some lists hide; NaN without any.
 
         Other hidden classes do not count as errors.
-
-        Args:
-            scores: (rows, classes) scores of the candidates.
-            rows: indices of the lists.
-            classes: indices of the candidates.
         """
         ranks: list[float] = []
         for row, values in zip(rows, scores, strict=True):
@@ -165,9 +162,8 @@ def words(
             reader = _trained_without(left_out, artifact, settings, root) if train else artifact
             labels += [artifact.vocabulary.labels[index] for index in left_out.tolist()]
             vectors = vectors_of(artifact.vocabulary, left_out, aliases=aliases)
-            for total, part in zip(
-                (auc, mrr), measure(artifact, reader, lists, left_out, vectors), strict=True
-            ):
+            tables = measure(artifact, reader, lists, left_out, vectors)
+            for total, part in zip((auc, mrr), tables, strict=True):
                 for name, values in part.items():
                     total.setdefault(name, []).extend(values)
         folder.mkdir(parents=True, exist_ok=True)
@@ -181,20 +177,17 @@ def words(
 
 
 def summary(title: str, values: dict[str, list[float]]) -> list[str]:
-    """Return the mean of each method with its interval over the classes, as lines.
-
-    NaN is the value of a class without lists.
-    """
+    """Return the mean of each method with its interval over the classes, as lines."""
     table = {name: np.array(column) for name, column in values.items()}
-    known = np.isfinite(table["predicted"])
-    means = {name: Ratio.of_scenes(column[known]) for name, column in table.items()}
+    has_lists = np.isfinite(table["predicted"])
+    means = {name: Ratio.of_scenes(column[has_lists]) for name, column in table.items()}
     lead = paired_difference(means["predicted"], means["nearest class"])
-    lines = [f"{title}, mean over {int(known.sum())} classes:"]
+    lines = [f"{title}, mean over {int(has_lists.sum())} classes:"]
     lines += [f"  {name:24} {mean.figure()}" for name, mean in means.items()]
     return [*lines, f"  {'predicted - nearest class':24} {lead}"]
 
 
-def read_parts(path: Path, vocabulary: Vocabulary) -> list[Ints]:
+def read_parts(path: Path, vocabulary: Vocabulary) -> list[Int[NDArray, " n"]]:
     """Return the indices of the classes of each part of a table of parts and labels.
 
     Raises:
@@ -211,26 +204,23 @@ def read_parts(path: Path, vocabulary: Vocabulary) -> list[Ints]:
 
 
 def measure(
-    artifact: SceneModel, reader: SceneModel, lists: Lists, left_out: Ints, vectors: Vectors
+    artifact: SceneModel,
+    reader: SceneModel,  # reads the left-out classes as words; `artifact`, or one without them
+    lists: Lists,
+    left_out: Int[NDArray, " n"],
+    vectors: Float[NDArray, "n dimensions"],
 ) -> tuple[dict[str, list[float]], dict[str, list[float]]]:
-    """Return the AUC of each left-out class by `METHODS`, and the MRR by `EVIDENCE`.
-
-    Args:
-        artifact: model with all classes.
-        reader: model that reads the left-out classes as words; the same model, or one without
-            these classes.
-        vectors: (n, dimensions) word vectors of the left-out classes.
-    """
+    """Return the AUC of each left-out class by `METHODS`, and the MRR by `EVIDENCE`."""
     vocabulary, labels = reader.vocabulary, artifact.vocabulary.labels
     index_of = {label: index for index, label in enumerate(vocabulary.labels)}
     own = np.array([index_of.get(label, -1) for label in labels])
     unseen = own[left_out][own[left_out] >= 0].tolist()
     words = [labels[index] for index in left_out.tolist()]
-    read = [_word(*word, vocabulary, unseen) for word in zip(words, vectors, strict=True)]
-    weights = RowMap.fit(reader.weights, vocabulary, unseen).with_words(reader.weights, read)
+    new = [_word(*word, vocabulary, unseen) for word in zip(words, vectors, strict=True)]
+    weights = RowMap.fit(reader.weights, vocabulary, unseen).with_words(reader.weights, new)
     listed = [own[classes][own[classes] >= 0] for classes in lists.listed]
-    columns = np.arange(len(vocabulary), len(vocabulary) + len(read))
-    nearest = np.array([word.nearest for word in read])
+    columns = np.arange(len(vocabulary), len(vocabulary) + len(new))
+    nearest = np.array([word.nearest for word in new])
     of_words = log_odds(weights, listed, np.concatenate([columns, nearest]))
     trained = log_odds(artifact.weights, lists.listed, left_out)
     length = np.repeat([[float(len(one))] for one in lists.listed], len(left_out), axis=1)
@@ -242,21 +232,23 @@ def measure(
     for k, index in enumerate(left_out.tolist()):
         rows = np.flatnonzero(lists.shows[:, index])[:_SHOWN]
         rest = [lists.listed[row][lists.listed[row] != index] for row in rows]
-        known = [own[classes][own[classes] >= 0] for classes in rest]
+        without = [own[classes][own[classes] >= 0] for classes in rest]
         with_word, with_nearest = (
-            [np.union1d(classes, [one[k]]) for classes in known] for one in (columns, nearest)
+            [np.union1d(classes, [one[k]]) for classes in without] for one in (columns, nearest)
         )
         for name, one, parts, targets in (
             ("predicted", weights, with_word, own[things]),
             ("nearest class", weights, with_nearest, own[things]),
             ("trained", artifact.weights, [lists.listed[row] for row in rows], things),
-            ("left out", weights, known, own[things]),
+            ("left out", weights, without, own[things]),
         ):
             mrr[name].append(lists.mrr(log_odds(one, parts, targets), rows, things))
     return dict(zip(METHODS, auc, strict=True)), mrr
 
 
-def vectors_of(vocabulary: Vocabulary, left_out: Ints, *, aliases: bool) -> Vectors:
+def vectors_of(
+    vocabulary: Vocabulary, left_out: Int[NDArray, " n"], *, aliases: bool
+) -> Float[NDArray, "n dimensions"]:
     """Return the word vectors of the labels of some classes, or of the labels and aliases.
 
     Raises:
@@ -271,10 +263,12 @@ def vectors_of(vocabulary: Vocabulary, left_out: Ints, *, aliases: bool) -> Vect
     return np.stack(vectors)
 
 
-def _word(label: str, vector: Vectors, vocabulary: Vocabulary, unseen: Sequence[int]) -> Word:
+def _word(
+    label: str, vector: Float[NDArray, " d"], vocabulary: Vocabulary, unseen: Sequence[int]
+) -> Word:
     """Return a label as a word of its own, which no unseen class may explain."""
-    vectors, known = vocabulary.vectors
-    usable = known & ~vocabulary.structure
+    vectors, has_vector = vocabulary.vectors
+    usable = has_vector & ~vocabulary.structure
     usable[list(unseen)] = False
     cosines = np.where(usable, vectors @ vector, -1.0)
     return Word(label, vector, int(cosines.argmax()), float(cosines.max()))
@@ -286,8 +280,10 @@ def scorer_of(weights: Weights) -> ObjectScorer:
     return ObjectScorer(weights)
 
 
-def log_odds(weights: Weights, listed: Sequence[Ints], columns: Ints) -> Floats:
-    """Return the log-odds of some classes given each list, (lists, columns)."""
+def log_odds(
+    weights: Weights, listed: Sequence[Int[NDArray, " k"]], columns: Int[NDArray, " n"]
+) -> Float[NDArray, "lists n"]:
+    """Return the log-odds of some classes given each list."""
     scorer, scores = scorer_of(weights), np.zeros((len(listed), len(columns)))
     for row, classes in enumerate(listed):
         x = weights["c1"] + weights["W"][classes].sum(0)
@@ -297,16 +293,16 @@ def log_odds(weights: Weights, listed: Sequence[Ints], columns: Ints) -> Floats:
 
 
 def _trained_without(
-    left_out: Ints, artifact: SceneModel, config: Config, root: Path
+    left_out: Int[NDArray, " n"], artifact: SceneModel, config: Config, root: Path
 ) -> SceneModel:
     """Train a model without some classes. Their kinds have no parent."""
-    labels = {artifact.vocabulary.labels[index] for index in left_out.tolist()}
+    original = artifact.vocabulary
+    labels = {original.labels[index] for index in left_out.tolist()}
     kept = [
         replace(entry, parent=None) if entry.parent in labels else entry
-        for entry in artifact.vocabulary.objects
+        for entry in original.objects
         if entry.label not in labels
     ]
-    known = artifact.vocabulary
-    vocabulary = Vocabulary(kept, known.room_types, known.room_aliases)
+    vocabulary = Vocabulary(kept, original.room_types, original.room_aliases)
     data = prepare(config, root, vocabulary).training_data()
     return draft_artifact(Trainer(config, data).run().machine, vocabulary)

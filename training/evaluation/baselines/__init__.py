@@ -1,7 +1,4 @@
-"""The baselines that comparisons and the gate use as references.
-
-The baselines are the class frequencies, EASE, and frequency tables for relations and places.
-`training.research.baselines` has further baselines.
+"""The baselines of comparisons and of the gate; `training.research.baselines` has further ones.
 
 Baselines for objects learn from the same scenes as a machine: with its weights of scenes, without
 structure, and without classes that a data source cannot show. They are selected by the same

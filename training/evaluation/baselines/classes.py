@@ -37,18 +37,12 @@ class LinearScore:
 
 @dataclass(frozen=True, eq=False)
 class Lists:
-    """Training scenes as the object part of a machine learns from them.
+    """Training scenes as the object part of a machine learns from them."""
 
-    Attributes:
-        v: presence, without structure classes.
-        labelled: False for classes that the data source cannot show.
-        weight, index: weight of each scene, 1 in the mean; its index in training.
-    """
-
-    v: Float[Tensor, "scenes V"]
-    labelled: Bool[Tensor, "scenes V"]
-    weight: Float[Tensor, " scenes"]
-    index: Int[Tensor, " scenes"]
+    v: Float[Tensor, "scenes V"]  # without structure classes
+    labelled: Bool[Tensor, "scenes V"]  # False for classes that the data source cannot show
+    weight: Float[Tensor, " scenes"]  # 1 in the mean
+    index: Int[Tensor, " scenes"]  # in training
 
     def frequency(self) -> Float[Tensor, " V"]:
         """Return the share of scenes with each class among the labelled scenes."""

@@ -1,10 +1,9 @@
 """Common interface of all baselines: fit on training scenes, select on validation scenes.
 
 A baseline is a generator function. It fits a model on the training scenes for each point of a
-hyperparameter grid, and yields pairs (parameters, score). A neural network yields a pair for each
-candidate number of steps. `Baseline.fit` evaluates each score on the validation scenes: objects by
-`validation_score`, others by the primary metric of the task. It sends the value back to the
-generator function, which never sees the validation scenes.
+hyperparameter grid, or each candidate number of steps, and yields pairs (parameters, score).
+`Baseline.fit` evaluates each score on the validation scenes, and sends the value back to the
+generator function, which never sees these scenes.
 """
 
 from __future__ import annotations
@@ -63,13 +62,9 @@ def halving(
 ) -> Proposals[Score]:
     """Yield short fits of all settings, and longer fits of the best settings.
 
-    Source: K. Jamieson and A. Talwalkar, "Non-stochastic best arm identification and hyperparameter
-    optimization", AISTATS 2016.
-
-    Args:
-        fit: function of a setting and the share of the full length of the training. It yields
-            scores, with parameters in addition to the setting.
-        rungs: number of settings, and share of the full length, of each round.
+    `fit` yields scores of a setting for a share of the full length. A rung is a number of settings
+    and a share. Source: K. Jamieson and A. Talwalkar, "Non-stochastic best arm identification and
+    hyperparameter optimization", AISTATS 2016.
     """
     for count, share in rungs:
         best: list[float] = []
@@ -114,8 +109,6 @@ def _precision(scored: list[Candidates], scenes: SceneTensors) -> float:
 def named_moved(scenes: SceneTensors, structure: Structure, score: MisplacedScore) -> float:
     """Return the share of moved objects that are named first (T3c); 0 if no object can move.
 
-    At most `_SCENES` scenes take part.
-
     Raises:
         ValueError: no scene has a relation.
     """
@@ -126,17 +119,11 @@ def named_moved(scenes: SceneTensors, structure: Structure, score: MisplacedScor
 
 
 class Answer(NamedTuple):
-    """What a score answers.
-
-    Attributes:
-        fields: fields of `Model` that the score fills.
-        judge: function of validation scenes, structure classes and score; higher is better.
-        of_relations: True if the score learns from scenes with annotated relations.
-    """
+    """The fields of `Model` that a score fills, and its validation metric."""
 
     fields: tuple[str, ...]
-    judge: Callable[[SceneTensors, Tensor, Any], float]
-    of_relations: bool = True
+    judge: Callable[[SceneTensors, Tensor, Any], float]  # of validation scenes; higher is better
+    of_relations: bool = True  # True if the score learns from annotated relations
 
 
 OBJECTS: Final = Answer(("missing",), missing_mrr, of_relations=False)
@@ -149,17 +136,12 @@ MISPLACED: Final = Answer(("misplaced",), named_moved)
 
 @dataclass(frozen=True)
 class Baseline:
-    """One baseline, shown as one row of a result table.
-
-    Attributes:
-        propose: function of training scenes, structure classes and seed, see the module.
-        stochastic: True if the fit depends on the seed.
-    """
+    """One baseline, shown as one row of a result table."""
 
     name: str
-    propose: Callable[[SceneTensors, Tensor, int], Proposals[Any]]
+    propose: Callable[[SceneTensors, Tensor, int], Proposals[Any]]  # scenes, structure, seed
     answer: Answer = OBJECTS
-    stochastic: bool = False
+    stochastic: bool = False  # True if the fit depends on the seed
 
     def fit(
         self,
@@ -170,9 +152,7 @@ class Baseline:
         seed: int = 0,
         progress: Callable[[str], None] = lambda _: None,
     ) -> Model:
-        """Fit on training scenes, and select the best grid point on validation scenes.
-
-        If two grid points have the same metric, the first is the best.
+        """Fit on training scenes, and select the first best grid point on validation scenes.
 
         Raises:
             ValueError: scenes needed for fit or metric are missing.

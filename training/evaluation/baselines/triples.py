@@ -14,21 +14,16 @@ from torch import Tensor
 from training.datasets.batches import Batch, SceneTensors
 from training.evaluation.baselines.classes import frequency
 from training.evaluation.baselines.fitting import Proposals
-from training.evaluation.model import ObjectScore, PlacedScore, Places, RelationScore
+from training.evaluation.model import ObjectScore, PlacedScore, RelationScore
 from training.evaluation.setting import Structure
 
 
 @dataclass(frozen=True, eq=False)
 class TripleCounts:
-    """Numbers of scenes with annotated relations; 0 for structure, and for equal classes.
+    """Numbers of scenes with annotated relations; 0 for structure, and for equal classes."""
 
-    Attributes:
-        holds: number of scenes in which a relation holds, by relation, subject and object.
-        together: number of scenes that contain both classes.
-    """
-
-    holds: Float[Tensor, "A V V"]
-    together: Float[Tensor, "V V"]
+    holds: Float[Tensor, "A V V"]  # scenes in which a relation holds
+    together: Float[Tensor, "V V"]  # scenes that contain both classes
 
     def overall(self) -> Float[Tensor, " A"]:
         """Return the add-one smoothed probability of each relation over all pairs."""
@@ -65,14 +60,12 @@ def count_triples(scenes: SceneTensors, structure: Structure) -> TripleCounts:
 
 
 def table_score(log_odds: Float[Tensor, "A V V"], multiplicity: float = 0.0) -> RelationScore:
-    """Return the relation score log_odds[a, i, j] + g · log(n_i n_j).
+    """Return the relation score log_odds[a, i, j] + multiplicity · log(n_i n_j).
 
-    n_i and n_j are the instance counts of the classes, and g is `multiplicity`. The score ignores
-    observed relations. It is arbitrary for padding.
+    n_i and n_j are the instance counts. The score ignores observed relations.
     """
 
     def score(batch: Batch) -> Float[Tensor, "B A n n"]:
-        """Look up the log-odds of the classes of a batch, and add the weighted counts."""
         index = batch.classes.clamp(min=0)
         values = log_odds[:, index[:, :, None], index[:, None, :]].movedim(0, 1)
         if multiplicity:
@@ -128,10 +121,7 @@ _CORRECTIONS = (0.0, 0.25, 0.5, 1.0)
 
 
 def place_score(log_p: Float[Tensor, "2 A V V"]) -> PlacedScore:
-    """Return the score log p(i | a, j) of class i at the place (a, j).
-
-    `log_p` is a table over `Places.outgoing`, relation a, class j and class i.
-    """
+    """Return the score log p(i | a, j) of a table over `outgoing`, relation a, class j, class i."""
     return lambda places: log_p[places.outgoing.long(), places.relation, places.anchor]
 
 
@@ -145,12 +135,10 @@ def smoothed_log_p(
     p(i | a) is smoothed in the same way towards p(i), with m in place of s. p(i) is proportional to
     the popularity. s (`place`) and m (`relation`) are numbers of added cases.
     """
-    # In the second table, the removed class is the subject of the relation. The transpose puts the
-    # class j of the place first.
+    # The second table is of outgoing places. The transpose puts the class j of the place first.
     holds = torch.stack([counts.holds, counts.holds.mT])
     share = popularity / popularity.sum()
-    any_anchor = holds.sum(2)
-    back_off = any_anchor + relation * share
+    back_off = holds.sum(2) + relation * share
     back_off = back_off / back_off.sum(-1, keepdim=True)
     table = holds + place * back_off.unsqueeze(2)
     return (table / (holds.sum(-1, keepdim=True) + place)).log()
@@ -178,16 +166,10 @@ def propose_products(
     def product_score(
         weight: float, correction: float, log_popularity: Float[Tensor, " V"]
     ) -> PlacedScore:
-        """Return the score of one weight and one correction for the class frequency.
-
-        Both factors depend on the class frequency.
-        """
-
-        def score(places: Places) -> Float[Tensor, "B V"]:
-            added = weight * table(places) - correction * log_popularity
-            return objects(places.v) + added
-
-        return score
+        # Both factors depend on the class frequency, so the correction subtracts it.
+        return lambda places: (
+            objects(places.v) + (weight * table(places) - correction * log_popularity)
+        )
 
     def propose(train: SceneTensors, _structure: Structure, _seed: int) -> Proposals[PlacedScore]:
         log_popularity = frequency(train.v, train.weight).log()

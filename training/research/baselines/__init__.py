@@ -5,13 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from training.evaluation.baselines import EASE, FREQUENCY_TABLE, PLACED, POPULARITY, triples
-from training.evaluation.baselines.fitting import (
-    COMPLETION,
-    MISPLACED,
-    RELATIONS,
-    ROOMS,
-    Baseline,
-)
+from training.evaluation.baselines.fitting import COMPLETION, MISPLACED, RELATIONS, ROOMS, Baseline
 from training.research.baselines import (
     networks,
     object_models,

@@ -59,8 +59,7 @@ class NetworkScore:
     @torch.no_grad()
     def __call__(self, v: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
         """Return the score of each class; -inf for present and structure classes."""
-        listed = v * ~self.structure
-        values: Tensor = self.network(listed)
+        values: Tensor = self.network(v * ~self.structure)
         values = values.masked_fill((v > 0) | self.structure, -torch.inf)
         return values.log_softmax(1) if self.softmax else values
 
@@ -76,9 +75,7 @@ def train_network(
     loss: str,
     steps: int,
 ) -> Iterator[tuple[int, NetworkScore]]:
-    """Train a network. At each candidate step, yield the step and the score of averaged weights.
-
-    Scenes with fewer than two classes are left out.
+    """Train on scenes with two classes. Yield candidate steps, and scores of averaged weights.
 
     Raises:
         ValueError: all scenes have fewer than two classes.
@@ -163,9 +160,8 @@ def autoencoder(train: SceneTensors, structure: Structure, seed: int) -> Proposa
     lists = dict(training_lists(train, structure))
 
     def fit(setting: dict[str, Any], share: float) -> Iterator[tuple[Parameters, ObjectScore]]:
-        """Train one setting for a share of the steps."""
-        chosen, options = lists[setting["scenes"]], setting.copy()
-        options.pop("scenes")
+        options = setting.copy()
+        chosen = lists[options.pop("scenes")]
         sizes = {name: options.pop(name) for name in ("width", "dropout")}
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -174,5 +170,4 @@ def autoencoder(train: SceneTensors, structure: Structure, seed: int) -> Proposa
         for step, score in train_network(network, chosen, structure, seed, **options, steps=steps):
             yield {"steps": step}, score
 
-    settings = drawn_settings(scenes=tuple(lists), loss=LOSSES, **_AUTOENCODER)
-    return halving(settings, fit, _RUNGS)
+    return halving(drawn_settings(scenes=tuple(lists), loss=LOSSES, **_AUTOENCODER), fit, _RUNGS)

@@ -72,7 +72,6 @@ def nearest_score(lists: Lists, *, neighbours: int, sharpness: float) -> ObjectS
     index = normalize(lists.v, dim=1).T.contiguous()
 
     def score(query: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
-        """Let the nearest scenes of each list vote for their classes."""
         cosine = normalize(query, dim=1) @ index
         similarity, neighbour = cosine.topk(min(neighbours, len(v)), dim=1)
         # The vote of a training scene without a class of the query is 0.
@@ -190,8 +189,7 @@ class RbmScore:
         return torch.cat(blocks) + self.b
 
     def _hidden_log_odds(self, x: Float[Tensor, "B H1"]) -> Float[Tensor, "B V"]:
-        with_class = softplus(x.unsqueeze(2) + self.W)
-        return (with_class - softplus(x).unsqueeze(2)).sum(1)
+        return (softplus(x.unsqueeze(2) + self.W) - softplus(x).unsqueeze(2)).sum(1)
 
 
 def fit_annealed(

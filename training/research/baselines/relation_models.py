@@ -27,8 +27,7 @@ def relation_popularity(
 ) -> Proposals[RelationScore]:
     """Yield a single score: the log-odds of each relation over all pairs of classes."""
     counts = count_triples(train, structure)
-    overall = counts.overall().logit()[:, None, None]
-    yield {}, table_score(overall.expand_as(counts.holds))
+    yield {}, table_score(counts.overall().logit()[:, None, None].expand_as(counts.holds))
 
 
 # ComplEx: complex embeddings of classes. Complex numbers allow different scores for left(i, j) and
@@ -88,8 +87,7 @@ def complex_logits(
     """Return the logits d_a + Re <S_i, R_a, conj S_j>."""
     turned = classes * relations[:, None]
     # Re(x conj(y)) = Re x Re y + Im x Im y. Two real products are faster than a complex product.
-    real = turned.real @ classes.real.T + turned.imag @ classes.imag.T
-    return bias[:, None, None] + real
+    return bias[:, None, None] + (turned.real @ classes.real.T + turned.imag @ classes.imag.T)
 
 
 def complex_embedding(
@@ -122,8 +120,7 @@ _PENALTY = (0.0, 1.0, 3.0)
 def closure_score(table: RelationScore, bonus: float, penalty: float) -> RelationScore:
     """Return the score of a table, changed by logical rules.
 
-    The log-odds of implied relations get the bonus. Those of the reverse of observed or implied
-    relations lose the penalty.
+    Implied relations get the bonus. Reverses of observed or implied relations lose the penalty.
     """
 
     def score(batch: Batch) -> Float[Tensor, "B A n n"]:

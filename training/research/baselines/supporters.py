@@ -35,15 +35,12 @@ _GAMMA: Final = (0.0, 0.25, 0.5, 1.0)
 
 
 def supporter_score(
-    suspicion: Float[NDArray, "V V+1"], structure: Bool[NDArray, " V"]
+    suspicion: Float[NDArray, "V V+1"],  # of class i with supporter s; the last s is "nothing"
+    structure: Bool[NDArray, " V"],
 ) -> MisplacedScore:
-    """Return a score with an entry for each object whose supporter is observed, likeliest first.
-
-    `suspicion` is that of class i with supporter s; the last s is "nothing".
-    """
+    """Return a score with an entry for each object whose supporter is observed, likeliest first."""
 
     def score(scene: Scene) -> list[dict[str, Any]]:
-        """Return an entry for each object with its least suspicious supporter."""
         entries = [
             {"subject": name, "moved": name, "probability": float(expit(values.min()))}
             for index, object_class, supporters in _supporters(scene, structure)
