@@ -49,9 +49,7 @@ def plain_label(label: str) -> str:
     return name
 
 
-def plain_scenes(
-    scenes: Iterable[AnnotatedScene],
-) -> tuple[list[AnnotatedScene], Counter[str]]:
+def plain_scenes(scenes: Iterable[AnnotatedScene]) -> tuple[list[AnnotatedScene], Counter[str]]:
     """Return the scenes with plain labels and without placeholders, and the left-out labels."""
     left_out: Counter[str] = Counter()
     plain = []

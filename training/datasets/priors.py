@@ -26,11 +26,7 @@ _SKIPPED: Final = ("tidybot", "conceptnet_atlocation", "housekeep_votes", "vg80k
 
 
 def read_prior_scenes(path: Path) -> list[AnnotatedScene]:
-    """Read each row of a list of places as a scene of two objects and their relation.
-
-    Rows of other sources are skipped. All scenes have the source name `SOURCE`. Rows about the same
-    pair of objects are in one group.
-    """
+    """Read each row of a list of places as a scene of two objects. Rows of a pair are one group."""
     scenes, errors = [], Errors(path)
     for row in read_table(path, COLUMNS, errors):
         with errors:

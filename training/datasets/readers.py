@@ -66,10 +66,7 @@ class _Room(BaseModel):
 
 
 def read_3dssg(path: Path) -> list[AnnotatedScene]:
-    """Read the scans, or splits of scans, in a relationships file of 3DSSG as scenes.
-
-    All scans of a room are in one group. The official files contain no room types and no poses.
-    """
+    """Read the scans, or splits of scans, as scenes. All scans of a room are in one group."""
     scans = read_json(path, _Scans).scans
     rooms = read_json(path.with_name("3RScan.json"), list[_Room])
     room_of = {scan.reference: room.reference for room in rooms for scan in (room, *room.scans)}
@@ -131,11 +128,7 @@ class _Instances(BaseModel):
 
 
 def read_coco(path: Path) -> list[AnnotatedScene]:
-    """Read the images of a COCO file as scenes. Images without objects are skipped.
-
-    Boxes around crowds are also skipped, because they contain several objects. Boxes are in the
-    image plane. Encoding later derives the relations left and above from boxes.
-    """
+    """Read the images of a COCO file as scenes, without empty images and boxes around crowds."""
     content = read_json(path, _Instances)
     categories = {category.id: category.name for category in content.categories}
     images: dict[int, dict[int, AnnotatedObject]] = {image.id: {} for image in content.images}

@@ -134,10 +134,7 @@ class AnnotatedScene:
                 )
 
     def only(self, kept: Sequence[int]) -> AnnotatedScene:
-        """Return the scene with some of its objects, whose indices are given in ascending order.
-
-        A relation or support link to another object is left out.
-        """
+        """Return the scene with the objects at ascending indices and their relations."""
         index_of = {old: new for new, old in enumerate(kept)}
         ids = {self.objects[k].id for k in kept}
 

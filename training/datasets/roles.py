@@ -32,11 +32,7 @@ Role = tuple[int, int, int]
 
 
 def count_roles(scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary) -> RoleCounts:
-    """Count the roles that scenes state by listed relations.
-
-    Each group of near-duplicate scenes counts once. A pair of classes also counts for its kin, with
-    half the weight: pairs with the parent or a kind of a class. Structure has no roles.
-    """
+    """Count the roles in listed relations, once in each group of near-duplicate scenes."""
     index = cache(vocabulary.index)
     stated: set[tuple[str, str, Role]] = set()
     for scene in scenes:

@@ -101,11 +101,7 @@ class _Box:
 
 
 def generate_rooms(count: int, seed: int, rooms: Rooms = ROOMS) -> list[AnnotatedScene]:
-    """Generate scenes. The same seed gives the same scenes. `DOMAINS` has other rooms.
-
-    Positions are in viewer axes. Objects have sizes, yaws, and the id of the furniture below them
-    (``supported_by``). ``relations`` is None, because encoding derives the relations.
-    """
+    """Generate scenes in viewer axes. The same seed gives the same scenes."""
     if count < 0:
         raise ValueError(f"count must not be negative, not {count}")
     rng, number = np.random.default_rng(seed), 0

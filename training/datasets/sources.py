@@ -119,10 +119,7 @@ _OWN_INVENTORY: Final = replace(SOURCES["inventories"], terms="", left_out=())
 
 
 def is_inventory(name: str) -> bool:
-    """Return True for the name of a written inventory: of a user's table, or of the repository's.
-
-    The table of a user is a source that keeps the name of its file, such as "ward.csv".
-    """
+    """Return True for the inventory of the repository, and a user's table such as "ward.csv"."""
     return name == "inventories" or name.casefold().endswith(".csv")
 
 
@@ -132,10 +129,7 @@ def source_of(name: str) -> Source:
 
 
 def meaning_of(source: str, *, listed: bool = True) -> Meaning:
-    """Return the meaning of relations and objects that a data source does not list.
-
-    It depends on whether the scene lists relations, except for sources with a fixed meaning.
-    """
+    """Return the meaning of unlisted relations and objects: that of the source, or by `listed`."""
     return source_of(source).meaning or (LISTS if listed else BOXES)
 
 
@@ -151,12 +145,9 @@ def relation_of(source: str, predicate: str) -> str | None:
 def relations_of(
     source: str, triples: Iterable[tuple[int, str, int]]
 ) -> tuple[tuple[int, str, int], ...]:
-    """Translate triples (subject, predicate, object) of a data source into distinct relations.
-
-    Predicates that are no relation of the service are skipped. Some image annotators relate an
-    object to itself. Such triples are also skipped.
-    """
+    """Translate triples (subject, predicate, object) into distinct relations of the service."""
     relations = [(i, relation_of(source, predicate), j) for i, predicate, j in triples]
+    # Some image annotators relate an object to itself.
     return tuple(dict.fromkeys((i, name, j) for i, name, j in relations if name and i != j))
 
 

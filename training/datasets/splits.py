@@ -87,11 +87,7 @@ def _stable_part(unit: str, seed: int) -> Part:
 def _families(
     scenes: Sequence[AnnotatedScene], units: Sequence[str]
 ) -> Sequence[Mapping[str, Counter[str]]]:
-    """Count the room types of each unit (group or scene), for each set of connected data sources.
-
-    Data sources are connected if they have common units. A unit is counted only in its largest
-    source, so that a small source cannot change the parts of a large source.
-    """
+    """Count the room types of each unit, for each set of data sources that share units."""
     sources_of: dict[str, set[str]] = defaultdict(set)
     sizes: Counter[str] = Counter()
     for scene, unit in zip(scenes, units, strict=True):
@@ -106,6 +102,7 @@ def _families(
     families = defaultdict(lambda: defaultdict(Counter))
     names = curated_names()
     for scene, unit in zip(scenes, units, strict=True):
+        # Only in its largest source: a small source cannot change the parts of a large one.
         if scene.source == max(sources_of[unit], key=lambda source: (sizes[source], source)):
             room = names.canonical_room(scene.room_type) or ""
             families[family_of[scene.source]][unit][room] += 1
@@ -115,12 +112,8 @@ def _families(
 def _assign(
     rooms_of: Mapping[str, Counter[str]], fractions: Mapping[Part, float], seed: int
 ) -> dict[str, Part]:
-    """Assign each unit to the part that is furthest below its target share of scenes.
-
-    The stratum of a unit is its most common room type. Large strata are assigned first, and a hash
-    orders the units within a stratum. The distance from the target is counted within the stratum
-    and over all scenes. Otherwise, all units of small strata would become training scenes.
-    """
+    """Assign each unit to the part that is furthest below its target share of scenes."""
+    # The stratum of a unit is its most common room type. Large strata are assigned first.
     strata: dict[str, list[str]] = defaultdict(list)
     for unit, rooms in rooms_of.items():
         strata[min(rooms, key=lambda room: (-rooms[room], room))].append(unit)
@@ -134,6 +127,7 @@ def _assign(
             lack = {
                 part: sum(
                     fraction * (counts.total() + weight[unit]) - counts[part]
+                    # Within the stratum alone, small strata would become training scenes.
                     for counts in (in_stratum, overall)
                 )
                 for part, fraction in fractions.items()

@@ -103,11 +103,10 @@ class Row:
 def read_table(
     path: Path, columns: Sequence[str], errors: Errors, optional: Sequence[str] = ()
 ) -> Iterator[Row]:
-    """Yield the rows of a table in UTF-8, whose first line names the columns.
+    """Yield the rows of a UTF-8 table that has the `columns`, and may have the `optional` ones.
 
-    Spaces around values are removed. Blank lines are skipped. A row with another number of values
-    is left out, and an error of the file ends the table. Both are added to the errors. The file has
-    the `columns`, and may have the `optional` ones. Any other named column is an error.
+    Spaces around values are removed. Invalid rows are left out, and an error of the file ends the
+    table. Both are added to the errors.
     """
     line = 1
     try:

@@ -40,9 +40,8 @@ def read_things(path: Path) -> dict[str, Thing]:
     """Read the things by label, in the order of the file.
 
     Raises:
-        DatasetError: the file cannot be read, a value is invalid, a label occurs twice, a parent
-            has no row, or the parents of a thing lead back to it. The error names the file, the
-            line and the column. It is an InvalidLinesError if there are several errors.
+        DatasetError: the file or a value is invalid, a label occurs twice, a parent has no row, or
+            parents form a loop. It names line and column; InvalidLinesError: several errors.
     """
     things: dict[str, Thing] = {}
     rows: dict[str, Row] = {}

@@ -69,10 +69,7 @@ class HomeScenes(Table):
 def adapt(
     parent: Weights, scenes: HomeScenes, *, trained_on: TrainedOn | None = None, seed: int = 0
 ) -> Weights:
-    """Return the weights of the parent, adapted to scenes of two or more classes.
-
-    Without `trained_on`, training scenes of the parent show all classes and room types.
-    """
+    """Return the parent's weights, adapted to scenes. Default of `trained_on`: everything."""
     scenes = scenes.rows(scenes.v.sum(1) >= 2)
     if not len(scenes):
         raise ValueError("no recorded scene has two known objects")
@@ -86,15 +83,9 @@ def adapt(
 
 
 def part_loss(
-    log_odds: Float[Tensor, "N V"],
-    target: Float[Tensor, "N V"],
-    scenes: HomeScenes,
-    parts: Parts,
+    log_odds: Float[Tensor, "N V"], target: Float[Tensor, "N V"], scenes: HomeScenes, parts: Parts
 ) -> Float[Tensor, "N"]:
-    """Return the cross-entropy of the classes that random parts of scenes do not list.
-
-    The log-odds are those of a machine given the parts, and the targets are probabilities.
-    """
+    """Return the cross-entropy of the unlisted classes of parts; targets are probabilities."""
     weight = scenes.observed * (1 - parts.listed)
     weight = weight * torch.where(scenes.v > 0, parts.weight.unsqueeze(1), 1.0)
     return binary_cross_entropy_with_logits(log_odds, target, weight, reduction="none").sum(1)

@@ -172,15 +172,13 @@ def _part_of(scene: Scene, rng: Rng) -> Scene:
 def _truth(
     entries: Entries, wrong: Triple | int | None
 ) -> tuple[Bool[NDArray, "n"], Bool[NDArray, "n"]]:
-    """Return which entries are wrong, and for which of them the truth is annotated.
-
-    A moved object makes its own support wrong. Its other relations may be right or wrong.
-    """
+    """Return which entries are wrong, and for which of them the truth is annotated."""
     every = np.ones(len(entries.kind), np.bool_)
     if wrong is None:
         return ~every, every
     if isinstance(wrong, tuple):
         return (entries.triple == np.array(wrong)).all(1), every
+    # Other relations of a moved object may be right or wrong.
     is_wrong = (entries.mover == wrong) & (entries.kind != BESIDE)
     return is_wrong, (entries.triple[:, 1:] != wrong).all(1) | is_wrong
 
@@ -239,14 +237,11 @@ def _line(points: Sequence[tuple[float, float]], least: float) -> AlarmLine:
 
 
 def hardest_quantile(values: Float[NDArray, "N"], sources: NDArray[np.str_], share: float) -> float:
-    """Return the highest quantile of the values over the large sources.
-
-    A robot sees scenes of one source. Small sources count as one. A value equal to the quantile is
-    below it.
-    """
+    """Return the highest quantile over the large sources, since a robot sees one source."""
     names, sizes = np.unique(sources, return_counts=True)
     small = np.isin(sources, names[sizes < _SOURCE_SCENES])
     parts = [sources == name for name in names[sizes >= _SOURCE_SCENES]]
     parts += [small] if small.any() else []
     highest = max(float(np.quantile(values[part], share)) for part in parts)
+    # A value equal to the quantile is below it.
     return float(np.nextafter(highest, np.inf))

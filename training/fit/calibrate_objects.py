@@ -83,18 +83,13 @@ _SOURCE_SCENES = 200  # maximum scenes of each source
 def calibrate_objects(
     artifact: SceneModel,
     validation: SceneTensors,
-    train: SceneTensors,
-    popularity: Float[Tensor, "V"],
-    sources: Collection[str],
+    train: SceneTensors,  # gives the intruders, and limits for room types
+    popularity: Float[Tensor, "V"],  # log-odds in the served mix; NaN without training scenes
+    sources: Collection[str],  # see `calibration_scenes`
     seed: int = 0,
-    chosen: Calibration | None = None,
+    chosen: Calibration | None = None,  # coverage and alpha are copied
 ) -> Calibration:
-    """Return the model's calibration with newly fitted entries about objects.
-
-    The training scenes give the intruders, and limits for room types. The coverage and alpha of a
-    `chosen` calibration are copied. `popularity` is the log-odds of each class in the served mix;
-    NaN for a class without a training scene. The `sources` are those of `calibration_scenes`.
-    """
+    """Return the model's calibration with newly fitted entries about objects."""
     scenes = calibration_scenes(validation, sources)
     learnt = complete_scenes(train, seed)
     rounded = tuple(None if math.isnan(x) else round(x, 4) for x in popularity.double().tolist())
@@ -106,10 +101,7 @@ def calibrate_objects(
 
 
 def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
-    """Return the scenes with complete object lists, or all scenes if no list is complete.
-
-    A near-duplicate scene is kept with a probability equal to its weight.
-    """
+    """Return the scenes with complete lists, else all. The weight is the chance of a scene."""
     rng = np.random.default_rng(seed)
     complete = scenes.complete.numpy()
     complete = complete if complete.any() else ~complete
@@ -118,11 +110,7 @@ def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
 
 
 def calibration_scenes(scenes: SceneTensors, sources: Collection[str]) -> SceneTensors:
-    """Return the scenes of the named sources with at least 20 scenes.
-
-    Without such a source, they are all scenes with complete object lists. At most 200 scenes of a
-    source take part.
-    """
+    """Return 20 to 200 scenes of each of the sources; without any, complete scenes of all."""
     names, size = scenes.source_names, scenes.source.bincount(minlength=len(scenes.source_names))
     chosen = [
         index for index, name in enumerate(names) if name in sources and size[index] >= LEAST_SCENES
@@ -224,10 +212,7 @@ def _mean_rank(z: Float[NDArray, "N V"], parts: _Lists) -> float:
 def _first_classes(
     z: Float[NDArray, "N V"], parts: _Lists
 ) -> tuple[Float[NDArray, "k"], Int[NDArray, "k"], Bool[NDArray, "k"]]:
-    """Return log-odds, part and truth of the first classes of each part.
-
-    Classes that the data source cannot show are left out, because their truth is unknown.
-    """
+    """Return log-odds, part and truth of the first classes that the source of a part can show."""
     first = np.argsort(np.where(parts.candidates, -z, np.inf), axis=1, kind="stable")[:, :_LISTED]
     rows = np.broadcast_to(np.arange(len(z))[:, None], first.shape)
     # A small vocabulary has fewer candidates.
@@ -264,12 +249,7 @@ def fit_outliers(
     train: SceneTensors,
     chosen: Calibration | None = None,
 ) -> dict[str, Any]:
-    """Fit the calibration of outliers on random parts of scenes, with and without an intruder.
-
-    The training scenes give the distributions of intruders. A `chosen` calibration gives alpha. The
-    entries are `popularity_weight`, `outlier`, `outlier_lines` and `room_lines`; none if there are
-    too few scenes or parts.
-    """
+    """Fit the calibration of outliers on random parts of scenes, with and without an intruder."""
     if len(scenes) < LEAST_SCENES:
         return {}
     untouched = score_untouched(artifact, scenes)
@@ -327,10 +307,7 @@ def score_lists(
 def score_untouched(
     artifact: SceneModel, scenes: SceneTensors, *, in_room: bool = False
 ) -> dict[int, ListScores]:
-    """Return the scores of random parts of scenes by length, without lengths of too few parts.
-
-    With `in_room`, the request states the room type, and scenes without a type are left out.
-    """
+    """Return the scores of random parts by length; with `in_room`, given the room type."""
     if in_room:
         scenes = subset(scenes, scenes.room >= 0)
     scores: dict[int, ListScores] = {}
@@ -393,10 +370,7 @@ def _fit_intruders(
 def fit_lines(
     artifact: SceneModel, scenes: SceneTensors, entry: CountSlope, alpha: float
 ) -> dict[str, AlarmLines | None]:
-    """Return the fields `outlier_lines` and `room_lines` of a `Calibration`.
-
-    A field is None if there are too few lists for it.
-    """
+    """Return the lines of a `Calibration` without and with the room type; None with few lists."""
     fields: dict[str, AlarmLines | None] = {}
     for name, in_room in (("outlier_lines", False), ("room_lines", True)):
         untouched = score_untouched(artifact, scenes, in_room=in_room)
@@ -409,14 +383,10 @@ def fit_lines(
 def fit_line(worst: Mapping[int, Float[NDArray, "N"]], share: float) -> AlarmLine:
     """Return a line above which about `MARGIN` times the share of the lists has an object.
 
-    `worst` has the largest log-odds of each list by the length of the lists.
-
-    The shape of the line is the least-squares parabola in the log of the length through the
-    quantiles of the lengths, weighted by the square roots of their numbers of lists. A parabola,
-    because short lists say little, and long lists of written places contain rare things. With fewer
-    than five lengths, the shape is a straight line, and with fewer than three, it is constant. The
-    quantiles are those of medium sensitivity, so the lines of two sensitivities never cross. The
-    intercept is such that the mean share over the lengths is right.
+    `worst` has the largest log-odds of each list by length. The shape is the weighted parabola in
+    the log of the length through the quantiles of medium sensitivity, so two lines never cross:
+    short lists say little, and long ones contain rare things. Below five lengths it is a straight
+    line, below three a constant. The intercept makes the mean share over the lengths right.
     """
     sizes, lists = np.log(list(worst)), list(worst.values())
     quantiles = [np.quantile(values, 1 - MARGIN * ALARMS["medium"]) for values in lists]

@@ -25,10 +25,7 @@ def is_file(source: str) -> bool:
 
 
 def source_name(source: str) -> str:
-    """Return the name of a source; for a file of scenes, its name before the first dot.
-
-    An inventory keeps the whole name of its file (`is_inventory`).
-    """
+    """Return the name of a source: of a file of scenes before the first dot, else the whole."""
     name = Path(source).name
     return name.partition(".")[0] if is_file(source) and not is_inventory(name) else name
 

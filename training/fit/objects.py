@@ -111,10 +111,7 @@ class ObjectScenes:
 
     @property
     def shows_rooms(self) -> Bool[Tensor, "sources 1"]:
-        """True for each source with scenes of two room types.
-
-        A source of bedrooms alone does not show how common bedrooms are.
-        """
+        """True for a source of two room types: one of bedrooms cannot show their frequency."""
         kinds = [self.room[self.source == q] for q in range(len(self.sources))]
         return torch.tensor([[len(room[room >= 0].unique()) > 1] for room in kinds])
 
@@ -138,10 +135,7 @@ class Parts(NamedTuple):
 def random_parts(
     v: Float[Tensor, "B V"], leave_one_out: float, generator: torch.Generator
 ) -> Parts:
-    """List a random part of the classes v of each scene, with at least one class hidden.
-
-    A share `leave_one_out` of the scenes hides one class.
-    """
+    """List a random part of each scene; a share `leave_one_out` of the parts hides one class."""
     n = v.sum(1)
     hides_one = torch.rand(len(v), generator=generator) < leave_one_out
     share = _LEAST_SHARE + (1 - _LEAST_SHARE) * torch.rand(len(v), generator=generator)
@@ -155,10 +149,7 @@ def random_parts(
 
 
 class ObjectFit:
-    """The fit of the object weights of a machine. It can stop after each step and continue.
-
-    `steps` counts the finished steps, and `loss` is that of the last step.
-    """
+    """The fit of the object weights of a machine. It can stop after each step and continue."""
 
     def __init__(
         self, machine: BoltzmannMachine, scenes: ObjectScenes, config: ObjectsConfig, seed: int
@@ -258,10 +249,7 @@ class ObjectFit:
         room: Int[Tensor, "B"],
         source: Int[Tensor, "B"],
     ) -> Float[Tensor, ""]:
-        """Return F(scenes) - F(chains) after a sweep of the chains, which keep their room types.
-
-        F is the free energy given the room types, because the chains do not draw them.
-        """
+        """Return F(scenes) - F(chains) given the room types, which the chains keep."""
         sweep(self.machine, chains, self._generator, classes=self.config.classes_per_sweep)
         n = len(v)
         v, room, source = (
@@ -290,8 +278,7 @@ class ObjectFit:
     def finish(self) -> None:
         """Set the weights to their average, with the base rates of the served mix in b.
 
-        Afterwards, a[q] is the difference of source q from the served mix. f are the log weights of
-        the mix, plus what training added to the log sizes of the sources.
+        Then a[q] is the difference of source q from the mix, whose log weights replace sizes in f.
         """
         for name, weight in self._weights.items():
             weight.copy_(self._average[name])
@@ -316,21 +303,14 @@ def with_served_rates(
     shows: Bool[Tensor, "sources k|1"],
     served: Float[Tensor, "sources"],
 ) -> tuple[Float[Tensor, "sources k"], Float[Tensor, "k"]]:
-    """Return rates a or y in which the served mean replaces rates that a source does not show.
-
-    The second result is the served mean: the mean over the sources that show the class or the room
-    types, with the weights of the served mix.
-    """
+    """Return rates a or y, completed by the mean over the served sources, and this mean."""
     weights = served.unsqueeze(1) * shows
     mean = (weights * rates).sum(0) / weights.sum(0).clamp(min=1e-9)
     return torch.where(shows, rates, mean), mean
 
 
 def served_popularity(scenes: ObjectScenes, config: ObjectsConfig) -> Float[Tensor, "V"]:
-    """Return the log-odds that a scene of the served mix has each class.
-
-    The value is NaN for a class that no scene shows.
-    """
+    """Return the log-odds of each class in a scene of the served mix; NaN without scenes."""
     count = torch.zeros(scenes.shows.shape)
     count.index_add_(0, scenes.source, scenes.v * scenes.weight.unsqueeze(1))
     share = (count + 0.5) / (scenes.source_sizes.unsqueeze(1) + 1)

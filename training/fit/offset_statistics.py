@@ -45,11 +45,7 @@ _RESOLUTION: Final = 0.005
 
 
 def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
-    """Fit the distribution of offsets. Return None if no scene has poses.
-
-    All offsets of a pair of classes in one scene have a total weight of 1, because they depend on
-    each other. All data sources have the same total weight.
-    """
+    """Fit the distribution of offsets, with equal weights of sources; None without poses."""
     observed = observed_offsets(scenes)
     if not len(observed.offset):
         return None
@@ -152,8 +148,7 @@ class _Fit:
     def tables(self) -> tuple[Float[NDArray, "6"], Float[NDArray, "2 V 6"]]:
         """Return tables whose sum gives mean and variance of a pair without data, as `predict`.
 
-        The first table contains three means and three variances for unknown classes, and the other
-        the contributions of the subject and of the object class.
+        They are those of unknown classes, and the contributions of subject and object class.
         """
         spread, unknown = self.beta / (self.alpha - 1), 1 / LAMBDA
         relation = np.concatenate([self.mu, spread * (1 + (1 + 2 * unknown) / self.kappa)])
@@ -166,10 +161,7 @@ Prior = tuple[Any, Any, Any, Any]
 
 
 def posterior(prior: Prior, n: Any, mean: Any, scatter: Any) -> tuple[Any, Any]:
-    """Return mean and variance of a new value given n values with this mean and scatter.
-
-    The scatter is the sum of the squared deviations. alpha + n / 2 must be above 1.
-    """
+    """Return mean and variance of a new value given n values; alpha + n / 2 is above 1."""
     after, shape, rate = _updated(prior, n, mean, scatter)
     expected, kappa, _, _ = prior
     return (kappa * expected + n * mean) / after, rate / (shape - 1) * (1 + 1 / after)
@@ -218,11 +210,7 @@ def _fit_prior(pairs: _Pairs, axis: int, expected: Float[NDArray, "P"]) -> Float
 
 
 def _fit_effects(fit: _Fit, pairs: _Pairs, V: int) -> None:
-    """Fit mu and the effects u and v of V classes, in place.
-
-    The function updates mu, u and v in turn, `_SWEEPS` times. Each update is a fit by weighted
-    least squares, given the other two. The ridge penalty `LAMBDA` shrinks u and v towards 0.
-    """
+    """Fit mu, u and v in turn by weighted least squares, with the ridge penalty `LAMBDA`."""
     subject, object_ = pairs.subject, pairs.object
     # Precision of the mean offset of each pair as a measurement of u and v, in units of kappa / s.
     weight = pairs.n / (pairs.n + fit.kappa)

@@ -66,11 +66,7 @@ SHARED = ("S", "O", "s", "o")  # weights that classes share
 
 
 class RelationFit:
-    """The fit of the relation weights of a machine: epochs over the scenes with annotations.
-
-    `epochs` counts the finished epochs. `offsets` are the corrections of the logits for each data
-    source, (sources, A).
-    """
+    """The fit of the relation weights of a machine: epochs over the scenes with annotations."""
 
     def __init__(
         self, machine: BoltzmannMachine, train: SceneTensors, config: RelationsConfig, seed: int
@@ -80,8 +76,9 @@ class RelationFit:
         self.train = subset(train, torch.tensor(annotated, dtype=torch.int64))
         sizes = [len(scene.evidence.classes) for scene in self.train.scenes]
         self._log_sizes = torch.tensor(sizes).clamp(1, _MOST_CLASSES).log()
-        self.epochs = self._updates = 0
+        self.epochs = self._updates = 0  # finished
         self._generator = torch.Generator().manual_seed(seed)
+        # Corrections of the logits for each data source.
         self.offsets = nn.Parameter(torch.zeros(len(train.source_names), machine.spec.A))
         self._source_weights = torch.tensor(
             [config.source_weights.get(name, 1.0) for name in train.source_names]
@@ -97,10 +94,7 @@ class RelationFit:
         )
 
     def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
-        """Return the negative log-likelihood plus the negative log prior, divided by scenes.
-
-        The likelihood is divided by the scenes of the batch, and the prior by those of an epoch.
-        """
+        """Return -log likelihood / scenes of the batch - log prior / scenes of an epoch."""
         machine = self.machine
         if self.config.count_dropout:
             hidden = torch.rand(len(batch), 1, generator=generator) < self.config.count_dropout
@@ -137,10 +131,7 @@ class RelationFit:
         return self.epochs >= self.config.epochs or not len(self.train)
 
     def epoch(self, progress: Callable[[float, float], None]) -> float:
-        """Run one epoch, and return its mean loss. Raise FloatingPointError if it is not finite.
-
-        It calls `progress` with the finished share of the fit and the mean loss.
-        """
+        """Run an epoch and return its mean loss. Raise FloatingPointError if it is not finite."""
         batches = self._batches()
         total = 0.0
         for number, index in enumerate(batches, 1):
@@ -210,10 +201,7 @@ class RelationFit:
             weight.copy_(values[name])
 
     def finish(self, parents: Int[Tensor, "V"]) -> BoltzmannMachine:
-        """Return the machine for storage, with averaged weights and counted residuals.
-
-        `parents` are the parents of the classes; -1 without a parent.
-        """
+        """Return the machine for storage, with averaged weights and counted residuals."""
         self._set(self._average)
         machine = self.machine
         bake_shared_weights(machine, SHARED)
@@ -232,19 +220,15 @@ def _nll(
 
 
 class Sharing(nn.Module):
-    """Add the parent's deviation and a trained map of word vectors to the weights of each class.
-
-    A class has `width` weights. With `columns`, the weights have the shape (width, V), else
-    (V, width). Word vectors are 0 where unknown, and parents -1.
-    """
+    """Add the parent's deviation and a trained map of word vectors to the weights of each class."""
 
     def __init__(
         self,
-        words: Float[Tensor, "V D"],
-        parents: Int[Tensor, "V"],
-        width: int,
+        words: Float[Tensor, "V D"],  # 0 where unknown
+        parents: Int[Tensor, "V"],  # -1 without a parent
+        width: int,  # weights of a class
         *,
-        columns: bool,
+        columns: bool,  # the weights have the shape (width, V), else (V, width)
     ) -> None:
         super().__init__()
         self.words, self.parents, self.columns = words, parents, columns

@@ -68,11 +68,7 @@ def _log_odds(p: Float[NDArray, "V"], sweeps: int) -> Float[NDArray, "V"]:
 
 
 def store_samples(machine: BoltzmannMachine, scenes: ObjectScenes, seed: int) -> None:
-    """Store N samples in the machine, in place.
-
-    Each chain starts at a training scene, with the served base rates, and keeps the room type of
-    that scene. Scenes are drawn in proportion to their weights.
-    """
+    """Store N states of chains from training scenes, drawn by weight, in the machine."""
     if not machine.spec.N:
         return
     generator = torch.Generator().manual_seed(seed)

@@ -33,11 +33,7 @@ class Edges:
 
 @dataclass(frozen=True)
 class PairEdges(Edges):
-    """All A·n² units between the n classes of each scene.
-
-    The units of a scene have the flattened layout (relations, subjects, objects). With this layout,
-    shared weights need only small matrix products.
-    """
+    """All A·n² units between the n classes of each scene, as flattened tables (A, n, n)."""
 
     classes: Int[Tensor, "B n"]  # padding is 0
     log_counts: Float[Tensor, "B n"]  # log of the number of instances of each class
@@ -51,10 +47,7 @@ class PairEdges(Edges):
 def pair_edges(
     classes: Int[Tensor, "B n"], relations: int, log_counts: Float[Tensor, "B n"] | None = None
 ) -> PairEdges:
-    """Return the units of `relations` canonical relations between the classes; -1 is padding.
-
-    Without `log_counts`, each class has one instance.
-    """
+    """Return the units between the classes (-1: padding), by default with one instance of each."""
     B, n = classes.shape
     exists, classes = classes >= 0, classes.clamp(min=0)
     subject, object_ = classes[:, None, :, None], classes[:, None, None, :]

@@ -39,10 +39,7 @@ def sweep(
     *,
     classes: int | None = None,
 ) -> None:
-    """Run one Gibbs sweep, in place.
-
-    A sweep over coupled classes draws a number of random `classes`. None means all.
-    """
+    """Run one Gibbs sweep, in place. It draws some random coupled `classes`, by default all."""
     h1 = draw_states(machine.hidden_logits(chains.v, chains.room), machine.spec.states, generator)
     bias = machine.scene_bias(chains.source) + machine.room_bias(chains.room)
     field = bias + h1 @ machine.W.T
@@ -57,10 +54,7 @@ def sweep(
 def draw_states(
     x: Float[Tensor, "B H1"], states: int, generator: torch.Generator
 ) -> Float[Tensor, "B H1"]:
-    """Draw the states h1 of hidden units with the logits x.
-
-    Each unit has `states` states. Its first state has the logit 0 and no entry in x.
-    """
+    """Draw the states h1 from the logits x, in which the first state of a unit has no entry."""
     if states == 2:
         return torch.bernoulli(x.sigmoid(), generator=generator)
     logits = x.unflatten(-1, (-1, states - 1))

@@ -129,10 +129,7 @@ class BoltzmannMachine(nn.Module, ABC):
 
     @property
     def couplings(self) -> Float[Tensor, "V V"] | None:
-        """The couplings between classes, symmetric with a diagonal of 0, or None.
-
-        L starts at 0, and each step of the training changes it by a symmetric matrix.
-        """
+        """The symmetric couplings between classes, with a diagonal of 0, or None."""
         return self.L if self.spec.coupled else None
 
     def by_unit(self, x: Float[Tensor, "... H1"]) -> Float[Tensor, "... units states-1"]:
@@ -163,20 +160,13 @@ class BoltzmannMachine(nn.Module, ABC):
     def hidden_log_odds(
         self, x: Float[Tensor, "B H1"], weights: Float[Tensor, "rows H1"]
     ) -> Float[Tensor, "B rows"]:
-        """Return what h1 with the logits x adds to the log-odds of a unit.
-
-        It is sum_m log sum_z p_m(z) exp(w[m, z]), where a row w has the weights between h1 and the
-        unit.
-        """
+        """Return sum_m log sum_z p_m(z) exp(w[m, z]) of each row w of weights, with p from x."""
         states = self._all_states(x).softmax(-1).movedim(-2, 0)
         factors = self.by_unit(weights).exp().permute(1, 2, 0)
         return (states[..., :1] + states[..., 1:] @ factors).log().sum(0)
 
     def scene_bias(self, source: Int[Tensor, "B"] | None) -> Float[Tensor, "B|1 V"]:
-        """Return the bias of each class in whole scenes, b + a[q] + u[q].
-
-        A source q of -1 or None has the bias of the served mix of sources, b + u[-1].
-        """
+        """Return b + a[q] + u[q] of whole scenes; for a source q of -1 or None, b + u[-1]."""
         if source is None or not self.spec.profiles:
             return (self.b + self.u[-1]).unsqueeze(0)
         return self.b + _rows(self.a, source) + self.u[source]
@@ -184,10 +174,7 @@ class BoltzmannMachine(nn.Module, ABC):
     def source_weights(
         self, v: Float[Tensor, "B V"], source: Int[Tensor, "B"] | None
     ) -> Float[Tensor, "B sources"]:
-        """Return p(q | v, source) of each data source q.
-
-        A stated source has the probability 1. A source of -1 or None is unknown.
-        """
+        """Return p(q | v, source): 1 for a stated source. A source of -1 or None is unknown."""
         inferred = (self.f + v @ self.a.T).softmax(-1)
         if source is None or not self.spec.profiles:
             return inferred
@@ -198,15 +185,11 @@ class BoltzmannMachine(nn.Module, ABC):
         self,
         v: Float[Tensor, "B V"],
         *,
-        room: Int[Tensor, "B"] | None = None,
-        source: Int[Tensor, "B"] | None = None,
-        share: Int[Tensor, "B"] | None = None,
+        room: Int[Tensor, "B"] | None = None,  # -1: unknown
+        source: Int[Tensor, "B"] | None = None,  # -1: unknown
+        share: Int[Tensor, "B"] | None = None,  # bin of the listed share (`SHARES`); adds kappa
     ) -> Float[Tensor, "B V"]:
-        """Return the log-odds of each unlisted class given the listed classes v, in closed form.
-
-        The result of a listed class has no meaning. Room types and sources of -1 are unknown.
-        `share` is the bin of the listed share (`app.inference.weights.SHARES`), which adds kappa.
-        """
+        """Return the log-odds of each unlisted class given the listed classes v, in closed form."""
         bias = self.b + self.source_weights(v, source) @ self.a + self.room_bias(room)
         log_odds = bias + self.hidden_log_odds(self.hidden_logits(v, room), self.W)
         couplings = self.couplings
@@ -233,10 +216,7 @@ class BoltzmannMachine(nn.Module, ABC):
     def room_log_p(
         self, v: Float[Tensor, "B V"], source: Int[Tensor, "B"] | None = None
     ) -> Float[Tensor, "B C"]:
-        """Return log p(t | v, source) of each room type t, for an unlisted type.
-
-        The mean over the sources has the probabilities of `source_weights`.
-        """
+        """Return log p(t | v, source) of each room type t, with the mean over the sources."""
         logits = self.e + self.hidden_log_odds(self.hidden_logits(v), self.Q)
         if self.spec.coupled:
             logits = logits + sparse_product(v, self.Y.T)
@@ -266,22 +246,15 @@ class BoltzmannMachine(nn.Module, ABC):
     @abstractmethod
     def start_relations(
         self,
-        by_relation: Float[Tensor, "A"],
-        by_unit: Float[Tensor, "T"],
-        mean_log_counts: Float[Tensor, "V"],
+        by_relation: Float[Tensor, "A"],  # log-odds that an observed relation holds
+        by_unit: Float[Tensor, "T"],  # log-odds of a triple in a scene with relations
+        mean_log_counts: Float[Tensor, "V"],  # of the number of instances of each class
     ) -> None:
-        """Set relation biases to log-odds of the training data.
-
-        They are the log-odds that an observed relation holds, and that a triple holds in a scene
-        with annotated relations. The means are of the log number of instances of each class.
-        """
+        """Set the relation biases from statistics of the training data."""
 
     @abstractmethod
     def edges(self, classes: Int[Tensor, "B n"], counts: Int[Tensor, "B n"] | None = None) -> Edges:
-        """Return the relation units between the given classes of each scene; -1 is padding.
-
-        The counts are the numbers of instances, 0 where unknown. The default is one of each class.
-        """
+        """Return the units between classes (-1: padding) with counts (0: unknown; default 1)."""
 
     @abstractmethod
     def lay_out(
@@ -293,8 +266,7 @@ class BoltzmannMachine(nn.Module, ABC):
     ) -> tuple[Edges, Float[Tensor, "B E"], Bool[Tensor, "B E"]]:
         """Return the relations between classes in the layout of this machine: edges, r, observed.
 
-        In an RBM or GBM, the units of absent classes are 0. They count as observed if the scene has
-        any annotated relation. `edges` describes classes and counts.
+        In RBM and GBM, units of absent classes are 0, and observed if any relation of the scene is.
         """
 
     @abstractmethod
@@ -310,10 +282,7 @@ class BoltzmannMachine(nn.Module, ABC):
     def implied(
         self, edges: Edges, observed: Float[Tensor, "B E"], h1: Float[Tensor, "B H1"]
     ) -> Float[Tensor, "B E"]:
-        """Return the change of each relation logit due to relations that are observed to hold.
-
-        h1 are means given the objects. Without implication weights, the change is zero.
-        """
+        """Return the changes of the relation logits by observed relations, given means of h1."""
         del edges, h1
         return torch.zeros_like(observed)
 
@@ -337,10 +306,7 @@ class BoltzmannMachine(nn.Module, ABC):
         room: Int[Tensor, "B"] | None = None,
         source: Int[Tensor, "B"] | None = None,
     ) -> Float[Tensor, "B"]:
-        """Return the energy E(v, r, h1, t); +inf if a unit with gate 0 is 1.
-
-        The states of h1 are 0 or 1. At most one state of each unit is 1.
-        """
+        """Return the energy E(v, r, h1, t) of states h1; +inf if a unit with gate 0 is 1."""
         hidden = (h1 * (self.hidden_bias(room) + v @ self.W)).sum(-1)
         log_weight = (v * self.scene_bias(source)).sum(-1) + hidden
         couplings = self.couplings

@@ -143,10 +143,7 @@ def _pairs(edges: Edges) -> PairEdges:
 
 
 def implication_features(observed: Float[Tensor, "B A n n"]) -> Float[Tensor, "B F n n"]:
-    """Return the features phi of relations that are observed to hold, over pairs of classes.
-
-    The pair feature of relation a equals r_e itself, so `implied` does not use that feature for a.
-    """
+    """Return the features phi of relations that are observed to hold, over pairs of classes."""
     n = observed.shape[-1]
     between = observed * ~torch.eye(n, dtype=torch.bool)
     directed = torch.cat([between, between.mT], 1)
@@ -166,12 +163,9 @@ def implied(
     observed: Float[Tensor, "B A n n"],
     h1: Float[Tensor, "B H1"],
 ) -> Float[Tensor, "B A n n"]:
-    """Return the changes x of the relation logits due to relations that are observed to hold.
-
-    gamma are the weights of the features, B the weights from h1 to z, and h1 means of the hidden
-    units given the objects.
-    """
+    """Return the changes x of the relation logits by observed relations, given means of h1."""
     A = observed.shape[1]
+    # The pair feature of relation a is r_e itself.
     itself = torch.zeros(gamma.shape[1:], dtype=torch.bool)
     itself[:, :A].fill_diagonal_(True)
     gamma = gamma.masked_fill(itself, 0.0)

@@ -64,10 +64,7 @@ def data_folder(reference: str, config: Config, given: Path | None = None) -> Pa
 
 
 def load_config(reference: str, *, seed: int | None = None) -> Config:
-    """Read a configuration. `config_path` describes the possible references.
-
-    The entry `base` names a shipped configuration, whose entries apply where the file has none.
-    """
+    """Read a configuration. Its entry `base` names a shipped one with the default entries."""
     path = config_path(reference)
     if not path.is_file():
         choice = f"pass a TOML file or one of {', '.join(shipped_configs())}"
@@ -140,10 +137,7 @@ def config_toml(config: Config) -> str:
 
 
 def sections_toml(values: Mapping[str, Any], reasons: Mapping[str, str] | None = None) -> str:
-    """Return entries and sections as TOML text.
-
-    `reasons` maps "section.entry" to a comment for the line above the entry.
-    """
+    """Return entries and sections as TOML, with `reasons` as comments above "section.entry"."""
     sections = {name: own for name, own in values.items() if isinstance(own, Mapping)}
     lines = [_entry(name, value) for name, value in values.items() if name not in sections]
     for section, entries in sections.items():

@@ -58,11 +58,7 @@ def save_run(
     data: Path | None = None,
     scenes: str = "",
 ) -> None:
-    """Replace the folder by the files of a finished run.
-
-    The function writes the files beside the folder. If it is interrupted, the folder stays as it
-    was.
-    """
+    """Replace the folder by the files of a finished run. An interruption leaves it as it was."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as beside:
         new, old = Path(beside, "new"), Path(beside, "old")

@@ -55,11 +55,7 @@ class Epoch:
 def phases(
     machine: Machine, scenes: Scenes, generator: torch.Generator, steps: int = 1
 ) -> tuple[State, State, Float[Tensor, "B"], Float[Tensor, "B"]]:
-    """Run the positive phase and `steps` sweeps of the negative phase.
-
-    The results are the states at the end of both phases, with the mean of h1 given all other units
-    in place of h1, and the errors E of the objects and of the relations.
-    """
+    """Run both phases. Return their last states, and the errors E of objects and of relations."""
     v, r, free = scenes.v, scenes.r, Free.of(scenes.v, scenes.annotated, scenes.r)
     start = state = State(v, r, *machine.hidden(v, r, generator))
     object_p, relation_p = v, r
