@@ -123,12 +123,10 @@ class Part(NamedTuple):
 def some_instances(encoded: EncodedScene, structure: ClassMask, rng: Rng) -> Part:
     """Draw a part: 25, 50, 75 or 100 % of the classes, in half of the parts once each."""
     things = np.flatnonzero(~structure[encoded.evidence.classes])
-    share = _LISTED[rng.integers(len(_LISTED))]
-    count = max(1, int(share * len(things) + 0.5))
+    count = max(1, int(_LISTED[rng.integers(len(_LISTED))] * len(things) + 0.5))
     index = np.sort(rng.permutation(things)[:count])
     number = np.minimum(encoded.evidence.counts[index], MOST)
-    lists_one = rng.random() < 0.5
-    listed = np.ones_like(number) if lists_one else rng.integers(1, number + 1)
+    listed = np.ones_like(number) if rng.random() < 0.5 else rng.integers(1, number + 1)
     room = encoded.room_type if rng.random() < 0.5 else -1
     return Part(encoded.evidence.classes[index], listed, number, room)
 
@@ -160,8 +158,7 @@ def altered_case(
     if true_triples is None:
         return None
     if rng.random() < 0.5:
-        all_instances = range(len(encoded.instance_classes))
-        return scene_of(encoded, all_instances, true_triples), None
+        return scene_of(encoded, range(len(encoded.instance_classes)), true_triples), None
     return altered_scene(encoded, structure, true_triples, rng)
 
 

@@ -102,8 +102,7 @@ class EncodedScene:
         arrays = {name: None if array is None else array[index] for name, array in arrays.items()}
         tables = (self.instance_holds, self.instance_observed)
         holds, observed = (table[:, index][:, :, index] for table in tables)
-        classes = arrays["instance_classes"]
-        evidence = pool_instances(classes, holds, observed, room)
+        evidence = pool_instances(arrays["instance_classes"], holds, observed, room)
         arrays |= {"instance_holds": holds, "instance_observed": observed}
         return replace(self, evidence=evidence, **arrays)
 
@@ -182,7 +181,6 @@ class _Encoder:
             np.add.at(counts, np.searchsorted(evidence.classes, classes), numbers)
             evidence = replace(evidence, counts=counts)
         labels = [thing.label for thing, c in zip(scene.objects, matches, strict=True) if c is None]
-        share = (meaning.scenes_per_group or group_size) / group_size
         return EncodedScene(
             scene_id=scene.scene_id,
             source=scene.source,
@@ -198,7 +196,7 @@ class _Encoder:
             instance_positions=None if boxes is None else boxes[kept, :3],
             instance_sizes=None if boxes is None else boxes[kept, 3:6],
             instance_yaws=None if boxes is None else boxes[kept, 6],
-            weight=min(1.0, share),
+            weight=min(1.0, (meaning.scenes_per_group or group_size) / group_size),
             complete=meaning.complete_objects,
         )
 

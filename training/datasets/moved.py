@@ -1,8 +1,7 @@
 """Cases of moved objects: one object of a scene stands at a wrong place.
 
-Scenes with boxes get the altered pose of the object. Other scenes get an altered support relation.
-An object is wrong on another object if no pair of their two classes stands on or in each other in
-the scene.
+Scenes with boxes get another pose of the object, and others another support relation. Strangers are
+two objects whose classes never stand on or in each other in the scene.
 """
 
 from __future__ import annotations
@@ -80,8 +79,7 @@ def untouched_scene(encoded: EncodedScene, structure: ClassMask, rng: Rng) -> Sc
 
 def moved_scene(encoded: EncodedScene, structure: ClassMask, rng: Rng) -> tuple[Scene, int] | None:
     """Return `moved_by_pose` for a scene with boxes, and `moved_by_triple` for other scenes."""
-    move = moved_by_pose if has_boxes(encoded) else moved_by_triple
-    return move(encoded, structure, rng)
+    return (moved_by_pose if has_boxes(encoded) else moved_by_triple)(encoded, structure, rng)
 
 
 def moved_by_triple(

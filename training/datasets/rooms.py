@@ -275,8 +275,7 @@ class _Layout:
             return True
         footprints = (_footprints(boxes) for boxes in ([box] * len(neighbours), neighbours))
         _, gap = overlap_and_gap(*itertools.chain.from_iterable(footprints))
-        clearance = 0.0 if box.support is not None else _CLEARANCE
-        return bool((gap > clearance).all())
+        return bool((gap > (0.0 if box.support is not None else _CLEARANCE)).all())
 
 
 def _footprints(boxes: Sequence[_Box]) -> tuple[Floats, Floats, Floats]:

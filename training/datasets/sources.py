@@ -4,12 +4,10 @@ A listed relation holds. An unlisted relation is false ("off"), false only betwe
 for neighbours"), false only if the support of its subject is listed ("off for supported"), or
 unobserved. docs/decisions/relations.md gives the reason for each source.
 
-Two rules apply to every data source. First, if on-top, inside or above is listed for a pair of
-objects, all unlisted relations of the pair are false in both directions. (1 to 10 % of such pairs
-also have a listed left or front.) Second, a relation that an annotator marked as false is false.
-
-With poses, two objects are neighbours if they are close by the rule of `app.scene.geometry`.
-Without poses, two objects with at least one listed relation are neighbours.
+If on-top, inside or above is listed for a pair, all its unlisted relations are false in both
+directions. (1 to 10 % of such pairs also have a listed left or front.) A relation that an annotator
+marked as false is false. Neighbours are close by the rule of `app.scene.geometry`; without poses,
+they have at least one listed relation.
 
 `vocabularies/sources.toml` describes the sources.
 """

@@ -8,13 +8,11 @@ The percentages are the shares of the training, test and validation part.
   all groups keep their parts when a data set grows. This protocol does not stratify.
 - ``final`` (90 / 0 / 10 %) is ``group`` without a test part, for shipped weights.
   Both assign written scenes separately: otherwise the weights would miss whole written places.
-- ``paper`` (60 / 30 / 10 %) is the protocol of Bozcan et al. (ICRA 2018). Each scene is assigned
-  separately.
+- ``paper`` (60 / 30 / 10 %), of Bozcan et al. (ICRA 2018), assigns each scene separately.
 - ``paper groups`` has the shares of ``paper`` and keeps groups together.
 
-All protocols except ``stable`` stratify by room type. Their parts depend on the seed and on the set
-of scenes, but neither on the order of scenes nor on the vocabulary. Data sources with common groups
-must be split together; others do not affect each other's parts.
+All protocols except ``stable`` stratify by room type, independent of the order of scenes and of the
+vocabulary. Data sources with common groups must be split together; others are independent.
 """
 
 from __future__ import annotations

@@ -1,19 +1,18 @@
 """Adapt the object weights of a trained machine to the scenes of one home.
 
-The weights change little where the home says little. δ is the change of the bias of each class, and
-Δ is the change of the rows of W of the recorded classes. The fit minimises
+δ is the change of the bias of each class, and Δ that of the rows of W of the recorded classes. The
+fit minimises
 
     n · [mean over parts of recorded scenes of (BCE(hidden classes | listed) - log p(t | listed))
          + 2 · mean over parts of stored samples of the cross-entropy of the parent and the home]
     + ρ_δ |δ|² + ρ_Δ |Δ|²
 
 - Random parts of the n recorded scenes predict the rest, as in training (`training.fit.objects`).
-- The second line is distillation: both machines predict unlisted classes and room types of random
-  parts of the samples that the artifact stores. Without this line, the machine forgets other rooms.
+- The second line is distillation: both machines predict unlisted classes and room types of the
+  stored samples. Without it, the machine forgets other rooms.
 - Few scenes without a class k do not prove that the home lacks it. Let the parent expect the class
   in E_k of the n scenes. If no scene shows it, its target is the answer of the parent, divided by
-  1 + E_k. The factor is the posterior mean of a rate with the prior exp(-rate), given no event
-  where E_k were expected.
+  1 + E_k: the posterior mean of a rate with the prior exp(-rate), given no event.
 - New classes (`training.fit.extend`) and rare ones of the parent have no part in the distillation
   if they are recorded. The prior of their biases is weak, and their biases start at least at the
   log-odds of the share of scenes that show the class.

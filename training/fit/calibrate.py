@@ -1,15 +1,12 @@
 """Fit the calibration, which turns log-odds into the probabilities that the service returns.
 
-All fits use validation scenes. Without enough scenes for `outlier` or `misplaced`, the entry is
-None and the model gives no judgement. An unfitted entry of another question keeps the model's own
-probability. `training.fit.calibrate_objects` fits the entries about objects.
+Without enough validation scenes for `outlier` or `misplaced`, the entry is None and the model gives
+no judgement. An unfitted entry of another question keeps the model's own probability.
 
-The probability of a relation means that it holds in a home with both objects. So the fits use
-only data sources that annotate true and false relations alike (`annotated_relations`), such as
-real rooms with listed supports. All fits are logistic regressions (Platt scaling). One source of
-generated rooms has more examples than all other sources together. The fits therefore give large
-sources a lower weight. A robot lists few objects or many, so each scene takes part as a whole and
-in parts.
+The probability of a relation means that it holds in a home with both objects. So the fits use only
+sources that annotate true and false relations alike (`annotated_relations`). All fits are logistic
+regressions (Platt scaling) with lower weights of large sources, such as generated rooms. A robot
+lists few objects or many, so each scene takes part as a whole and in parts.
 
 Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 """
@@ -94,8 +91,7 @@ def fit_relations(
 ) -> tuple[CountSlope, ...]:
     """Fit the relations of two instances, given the objects of whole scenes and of parts."""
     rng = np.random.default_rng(seed)
-    structure = artifact.vocabulary.structure
-    parts = [_part_of(encoded, structure, rng) for encoded in scenes]
+    parts = [_part_of(encoded, artifact.vocabulary.structure, rng) for encoded in scenes]
     return _fit_possible(_examples_of_pairs(artifact, [*scenes, *parts]))
 
 

@@ -1,14 +1,12 @@
 """Fit the judgement of observed relations, and of objects on the floor or on a wall.
 
-Each validation scene takes part several times: with listed true relations, with one of them
-altered, with its boxes or listed relations as they are, and with one moved object
-(`training.datasets.moved`). An altered on-top is also asked in the words "under". Sentences that a
-program has parsed contain errors, so they only show how objects are above and under each other.
-Boxes show many relations above that no person would mention, so a listed one of boxes is left out.
+Each validation scene takes part several times: with true relations, with one of them altered, with
+its boxes, and with one moved object (`training.datasets.moved`). Sentences that a program has
+parsed contain errors, so they only show how objects are above and under each other. Boxes show many
+relations above that no person would mention, so a listed one of boxes is left out.
 
-A logistic regression for each kind of entry turns its terms into the log-odds that the entry is
-wrong (`app.questions.misplaced`). The alarm lines keep the share of untouched scenes with an alarm.
-Long lists have a higher line than short ones.
+A logistic regression of each kind of entry gives the log-odds that the entry is wrong
+(`app.questions.misplaced`). The alarm lines keep the share of untouched scenes with an alarm.
 """
 
 from __future__ import annotations

@@ -1,18 +1,14 @@
-"""Fit the calibration of answers about objects to short lists.
-
-A robot lists a few objects of a room. So all fits use random parts of validation scenes
-(`calibration_scenes`). Structure is not listed.
+"""Fit the calibration of answers about objects to short lists: random parts of validation scenes.
 
     coverage   Listed share that the answers assume: the share with the best rank of hidden classes.
     missing    Probability that an unlisted class is present, fitted to the first classes of parts
                of each number of classes. Written places have far more things than a person or a
-               detector lists of a room. So these parts are not written, unless all scenes are.
+               detector lists, so these parts are not written, unless all scenes are.
     covered    The same in parts of a stated share of the scene, written scenes included.
     outlier    Probability that a class is an intruder. Half of the parts contain an intruder.
     lines      An object is an outlier if its log-odds of being an intruder are above a line in the
                log of the number of listed classes. Each line raises alarms in a given share of the
-               untouched parts (`training.evaluation.alarms.ALARMS`), with and without the room
-               type. A class that few training scenes show raises no alarm.
+               untouched parts (`ALARMS`), with and without the room type.
 
 The prior of an intruder class is proportional to (frequency of the class)^alpha. Alpha and the
 logistic regression are fitted to three kinds of intruders with equal weights. Intruders are drawn
@@ -272,8 +268,7 @@ def refitted_lines(
     entry, alpha = artifact.calibration.outlier, artifact.calibration.popularity_weight
     if entry is None:
         return artifact
-    lines = fit_lines(artifact, scenes, entry, alpha)
-    return recalibrated(artifact, **lines)
+    return recalibrated(artifact, **fit_lines(artifact, scenes, entry, alpha))
 
 
 def judged_classes(artifact: SceneModel) -> ClassMask:
@@ -323,8 +318,7 @@ def score_intruders(
     artifact: SceneModel, scenes: SceneTensors, weights: Tensor | None
 ) -> ListScores:
     """Return the scores of random parts of scenes, each with an intruder drawn by the weights."""
-    unjudged = torch.from_numpy(~judged_classes(artifact))
-    intruders = draw_intruders(scenes, unjudged, weights)
+    intruders = draw_intruders(scenes, torch.from_numpy(~judged_classes(artifact)), weights)
     kept = (intruders >= 0).nonzero().squeeze(1)
     parts = draw_parts(subset(scenes, kept), structure_of(artifact), up_to_longest, _SEEDS)
     return score_lists(artifact, parts, intruders[kept][parts.scene])
@@ -345,8 +339,7 @@ def _detection(scores: ListScores, alpha: float, limit: float) -> float:
     """Return the mean of hit@1 and of the share of intruders above a limit."""
     values = -scores.score(alpha)
     first = values >= scores.largest(values)[scores.row]
-    caught = values > limit
-    return float(first[scores.intruder].mean() + caught[scores.intruder].mean()) / 2
+    return float(first[scores.intruder].mean() + (values > limit)[scores.intruder].mean()) / 2
 
 
 def _fit_intruders(

@@ -1,13 +1,11 @@
 """Fit the calibration entries about room types.
 
-rooms        Sharpness of the probabilities of room types (`/rooms`), fitted by maximum
-             likelihood to parts of validation scenes of each number of classes, and to whole
-             scenes.
-rare_rooms   Room types of few training scenes (`rare_rooms`).
-written_rooms
-             Room types that only written sources show.
+rooms          Sharpness of the probabilities of `/rooms`, by maximum likelihood on parts of
+               validation scenes of each number of classes, and on whole scenes.
+rare_rooms     Room types of few training scenes (`rare_rooms`).
+written_rooms  Room types that only written sources show.
 smallest, room_fit
-             Limits of a generated scene of each room type, from parts of whole rooms (`limits`).
+               Limits of a generated scene of each room type, from parts of whole rooms (`limits`).
 """
 
 from __future__ import annotations

@@ -169,8 +169,7 @@ def _log_frequencies(cases: _Cases, V: int) -> Float[NDArray, "V M"]:
     table = np.zeros((V, MOST))
     np.add.at(table, (cases.index, cases.number - 1), cases.weight)
     # Each number needs a positive share, because the fitted scene may favour it.
-    overall = 0.999 * table.sum(axis=0) / table.sum() + 0.001 / MOST
-    table += _PRIOR * overall
+    table += _PRIOR * (0.999 * table.sum(axis=0) / table.sum() + 0.001 / MOST)
     return np.log(table / table.sum(axis=1, keepdims=True))
 
 
@@ -214,8 +213,7 @@ def _weights(
     terms = optimum.x.reshape(-1, EXPONENTS)
     weights = np.zeros((V * width, EXPONENTS))
     weights[used_columns] = terms[: len(used_columns)]
-    of_class = weights.reshape(V, width, EXPONENTS) + terms[len(used_columns) :]
-    return of_class.swapaxes(1, 2)
+    return (weights.reshape(V, width, EXPONENTS) + terms[len(used_columns) :]).swapaxes(1, 2)
 
 
 def _is_better_than_mean(

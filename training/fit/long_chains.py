@@ -1,8 +1,6 @@
 """Long Gibbs chains that start at scenes, and the test that served scenes stay like these scenes.
 
-A machine whose chains drift away from the scenes learnt a wrong distribution: the samples of
-`/generate` are then good only as long as the chains are short. The test applies the filter of
-`/generate` to the states of long chains.
+If chains drift away from the scenes, samples of `/generate` are good only while chains are short.
 """
 
 from __future__ import annotations

@@ -9,21 +9,18 @@ scene. The loss is the negative log-likelihood of every class that is not listed
 λ_i is the closed-form log-odds of class i given the listed classes (`BoltzmannMachine`), and ζ the
 softplus.
 
-- 30 % of the parts list all classes but one. The class left out counts as often as the scene has
-  classes. The other parts list a share of U(.05, 1) of the classes.
-- The room type t is listed in 15 % of the parts. If it is not listed, the loss contains its
-  cross-entropy, with the weight k.
-- A class that a source shows in fewer than 3 scenes has no term in the loss there (partial labels).
-  Structure is neither listed nor predicted.
-- Unlisted classes of the family of a present class (`Vocabulary.related`) have no term: a desk lamp
+- 30 % of the parts list all classes but one, which counts as often as the scene has classes. The
+  other parts list a share of U(.05, 1) of the classes.
+- The room type t is listed in 15 % of the parts. If not, its cross-entropy has the weight k.
+- A class that a source shows in fewer than 3 scenes has no term there (partial labels). Structure
+  has none, and unlisted relatives of a present class (`Vocabulary.related`) have none: a desk lamp
   is a lamp, and an annotator may call it so.
 - Each source q has its own base rates a_q and y_q, and each listed share its own bias kappa. The
   machine also learns p(q | listed), with the weight s, because a robot's list names no source.
 - With the weight g, persistent Gibbs chains (PCD) keep samples of the machine like scenes. The
   chains of a source have its base rates.
 
-The weights have normal priors. The precision of a prior is divided by the number of scenes. Without
-it, the machine would learn few scenes by heart.
+Normal priors, divided by the number of scenes, keep the machine from learning scenes by heart.
 
 Sources: Besag, "Statistical analysis of non-lattice data" (1975), for conditional likelihoods;
 Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008), for PCD.
@@ -117,8 +114,7 @@ class ObjectScenes:
 
     def log_odds(self) -> Float[Tensor, "V"]:
         """Return the smoothed log-odds of each class in the scenes that can show it."""
-        weight = self.weight.unsqueeze(1)
-        count = (self.v * weight).sum(0)
+        count = (self.v * self.weight.unsqueeze(1)).sum(0)
         total = (self.shows * self.source_sizes.unsqueeze(1)).sum(0)
         total = torch.where(total > 0, total, self.size)
         return ((count + 0.5) / (total - count + 0.5)).log()
@@ -143,8 +139,7 @@ def random_parts(
     # Listed are the `count` present classes with the smallest random keys.
     keys = torch.rand(v.shape, generator=generator) + 2 * (1 - v)
     smallest = keys.topk(int(count.max()), largest=False).values
-    limit = smallest.gather(1, count.long().unsqueeze(1) - 1)
-    listed = v * (keys <= limit)
+    listed = v * (keys <= smallest.gather(1, count.long().unsqueeze(1) - 1))
     return Parts(listed, share_bin(count, n), torch.where(hides_one, n, 1.0))
 
 
@@ -227,8 +222,7 @@ class ObjectFit:
         weight = scenes.observed[index] * (1 - parts.listed)
         weight = weight * torch.where(hidden > 0, parts.weight.unsqueeze(1), 1.0)
         loss = ((softplus(log_odds) - hidden * log_odds) * weight).sum()
-        served = served_weights(scenes, self.config)
-        rates, _ = with_served_rates(machine.a, scenes.shows, served)
+        rates, _ = with_served_rates(machine.a, scenes.shows, served_weights(scenes, self.config))
         logits = machine.f + parts.listed @ rates.T
         loss = loss + self.config.source_loss * cross_entropy(logits, source, reduction="sum")
         is_hidden = (listed_room < 0) & (room >= 0)

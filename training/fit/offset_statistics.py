@@ -1,17 +1,14 @@
 """Fit the distribution of offsets (position differences) between related objects.
 
-The training data are scenes with poses. Each canonical relation and each axis have a separate
-model. The offset from an object of class j to an object of class i is normal, with a mean m and a
-variance s for each pair of classes:
+Each canonical relation and axis have a separate model. The offset from an object of class j to an
+object of class i is normal, with a mean m and a variance s for each pair of classes:
 
     s ~ inverse-gamma(alpha, beta)    m given s ~ normal(mu + u_i + v_j, s / kappa)
     u_i and v_j given s ~ normal(0, s / (kappa lambda))
 
-All pairs of classes share mu, kappa, alpha and beta. Training alternates between these parameters,
-by maximum likelihood over all pairs, and the class effects u and v. Given all these values, the
-distribution of the offset of a pair has a closed form. The distribution of a frequent pair depends
-mainly on the data of the pair. The distribution of a rare pair depends mainly on the two classes
-and the relation.
+All pairs share mu, kappa, alpha and beta. Training alternates between these, by maximum likelihood,
+and the class effects u and v. Given all these values, the offset of a pair has a closed form: data
+decide for frequent pairs, and the classes and the relation for rare pairs.
 `docs/decisions/relations.md` describes the alternatives.
 """
 

@@ -3,27 +3,21 @@
     loss = - sum over scenes and annotated relations e of log p(r_e | v, E[h1 | v])
     logit of r_e = ℓ_e + δ[source, a]
 
-Relations without an annotation have no term (`training.datasets.sources`). Data sources annotate
-different relations. For example, people mention notable relations, and generated rooms list all
-relations. Each source therefore has a trained logit correction δ, called offset, for each relation
-a. The service leaves the offsets out. An epoch draws each scene of a source with the weight of the
-source as probability; a weight above 1 multiplies the terms of its scenes.
+Data sources annotate different relations: people mention notable ones, and generated rooms list
+all. So each source has a trained logit correction δ, called offset, for each relation a. The
+service leaves the offsets out. An epoch draws each scene with the weight of its source as
+probability; a weight above 1 multiplies the terms of its scenes.
 
-Weights and offsets have normal priors, with the precisions `weight_prior` and `offset_prior`. The
-relation weights of a class can depend on its word vector. With the matrix X of word vectors, the
-weights are a trained linear map of X plus a small deviation of each class:
+Weights and offsets have normal priors. With the matrix X of word vectors, the weights are a trained
+map of X plus a small deviation of each class, so a rare class resembles those of similar words:
 
     S = X A_S + S',   O = X A_O + O',   s = (X B_s)' + s',   o = (X B_o)' + o'
 
-A rare class then has weights similar to those of classes with similar word vectors.
+A robot seldom sees a whole scene, so the hidden units depend on a random subset of the objects.
+Otherwise, complete scenes of one source would fit well, but relations in other scenes would not.
 
-A robot seldom sees a whole scene. In training, the hidden units h1 therefore depend on a random
-subset of the objects. The size of the subset is drawn uniformly for each scene. Otherwise, the
-relations of complete scenes of one source would fit well, but relations in other scenes would not.
-
-For a machine with implication weights, the loss has a second term. This term conditions on a random
-share of the observed relations of each scene, and sums over the other relations. The object weights
-of the machine stay fixed.
+For a machine with implication weights, a second term conditions on a random share of the observed
+relations, and sums over the others. The object weights stay fixed.
 
 Sources: Besag, "Statistical analysis of non-lattice data" (1975); Mnih and Salakhutdinov,
 "Probabilistic matrix factorization" (2007), for normal priors on factors.

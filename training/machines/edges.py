@@ -1,9 +1,8 @@
 """The layout of the relation units r of a machine.
 
 A relation unit e = (a, i, j) is 1 if object class i has the canonical relation a to object class j.
-With A relations and V classes there are A·V² units, too many to allocate. Every computation
-therefore lists its units in an `Edges` object, which has one row for each scene. Units that the row
-of a scene does not list are 0.
+A·V² units are too many to allocate, so `Edges` lists units in one row for each scene. Units that
+the row of a scene does not list are 0.
 """
 
 from __future__ import annotations

@@ -3,11 +3,10 @@
     E(v, r, h1, t | q) = - (b + a_q + u_q + Y_t)·v - v'Lv/2 - (c1 + Q_t)·h1 - v'W h1
                          - (e + y_q)_t - sum_e g_e [r_e ℓ_e(v, h1) - log(1 + exp ℓ_e)]
 
-q is the data source of the scene, and t its room type. A hidden unit has Z states. h1 has one entry
-for each state but the first: 1 for the state of the unit, else 0. The first state has the energy 0.
-For Z = 2, the units are binary, as in the paper. An unknown room type has the weights 0. The last
-sum runs over the relation units e = (a, i, j). A variant defines its relation units, the gate g_e
-of a unit and the logit ℓ_e. A gate of 0 forces its unit to 0.
+q is the data source of the scene, and t its room type; an unknown one has the weights 0. h1 has one
+entry for each state of a hidden unit but the first, which has the energy 0: 1 for the state of the
+unit, else 0. With two states, the units are binary, as in the paper. A variant defines its relation
+units e = (a, i, j), their gates g_e and logits ℓ_e. A gate of 0 forces its unit to 0.
 
 The term log(1 + exp ℓ_e) normalises each relation separately. So the sum over an unobserved
 relation is 1, and relations have no effect on objects and hidden units. The published machine lacks
@@ -192,8 +191,7 @@ class BoltzmannMachine(nn.Module, ABC):
         """Return the log-odds of each unlisted class given the listed classes v, in closed form."""
         bias = self.b + self.source_weights(v, source) @ self.a + self.room_bias(room)
         log_odds = bias + self.hidden_log_odds(self.hidden_logits(v, room), self.W)
-        couplings = self.couplings
-        if couplings is not None:
+        if (couplings := self.couplings) is not None:
             log_odds = log_odds + sparse_product(v, couplings)
         return log_odds if share is None else log_odds + self.kappa[share]
 
@@ -209,8 +207,7 @@ class BoltzmannMachine(nn.Module, ABC):
             return torch.zeros(1)
         rate = self.e[room.clamp(min=0)]
         if source is not None and self.spec.profiles:
-            by_source = self.y[source.clamp(min=0), room.clamp(min=0)]
-            rate = rate + by_source * (source >= 0)
+            rate = rate + self.y[source.clamp(min=0), room.clamp(min=0)] * (source >= 0)
         return rate * (room >= 0)
 
     def room_log_p(
@@ -223,8 +220,7 @@ class BoltzmannMachine(nn.Module, ABC):
         if not self.spec.profiles:
             return logits.log_softmax(-1)
         by_source = (logits.unsqueeze(-2) + self.y).log_softmax(-1)
-        weights = self.source_weights(v, source).unsqueeze(-1)
-        return (weights.log() + by_source).logsumexp(-2)
+        return (self.source_weights(v, source).unsqueeze(-1).log() + by_source).logsumexp(-2)
 
     def free_energy(
         self,
@@ -234,8 +230,7 @@ class BoltzmannMachine(nn.Module, ABC):
     ) -> Float[Tensor, "B"]:
         """Return F = -log sum over h1 and r of exp(-E), in closed form."""
         free = -(v * self.scene_bias(source)).sum(-1)
-        couplings = self.couplings
-        if couplings is not None:
+        if (couplings := self.couplings) is not None:
             free = free - 0.5 * (sparse_product(v, couplings) * v).sum(-1)
             free = free - (v * self.room_bias(room)).sum(-1)
         log_states = self._all_states(self.hidden_logits(v, room)).logsumexp(-1).sum(-1)
@@ -309,8 +304,7 @@ class BoltzmannMachine(nn.Module, ABC):
         """Return the energy E(v, r, h1, t) of states h1; +inf if a unit with gate 0 is 1."""
         hidden = (h1 * (self.hidden_bias(room) + v @ self.W)).sum(-1)
         log_weight = (v * self.scene_bias(source)).sum(-1) + hidden
-        couplings = self.couplings
-        if couplings is not None:
+        if (couplings := self.couplings) is not None:
             log_weight = log_weight + 0.5 * ((v @ couplings) * v).sum(-1)
             log_weight = log_weight + (v * self.room_bias(room)).sum(-1)
         log_weight = log_weight + self.room_rate(room, source)

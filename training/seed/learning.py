@@ -1,16 +1,14 @@
 """Training of the machines: contrastive divergence, reconstruction error and early stopping.
 
-One step takes 32 scenes. The positive phase samples the context given the scene. The negative
-phase samples objects given context and relations, and then relations given context and objects, at
-temperature 1. A step adds .5 (<-dE/dw>_positive - <-dE/dw>_negative) to each weight w. Both phases
-sample their last context with the same random numbers, so most of the noise cancels. An unlisted
-relation of an annotated scene is false. The relations of a scene without annotation occur in
-neither phase.
+The positive phase samples the context given the scene. The negative phase samples objects given
+context and relations, and then relations given context and objects, at temperature 1. A step adds
+.5 (<-dE/dw>_positive - <-dE/dw>_negative) to each weight w. Both phases sample their last context
+with the same random numbers, so most of the noise cancels. An unlisted relation of an annotated
+scene is false. The relations of a scene without annotation occur in neither phase.
 
 The error E of the paper is the squared difference between the probabilities at the start of the
-positive phase and at the end of the negative phase, summed over units and averaged over scenes. The
-scene is observed, so the first probabilities are 0 or 1. Objects and relations are separate.
-Training stops if the error of the validation scenes, objects plus relations, has not fallen for
+positive phase (0 or 1) and at the end of the negative phase, summed over units and averaged over
+scenes. Training stops if the validation error, objects plus relations, has not fallen for
 `PATIENCE` epochs, and the weights of the best epoch are kept.
 
 Sources: Hinton, "Training products of experts by minimizing contrastive divergence" (2002);
