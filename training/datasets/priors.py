@@ -20,8 +20,7 @@ SOURCE: Final = "placing_priors"
 
 # Sources whose rows become training scenes: the places of VirtualHome and AI2-THOR.
 _TRAINED: Final = ("virtualhome_placing", "ithor_receptacles")
-# Other values of the column ``source``: places that people prefer, tables of locations, of votes
-# and of part counts.
+# Other values of the column ``source``, such as tables of votes and of part counts.
 _SKIPPED: Final = ("tidybot", "conceptnet_atlocation", "housekeep_votes", "vg80k_partof_counts")
 
 

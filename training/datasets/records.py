@@ -106,8 +106,7 @@ class AnnotatedScene:
     # True if positions are in viewer axes. Otherwise a viewpoint must be chosen for left and front.
     viewer_frame: bool = False
     false_relations: tuple[tuple[int, str, int], ...] = ()  # marked as false by an annotator
-    # Indices of the objects whose support is listed, also by other relations than the ten of the
-    # service, such as "attached to".
+    # Indices of objects with a listed support, also by other relations such as "attached to".
     supported: tuple[int, ...] = ()
     # Of scenes recorded by a robot: seconds and nanoseconds since 1970, and whether a person has
     # confirmed the scene. The digest of a data source does not depend on them.

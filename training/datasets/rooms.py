@@ -49,9 +49,8 @@ class Piece:
     where: Where = "wall"  # not used for small objects, which stand on the piece that carries them
     most: int = 1
     carries: tuple[Piece, ...] = ()  # small objects that can stand on the piece
-    # Pieces beside the piece, such as a nightstand left of a bed, with their sides. The side is
-    # seen from the wall behind the main piece; ``around`` means all four sides. The ``chance`` of
-    # the adjacent piece applies to each side.
+    # Adjacent pieces, such as a nightstand left of a bed, with their sides seen from the wall.
+    # ``around`` means all four sides. The ``chance`` of the adjacent piece applies to each side.
     beside: tuple[tuple[Piece, Side], ...] = ()
 
 

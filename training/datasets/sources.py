@@ -38,8 +38,7 @@ class Meaning:
     lateral: Unlisted = "off"  # left and front
     # Object lists are nearly complete: in the training of objects, unlisted objects are absent.
     complete_objects: bool = True
-    # Maximum total weight of a group of near-duplicates in the training of objects, in scenes. The
-    # scenes of all data sources count. None means that each scene has weight 1.
+    # Maximum total weight of a group of near-duplicates of all sources; None: 1 for each scene.
     scenes_per_group: float | None = None
 
     @property
@@ -57,25 +56,20 @@ class Source:
     research_only: bool = False  # the licence excludes commercial use
     # None means `LISTS` for scenes with listed relations, and `BOXES` for other scenes.
     meaning: Meaning | None = None
-    # Relations of the predicates that are no names of relations. The reader skips other predicates,
-    # such as "next to". None means that another predicate is an error.
+    # Relations of predicates with other names. Other predicates are skipped; None: an error.
     predicates: Mapping[str, str] | None = None
     supports: tuple[str, ...] = ()  # predicates that state the support of their subject
     left_out: tuple[str, ...] = ()  # labels whose annotation is too incomplete or biased
-    # Classes whose objects annotators mostly call by the name of the broader class, such as "table"
-    # for a coffee table. An unlisted class of this kind is unobserved.
+    # Classes that annotators mostly call by a broader name, so they are unobserved if unlisted.
     coarse: tuple[str, ...] = ()
-    # Annotators used free words, so an unlisted class is absent. Otherwise a class outside their
-    # list of labels is unobserved.
+    # Annotators used free words: an unlisted class is absent, also outside a list of labels.
     open_vocabulary: bool = False
     counts_movables: bool = False  # only movable objects are counted, others occur once in a scene
-    # A scene is one camera frame, which does not show how many objects are in the room. So
-    # statistics of counts do not learn from it.
+    # A scene is one camera frame, which does not show how many objects are in the room.
     of_one_view: bool = False
     # Numbers of instances are the judgements of a writer, so statistics of counts leave them out.
     written: bool = False
-    # A scene lists nearly all things of a whole room, as people furnish it. Scenes drawn for
-    # `/generate` are compared with such rooms.
+    # A scene lists nearly all things of a room. `/generate` is compared with such scenes.
     whole_rooms: bool = False
 
 

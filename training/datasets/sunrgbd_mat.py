@@ -77,8 +77,7 @@ class _Box(BaseModel):
         return AnnotatedObject(
             id=str(number),
             label=self.classname.strip(),
-            # In the file, x points right and y away from the camera. In viewer axes, x points away
-            # from the viewer and y left.
+            # In the file, x points right and y ahead. In viewer axes, x points ahead and y left.
             position=(y, -x, z),
             size=(size[ahead], size[aside], size[upright]),
             yaw=math.atan2(-float(self.basis[ahead, 0]), float(self.basis[ahead, 1])),

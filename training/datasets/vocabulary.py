@@ -35,8 +35,7 @@ class Names:
     placeholders: tuple[str, ...] = ()  # words of labels that name no kind of object
     numbered: tuple[str, ...] = ()  # words that are placeholders if a number follows
     aliases: dict[str, tuple[str, ...]] = field(default_factory=dict)  # other names of each class
-    # More specific names of each class. If a vocabulary has a class for the specific name, the
-    # broader class is its parent. Otherwise the name can become an alias.
+    # More specific names of each class: classes with this parent, otherwise aliases.
     kinds: dict[str, tuple[str, ...]] = field(default_factory=dict)
     # Other names of each room type. The key "" lists names without a room type.
     rooms: dict[str, tuple[str, ...]] = field(default_factory=dict)

@@ -42,7 +42,7 @@ from training.fit.calibrate_misplaced import fit_misplaced
 from training.fit.calibrate_objects import calibrate_objects
 from training.fit.configuration import ObjectsConfig
 from training.fit.objects import ObjectScenes, served_popularity
-from training.fit.regression import fit_count_slope, recalibrated
+from training.fit.regression import fit_count_slope, recalibrated, structure_of
 
 _SCENES = 1500
 _LISTED = 20  # relations that an answer of the service lists by default
@@ -51,8 +51,7 @@ _POSSIBLE = -3.5  # least log-odds of a relation that may well hold
 _OF_THE_REST = 0.02
 _ROUNDS = 3
 _UNKNOWN = -1.0  # truth of an example whose data source does not annotate the relation
-# Number of objects that are removed from each scene in turn to fit placements. With one removed
-# object, the fit depends too much on chance.
+# Objects removed from each scene in turn: with one, the fit depends too much on chance.
 _PLACEMENT_CASES = 4
 
 
@@ -116,9 +115,8 @@ def with_lower_lateral(
         logits = table[:, 0] + table[:, 1] * log_odds + table[:, 2] * (logs[:, None] + logs)
         return both_ways(logits, question.pairs)
 
-    structure = torch.from_numpy(artifact.vocabulary.structure.copy())
     # Of two stacked objects, an annotator lists only the stacked relation.
-    shift = lateral_shift(score, listed_pairs(scenes, structure, STACKED))
+    shift = lateral_shift(score, listed_pairs(scenes, structure_of(artifact), STACKED))
     return tuple(
         entry.model_copy(update={"intercept": entry.intercept + shift}) if a in LATERAL else entry
         for a, entry in enumerate(slopes)

@@ -44,8 +44,7 @@ class DataConfig(_Section):
 
     sources: tuple[str, ...] = Field(min_length=1)
     vocabulary: str = Field(
-        default="written",
-        description="written, source, rooms, or a file that ends in .json",
+        default="written", description="written, source, rooms, or a file that ends in .json"
     )
     split: Literal["group", "stable", "final"] = "group"
     split_seed: int = 0

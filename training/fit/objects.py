@@ -71,8 +71,7 @@ class ObjectScenes:
         names, annotated = train.source_names, train.annotated_classes
         weights = torch.tensor([config.source_weights.get(q, 1.0) for q in names])
         counts = torch.zeros(annotated.shape).index_add_(0, train.source, (train.v > 0).float())
-        # A user's own source and one with an open vocabulary show every class, except those that
-        # one of `SOURCES` annotates incompletely.
+        # Own sources and open vocabularies show every class but incompletely annotated ones.
         is_open = [q not in SOURCES or SOURCES[q].open_vocabulary for q in names]
         shows_all = [q in config.open_sources for q in names] if config.open_sources else is_open
         partial = torch.tensor([q in SOURCES for q in names]) & torch.tensor(is_open)

@@ -36,8 +36,7 @@ _LEAST_ALPHA: Final = 1.5
 # Minimum number of scenes for which a data source can lower the weights of larger sources.
 _FEW: Final = 100
 _ROUNDS, _SWEEPS = 4, 10
-# Resolution of annotated box centres in metres. It keeps the variance above 0 if all heights are
-# equal.
+# Resolution of box centres in metres. It keeps the variance of equal heights above 0.
 _RESOLUTION: Final = 0.005
 
 

@@ -49,8 +49,7 @@ from training.machines import BoltzmannMachine
 from training.machines.machine import OBJECT_WEIGHTS
 
 _WITHOUT_PRIOR = frozenset({*OBJECT_WEIGHTS, "gamma", "B", "usual", "d"})
-# Factor of the prior precision for the map of word vectors. All classes share the map, so its prior
-# is weaker than the prior of the weights of a class.
+# Factor of the prior precision for the map of word vectors, which all classes share.
 _MAP_PRIOR = 0.1
 # Most classes of a scene whose relations one batch has; the time grows with their third power.
 _MOST_CLASSES = 20

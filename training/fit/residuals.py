@@ -15,8 +15,7 @@ from training.datasets.batches import Batch, SceneTensors, relation_units
 from training.machines import BoltzmannMachine, build
 from training.machines.edges import triple_keys
 
-# Precision τ of the normal prior of a residual weight. A scene with p(r) = 1/2 has the Fisher
-# information 1/4, so the prior has the weight of four such scenes.
+# Precision τ of the normal prior of a residual weight: that of four scenes with p(r) = 1/2.
 _PRECISION = 1.0
 # Minimum number of scenes with an annotation of a triple, and minimum size of a stored residual.
 _SPEAKING_SCENES = 2

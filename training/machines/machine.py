@@ -73,8 +73,7 @@ class BoltzmannMachine(nn.Module, ABC):
             self.Y = nn.Parameter(torch.zeros(spec.C, spec.V))
         self.register_buffer("triples", torch.zeros(spec.T, 3, dtype=torch.int32))
         if spec.N:
-            # Stored chain samples as bits, (samples, words of 32 classes), and their room types. A
-            # room type of -1 is unknown.
+            # Stored chain samples in words of 32 classes, and their room types (-1: unknown).
             empty = torch.zeros(spec.N, -(-spec.V // 32), dtype=torch.int32)
             self.register_buffer("fantasies", empty)
             self.register_buffer("fantasy_rooms", torch.full((spec.N,), -1, dtype=torch.int32))
