@@ -162,7 +162,6 @@ class _Places:
             self.anchored.append((row, place, item.anchor))
 
     def places(self) -> tuple[Place, ...]:
-        """Return the places, in the order of their first rows."""
         return tuple(
             Place(
                 place,

@@ -88,9 +88,8 @@ def read_3dssg(path: Path) -> list[AnnotatedScene]:
                 not {subject, anchor} <= labels.keys() for subject, anchor, *_ in scan.relationships
             ),
         }
-        for problem, is_found in problems.items():
-            if is_found:
-                raise DatasetError(path, f"scans.{number}", problem)
+        if problem := next((text for text, applies in problems.items() if applies), None):
+            raise DatasetError(path, f"scans.{number}", problem)
         triples = [(index_of[i], name, index_of[j]) for i, j, _, name in scan.relationships]
         scenes[scene_id] = AnnotatedScene(
             scene_id=scene_id,

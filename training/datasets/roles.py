@@ -61,7 +61,6 @@ def lift_of(thing: AnnotatedObject, support: AnnotatedObject) -> float | None:
 
 
 def _table(own: Counter[Role], vocabulary: Vocabulary) -> RoleCounts:
-    """Return the counts of pairs and of larger objects, with those of their kin."""
     V, kin = len(vocabulary), _kin(vocabulary)
     pairs: defaultdict[int, np.ndarray] = defaultdict(lambda: np.zeros(3, np.float32))
     anchor = np.zeros((V, 3), np.float32)

@@ -85,7 +85,6 @@ class _File(BaseModel):
         return Meaning(**self.meanings[like] | entries)
 
     def source(self, entry: dict[str, Any]) -> Source:
-        """Return the source of an entry of the file."""
         own = self.meaning(**entry["meaning"]) if "meaning" in entry else None
         camera_subjects = self.camera_subjects if entry.get("without_camera_subjects") else ()
         left_out = (*camera_subjects, *entry.get("left_out", ()))

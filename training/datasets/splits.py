@@ -73,7 +73,6 @@ def stable_part(scene: AnnotatedScene, seed: int) -> Part:
 
 
 def _stable_part(unit: str, seed: int) -> Part:
-    """Return the part of a unit from a hash of the seed and its name."""
     fraction = int.from_bytes(_rank(seed, unit)[:8], "big") / 2**64
     for part, share in FRACTIONS["stable"].items():
         if fraction < share:

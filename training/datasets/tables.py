@@ -64,7 +64,6 @@ class Row:
         self.position = f"line {line}"
 
     def error(self, column: str, problem: str) -> DatasetError:
-        """Return an error about a value of the row."""
         return DatasetError(self._path, f"{self.position}, column {column}", problem)
 
     def __contains__(self, column: str) -> bool:
@@ -134,7 +133,6 @@ def read_table(
 
 
 def _decoded(path: Path) -> Iterator[str]:
-    """Yield the lines of a file in UTF-8."""
     for number, line in enumerate(read_lines(path, MAX_LINE), 1):
         try:
             yield line.decode("utf-8-sig")

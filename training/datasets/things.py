@@ -75,7 +75,6 @@ def _check_parents(label: str, things: Mapping[str, Thing], row: Row) -> None:
 
 
 def _thing(row: Row) -> Thing:
-    """Return the thing of a row. Raise DatasetError if a value is invalid."""
     return Thing(
         label=row.text("label"),
         size=(row.number("long", 1000), row.number("wide", 1000), row.number("high", 1000)),

@@ -94,7 +94,6 @@ def with_things(vocabulary: Vocabulary, things: Mapping[str, Thing]) -> Vocabula
 
 
 def _ancestors(label: str | None, parents: Mapping[str, str | None]) -> set[str]:
-    """Return a class and its broader classes."""
     ancestors: set[str] = set()
     while label is not None:
         ancestors.add(label)

@@ -137,7 +137,6 @@ class _Fit:
         return changes
 
     def step(self) -> None:
-        """Update the weights by one batch."""
         loss = len(self.scenes) * self._batch_loss() + self._prior()
         self._optimiser.zero_grad()
         loss.backward()

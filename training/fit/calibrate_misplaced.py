@@ -90,7 +90,6 @@ def fit_misplaced(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: in
 
 
 def _cases(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int) -> _Cases | None:
-    """Return the cases of the scenes, or None without any."""
     of_scene: list[tuple[int, str, bool, bool, float]] = []
     of_entries: list[tuple[NDArray, ...]] = []
     for number, encoded in enumerate(scenes):

@@ -233,7 +233,6 @@ class ListScores:
         return self.log_odds - alpha * self.popularity
 
     def largest(self, values: Float[NDArray, "n"]) -> Float[NDArray, "N"]:
-        """Return the largest value of each list."""
         worst = np.full(len(self.size), -np.inf)
         np.maximum.at(worst, self.row, values)
         return worst

@@ -50,7 +50,6 @@ def extended(
 
 
 def _weights(weights: Weights, V: int, C: int) -> Weights:
-    """Return the weights with V classes and C room types."""
     old, larger = weights.spec, weights.enlarged(V, C if weights.spec.C else 0)
     arrays = larger.arrays
     arrays["b"][old.V :] = np.quantile(weights["b"], _RARE)
@@ -79,7 +78,6 @@ def _calibration(calibration: Calibration, classes: int, C: int, rooms: int) -> 
 
 
 def _offsets(offsets: Offsets, old: int, new: int) -> Offsets:
-    """Return the offsets of `new` classes instead of `old` ones."""
     A, more = len(offsets.relation), ((0, 0), (0, new - old), (0, 0))
     return replace(
         offsets,
@@ -108,8 +106,6 @@ def _counts(counts: Counts, C: int, rooms: int, classes: int) -> Counts:
 
 
 def _places(places: Places, old: int, new: int) -> Places:
-    """Return the places of `new` classes instead of `old` ones."""
-
     def averaged(table: NDArray[Any]) -> NDArray[Any]:
         mean = table.mean(0, keepdims=True).repeat(new - old, 0)
         return np.concatenate([table, mean.astype(table.dtype)])

@@ -67,7 +67,6 @@ class ObjectScenes:
 
     @classmethod
     def of(cls, train: SceneTensors, structure: Bool[Tensor, "V"], config: ObjectsConfig) -> Self:
-        """Select the scenes."""
         names, annotated = train.source_names, train.annotated_classes
         weights = torch.tensor([config.source_weights.get(q, 1.0) for q in names])
         counts = torch.zeros(annotated.shape).index_add_(0, train.source, (train.v > 0).float())
@@ -196,7 +195,6 @@ class ObjectFit:
         self._add_to_average()
 
     def _batch_loss(self) -> Tensor:
-        """Return the loss of the next batch."""
         scenes = self.scenes
         index = scenes.draw(self.config.batch_size, self._generator)
         loss = self._conditional_loss(index)

@@ -195,8 +195,6 @@ def _fit(pairs: _Pairs, V: int) -> _Fit:
 
 
 def _fit_prior(pairs: _Pairs, axis: int, expected: Float[NDArray, "P"]) -> Float[NDArray, "3"]:
-    """Return kappa, alpha and beta of one axis, fitted by maximum likelihood."""
-
     def loss(logs: NDArray[np.float64]) -> float:
         n, mean, scatter = pairs.n[:, 0], pairs.mean[:, axis], pairs.scatter[:, axis]
         return -float(log_likelihood((expected, *np.exp(logs)), n, mean, scatter).sum())

@@ -107,7 +107,6 @@ class Trainer:
     def run(
         self, progress: Progress = lambda *_: None, passed: Passed = lambda _: None
     ) -> TrainingResult:
-        """Run both phases."""
         began, seed = time.perf_counter(), self.config.training.seed
 
         def add(point: CurvePoint) -> None:

@@ -43,7 +43,6 @@ def own_or_shipped(path: Path | None, config: Config, kind: str, option: str) ->
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
@@ -150,7 +149,6 @@ def sections_toml(values: Mapping[str, Any], reasons: Mapping[str, str] | None =
 
 
 def _entry(name: str, value: Any) -> str:
-    """Return an entry as a line of TOML."""
     if isinstance(value, Mapping):
         entries = ", ".join(_entry(json.dumps(key), entry) for key, entry in value.items())
         return f"{name} = {{ {entries} }}"

@@ -77,7 +77,6 @@ def save_run(
 def _write(
     folder: Path, config: Config, result: TrainingResult, data: Path | None, scenes: str
 ) -> None:
-    """Write the files of a run into a folder."""
     machine = result.machine
     state = {name: tensor.contiguous() for name, tensor in machine.state_dict().items()}
     spec = json.dumps(machine.spec.to_dict())
@@ -91,7 +90,6 @@ def _write(
 
 
 def load_run(folder: Path) -> FinishedRun:
-    """Read a finished run."""
     for name in ("config.json", "model.safetensors", "result.json"):
         if not (folder / name).is_file():
             runs = ", ".join(str(path.parent) for path in sorted(folder.glob("*/result.json")))

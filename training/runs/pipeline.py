@@ -114,7 +114,6 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
 
 
 def _path(source: str, root: Path) -> Path:
-    """Return the file of a data source."""
     if source == inventories.SOURCE:
         return KNOWLEDGE / "inventories.csv"
     if is_file(source):
@@ -125,7 +124,6 @@ def _path(source: str, root: Path) -> Path:
 
 
 def _require_files(data: DataConfig, root: Path) -> None:
-    """Raise ConfigError if a file of a source is missing."""
     paths = {source: _path(source, root) for source in data.sources if source != "rooms"}
     missing = {source: path for source, path in paths.items() if not path.is_file()}
     if not missing:

@@ -221,8 +221,7 @@ def data_sources(scenes: SplitScenes, learnt: ObjectScenes) -> tuple[DataSource,
         digest = scenes.digests[name]
         source = DataSource(
             source=name, scenes=count, digest=digest, terms=words, research_only=research_only,
-            share=round(share_of.get(name, 0.0), 4),
-            written=name in written,
+            share=round(share_of.get(name, 0.0), 4), written=name in written,
         )  # fmt: skip
         sources.append(source)
     return tuple(sources)

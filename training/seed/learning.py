@@ -99,7 +99,6 @@ def train(
 
 
 def _epoch(machine: Machine, material: Material, generator: torch.Generator, rate: float) -> Epoch:
-    """Update the weights by all batches of an epoch, and return its errors."""
     start, own = time.perf_counter(), []
     for index in torch.randperm(len(material.train), generator=generator).split(BATCH):
         positive, negative, *error = phases(machine, material.train.rows(index), generator)
@@ -123,7 +122,6 @@ def _averages(own: Sequence[Sequence[Tensor]], scenes: Scenes) -> tuple[float, f
 
 
 def _check(machine: Machine, epoch: int, rate: float) -> None:
-    """Raise FloatingPointError if a weight shows divergence."""
     for name, weight in machine.named_parameters():
         largest = float(weight.abs().max()) if weight.numel() else 0.0
         if not largest <= LARGEST_WEIGHT:  # also true for NaN

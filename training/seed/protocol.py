@@ -78,7 +78,6 @@ def frequency_answer(triples: Int[Tensor, "T 3"], train: Scenes) -> Answer:
 
 
 def nothing_answer(v: Tensor, r: Tensor, free: Free, generator: torch.Generator) -> Visible:  # noqa: ARG001
-    """Return the scene as it is."""
     return v, r
 
 

@@ -113,7 +113,6 @@ def _keys(scene: EncodedScene, V: int) -> Int[NDArray, "n"]:
 
 
 def _scenes(scenes: Sequence[EncodedScene], units: Int[NDArray, "T"], V: int) -> Scenes:
-    """Return the scenes as tensors, with the triples `units` as relation units."""
     v, r = torch.zeros(len(scenes), V), torch.zeros(len(scenes), len(units))
     keys = [_keys(scene, V) for scene in scenes]
     for row, (scene, own) in enumerate(zip(scenes, keys, strict=True)):
