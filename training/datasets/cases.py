@@ -61,9 +61,8 @@ def scene_of(encoded: EncodedScene, kept: Sequence[int], triples: Sequence[Tripl
 def annotated_relations(encoded: EncodedScene) -> Bool[NDArray, "A N N"]:
     """Return a mask of the relations whose truth is annotated without selection bias.
 
-    The data source must also show that a relation does not hold (docs/decisions/relations.md).
-    Sentences show this only for left and front between stacked objects. Boxes show it for left and
-    front, except in a camera frame, but show too few relations above.
+    The source must also show that a relation does not hold (docs/decisions/relations.md): sentences do
+    for left and front of stacked objects, and boxes for left and front, except in a camera frame.
     """
     positions, of_one_view = encoded.instance_positions, source_of(encoded.source).of_one_view
     annotated = encoded.instance_observed.copy()

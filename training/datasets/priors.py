@@ -1,8 +1,4 @@
-"""Read placing priors: tables of the usual relations between pairs of objects, without scenes.
-
-The table has tab-separated columns and can be gzipped. An empty ``room`` means any room. Training
-skips relations that the service does not have, such as ``nearby``.
-"""
+"""Read placing priors: tables of the usual relations between pairs of objects, without scenes."""
 
 from __future__ import annotations
 

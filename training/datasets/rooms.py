@@ -1,9 +1,8 @@
 """A generator of random furnished rooms, for tests, for examples and for training without data.
 
-The tables of `vocabularies/rooms.toml` define the rooms. Furniture stands at walls without overlap,
-and small objects stand on the furniture. Encoding derives the relations from the boxes by the rules
-of `app.scene.geometry`. The generator creates one to three views of each room from different sides.
-A view omits 10 % of the small objects at random. All views of a room are in one group.
+The tables of `vocabularies/rooms.toml` define the rooms. Furniture stands at walls, and small
+objects on it. A room has one to three views from different sides, which are one group. A view omits
+10 % of the small objects.
 """
 
 from __future__ import annotations

@@ -102,11 +102,7 @@ class Row:
 def read_table(
     path: Path, columns: Sequence[str], errors: Errors, optional: Sequence[str] = ()
 ) -> Iterator[Row]:
-    """Yield the rows of a UTF-8 table that has the `columns`, and may have the `optional` ones.
-
-    Spaces around values are removed. Invalid rows are left out, and an error of the file ends the
-    table. Both are added to the errors.
-    """
+    """Yield the rows of a UTF-8 table that has the `columns`, and may have the `optional` ones."""
     line = 1
     try:
         lines = _decoded(path)

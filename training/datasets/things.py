@@ -1,8 +1,4 @@
-"""Written facts about things: sizes, where they stand, broader words and other names.
-
-`things.csv` has one row for each thing. Extents are those of a typical thing as it usually stands,
-in metres. ``stands`` has shares, such as "floor .92 inside .08".
-"""
+"""Written facts about things in `things.csv`: sizes, where they stand, broader and other names."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

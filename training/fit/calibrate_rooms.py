@@ -101,11 +101,7 @@ def written_rooms(train: SceneTensors) -> tuple[int, ...]:
 
 
 def rare_rooms(artifact: SceneModel, train: SceneTensors, seed: int = 0) -> tuple[int, ...]:
-    """Return the room types with too few training scenes to sample them, in ascending order.
-
-    These have fewer than 10 scenes, or fewer than 50 scenes whose samples resemble the scenes less
-    than two halves of the scenes resemble each other.
-    """
+    """Return the room types whose samples resemble scenes less than halves of the scenes do."""
     rng, things = np.random.default_rng(seed), ~artifact.vocabulary.structure
     rare = []
     for t in range(artifact.spec.C):
@@ -143,10 +139,9 @@ def refitted_limits(artifact: SceneModel, train: SceneTensors) -> SceneModel:
 def limits(artifact: SceneModel, train: SceneTensors) -> dict[str, Any]:
     """Return the entries `smallest` and `room_fit`: limits of a generated scene by room type.
 
-    A limit is a 5 % quantile over parts of whole rooms with complete object lists. All sources
-    have equal weight. `smallest` has parts of 30 % of the classes, as a robot lists a room. The
-    limit of the fit grows with the log of the number of classes. A room type of fewer than 20
-    scenes has the number of classes of all rooms, and a fit of at least -1e9.
+    A limit is a 5 % quantile over parts of whole rooms, with equal weight of all sources. `smallest`
+    has parts of 30 % of the classes, as a robot lists a room. The limit of the fit grows with the
+    log of the number of classes. A room type of few scenes has the number of all rooms.
     """
     rooms = whole_rooms(train)
     parts = [draw_parts(rooms, structure_of(artifact), _part_of(share)) for share in _PARTS]

@@ -75,10 +75,7 @@ class DataConfig(_Section):
 
 
 class MachineConfig(_Section):
-    """The variant and the sizes of the machine.
-
-    The data determine the numbers of classes V, relations A, room types C and triples T.
-    """
+    """The variant and the sizes of the machine. The data determine V, A, C and T."""
 
     variant: Variant
     units: int = Field(default=8, ge=1, description="hidden units")

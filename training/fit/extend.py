@@ -1,8 +1,7 @@
-"""Add classes and room types to a model, before the fit to the home where they occur.
+"""Add classes and room types to a model, before `training.fit.adapt` fits their biases and weights.
 
-New classes follow the classes of the model, and new room types its room types. Their weights are 0:
-such a class does not change the log-odds of others, and its relations are those of an average pair.
-The biases make it rare. `training.fit.adapt` fits biases and weights.
+They follow those of the model. Their weights are 0: such a class does not change the log-odds of
+others, and its relations are those of an average pair. The biases make it rare.
 """
 
 from __future__ import annotations

@@ -267,16 +267,14 @@ class ObjectFit:
 
     @torch.no_grad()
     def finish(self) -> None:
-        """Set the weights to their average, with the base rates of the served mix in b.
-
-        Then a[q] is the difference of source q from the mix, whose log weights replace sizes in f.
-        """
+        """Set the weights to their average, with the base rates of the served mix in b."""
         for name, weight in self._weights.items():
             weight.copy_(self._average[name])
         machine, scenes = self.machine, self.scenes
         if (couplings := machine.couplings) is not None:
             # The optimiser rounds the two halves differently, in its last bits.
             couplings.copy_((couplings + couplings.T).div_(2))
+        # Then a[q] is the difference of source q from the mix, whose log weights are in f.
         served = served_weights(scenes, self.config)
         for rates, bias, shows in (
             (machine.a, machine.b, scenes.shows),

@@ -142,10 +142,7 @@ class _Fit:
         return posterior(prior, pairs.n, pairs.mean, pairs.scatter)
 
     def tables(self) -> tuple[Float[NDArray, "6"], Float[NDArray, "2 V 6"]]:
-        """Return tables whose sum gives mean and variance of a pair without data, as `predict`.
-
-        They are those of unknown classes, and the contributions of subject and object class.
-        """
+        """Return tables whose sum gives mean and variance of a pair without data, as `predict`."""
         spread, unknown = self.beta / (self.alpha - 1), 1 / LAMBDA
         relation = np.concatenate([self.mu, spread * (1 + (1 + 2 * unknown) / self.kappa)])
         variances = spread * (self.effect_variances - unknown) / self.kappa

@@ -44,10 +44,8 @@ def means_of_parts(
 def lower_unseen_roles(
     machine: BoltzmannMachine, train: SceneTensors, parents: Int[Tensor, "V"]
 ) -> None:
-    """Lower the weights of classes that no training scene shows on, in or above an object.
-
-    Factors extrapolate: they put windows on tables. The roles of the parent and of kinds count.
-    """
+    """Lower the weights of classes that no training scene shows on, in or above an object."""
+    # Factors extrapolate: they put windows on tables. Roles of the parent and of kinds count.
     seen = np.zeros((2, machine.spec.A, machine.spec.V), dtype=np.bool_)
     chances = np.zeros(seen.shape, dtype=np.int64)
     for scene in train.scenes:

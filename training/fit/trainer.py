@@ -1,8 +1,4 @@
-"""Train a machine in two phases: the object weights, and then the relation weights.
-
-`training.fit.objects` and `training.fit.relation_weights` define the losses. Two runs with the same
-seed and one thread give bit-identical weights.
-"""
+"""Train a machine in two phases. Equal seeds and one thread give bit-identical weights."""
 
 from __future__ import annotations
 

@@ -258,10 +258,7 @@ class BoltzmannMachine(nn.Module, ABC):
         holds: Float[Tensor, "B A n n"],
         observed: Bool[Tensor, "B A n n"],
     ) -> tuple[Edges, Float[Tensor, "B E"], Bool[Tensor, "B E"]]:
-        """Return the relations between classes in the layout of this machine: edges, r, observed.
-
-        In RBM and GBM, units of absent classes are 0, and observed if any relation of the scene is.
-        """
+        """Return the relations between classes as edges, r and observed flags of this machine."""
 
     @abstractmethod
     def gate(self, edges: Edges, v: Float[Tensor, "... B V"]) -> Float[Tensor, "... B E"]:

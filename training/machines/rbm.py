@@ -45,7 +45,8 @@ class RBM(BoltzmannMachine):
         holds: Float[Tensor, "B A n n"],
         observed: Bool[Tensor, "B A n n"],
     ) -> tuple[Edges, Float[Tensor, "B E"], Bool[Tensor, "B E"]]:
-        # Relations without a unit are left out.
+        # Relations without a unit are left out. Units of absent classes are 0, and observed if any
+        # relation of the scene is.
         pairs = pair_edges(classes, holds.shape[1])
         keys = triple_keys(pairs.relation, pairs.subject, pairs.object, self.spec.V)
         position, exists = find_triples(self.triple_keys, keys)
