@@ -61,8 +61,9 @@ def scene_of(encoded: EncodedScene, kept: Sequence[int], triples: Sequence[Tripl
 def annotated_relations(encoded: EncodedScene) -> Bool[NDArray, "A N N"]:
     """Return a mask of the relations whose truth is annotated without selection bias.
 
-    The source must also show that a relation does not hold (docs/decisions/relations.md): sentences do
-    for left and front of stacked objects, and boxes for left and front, except in a camera frame.
+    The source must also show that a relation does not hold: sentences do for left and front of
+    stacked objects, and boxes for left and front, but no camera frame, and boxes not for above
+    (docs/decisions/relations.md).
     """
     positions, of_one_view = encoded.instance_positions, source_of(encoded.source).of_one_view
     annotated = encoded.instance_observed.copy()

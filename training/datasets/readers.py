@@ -143,10 +143,8 @@ def read_coco(path: Path) -> list[AnnotatedScene]:
             raise DatasetError(path, where, f"two annotations of the image have the id {entry.id}")
         if not entry.iscrowd:
             x, y, width, height = entry.bbox
-            label = categories[entry.category_id]
-            things[entry.id] = AnnotatedObject(
-                str(entry.id), label, box2d=(x, y, x + width, y + height)
-            )
+            label, box = categories[entry.category_id], (x, y, x + width, y + height)
+            things[entry.id] = AnnotatedObject(str(entry.id), label, box2d=box)
     return [
         AnnotatedScene(f"coco-{image}", "coco", f"coco-{image}", None, tuple(objects.values()))
         for image, objects in images.items()

@@ -139,9 +139,9 @@ def refitted_limits(artifact: SceneModel, train: SceneTensors) -> SceneModel:
 def limits(artifact: SceneModel, train: SceneTensors) -> dict[str, Any]:
     """Return the entries `smallest` and `room_fit`: limits of a generated scene by room type.
 
-    A limit is a 5 % quantile over parts of whole rooms, with equal weight of all sources. `smallest`
+    A limit is a 5 % quantile over parts of whole rooms. All sources have equal weight. `smallest`
     has parts of 30 % of the classes, as a robot lists a room. The limit of the fit grows with the
-    log of the number of classes. A room type of few scenes has the number of all rooms.
+    log of the number of classes. A room type of few scenes has the smallest number of all rooms.
     """
     rooms = whole_rooms(train)
     parts = [draw_parts(rooms, structure_of(artifact), _part_of(share)) for share in _PARTS]

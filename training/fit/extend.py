@@ -6,7 +6,7 @@ others, and its relations are those of an average pair. The biases make it rare.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -62,17 +62,15 @@ def _weights(weights: Weights, V: int, C: int) -> Weights:
 
 def _calibration(calibration: Calibration, classes: int, C: int, rooms: int) -> Calibration:
     """Return the calibration with further classes, and room types after the first C."""
-    update: Mapping[str, Any] = {
-        "popularity": (*calibration.popularity, *[None] * classes),
+    update: dict[str, Any] = {
+        "popularity": calibration.popularity and (*calibration.popularity, *[None] * classes),
         "rare_rooms": (*calibration.rare_rooms, *range(C, C + rooms)),
     }
     if calibration.smallest:
         of_rooms, unknown = calibration.smallest[:-1], calibration.smallest[-1]
-        update = {**update, "smallest": (*of_rooms, *[unknown] * rooms, unknown)}
+        update["smallest"] = (*of_rooms, *[unknown] * rooms, unknown)
     if calibration.room_fit:
-        update = {**update, "room_fit": (*calibration.room_fit, *[NO_LIMIT] * rooms)}
-    if not calibration.popularity:
-        update = {**update, "popularity": ()}
+        update["room_fit"] = (*calibration.room_fit, *[NO_LIMIT] * rooms)
     return calibration.model_copy(update=update)
 
 

@@ -149,13 +149,13 @@ def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path)
         "source": partial(source_vocabulary, scenes),
         "rooms": rooms_vocabulary,
     }
-    if name not in makers and not name.endswith(".json"):
+    if name in makers:
+        return with_typical_sizes(makers[name](), scenes)
+    if not name.endswith(".json"):
         raise ConfigError(
             f"data.vocabulary is {name!r}; it must be {', '.join(makers)}, or the name of a .json "
             "file"
         )
-    if name in makers:
-        return with_typical_sizes(makers[name](), scenes)
     try:
         vocabulary = read_vocabulary(root / name)
     except OSError as error:
