@@ -121,7 +121,7 @@ class Part(NamedTuple):
 
 
 def some_instances(encoded: EncodedScene, structure: ClassMask, rng: Rng) -> Part:
-    """Draw a part: 25, 50, 75 or 100 % of the classes, in half of the parts once each."""
+    """Draw a part to list: 25, 50, 75 or 100 % of the classes, with one or more instances."""
     things = np.flatnonzero(~structure[encoded.evidence.classes])
     count = max(1, int(_LISTED[rng.integers(len(_LISTED))] * len(things) + 0.5))
     index = np.sort(rng.permutation(things)[:count])

@@ -14,10 +14,8 @@ from training.datasets.records import DatasetError
 
 T = TypeVar("T")
 
-MAX_BYTES: Final = 2**30
-"""Maximum size of a text file in bytes, after decompression."""
-DATA: Final = Path("../shared/data")
-"""Default folder of the shipped data sources."""
+MAX_BYTES: Final = 2**30  # maximum size of a text file in bytes, after decompression
+DATA: Final = Path("../shared/data")  # default folder of the shipped data sources
 KNOWLEDGE: Final = Path(__file__).resolve().parents[1] / "knowledge"
 """Folder of the written tables, which the repository contains."""
 

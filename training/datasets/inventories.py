@@ -37,18 +37,15 @@ from training.datasets.records import MAX_COUNT, AnnotatedObject, AnnotatedScene
 from training.datasets.tables import Errors, Row, read_table
 from training.datasets.things import Thing, read_things
 
-SOURCE: Final = "inventories"
-"""Source name of the written scenes of the repository."""
+SOURCE: Final = "inventories"  # source name of the written scenes of the repository
 
 COLUMNS: Final = ("room_type", "label")
 OPTIONAL: Final = ("place", "group", "group_share", "share", "count", "relation", "anchor")
 THINGS: Final = "things.csv"
-SHARE: Final = 0.5
-"""Share of the places that have a thing whose row states no share."""
+SHARE: Final = 0.5  # share of the places that have a thing whose row states no share
 _AT_ANCHOR: Final = ("on-top", "inside", "under", "above")
 _BY_ITSELF: Final = ("floor", "wall", "ceiling")
-LISTED: Final = 0.55
-"""Probability that a detector lists a thing of unknown size."""
+LISTED: Final = 0.55  # probability that a detector lists a thing of unknown size
 _SMALLEST, _LENGTH = 0.3, 0.4  # share of the smallest things that are listed; decay length, metres
 _COUNT: Final = re.compile(r"(\d{1,7})(?:-(\d{1,7}))?")
 
@@ -254,7 +251,7 @@ def detection_rates(things: Iterable[Thing]) -> dict[str, float]:
 
 
 def detected_part(scene: AnnotatedScene, rates: Mapping[str, float], rng: Rng) -> AnnotatedScene:
-    """Return the part that a detector lists: whole labels, and always the floor."""
+    """Return the part that a detector lists: all or no objects of a label, always the floor."""
     labels = list(dict.fromkeys(label_key(thing.label) for thing in scene.objects))
     drawn = rng.random(len(labels)) < np.array([rates.get(label, LISTED) for label in labels])
     is_listed = dict(zip(labels, drawn.tolist(), strict=True)) | {"floor": True}

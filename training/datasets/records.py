@@ -16,8 +16,7 @@ from app.scene import RELATIONS
 Box2d = tuple[float, float, float, float]
 
 MAX_COUNT: Final = 1_000_000
-MAX_PROBLEM: Final = 500
-"""Maximum length of the text of a `DatasetError`, in characters."""
+MAX_PROBLEM: Final = 500  # maximum length of the text of a `DatasetError`, in characters
 
 
 class DatasetError(ValueError):
@@ -67,8 +66,7 @@ def _ordered(box: Box2d) -> Box2d:
     return box
 
 
-Text = Annotated[str, Field(pattern=r"\S")]
-"""A text that is not blank."""
+Text = Annotated[str, Field(pattern=r"\S")]  # a text that is not blank
 Id = Annotated[str, BeforeValidator(lambda x: str(x) if type(x) is int else x)]
 """An id: a text, or an integer, which is converted to text."""
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]

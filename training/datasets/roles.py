@@ -27,8 +27,7 @@ _CONTAINS: Final = 0.08
 
 _ROLES: Final = {"on-top": ON, "under": UNDER, "below": UNDER, "inside": IN, "contains": IN}
 
-Role = tuple[int, int, int]
-"""A role, the class in this role, and the class of the larger object."""
+Role = tuple[int, int, int]  # role, the class in this role, and the class of the larger object
 
 
 def count_roles(scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary) -> RoleCounts:

@@ -54,8 +54,7 @@ from training.fit.regression import LEAST_SCENES, RIDGE, at_most, logistic
 _SCENES: Final = 250  # maximum scenes of a source
 _SOURCE_SCENES: Final = 60  # minimum scenes of a source with its own alarm line
 _OF_WORDS: Final = 0.1  # weight of an altered on-top that is asked in the words "under"
-_LENGTHS: Final = (1, 2, 4, 8, 16, 32)
-"""Numbers of entries to which the alarm lines are fitted."""
+_LENGTHS: Final = (1, 2, 4, 8, 16, 32)  # numbers of entries to which the alarm lines are fitted
 # Share of the alarms that each kind of entry may raise. Wrong supports are the surest signs.
 _BUDGET: Final = {"lateral": 0.05, "support": 0.45, "above": 0.1, "under": 0.1, "stand": 0.3}
 

@@ -61,8 +61,7 @@ from training.fit.regression import (
 COVERAGES = (0.15, 0.3, 0.45, 0.6, 0.8)
 # Tested exponents alpha of the prior of intruders.
 ALPHAS = (0.0, 0.125, 0.25, 0.375, 0.5)
-LENGTHS = (1, 2, 3, 4, 5, 6, 8, 10, 12)
-"""Numbers of listed classes to which `missing` is fitted."""
+LENGTHS = (1, 2, 3, 4, 5, 6, 8, 10, 12)  # numbers of listed classes to which `missing` is fitted
 JUDGED_LENGTHS = (*LENGTHS[1:], 16, 24, LONGEST_JUDGED)
 """Numbers of listed classes to which the alarm lines are fitted: a single class is not judged."""
 COVERED = (0.15, 0.25, 0.5, 0.75, 0.9)
@@ -97,7 +96,7 @@ def calibrate_objects(
 
 
 def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
-    """Return the scenes with complete lists, else all. The weight is the chance of a scene."""
+    """Return complete scenes, else all. The weight of a scene is the probability to keep it."""
     rng = np.random.default_rng(seed)
     complete = scenes.complete.numpy()
     complete = complete if complete.any() else ~complete
@@ -106,7 +105,7 @@ def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
 
 
 def calibration_scenes(scenes: SceneTensors, sources: Collection[str]) -> SceneTensors:
-    """Return 20 to 200 scenes of each of the sources; without any, complete scenes of all."""
+    """Return 20 to 200 scenes of each of the `sources`; without these, complete scenes of all."""
     names, size = scenes.source_names, scenes.source.bincount(minlength=len(scenes.source_names))
     chosen = [
         index for index, name in enumerate(names) if name in sources and size[index] >= LEAST_SCENES

@@ -29,8 +29,7 @@ from training.fit.objects import ObjectScenes, served_weights
 
 T = TypeVar("T")
 
-RECORDED: Final = 5
-"""Number of sweeps between two recorded states."""
+RECORDED: Final = 5  # number of sweeps between two recorded states
 
 _CHAINS, _SWEEPS = 256, 3000
 _SETTLED = 2000  # sweeps before the first recorded state of the test

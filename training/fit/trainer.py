@@ -33,8 +33,7 @@ _SCORED = 200  # minimum number of scenes with relations of a validation score
 Progress = Callable[[str, float, float], None]
 """Function that is called with the phase, its finished share, and its mean loss."""
 
-Passed = Callable[[CurvePoint], None]
-"""Function that is called with each new point of the curve."""
+Passed = Callable[[CurvePoint], None]  # function that is called with each new point of the curve
 
 
 def new_machine(config: Config, data: TrainingData, scenes: ObjectScenes) -> BoltzmannMachine:

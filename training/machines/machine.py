@@ -158,7 +158,7 @@ class BoltzmannMachine(nn.Module, ABC):
     def hidden_log_odds(
         self, x: Float[Tensor, "B H1"], weights: Float[Tensor, "rows H1"]
     ) -> Float[Tensor, "B rows"]:
-        """Return sum_m log sum_z p_m(z) exp(w[m, z]) of each row w of weights, with p from x."""
+        """Return sum_m log sum_z p_m(z) exp(w[m, z]) of each row w; x are the logits of p_m."""
         states = self._all_states(x).softmax(-1).movedim(-2, 0)
         factors = self.by_unit(weights).exp().permute(1, 2, 0)
         return (states[..., :1] + states[..., 1:] @ factors).log().sum(0)

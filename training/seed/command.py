@@ -43,14 +43,9 @@ from training.seed.scenes import Material, read_material
 
 console = Console()
 
-Job = tuple[str, str, int]
-"""Split, variant and training seed of a machine."""
-
-Run = dict[str, Any]
-"""Figures of a machine, and the errors of each epoch."""
-
-Row = dict[str, float]
-"""Figures by metric."""
+Job = tuple[str, str, int]  # split, variant and training seed of a machine
+Run = dict[str, Any]  # figures of a machine, and the errors of each epoch
+Row = dict[str, float]  # figures by metric
 
 
 class FolderError(ValueError):

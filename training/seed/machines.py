@@ -155,7 +155,7 @@ class Machine(nn.Module):
     def sweep(
         self, state: State, free: Free, temperature: float, generator: torch.Generator
     ) -> tuple[State, Float[Tensor, "B V"], Float[Tensor, "B T"]]:
-        """Sample h2, h1, free objects and free relations. Return the state, and p of both."""
+        """Sample h2, h1, free objects and relations. Return state, p(objects), p(relations)."""
         h2 = bernoulli((self.h2_logits(state.h1) / temperature).sigmoid(), generator)
         logits = self.h1_logits(state.v, state.r, h2)
         h1 = bernoulli((logits / temperature).sigmoid(), generator)
