@@ -271,10 +271,7 @@ def _promote(
     *,
     accept: Callable[[str], None] | None,
 ) -> None:
-    """Publish the version and point the alias at it, unless the gate refuses the version.
-
-    `accept`: see `publish_run`.
-    """
+    """Publish the version and point the alias at it, unless the gate refuses the version."""
     served = served_model(store, alias)
 
     def judge(model: SceneModel, say: Progress) -> list[str]:

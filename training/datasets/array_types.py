@@ -11,8 +11,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 Rng = np.random.Generator
-ClassMask = Bool[NDArray, "V"]
-"""True for some of the V classes."""
+ClassMask = Bool[NDArray, "V"]  # True for some of the V classes
 
 
 class Table:

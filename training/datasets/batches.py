@@ -78,10 +78,7 @@ class SceneTensors:
         index: Int[Tensor, "N"],
         part: Callable[[ClassEvidence], ClassEvidence] = lambda whole: whole,
     ) -> Batch:
-        """Return the scenes at the given indices as one batch.
-
-        `part` returns the evidence of a scene that the batch has. Its `v` has all classes.
-        """
+        """Return the scenes at the indices, with `part` of their evidence. v has all classes."""
         evidence = [part(self.scenes[k].evidence) for k in index.tolist()]
         n = max((len(e.classes) for e in evidence), default=0)
         relations = self.scenes[0].evidence.holds.shape[0] if self.scenes else 0
@@ -97,9 +94,7 @@ class SceneTensors:
 
 
 def scene_tensors(
-    scenes: Sequence[EncodedScene],
-    annotated: dict[str, ClassMask],
-    vocabulary: Vocabulary,
+    scenes: Sequence[EncodedScene], annotated: dict[str, ClassMask], vocabulary: Vocabulary
 ) -> SceneTensors:
     """Return encoded scenes as tensors. `annotated` has the classes of each source."""
     names = sorted(annotated)

@@ -1,7 +1,6 @@
 """Turn scenes into test questions: choose the parts of a scene to state, hide or alter.
 
-The random choices for a scene depend only on the seed and the id of the scene. Every model
-therefore gets the same questions, whether the evaluation uses one data source or all sources.
+The random choices depend only on the seed and the scene id, so every model has the same questions.
 """
 
 from __future__ import annotations
@@ -41,10 +40,7 @@ def scene_rng(scene: EncodedScene, seed: int) -> Rng:
 
 
 def some_scenes(scenes: SceneTensors, limit: int | None, seed: int = 0) -> SceneTensors:
-    """Return at most `limit` random scenes in their original order.
-
-    The choice depends only on the seed and on the names of the scenes and their sources.
-    """
+    """Return at most `limit` scenes in their order, drawn by the seed and their names."""
     if limit is None or len(scenes) <= limit:
         return scenes
     order = [crc32(f"{seed} {scene.source} {scene.scene_id}".encode()) for scene in scenes.scenes]
@@ -65,10 +61,8 @@ def scene_of(encoded: EncodedScene, kept: Sequence[int], triples: Sequence[Tripl
 def annotated_relations(encoded: EncodedScene) -> Bool[NDArray, "A N N"]:
     """Return a mask of the relations whose truth is annotated without selection bias.
 
-    It contains a relation only if the data source also shows that the relation does not hold.
-    Sentences only show this for left and front between stacked objects. With positions, left and
-    front do not hold beyond the neighbours; without positions, an annotator selected the
-    neighbours, and a camera frame shows only neighbours. Boxes show too few relations above
+    The source must also show that a relation does not hold: sentences do for left and front of
+    stacked objects, and boxes for left and front, but no camera frame, and boxes not for above
     (docs/decisions/relations.md).
     """
     positions, of_one_view = encoded.instance_positions, source_of(encoded.source).of_one_view
@@ -88,11 +82,7 @@ def annotated_relations(encoded: EncodedScene) -> Bool[NDArray, "A N N"]:
 def removed_class(
     encoded: EncodedScene, structure: ClassMask, rng: Rng
 ) -> tuple[int, list[int]] | None:
-    """Draw a class to remove. Return its index and the indices of the remaining instances.
-
-    Structure classes such as walls stay in the scene. The result is None if the scene has fewer
-    than two other classes.
-    """
+    """Draw a class to remove, without structure. Return it and the instances of others."""
     classes = encoded.evidence.classes
     removable = classes[~structure[classes]]
     if len(removable) < 2:
@@ -104,11 +94,8 @@ def removed_class(
 def observed_pairs(
     encoded: EncodedScene, structure: ClassMask, rng: Rng
 ) -> tuple[Bool[NDArray, "N N"], list[Triple]]:
-    """Draw half of the object pairs of a scene as observed pairs, with or without relations.
-
-    If relations were drawn, pairs without an observed relation would have fewer than other pairs.
-    The results are a mask of the unobserved pairs, and the observed triples.
-    """
+    """Draw half of the pairs as observed. Return the unobserved pairs and the observed triples."""
+    # If relations were drawn, pairs without an observed relation would have fewer than others.
     size = len(encoded.instance_classes)
     half = np.triu(rng.random((size, size)) < 0.5, 1)
     observed = half | half.T
@@ -134,18 +121,12 @@ class Part(NamedTuple):
 
 
 def some_instances(encoded: EncodedScene, structure: ClassMask, rng: Rng) -> Part:
-    """Draw a part of a scene to list: 25, 50, 75 or 100 % of the classes.
-
-    Half of the parts list one instance of each class. The others list from one to all instances,
-    with equal probability. Half of the parts state the room type.
-    """
+    """Draw a part to list: 25, 50, 75 or 100 % of the classes, with one or more instances."""
     things = np.flatnonzero(~structure[encoded.evidence.classes])
-    share = _LISTED[rng.integers(len(_LISTED))]
-    count = max(1, int(share * len(things) + 0.5))
+    count = max(1, int(_LISTED[rng.integers(len(_LISTED))] * len(things) + 0.5))
     index = np.sort(rng.permutation(things)[:count])
     number = np.minimum(encoded.evidence.counts[index], MOST)
-    lists_one = rng.random() < 0.5
-    listed = np.ones_like(number) if lists_one else rng.integers(1, number + 1)
+    listed = np.ones_like(number) if rng.random() < 0.5 else rng.integers(1, number + 1)
     room = encoded.room_type if rng.random() < 0.5 else -1
     return Part(encoded.evidence.classes[index], listed, number, room)
 
@@ -157,13 +138,8 @@ def occupied_place(
     rng: Rng,
     relations: Collection[int],
 ) -> tuple[int, int] | None:
-    """Draw a place that is related to a shown object and contains another object.
-
-    The object at the place may be shown or hidden: with hidden objects alone, a missing object
-    would seem more likely at every place. The results are one of the canonical `relations`, and the
-    index of the shown object, which is the object of the relation. None means that the scene has no
-    such place.
-    """
+    """Draw a place with an object: one of the `relations` and its shown anchor."""
+    # With hidden objects alone, a missing object would seem more likely at every place.
     is_thing = ~structure[encoded.instance_classes]
     holds = encoded.instance_holds & annotated_relations(encoded)
     places = np.argwhere((holds & is_thing[:, None] & (is_thing & shown)).any(1))
@@ -177,28 +153,19 @@ def occupied_place(
 def altered_case(
     encoded: EncodedScene, structure: ClassMask, rng: Rng
 ) -> tuple[Scene, Triple | None] | None:
-    """Draw observed relations of a scene. With probability 1/2, replace one by a false triple.
-
-    The results are the scene with the observed relations, and the false triple, or None if all
-    relations are true. The whole result is None if the scene has fewer than two usable relations,
-    or if `altered_scene` draws no false triple.
-    """
+    """Draw a scene with observed relations. With probability 1/2, one of them is false."""
     true_triples = draw_true_relations(encoded, structure, rng)
     if true_triples is None:
         return None
     if rng.random() < 0.5:
-        all_instances = range(len(encoded.instance_classes))
-        return scene_of(encoded, all_instances, true_triples), None
+        return scene_of(encoded, range(len(encoded.instance_classes)), true_triples), None
     return altered_scene(encoded, structure, true_triples, rng)
 
 
 def draw_true_relations(
     encoded: EncodedScene, structure: ClassMask, rng: Rng
 ) -> list[Triple] | None:
-    """Draw at most 40 true triples (relation, subject, object) of instances without structure.
-
-    The result is None if the scene has fewer than two: an altered triple needs other evidence.
-    """
+    """Draw at most 40 true triples without structure; None if there are fewer than two."""
     triples = _triples(encoded.instance_holds, encoded, structure)
     if len(triples) > _MOST_TRIPLES:
         drawn = np.sort(rng.choice(len(triples), _MOST_TRIPLES, replace=False))
@@ -209,12 +176,7 @@ def draw_true_relations(
 def altered_scene(
     encoded: EncodedScene, structure: ClassMask, triples: Sequence[Triple], rng: Rng
 ) -> tuple[Scene, Triple] | None:
-    """Replace one random triple by a false triple with another relation or another object.
-
-    A triple is false if the scene lists neither it nor its mirror image. The results are the scene
-    with the altered triples, and the false triple. They are None if `_ATTEMPTS` draws give no false
-    triple.
-    """
+    """Replace a random triple by a false one. Return the scene and the false triple."""
     is_thing = ~structure[encoded.instance_classes]
     holds = encoded.instance_holds
     index = int(rng.integers(len(triples)))
@@ -224,6 +186,7 @@ def altered_scene(
             relation = int(rng.integers(len(CANONICAL)))
         else:
             object_ = int(rng.integers(len(is_thing)))
+        # A triple is false if the scene lists neither it nor its mirror image.
         is_listed = holds[relation, subject, object_] or holds[relation, object_, subject]
         if subject == object_ or not is_thing[object_] or is_listed:
             continue
@@ -238,11 +201,7 @@ _COUNTING: Final = 0.05
 
 
 def counted_classes(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> dict[str, ClassMask]:
-    """Return the classes whose instances a data source counts, as masks by source name.
-
-    A source counts instances if its object lists are complete and if at least 5 % of the entries
-    (scene, class) have several instances.
-    """
+    """Return masks of the classes that each source counts. Its object lists must be complete."""
     things = ~vocabulary.structure
     entries, several = Counter[str](), Counter[str]()
     repeated: dict[str, ClassMask] = {}

@@ -46,16 +46,12 @@ _IN_THE_IMAGE: Final = [CANONICAL.index("left"), CANONICAL.index("above")]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClassEvidence:
-    """The n distinct classes of a scene and their observed relations.
-
-    ``holds[a, x, y]`` means that classes[x] has relation a to classes[y]. A relation that holds is
-    also observed.
-    """
+    """The n distinct classes of a scene and their observed relations."""
 
     classes: Int[NDArray, "n"]  # in ascending order
     counts: Int[NDArray, "n"]  # number of instances of each class
-    holds: Bool[NDArray, "A n n"]
-    observed: Bool[NDArray, "A n n"]
+    holds: Bool[NDArray, "A n n"]  # [a, x, y]: classes[x] has relation a to classes[y]
+    observed: Bool[NDArray, "A n n"]  # also True where a relation holds
     room_type: int | None  # index
 
     def only(self, rows: Int[NDArray, "m"]) -> ClassEvidence:
@@ -71,13 +67,7 @@ def pool_instances(
     observed: Bool[NDArray, "A N N"],
     room_type: int | None = None,
 ) -> ClassEvidence:
-    """Pool N instances by their class, with a logical OR.
-
-    A relation between classes is on if the relation holds for at least one pair of instances. The
-    relation is off if it was observed for at least one pair, but holds for none. Otherwise the
-    relation is unobserved. If a class has a single instance, the relations between the class and
-    itself stay unobserved.
-    """
+    """Pool N instances by class, with a logical OR over the pairs of their instances."""
     distinct, _, row, counts, _ = pool_classes(classes, np.ones(len(classes)))
     holds, observed = pool_relations(row, len(distinct), holds, observed)
     return ClassEvidence(distinct, counts, holds, observed, room_type)
@@ -85,11 +75,7 @@ def pool_instances(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EncodedScene:
-    """One scene, encoded with a vocabulary.
-
-    The boxes are in the viewer axes from which relations were derived: NaN means unknown, and None
-    that the relations do not come from positions.
-    """
+    """One scene, encoded with a vocabulary."""
 
     scene_id: str
     source: str
@@ -101,6 +87,7 @@ class EncodedScene:
     instance_observed: Bool[NDArray, "A N N"]
     unknown: tuple[str, ...]  # distinct labels outside the vocabulary, sorted; they are left out
     instance_stands: Int[NDArray, "N"]  # what carries each instance; see `app.scene.stands`
+    # Boxes in the viewer axes of the relations. NaN: unknown; None: relations without positions.
     instance_positions: Float[NDArray, "N 3"] | None = None  # centres in metres
     instance_sizes: Float[NDArray, "N 3"] | None = None  # extents before the rotation in metres
     instance_yaws: Float[NDArray, "N"] | None = None  # rotations about the z axis in radians
@@ -115,8 +102,7 @@ class EncodedScene:
         arrays = {name: None if array is None else array[index] for name, array in arrays.items()}
         tables = (self.instance_holds, self.instance_observed)
         holds, observed = (table[:, index][:, :, index] for table in tables)
-        classes = arrays["instance_classes"]
-        evidence = pool_instances(classes, holds, observed, room)
+        evidence = pool_instances(arrays["instance_classes"], holds, observed, room)
         arrays |= {"instance_holds": holds, "instance_observed": observed}
         return replace(self, evidence=evidence, **arrays)
 
@@ -147,12 +133,7 @@ def encode(
 def annotated_classes(
     scenes: Sequence[EncodedScene], vocabulary: Vocabulary
 ) -> dict[str, ClassMask]:
-    """Return the classes that each data source annotates, as masks by source name.
-
-    If a scene does not list an annotated class, the class is absent. A data source annotates the
-    classes that it mentions at least once. A source with an open vocabulary annotates all classes.
-    Labels in `Source.left_out` and `Source.coarse` are excluded.
-    """
+    """Return masks of the annotated classes of each source: unlisted, they are absent."""
     annotated: dict[str, ClassMask] = {}
     for scene in scenes:
         if scene.source not in annotated:
@@ -200,7 +181,6 @@ class _Encoder:
             np.add.at(counts, np.searchsorted(evidence.classes, classes), numbers)
             evidence = replace(evidence, counts=counts)
         labels = [thing.label for thing, c in zip(scene.objects, matches, strict=True) if c is None]
-        share = (meaning.scenes_per_group or group_size) / group_size
         return EncodedScene(
             scene_id=scene.scene_id,
             source=scene.source,
@@ -216,7 +196,7 @@ class _Encoder:
             instance_positions=None if boxes is None else boxes[kept, :3],
             instance_sizes=None if boxes is None else boxes[kept, 3:6],
             instance_yaws=None if boxes is None else boxes[kept, 6],
-            weight=min(1.0, share),
+            weight=min(1.0, (meaning.scenes_per_group or group_size) / group_size),
             complete=meaning.complete_objects,
         )
 
@@ -227,10 +207,7 @@ def _stands(
     boxes: Float[NDArray, "N 7"] | None,
     structure: Bool[NDArray, "N"],
 ) -> Int[NDArray, "N"]:
-    """Return what carries each object of a scene; see `app.scene.stands`.
-
-    Without positions, a listed support that is neither the floor nor an object is a wall.
-    """
+    """Return what carries each object of a scene; see `app.scene.stands`."""
     if boxes is not None:
         heights = Heights.of(boxes[:, :3], boxes[:, 3:6])
         if np.isfinite(heights.bottoms).any():
@@ -239,6 +216,7 @@ def _stands(
             stands[[thing.supported_by is not None for thing in scene.objects]] = SUPPORTED
             return stands
     stands = np.full(len(scene.objects), UNKNOWN)
+    # A listed support that is neither the floor nor an object is a wall.
     stands[[*scene.supported]] = HANGS
     supports: Bool[NDArray, "N N"] = np.any(relations.holds[[*SUPPORTS]], axis=0)
     stands[supports[:, structure].any(1)] = FLOOR
@@ -345,13 +323,9 @@ def _add_supports(
 
 
 def room_viewpoint(scene_id: str, positions: Float[NDArray, "N 3"]) -> Viewpoint:
-    """Return a viewpoint at the middle of one side of the room, facing inwards.
-
-    The room is the bounding box of the object centres in metres. Centres with NaN are ignored, and
-    at least one centre is finite. A hash of the scene id selects the side, so the viewpoint of a
-    scene never changes. Over many scenes, all four sides occur.
-    """
+    """Return a viewpoint at one side of the box of the object centres (metres), facing inwards."""
     (x0, y0), (x1, y1) = np.nanmin(positions[:, :2], 0), np.nanmax(positions[:, :2], 0)
+    # A hash never changes the side of a scene, and over many scenes all four sides occur.
     side = hashlib.sha256(scene_id.encode()).digest()[0] % 4
     return side_viewpoints(float(x0), float(y0), float(x1), float(y1))[side]
 
@@ -368,10 +342,7 @@ def side_viewpoints(x0: float, y0: float, x1: float, y1: float) -> tuple[Viewpoi
 
 
 def derive_from_boxes(boxes: Sequence[Box2d]) -> PoseRelations:
-    """Derive the relations left and above between image boxes (`scene_client.image_plane`).
-
-    The boxes (xmin, ymin, xmax, ymax) have y downwards. NaN means no box.
-    """
+    """Derive left and above between image boxes by `scene_client.image_plane`; NaN means no box."""
     holds, observed = np.zeros((2, A, len(boxes), len(boxes)), dtype=np.bool_)
     for i, j in itertools.combinations(range(len(boxes)), 2):
         if are_neighbours(boxes[i], boxes[j]):

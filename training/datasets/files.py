@@ -14,23 +14,18 @@ from training.datasets.records import DatasetError
 
 T = TypeVar("T")
 
-MAX_BYTES: Final = 2**30
-"""Maximum size of a text file in bytes, after decompression."""
-DATA: Final = Path("../shared/data")
-"""Default folder of the shipped data sources."""
+MAX_BYTES: Final = 2**30  # maximum size of a text file in bytes, after decompression
+DATA: Final = Path("../shared/data")  # default folder of the shipped data sources
 KNOWLEDGE: Final = Path(__file__).resolve().parents[1] / "knowledge"
 """Folder of the written tables, which the repository contains."""
 
 
 def read_lines(path: Path, limit: int) -> Iterator[bytes]:
-    """Yield the lines of a file as bytes. A file named ``*.gz`` is decompressed.
-
-    The lines are not decoded, so that invalid UTF-8 affects one line only. Without the limits, a
-    small compressed file could fill the memory.
+    """Yield the undecoded lines of a file, plain or ``*.gz``: invalid UTF-8 affects one line only.
 
     Raises:
-        DatasetError: the file cannot be read, a line has more bytes than the limit with its line
-            end, or all lines exceed `MAX_BYTES`.
+        DatasetError: the file cannot be read, a line with its end has more bytes than the limit, or
+            all lines exceed `MAX_BYTES`: a small compressed file could fill the memory.
     """
     opener = gzip.open if path.suffix == ".gz" else open
     try:
@@ -66,8 +61,7 @@ def read_json(path: Path, content: type[T]) -> T:
     """Read a JSON file of at most `MAX_BYTES`, whose content has the given type.
 
     Raises:
-        DatasetError: the file cannot be read, is not JSON, or has content of another type. The
-            error has the position of the first such value, such as ``scans.3.objects``.
+        DatasetError: the file cannot be read, is not JSON or has another type at a named position.
     """
     try:
         check_size(path, path.stat().st_size, MAX_BYTES)

@@ -37,18 +37,15 @@ from training.datasets.records import MAX_COUNT, AnnotatedObject, AnnotatedScene
 from training.datasets.tables import Errors, Row, read_table
 from training.datasets.things import Thing, read_things
 
-SOURCE: Final = "inventories"
-"""Source name of the written scenes of the repository."""
+SOURCE: Final = "inventories"  # source name of the written scenes of the repository
 
 COLUMNS: Final = ("room_type", "label")
 OPTIONAL: Final = ("place", "group", "group_share", "share", "count", "relation", "anchor")
 THINGS: Final = "things.csv"
-SHARE: Final = 0.5
-"""Share of the places that have a thing whose row states no share."""
+SHARE: Final = 0.5  # share of the places that have a thing whose row states no share
 _AT_ANCHOR: Final = ("on-top", "inside", "under", "above")
 _BY_ITSELF: Final = ("floor", "wall", "ceiling")
-LISTED: Final = 0.55
-"""Probability that a detector lists a thing of unknown size."""
+LISTED: Final = 0.55  # probability that a detector lists a thing of unknown size
 _SMALLEST, _LENGTH = 0.3, 0.4  # share of the smallest things that are listed; decay length, metres
 _COUNT: Final = re.compile(r"(\d{1,7})(?:-(\d{1,7}))?")
 
@@ -109,9 +106,7 @@ def shipped_things() -> Mapping[str, Thing]:
 
 
 def read_inventory(path: Path) -> Inventory:
-    """Read the places of a file in its order, and the things of the table beside it.
-
-    A label that names no kind of object (`is_placeholder`) is left out, also as an anchor.
+    """Read the places of a file and the things beside it, without placeholder labels.
 
     Raises:
         DatasetError: a file cannot be read, or a value is invalid. The error names the file, the
@@ -164,7 +159,6 @@ class _Places:
             self.anchored.append((row, place, item.anchor))
 
     def places(self) -> tuple[Place, ...]:
-        """Return the places, in the order of their first rows."""
         return tuple(
             Place(
                 place,
@@ -197,11 +191,7 @@ def _item(row: Row) -> Item:
 
 
 def draw_scene(place: Place, scene_id: str, rng: Rng) -> AnnotatedScene:
-    """Draw a whole place: its groups, then their things, then the number of each.
-
-    A thing whose anchor is not drawn has no relation. Things on the floor stand on an object
-    "floor". Things at the wall or ceiling are listed as supported.
-    """
+    """Draw a whole place: its groups, then their things, then the number of each."""
     drawn: list[tuple[Item, int]] = []
     for group in place.groups:
         if rng.random() < group.share:
@@ -219,7 +209,7 @@ def complete_scene(place: Place) -> AnnotatedScene:
 
 
 def _scene(place: Place, scene_id: str, things: Sequence[tuple[Item, int]]) -> AnnotatedScene:
-    """Return a scene with these things and their numbers."""
+    """Return a scene with these numbers of things. A thing without its anchor has no relation."""
     objects = [
         AnnotatedObject(str(index), item.label, count=count)
         for index, (item, count) in enumerate(things)
@@ -251,10 +241,7 @@ def _scene(place: Place, scene_id: str, things: Sequence[tuple[Item, int]]) -> A
 
 
 def detection_rates(things: Iterable[Thing]) -> dict[str, float]:
-    """Return the probability that a detector lists a thing of a written place, by key of its name.
-
-    It is 1 - .7 exp(-length / .4 m): nearly all of the large things, and a third of the smallest.
-    """
+    """Return the probability that a detector lists a thing: 1 - .7 exp(-length / .4 m)."""
     rates: dict[str, float] = {}
     for thing in things:
         for name in (thing.label, *thing.other_names):
@@ -264,10 +251,7 @@ def detection_rates(things: Iterable[Thing]) -> dict[str, float]:
 
 
 def detected_part(scene: AnnotatedScene, rates: Mapping[str, float], rng: Rng) -> AnnotatedScene:
-    """Return a part of a scene, as a detector with these `detection_rates` lists it.
-
-    All objects with one label are in the part, or none. The floor stays.
-    """
+    """Return the part that a detector lists: all or no objects of a label, always the floor."""
     labels = list(dict.fromkeys(label_key(thing.label) for thing in scene.objects))
     drawn = rng.random(len(labels)) < np.array([rates.get(label, LISTED) for label in labels])
     is_listed = dict(zip(labels, drawn.tolist(), strict=True)) | {"floor": True}
@@ -283,10 +267,7 @@ def detected_part(scene: AnnotatedScene, rates: Mapping[str, float], rng: Rng) -
 def written_scenes(
     places: Sequence[Place], rates: Mapping[str, float], each: int, seed: int
 ) -> list[AnnotatedScene]:
-    """Draw parts of a number of scenes of each place, with these `detection_rates`.
-
-    The scenes of a place are one group.
-    """
+    """Draw detected parts of `each` scenes of a place. The scenes of a place are one group."""
     rngs = np.random.default_rng(seed).spawn(len(places))
     return [
         detected_part(draw_scene(place, f"{place.name} {number}", rng), rates, rng)

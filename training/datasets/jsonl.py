@@ -27,8 +27,7 @@ MAX_LINE: Final = 8 * 2**20
 
 _NAMES = ("scene_id", "source", "group", "room_type")
 
-# Data sources with positions in viewer axes whose files were written before the field
-# ``viewer_frame`` existed.
+# Sources in viewer axes whose files are older than the field ``viewer_frame``.
 _VIEWER_SOURCES = frozenset({"sunrgbd-bedroom-3d"})
 
 

@@ -1,8 +1,7 @@
 """Cases of moved objects: one object of a scene stands at a wrong place.
 
-Scenes with boxes get the altered pose of the object. Other scenes get an altered support relation.
-An object is wrong on another object if no pair of their two classes stands on or in each other in
-the scene.
+Scenes with boxes get another pose of the object, and others another support relation. Strangers are
+two objects whose classes never stand on or in each other in the scene.
 """
 
 from __future__ import annotations
@@ -80,19 +79,13 @@ def untouched_scene(encoded: EncodedScene, structure: ClassMask, rng: Rng) -> Sc
 
 def moved_scene(encoded: EncodedScene, structure: ClassMask, rng: Rng) -> tuple[Scene, int] | None:
     """Return `moved_by_pose` for a scene with boxes, and `moved_by_triple` for other scenes."""
-    move = moved_by_pose if has_boxes(encoded) else moved_by_triple
-    return move(encoded, structure, rng)
+    return (moved_by_pose if has_boxes(encoded) else moved_by_triple)(encoded, structure, rng)
 
 
 def moved_by_triple(
     encoded: EncodedScene, structure: ClassMask, rng: Rng
 ) -> tuple[Scene, int] | None:
-    """Return a scene with one altered support relation, and the index of the moved object.
-
-    The scene states at most 40 true relations. One of them, object i on or in object j, becomes
-    "i on top of k". The other support relations of i are left out, and all relations between i and
-    j or k. The result is None if the scene has no such relation or no such object k.
-    """
+    """Return a scene in which one "i on or in j" is "i on top of a stranger k", and the index i."""
     triples = draw_true_relations(encoded, structure, rng) or []
     supports = [(i, j) for a, i, j in triples if a in SUPPORTS]
     strange: Bool[NDArray, "N N"] = _strangers(encoded) & ~structure[encoded.instance_classes]
@@ -100,6 +93,7 @@ def moved_by_triple(
         i, j = supports[index]
         if len(anchors := np.flatnonzero(strange[i])):
             k = int(rng.choice(anchors))
+            # Without the other supports of i, and without relations between i and j or k.
             kept = [
                 (a, x, y)
                 for a, x, y in triples
@@ -128,15 +122,11 @@ def _strangers(encoded: EncodedScene) -> Bool[NDArray, "N N"]:
 def moved_by_pose(
     encoded: EncodedScene, structure: ClassMask, rng: Rng
 ) -> tuple[Scene, int] | None:
-    """Return a scene with one object at a wrong place, and the index of this object.
+    """Return a scene with poses and one object at a wrong place, and the index of this object.
 
-    The scene has poses and no relations. Objects on the moved object move with it. In two thirds of
-    the cases, the object stands on or in a larger object, its supporter. With equal probability, it
-    moves onto another object, whose footprint is at least as large; to a free spot of the floor
-    beside its supporter; or under its supporter, if it is not higher. The last two moves change the
-    height by at least .3 m. In one third, an object on the floor moves onto another object. This
-    object is at least .3 m high, and its footprint has at least half of the area. If a place does
-    not exist, another one is tried. The result is None if the scene has none.
+    Objects on the moved object move with it. In two thirds of the cases, the object has a larger
+    supporter: it moves onto a larger stranger, to the floor beside its supporter, or under it. In
+    one third, an object on the floor moves onto a high stranger. None means no free place.
     """
     bare = posed_scene(encoded)
     boxes = _Boxes.of(encoded, structure)
@@ -150,7 +140,6 @@ def moved_by_pose(
 
 
 def _shifted(scene: Scene, group: Bool[NDArray, "N"], step: Float[NDArray, "3"]) -> Scene:
-    """Return the scene with the objects of a group shifted by (x, y, z) metres."""
     objects = tuple(
         replace(thing, position=_point(np.add(thing.position, step)))
         if moves and thing.position is not None
@@ -198,10 +187,7 @@ class _Boxes:
         return group
 
     def beside(self, j: int, share: Float[NDArray, "2"], margin: float) -> Float[NDArray, "2"]:
-        """Return a point (x, y) at a share of the extents of instance j, plus a margin in metres.
-
-        The share and the margin are measured from the centre, along the axes of the instance.
-        """
+        """Return the point at a share of the extents of j plus a margin (m) from its centre."""
         x, y = share * (self.size[j, :2] + 2 * margin)
         cos, sin = np.cos(self.yaw[j]), np.sin(self.yaw[j])
         return np.array([cos * x - sin * y, sin * x + cos * y]) + self.centre[j, :2]

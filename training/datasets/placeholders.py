@@ -1,8 +1,7 @@
 """Labels that name no kind of object: placeholders of annotators, ids of detectors and catalogues.
 
-Recordings of the field have labels such as REMOVE, unknown, object_7, n03001627 or /m/01mzpv. A
-class of such a label would teach the model only how often a tool failed. So the scenes and
-inventories of a user are read without them. A sense of WordNet names a kind: sofa.n.01 is a sofa.
+A class of such a label (REMOVE, object_7, n03001627, /m/01mzpv) would teach only how often a tool
+failed, so scenes and inventories are read without it. A sense of WordNet names a kind: sofa.n.01.
 """
 
 from __future__ import annotations
@@ -39,19 +38,15 @@ def is_placeholder(label: str) -> bool:
 
 
 def plain_label(label: str) -> str:
-    """Return the curated name in a label: chair for "chair_12", sofa for "sofa.n.01".
-
-    A label without a curated name stays, because its number may distinguish kinds: "screw m4".
-    """
+    """Return the curated name in a label: chair for "chair_12", sofa for "sofa.n.01"."""
     names = curated_names()
+    # The number of a label without a curated name may distinguish kinds: "screw m4".
     if names.is_curated(label) or not names.is_curated(name := without_instance(label)):
         return label
     return name
 
 
-def plain_scenes(
-    scenes: Iterable[AnnotatedScene],
-) -> tuple[list[AnnotatedScene], Counter[str]]:
+def plain_scenes(scenes: Iterable[AnnotatedScene]) -> tuple[list[AnnotatedScene], Counter[str]]:
     """Return the scenes with plain labels and without placeholders, and the left-out labels."""
     left_out: Counter[str] = Counter()
     plain = []

@@ -1,8 +1,4 @@
-"""Read placing priors: tables of the usual relations between pairs of objects, without scenes.
-
-The table has tab-separated columns and can be gzipped. An empty ``room`` means any room. Training
-skips relations that the service does not have, such as ``nearby``.
-"""
+"""Read placing priors: tables of the usual relations between pairs of objects, without scenes."""
 
 from __future__ import annotations
 
@@ -20,17 +16,12 @@ SOURCE: Final = "placing_priors"
 
 # Sources whose rows become training scenes: the places of VirtualHome and AI2-THOR.
 _TRAINED: Final = ("virtualhome_placing", "ithor_receptacles")
-# Other values of the column ``source``: places that people prefer, tables of locations, of votes
-# and of part counts.
+# Other values of the column ``source``, such as tables of votes and of part counts.
 _SKIPPED: Final = ("tidybot", "conceptnet_atlocation", "housekeep_votes", "vg80k_partof_counts")
 
 
 def read_prior_scenes(path: Path) -> list[AnnotatedScene]:
-    """Read each row of a list of places as a scene of two objects and their relation.
-
-    Rows of other sources are skipped. All scenes have the source name `SOURCE`. Rows about the same
-    pair of objects are in one group.
-    """
+    """Read each row of a list of places as a scene of two objects. Rows of a pair are one group."""
     scenes, errors = [], Errors(path)
     for row in read_table(path, COLUMNS, errors):
         with errors:

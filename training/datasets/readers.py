@@ -66,10 +66,7 @@ class _Room(BaseModel):
 
 
 def read_3dssg(path: Path) -> list[AnnotatedScene]:
-    """Read the scans, or splits of scans, in a relationships file of 3DSSG as scenes.
-
-    All scans of a room are in one group. The official files contain no room types and no poses.
-    """
+    """Read the scans, or splits of scans, as scenes. All scans of a room are in one group."""
     scans = read_json(path, _Scans).scans
     rooms = read_json(path.with_name("3RScan.json"), list[_Room])
     room_of = {scan.reference: room.reference for room in rooms for scan in (room, *room.scans)}
@@ -91,9 +88,8 @@ def read_3dssg(path: Path) -> list[AnnotatedScene]:
                 not {subject, anchor} <= labels.keys() for subject, anchor, *_ in scan.relationships
             ),
         }
-        for problem, is_found in problems.items():
-            if is_found:
-                raise DatasetError(path, f"scans.{number}", problem)
+        if problem := next((text for text, applies in problems.items() if applies), None):
+            raise DatasetError(path, f"scans.{number}", problem)
         triples = [(index_of[i], name, index_of[j]) for i, j, _, name in scan.relationships]
         scenes[scene_id] = AnnotatedScene(
             scene_id=scene_id,
@@ -131,11 +127,7 @@ class _Instances(BaseModel):
 
 
 def read_coco(path: Path) -> list[AnnotatedScene]:
-    """Read the images of a COCO file as scenes. Images without objects are skipped.
-
-    Boxes around crowds are also skipped, because they contain several objects. Boxes are in the
-    image plane. Encoding later derives the relations left and above from boxes.
-    """
+    """Read the images of a COCO file as scenes, without empty images and boxes around crowds."""
     content = read_json(path, _Instances)
     categories = {category.id: category.name for category in content.categories}
     images: dict[int, dict[int, AnnotatedObject]] = {image.id: {} for image in content.images}
@@ -151,10 +143,8 @@ def read_coco(path: Path) -> list[AnnotatedScene]:
             raise DatasetError(path, where, f"two annotations of the image have the id {entry.id}")
         if not entry.iscrowd:
             x, y, width, height = entry.bbox
-            label = categories[entry.category_id]
-            things[entry.id] = AnnotatedObject(
-                str(entry.id), label, box2d=(x, y, x + width, y + height)
-            )
+            label, box = categories[entry.category_id], (x, y, x + width, y + height)
+            things[entry.id] = AnnotatedObject(str(entry.id), label, box2d=box)
     return [
         AnnotatedScene(f"coco-{image}", "coco", f"coco-{image}", None, tuple(objects.values()))
         for image, objects in images.items()

@@ -16,8 +16,7 @@ from app.scene import RELATIONS
 Box2d = tuple[float, float, float, float]
 
 MAX_COUNT: Final = 1_000_000
-MAX_PROBLEM: Final = 500
-"""Maximum length of the text of a `DatasetError`, in characters."""
+MAX_PROBLEM: Final = 500  # maximum length of the text of a `DatasetError`, in characters
 
 
 class DatasetError(ValueError):
@@ -67,8 +66,7 @@ def _ordered(box: Box2d) -> Box2d:
     return box
 
 
-Text = Annotated[str, Field(pattern=r"\S")]
-"""A text that is not blank."""
+Text = Annotated[str, Field(pattern=r"\S")]  # a text that is not blank
 Id = Annotated[str, BeforeValidator(lambda x: str(x) if type(x) is int else x)]
 """An id: a text, or an integer, which is converted to text."""
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -106,8 +104,7 @@ class AnnotatedScene:
     # True if positions are in viewer axes. Otherwise a viewpoint must be chosen for left and front.
     viewer_frame: bool = False
     false_relations: tuple[tuple[int, str, int], ...] = ()  # marked as false by an annotator
-    # Indices of the objects whose support is listed, also by other relations than the ten of the
-    # service, such as "attached to".
+    # Indices of objects with a listed support, also by other relations such as "attached to".
     supported: tuple[int, ...] = ()
     # Of scenes recorded by a robot: seconds and nanoseconds since 1970, and whether a person has
     # confirmed the scene. The digest of a data source does not depend on them.
@@ -134,10 +131,7 @@ class AnnotatedScene:
                 )
 
     def only(self, kept: Sequence[int]) -> AnnotatedScene:
-        """Return the scene with some of its objects, whose indices are given in ascending order.
-
-        A relation or support link to another object is left out.
-        """
+        """Return the scene with the objects at ascending indices and their relations."""
         index_of = {old: new for new, old in enumerate(kept)}
         ids = {self.objects[k].id for k in kept}
 

@@ -27,16 +27,11 @@ _CONTAINS: Final = 0.08
 
 _ROLES: Final = {"on-top": ON, "under": UNDER, "below": UNDER, "inside": IN, "contains": IN}
 
-Role = tuple[int, int, int]
-"""A role, the class in this role, and the class of the larger object."""
+Role = tuple[int, int, int]  # role, the class in this role, and the class of the larger object
 
 
 def count_roles(scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary) -> RoleCounts:
-    """Count the roles that scenes state by listed relations.
-
-    Each group of near-duplicate scenes counts once. A pair of classes also counts for its kin, with
-    half the weight: pairs with the parent or a kind of a class. Structure has no roles.
-    """
+    """Count the roles in listed relations, once in each group of near-duplicate scenes."""
     index = cache(vocabulary.index)
     stated: set[tuple[str, str, Role]] = set()
     for scene in scenes:
@@ -65,7 +60,6 @@ def lift_of(thing: AnnotatedObject, support: AnnotatedObject) -> float | None:
 
 
 def _table(own: Counter[Role], vocabulary: Vocabulary) -> RoleCounts:
-    """Return the counts of pairs and of larger objects, with those of their kin."""
     V, kin = len(vocabulary), _kin(vocabulary)
     pairs: defaultdict[int, np.ndarray] = defaultdict(lambda: np.zeros(3, np.float32))
     anchor = np.zeros((V, 3), np.float32)

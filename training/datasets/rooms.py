@@ -1,9 +1,8 @@
 """A generator of random furnished rooms, for tests, for examples and for training without data.
 
-The tables of `vocabularies/rooms.toml` define the rooms. Furniture stands at walls without overlap,
-and small objects stand on the furniture. Encoding derives the relations from the boxes by the rules
-of `app.scene.geometry`. The generator creates one to three views of each room from different sides.
-A view omits 10 % of the small objects at random. All views of a room are in one group.
+The tables of `vocabularies/rooms.toml` define the rooms. Furniture stands at walls, and small
+objects on it. A room has one to three views from different sides, which are one group. A view omits
+10 % of the small objects.
 """
 
 from __future__ import annotations
@@ -49,9 +48,8 @@ class Piece:
     where: Where = "wall"  # not used for small objects, which stand on the piece that carries them
     most: int = 1
     carries: tuple[Piece, ...] = ()  # small objects that can stand on the piece
-    # Pieces beside the piece, such as a nightstand left of a bed, with their sides. The side is
-    # seen from the wall behind the main piece; ``around`` means all four sides. The ``chance`` of
-    # the adjacent piece applies to each side.
+    # Adjacent pieces, such as a nightstand left of a bed, with their sides seen from the wall.
+    # ``around`` means all four sides. The ``chance`` of the adjacent piece applies to each side.
     beside: tuple[tuple[Piece, Side], ...] = ()
 
 
@@ -101,11 +99,7 @@ class _Box:
 
 
 def generate_rooms(count: int, seed: int, rooms: Rooms = ROOMS) -> list[AnnotatedScene]:
-    """Generate scenes. The same seed gives the same scenes. `DOMAINS` has other rooms.
-
-    Positions are in viewer axes. Objects have sizes, yaws, and the id of the furniture below them
-    (``supported_by``). ``relations`` is None, because encoding derives the relations.
-    """
+    """Generate scenes in viewer axes. The same seed gives the same scenes."""
     if count < 0:
         raise ValueError(f"count must not be negative, not {count}")
     rng, number = np.random.default_rng(seed), 0
@@ -279,8 +273,7 @@ class _Layout:
             return True
         footprints = (_footprints(boxes) for boxes in ([box] * len(neighbours), neighbours))
         _, gap = overlap_and_gap(*itertools.chain.from_iterable(footprints))
-        clearance = 0.0 if box.support is not None else _CLEARANCE
-        return bool((gap > clearance).all())
+        return bool((gap > (0.0 if box.support is not None else _CLEARANCE)).all())
 
 
 def _footprints(boxes: Sequence[_Box]) -> tuple[Floats, Floats, Floats]:

@@ -4,12 +4,10 @@ A listed relation holds. An unlisted relation is false ("off"), false only betwe
 for neighbours"), false only if the support of its subject is listed ("off for supported"), or
 unobserved. docs/decisions/relations.md gives the reason for each source.
 
-Two rules apply to every data source. First, if on-top, inside or above is listed for a pair of
-objects, all unlisted relations of the pair are false in both directions. (1 to 10 % of such pairs
-also have a listed left or front.) Second, a relation that an annotator marked as false is false.
-
-With poses, two objects are neighbours if they are close by the rule of `app.scene.geometry`.
-Without poses, two objects with at least one listed relation are neighbours.
+If on-top, inside or above is listed for a pair, all its unlisted relations are false in both
+directions. (1 to 10 % of such pairs also have a listed left or front.) A relation that an annotator
+marked as false is false. Neighbours are close by the rule of `app.scene.geometry`; without poses,
+they have at least one listed relation.
 
 `vocabularies/sources.toml` describes the sources.
 """
@@ -40,8 +38,7 @@ class Meaning:
     lateral: Unlisted = "off"  # left and front
     # Object lists are nearly complete: in the training of objects, unlisted objects are absent.
     complete_objects: bool = True
-    # Maximum total weight of a group of near-duplicates in the training of objects, in scenes. The
-    # scenes of all data sources count. None means that each scene has weight 1.
+    # Maximum total weight of a group of near-duplicates of all sources; None: 1 for each scene.
     scenes_per_group: float | None = None
 
     @property
@@ -59,25 +56,20 @@ class Source:
     research_only: bool = False  # the licence excludes commercial use
     # None means `LISTS` for scenes with listed relations, and `BOXES` for other scenes.
     meaning: Meaning | None = None
-    # Relations of the predicates that are no names of relations. The reader skips other predicates,
-    # such as "next to". None means that another predicate is an error.
+    # Relations of predicates with other names. Other predicates are skipped; None: an error.
     predicates: Mapping[str, str] | None = None
     supports: tuple[str, ...] = ()  # predicates that state the support of their subject
     left_out: tuple[str, ...] = ()  # labels whose annotation is too incomplete or biased
-    # Classes whose objects annotators mostly call by the name of the broader class, such as "table"
-    # for a coffee table. An unlisted class of this kind is unobserved.
+    # Classes that annotators mostly call by a broader name, so they are unobserved if unlisted.
     coarse: tuple[str, ...] = ()
-    # Annotators used free words, so an unlisted class is absent. Otherwise a class outside their
-    # list of labels is unobserved.
+    # Annotators used free words: an unlisted class is absent, also outside a list of labels.
     open_vocabulary: bool = False
     counts_movables: bool = False  # only movable objects are counted, others occur once in a scene
-    # A scene is one camera frame, which does not show how many objects are in the room. So
-    # statistics of counts do not learn from it.
+    # A scene is one camera frame, which does not show how many objects are in the room.
     of_one_view: bool = False
     # Numbers of instances are the judgements of a writer, so statistics of counts leave them out.
     written: bool = False
-    # A scene lists nearly all things of a whole room, as people furnish it. Scenes drawn for
-    # `/generate` are compared with such rooms.
+    # A scene lists nearly all things of a room. `/generate` is compared with such scenes.
     whole_rooms: bool = False
 
 
@@ -93,7 +85,6 @@ class _File(BaseModel):
         return Meaning(**self.meanings[like] | entries)
 
     def source(self, entry: dict[str, Any]) -> Source:
-        """Return the source of an entry of the file."""
         own = self.meaning(**entry["meaning"]) if "meaning" in entry else None
         camera_subjects = self.camera_subjects if entry.get("without_camera_subjects") else ()
         left_out = (*camera_subjects, *entry.get("left_out", ()))
@@ -119,10 +110,7 @@ _OWN_INVENTORY: Final = replace(SOURCES["inventories"], terms="", left_out=())
 
 
 def is_inventory(name: str) -> bool:
-    """Return True for the name of a written inventory: of a user's table, or of the repository's.
-
-    The table of a user is a source that keeps the name of its file, such as "ward.csv".
-    """
+    """Return True for the inventory of the repository, and a user's table such as "ward.csv"."""
     return name == "inventories" or name.casefold().endswith(".csv")
 
 
@@ -132,10 +120,7 @@ def source_of(name: str) -> Source:
 
 
 def meaning_of(source: str, *, listed: bool = True) -> Meaning:
-    """Return the meaning of relations and objects that a data source does not list.
-
-    It depends on whether the scene lists relations, except for sources with a fixed meaning.
-    """
+    """Return the meaning of unlisted relations and objects: that of the source, or by `listed`."""
     return source_of(source).meaning or (LISTS if listed else BOXES)
 
 
@@ -151,12 +136,9 @@ def relation_of(source: str, predicate: str) -> str | None:
 def relations_of(
     source: str, triples: Iterable[tuple[int, str, int]]
 ) -> tuple[tuple[int, str, int], ...]:
-    """Translate triples (subject, predicate, object) of a data source into distinct relations.
-
-    Predicates that are no relation of the service are skipped. Some image annotators relate an
-    object to itself. Such triples are also skipped.
-    """
+    """Translate triples (subject, predicate, object) into distinct relations of the service."""
     relations = [(i, relation_of(source, predicate), j) for i, predicate, j in triples]
+    # Some image annotators relate an object to itself.
     return tuple(dict.fromkeys((i, name, j) for i, name, j in relations if name and i != j))
 
 

@@ -8,13 +8,11 @@ The percentages are the shares of the training, test and validation part.
   all groups keep their parts when a data set grows. This protocol does not stratify.
 - ``final`` (90 / 0 / 10 %) is ``group`` without a test part, for shipped weights.
   Both assign written scenes separately: otherwise the weights would miss whole written places.
-- ``paper`` (60 / 30 / 10 %) is the protocol of Bozcan et al. (ICRA 2018). Each scene is assigned
-  separately.
+- ``paper`` (60 / 30 / 10 %), of Bozcan et al. (ICRA 2018), assigns each scene separately.
 - ``paper groups`` has the shares of ``paper`` and keeps groups together.
 
-All protocols except ``stable`` stratify by room type. Their parts depend on the seed and on the set
-of scenes, but neither on the order of scenes nor on the vocabulary. Data sources with common groups
-must be split together; others do not affect each other's parts.
+All protocols except ``stable`` stratify by room type, independent of the order of scenes and of the
+vocabulary. Data sources with common groups must be split together; others are independent.
 """
 
 from __future__ import annotations
@@ -75,7 +73,6 @@ def stable_part(scene: AnnotatedScene, seed: int) -> Part:
 
 
 def _stable_part(unit: str, seed: int) -> Part:
-    """Return the part of a unit from a hash of the seed and its name."""
     fraction = int.from_bytes(_rank(seed, unit)[:8], "big") / 2**64
     for part, share in FRACTIONS["stable"].items():
         if fraction < share:
@@ -87,11 +84,7 @@ def _stable_part(unit: str, seed: int) -> Part:
 def _families(
     scenes: Sequence[AnnotatedScene], units: Sequence[str]
 ) -> Sequence[Mapping[str, Counter[str]]]:
-    """Count the room types of each unit (group or scene), for each set of connected data sources.
-
-    Data sources are connected if they have common units. A unit is counted only in its largest
-    source, so that a small source cannot change the parts of a large source.
-    """
+    """Count the room types of each unit, for each set of data sources that share units."""
     sources_of: dict[str, set[str]] = defaultdict(set)
     sizes: Counter[str] = Counter()
     for scene, unit in zip(scenes, units, strict=True):
@@ -106,6 +99,7 @@ def _families(
     families = defaultdict(lambda: defaultdict(Counter))
     names = curated_names()
     for scene, unit in zip(scenes, units, strict=True):
+        # Only in its largest source: a small source cannot change the parts of a large one.
         if scene.source == max(sources_of[unit], key=lambda source: (sizes[source], source)):
             room = names.canonical_room(scene.room_type) or ""
             families[family_of[scene.source]][unit][room] += 1
@@ -115,12 +109,8 @@ def _families(
 def _assign(
     rooms_of: Mapping[str, Counter[str]], fractions: Mapping[Part, float], seed: int
 ) -> dict[str, Part]:
-    """Assign each unit to the part that is furthest below its target share of scenes.
-
-    The stratum of a unit is its most common room type. Large strata are assigned first, and a hash
-    orders the units within a stratum. The distance from the target is counted within the stratum
-    and over all scenes. Otherwise, all units of small strata would become training scenes.
-    """
+    """Assign each unit to the part that is furthest below its target share of scenes."""
+    # The stratum of a unit is its most common room type. Large strata are assigned first.
     strata: dict[str, list[str]] = defaultdict(list)
     for unit, rooms in rooms_of.items():
         strata[min(rooms, key=lambda room: (-rooms[room], room))].append(unit)
@@ -134,6 +124,7 @@ def _assign(
             lack = {
                 part: sum(
                     fraction * (counts.total() + weight[unit]) - counts[part]
+                    # Within the stratum alone, small strata would become training scenes.
                     for counts in (in_stratum, overall)
                 )
                 for part, fraction in fractions.items()

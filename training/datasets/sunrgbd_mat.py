@@ -77,8 +77,7 @@ class _Box(BaseModel):
         return AnnotatedObject(
             id=str(number),
             label=self.classname.strip(),
-            # In the file, x points right and y away from the camera. In viewer axes, x points away
-            # from the viewer and y left.
+            # In the file, x points right and y ahead. In viewer axes, x points ahead and y left.
             position=(y, -x, z),
             size=(size[ahead], size[aside], size[upright]),
             yaw=math.atan2(-float(self.basis[ahead, 0]), float(self.basis[ahead, 1])),
@@ -94,12 +93,7 @@ _FRAMES = TypeAdapter(Annotated[list[_Frame], BeforeValidator(_structs)])
 
 
 def read_sunrgbd_mat(path: Path) -> list[AnnotatedScene]:
-    """Read all camera frames with boxes as scenes.
-
-    ``<sequenceName>/scene.txt`` in the folder of the MATLAB file gives the room type. Frames of one
-    SUN3D place are in one group. Other frames form groups of 20 consecutive frames from one sensor
-    and collection. The file may have at most `MAX_BYTES`.
-    """
+    """Read all frames with boxes. ``<sequenceName>/scene.txt`` contains the room type."""
     try:
         frames = _FRAMES.validate_python(_load(path))
     except ValidationError as error:
@@ -139,10 +133,7 @@ def _load(path: Path) -> Any:
 
 
 def _check_sizes(path: Path) -> None:
-    """Check the size of all arrays, before `loadmat` allocates memory for them.
-
-    A file can be small in two ways: by compression, and by a header that announces many entries.
-    """
+    """Check compressed data and announced entries, before `loadmat` allocates memory for them."""
     with path.open("rb") as file:
         content = file.read(MAX_BYTES + 1)
     check_size(path, len(content), MAX_BYTES)

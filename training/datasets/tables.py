@@ -64,7 +64,6 @@ class Row:
         self.position = f"line {line}"
 
     def error(self, column: str, problem: str) -> DatasetError:
-        """Return an error about a value of the row."""
         return DatasetError(self._path, f"{self.position}, column {column}", problem)
 
     def __contains__(self, column: str) -> bool:
@@ -103,12 +102,7 @@ class Row:
 def read_table(
     path: Path, columns: Sequence[str], errors: Errors, optional: Sequence[str] = ()
 ) -> Iterator[Row]:
-    """Yield the rows of a table in UTF-8, whose first line names the columns.
-
-    Spaces around values are removed. Blank lines are skipped. A row with another number of values
-    is left out, and an error of the file ends the table. Both are added to the errors. The file has
-    the `columns`, and may have the `optional` ones. Any other named column is an error.
-    """
+    """Yield the rows of a UTF-8 table that has the `columns`, and may have the `optional` ones."""
     line = 1
     try:
         lines = _decoded(path)
@@ -135,7 +129,6 @@ def read_table(
 
 
 def _decoded(path: Path) -> Iterator[str]:
-    """Yield the lines of a file in UTF-8."""
     for number, line in enumerate(read_lines(path, MAX_LINE), 1):
         try:
             yield line.decode("utf-8-sig")

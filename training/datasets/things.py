@@ -1,8 +1,4 @@
-"""Written facts about things: sizes, where they stand, broader words and other names.
-
-`things.csv` has one row for each thing. Extents are those of a typical thing as it usually stands,
-in metres. ``stands`` has shares, such as "floor .92 inside .08".
-"""
+"""Written facts about things in `things.csv`: sizes, where they stand, broader and other names."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -40,9 +36,8 @@ def read_things(path: Path) -> dict[str, Thing]:
     """Read the things by label, in the order of the file.
 
     Raises:
-        DatasetError: the file cannot be read, a value is invalid, a label occurs twice, a parent
-            has no row, or the parents of a thing lead back to it. The error names the file, the
-            line and the column. It is an InvalidLinesError if there are several errors.
+        DatasetError: the file or a value is invalid, a label occurs twice, a parent has no row, or
+            parents form a loop. It names line and column; InvalidLinesError: several errors.
     """
     things: dict[str, Thing] = {}
     rows: dict[str, Row] = {}
@@ -76,7 +71,6 @@ def _check_parents(label: str, things: Mapping[str, Thing], row: Row) -> None:
 
 
 def _thing(row: Row) -> Thing:
-    """Return the thing of a row. Raise DatasetError if a value is invalid."""
     return Thing(
         label=row.text("label"),
         size=(row.number("long", 1000), row.number("wide", 1000), row.number("high", 1000)),

@@ -35,8 +35,7 @@ class Names:
     placeholders: tuple[str, ...] = ()  # words of labels that name no kind of object
     numbered: tuple[str, ...] = ()  # words that are placeholders if a number follows
     aliases: dict[str, tuple[str, ...]] = field(default_factory=dict)  # other names of each class
-    # More specific names of each class. If a vocabulary has a class for the specific name, the
-    # broader class is its parent. Otherwise the name can become an alias.
+    # More specific names of each class: classes with this parent, otherwise aliases.
     kinds: dict[str, tuple[str, ...]] = field(default_factory=dict)
     # Other names of each room type. The key "" lists names without a room type.
     rooms: dict[str, tuple[str, ...]] = field(default_factory=dict)
@@ -60,10 +59,7 @@ class Names:
         return self._rooms_by_key.get(label_key(room), _plain(room)) or None
 
     def room_index(self, room: str | None, vocabulary: Vocabulary) -> int | None:
-        """Return the index of a room type in a vocabulary, or None for an unknown room type.
-
-        A name of the vocabulary takes precedence over the curated names.
-        """
+        """Return the index of a room type, or None. Names of the vocabulary come first."""
         names = (room, self.canonical_room(room))
         indices = (vocabulary.room_index(name) for name in names if name is not None)
         return next((index for index in indices if index is not None), None)
@@ -117,15 +113,9 @@ MINIMUM_BOXES = 5  # from which a typical size is computed
 
 
 def build_vocabulary(
-    scenes: Iterable[AnnotatedScene],
-    names: Names,
-    *,
-    minimum: int = MINIMUM_MENTIONS,
+    scenes: Iterable[AnnotatedScene], names: Names, *, minimum: int = MINIMUM_MENTIONS
 ) -> Vocabulary:
-    """Collect the frequent classes of scenes with their aliases, most frequent class first.
-
-    A label counts for its curated name. The base and household classes of ``names`` are always
-    included, and labels in ``names.not_objects`` excluded.
+    """Collect the base classes of `names` and the frequent ones, most frequent class first.
 
     Raises:
         ValueError: every class has fewer objects than the minimum.
@@ -159,10 +149,7 @@ def most_frequent(counts: Counter[str]) -> str:
 
 
 def vocabulary_json(vocabulary: Vocabulary) -> str:
-    """Return a vocabulary as JSON text that people can edit, with one class on each line.
-
-    The text contains the sizes of described things only: `with_typical_sizes` computes others.
-    """
+    """Return a vocabulary as JSON text that people can edit, without empty sizes."""
     values = vocabulary.to_dict()
     for entry in values["objects"]:
         if entry["size"] is None:
@@ -183,11 +170,7 @@ def vocabulary_text(values: Mapping[str, Any]) -> str:
 
 
 def with_aliases(vocabulary: Vocabulary) -> Vocabulary:
-    """Return the vocabulary with the curated synonyms of its classes, and of kinds that it lacks.
-
-    The parents and the flag `anywhere` of its classes are renewed too. The labels, their order and
-    their sizes stay the same.
-    """
+    """Return the vocabulary with curated synonyms, kinds and parents. Labels and sizes stay."""
     aliases, objects = curated_names().aliases, []
     for entry in vocabulary.objects:
         synonyms = (x for x in aliases.get(entry.label, ()) if vocabulary.index(x) is None)
@@ -226,17 +209,13 @@ def source_vocabulary(
     minimum: int = MINIMUM_MENTIONS,
     required: Iterable[str] = (),
 ) -> Vocabulary:
-    """Build a vocabulary of the classes of one data source, without the base classes.
-
-    A `required` label becomes a class, also with fewer objects than the minimum. Because the
-    vocabulary has few classes, more specific names become aliases. For example, "coffee table"
-    becomes an alias of "table".
-    """
+    """Build a vocabulary of the frequent classes of one data source and the `required` labels."""
     names = curated_names()
     # An empty entry preserves the curated spelling of a class without aliases.
     spellings = dict.fromkeys((*names.base, *names.household, *names.structure), ())
     aliases = spellings | names.aliases
     base = tuple({label_key(name): name for name in map(names.canonical, required)}.values())
+    # Without kinds, a specific name becomes an alias: "coffee table" of "table".
     mentioned_only = replace(names, base=base, household=(), kinds={}, aliases=aliases)
     return _with_kinds(build_vocabulary(scenes, mentioned_only, minimum=minimum))
 
@@ -259,18 +238,13 @@ def _with_kinds(vocabulary: Vocabulary) -> Vocabulary:
 
 
 def with_typical_sizes(vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene]) -> Vocabulary:
-    """Add the typical size of each class, the median size of its boxes in the scenes.
-
-    The service uses the typical size for objects without a size, whose yaw is also unknown. The
-    typical footprint is therefore a square. The side of the square is the median of sqrt(dx * dy),
-    which preserves the area. A class with fewer than `MINIMUM_BOXES` boxes stays unchanged. Objects
-    without a size and flat objects are skipped.
-    """
+    """Add the typical size of each class: the median of its boxes, if it has `MINIMUM_BOXES`."""
     boxes: dict[int, list[tuple[float, float]]] = {}
     index_of = cache(vocabulary.index)
     for thing in (thing for scene in scenes for thing in scene.objects):
         if thing.size and min(thing.size) and (index := index_of(thing.label)) is not None:
             x, y, z = thing.size
+            # The yaw is unknown, so the footprint is a square with the area of the box.
             boxes.setdefault(index, []).append(((x * y) ** 0.5, z))
     classes = list(vocabulary.objects)
     for index, class_boxes in boxes.items():

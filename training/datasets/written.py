@@ -24,13 +24,7 @@ LEAST_PLACES: Final = 0.5
 
 @cache
 def written_vocabulary() -> Vocabulary:
-    """Build the vocabulary: the commonest things of the written places come first.
-
-    The classes of the indoor vocabulary are always included. Another thing is a class from
-    `LEAST_PLACES` on, and otherwise a name of its nearest broader class. The parent of a class is
-    its nearest broader class. A name with a class of its own is never an alias. Of several classes
-    with the same other name, `things.csv` comes before the curated names.
-    """
+    """Build the vocabulary: the commonest things of the written places come first."""
     names, indoor = curated_names(), read_vocabulary(INDOOR_FILE)
     inventory = read_inventory(KNOWLEDGE / "inventories.csv")
     things, places = inventory.things, inventory.places
@@ -44,6 +38,8 @@ def written_vocabulary() -> Vocabulary:
         for label, thing in sorted(things.items(), key=lambda x: -expected[label_key(x[0])])
         if label_key(label) in indoor_class or expected[label_key(label)] >= LEAST_PLACES
     }
+    # A thing without a class is a name of its nearest broader class.
+    # Names in `things.csv` come before the curated ones.
     aliases = _Aliases(classes)
     for thing in things.values():
         label = thing.label if thing.label in classes else _broader(thing, things, classes)
@@ -68,10 +64,7 @@ def written_vocabulary() -> Vocabulary:
 
 
 def with_things(vocabulary: Vocabulary, things: Mapping[str, Thing]) -> Vocabulary:
-    """Return the vocabulary with the sizes, parents and other names of described things.
-
-    What the vocabulary states itself stays. Of things with the same other name, the first counts.
-    """
+    """Return the vocabulary with described sizes, parents and names. Its own entries stay."""
     described = {label_key(thing.label): thing for thing in things.values()}
     for thing in things.values():
         for name in thing.other_names:
@@ -101,7 +94,6 @@ def with_things(vocabulary: Vocabulary, things: Mapping[str, Thing]) -> Vocabula
 
 
 def _ancestors(label: str | None, parents: Mapping[str, str | None]) -> set[str]:
-    """Return a class and its broader classes."""
     ancestors: set[str] = set()
     while label is not None:
         ancestors.add(label)

@@ -1,19 +1,18 @@
 """Adapt the object weights of a trained machine to the scenes of one home.
 
-The weights change little where the home says little. δ is the change of the bias of each class, and
-Δ is the change of the rows of W of the recorded classes. The fit minimises
+δ is the change of the bias of each class, and Δ that of the rows of W of the recorded classes. The
+fit minimises
 
     n · [mean over parts of recorded scenes of (BCE(hidden classes | listed) - log p(t | listed))
          + 2 · mean over parts of stored samples of the cross-entropy of the parent and the home]
     + ρ_δ |δ|² + ρ_Δ |Δ|²
 
 - Random parts of the n recorded scenes predict the rest, as in training (`training.fit.objects`).
-- The second line is distillation: both machines predict unlisted classes and room types of random
-  parts of the samples that the artifact stores. Without this line, the machine forgets other rooms.
+- The second line is distillation: both machines predict unlisted classes and room types of the
+  stored samples. Without it, the machine forgets other rooms.
 - Few scenes without a class k do not prove that the home lacks it. Let the parent expect the class
   in E_k of the n scenes. If no scene shows it, its target is the answer of the parent, divided by
-  1 + E_k. The factor is the posterior mean of a rate with the prior exp(-rate), given no event
-  where E_k were expected.
+  1 + E_k: the posterior mean of a rate with the prior exp(-rate), given no event.
 - New classes (`training.fit.extend`) and rare ones of the parent have no part in the distillation
   if they are recorded. The prior of their biases is weak, and their biases start at least at the
   log-odds of the share of scenes that show the class.
@@ -69,10 +68,7 @@ class HomeScenes(Table):
 def adapt(
     parent: Weights, scenes: HomeScenes, *, trained_on: TrainedOn | None = None, seed: int = 0
 ) -> Weights:
-    """Return the weights of the parent, adapted to scenes of two or more classes.
-
-    Without `trained_on`, training scenes of the parent show all classes and room types.
-    """
+    """Return the parent's weights, adapted to scenes. Default of `trained_on`: everything."""
     scenes = scenes.rows(scenes.v.sum(1) >= 2)
     if not len(scenes):
         raise ValueError("no recorded scene has two known objects")
@@ -86,15 +82,9 @@ def adapt(
 
 
 def part_loss(
-    log_odds: Float[Tensor, "N V"],
-    target: Float[Tensor, "N V"],
-    scenes: HomeScenes,
-    parts: Parts,
+    log_odds: Float[Tensor, "N V"], target: Float[Tensor, "N V"], scenes: HomeScenes, parts: Parts
 ) -> Float[Tensor, "N"]:
-    """Return the cross-entropy of the classes that random parts of scenes do not list.
-
-    The log-odds are those of a machine given the parts, and the targets are probabilities.
-    """
+    """Return the cross-entropy of the unlisted classes of parts; targets are probabilities."""
     weight = scenes.observed * (1 - parts.listed)
     weight = weight * torch.where(scenes.v > 0, parts.weight.unsqueeze(1), 1.0)
     return binary_cross_entropy_with_logits(log_odds, target, weight, reduction="none").sum(1)
@@ -147,7 +137,6 @@ class _Fit:
         return changes
 
     def step(self) -> None:
-        """Update the weights by one batch."""
         loss = len(self.scenes) * self._batch_loss() + self._prior()
         self._optimiser.zero_grad()
         loss.backward()

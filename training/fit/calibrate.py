@@ -1,15 +1,12 @@
 """Fit the calibration, which turns log-odds into the probabilities that the service returns.
 
-All fits use validation scenes. Without enough scenes for `outlier` or `misplaced`, the entry is
-None and the model gives no judgement. An unfitted entry of another question keeps the model's own
-probability. `training.fit.calibrate_objects` fits the entries about objects.
+Without enough validation scenes for `outlier` or `misplaced`, the entry is None and the model gives
+no judgement. An unfitted entry of another question keeps the model's own probability.
 
-The probability of a relation means that it holds in a home with both objects. So the fits use
-only data sources that annotate true and false relations alike (`annotated_relations`), such as
-real rooms with listed supports. All fits are logistic regressions (Platt scaling). One source of
-generated rooms has more examples than all other sources together. The fits therefore give large
-sources a lower weight. A robot lists few objects or many, so each scene takes part as a whole and
-in parts.
+The probability of a relation means that it holds in a home with both objects. So the fits use only
+sources that annotate true and false relations alike (`annotated_relations`). All fits are logistic
+regressions (Platt scaling) with lower weights of large sources, such as generated rooms. A robot
+lists few objects or many, so each scene takes part as a whole and in parts.
 
 Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 """
@@ -45,7 +42,7 @@ from training.fit.calibrate_misplaced import fit_misplaced
 from training.fit.calibrate_objects import calibrate_objects
 from training.fit.configuration import ObjectsConfig
 from training.fit.objects import ObjectScenes, served_popularity
-from training.fit.regression import fit_count_slope, recalibrated
+from training.fit.regression import fit_count_slope, recalibrated, structure_of
 
 _SCENES = 1500
 _LISTED = 20  # relations that an answer of the service lists by default
@@ -54,8 +51,7 @@ _POSSIBLE = -3.5  # least log-odds of a relation that may well hold
 _OF_THE_REST = 0.02
 _ROUNDS = 3
 _UNKNOWN = -1.0  # truth of an example whose data source does not annotate the relation
-# Number of objects that are removed from each scene in turn to fit placements. With one removed
-# object, the fit depends too much on chance.
+# Objects removed from each scene in turn: with one, the fit depends too much on chance.
 _PLACEMENT_CASES = 4
 
 
@@ -92,13 +88,9 @@ def calibrate(
 def fit_relations(
     artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int = 0
 ) -> tuple[CountSlope, ...]:
-    """Fit the probability that a relation holds between two instances, in whole and partial scenes.
-
-    The input is the log-odds of the relation between the two classes. No relation is observed.
-    """
+    """Fit the relations of two instances, given the objects of whole scenes and of parts."""
     rng = np.random.default_rng(seed)
-    structure = artifact.vocabulary.structure
-    parts = [_part_of(encoded, structure, rng) for encoded in scenes]
+    parts = [_part_of(encoded, artifact.vocabulary.structure, rng) for encoded in scenes]
     return _fit_possible(_examples_of_pairs(artifact, [*scenes, *parts]))
 
 
@@ -112,11 +104,7 @@ def fit_with_observed(
 def with_lower_lateral(
     artifact: SceneModel, slopes: tuple[CountSlope, ...], scenes: SceneTensors
 ) -> tuple[CountSlope, ...]:
-    """Lower the log-odds of left and front until the likeliest relations are the listed ones.
-
-    Of two stacked objects, an annotator lists the stacked relation. `lateral_shift` finds the
-    change of the intercept of left and front.
-    """
+    """Lower the log-odds of left and front until the likeliest relations are the listed ones."""
     table = np.array([(s.intercept, s.slope, s.log_count) for s in slopes])[:, :, None, None]
 
     def score(question: ScenePairs) -> NDArray[np.float64]:
@@ -127,8 +115,8 @@ def with_lower_lateral(
         logits = table[:, 0] + table[:, 1] * log_odds + table[:, 2] * (logs[:, None] + logs)
         return both_ways(logits, question.pairs)
 
-    structure = torch.from_numpy(artifact.vocabulary.structure.copy())
-    shift = lateral_shift(score, listed_pairs(scenes, structure, STACKED))
+    # Of two stacked objects, an annotator lists only the stacked relation.
+    shift = lateral_shift(score, listed_pairs(scenes, structure_of(artifact), STACKED))
     return tuple(
         entry.model_copy(update={"intercept": entry.intercept + shift}) if a in LATERAL else entry
         for a, entry in enumerate(slopes)
@@ -166,10 +154,7 @@ class _Examples(Table):
 
     @classmethod
     def joined(cls, blocks: Sequence[_Examples]) -> _Examples:
-        """Join blocks, without pairs for which the machine has no relation unit.
-
-        A column of a block is an array, or a single value of the whole block.
-        """
+        """Join blocks, without pairs that have no relation unit. A column may be one value."""
         arrays = (np.broadcast_arrays(*vars(block).values()) for block in blocks)
         columns = zip(*arrays, strict=True)
         joined = map(np.concatenate, columns) if blocks else np.zeros((6, 0), dtype=np.int64)
@@ -185,11 +170,7 @@ class _Examples(Table):
 def _examples_of_pairs(
     artifact: SceneModel, scenes: Sequence[EncodedScene], rng: Rng | None = None
 ) -> _Examples:
-    """Return the examples of all pairs of a scene; with `rng`, of half, given the other half.
-
-    Relations without annotation are examples only if their log-odds are high enough for the list of
-    an answer.
-    """
+    """Return the examples of all pairs of a scene; with `rng`, of half, given the other half."""
     blocks = []
     structure = artifact.vocabulary.structure
     sources = sorted({encoded.source for encoded in scenes})
@@ -206,7 +187,7 @@ def _examples_of_pairs(
         is_thing = ~structure[encoded.instance_classes]
         pairs = pairs & is_thing[:, None] & is_thing & ~np.eye(n, dtype=np.bool_)
         annotated = annotated_relations(encoded)
-        # The smallest of the `_LISTED` largest values of each relation.
+        # Without annotation, relations are examples from the `_LISTED`-th largest value on.
         few = pairs.sum() <= _LISTED
         least = [-np.inf if few else np.partition(v[pairs], -_LISTED)[-_LISTED] for v in log_odds]
         is_example = pairs & (annotated | (log_odds >= np.array(least)[:, None, None]))
@@ -227,11 +208,7 @@ def _examples_of_pairs(
 def fit_placements(
     artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int = 0
 ) -> tuple[CountSlope, ...]:
-    """Fit the probability of relations between a removed object and the objects of its scene.
-
-    The fit is mainly to the likeliest relations, because an answer lists them. The scenes are whole
-    scenes and parts.
-    """
+    """Fit the probability of relations of a removed object, in whole scenes and in parts."""
     rng = np.random.default_rng(seed)
     structure = artifact.vocabulary.structure
     sources = sorted({encoded.source for encoded in scenes})
@@ -277,15 +254,11 @@ def _fit_possible(examples: _Examples) -> tuple[CountSlope, ...]:
 
 
 def _fit_listed(examples: _Examples, listed: int) -> tuple[CountSlope, ...]:
-    """Fit the slopes, mainly to the `listed` likeliest examples of each scene.
-
-    An answer lists only these examples. Selection by high log-odds also selects errors, so listed
-    relations hold less often than unselected relations with equal log-odds. Examples outside the
-    list have a small weight. Examples without annotation take part only in the ranking.
-    """
+    """Fit the slopes, mainly to the `listed` likeliest examples of a scene, as an answer does."""
     annotated = examples.annotated
     fitted = examples.rows(annotated)
     slopes = _fit_by_kind(fitted, np.ones(len(fitted.truth)))
+    # Selection by log-odds also selects errors, so the ranking changes the fit.
     for _ in range(_ROUNDS):
         is_listed = _is_listed(examples, slopes, listed)[annotated]
         weight = np.where(is_listed, 1.0, _OF_THE_REST)
@@ -316,12 +289,9 @@ def _is_listed(
 
 
 def _fit_by_kind(examples: _Examples, weight: Float[NDArray, "N"]) -> tuple[CountSlope, ...]:
-    """Fit one slope to left and front, and one to on-top for all relations of stacked objects.
-
-    Complete sources show hundreds of times more pairs with on-top than with inside, and no pairs
-    with above. A kind with one truth value keeps its log-odds.
-    """
+    """Fit one slope to left and front, and one to on-top for all relations of stacked objects."""
     entries = [CountSlope()] * len(CANONICAL)
+    # Sources show hundreds of times more on-top than inside, and no above.
     for fitted, kind in ((LATERAL, LATERAL), ((ON_TOP,), STACKED)):
         is_fitted = np.isin(examples.relation, fitted)
         rows = examples.rows(is_fitted)

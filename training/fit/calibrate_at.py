@@ -2,10 +2,9 @@
 
     p(class and place) = p(class) p(place | class)
 
-The first factor is that of `/missing` without a place. The entries `at` of the calibration give the
-second factor (`app.registry.PlaceFit`). They are fitted by maximum likelihood of the product, over
-all classes that may stand at places in parts of scenes. Data sources have equal weights. Relations
-of stacked objects share an entry, and so do left and front.
+The first factor is that of `/missing` without a place. The entries `at` of the calibration
+(`app.registry.PlaceFit`) give the second, by maximum likelihood of the product over all classes
+that may stand at places in parts of scenes. Data sources have equal weights.
 """
 
 from __future__ import annotations
@@ -63,8 +62,7 @@ def place_terms(artifact: SceneModel, question: PlaceQuestion) -> PlaceTerms:
     """Return the terms of the candidate classes at a place."""
     scene, place, is_there, usable = question
     posterior, classes = Posterior(artifact, scene), np.flatnonzero(usable)
-    coverage = artifact.calibration.coverage
-    z = posterior.absent_log_odds(classes, coverage).astype(np.float64)
+    z = posterior.absent_log_odds(classes, artifact.calibration.coverage).astype(np.float64)
     counts = np.zeros(len(classes))
     if artifact.places is not None:
         anchor = int(posterior.present.classes[posterior.present.row[place.anchor]])

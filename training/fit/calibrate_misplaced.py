@@ -1,14 +1,12 @@
 """Fit the judgement of observed relations, and of objects on the floor or on a wall.
 
-Each validation scene takes part several times: with listed true relations, with one of them
-altered, with its boxes or listed relations as they are, and with one moved object
-(`training.datasets.moved`). An altered on-top is also asked in the words "under". Sentences that a
-program has parsed contain errors, so they only show how objects are above and under each other.
-Boxes show many relations above that no person would mention, so a listed one of boxes is left out.
+Each validation scene takes part several times: with true relations, with one of them altered, with
+its boxes, and with one moved object (`training.datasets.moved`). Sentences that a program has
+parsed contain errors, so they only show how objects are above and under each other. Boxes show many
+relations above that no person would mention, so a listed one of boxes is left out.
 
-A logistic regression for each kind of entry turns its terms into the log-odds that the entry is
-wrong (`app.questions.misplaced`). The alarm lines keep the share of untouched scenes with an alarm.
-Long lists have a higher line than short ones.
+A logistic regression of each kind of entry gives the log-odds that the entry is wrong
+(`app.questions.misplaced`). The alarm lines keep the share of untouched scenes with an alarm.
 """
 
 from __future__ import annotations
@@ -56,8 +54,7 @@ from training.fit.regression import LEAST_SCENES, RIDGE, at_most, logistic
 _SCENES: Final = 250  # maximum scenes of a source
 _SOURCE_SCENES: Final = 60  # minimum scenes of a source with its own alarm line
 _OF_WORDS: Final = 0.1  # weight of an altered on-top that is asked in the words "under"
-_LENGTHS: Final = (1, 2, 4, 8, 16, 32)
-"""Numbers of entries to which the alarm lines are fitted."""
+_LENGTHS: Final = (1, 2, 4, 8, 16, 32)  # numbers of entries to which the alarm lines are fitted
 # Share of the alarms that each kind of entry may raise. Wrong supports are the surest signs.
 _BUDGET: Final = {"lateral": 0.05, "support": 0.45, "above": 0.1, "under": 0.1, "stand": 0.3}
 
@@ -92,7 +89,6 @@ def fit_misplaced(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: in
 
 
 def _cases(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int) -> _Cases | None:
-    """Return the cases of the scenes, or None without any."""
     of_scene: list[tuple[int, str, bool, bool, float]] = []
     of_entries: list[tuple[NDArray, ...]] = []
     for number, encoded in enumerate(scenes):
@@ -172,15 +168,13 @@ def _part_of(scene: Scene, rng: Rng) -> Scene:
 def _truth(
     entries: Entries, wrong: Triple | int | None
 ) -> tuple[Bool[NDArray, "n"], Bool[NDArray, "n"]]:
-    """Return which entries are wrong, and for which of them the truth is annotated.
-
-    A moved object makes its own support wrong. Its other relations may be right or wrong.
-    """
+    """Return which entries are wrong, and for which of them the truth is annotated."""
     every = np.ones(len(entries.kind), np.bool_)
     if wrong is None:
         return ~every, every
     if isinstance(wrong, tuple):
         return (entries.triple == np.array(wrong)).all(1), every
+    # Other relations of a moved object may be right or wrong.
     is_wrong = (entries.mover == wrong) & (entries.kind != BESIDE)
     return is_wrong, (entries.triple[:, 1:] != wrong).all(1) | is_wrong
 
@@ -239,14 +233,11 @@ def _line(points: Sequence[tuple[float, float]], least: float) -> AlarmLine:
 
 
 def hardest_quantile(values: Float[NDArray, "N"], sources: NDArray[np.str_], share: float) -> float:
-    """Return the highest quantile of the values over the large sources.
-
-    A robot sees scenes of one source. Small sources count as one. A value equal to the quantile is
-    below it.
-    """
+    """Return the highest quantile over the large sources, since a robot sees one source."""
     names, sizes = np.unique(sources, return_counts=True)
     small = np.isin(sources, names[sizes < _SOURCE_SCENES])
     parts = [sources == name for name in names[sizes >= _SOURCE_SCENES]]
     parts += [small] if small.any() else []
     highest = max(float(np.quantile(values[part], share)) for part in parts)
+    # A value equal to the quantile is below it.
     return float(np.nextafter(highest, np.inf))

@@ -1,18 +1,14 @@
-"""Fit the calibration of answers about objects to short lists.
-
-A robot lists a few objects of a room. So all fits use random parts of validation scenes
-(`calibration_scenes`). Structure is not listed.
+"""Fit the calibration of answers about objects to short lists: random parts of validation scenes.
 
     coverage   Listed share that the answers assume: the share with the best rank of hidden classes.
     missing    Probability that an unlisted class is present, fitted to the first classes of parts
                of each number of classes. Written places have far more things than a person or a
-               detector lists of a room. So these parts are not written, unless all scenes are.
+               detector lists, so these parts are not written, unless all scenes are.
     covered    The same in parts of a stated share of the scene, written scenes included.
     outlier    Probability that a class is an intruder. Half of the parts contain an intruder.
     lines      An object is an outlier if its log-odds of being an intruder are above a line in the
                log of the number of listed classes. Each line raises alarms in a given share of the
-               untouched parts (`training.evaluation.alarms.ALARMS`), with and without the room
-               type. A class that few training scenes show raises no alarm.
+               untouched parts (`ALARMS`), with and without the room type.
 
 The prior of an intruder class is proportional to (frequency of the class)^alpha. Alpha and the
 logistic regression are fitted to three kinds of intruders with equal weights. Intruders are drawn
@@ -65,8 +61,7 @@ from training.fit.regression import (
 COVERAGES = (0.15, 0.3, 0.45, 0.6, 0.8)
 # Tested exponents alpha of the prior of intruders.
 ALPHAS = (0.0, 0.125, 0.25, 0.375, 0.5)
-LENGTHS = (1, 2, 3, 4, 5, 6, 8, 10, 12)
-"""Numbers of listed classes to which `missing` is fitted."""
+LENGTHS = (1, 2, 3, 4, 5, 6, 8, 10, 12)  # numbers of listed classes to which `missing` is fitted
 JUDGED_LENGTHS = (*LENGTHS[1:], 16, 24, LONGEST_JUDGED)
 """Numbers of listed classes to which the alarm lines are fitted: a single class is not judged."""
 COVERED = (0.15, 0.25, 0.5, 0.75, 0.9)
@@ -83,18 +78,13 @@ _SOURCE_SCENES = 200  # maximum scenes of each source
 def calibrate_objects(
     artifact: SceneModel,
     validation: SceneTensors,
-    train: SceneTensors,
-    popularity: Float[Tensor, "V"],
-    sources: Collection[str],
+    train: SceneTensors,  # gives the intruders, and limits for room types
+    popularity: Float[Tensor, "V"],  # log-odds in the served mix; NaN without training scenes
+    sources: Collection[str],  # see `calibration_scenes`
     seed: int = 0,
-    chosen: Calibration | None = None,
+    chosen: Calibration | None = None,  # coverage and alpha are copied
 ) -> Calibration:
-    """Return the model's calibration with newly fitted entries about objects.
-
-    The training scenes give the intruders, and limits for room types. The coverage and alpha of a
-    `chosen` calibration are copied. `popularity` is the log-odds of each class in the served mix;
-    NaN for a class without a training scene. The `sources` are those of `calibration_scenes`.
-    """
+    """Return the model's calibration with newly fitted entries about objects."""
     scenes = calibration_scenes(validation, sources)
     learnt = complete_scenes(train, seed)
     rounded = tuple(None if math.isnan(x) else round(x, 4) for x in popularity.double().tolist())
@@ -106,10 +96,7 @@ def calibrate_objects(
 
 
 def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
-    """Return the scenes with complete object lists, or all scenes if no list is complete.
-
-    A near-duplicate scene is kept with a probability equal to its weight.
-    """
+    """Return complete scenes, else all. The weight of a scene is the probability to keep it."""
     rng = np.random.default_rng(seed)
     complete = scenes.complete.numpy()
     complete = complete if complete.any() else ~complete
@@ -118,11 +105,7 @@ def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
 
 
 def calibration_scenes(scenes: SceneTensors, sources: Collection[str]) -> SceneTensors:
-    """Return the scenes of the named sources with at least 20 scenes.
-
-    Without such a source, they are all scenes with complete object lists. At most 200 scenes of a
-    source take part.
-    """
+    """Return 20 to 200 scenes of each of the `sources`; without these, complete scenes of all."""
     names, size = scenes.source_names, scenes.source.bincount(minlength=len(scenes.source_names))
     chosen = [
         index for index, name in enumerate(names) if name in sources and size[index] >= LEAST_SCENES
@@ -224,10 +207,7 @@ def _mean_rank(z: Float[NDArray, "N V"], parts: _Lists) -> float:
 def _first_classes(
     z: Float[NDArray, "N V"], parts: _Lists
 ) -> tuple[Float[NDArray, "k"], Int[NDArray, "k"], Bool[NDArray, "k"]]:
-    """Return log-odds, part and truth of the first classes of each part.
-
-    Classes that the data source cannot show are left out, because their truth is unknown.
-    """
+    """Return log-odds, part and truth of the first classes that the source of a part can show."""
     first = np.argsort(np.where(parts.candidates, -z, np.inf), axis=1, kind="stable")[:, :_LISTED]
     rows = np.broadcast_to(np.arange(len(z))[:, None], first.shape)
     # A small vocabulary has fewer candidates.
@@ -252,7 +232,6 @@ class ListScores:
         return self.log_odds - alpha * self.popularity
 
     def largest(self, values: Float[NDArray, "n"]) -> Float[NDArray, "N"]:
-        """Return the largest value of each list."""
         worst = np.full(len(self.size), -np.inf)
         np.maximum.at(worst, self.row, values)
         return worst
@@ -264,12 +243,7 @@ def fit_outliers(
     train: SceneTensors,
     chosen: Calibration | None = None,
 ) -> dict[str, Any]:
-    """Fit the calibration of outliers on random parts of scenes, with and without an intruder.
-
-    The training scenes give the distributions of intruders. A `chosen` calibration gives alpha. The
-    entries are `popularity_weight`, `outlier`, `outlier_lines` and `room_lines`; none if there are
-    too few scenes or parts.
-    """
+    """Fit the calibration of outliers on random parts of scenes, with and without an intruder."""
     if len(scenes) < LEAST_SCENES:
         return {}
     untouched = score_untouched(artifact, scenes)
@@ -292,8 +266,7 @@ def refitted_lines(
     entry, alpha = artifact.calibration.outlier, artifact.calibration.popularity_weight
     if entry is None:
         return artifact
-    lines = fit_lines(artifact, scenes, entry, alpha)
-    return recalibrated(artifact, **lines)
+    return recalibrated(artifact, **fit_lines(artifact, scenes, entry, alpha))
 
 
 def judged_classes(artifact: SceneModel) -> ClassMask:
@@ -327,10 +300,7 @@ def score_lists(
 def score_untouched(
     artifact: SceneModel, scenes: SceneTensors, *, in_room: bool = False
 ) -> dict[int, ListScores]:
-    """Return the scores of random parts of scenes by length, without lengths of too few parts.
-
-    With `in_room`, the request states the room type, and scenes without a type are left out.
-    """
+    """Return the scores of random parts by length; with `in_room`, given the room type."""
     if in_room:
         scenes = subset(scenes, scenes.room >= 0)
     scores: dict[int, ListScores] = {}
@@ -346,8 +316,7 @@ def score_intruders(
     artifact: SceneModel, scenes: SceneTensors, weights: Tensor | None
 ) -> ListScores:
     """Return the scores of random parts of scenes, each with an intruder drawn by the weights."""
-    unjudged = torch.from_numpy(~judged_classes(artifact))
-    intruders = draw_intruders(scenes, unjudged, weights)
+    intruders = draw_intruders(scenes, torch.from_numpy(~judged_classes(artifact)), weights)
     kept = (intruders >= 0).nonzero().squeeze(1)
     parts = draw_parts(subset(scenes, kept), structure_of(artifact), up_to_longest, _SEEDS)
     return score_lists(artifact, parts, intruders[kept][parts.scene])
@@ -368,8 +337,7 @@ def _detection(scores: ListScores, alpha: float, limit: float) -> float:
     """Return the mean of hit@1 and of the share of intruders above a limit."""
     values = -scores.score(alpha)
     first = values >= scores.largest(values)[scores.row]
-    caught = values > limit
-    return float(first[scores.intruder].mean() + caught[scores.intruder].mean()) / 2
+    return float(first[scores.intruder].mean() + (values > limit)[scores.intruder].mean()) / 2
 
 
 def _fit_intruders(
@@ -393,10 +361,7 @@ def _fit_intruders(
 def fit_lines(
     artifact: SceneModel, scenes: SceneTensors, entry: CountSlope, alpha: float
 ) -> dict[str, AlarmLines | None]:
-    """Return the fields `outlier_lines` and `room_lines` of a `Calibration`.
-
-    A field is None if there are too few lists for it.
-    """
+    """Return the lines of a `Calibration` without and with the room type; None with few lists."""
     fields: dict[str, AlarmLines | None] = {}
     for name, in_room in (("outlier_lines", False), ("room_lines", True)):
         untouched = score_untouched(artifact, scenes, in_room=in_room)
@@ -409,14 +374,10 @@ def fit_lines(
 def fit_line(worst: Mapping[int, Float[NDArray, "N"]], share: float) -> AlarmLine:
     """Return a line above which about `MARGIN` times the share of the lists has an object.
 
-    `worst` has the largest log-odds of each list by the length of the lists.
-
-    The shape of the line is the least-squares parabola in the log of the length through the
-    quantiles of the lengths, weighted by the square roots of their numbers of lists. A parabola,
-    because short lists say little, and long lists of written places contain rare things. With fewer
-    than five lengths, the shape is a straight line, and with fewer than three, it is constant. The
-    quantiles are those of medium sensitivity, so the lines of two sensitivities never cross. The
-    intercept is such that the mean share over the lengths is right.
+    `worst` has the largest log-odds of each list by length. The shape is the weighted parabola in
+    the log of the length through the quantiles of medium sensitivity, so two lines never cross:
+    short lists say little, and long ones contain rare things. Below five lengths it is a straight
+    line, below three a constant. The intercept makes the mean share over the lengths right.
     """
     sizes, lists = np.log(list(worst)), list(worst.values())
     quantiles = [np.quantile(values, 1 - MARGIN * ALARMS["medium"]) for values in lists]

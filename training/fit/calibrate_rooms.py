@@ -1,13 +1,11 @@
 """Fit the calibration entries about room types.
 
-rooms        Sharpness of the probabilities of room types (`/rooms`), fitted by maximum
-             likelihood to parts of validation scenes of each number of classes, and to whole
-             scenes.
-rare_rooms   Room types of few training scenes (`rare_rooms`).
-written_rooms
-             Room types that only written sources show.
+rooms          Sharpness of the probabilities of `/rooms`, by maximum likelihood on parts of
+               validation scenes of each number of classes, and on whole scenes.
+rare_rooms     Room types of few training scenes (`rare_rooms`).
+written_rooms  Room types that only written sources show.
 smallest, room_fit
-             Limits of a generated scene of each room type, from parts of whole rooms (`limits`).
+               Limits of a generated scene of each room type, from parts of whole rooms (`limits`).
 """
 
 from __future__ import annotations
@@ -53,11 +51,7 @@ _LONG_SCENES = 100  # of a room type, for a limit of the fit that grows with the
 def calibrate_rooms(
     artifact: SceneModel, scenes: SceneTensors, train: SceneTensors
 ) -> dict[str, Any]:
-    """Return the calibration entries about room types.
-
-    They are fitted to validation scenes of the served sources, and to training scenes with complete
-    object lists.
-    """
+    """Return the entries about room types, from validation and complete training scenes."""
     return {
         "rooms": fit_rooms(artifact, scenes),
         "rare_rooms": rare_rooms(artifact, train),
@@ -107,13 +101,7 @@ def written_rooms(train: SceneTensors) -> tuple[int, ...]:
 
 
 def rare_rooms(artifact: SceneModel, train: SceneTensors, seed: int = 0) -> tuple[int, ...]:
-    """Return the room types with too few training scenes to sample them, in ascending order.
-
-    These are the types of fewer than 10 scenes. They are also the types of fewer than 50 scenes
-    whose samples resemble the scenes less than two halves of the scenes resemble each other. The
-    resemblance of two sets is sum_i min(p_i, q_i) / sum_i max(p_i, q_i), where p_i and q_i are the
-    shares of scenes with class i.
-    """
+    """Return the room types whose samples resemble scenes less than halves of the scenes do."""
     rng, things = np.random.default_rng(seed), ~artifact.vocabulary.structure
     rare = []
     for t in range(artifact.spec.C):
@@ -138,7 +126,7 @@ def _samples(artifact: SceneModel, room: int, seed: int) -> Bool[NDArray, "N V"]
 
 
 def _resemblance(first: Bool[NDArray, "N V"], second: Bool[NDArray, "M V"]) -> float:
-    """Return the resemblance of two sets of scenes, as defined by `rare_rooms`."""
+    """Return sum_i min(p_i, q_i) / sum_i max(p_i, q_i) of the shares of scenes with class i."""
     p, q = first.mean(0), second.mean(0)
     return float(np.minimum(p, q).sum() / max(np.maximum(p, q).sum(), 1e-9))
 
@@ -151,14 +139,9 @@ def refitted_limits(artifact: SceneModel, train: SceneTensors) -> SceneModel:
 def limits(artifact: SceneModel, train: SceneTensors) -> dict[str, Any]:
     """Return the entries `smallest` and `room_fit`: limits of a generated scene by room type.
 
-    A limit is a 5 % quantile over parts of whole rooms. The number of classes has the parts of 30 %
-    of the classes, as a robot lists a room, so rooms in short real lists also reach the limits. The
-    fit grows with the number of classes. For a room type of at least 100 scenes, its limit is the
-    least-squares line through the quantiles of parts of 30, 50, 75 and 100 %, in the log of their
-    mean numbers of classes. All sources have equal weight. Sources of frames, sentences or
-    procedural rooms do not take part, except in data without whole rooms. A room type with fewer
-    than 20 scenes has the number of classes of all rooms, and a fit of at least -1e9. The training
-    scenes have complete object lists.
+    A limit is a 5 % quantile over parts of whole rooms. All sources have equal weight. `smallest`
+    has parts of 30 % of the classes, as a robot lists a room. The limit of the fit grows with the
+    log of the number of classes. A room type of few scenes has the smallest number of all rooms.
     """
     rooms = whole_rooms(train)
     parts = [draw_parts(rooms, structure_of(artifact), _part_of(share)) for share in _PARTS]
@@ -197,11 +180,8 @@ class _ListedRooms(Table):
 
 
 def _fit_limit(artifact: SceneModel, lists: Sequence[_ListedRooms], room: int) -> FitLimit:
-    """Return the limit of the fit from lists of a room type, one entry for each of `_PARTS`.
-
-    With few scenes, the quantile of whole lists is that of the few worst. A small machine cannot
-    follow them, so the limit is then that of the shortest lists at any length.
-    """
+    """Return the limit of the fit from lists of a room type, one entry for each of `_PARTS`."""
+    # A quantile of few whole rooms is that of the worst: a small machine cannot follow.
     lists = lists if len(np.unique(lists[0].scene)) >= _LONG_SCENES else lists[:1]
     quantiles = []
     for parts in lists:

@@ -25,10 +25,7 @@ def is_file(source: str) -> bool:
 
 
 def source_name(source: str) -> str:
-    """Return the name of a source; for a file of scenes, its name before the first dot.
-
-    An inventory keeps the whole name of its file (`is_inventory`).
-    """
+    """Return the name of a source: of a file of scenes before the first dot, else the whole."""
     name = Path(source).name
     return name.partition(".")[0] if is_file(source) and not is_inventory(name) else name
 
@@ -47,8 +44,7 @@ class DataConfig(_Section):
 
     sources: tuple[str, ...] = Field(min_length=1)
     vocabulary: str = Field(
-        default="written",
-        description="written, source, rooms, or a file that ends in .json",
+        default="written", description="written, source, rooms, or a file that ends in .json"
     )
     split: Literal["group", "stable", "final"] = "group"
     split_seed: int = 0
@@ -79,10 +75,7 @@ class DataConfig(_Section):
 
 
 class MachineConfig(_Section):
-    """The variant and the sizes of the machine.
-
-    The data determine the numbers of classes V, relations A, room types C and triples T.
-    """
+    """The variant and the sizes of the machine. The data determine V, A, C and T."""
 
     variant: Variant
     units: int = Field(default=8, ge=1, description="hidden units")

@@ -49,10 +49,8 @@ _FOLDS: Final = 5
 def fit_counts(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> Counts | None:
     """Fit the statistics of counts. Return None if no class has enough data.
 
-    All data sources that count instances have the same total weight. Camera frames are left out,
-    because they show a part of a room, and written numbers, which are judgements. A class gets
-    statistics only if, in a cross-validation, the expected number is closer to the truth than the
-    class mean.
+    All sources have the same weight. Camera frames show parts of rooms, and written numbers are
+    judgements, so both are left out. A class must beat the class mean in a cross-validation.
     """
     counted = {
         name: classes
@@ -93,15 +91,9 @@ def _fit(cases: _Cases, most: Int[NDArray, "V"], vocabulary: Vocabulary) -> Coun
 
 
 def _most_listed(
-    scenes: Sequence[EncodedScene],
-    counted: dict[str, ClassMask],
-    vocabulary: Vocabulary,
+    scenes: Sequence[EncodedScene], counted: dict[str, ClassMask], vocabulary: Vocabulary
 ) -> Int[NDArray, "V"]:
-    """Return the maximum listed number of each class for which the data suffice.
-
-    It is at least 2 for a class with enough scenes and enough groups with several instances, and 0
-    for the other classes. `counted` are the counted classes by source.
-    """
+    """Return the maximum listed number of each class: at least 2, or 0 without enough data."""
     scene_counts = np.zeros(len(vocabulary), dtype=np.int64)
     largest: dict[tuple[str, str], Int[NDArray, "V"]] = {}  # numbers of instances in a group
     for scene in scenes:
@@ -130,10 +122,7 @@ class _Cases(Table):
 
     @classmethod
     def of(
-        cls,
-        scenes: Sequence[EncodedScene],
-        counted: dict[str, ClassMask],
-        vocabulary: Vocabulary,
+        cls, scenes: Sequence[EncodedScene], counted: dict[str, ClassMask], vocabulary: Vocabulary
     ) -> _Cases:
         """List each scene in part, `_DRAWS` times."""
         names, start = sorted(counted), ROOM + len(vocabulary.room_types)
@@ -164,10 +153,7 @@ class _Cases(Table):
 def _features(
     part: Part, k: int, start: int
 ) -> tuple[Int[NDArray, "columns"], Float[NDArray, "columns"]]:
-    """Return columns of `Counts.weights` and their values for the k-th class of a part.
-
-    The columns of the classes begin at `start`.
-    """
+    """Return columns and values for the k-th class of a part; classes begin at `start`."""
     others, listed = np.delete(part.classes, k), np.delete(part.listed, k)
     columns = [INTERCEPT, SINGLE, SEVERAL, *(start + others).tolist()]
     values = [1.0, float(part.listed[k] == 1), float((listed > 1).any())]
@@ -183,18 +169,14 @@ def _log_frequencies(cases: _Cases, V: int) -> Float[NDArray, "V M"]:
     table = np.zeros((V, MOST))
     np.add.at(table, (cases.index, cases.number - 1), cases.weight)
     # Each number needs a positive share, because the fitted scene may favour it.
-    overall = 0.999 * table.sum(axis=0) / table.sum() + 0.001 / MOST
-    table += _PRIOR * overall
+    table += _PRIOR * (0.999 * table.sum(axis=0) / table.sum() + 0.001 / MOST)
     return np.log(table / table.sum(axis=1, keepdims=True))
 
 
 def _weights(
     cases: _Cases, log_frequency: Float[NDArray, "V M"], fitted: ClassMask
 ) -> Float[NDArray, "V 2 3+C+V"]:
-    """Return the weights of each class by maximum penalised likelihood.
-
-    A class has terms of its own only where `fitted` is true and `_OWN_CASES` cases show it.
-    """
+    """Return the weights of each class by maximum penalised likelihood."""
     features, (N, width), V = cases.features, cases.features.shape, len(fitted)
     # The terms of a class act only on cases of this class.
     entries = features.tocoo()
@@ -231,8 +213,7 @@ def _weights(
     terms = optimum.x.reshape(-1, EXPONENTS)
     weights = np.zeros((V * width, EXPONENTS))
     weights[used_columns] = terms[: len(used_columns)]
-    of_class = weights.reshape(V, width, EXPONENTS) + terms[len(used_columns) :]
-    return of_class.swapaxes(1, 2)
+    return (weights.reshape(V, width, EXPONENTS) + terms[len(used_columns) :]).swapaxes(1, 2)
 
 
 def _is_better_than_mean(

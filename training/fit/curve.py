@@ -45,11 +45,7 @@ SCORES: Final = {"objects": "MRR", "relations": "R-precision"}
 
 
 def write_plot(path: Path, curve: Sequence[CurvePoint], title: str) -> None:
-    """Plot the loss and the validation score of each phase.
-
-    No score chooses a point: a phase has a fixed length, and the model keeps average weights. The
-    last score is that of the kept weights, and has a mark.
-    """
+    """Plot the loss and the score of each phase. A mark shows the score of the kept weights."""
     from matplotlib.figure import Figure
 
     phases = [phase for phase in SCORES if any(point.phase == phase for point in curve)]

@@ -47,10 +47,7 @@ _OF_PARENT, _OF_ALL = 5.0, 5.0
 def fit_places(
     scenes: Sequence[EncodedScene], roles: RoleCounts, vocabulary: Vocabulary
 ) -> Places | None:
-    """Count the relations of the scenes. Return None if no scene has a relation.
-
-    Relations of structure, and relations between objects of one class, do not count.
-    """
+    """Count the relations between things of two classes. Return None without any relation."""
     V, is_thing = len(vocabulary), ~vocabulary.structure
     blocks, listed = [np.zeros(0, np.int64)], np.ones(V)
     for scene in scenes:

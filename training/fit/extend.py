@@ -1,13 +1,12 @@
-"""Add classes and room types to a model, before the fit to the home where they occur.
+"""Add classes and room types to a model, before `training.fit.adapt` fits their biases and weights.
 
-New classes follow the classes of the model, and new room types its room types. Their weights are 0:
-such a class does not change the log-odds of others, and its relations are those of an average pair.
-The biases make it rare. `training.fit.adapt` fits biases and weights.
+They follow those of the model. Their weights are 0: such a class does not change the log-odds of
+others, and its relations are those of an average pair. The biases make it rare.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -50,7 +49,6 @@ def extended(
 
 
 def _weights(weights: Weights, V: int, C: int) -> Weights:
-    """Return the weights with V classes and C room types."""
     old, larger = weights.spec, weights.enlarged(V, C if weights.spec.C else 0)
     arrays = larger.arrays
     arrays["b"][old.V :] = np.quantile(weights["b"], _RARE)
@@ -64,22 +62,19 @@ def _weights(weights: Weights, V: int, C: int) -> Weights:
 
 def _calibration(calibration: Calibration, classes: int, C: int, rooms: int) -> Calibration:
     """Return the calibration with further classes, and room types after the first C."""
-    update: Mapping[str, Any] = {
-        "popularity": (*calibration.popularity, *[None] * classes),
+    update: dict[str, Any] = {
+        "popularity": calibration.popularity and (*calibration.popularity, *[None] * classes),
         "rare_rooms": (*calibration.rare_rooms, *range(C, C + rooms)),
     }
     if calibration.smallest:
         of_rooms, unknown = calibration.smallest[:-1], calibration.smallest[-1]
-        update = {**update, "smallest": (*of_rooms, *[unknown] * rooms, unknown)}
+        update["smallest"] = (*of_rooms, *[unknown] * rooms, unknown)
     if calibration.room_fit:
-        update = {**update, "room_fit": (*calibration.room_fit, *[NO_LIMIT] * rooms)}
-    if not calibration.popularity:
-        update = {**update, "popularity": ()}
+        update["room_fit"] = (*calibration.room_fit, *[NO_LIMIT] * rooms)
     return calibration.model_copy(update=update)
 
 
 def _offsets(offsets: Offsets, old: int, new: int) -> Offsets:
-    """Return the offsets of `new` classes instead of `old` ones."""
     A, more = len(offsets.relation), ((0, 0), (0, new - old), (0, 0))
     return replace(
         offsets,
@@ -108,8 +103,6 @@ def _counts(counts: Counts, C: int, rooms: int, classes: int) -> Counts:
 
 
 def _places(places: Places, old: int, new: int) -> Places:
-    """Return the places of `new` classes instead of `old` ones."""
-
     def averaged(table: NDArray[Any]) -> NDArray[Any]:
         mean = table.mean(0, keepdims=True).repeat(new - old, 0)
         return np.concatenate([table, mean.astype(table.dtype)])

@@ -1,8 +1,6 @@
 """Long Gibbs chains that start at scenes, and the test that served scenes stay like these scenes.
 
-A machine whose chains drift away from the scenes learnt a wrong distribution: the samples of
-`/generate` are then good only as long as the chains are short. The test applies the filter of
-`/generate` to the states of long chains.
+If chains drift away from the scenes, samples of `/generate` are good only while chains are short.
 """
 
 from __future__ import annotations
@@ -31,8 +29,7 @@ from training.fit.objects import ObjectScenes, served_weights
 
 T = TypeVar("T")
 
-RECORDED: Final = 5
-"""Number of sweeps between two recorded states."""
+RECORDED: Final = 5  # number of sweeps between two recorded states
 
 _CHAINS, _SWEEPS = 256, 3000
 _SETTLED = 2000  # sweeps before the first recorded state of the test
@@ -53,24 +50,17 @@ class Population:
     p: Float[NDArray, "V"]  # share of the scenes with each class
 
     def draw(self, count: int, rng: np.random.Generator) -> Int[NDArray, "count"]:
-        """Return indices of scenes, drawn in proportion to their weights.
-
-        The draw is systematic: each room type has its share of the scenes, rounded.
-        """
+        """Return indices drawn by weight, systematically: room types keep their shares."""
         order = np.lexsort((rng.random(len(self.room)), self.room))
         position = (np.arange(count) + rng.random()) / count
         return order[np.searchsorted(self.weight[order].cumsum()[:-1], position)]
 
 
 def populations(scenes: ObjectScenes, config: ObjectsConfig) -> Iterator[Population]:
-    """Yield the population of each data source, and that of the served mix.
-
-    The served mix has the whole rooms of the served sources (`Source.whole_rooms`): lists of
-    photographs and sentences are parts of rooms. Without whole rooms, it has all scenes of the
-    served sources. Without a scene of a served source, it has all scenes.
-    """
+    """Yield the population of each data source, and that of the served mix."""
     served = served_weights(scenes, config)
     served = served if served.any() else torch.ones_like(served)
+    # Lists of photographs and sentences are parts of rooms: whole rooms come first.
     whole = served * torch.tensor([float(source_of(q).whole_rooms) for q in scenes.sources])
     served = whole if whole.any() else served
     v = scenes.v.double().numpy()
@@ -85,10 +75,7 @@ def populations(scenes: ObjectScenes, config: ObjectsConfig) -> Iterator[Populat
 
 
 class LongChains:
-    """A number of Gibbs chains that start at scenes of a population.
-
-    Each chain keeps the room type of its scene, and continues from call to call.
-    """
+    """Gibbs chains that start at scenes of a population, and keep their room types."""
 
     def __init__(
         self,
@@ -105,11 +92,7 @@ class LongChains:
         self._streams = [random_stream(seed, k) for k in range(count)]
 
     def run(self, sweeps: int, every: int = RECORDED) -> Float[NDArray, "chains V"]:
-        """Run sweeps, and return the share of the recorded states in which each class is present.
-
-        A state is recorded every ``every`` sweeps. The number of sweeps is rounded up to a multiple
-        of it.
-        """
+        """Run sweeps, and return the share of each class in the states recorded by `every`."""
         count = np.zeros(self.on.shape)  # number of records with each class
         records = range(0, sweeps, every)
         conditioned = {
@@ -181,11 +164,7 @@ class Drift:
 
 
 def measure_drift(artifact: SceneModel, scenes: ObjectScenes, config: ObjectsConfig) -> Drift:
-    """Run 3,000 sweeps from training scenes of the served mix, and compare chains and scenes.
-
-    The states of the last 1,000 sweeps count if the filter of `/generate` accepts them
-    (`served_frequencies`).
-    """
+    """Run 3,000 sweeps from scenes of the served mix, and compare the last 1,000 with them."""
     *_, population = populations(scenes, config)
     long = LongChains(scene_chains(artifact.weights), scenes, population, _CHAINS, seed=1)
     long.run(_SETTLED, every=_SETTLED)
@@ -205,12 +184,7 @@ def measure_drift(artifact: SceneModel, scenes: ObjectScenes, config: ObjectsCon
 def served_frequencies(
     artifact: SceneModel, long: LongChains, states: int
 ) -> Float[NDArray, "chains V"]:
-    """Continue the chains, and return the share of each class in the served scenes of each chain.
-
-    A state is recorded every `STEPS` sweeps, the length of a draw of `/generate`. A served scene is
-    the first plausible one of `ATTEMPTS` states, or the last of them. The number of states is at
-    least `ATTEMPTS`.
-    """
+    """Continue the chains. Return the share of each class in the served scenes of each chain."""
     evidence = Scene(())
     count, served = np.zeros(long.on.shape), np.zeros(len(long.on))
     refused = np.zeros(len(long.on), np.int64)  # states since the last served scene
@@ -222,6 +196,7 @@ def served_frequencies(
     for _ in range(states):
         long.run(STEPS, every=STEPS)
         refused += 1
+        # The first plausible one of `ATTEMPTS` states is served, or the last of them.
         taken = np.array(in_threads(accepts, len(long.on))) | (refused == ATTEMPTS)
         count[taken] += long.on[taken]
         served[taken] += 1

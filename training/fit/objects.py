@@ -9,21 +9,18 @@ scene. The loss is the negative log-likelihood of every class that is not listed
 λ_i is the closed-form log-odds of class i given the listed classes (`BoltzmannMachine`), and ζ the
 softplus.
 
-- 30 % of the parts list all classes but one. The class left out counts as often as the scene has
-  classes. The other parts list a share of U(.05, 1) of the classes.
-- The room type t is listed in 15 % of the parts. If it is not listed, the loss contains its
-  cross-entropy, with the weight k.
-- A class that a source shows in fewer than 3 scenes has no term in the loss there (partial labels).
-  Structure is neither listed nor predicted.
-- Unlisted classes of the family of a present class (`Vocabulary.related`) have no term: a desk lamp
+- 30 % of the parts list all classes but one, which counts as often as the scene has classes. The
+  other parts list a share of U(.05, 1) of the classes.
+- The room type t is listed in 15 % of the parts. If not, its cross-entropy has the weight k.
+- A class that a source shows in fewer than 3 scenes has no term there (partial labels). Structure
+  has none, and unlisted relatives of a present class (`Vocabulary.related`) have none: a desk lamp
   is a lamp, and an annotator may call it so.
 - Each source q has its own base rates a_q and y_q, and each listed share its own bias kappa. The
   machine also learns p(q | listed), with the weight s, because a robot's list names no source.
 - With the weight g, persistent Gibbs chains (PCD) keep samples of the machine like scenes. The
   chains of a source have its base rates.
 
-The weights have normal priors. The precision of a prior is divided by the number of scenes. Without
-it, the machine would learn few scenes by heart.
+Normal priors, divided by the number of scenes, keep the machine from learning scenes by heart.
 
 Sources: Besag, "Statistical analysis of non-lattice data" (1975), for conditional likelihoods;
 Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008), for PCD.
@@ -70,12 +67,10 @@ class ObjectScenes:
 
     @classmethod
     def of(cls, train: SceneTensors, structure: Bool[Tensor, "V"], config: ObjectsConfig) -> Self:
-        """Select the scenes."""
         names, annotated = train.source_names, train.annotated_classes
         weights = torch.tensor([config.source_weights.get(q, 1.0) for q in names])
         counts = torch.zeros(annotated.shape).index_add_(0, train.source, (train.v > 0).float())
-        # A user's own source and one with an open vocabulary show every class, except those that
-        # one of `SOURCES` annotates incompletely.
+        # Own sources and open vocabularies show every class but incompletely annotated ones.
         is_open = [q not in SOURCES or SOURCES[q].open_vocabulary for q in names]
         shows_all = [q in config.open_sources for q in names] if config.open_sources else is_open
         partial = torch.tensor([q in SOURCES for q in names]) & torch.tensor(is_open)
@@ -111,17 +106,13 @@ class ObjectScenes:
 
     @property
     def shows_rooms(self) -> Bool[Tensor, "sources 1"]:
-        """True for each source with scenes of two room types.
-
-        A source of bedrooms alone does not show how common bedrooms are.
-        """
+        """True for a source of two room types: one of bedrooms cannot show their frequency."""
         kinds = [self.room[self.source == q] for q in range(len(self.sources))]
         return torch.tensor([[len(room[room >= 0].unique()) > 1] for room in kinds])
 
     def log_odds(self) -> Float[Tensor, "V"]:
         """Return the smoothed log-odds of each class in the scenes that can show it."""
-        weight = self.weight.unsqueeze(1)
-        count = (self.v * weight).sum(0)
+        count = (self.v * self.weight.unsqueeze(1)).sum(0)
         total = (self.shows * self.source_sizes.unsqueeze(1)).sum(0)
         total = torch.where(total > 0, total, self.size)
         return ((count + 0.5) / (total - count + 0.5)).log()
@@ -138,10 +129,7 @@ class Parts(NamedTuple):
 def random_parts(
     v: Float[Tensor, "B V"], leave_one_out: float, generator: torch.Generator
 ) -> Parts:
-    """List a random part of the classes v of each scene, with at least one class hidden.
-
-    A share `leave_one_out` of the scenes hides one class.
-    """
+    """List a random part of each scene; a share `leave_one_out` of the parts hides one class."""
     n = v.sum(1)
     hides_one = torch.rand(len(v), generator=generator) < leave_one_out
     share = _LEAST_SHARE + (1 - _LEAST_SHARE) * torch.rand(len(v), generator=generator)
@@ -149,16 +137,12 @@ def random_parts(
     # Listed are the `count` present classes with the smallest random keys.
     keys = torch.rand(v.shape, generator=generator) + 2 * (1 - v)
     smallest = keys.topk(int(count.max()), largest=False).values
-    limit = smallest.gather(1, count.long().unsqueeze(1) - 1)
-    listed = v * (keys <= limit)
+    listed = v * (keys <= smallest.gather(1, count.long().unsqueeze(1) - 1))
     return Parts(listed, share_bin(count, n), torch.where(hides_one, n, 1.0))
 
 
 class ObjectFit:
-    """The fit of the object weights of a machine. It can stop after each step and continue.
-
-    `steps` counts the finished steps, and `loss` is that of the last step.
-    """
+    """The fit of the object weights of a machine. It can stop after each step and continue."""
 
     def __init__(
         self, machine: BoltzmannMachine, scenes: ObjectScenes, config: ObjectsConfig, seed: int
@@ -211,7 +195,6 @@ class ObjectFit:
         self._add_to_average()
 
     def _batch_loss(self) -> Tensor:
-        """Return the loss of the next batch."""
         scenes = self.scenes
         index = scenes.draw(self.config.batch_size, self._generator)
         loss = self._conditional_loss(index)
@@ -236,8 +219,7 @@ class ObjectFit:
         weight = scenes.observed[index] * (1 - parts.listed)
         weight = weight * torch.where(hidden > 0, parts.weight.unsqueeze(1), 1.0)
         loss = ((softplus(log_odds) - hidden * log_odds) * weight).sum()
-        served = served_weights(scenes, self.config)
-        rates, _ = with_served_rates(machine.a, scenes.shows, served)
+        rates, _ = with_served_rates(machine.a, scenes.shows, served_weights(scenes, self.config))
         logits = machine.f + parts.listed @ rates.T
         loss = loss + self.config.source_loss * cross_entropy(logits, source, reduction="sum")
         is_hidden = (listed_room < 0) & (room >= 0)
@@ -258,10 +240,7 @@ class ObjectFit:
         room: Int[Tensor, "B"],
         source: Int[Tensor, "B"],
     ) -> Float[Tensor, ""]:
-        """Return F(scenes) - F(chains) after a sweep of the chains, which keep their room types.
-
-        F is the free energy given the room types, because the chains do not draw them.
-        """
+        """Return F(scenes) - F(chains) given the room types, which the chains keep."""
         sweep(self.machine, chains, self._generator, classes=self.config.classes_per_sweep)
         n = len(v)
         v, room, source = (
@@ -288,17 +267,14 @@ class ObjectFit:
 
     @torch.no_grad()
     def finish(self) -> None:
-        """Set the weights to their average, with the base rates of the served mix in b.
-
-        Afterwards, a[q] is the difference of source q from the served mix. f are the log weights of
-        the mix, plus what training added to the log sizes of the sources.
-        """
+        """Set the weights to their average, with the base rates of the served mix in b."""
         for name, weight in self._weights.items():
             weight.copy_(self._average[name])
         machine, scenes = self.machine, self.scenes
         if (couplings := machine.couplings) is not None:
             # The optimiser rounds the two halves differently, in its last bits.
             couplings.copy_((couplings + couplings.T).div_(2))
+        # Then a[q] is the difference of source q from the mix, whose log weights are in f.
         served = served_weights(scenes, self.config)
         for rates, bias, shows in (
             (machine.a, machine.b, scenes.shows),
@@ -316,21 +292,14 @@ def with_served_rates(
     shows: Bool[Tensor, "sources k|1"],
     served: Float[Tensor, "sources"],
 ) -> tuple[Float[Tensor, "sources k"], Float[Tensor, "k"]]:
-    """Return rates a or y in which the served mean replaces rates that a source does not show.
-
-    The second result is the served mean: the mean over the sources that show the class or the room
-    types, with the weights of the served mix.
-    """
+    """Return rates a or y, completed by the mean over the served sources, and this mean."""
     weights = served.unsqueeze(1) * shows
     mean = (weights * rates).sum(0) / weights.sum(0).clamp(min=1e-9)
     return torch.where(shows, rates, mean), mean
 
 
 def served_popularity(scenes: ObjectScenes, config: ObjectsConfig) -> Float[Tensor, "V"]:
-    """Return the log-odds that a scene of the served mix has each class.
-
-    The value is NaN for a class that no scene shows.
-    """
+    """Return the log-odds of each class in a scene of the served mix; NaN without scenes."""
     count = torch.zeros(scenes.shows.shape)
     count.index_add_(0, scenes.source, scenes.v * scenes.weight.unsqueeze(1))
     share = (count + 0.5) / (scenes.source_sizes.unsqueeze(1) + 1)

@@ -1,17 +1,14 @@
 """Fit the distribution of offsets (position differences) between related objects.
 
-The training data are scenes with poses. Each canonical relation and each axis have a separate
-model. The offset from an object of class j to an object of class i is normal, with a mean m and a
-variance s for each pair of classes:
+Each canonical relation and axis have a separate model. The offset from an object of class j to an
+object of class i is normal, with a mean m and a variance s for each pair of classes:
 
     s ~ inverse-gamma(alpha, beta)    m given s ~ normal(mu + u_i + v_j, s / kappa)
     u_i and v_j given s ~ normal(0, s / (kappa lambda))
 
-All pairs of classes share mu, kappa, alpha and beta. Training alternates between these parameters,
-by maximum likelihood over all pairs, and the class effects u and v. Given all these values, the
-distribution of the offset of a pair has a closed form. The distribution of a frequent pair depends
-mainly on the data of the pair. The distribution of a rare pair depends mainly on the two classes
-and the relation.
+All pairs share mu, kappa, alpha and beta. Training alternates between these, by maximum likelihood,
+and the class effects u and v. Given all these values, the offset of a pair has a closed form: data
+decide for frequent pairs, and the classes and the relation for rare pairs.
 `docs/decisions/relations.md` describes the alternatives.
 """
 
@@ -39,17 +36,12 @@ _LEAST_ALPHA: Final = 1.5
 # Minimum number of scenes for which a data source can lower the weights of larger sources.
 _FEW: Final = 100
 _ROUNDS, _SWEEPS = 4, 10
-# Resolution of annotated box centres in metres. It keeps the variance above 0 if all heights are
-# equal.
+# Resolution of box centres in metres. It keeps the variance of equal heights above 0.
 _RESOLUTION: Final = 0.005
 
 
 def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
-    """Fit the distribution of offsets. Return None if no scene has poses.
-
-    All offsets of a pair of classes in one scene have a total weight of 1, because they depend on
-    each other. All data sources have the same total weight.
-    """
+    """Fit the distribution of offsets, with equal weights of sources; None without poses."""
     observed = observed_offsets(scenes)
     if not len(observed.offset):
         return None
@@ -150,11 +142,7 @@ class _Fit:
         return posterior(prior, pairs.n, pairs.mean, pairs.scatter)
 
     def tables(self) -> tuple[Float[NDArray, "6"], Float[NDArray, "2 V 6"]]:
-        """Return tables whose sum gives mean and variance of a pair without data, as `predict`.
-
-        The first table contains three means and three variances for unknown classes, and the other
-        the contributions of the subject and of the object class.
-        """
+        """Return tables whose sum gives mean and variance of a pair without data, as `predict`."""
         spread, unknown = self.beta / (self.alpha - 1), 1 / LAMBDA
         relation = np.concatenate([self.mu, spread * (1 + (1 + 2 * unknown) / self.kappa)])
         variances = spread * (self.effect_variances - unknown) / self.kappa
@@ -166,10 +154,7 @@ Prior = tuple[Any, Any, Any, Any]
 
 
 def posterior(prior: Prior, n: Any, mean: Any, scatter: Any) -> tuple[Any, Any]:
-    """Return mean and variance of a new value given n values with this mean and scatter.
-
-    The scatter is the sum of the squared deviations. alpha + n / 2 must be above 1.
-    """
+    """Return mean and variance of a new value given n values; alpha + n / 2 is above 1."""
     after, shape, rate = _updated(prior, n, mean, scatter)
     expected, kappa, _, _ = prior
     return (kappa * expected + n * mean) / after, rate / (shape - 1) * (1 + 1 / after)
@@ -207,8 +192,6 @@ def _fit(pairs: _Pairs, V: int) -> _Fit:
 
 
 def _fit_prior(pairs: _Pairs, axis: int, expected: Float[NDArray, "P"]) -> Float[NDArray, "3"]:
-    """Return kappa, alpha and beta of one axis, fitted by maximum likelihood."""
-
     def loss(logs: NDArray[np.float64]) -> float:
         n, mean, scatter = pairs.n[:, 0], pairs.mean[:, axis], pairs.scatter[:, axis]
         return -float(log_likelihood((expected, *np.exp(logs)), n, mean, scatter).sum())
@@ -218,11 +201,7 @@ def _fit_prior(pairs: _Pairs, axis: int, expected: Float[NDArray, "P"]) -> Float
 
 
 def _fit_effects(fit: _Fit, pairs: _Pairs, V: int) -> None:
-    """Fit mu and the effects u and v of V classes, in place.
-
-    The function updates mu, u and v in turn, `_SWEEPS` times. Each update is a fit by weighted
-    least squares, given the other two. The ridge penalty `LAMBDA` shrinks u and v towards 0.
-    """
+    """Fit mu, u and v in turn by weighted least squares, with the ridge penalty `LAMBDA`."""
     subject, object_ = pairs.subject, pairs.object
     # Precision of the mean offset of each pair as a measurement of u and v, in units of kappa / s.
     weight = pairs.n / (pairs.n + fit.kappa)

@@ -40,11 +40,7 @@ def logistic(
     weight: Float[NDArray, "N"] | None = None,
     C: float = 1e6,
 ) -> list[float]:
-    """Return the coefficients and then the intercept of a logistic regression.
-
-    C is the inverse of the ridge penalty on the coefficients. `RIDGE` keeps them finite if a few
-    examples without `weight` are separable.
-    """
+    """Return coefficients and then the intercept; C is the inverse of the ridge penalty."""
     from sklearn.linear_model import LogisticRegression  # slow to import
 
     fit = LogisticRegression(C=C, max_iter=1000).fit(features, truth, weight)

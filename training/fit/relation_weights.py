@@ -3,27 +3,21 @@
     loss = - sum over scenes and annotated relations e of log p(r_e | v, E[h1 | v])
     logit of r_e = ℓ_e + δ[source, a]
 
-Relations without an annotation have no term (`training.datasets.sources`). Data sources annotate
-different relations. For example, people mention notable relations, and generated rooms list all
-relations. Each source therefore has a trained logit correction δ, called offset, for each relation
-a. The service leaves the offsets out. An epoch draws each scene of a source with the weight of the
-source as probability; a weight above 1 multiplies the terms of its scenes.
+Data sources annotate different relations: people mention notable ones, and generated rooms list
+all. So each source has a trained logit correction δ, called offset, for each relation a. The
+service leaves the offsets out. An epoch draws each scene with the weight of its source as
+probability; a weight above 1 multiplies the terms of its scenes.
 
-Weights and offsets have normal priors, with the precisions `weight_prior` and `offset_prior`. The
-relation weights of a class can depend on its word vector. With the matrix X of word vectors, the
-weights are a trained linear map of X plus a small deviation of each class:
+Weights and offsets have normal priors. With the matrix X of word vectors, the weights are a trained
+map of X plus a small deviation of each class, so a rare class resembles those of similar words:
 
     S = X A_S + S',   O = X A_O + O',   s = (X B_s)' + s',   o = (X B_o)' + o'
 
-A rare class then has weights similar to those of classes with similar word vectors.
+A robot seldom sees a whole scene, so the hidden units depend on a random subset of the objects.
+Otherwise, complete scenes of one source would fit well, but relations in other scenes would not.
 
-A robot seldom sees a whole scene. In training, the hidden units h1 therefore depend on a random
-subset of the objects. The size of the subset is drawn uniformly for each scene. Otherwise, the
-relations of complete scenes of one source would fit well, but relations in other scenes would not.
-
-For a machine with implication weights, the loss has a second term. This term conditions on a random
-share of the observed relations of each scene, and sums over the other relations. The object weights
-of the machine stay fixed.
+For a machine with implication weights, a second term conditions on a random share of the observed
+relations, and sums over the others. The object weights stay fixed.
 
 Sources: Besag, "Statistical analysis of non-lattice data" (1975); Mnih and Salakhutdinov,
 "Probabilistic matrix factorization" (2007), for normal priors on factors.
@@ -55,8 +49,7 @@ from training.machines import BoltzmannMachine
 from training.machines.machine import OBJECT_WEIGHTS
 
 _WITHOUT_PRIOR = frozenset({*OBJECT_WEIGHTS, "gamma", "B", "usual", "d"})
-# Factor of the prior precision for the map of word vectors. All classes share the map, so its prior
-# is weaker than the prior of the weights of a class.
+# Factor of the prior precision for the map of word vectors, which all classes share.
 _MAP_PRIOR = 0.1
 # Most classes of a scene whose relations one batch has; the time grows with their third power.
 _MOST_CLASSES = 20
@@ -66,11 +59,7 @@ SHARED = ("S", "O", "s", "o")  # weights that classes share
 
 
 class RelationFit:
-    """The fit of the relation weights of a machine: epochs over the scenes with annotations.
-
-    `epochs` counts the finished epochs. `offsets` are the corrections of the logits for each data
-    source, (sources, A).
-    """
+    """The fit of the relation weights of a machine: epochs over the scenes with annotations."""
 
     def __init__(
         self, machine: BoltzmannMachine, train: SceneTensors, config: RelationsConfig, seed: int
@@ -80,8 +69,9 @@ class RelationFit:
         self.train = subset(train, torch.tensor(annotated, dtype=torch.int64))
         sizes = [len(scene.evidence.classes) for scene in self.train.scenes]
         self._log_sizes = torch.tensor(sizes).clamp(1, _MOST_CLASSES).log()
-        self.epochs = self._updates = 0
+        self.epochs = self._updates = 0  # finished
         self._generator = torch.Generator().manual_seed(seed)
+        # Corrections of the logits for each data source.
         self.offsets = nn.Parameter(torch.zeros(len(train.source_names), machine.spec.A))
         self._source_weights = torch.tensor(
             [config.source_weights.get(name, 1.0) for name in train.source_names]
@@ -97,10 +87,7 @@ class RelationFit:
         )
 
     def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
-        """Return the negative log-likelihood plus the negative log prior, divided by scenes.
-
-        The likelihood is divided by the scenes of the batch, and the prior by those of an epoch.
-        """
+        """Return -log likelihood / scenes of the batch - log prior / scenes of an epoch."""
         machine = self.machine
         if self.config.count_dropout:
             hidden = torch.rand(len(batch), 1, generator=generator) < self.config.count_dropout
@@ -137,10 +124,7 @@ class RelationFit:
         return self.epochs >= self.config.epochs or not len(self.train)
 
     def epoch(self, progress: Callable[[float, float], None]) -> float:
-        """Run one epoch, and return its mean loss. Raise FloatingPointError if it is not finite.
-
-        It calls `progress` with the finished share of the fit and the mean loss.
-        """
+        """Run an epoch and return its mean loss. Raise FloatingPointError if it is not finite."""
         batches = self._batches()
         total = 0.0
         for number, index in enumerate(batches, 1):
@@ -210,10 +194,7 @@ class RelationFit:
             weight.copy_(values[name])
 
     def finish(self, parents: Int[Tensor, "V"]) -> BoltzmannMachine:
-        """Return the machine for storage, with averaged weights and counted residuals.
-
-        `parents` are the parents of the classes; -1 without a parent.
-        """
+        """Return the machine for storage, with averaged weights and counted residuals."""
         self._set(self._average)
         machine = self.machine
         bake_shared_weights(machine, SHARED)
@@ -232,19 +213,15 @@ def _nll(
 
 
 class Sharing(nn.Module):
-    """Add the parent's deviation and a trained map of word vectors to the weights of each class.
-
-    A class has `width` weights. With `columns`, the weights have the shape (width, V), else
-    (V, width). Word vectors are 0 where unknown, and parents -1.
-    """
+    """Add the parent's deviation and a trained map of word vectors to the weights of each class."""
 
     def __init__(
         self,
-        words: Float[Tensor, "V D"],
-        parents: Int[Tensor, "V"],
-        width: int,
+        words: Float[Tensor, "V D"],  # 0 where unknown
+        parents: Int[Tensor, "V"],  # -1 without a parent
+        width: int,  # weights of a class
         *,
-        columns: bool,
+        columns: bool,  # the weights have the shape (width, V), else (V, width)
     ) -> None:
         super().__init__()
         self.words, self.parents, self.columns = words, parents, columns

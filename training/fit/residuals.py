@@ -15,8 +15,7 @@ from training.datasets.batches import Batch, SceneTensors, relation_units
 from training.machines import BoltzmannMachine, build
 from training.machines.edges import triple_keys
 
-# Precision τ of the normal prior of a residual weight. A scene with p(r) = 1/2 has the Fisher
-# information 1/4, so the prior has the weight of four such scenes.
+# Precision τ of the normal prior of a residual weight: that of four scenes with p(r) = 1/2.
 _PRECISION = 1.0
 # Minimum number of scenes with an annotation of a triple, and minimum size of a stored residual.
 _SPEAKING_SCENES = 2
@@ -33,11 +32,7 @@ _CHANCES = 10
 def means_of_parts(
     machine: BoltzmannMachine, batch: Batch, generator: torch.Generator
 ) -> Float[Tensor, "B H1"]:
-    """Return the means of h1 given a random subset of the objects.
-
-    A scene lists each of its classes with a probability that is drawn uniformly from [0, 1]. It
-    lists its room type with probability 1/2.
-    """
+    """Return the means of h1 given random parts of scenes, half of them with the room type."""
     probability = torch.rand(len(batch), 1, generator=generator)
     listed = batch.v * (torch.rand(batch.v.shape, generator=generator) < probability)
     lists_room = torch.rand(len(batch), generator=generator) < 0.5
@@ -49,13 +44,8 @@ def means_of_parts(
 def lower_unseen_roles(
     machine: BoltzmannMachine, train: SceneTensors, parents: Int[Tensor, "V"]
 ) -> None:
-    """Lower the weights of classes that no training scene shows on, in or above an object.
-
-    Factors extrapolate: they put windows on tables. A class has a role, as the subject or as the
-    object of a stacked relation, if a scene shows it, its parent or one of its kinds in this role.
-    Classes with few annotated relations keep their weights. `RelationFit.finish` describes the
-    parents.
-    """
+    """Lower the weights of classes that no training scene shows on, in or above an object."""
+    # Factors extrapolate: they put windows on tables. Roles of the parent and of kinds count.
     seen = np.zeros((2, machine.spec.A, machine.spec.V), dtype=np.bool_)
     chances = np.zeros(seen.shape, dtype=np.int64)
     for scene in train.scenes:
@@ -84,16 +74,14 @@ def with_counted_residuals(
 ) -> BoltzmannMachine:
     """Return the machine with fitted residual weights of single triples.
 
-    All classes share the factors of a relation. For some pairs of classes, the factors give a high
-    probability although the relation is false in many scenes (a window on a stove). After training,
-    this function therefore fits a change δ_e of the residual weight w_e' of each triple e = (a,i,j)
-    that enough scenes annotate. Newton's method maximises
+    Shared factors can give a false relation a high probability (a window on a stove). Newton's
+    method fits a change δ_e of the residual weight w_e' of each triple e = (a,i,j) with enough
+    annotations. All other weights are fixed. It maximises
 
         sum over scenes of log p(r_e | v, E[h1 | v], w_e' + δ_e) - τ/2 δ_e².
 
-    All other weights are fixed. As in training, the hidden units depend on a random subset of the
-    objects. With few scenes, δ_e stays close to 0. The offsets are corrections of the logits for
-    each data source, and the source weights those of a relation from each source.
+    As in training, the hidden units depend on a random subset of the objects, and each data source
+    corrects the logits by its offsets.
     """
     V, columns = machine.spec.V, []
     generator = torch.Generator().manual_seed(0)

@@ -1,18 +1,15 @@
 """Fit the base rates of whole scenes, and store samples of a trained machine.
 
-The loss of the objects fits the answers for random parts of scenes. It fits samples only in part
-(`training.fit.objects`). So the weights u, which only Gibbs chains use, are fitted afterwards. They
-are the solution of
+The loss of the objects fits answers, and samples only in part (`training.fit.objects`). So the
+weights u, which only Gibbs chains use, are fitted afterwards. They are the solution of
 
     p(v_i = 1) in the chains of source q = p(v_i = 1) in the scenes of source q
 
-for each class i, by stochastic approximation with persistent chains. The chains start at the scenes
-of the source, and keep the room type of their scene, as `/generate` does. The last row of u belongs
-to the served mix of sources. A class that a source cannot show has u = 0 there.
+for each class i, by stochastic approximation with persistent chains from the scenes of the source.
+The last row of u belongs to the served mix. A class that a source cannot show has u = 0 there.
 
-The stored samples are the states of long Gibbs chains, where new chains start. A chain that starts
-with an empty scene needs thousands of sweeps to visit all room types, because scenes between two
-room types are improbable.
+The stored samples are states of long chains, where new chains start. A chain from an empty scene
+needs thousands of sweeps, because scenes between two room types are improbable.
 
 Source: Robbins and Monro, "A stochastic approximation method" (1951).
 """
@@ -68,15 +65,10 @@ def _log_odds(p: Float[NDArray, "V"], sweeps: int) -> Float[NDArray, "V"]:
 
 
 def store_samples(machine: BoltzmannMachine, scenes: ObjectScenes, seed: int) -> None:
-    """Store N samples in the machine, in place.
-
-    Each chain starts at a training scene, with the served base rates, and keeps the room type of
-    that scene. Scenes are drawn in proportion to their weights.
-    """
+    """Store N states of chains from training scenes, drawn by weight, in the machine."""
     if not machine.spec.N:
         return
-    generator = torch.Generator().manual_seed(seed)
-    index = scenes.draw(machine.spec.N, generator)
+    index = scenes.draw(machine.spec.N, torch.Generator().manual_seed(seed))
     chains = scene_chains(weights_of(machine))
     v, rooms = scenes.v[index].numpy(), scenes.room[index].numpy()
 

@@ -1,8 +1,4 @@
-"""Train a machine in two phases: the object weights, and then the relation weights.
-
-`training.fit.objects` and `training.fit.relation_weights` define the losses. Two runs with the same
-seed and one thread give bit-identical weights.
-"""
+"""Train a machine in two phases. Equal seeds and one thread give bit-identical weights."""
 
 from __future__ import annotations
 
@@ -37,8 +33,7 @@ _SCORED = 200  # minimum number of scenes with relations of a validation score
 Progress = Callable[[str, float, float], None]
 """Function that is called with the phase, its finished share, and its mean loss."""
 
-Passed = Callable[[CurvePoint], None]
-"""Function that is called with each new point of the curve."""
+Passed = Callable[[CurvePoint], None]  # function that is called with each new point of the curve
 
 
 def new_machine(config: Config, data: TrainingData, scenes: ObjectScenes) -> BoltzmannMachine:
@@ -107,7 +102,6 @@ class Trainer:
     def run(
         self, progress: Progress = lambda *_: None, passed: Passed = lambda _: None
     ) -> TrainingResult:
-        """Run both phases."""
         began, seed = time.perf_counter(), self.config.training.seed
 
         def add(point: CurvePoint) -> None:

@@ -1,9 +1,4 @@
-"""The Boltzmann machines: energies, conditionals, expectations and samplers, on tensors only.
-
-The page docs/models.md defines the symbols. Units: v objects, r relations, h1 hidden units.
-Weights: b, c1 and W of objects and hidden units; d, s, o, S, O, R, M and U of relations.
-Sizes: B scenes, V object classes, A relations, E relation units, H1 entries of h1.
-"""
+"""The Boltzmann machines on tensors: energies, conditionals, samplers (symbols: docs/models.md)."""
 
 from __future__ import annotations
 

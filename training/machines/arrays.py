@@ -23,10 +23,7 @@ def weights_of(machine: BoltzmannMachine) -> Weights:
 
 @lru_cache(maxsize=16)
 def machine_of(weights: Weights) -> BoltzmannMachine:
-    """Return the machine with these weights.
-
-    The machine and `weights` share memory, so do not change the machine.
-    """
+    """Return the machine with these weights. Both share memory, so do not change the machine."""
     with torch.device("meta"):
         machine = build(weights.spec)
     state = {name: torch.from_numpy(array) for name, array in weights.arrays.items()}

@@ -1,9 +1,8 @@
 """The layout of the relation units r of a machine.
 
 A relation unit e = (a, i, j) is 1 if object class i has the canonical relation a to object class j.
-With A relations and V classes there are A·V² units, too many to allocate. Every computation
-therefore lists its units in an `Edges` object, which has one row for each scene. Units that the row
-of a scene does not list are 0.
+A·V² units are too many to allocate, so `Edges` lists units in one row for each scene. Units that
+the row of a scene does not list are 0.
 """
 
 from __future__ import annotations
@@ -33,11 +32,7 @@ class Edges:
 
 @dataclass(frozen=True)
 class PairEdges(Edges):
-    """All A·n² units between the n classes of each scene.
-
-    The units of a scene have the flattened layout (relations, subjects, objects). With this layout,
-    shared weights need only small matrix products.
-    """
+    """All A·n² units between the n classes of each scene, as flattened tables (A, n, n)."""
 
     classes: Int[Tensor, "B n"]  # padding is 0
     log_counts: Float[Tensor, "B n"]  # log of the number of instances of each class
@@ -51,10 +46,7 @@ class PairEdges(Edges):
 def pair_edges(
     classes: Int[Tensor, "B n"], relations: int, log_counts: Float[Tensor, "B n"] | None = None
 ) -> PairEdges:
-    """Return the units of `relations` canonical relations between the classes; -1 is padding.
-
-    Without `log_counts`, each class has one instance.
-    """
+    """Return the units between the classes (-1: padding), by default with one instance of each."""
     B, n = classes.shape
     exists, classes = classes >= 0, classes.clamp(min=0)
     subject, object_ = classes[:, None, :, None], classes[:, None, None, :]

@@ -1,12 +1,10 @@
 """Gibbs sampling of objects and hidden units for training and for tests of the machine.
 
-A sweep draws h1 given v, and then the classes given h1. Without couplings, the classes are
-independent given h1. With couplings, the sweep draws them one after another:
+A sweep draws h1 given v, and then the classes given h1, with couplings one after another:
 
     p(v_i = 1 | h1, other classes) = sigmoid(b_i + a_qi + u_qi + Y_ti + W_i·h1 + (vL)_i)
 
-Relations are summed out: in every sweep, their sum is 1. The service samples with compiled kernels
-of its own (`app.inference.chains`).
+Relations are summed out: their sum is 1. The service has compiled kernels (`app.inference.chains`).
 """
 
 from __future__ import annotations
@@ -39,17 +37,12 @@ def sweep(
     *,
     classes: int | None = None,
 ) -> None:
-    """Run one Gibbs sweep, in place.
-
-    A sweep over coupled classes draws a number of random `classes`. None means all.
-    """
+    """Run one Gibbs sweep, in place. It draws some random coupled `classes`, by default all."""
     h1 = draw_states(machine.hidden_logits(chains.v, chains.room), machine.spec.states, generator)
     bias = machine.scene_bias(chains.source) + machine.room_bias(chains.room)
     field = bias + h1 @ machine.W.T
-    couplings = machine.couplings
-    if couplings is None:
-        drawn = torch.bernoulli(field.sigmoid(), generator=generator)
-        chains.v = drawn * chains.possible
+    if (couplings := machine.couplings) is None:
+        chains.v = torch.bernoulli(field.sigmoid(), generator=generator) * chains.possible
     else:
         chains.v = _draw_coupled(chains, field, couplings, classes, generator)
 
@@ -57,15 +50,11 @@ def sweep(
 def draw_states(
     x: Float[Tensor, "B H1"], states: int, generator: torch.Generator
 ) -> Float[Tensor, "B H1"]:
-    """Draw the states h1 of hidden units with the logits x.
-
-    Each unit has `states` states. Its first state has the logit 0 and no entry in x.
-    """
+    """Draw the states h1 from the logits x, in which the first state of a unit has no entry."""
     if states == 2:
         return torch.bernoulli(x.sigmoid(), generator=generator)
     logits = x.unflatten(-1, (-1, states - 1))
-    first = torch.zeros_like(logits[..., :1])
-    odds = torch.cat([first, logits], -1).softmax(-1)
+    odds = torch.cat([torch.zeros_like(logits[..., :1]), logits], -1).softmax(-1)
     cumulative = odds.cumsum(-1)[..., :-1]
     uniform = torch.rand(*odds.shape[:-1], 1, generator=generator, dtype=x.dtype)
     state = (uniform >= cumulative).sum(-1)
@@ -81,13 +70,11 @@ def _draw_coupled(
 ) -> Float[Tensor, "B V"]:
     """Draw some random classes (None: all), one after another given all other classes."""
     # numpy has a smaller overhead than torch for the many small steps.
-    V = field.shape[1]
-    order = torch.randperm(V, generator=generator)[:classes].tolist()
+    order = torch.randperm(field.shape[1], generator=generator)[:classes].tolist()
     uniform = torch.rand(len(order), len(field), generator=generator, dtype=field.dtype).numpy()
     v, field_of_class = chains.v.T.numpy().copy(), field.T.numpy()  # (classes, chains)
     possible, L = chains.possible.T.numpy(), couplings.numpy()
     for u, i in zip(uniform, order, strict=True):
         logit = np.maximum(field_of_class[i] + L[i] @ v, -80)  # e^89 overflows float32
-        is_present = u * (1 + np.exp(-logit)) < 1  # u < sigmoid(logit)
-        v[i] = is_present & possible[i]
+        v[i] = (u * (1 + np.exp(-logit)) < 1) & possible[i]  # u < sigmoid(logit)
     return torch.from_numpy(v.T.copy())

@@ -3,11 +3,10 @@
     E(v, r, h1, t | q) = - (b + a_q + u_q + Y_t)·v - v'Lv/2 - (c1 + Q_t)·h1 - v'W h1
                          - (e + y_q)_t - sum_e g_e [r_e ℓ_e(v, h1) - log(1 + exp ℓ_e)]
 
-q is the data source of the scene, and t its room type. A hidden unit has Z states. h1 has one entry
-for each state but the first: 1 for the state of the unit, else 0. The first state has the energy 0.
-For Z = 2, the units are binary, as in the paper. An unknown room type has the weights 0. The last
-sum runs over the relation units e = (a, i, j). A variant defines its relation units, the gate g_e
-of a unit and the logit ℓ_e. A gate of 0 forces its unit to 0.
+q is the data source of the scene, and t its room type; an unknown one has the weights 0. h1 has one
+entry for each state of a hidden unit but the first, which has the energy 0: 1 for the state of the
+unit, else 0. With two states, the units are binary, as in the paper. A variant defines its relation
+units e = (a, i, j), their gates g_e and logits ℓ_e. A gate of 0 forces its unit to 0.
 
 The term log(1 + exp ℓ_e) normalises each relation separately. So the sum over an unobserved
 relation is 1, and relations have no effect on objects and hidden units. The published machine lacks
@@ -74,8 +73,7 @@ class BoltzmannMachine(nn.Module, ABC):
             self.Y = nn.Parameter(torch.zeros(spec.C, spec.V))
         self.register_buffer("triples", torch.zeros(spec.T, 3, dtype=torch.int32))
         if spec.N:
-            # Stored chain samples as bits, (samples, words of 32 classes), and their room types. A
-            # room type of -1 is unknown.
+            # Stored chain samples in words of 32 classes, and their room types (-1: unknown).
             empty = torch.zeros(spec.N, -(-spec.V // 32), dtype=torch.int32)
             self.register_buffer("fantasies", empty)
             self.register_buffer("fantasy_rooms", torch.full((spec.N,), -1, dtype=torch.int32))
@@ -129,10 +127,7 @@ class BoltzmannMachine(nn.Module, ABC):
 
     @property
     def couplings(self) -> Float[Tensor, "V V"] | None:
-        """The couplings between classes, symmetric with a diagonal of 0, or None.
-
-        L starts at 0, and each step of the training changes it by a symmetric matrix.
-        """
+        """The symmetric couplings between classes, with a diagonal of 0, or None."""
         return self.L if self.spec.coupled else None
 
     def by_unit(self, x: Float[Tensor, "... H1"]) -> Float[Tensor, "... units states-1"]:
@@ -163,20 +158,13 @@ class BoltzmannMachine(nn.Module, ABC):
     def hidden_log_odds(
         self, x: Float[Tensor, "B H1"], weights: Float[Tensor, "rows H1"]
     ) -> Float[Tensor, "B rows"]:
-        """Return what h1 with the logits x adds to the log-odds of a unit.
-
-        It is sum_m log sum_z p_m(z) exp(w[m, z]), where a row w has the weights between h1 and the
-        unit.
-        """
+        """Return sum_m log sum_z p_m(z) exp(w[m, z]) of each row w; x are the logits of p_m."""
         states = self._all_states(x).softmax(-1).movedim(-2, 0)
         factors = self.by_unit(weights).exp().permute(1, 2, 0)
         return (states[..., :1] + states[..., 1:] @ factors).log().sum(0)
 
     def scene_bias(self, source: Int[Tensor, "B"] | None) -> Float[Tensor, "B|1 V"]:
-        """Return the bias of each class in whole scenes, b + a[q] + u[q].
-
-        A source q of -1 or None has the bias of the served mix of sources, b + u[-1].
-        """
+        """Return b + a[q] + u[q] of whole scenes; for a source q of -1 or None, b + u[-1]."""
         if source is None or not self.spec.profiles:
             return (self.b + self.u[-1]).unsqueeze(0)
         return self.b + _rows(self.a, source) + self.u[source]
@@ -184,10 +172,7 @@ class BoltzmannMachine(nn.Module, ABC):
     def source_weights(
         self, v: Float[Tensor, "B V"], source: Int[Tensor, "B"] | None
     ) -> Float[Tensor, "B sources"]:
-        """Return p(q | v, source) of each data source q.
-
-        A stated source has the probability 1. A source of -1 or None is unknown.
-        """
+        """Return p(q | v, source): 1 for a stated source. A source of -1 or None is unknown."""
         inferred = (self.f + v @ self.a.T).softmax(-1)
         if source is None or not self.spec.profiles:
             return inferred
@@ -198,19 +183,14 @@ class BoltzmannMachine(nn.Module, ABC):
         self,
         v: Float[Tensor, "B V"],
         *,
-        room: Int[Tensor, "B"] | None = None,
-        source: Int[Tensor, "B"] | None = None,
-        share: Int[Tensor, "B"] | None = None,
+        room: Int[Tensor, "B"] | None = None,  # -1: unknown
+        source: Int[Tensor, "B"] | None = None,  # -1: unknown
+        share: Int[Tensor, "B"] | None = None,  # bin of the listed share (`SHARES`); adds kappa
     ) -> Float[Tensor, "B V"]:
-        """Return the log-odds of each unlisted class given the listed classes v, in closed form.
-
-        The result of a listed class has no meaning. Room types and sources of -1 are unknown.
-        `share` is the bin of the listed share (`app.inference.weights.SHARES`), which adds kappa.
-        """
+        """Return the log-odds of each unlisted class given the listed classes v, in closed form."""
         bias = self.b + self.source_weights(v, source) @ self.a + self.room_bias(room)
         log_odds = bias + self.hidden_log_odds(self.hidden_logits(v, room), self.W)
-        couplings = self.couplings
-        if couplings is not None:
+        if (couplings := self.couplings) is not None:
             log_odds = log_odds + sparse_product(v, couplings)
         return log_odds if share is None else log_odds + self.kappa[share]
 
@@ -226,25 +206,20 @@ class BoltzmannMachine(nn.Module, ABC):
             return torch.zeros(1)
         rate = self.e[room.clamp(min=0)]
         if source is not None and self.spec.profiles:
-            by_source = self.y[source.clamp(min=0), room.clamp(min=0)]
-            rate = rate + by_source * (source >= 0)
+            rate = rate + self.y[source.clamp(min=0), room.clamp(min=0)] * (source >= 0)
         return rate * (room >= 0)
 
     def room_log_p(
         self, v: Float[Tensor, "B V"], source: Int[Tensor, "B"] | None = None
     ) -> Float[Tensor, "B C"]:
-        """Return log p(t | v, source) of each room type t, for an unlisted type.
-
-        The mean over the sources has the probabilities of `source_weights`.
-        """
+        """Return log p(t | v, source) of each room type t, with the mean over the sources."""
         logits = self.e + self.hidden_log_odds(self.hidden_logits(v), self.Q)
         if self.spec.coupled:
             logits = logits + sparse_product(v, self.Y.T)
         if not self.spec.profiles:
             return logits.log_softmax(-1)
         by_source = (logits.unsqueeze(-2) + self.y).log_softmax(-1)
-        weights = self.source_weights(v, source).unsqueeze(-1)
-        return (weights.log() + by_source).logsumexp(-2)
+        return (self.source_weights(v, source).unsqueeze(-1).log() + by_source).logsumexp(-2)
 
     def free_energy(
         self,
@@ -254,8 +229,7 @@ class BoltzmannMachine(nn.Module, ABC):
     ) -> Float[Tensor, "B"]:
         """Return F = -log sum over h1 and r of exp(-E), in closed form."""
         free = -(v * self.scene_bias(source)).sum(-1)
-        couplings = self.couplings
-        if couplings is not None:
+        if (couplings := self.couplings) is not None:
             free = free - 0.5 * (sparse_product(v, couplings) * v).sum(-1)
             free = free - (v * self.room_bias(room)).sum(-1)
         log_states = self._all_states(self.hidden_logits(v, room)).logsumexp(-1).sum(-1)
@@ -266,22 +240,15 @@ class BoltzmannMachine(nn.Module, ABC):
     @abstractmethod
     def start_relations(
         self,
-        by_relation: Float[Tensor, "A"],
-        by_unit: Float[Tensor, "T"],
-        mean_log_counts: Float[Tensor, "V"],
+        by_relation: Float[Tensor, "A"],  # log-odds that an observed relation holds
+        by_unit: Float[Tensor, "T"],  # log-odds of a triple in a scene with relations
+        mean_log_counts: Float[Tensor, "V"],  # of the number of instances of each class
     ) -> None:
-        """Set relation biases to log-odds of the training data.
-
-        They are the log-odds that an observed relation holds, and that a triple holds in a scene
-        with annotated relations. The means are of the log number of instances of each class.
-        """
+        """Set the relation biases from statistics of the training data."""
 
     @abstractmethod
     def edges(self, classes: Int[Tensor, "B n"], counts: Int[Tensor, "B n"] | None = None) -> Edges:
-        """Return the relation units between the given classes of each scene; -1 is padding.
-
-        The counts are the numbers of instances, 0 where unknown. The default is one of each class.
-        """
+        """Return the units between classes (-1: padding) with counts (0: unknown; default 1)."""
 
     @abstractmethod
     def lay_out(
@@ -291,11 +258,7 @@ class BoltzmannMachine(nn.Module, ABC):
         holds: Float[Tensor, "B A n n"],
         observed: Bool[Tensor, "B A n n"],
     ) -> tuple[Edges, Float[Tensor, "B E"], Bool[Tensor, "B E"]]:
-        """Return the relations between classes in the layout of this machine: edges, r, observed.
-
-        In an RBM or GBM, the units of absent classes are 0. They count as observed if the scene has
-        any annotated relation. `edges` describes classes and counts.
-        """
+        """Return the relations between classes as edges, r and observed flags of this machine."""
 
     @abstractmethod
     def gate(self, edges: Edges, v: Float[Tensor, "... B V"]) -> Float[Tensor, "... B E"]:
@@ -310,10 +273,7 @@ class BoltzmannMachine(nn.Module, ABC):
     def implied(
         self, edges: Edges, observed: Float[Tensor, "B E"], h1: Float[Tensor, "B H1"]
     ) -> Float[Tensor, "B E"]:
-        """Return the change of each relation logit due to relations that are observed to hold.
-
-        h1 are means given the objects. Without implication weights, the change is zero.
-        """
+        """Return the changes of the relation logits by observed relations, given means of h1."""
         del edges, h1
         return torch.zeros_like(observed)
 
@@ -337,14 +297,10 @@ class BoltzmannMachine(nn.Module, ABC):
         room: Int[Tensor, "B"] | None = None,
         source: Int[Tensor, "B"] | None = None,
     ) -> Float[Tensor, "B"]:
-        """Return the energy E(v, r, h1, t); +inf if a unit with gate 0 is 1.
-
-        The states of h1 are 0 or 1. At most one state of each unit is 1.
-        """
+        """Return the energy E(v, r, h1, t) of states h1; +inf if a unit with gate 0 is 1."""
         hidden = (h1 * (self.hidden_bias(room) + v @ self.W)).sum(-1)
         log_weight = (v * self.scene_bias(source)).sum(-1) + hidden
-        couplings = self.couplings
-        if couplings is not None:
+        if (couplings := self.couplings) is not None:
             log_weight = log_weight + 0.5 * ((v @ couplings) * v).sum(-1)
             log_weight = log_weight + (v * self.room_bias(room)).sum(-1)
         log_weight = log_weight + self.room_rate(room, source)

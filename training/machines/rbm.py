@@ -1,10 +1,9 @@
 """The machines of the paper with a relation unit for each triple seen in training: RBM and GBM.
 
-The RBM has the relation logits ℓ_t = d_t + U_t·h1. The triples t are (relation a, subject class i,
-object class j). All other relations are always 0. The units have no gate, so r_t depends on its two
-objects only through the hidden units. The general Boltzmann machine (GBM) adds two-way weights
-between relations and objects: ℓ_t = d_t + g_t v_i + g'_t v_j + U_t·h1. The GBM of the paper has a
-second hidden layer, which `training.seed` keeps.
+The RBM has the relation logits ℓ_t = d_t + U_t·h1 of triples t = (relation a, classes i, j), and
+no gate. All other relations are 0. The general Boltzmann machine (GBM) adds two-way weights between
+relations and objects: ℓ_t = d_t + g_t v_i + g'_t v_j + U_t·h1. The GBM of the paper has a second
+hidden layer, which `training.seed` keeps.
 """
 
 from __future__ import annotations
@@ -46,7 +45,8 @@ class RBM(BoltzmannMachine):
         holds: Float[Tensor, "B A n n"],
         observed: Bool[Tensor, "B A n n"],
     ) -> tuple[Edges, Float[Tensor, "B E"], Bool[Tensor, "B E"]]:
-        # Relations without a unit are left out.
+        # Relations without a unit are left out. Units of absent classes are 0, and observed if any
+        # relation of the scene is.
         pairs = pair_edges(classes, holds.shape[1])
         keys = triple_keys(pairs.relation, pairs.subject, pairs.object, self.spec.V)
         position, exists = find_triples(self.triple_keys, keys)

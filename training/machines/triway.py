@@ -4,32 +4,28 @@
     w_e = s[a,i] + o[a,j] + sum_k S[i,k] R[a,k] O[j,k] + w_e' + n[a,0] log n_i + n[a,1] log n_j
     U_e = P[a] + sum_k S[i,k] M[a,k] O[j,k]
 
-A relation can be 1 only between present objects. Products of the factors S, O, R and M replace a
-free weight for each triple (a,i,j). Triples seen in training also have a free residual weight w'.
-n_i and n_j are the numbers of instances of the two classes. Their logs enter with the weights n,
-because a relation between classes holds if it holds between any two instances. If a number of
-instances is unknown, the mean log n_i of the class is used.
+Products of the factors S, O, R and M replace a free weight for each triple (a,i,j). Triples seen in
+training also have a free residual weight w'. n_i and n_j are the numbers of instances: a relation
+between classes holds if it holds between any two instances. An unknown log n_i is its class mean.
 
-With G > 0, the observed relations r_G also change the logits of other relations. For example, if A
-is left of B and B is left of C, then A is left of C. Relation units that are independent given h1
-cannot represent such a rule.
+With G > 0, the observed relations r_G also change the logits of other relations: if A is left of B
+and B is left of C, then A is left of C. Units that are independent given h1 cannot represent this.
 
     log-odds of r_e given r_G  =  ℓ_e(h1) + x_e(r_G)
     x_e = sum_f (gamma[0,a,f] + sum_q z_q gamma[q,a,f]) phi_f(i, j; r_G),    z = B E[h1 | v]
 
-The model is conditioned on r_G and has no energy term for r_G. All other conditionals keep their
-closed form. Without observed relations, x = 0. The strength of the rules depends on the hidden
-units through z, because some data sets annotate every visible pair and others only a few. The
-features phi_f use the A relations in both directions, so b and c are 2A relations. The features of
-r_e never use r_e itself:
+The model is conditioned on r_G and has no energy term for it. All other conditionals keep their
+closed form. The rules depend on h1 through z, because some data sets annotate every visible pair
+and others only a few. The features phi_f use the A relations in both directions, so b and c are 2A
+relations. The features of r_e never use r_e itself:
 
     pair      r_b(i, j)                                              2A features
     path      there is a class k with r_b(i, k) and r_c(k, j)        (2A)² features
     degree    number of classes k other than j with r_b(i, k)        2A features, each at most 3
               number of classes k other than i with r_b(k, j)        2A features, each at most 3
 
-The rules follow Mnih, Larochelle and Hinton, "Conditional restricted Boltzmann machines for
-structured output prediction" (2011), whose model is also conditioned on observed units.
+Source: Mnih, Larochelle and Hinton, "Conditional restricted Boltzmann machines for structured
+output prediction" (2011), for models that are conditioned on observed units.
 """
 
 from __future__ import annotations
@@ -128,8 +124,7 @@ class Triway(BoltzmannMachine):
     ) -> Float[Tensor, "B E"]:
         if not self.spec.G:
             return super().implied(edges, observed, h1)
-        grid = _pairs(edges).unflatten(observed)
-        return implied(self.gamma, self.B, grid, h1).flatten(-3)
+        return implied(self.gamma, self.B, _pairs(edges).unflatten(observed), h1).flatten(-3)
 
 
 def _pairs(edges: Edges) -> PairEdges:
@@ -143,10 +138,7 @@ def _pairs(edges: Edges) -> PairEdges:
 
 
 def implication_features(observed: Float[Tensor, "B A n n"]) -> Float[Tensor, "B F n n"]:
-    """Return the features phi of relations that are observed to hold, over pairs of classes.
-
-    The pair feature of relation a equals r_e itself, so `implied` does not use that feature for a.
-    """
+    """Return the features phi of relations that are observed to hold, over pairs of classes."""
     n = observed.shape[-1]
     between = observed * ~torch.eye(n, dtype=torch.bool)
     directed = torch.cat([between, between.mT], 1)
@@ -166,15 +158,11 @@ def implied(
     observed: Float[Tensor, "B A n n"],
     h1: Float[Tensor, "B H1"],
 ) -> Float[Tensor, "B A n n"]:
-    """Return the changes x of the relation logits due to relations that are observed to hold.
-
-    gamma are the weights of the features, B the weights from h1 to z, and h1 means of the hidden
-    units given the objects.
-    """
+    """Return the changes x of the relation logits by observed relations, given means of h1."""
     A = observed.shape[1]
+    # The pair feature of relation a is r_e itself.
     itself = torch.zeros(gamma.shape[1:], dtype=torch.bool)
     itself[:, :A].fill_diagonal_(True)
     gamma = gamma.masked_fill(itself, 0.0)
     weight = gamma[0] + torch.einsum("bq,qaf->baf", h1 @ B.T, gamma[1:])
-    features = implication_features(observed)
-    return (weight @ features.flatten(2)).view(observed.shape)
+    return (weight @ implication_features(observed).flatten(2)).view(observed.shape)

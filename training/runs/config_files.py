@@ -43,7 +43,6 @@ def own_or_shipped(path: Path | None, config: Config, kind: str, option: str) ->
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
@@ -64,10 +63,7 @@ def data_folder(reference: str, config: Config, given: Path | None = None) -> Pa
 
 
 def load_config(reference: str, *, seed: int | None = None) -> Config:
-    """Read a configuration. `config_path` describes the possible references.
-
-    The entry `base` names a shipped configuration, whose entries apply where the file has none.
-    """
+    """Read a configuration. Its entry `base` names a shipped one with the default entries."""
     path = config_path(reference)
     if not path.is_file():
         choice = f"pass a TOML file or one of {', '.join(shipped_configs())}"
@@ -140,10 +136,7 @@ def config_toml(config: Config) -> str:
 
 
 def sections_toml(values: Mapping[str, Any], reasons: Mapping[str, str] | None = None) -> str:
-    """Return entries and sections as TOML text.
-
-    `reasons` maps "section.entry" to a comment for the line above the entry.
-    """
+    """Return entries and sections as TOML, with `reasons` as comments above "section.entry"."""
     sections = {name: own for name, own in values.items() if isinstance(own, Mapping)}
     lines = [_entry(name, value) for name, value in values.items() if name not in sections]
     for section, entries in sections.items():
@@ -156,7 +149,6 @@ def sections_toml(values: Mapping[str, Any], reasons: Mapping[str, str] | None =
 
 
 def _entry(name: str, value: Any) -> str:
-    """Return an entry as a line of TOML."""
     if isinstance(value, Mapping):
         entries = ", ".join(_entry(json.dumps(key), entry) for key, entry in value.items())
         return f"{name} = {{ {entries} }}"

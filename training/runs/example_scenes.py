@@ -39,11 +39,7 @@ _FEWEST_CLASSES: Final = 3
 
 
 def read_examples(reference: str, root: Path) -> tuple[Example, ...]:
-    """Read the examples of a configuration.
-
-    The reference is its entry `examples`: the name of a shipped file, or a file in `root` that ends
-    in .json. An empty text means no examples.
-    """
+    """Read the examples that a configuration names: a shipped file, or a .json file in `root`."""
     if not reference:
         return ()
     path = root / reference
@@ -96,12 +92,7 @@ def examples_json(examples: Sequence[Example]) -> str:
 def choose_examples(
     scenes: Sequence[AnnotatedScene], vocabulary: Vocabulary
 ) -> tuple[Example, ...]:
-    """Return up to three typical scenes, if possible of different room types.
-
-    A typical scene contains frequent classes, and as many classes as the median scene of its room
-    type. In a scene with more classes, `/missing` would propose few objects. Scenes with positions
-    take precedence. Scenes of research-only data sets are left out.
-    """
+    """Return up to three typical scenes, if possible of different room types."""
     own = [scene for scene in scenes if not source_of(scene.source).research_only]
     objects_of = {scene: _usable(scene, vocabulary) for scene in own}
     classes = {scene: {index for index, _ in pairs} for scene, pairs in objects_of.items()}
@@ -112,6 +103,7 @@ def choose_examples(
         sizes[scene.room_type].append(len(classes[scene]))
 
     def rank(scene: AnnotatedScene) -> tuple[bool, float, int]:
+        # Scenes with more classes than the median leave few objects for `/missing` to propose.
         distance = abs(len(classes[scene]) - np.median(sizes[scene.room_type]))
         bare = not any(thing.position for _, thing in objects_of[scene])
         return bare, float(distance), -sum(frequency[index] for index in classes[scene])

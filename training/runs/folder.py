@@ -58,11 +58,7 @@ def save_run(
     data: Path | None = None,
     scenes: str = "",
 ) -> None:
-    """Replace the folder by the files of a finished run.
-
-    The function writes the files beside the folder. If it is interrupted, the folder stays as it
-    was.
-    """
+    """Replace the folder by the files of a finished run. An interruption leaves it as it was."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as beside:
         new, old = Path(beside, "new"), Path(beside, "old")
@@ -81,7 +77,6 @@ def save_run(
 def _write(
     folder: Path, config: Config, result: TrainingResult, data: Path | None, scenes: str
 ) -> None:
-    """Write the files of a run into a folder."""
     machine = result.machine
     state = {name: tensor.contiguous() for name, tensor in machine.state_dict().items()}
     spec = json.dumps(machine.spec.to_dict())
@@ -95,7 +90,6 @@ def _write(
 
 
 def load_run(folder: Path) -> FinishedRun:
-    """Read a finished run."""
     for name in ("config.json", "model.safetensors", "result.json"):
         if not (folder / name).is_file():
             runs = ", ".join(str(path.parent) for path in sorted(folder.glob("*/result.json")))

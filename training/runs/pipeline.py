@@ -64,10 +64,7 @@ class SplitScenes:
         return hashlib.sha256(json.dumps(decisive).encode()).hexdigest()
 
     def training_data(self) -> TrainingData:
-        """Return the tensors for the trainer.
-
-        A data source annotates the classes that occur in its training part.
-        """
+        """Return the tensors. A source annotates the classes that occur in its training part."""
         annotated = annotated_classes(self.parts["train"], self.vocabulary)
         sources = {scene.source for scenes in self.parts.values() for scene in scenes}
         for source in sources - set(annotated):
@@ -97,12 +94,7 @@ class SplitScenes:
 
 
 def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]]:
-    """Read the scenes of every data source, by source name.
-
-    A data source is a file, or a name. A name means `<name>.jsonl.gz` in `root` or in `root/extra`
-    (`<name>.tsv.gz` for the placing priors). `rooms` and `inventories` come from the repository.
-    The scenes of a file have plain labels, and no placeholders (`plain_scenes`).
-    """
+    """Read the scenes of every data source, by source name. Scenes of files have plain labels."""
     _require_files(data, root)
     scenes: dict[str, list[AnnotatedScene]] = {}
     for source in data.sources:
@@ -122,7 +114,6 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
 
 
 def _path(source: str, root: Path) -> Path:
-    """Return the file of a data source."""
     if source == inventories.SOURCE:
         return KNOWLEDGE / "inventories.csv"
     if is_file(source):
@@ -133,7 +124,6 @@ def _path(source: str, root: Path) -> Path:
 
 
 def _require_files(data: DataConfig, root: Path) -> None:
-    """Raise ConfigError if a file of a source is missing."""
     paths = {source: _path(source, root) for source in data.sources if source != "rooms"}
     missing = {source: path for source, path in paths.items() if not path.is_file()}
     if not missing:
@@ -159,13 +149,13 @@ def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path)
         "source": partial(source_vocabulary, scenes),
         "rooms": rooms_vocabulary,
     }
-    if name not in makers and not name.endswith(".json"):
+    if name in makers:
+        return with_typical_sizes(makers[name](), scenes)
+    if not name.endswith(".json"):
         raise ConfigError(
             f"data.vocabulary is {name!r}; it must be {', '.join(makers)}, or the name of a .json "
             "file"
         )
-    if name in makers:
-        return with_typical_sizes(makers[name](), scenes)
     try:
         vocabulary = read_vocabulary(root / name)
     except OSError as error:
@@ -183,11 +173,7 @@ def split_and_encode(
     root: Path,
     vocabulary: Vocabulary | None = None,
 ) -> SplitScenes:
-    """Split the scenes into train, validation and test parts, and encode them.
-
-    The split includes all data sources at once, because sources can contain the same room. The
-    vocabulary is that of a published model, or by default that of the configuration in `root`.
-    """
+    """Split the scenes of all sources at once, because sources can share rooms, and encode them."""
     all_scenes = [scene for source in scenes.values() for scene in source]
     parts = split(all_scenes, seed=data.split_seed, protocol=data.split)
     if vocabulary is None:
@@ -205,8 +191,5 @@ def split_and_encode(
 
 
 def prepare(config: Config, root: Path, vocabulary: Vocabulary | None = None) -> SplitScenes:
-    """Read the scenes of a configuration from the folder `root`, split and encode them.
-
-    `vocabulary` is that of a published model. The default is that of the configuration.
-    """
+    """Read, split and encode the scenes of a configuration; `vocabulary`: of a published model."""
     return split_and_encode(config.data, read_sources(config.data, root), root, vocabulary)

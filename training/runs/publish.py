@@ -58,20 +58,13 @@ def publish_run(
 ) -> Artifact:
     """Calibrate on validation scenes, fit statistics, evaluate on test scenes, and publish.
 
-    The model is refused if it certainly raises too many alarms about untouched validation scenes
-    (`training.evaluation.alarms`), or if long chains certainly drift away from the training scenes
-    (`training.fit.long_chains`). The store keeps weights in half precision. Calibration and
-    evaluation use the same precision.
-
-    Args:
-        measured: second run of the same configuration, and its scenes, for a `run` that was trained
-            on test scenes. Its test results and chosen calibration values are published.
-        judge: function that returns further reasons against the calibrated model.
-        accept: function of each reason against a model that is published all the same. None refuses
-            the model.
+    If `run` was trained on test scenes, a second run of the configuration, `measured`, gives the
+    test results and the chosen calibration values. `judge` returns further reasons against the
+    calibrated model. `accept` gets each reason against a model that is published all the same.
 
     Raises:
-        RefusedError: there is a reason against the model.
+        RefusedError: the model raises too many alarms about untouched validation scenes, long
+            chains drift away from the training scenes, or there is another reason.
         RunError: the run was trained on other scenes than `scenes`.
         StoreError, ArtifactError: see `Store.publish`.
     """
@@ -125,13 +118,10 @@ def refit(
 ) -> Artifact:
     """Publish a new version of a published model with refitted statistics, without training.
 
-    Only the statistics (offsets, counts, alarm lines, limits of generated scenes), their metrics,
-    the example scenes and the built-in synonyms of classes are new. The examples are those of the
-    shipped configuration with the name of the model, otherwise those of its own configuration. The
-    metrics of weights that were trained on test scenes come from statistics that were not fitted to
-    test scenes. The new version has no shares of flagged intruders, of alarms and of refused rooms
-    of such weights, because they would need other weights. `root` is the folder of the training
-    scenes.
+    New are offsets, counts, alarm lines, limits of generated scenes, their metrics, the examples
+    of the configuration, and built-in synonyms. Statistics of weights that know the test scenes
+    are measured on a second split. Flagged intruders, alarms and refused rooms of such weights
+    need other weights, so their metrics are left out. `root` is the folder of the scenes.
 
     Raises:
         RunError: the scenes in `root` are not the training scenes of the model.
@@ -222,10 +212,7 @@ def _measure(
 
 
 def data_sources(scenes: SplitScenes, learnt: ObjectScenes) -> tuple[DataSource, ...]:
-    """Return the data sources with the digests of their scenes, their terms of use and shares.
-
-    The shares are those of the weights of the scenes in the training of objects, `learnt`.
-    """
+    """Return the data sources, with their shares of the weight in the training of objects."""
     sources = []
     share_of = dict(zip(learnt.sources, (learnt.source_sizes / learnt.size).tolist(), strict=True))
     written = {source_name(source) for source in scenes.data.sources if is_inventory(source)}
@@ -234,8 +221,7 @@ def data_sources(scenes: SplitScenes, learnt: ObjectScenes) -> tuple[DataSource,
         digest = scenes.digests[name]
         source = DataSource(
             source=name, scenes=count, digest=digest, terms=words, research_only=research_only,
-            share=round(share_of.get(name, 0.0), 4),
-            written=name in written,
+            share=round(share_of.get(name, 0.0), 4), written=name in written,
         )  # fmt: skip
         sources.append(source)
     return tuple(sources)

@@ -43,14 +43,9 @@ from training.seed.scenes import Material, read_material
 
 console = Console()
 
-Job = tuple[str, str, int]
-"""Split, variant and training seed of a machine."""
-
-Run = dict[str, Any]
-"""Figures of a machine, and the errors of each epoch."""
-
-Row = dict[str, float]
-"""Figures by metric."""
+Job = tuple[str, str, int]  # split, variant and training seed of a machine
+Run = dict[str, Any]  # figures of a machine, and the errors of each epoch
+Row = dict[str, float]  # figures by metric
 
 
 class FolderError(ValueError):
@@ -209,7 +204,6 @@ def markdown(source: str, materials: Mapping[str, Material], results: Mapping[st
 
 
 def _table(result: Mapping[str, Any]) -> str:
-    """Return the table of a split in Markdown."""
     columns: dict[str, list[Row]] = dict(result["references"])
     columns |= {name: [_row(run) for run in runs] for name, runs in result["machines"].items()}
     metrics = dict.fromkeys(metric for rows in columns.values() for row in rows for metric in row)
@@ -237,7 +231,6 @@ def _row(run: Run) -> Row:
 
 
 def _cells(metric: str, columns: Iterable[list[Row]]) -> Iterator[str]:
-    """Yield the mean ± standard deviation of a metric in each column."""
     for rows in columns:
         values = [row[metric] for row in rows if metric in row]
         digits = 0 if metric in ("epochs", "weights") else 1 if metric.startswith("E ") else 3

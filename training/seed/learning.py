@@ -1,16 +1,14 @@
 """Training of the machines: contrastive divergence, reconstruction error and early stopping.
 
-One step takes 32 scenes. The positive phase samples the context given the scene. The negative
-phase samples objects given context and relations, and then relations given context and objects, at
-temperature 1. A step adds .5 (<-dE/dw>_positive - <-dE/dw>_negative) to each weight w. Both phases
-sample their last context with the same random numbers, so most of the noise cancels. An unlisted
-relation of an annotated scene is false. The relations of a scene without annotation occur in
-neither phase.
+The positive phase samples the context given the scene. The negative phase samples objects given
+context and relations, and then relations given context and objects, at temperature 1. A step adds
+.5 (<-dE/dw>_positive - <-dE/dw>_negative) to each weight w. Both phases sample their last context
+with the same random numbers, so most of the noise cancels. An unlisted relation of an annotated
+scene is false. The relations of a scene without annotation occur in neither phase.
 
 The error E of the paper is the squared difference between the probabilities at the start of the
-positive phase and at the end of the negative phase, summed over units and averaged over scenes. The
-scene is observed, so the first probabilities are 0 or 1. Objects and relations are separate.
-Training stops if the error of the validation scenes, objects plus relations, has not fallen for
+positive phase (0 or 1) and at the end of the negative phase, summed over units and averaged over
+scenes. Training stops if the validation error, objects plus relations, has not fallen for
 `PATIENCE` epochs, and the weights of the best epoch are kept.
 
 Sources: Hinton, "Training products of experts by minimizing contrastive divergence" (2002);
@@ -55,11 +53,7 @@ class Epoch:
 def phases(
     machine: Machine, scenes: Scenes, generator: torch.Generator, steps: int = 1
 ) -> tuple[State, State, Float[Tensor, "B"], Float[Tensor, "B"]]:
-    """Run the positive phase and `steps` sweeps of the negative phase.
-
-    The results are the states at the end of both phases, with the mean of h1 given all other units
-    in place of h1, and the errors E of the objects and of the relations.
-    """
+    """Run both phases. Return their last states, and the errors E of objects and of relations."""
     v, r, free = scenes.v, scenes.r, Free.of(scenes.v, scenes.annotated, scenes.r)
     start = state = State(v, r, *machine.hidden(v, r, generator))
     object_p, relation_p = v, r
@@ -105,7 +99,6 @@ def train(
 
 
 def _epoch(machine: Machine, material: Material, generator: torch.Generator, rate: float) -> Epoch:
-    """Update the weights by all batches of an epoch, and return its errors."""
     start, own = time.perf_counter(), []
     for index in torch.randperm(len(material.train), generator=generator).split(BATCH):
         positive, negative, *error = phases(machine, material.train.rows(index), generator)
@@ -129,7 +122,6 @@ def _averages(own: Sequence[Sequence[Tensor]], scenes: Scenes) -> tuple[float, f
 
 
 def _check(machine: Machine, epoch: int, rate: float) -> None:
-    """Raise FloatingPointError if a weight shows divergence."""
     for name, weight in machine.named_parameters():
         largest = float(weight.abs().max()) if weight.numel() else 0.0
         if not largest <= LARGEST_WEIGHT:  # also true for NaN

@@ -68,11 +68,7 @@ def bernoulli(p: Float[Tensor, "*s"], generator: torch.Generator) -> Float[Tenso
 
 
 class Machine(nn.Module):
-    """The parts that all machines share. A subclass defines its relations and their effect.
-
-    The triples are the relation, subject class and object class of each unit of r. The generator
-    draws the initial weights W, J and U. The biases start at zero.
-    """
+    """The parts that all machines share. A subclass defines its relations and their effect."""
 
     def __init__(
         self, triples: Int[Tensor, "T 3"], V: int, H1: int, H2: int, generator: torch.Generator
@@ -89,15 +85,12 @@ class Machine(nn.Module):
         self.d, self.U = _fixed(torch.zeros(T)), weights(T, H1)
 
     def update(self, positive: State, negative: State, rate: float) -> None:
-        """Add rate * (<-dE/dw>_positive - <-dE/dw>_negative), means over scenes, to each weight w.
-
-        E is linear in each weight, so -dE/dw is a product of units.
-        """
+        """Add rate * (<-dE/dw>_positive - <-dE/dw>_negative) to each weight; means over scenes."""
         for state, step in ((positive, rate), (negative, -rate)):
             self.add_products(state, step / len(state.v))
 
     def add_products(self, state: State, step: float) -> None:
-        """Add step * -dE/dw, summed over scenes, to each weight w."""
+        """Add step * -dE/dw, a product of units, summed over scenes, to each weight w."""
         v, r, h1, h2 = state.v, state.r, state.h1, state.h2
         for bias, units in ((self.b, v), (self.c1, h1), (self.c2, h2), (self.d, r)):
             bias.add_(units.sum(0), alpha=step)
@@ -162,10 +155,7 @@ class Machine(nn.Module):
     def sweep(
         self, state: State, free: Free, temperature: float, generator: torch.Generator
     ) -> tuple[State, Float[Tensor, "B V"], Float[Tensor, "B T"]]:
-        """Sample h2, h1, the free objects and the free relations once, in this order.
-
-        Return the new state, and the probabilities of objects and relations to be on.
-        """
+        """Sample h2, h1, free objects and relations. Return state, p(objects), p(relations)."""
         h2 = bernoulli((self.h2_logits(state.h1) / temperature).sigmoid(), generator)
         logits = self.h1_logits(state.v, state.r, h2)
         h1 = bernoulli((logits / temperature).sigmoid(), generator)

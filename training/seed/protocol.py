@@ -63,13 +63,10 @@ def machine_answer(machine: Machine, schedule: Sequence[float] = ONE_PASS) -> An
 
 
 def frequency_answer(triples: Int[Tensor, "T 3"], train: Scenes) -> Answer:
-    """Return the reconstruction by frequencies in the training scenes, without any context.
-
-    p(v_i) is the share of scenes with class i. p(r_e) is the share of listed relations among the
-    annotated scenes with both classes.
-    """
+    """Return the reconstruction by frequencies in the training scenes, without any context."""
     subject, object_ = triples[:, 1], triples[:, 2]
     both = train.v[:, subject] * train.v[:, object_] * train.annotated.unsqueeze(1)
+    # p(r_e) is the share of listed relations among the annotated scenes with both classes.
     object_p, relation_p = train.v.mean(0), train.r.sum(0) / both.sum(0).clamp(min=1)
 
     def answer(v: Tensor, r: Tensor, free: Free, generator: torch.Generator) -> Visible:
@@ -81,7 +78,6 @@ def frequency_answer(triples: Int[Tensor, "T 3"], train: Scenes) -> Answer:
 
 
 def nothing_answer(v: Tensor, r: Tensor, free: Free, generator: torch.Generator) -> Visible:  # noqa: ARG001
-    """Return the scene as it is."""
     return v, r
 
 
@@ -121,11 +117,7 @@ def removed_on(
     left: bool,
     generator: torch.Generator,
 ) -> dict[str, float]:
-    """Measure T2 over the scenes of two or more classes.
-
-    The absent classes and their relations are free. With `left`, the relations of the removed class
-    stay as they are.
-    """
+    """Measure T2 over scenes of two or more classes; with `left`, no relations are deleted."""
     scenes = test.rows(test.v.sum(1) >= 2)
     removed = torch.multinomial(scenes.v, 1, generator=generator)
     shown = scenes.v.scatter(1, removed, 0.0)
@@ -155,16 +147,12 @@ def extra_errors(answer: Answer, test: Scenes, generator: torch.Generator) -> di
 def generate(
     machine: Machine, train: Scenes, vocabulary: Vocabulary, seed: int
 ) -> tuple[dict[str, float], dict[str, list[str]]]:
-    """Measure T4 for the hidden units of h1 whose mean varies most over the training scenes.
-
-    Objects and then relations are sampled given h1 from an empty scene. The results are figures,
-    and the most frequent classes by hidden unit. A pair of sampled classes is "seen" if both
-    classes are in one training scene.
-    """
+    """Measure T4 for the units of h1 whose mean varies most; also return classes by unit."""
     generator = torch.Generator().manual_seed(seed)
     _, h2 = machine.hidden(train.v, train.r, generator)
     mean = machine.h1_logits(train.v, train.r, h2).sigmoid()
     units = mean.var(0).topk(min(_ROWS, mean.shape[1])).indices
+    # A pair of sampled classes is "seen" if both classes are in one training scene.
     seen = (train.v.T @ train.v) > 0
     figures, classes = {}, {}
     for name, rest in (("mean", mean.mean(0)), ("zero", torch.zeros_like(mean[0]))):

@@ -61,9 +61,6 @@ class Material:
 def read_material(source: str, folder: Path) -> dict[str, Material]:
     """Read the scenes of a source, and split them 60 / 30 / 10 % by each of `SPLITS`.
 
-    A source is a file, or the name of a file `<name>.jsonl.gz` in the folder. The vocabulary has
-    the classes of the source. Structure such as the floor is an ordinary class, as in the paper.
-
     Raises:
         DatasetError: the file is missing or invalid.
     """
@@ -71,6 +68,7 @@ def read_material(source: str, folder: Path) -> dict[str, Material]:
     read = read_scenes(path if path.suffix else folder / f"{source}.jsonl.gz")
     scenes = [_of_the_paper(scene) for scene in read]
     classes = source_vocabulary(scenes)
+    # Structure such as the floor is an ordinary class, as in the paper.
     objects = [replace(entry, structure=False) for entry in classes.objects]
     vocabulary = Vocabulary(objects, classes.room_types, classes.room_aliases)
     encoded = {scene.scene_id: scene for scene in encode(scenes, vocabulary)}
@@ -115,7 +113,6 @@ def _keys(scene: EncodedScene, V: int) -> Int[NDArray, "n"]:
 
 
 def _scenes(scenes: Sequence[EncodedScene], units: Int[NDArray, "T"], V: int) -> Scenes:
-    """Return the scenes as tensors, with the triples `units` as relation units."""
     v, r = torch.zeros(len(scenes), V), torch.zeros(len(scenes), len(units))
     keys = [_keys(scene, V) for scene in scenes]
     for row, (scene, own) in enumerate(zip(scenes, keys, strict=True)):
