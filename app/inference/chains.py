@@ -94,10 +94,7 @@ class SceneChains:
     """Gibbs chains of a machine. Scenes of `excluded` room types start a chain only on request."""
 
     def __init__(
-        self,
-        weights: Weights,
-        units: RelationUnits | None = None,
-        excluded: Collection[int] = (),
+        self, weights: Weights, units: RelationUnits | None = None, excluded: Collection[int] = ()
     ) -> None:
         self.machine, self._excluded = weights, list(excluded)
         self.units = units or relation_units(weights)

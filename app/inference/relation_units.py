@@ -354,9 +354,7 @@ def _chosen_relations(relations: int, only: int | None) -> slice:
     return slice(0, relations) if only is None else slice(only, only + 1)
 
 
-def _directions(
-    weights: Weights,
-) -> tuple[Float[NDArray, "A r H1"], Float[NDArray, "A r K+1"]]:
+def _directions(weights: Weights) -> tuple[Float[NDArray, "A r H1"], Float[NDArray, "A r K+1"]]:
     """Return F and Y; see `SharedUnits`.
 
     The rows of F[a] are the r directions in which U_e·h1 has the largest variance. Y[a] converts

@@ -93,11 +93,7 @@ def _copy(
 
 
 def _replacement(
-    old: AliasTarget,
-    new: AliasTarget,
-    source: Store,
-    target: Store,
-    added: set[tuple[str, str]],
+    old: AliasTarget, new: AliasTarget, source: Store, target: Store, added: set[tuple[str, str]]
 ) -> AliasTarget | None:
     """Return the target that replaces a shipped model of an earlier release, if an alias moves.
 

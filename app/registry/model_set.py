@@ -11,13 +11,7 @@ from typing import Final
 
 from app.registry.artifact import Artifact
 from app.registry.errors import OUTDATED, ArtifactError, StoreError
-from app.registry.references import (
-    NOTHING,
-    AliasTarget,
-    Shipped,
-    resolve_reference,
-    version_key,
-)
+from app.registry.references import NOTHING, AliasTarget, Shipped, resolve_reference, version_key
 from app.registry.store import Store
 
 _logger = logging.getLogger("app.registry")
