@@ -333,15 +333,12 @@ _EXAMPLES: Final = {
 }
 _EXAMPLE_ANSWER: Final = {
     "seed": 7,
-    "scenes": [
-        {
-            "room_type": "bedroom",
-            "objects": ["bed", "nightstand", "lamp"],
-            "relations": [{"subject": "lamp", "relation": "on-top", "object": "nightstand"}],
-            "log_score": -6.1,
-        }
-    ],
-}
+    "scenes": [{
+        "room_type": "bedroom", "objects": ["bed", "nightstand", "lamp"],
+        "relations": [{"subject": "lamp", "relation": "on-top", "object": "nightstand"}],
+        "log_score": -6.1,
+    }],
+}  # fmt: skip
 
 GENERATE: Final = Question(
     generate,

@@ -350,54 +350,32 @@ _EXAMPLES: Final = {
 }
 _EXAMPLE_ANSWER: Final = {
     "coverage": 0.5,
-    "missing": [
-        {
-            "label": "pillow",
-            "probability": 0.46,
-            "log_odds": -0.16,
-            "placements": [
-                {
-                    "relation": "on-top",
-                    "object": "bed",
-                    "probability": 0.91,
-                    "offset": {
-                        "mean": {"x": 0.005, "y": 0.012, "z": 0.421},
-                        "std": {"x": 0.466, "y": 0.491, "z": 0.242},
-                        "scenes": 1089,
-                    },
-                }
-            ],
-            "because": [
-                {"object": "bed", "log_odds_change": 1.7},
-                {"object": "lamp_1", "log_odds_change": -0.2},
-            ],
-        }
-    ],
-    "more": [
-        {
-            "label": "nightstand",
-            "listed_as": "bedside table",
-            "listed_count": 1,
-            "expected_count": 1.7,
-            "low": 1,
-            "high": 2,
-            "probability": 0.6,
-        }
-    ],
-}
+    "missing": [{
+        "label": "pillow", "probability": 0.46, "log_odds": -0.16,
+        "placements": [{
+            "relation": "on-top", "object": "bed", "probability": 0.91,
+            "offset": {
+                "mean": {"x": 0.005, "y": 0.012, "z": 0.421},
+                "std": {"x": 0.466, "y": 0.491, "z": 0.242}, "scenes": 1089,
+            },
+        }],
+        "because": [
+            {"object": "bed", "log_odds_change": 1.7},
+            {"object": "lamp_1", "log_odds_change": -0.2},
+        ],
+    }],
+    "more": [{
+        "label": "nightstand", "listed_as": "bedside table", "listed_count": 1,
+        "expected_count": 1.7, "low": 1, "high": 2, "probability": 0.6,
+    }],
+}  # fmt: skip
 
-MISSING: Final = Question(
-    missing,
-    _read,
-    MissingRequest,
-    MissingAnswer,
-    _EXAMPLES,
-    _EXAMPLE_ANSWER,
-    description="""
+_TEXT: Final = """
 Rank the classes that the scene does not list, most probable first, with likely places.
 
 The list `more` contains listed classes that probably have further instances, such as a second
 nightstand. It is empty for questions about a place.
-""",
-    ask_all=_ask_all,
+"""
+MISSING: Final = Question(
+    missing, _read, MissingRequest, MissingAnswer, _EXAMPLES, _EXAMPLE_ANSWER, _TEXT, _ask_all
 )

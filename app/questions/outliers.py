@@ -278,49 +278,30 @@ _EXAMPLE_ANSWER: Final = {
     "threshold": 0.7,
     "outliers": [
         {
-            "object": "wc_1",
-            "label": "toilet",
-            "listed_as": "WC",
-            "probability": 0.94,
-            "log_odds": 2.75,
-            "is_outlier": True,
+            "object": "wc_1", "label": "toilet", "listed_as": "WC", "probability": 0.94,
+            "log_odds": 2.75, "is_outlier": True,
             "because": [{"object": "bed", "log_odds_change": 1.8}],
             "usually_with": ["toilet paper", "sink", "faucet"],
         },
         {
-            "object": "bed",
-            "label": "bed",
-            "probability": 0.03,
-            "log_odds": -3.48,
+            "object": "bed", "label": "bed", "probability": 0.03, "log_odds": -3.48,
             "is_outlier": False,
             "because": [{"object": "lamp_1", "log_odds_change": -0.6}],
             "usually_with": [],
         },
     ],
-    "misplaced": [
-        {
-            "subject": "lamp_1",
-            "relation": "on-top",
-            "object": "nightstand_1",
-            "probability": 0.05,
-            "is_misplaced": False,
-            "moved": "lamp_1",
-        }
-    ],
-}
+    "misplaced": [{
+        "subject": "lamp_1", "relation": "on-top", "object": "nightstand_1", "probability": 0.05,
+        "is_misplaced": False, "moved": "lamp_1",
+    }],
+}  # fmt: skip
 
-OUTLIERS: Final = Question(
-    outliers,
-    _read,
-    OutliersRequest,
-    OutliersAnswer,
-    _EXAMPLES,
-    _EXAMPLE_ANSWER,
-    description="""
+_TEXT: Final = """
 Return probabilities that each object is an outlier and that each observed relation is false.
 
 The list `outliers` starts with the most probable outlier. All instances of a class have the
 same probability. The list `misplaced` starts with the relation that is most probably false.
-""",
-    ask_all=_ask_all,
+"""
+OUTLIERS: Final = Question(
+    outliers, _read, OutliersRequest, OutliersAnswer, _EXAMPLES, _EXAMPLE_ANSWER, _TEXT, _ask_all
 )

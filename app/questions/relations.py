@@ -404,44 +404,26 @@ _EXAMPLES: Final = {
 _EXAMPLE_ANSWER: Final = {
     "relations": [
         {
-            "subject": "lamp_1",
-            "relation": "on-top",
-            "object": "nightstand_1",
-            "probability": 0.92,
-            "observed": True,
-            "expected": 0.83,
+            "subject": "lamp_1", "relation": "on-top", "object": "nightstand_1",
+            "probability": 0.92, "observed": True, "expected": 0.83,
         },
         {
-            "subject": "nightstand_1",
-            "relation": "left",
-            "object": "bed",
-            "probability": 0.41,
+            "subject": "nightstand_1", "relation": "left", "object": "bed", "probability": 0.41,
             "observed": False,
         },
     ],
-    "disagreements": [
-        {
-            "subject": "lamp_1",
-            "object": "bed",
-            "observed": ["on-top"],
-            "expected": "left",
-            "probability": 0.36,
-            "observed_probability": 0.02,
-        }
-    ],
-}
+    "disagreements": [{
+        "subject": "lamp_1", "object": "bed", "observed": ["on-top"], "expected": "left",
+        "probability": 0.36, "observed_probability": 0.02,
+    }],
+}  # fmt: skip
 
-RELATIONS: Final = Question(
-    relations,
-    _read,
-    RelationsRequest,
-    RelationsAnswer,
-    _EXAMPLES,
-    _EXAMPLE_ANSWER,
-    description="""
+_TEXT: Final = """
 Rank the relations between the objects of a scene, most probable first.
 
 The answer also lists disagreements: pairs of objects whose observed relation differs from the
 relation that the model expects from the rest of the scene.
-""",
+"""
+RELATIONS: Final = Question(
+    relations, _read, RelationsRequest, RelationsAnswer, _EXAMPLES, _EXAMPLE_ANSWER, _TEXT
 )

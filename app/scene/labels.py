@@ -64,18 +64,10 @@ _ONLY_S: Final = (
 _IRREGULAR: Final = {
     **{f"{word}s": word for word in _ONLY_S},
     **{f"{stem}ves": f"{stem}f" for stem in ("shel", "lea", "loa", "scar", "wol", "cal")},
-    "knives": "knife",
-    "women": "woman",
-    "men": "man",
-    "people": "person",
-    "children": "child",
-    "feet": "foot",
-    "teeth": "tooth",
-    "geese": "goose",
-    "mice": "mouse",
-    "buses": "bus",
+    "knives": "knife", "women": "woman", "men": "man", "people": "person", "children": "child",
+    "feet": "foot", "teeth": "tooth", "geese": "goose", "mice": "mouse", "buses": "bus",
     "lenses": "lens",
-}
+}  # fmt: skip
 _IRREGULAR_ENDINGS: Final = tuple(_IRREGULAR)
 
 _OF: Final = re.compile(r"[\s_\-.]of[\s_\-.]+", re.IGNORECASE)

@@ -21,12 +21,8 @@ LEFT, FRONT, ON_TOP, ABOVE, INSIDE = 0, 1, 2, 3, 4  # indices of the canonical r
 
 CANONICAL: Final[tuple[str, ...]] = ("left", "front", "on-top", "above", "inside")
 OPPOSITES: Final[dict[str, str]] = {
-    "left": "right",
-    "front": "behind",
-    "on-top": "under",
-    "above": "below",
-    "inside": "contains",
-}
+    "left": "right", "front": "behind", "on-top": "under", "above": "below", "inside": "contains",
+}  # fmt: skip
 RELATIONS: Final[tuple[str, ...]] = CANONICAL + tuple(OPPOSITES[name] for name in CANONICAL)
 
 # Indices of groups of relations:

@@ -346,18 +346,6 @@ class _WithWords(Vocabulary):
         self.stand_in = _read_only([*base.stand_in, *self._nearest])
 
     @cached_property
-    def labels(self) -> tuple[str, ...]:
-        return (*self._base.labels, *(entry.label for entry in self.objects[self.trained :]))
-
-    @cached_property
-    def structure(self) -> NDArray[np.bool_]:
-        return _read_only(self._base.structure[self.stand_in])
-
-    @cached_property
-    def anywhere(self) -> NDArray[np.bool_]:
-        return _read_only(self._base.anywhere[self.stand_in])
-
-    @cached_property
     def sizes(self) -> NDArray[np.float64]:
         return np.pad(self._base.sizes, ((0, len(self._nearest)), (0, 0)), constant_values=math.nan)
 
@@ -368,10 +356,6 @@ class _WithWords(Vocabulary):
     @cached_property
     def broader(self) -> NDArray[np.bool_]:
         return np.pad(self._base.broader, (0, len(self._nearest)))
-
-    @cached_property
-    def related(self) -> NDArray[np.bool_]:
-        return np.pad(self._base.related, (0, len(self._nearest)))
 
     @cached_property
     def broader_labels(self) -> tuple[tuple[str, ...], ...]:
