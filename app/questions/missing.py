@@ -54,8 +54,8 @@ def missing(
     top_k: int = 10,  # maximum of classes in each list
     candidates: Sequence[int] | None = None,  # class indices; None: all classes
     listed_as: Mapping[int, str] = MappingProxyType({}),  # the request's words for candidates
-    at: tuple[str, int] | None = None,
-    coverage: float | None = None,
+    at: tuple[str, int] | None = None,  # a place: (relation, index of the anchor object)
+    coverage: float | None = None,  # listed share of the classes of the scene; None: unknown
     axes: Axes | None = VIEWER,  # see `viewer_axes`; None: the viewing direction is unknown
     details: bool = True,  # whether the answer contains `placements` and `because`
 ) -> Fields:
@@ -68,13 +68,9 @@ def missing(
     kind of a listed class only if `candidates` names this kind, because an office chair may be the
     listed chair itself. Of two classes of one family, the list has the likelier.
 
-    Args:
-        at: a place, as (relation, index of the anchor object). If set, `probability` is the
-            probability that the class is present *and* has this relation to the anchor: the
-            probability of the class, multiplied by that of the place if the class is present.
-        coverage: listed share of the classes of the scene. At 1, at most one class is missing. None
-            means an unknown share: the base rates are those of the model's coverage, and the
-            calibration is that of lists of any share.
+    With ``at``, `probability` is the probability that the class is present *and* has this relation
+    to the anchor. At a coverage of 1, at most one class is missing. Without a coverage, the base
+    rates are those of the model's coverage, and the calibration is that of lists of any share.
 
     Returns:
         The fields `coverage`, `missing` and `more` of `scene_client.schemas.MissingAnswer`.
@@ -125,19 +121,16 @@ def more(
     listing: Present,
     *,
     top_k: int = 10,
-    candidates: Collection[int] | None = None,
-    coverage: float | None = None,
+    candidates: Collection[int] | None = None,  # listed at any probability; None: see `LIKELY`
+    coverage: float | None = None,  # probability that the request lists an object of the scene
 ) -> list[Fields]:
     """Return the listed classes with probably more instances than listed, likeliest first.
 
     Listed objects count as present, whatever their confidence. The answer never contains structural
     classes, classes without statistics, or classes with more listed objects than these cover.
 
-    Args:
-        candidates: class indices; the answer contains these classes at any probability. None means
-            all classes with a probability of at least `LIKELY`.
-        coverage: probability that the request lists an object of the scene. Only values above the
-            model's coverage change the answer. At 1, the scene has no further instances.
+    Only a coverage above that of the model changes the answer. At 1, the scene has no further
+    instances.
 
     Returns:
         The fields of `scene_client.schemas.MoreInstances`. The number of instances is from `low` to

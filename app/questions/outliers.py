@@ -50,14 +50,11 @@ def outliers(
     scores keep the order of the request.
 
     The score of an object is the log-odds of its class given the rest of the scene, without the
-    instances of the class and their relations. So all instances of a class have the same score.
-    Intruders are often common objects in the wrong room. So the prior of an intruder is
-    proportional to popularity^alpha. The popularity of a class is the odds that a training scene
-    has the class. A class that no training scene shows counts as the rarest other class. Structural
-    classes, such as wall, and classes that belong anywhere, such as cat or bag, always have the
-    probability 0. A scene with few objects gives little evidence, so its threshold is higher. A
-    single class without structure is never an outlier, because no other object says whether it
-    belongs.
+    instances of the class and their relations. Intruders are often common objects in the wrong
+    room, so they have a prior (`SceneModel.intruder_prior`). Structural classes, such as wall, and
+    classes that belong anywhere, such as cat or bag, always have the probability 0. A scene with
+    few objects gives little evidence, so its threshold is higher. A single class without structure
+    is never an outlier.
 
     The model knows little about a class that few training scenes show (`rarely_shown`). At a
     sensitivity, an object of such a class is never an outlier. If its probability reaches the

@@ -1,15 +1,12 @@
 """The question `relations`: which relations hold between objects, and which are unexpected?
 
 A disagreement is a pair of objects whose observed relation is not the relation that the rest of the
-scene suggests. To find disagreements, the module judges each pair with an observed relation a
-second time. It then treats all relations between the two classes as unobserved, in both directions.
-Otherwise an observation would be evidence for itself: if left is observed, the model also knows
-that front does not hold. The pair is a disagreement if the likeliest of the ten relations is
-unobserved and has a probability of at least `EXPECTED`.
+scene suggests. To find it, the module judges the pair a second time without its observations: if
+left is observed, the model also knows that front does not hold. The pair is a disagreement if the
+likeliest of the ten relations is unobserved and has a probability of at least `EXPECTED`.
 
 The model has relation units between classes. If a class has several instances, a relation of any
-instance counts as observed for all instances. Example: one chair is to the left of the table, and
-another chair is to the right. Then left and right both count as observed for each chair.
+instance counts as observed for all instances.
 """
 
 from collections.abc import Sequence
@@ -65,8 +62,7 @@ def relations(
 ) -> Fields:
     """Return the likeliest relations between the objects of a scene, and the disagreements.
 
-    A disagreement is an observed relation of two objects for which the model expects another
-    relation. The `probability` of an observed relation is that of its evidence. Its `expected` is
+    The `probability` of an observed relation is that of its evidence. Its `expected` is
     the probability of the model without this observation. The probability is at most .01 if the
     relation is observed not to hold, or if the boxes or other relations exclude it. Structural
     classes (floor, wall) are left out unless `pairs` contains them.
