@@ -127,10 +127,7 @@ def _refuse_address(settings: "Settings", error: OSError) -> int:
 
 
 def serve(settings: "Settings", began: float) -> int:
-    """Serve until the process is stopped. Return its exit status: 0, or 3 if it could not start.
-
-    ``began`` is `time.monotonic()` at the start of the process.
-    """
+    """Serve until the process is stopped. Return its exit status: 0, or 3 if it could not start."""
     try:
         sockets = _bind(settings.host, settings.port, settings.client_timeout)
     except OSError as error:

@@ -236,10 +236,7 @@ class ConditionedChains:
         logits: Float[NDArray, "A n n"],
         stream: np.random.Generator,
     ) -> Bool[NDArray, "A n n"]:
-        """Sample the relations r between different classes. Observed relations keep their value.
-
-        Relations of a class to itself are off unless observed: other units do not depend on them.
-        """
+        """Sample the relations between different classes. Observed relations keep their value."""
         r = np.zeros(logits.shape, np.bool_)
         free = ~np.broadcast_to(np.eye(len(classes), dtype=np.bool_), r.shape)
         observed = self._conditions.observed

@@ -87,10 +87,7 @@ class Places(TensorGroup):
     def supporters(
         self, subject: Int[Indices, "N"], other: Int[Indices, "M"]
     ) -> Float[Floats, "N M"]:
-        """Return the share of each class among the supporters of each subject class.
-
-        A supporter is an object on or in which the subject is.
-        """
+        """Return the share of each class among the objects on or in which each subject class is."""
         total, share = self._supporters
         V, of_pairs = len(self.frequency), _SUPPORTER * share[other]
         for a in SUPPORTS:

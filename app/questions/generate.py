@@ -132,10 +132,7 @@ def _scene(
     shown: Bool[NDArray[np.bool_], "n"],
     evidence: set[Triple],
 ) -> Fields:
-    """Return the fields of `scene_client.schemas.GeneratedScene` for a drawn scene.
-
-    ``shown`` is True for the classes of ``state`` that the answer lists.
-    """
+    """Return the `GeneratedScene` of a drawn scene, with the ``shown`` classes of its state."""
     labels, room_types = model.vocabulary.labels, model.vocabulary.room_types
     units = np.nonzero(state.r & shown[:, None] & shown)
     a, i, j = units

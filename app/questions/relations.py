@@ -256,10 +256,7 @@ def _observed_pairs(
 def _names(
     scene: Scene, A: int, subject: int, object_: int, observed_kinds: list[int], expected: int
 ) -> Fields:
-    """Return the names of a disagreement, from the subject of the relation in the request.
-
-    `observed_kinds` and `expected` are indices in `relation_names(A)`.
-    """
+    """Return the names of a disagreement, from the subject of the relation in the request."""
     names = relation_names(A)
     observed = [names[kind] for kind in observed_kinds]
     triples = {canonicalise(subject, relation, object_) for relation in observed}

@@ -155,10 +155,7 @@ def _sized(
 
 
 def _scaled(sized: Sequence[_Sized]) -> tuple[float, list[SceneObject]]:
-    """Return the common factor between sizes and typical sizes, and its objects.
-
-    The list is empty if the factor is plausible or the objects do not agree.
-    """
+    """Return the common factor of sizes and typical sizes, and its objects if it is implausible."""
     if len(sized) < _LEAST:
         return 1.0, []
     # The mean log ratio of the three sides of each object.

@@ -19,10 +19,7 @@ _logger = logging.getLogger("app.registry")
 
 @dataclass(frozen=True, eq=False)
 class ModelSet:
-    """The state of a store at one moment, by the (name, version) of each published model.
-
-    The errors were never raised, so they keep no stack frames or weights in memory.
-    """
+    """The state of a store by (name, version). Its errors were never raised, so hold no frames."""
 
     entries: Mapping[tuple[str, str], Artifact | ArtifactError]
     aliases: Mapping[str, AliasTarget]

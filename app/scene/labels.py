@@ -95,10 +95,7 @@ def head_of(label: str) -> str | None:
 
 
 def singular(word: str) -> str:
-    """Return the singular of an English noun in lower case. Return other words unchanged.
-
-    docs/decisions/data.md compares the function with a general inflection library.
-    """
+    """Return the singular of an English noun in lower case, or another word unchanged."""
     if word.endswith(_IRREGULAR_ENDINGS):
         for plural, single in _IRREGULAR.items():
             if word.endswith(plural):
@@ -134,10 +131,7 @@ def label_key(label: str) -> str:
 
 
 def split_words(label: str) -> tuple[str, ...]:
-    """Return the words of a label in lower case and in the singular.
-
-    A label with more than `LONGEST` characters after Unicode normalisation has no words.
-    """
+    """Return the words of a label in lower case and singular; none of one longer than `LONGEST`."""
     folded = unicodedata.normalize("NFKC", label)
     if len(folded) > LONGEST:
         return ()

@@ -75,10 +75,7 @@ def canonicalise(subject: End, relation: str, anchor: End) -> tuple[int, End, En
 
 
 def support_cycle(triples: Iterable[tuple[int, End, End]]) -> list[End] | None:
-    """Return objects that support each other in a circle, each on or in the next, or None.
-
-    The last object is the first one again. The triples are canonical.
-    """
+    """Return objects in a circle, each on or in the next and the last one first again, or None."""
     below: dict[End, list[End]] = {}
     for relation, subject, anchor in triples:
         if relation in SUPPORTS:
