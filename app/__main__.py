@@ -59,10 +59,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def tune() -> None:
-    """Set the garbage collector, the C library and OpenBLAS of this process for the service.
-
-    Call this function before the first import of numpy.
-    """
+    """Set the garbage collector, the C library and OpenBLAS, before the import of numpy."""
     # Objects that the start creates stay in use. A search for garbage among them would take a fifth
     # of the startup time. The runtime enables the garbage collector again after the start.
     gc.disable()

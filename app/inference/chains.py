@@ -137,10 +137,7 @@ class SceneChains:
         return weights / weights.sum()
 
     def _room_log_weights(self, room: int | None) -> Float[NDArray, " N"]:
-        """Return the log weight of each stored scene for a requested room type.
-
-        Without a requested room type, the excluded room types have a low weight.
-        """
+        """Return the log weight of each stored scene for a requested room type, or for none."""
         machine = self.machine
         stored_rooms = machine["fantasy_rooms"]
         if room is None:
@@ -185,10 +182,7 @@ class ConditionedChains:
         return self._others[room]
 
     def draw(self, steps: int, stream: np.random.Generator) -> ChainState:
-        """Run ``steps`` sweeps of one chain with its random stream and return its final state.
-
-        If the machine stores no scenes, the start has only the required classes.
-        """
+        """Run ``steps`` sweeps of one chain with its random stream and return its final state."""
         on, room = np.zeros(self._machine.spec.V, np.uint8), self._room
         if self._machine.spec.N:
             start = int(np.searchsorted(self._start_cdf[:-1], stream.random(), "right"))

@@ -131,10 +131,7 @@ class Places(TensorGroup):
         return math.log(counts[UNDER] ** 2 / (counts[ON] + counts[IN] + _OTHER_ROLES))
 
     def means_under(self, upper: int, lower: int) -> bool:
-        """Return whether "upper on top of lower" means that the lower object is under the other.
-
-        A desk is on top of a bin in this sense. The roles of the two classes decide.
-        """
+        """Return whether "upper on top of lower" means lower under upper, as with desk and bin."""
         under = role_counts(self.roles, lower, upper)[UNDER]
         return bool(under >= _SHOWN and under > role_counts(self.roles, upper, lower)[ON])
 

@@ -105,10 +105,7 @@ def draw_plausible(
     stream: np.random.Generator,
     stop: Callable[[], bool] = lambda: False,
 ) -> ChainState:
-    """Draw scenes until one is plausible, at most `ATTEMPTS` times. Return the last one.
-
-    After ``stop`` returns True, the function draws no further scene.
-    """
+    """Draw scenes until one is plausible, `ATTEMPTS` times at most. Return the last one."""
     state = chains.draw(steps, stream)
     for _ in range(ATTEMPTS - 1):
         if is_plausible(model, evidence, state.classes, state.room) or stop():

@@ -225,10 +225,7 @@ def _disagreements(
 def _named_relations(
     stated: RelationTable, row: Int[Indices, "N"], n: int, A: int
 ) -> tuple[Bool[Mask, "N N B"], Bool[Mask, "n n B"]]:
-    """Return which of the B = 2A relations hold from each object, and class, to each other one.
-
-    Relation A + a is the opposite of relation a.
-    """
+    """Return which relations hold between objects, and classes; A + a is opposite to a."""
     N, a = len(row), stated.relation
     holds, of_classes = np.zeros((N, N, 2 * A), np.bool_), np.zeros((n, n, 2 * A), np.bool_)
     for grid, i, j in (
@@ -242,10 +239,7 @@ def _named_relations(
 def _observed_pairs(
     holds: Bool[Mask, "N N B"], judged: Bool[Mask, "N N"], A: int
 ) -> tuple[Int[Indices, "P"], Int[Indices, "P"]]:
-    """Return the subjects and objects of the pairs with an observed relation, in either order.
-
-    The subject is that of the first of the pair's relations in `CANONICAL`.
-    """
+    """Return the pairs with a relation, as subjects and objects of the first in `CANONICAL`."""
     forward = holds[..., :A]
     first = np.where(forward.any(-1), forward.argmax(-1), A)
     x, y = np.triu(holds.any(-1) & (judged | judged.T), 1).nonzero()

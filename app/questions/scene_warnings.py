@@ -96,11 +96,7 @@ def scene_warnings(
 
 
 def _distant(placed: Sequence[SceneObject], request: SceneRequest) -> list[SceneObject]:
-    """Return the objects that are too far from the viewer.
-
-    In a world-fixed frame without a viewpoint, the position of the viewer is unknown. The median
-    position of the objects then replaces the position of the viewer.
-    """
+    """Return the objects too far from the viewer, or from the median of a map."""
     positions = [thing.position or _ORIGIN for thing in placed]
     centre = _ORIGIN
     if request.viewpoint is not None:

@@ -108,10 +108,7 @@ class NameIndex:
         return self._by_head_words(words[:end])
 
     def _by_head_words(self, words: Sequence[str]) -> LookUp | None:
-        """Return the entry whose name is the longest end of a phrase, or None.
-
-        A phrase with an imitation, such as "toy trailer", stands for the imitation ("toy").
-        """
+        """Return the entry of the longest end of a phrase, or of its imitation ("toy"), or None."""
         imitations = [word for word in words[:-1] if word in _IMITATIONS]
         for start in range(len(words)):
             head = imitations[:1] or words[start:]

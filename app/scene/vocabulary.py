@@ -221,10 +221,7 @@ class Vocabulary:
 
     @_remembered
     def read(self, label: str, *, is_room: bool = False) -> LookUp | None:
-        """Return the class or room type that a label names for certain, or None.
-
-        The method reads the syntax of detectors (`readings`) if `index` does not know the label.
-        """
+        """Return the class or room type that a label or one of its `readings` names, or None."""
         index_of = self.room_index if is_room else self.index
         if (index := index_of(label)) is not None:
             return LookUp(index, 1.0, self._rule_of(label, index, is_room=is_room))
@@ -291,11 +288,7 @@ class Vocabulary:
         return None
 
     def with_words(self, words: Sequence[Word]) -> "Vocabulary":
-        """Return a vocabulary with a further class for each word, in the order of the words.
-
-        Such a class is structure, or belongs anywhere, as its nearest class does. It has no
-        relatives and no known size. The methods that read labels do not find it.
-        """
+        """Return a vocabulary with a further class for each word, like its nearest class."""
         return _WithWords(self, words) if words else self
 
     def remembers(self, label: str, searches: Sequence[str], *, is_room: bool = False) -> bool:
