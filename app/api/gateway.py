@@ -203,7 +203,10 @@ class Failures:
 
 
 async def _fail(error: Exception, scope: Scope, receive: Receive, send: Send) -> None:
-    """Answer a failure, or raise it after a part of the response. No frame here keeps the error."""
+    """Answer a failure, or raise it again if a part of the response has been sent already.
+
+    A variable of the caller's frame must not refer to the error: that cycle would keep the body.
+    """
     problem = from_exception(error, scope["state"]["request_id"])
     record: Record = scope["state"]["record"]
     if record.status:

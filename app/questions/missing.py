@@ -181,11 +181,7 @@ def _ranked(
     place: Place | None,
     coverage: float | None,
 ) -> tuple[Int[Indices, "k"], Float[Floats, "k"], Float[Floats, "k"]]:
-    """Return the likeliest candidates, likeliest first.
-
-    The results are class indices, log-odds that the classes are present (and at the place), and
-    probabilities of the place if they are present (1 without a place).
-    """
+    """Return the likeliest classes, their log-odds (at the place) and p(place | present)."""
     vocabulary, listed = model.vocabulary, posterior.present.classes
     usable = ~vocabulary.structure
     usable[listed] = False

@@ -197,10 +197,7 @@ def calibrated(
 def calibrated_missing(
     calibration: Calibration, z: Float[Floats, "N"], n: int, coverage: float | None
 ) -> Float[Floats, "N"]:
-    """Return the calibrated log-odds that unlisted classes are present.
-
-    n is the number of listed classes without structure. A `coverage` of None is not stated.
-    """
+    """Return the calibrated log-odds that classes are present, beside n listed ones."""
     n = max(1, n)
     if coverage is None:
         return calibrated(calibration.missing, z, n)

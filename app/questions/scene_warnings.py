@@ -61,10 +61,7 @@ def scene_warnings(
     *,
     derived: bool,  # whether relations were derived from the poses
 ) -> list[SceneWarning]:
-    """Return the warnings about a scene in the request's frame, with axes of REP-103.
-
-    x points forward, y left and z up.
-    """
+    """Return the warnings about a scene in the frame of the request (x forward, y left, z up)."""
     # Python loops are fast enough, because most scenes have no poses or pass all checks.
     placed = [thing for thing in scene.objects if thing.position is not None]
     sized = _sized(scene, detections, vocabulary)

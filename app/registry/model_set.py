@@ -125,11 +125,7 @@ def with_default(
     previous: ModelSet = EMPTY,
     check: Callable[[Artifact], None] = lambda _: None,
 ) -> ModelSet:
-    """Add the default model of the release, if an alias needs it and the store does not have it.
-
-    An alias needs the model if it points at a model that only earlier releases could load. See
-    `load_model_set` for the arguments.
-    """
+    """Add the default model of the release, if an outdated alias needs it and it is missing."""
     if models.shipped.default is None or not any(map(models.is_outdated, models.aliases)):
         return models
     try:

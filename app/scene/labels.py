@@ -176,10 +176,7 @@ _IDS: Final = re.compile(
 
 
 def readings(label: str) -> Iterator[tuple[Rule, str]]:
-    """Yield pairs (rule, name) of the names in a detector's label, most certain name first.
-
-    A name can need two rules: "a photo of a sofa/couch". Its pair contains the first rule.
-    """
+    """Yield pairs (rule, name) of the names in a detector's label, most certain name first."""
     return islice(_readings(label), _MOST_READINGS)
 
 
