@@ -59,10 +59,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def tune() -> None:
-    """Set the garbage collector, the C library and OpenBLAS of this process for the service.
-
-    Call this function before the first import of numpy.
-    """
+    """Set the garbage collector, the C library and OpenBLAS, before the import of numpy."""
     # Objects that the start creates stay in use. A search for garbage among them would take a fifth
     # of the startup time. The runtime enables the garbage collector again after the start.
     gc.disable()
@@ -127,10 +124,7 @@ def _refuse_address(settings: "Settings", error: OSError) -> int:
 
 
 def serve(settings: "Settings", began: float) -> int:
-    """Serve until the process is stopped. Return its exit status: 0, or 3 if it could not start.
-
-    ``began`` is `time.monotonic()` at the start of the process.
-    """
+    """Serve until the process is stopped. Return its exit status: 0, or 3 if it could not start."""
     try:
         sockets = _bind(settings.host, settings.port, settings.client_timeout)
     except OSError as error:

@@ -121,10 +121,7 @@ class Server(uvicorn.Server):
             )
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Start the shutdown. A second signal ends the first step of the shutdown at once.
-
-        During the start, the signal ends the process at once.
-        """
+        """Start the shutdown, or end its first step. During the start, end the process at once."""
         if not self.started:
             signal.signal(sig, signal.SIG_DFL)
             signal.raise_signal(sig)
@@ -155,10 +152,7 @@ def _page(host: str, port: int) -> str:
 
 
 def _lan_addresses() -> list[str]:
-    """Return the IPv4 addresses of this machine, except the loopback.
-
-    Without one, and on other systems than Linux, return the machine's name in multicast DNS.
-    """
+    """Return the IPv4 addresses of this machine, except the loopback, or else its `.local` name."""
     addresses = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         for _, name in socket.if_nameindex():

@@ -104,10 +104,7 @@ def parse(body: bytes, most: int) -> Any:
 
 
 def _check_density(body: bytes, most: int) -> None:
-    """Check that each part of a large body has at most one array or object for every five bytes.
-
-    The shortest sensible one is the array of a pair, such as `[1,2],`.
-    """
+    """Check that a large body has at most one array or object, such as `[1,2],`, per 5 bytes."""
     for start in range(0, len(body), most) if len(body) > SMALL else ():
         part = body[start : start + most]
         if part.count(b"[") + part.count(b"{") > len(part) // 5:

@@ -13,11 +13,9 @@ from app.questions.question import BATCH, Example
 
 REQUEST_ID: Final = "0b0f5b1e-6b1f-4a52-9d5c-3f7a2f1f6c11"
 _MODEL: Final = {
-    "name": "home",
-    "version": "1.0.0",
-    "variant": "triway",
+    "name": "home", "version": "1.0.0", "variant": "triway",
     "digest": "4e706b9f30e062589ec5cace2744da497a49f08f095626ee533c50f22dad94d4",
-}
+}  # fmt: skip
 _LISTS: Final[dict[str, Any]] = {"ignored": [], "mapped": [], "warnings": []}
 _ENVELOPE: Final = {"model": _MODEL, "request_id": REQUEST_ID, **_LISTS}
 
@@ -29,13 +27,9 @@ _CAUSE: Final = {
     "detail": "model.safetensors does not match the manifest",
 }
 _BIN: Final = {
-    "label": "garbage bin",
-    "aliases": ["trash can"],
-    "structure": False,
-    "anywhere": False,
-    "size": {"x": 0.3, "y": 0.3, "z": 0.5},
-    "parent": "container",
-}
+    "label": "garbage bin", "aliases": ["trash can"], "structure": False, "anywhere": False,
+    "size": {"x": 0.3, "y": 0.3, "z": 0.5}, "parent": "container",
+}  # fmt: skip
 _REFUSED: Final = {"version": "1.1.0", "status": "refused", "aliases": [], **_CAUSE}
 _FAILURE: Final = {"subject": "home@1.1.0", **_CAUSE}
 _SUMMARY: Final = {"name": "home", "versions": [_REFUSED, _VERSION]}
@@ -79,32 +73,27 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
     "scenes": {
         "request_id": REQUEST_ID,
         "scenes": [{"name": "42", "scene": {"objects": [{"id": "desk_1", "label": "desk"}]}}],
-        "notes": [
-            {"scene": 0, "detection": 1, "reason": "no-label", "detail": "class '12' has no label"}
-        ],
+        "notes": [{
+            "scene": 0, "detection": 1, "reason": "no-label", "detail": "class '12' has no label",
+        }],
     },
     "list_models": {
-        "generation": "3f6d0f4be1a25c77",
-        "models": [_SUMMARY],
-        "aliases": {"default": "home@1.0.0"},
-        "failures": [_FAILURE],
+        "generation": "3f6d0f4be1a25c77", "models": [_SUMMARY],
+        "aliases": {"default": "home@1.0.0"}, "failures": [_FAILURE],
     },
     "show_model": _SUMMARY,
     "show_version": _VERSION
     | {
-        "name": "home",
-        "created": "2026-01-02T03:04:05Z",
-        "parameters": 136000,
+        "name": "home", "created": "2026-01-02T03:04:05Z", "parameters": 136000,
         "metrics": [
             {"task": "T2", "source": "procthor", "metric": "MRR"}
-            | {"value": 0.5, "low": 0.49, "high": 0.51, "n": 1000}
+            | {"value": 0.5, "low": 0.49, "high": 0.51, "n": 1000},
         ],
         "data": [
             {"source": "procthor", "scenes": 4936, "digest": _MODEL["digest"]}
-            | {"terms": "Apache-2.0", "research_only": False}
+            | {"terms": "Apache-2.0", "research_only": False},
         ],
-        "terms": "Apache-2.0",
-        "card": "# home 1.0.0\n",
+        "terms": "Apache-2.0", "card": "# home 1.0.0\n",
     },
     "show_vocabulary": {
         "model": _MODEL,
@@ -117,26 +106,18 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
             *("left", "front", "on-top", "above", "inside"),
             *("right", "behind", "under", "below", "contains"),
         ],
-        "room_types": ["bedroom", "garage"],
-        "rare_room_types": ["garage"],
-        "written_room_types": [],
-        "profiles": ["sunrgbd", "procthor"],
-        "examples": [
-            {
-                "name": "A bedroom",
-                "scene": {
-                    "room_type": "bedroom",
-                    "objects": [{"label": "floor"}, {"label": "garbage bin"}],
-                },
-            }
-        ],
+        "room_types": ["bedroom", "garage"], "rare_room_types": ["garage"],
+        "written_room_types": [], "profiles": ["sunrgbd", "procthor"],
+        "examples": [{
+            "name": "A bedroom",
+            "scene": {
+                "room_type": "bedroom",
+                "objects": [{"label": "floor"}, {"label": "garbage bin"}],
+            },
+        }],
     },
     "show_word": {
-        "model": _MODEL,
-        "word": "trash can",
-        "class": _BIN,
-        "rule": "alias",
-        "certain": True,
+        "model": _MODEL, "word": "trash can", "class": _BIN, "rule": "alias", "certain": True,
         "suggestions": [],
     },
     "health_live": {"status": "live", "version": "2.0.0"},
@@ -147,4 +128,4 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
         'scene_requests_total{method="POST",outcome="success",route="/missing"} 1027.0\n'
         'scene_requests_total{method="POST",outcome="unknown-labels",route="/missing"} 3.0\n'
     ),
-}
+}  # fmt: skip

@@ -205,8 +205,7 @@ class Failures:
 async def _fail(error: Exception, scope: Scope, receive: Receive, send: Send) -> None:
     """Answer a failure, or raise it again if a part of the response has been sent already.
 
-    This is a separate function, because the error refers to the frame that catches it. A variable
-    of that frame must not refer to the error: the cycle would keep the body in memory.
+    A variable of the caller's frame must not refer to the error: that cycle would keep the body.
     """
     problem = from_exception(error, scope["state"]["request_id"])
     record: Record = scope["state"]["record"]

@@ -30,9 +30,7 @@ async def health_live() -> schemas.Health:
 
 @_head("/health/ready")
 @_get(
-    "/health/ready",
-    summary="Does a default model answer?",
-    responses=error_responses("readiness"),
+    "/health/ready", summary="Does a default model answer?", responses=error_responses("readiness")
 )
 async def health_ready(runtime: RuntimeDep) -> schemas.Health:
     """Return status 200 if a model answers for the alias `default`, else status 503.

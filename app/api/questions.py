@@ -76,10 +76,7 @@ async def _validated(
 
 
 def _failed(error: Exception, number: int, scene: Any, request_id: str) -> tuple[str, bytes]:
-    """Return the outcome for the metrics and the answer's entry of a failed scene.
-
-    This is a separate function to avoid a reference cycle; see `gateway._fail`.
-    """
+    """Return outcome and answer entry of a failed scene, without a cycle; see `gateway._fail`."""
     if isinstance(error, RequestError):
         error.locate(scene, ("scenes", number))
     failure = from_exception(error, request_id)

@@ -53,10 +53,7 @@ async def scenes(data: ScenesRequest, http: Request) -> bytes:
 
 
 def _read(data: ScenesRequest, request_id: str, limit: int, stop: Callable[[], bool]) -> bytes:
-    """Return the answer as JSON, with at most ``limit`` bytes of scenes.
-
-    ``stop`` returns whether the request has ended.
-    """
+    """Return the answer as JSON, with at most ``limit`` bytes of scenes. ``stop`` ends it early."""
     content = _content(data)
     if any(content.count(mark) > most * MOST_PARTS for mark, most in _MARKS.items()):
         detail = f"The file has more than {MOST_PARTS} entries. The command `scene` reads it."

@@ -19,10 +19,7 @@ _REDACTED: Final = ("url.path", "url.query", "http.request.method_original")
 
 
 def configuration(*, enabled: bool) -> TelemetryConfig:
-    """Return the telemetry configuration for `FastAPI`.
-
-    `Settings` has already checked that the OpenTelemetry packages are installed.
-    """
+    """Return the telemetry configuration for `FastAPI`. `Settings` has checked the packages."""
     if not enabled:
         return TelemetryConfig(tracing=False, metrics=False, logs=False, auto_configure=False)
     from opentelemetry.context import Context

@@ -94,10 +94,7 @@ class SceneChains:
     """Gibbs chains of a machine. Scenes of `excluded` room types start a chain only on request."""
 
     def __init__(
-        self,
-        weights: Weights,
-        units: RelationUnits | None = None,
-        excluded: Collection[int] = (),
+        self, weights: Weights, units: RelationUnits | None = None, excluded: Collection[int] = ()
     ) -> None:
         self.machine, self._excluded = weights, list(excluded)
         self.units = units or relation_units(weights)
@@ -140,10 +137,7 @@ class SceneChains:
         return weights / weights.sum()
 
     def _room_log_weights(self, room: int | None) -> Float[NDArray, " N"]:
-        """Return the log weight of each stored scene for a requested room type.
-
-        Without a requested room type, the excluded room types have a low weight.
-        """
+        """Return the log weight of each stored scene for a requested room type, or for none."""
         machine = self.machine
         stored_rooms = machine["fantasy_rooms"]
         if room is None:
@@ -188,10 +182,7 @@ class ConditionedChains:
         return self._others[room]
 
     def draw(self, steps: int, stream: np.random.Generator) -> ChainState:
-        """Run ``steps`` sweeps of one chain with its random stream and return its final state.
-
-        If the machine stores no scenes, the start has only the required classes.
-        """
+        """Run ``steps`` sweeps of one chain with its random stream and return its final state."""
         on, room = np.zeros(self._machine.spec.V, np.uint8), self._room
         if self._machine.spec.N:
             start = int(np.searchsorted(self._start_cdf[:-1], stream.random(), "right"))
@@ -239,10 +230,7 @@ class ConditionedChains:
         logits: Float[NDArray, "A n n"],
         stream: np.random.Generator,
     ) -> Bool[NDArray, "A n n"]:
-        """Sample the relations r between different classes. Observed relations keep their value.
-
-        Relations of a class to itself are off unless observed: other units do not depend on them.
-        """
+        """Sample the relations between different classes. Observed relations keep their value."""
         r = np.zeros(logits.shape, np.bool_)
         free = ~np.broadcast_to(np.eye(len(classes), dtype=np.bool_), r.shape)
         observed = self._conditions.observed

@@ -121,11 +121,7 @@ class RelationUnits(ABC):
     def moments(
         self, means: Means, pairs: Pairs, only: int | None = None, *, sampled: bool = False
     ) -> Moments:
-        """Return the moments of the relation `only`, or of all A relations.
-
-        A relation without a unit has the mean `NEVER`. A `sampled` h1 has the means 0 or 1, so all
-        variances are 0.
-        """
+        """Return the moments of `only`, or of all relations; the mean is `NEVER` without a unit."""
 
     def logits(self, scene: EncodedScene) -> RelationLogits:
         """Return the logits of all relations between the classes of a scene."""
@@ -160,10 +156,7 @@ class RelationUnits(ABC):
     def log_odds(
         self, logits: RelationLogits, *, leave_out_pair: bool = False
     ) -> Float[NDArray, "A n n"]:
-        """Return the log-odds of all relations between the n classes of a scene.
-
-        With `leave_out_pair`, relations of a pair are not evidence for its other relations.
-        """
+        """Return the log-odds of all relations, or without the evidence of the same pair."""
         shift = logits.shift_by_others if leave_out_pair else logits.shift
         return to_log_odds(logits.mean + shift, logits.spread)
 
@@ -354,9 +347,7 @@ def _chosen_relations(relations: int, only: int | None) -> slice:
     return slice(0, relations) if only is None else slice(only, only + 1)
 
 
-def _directions(
-    weights: Weights,
-) -> tuple[Float[NDArray, "A r H1"], Float[NDArray, "A r K+1"]]:
+def _directions(weights: Weights) -> tuple[Float[NDArray, "A r H1"], Float[NDArray, "A r K+1"]]:
     """Return F and Y; see `SharedUnits`.
 
     The rows of F[a] are the r directions in which U_e·h1 has the largest variance. Y[a] converts

@@ -140,10 +140,7 @@ class Weights:
     def source_weights(
         self, classes: Int[NDArray, " n"], presence: Float[NDArray, "N n"], profile: int | None
     ) -> Float[NDArray, "N profiles"]:
-        """Return p(q | listed classes) of each data source q in N scenes.
-
-        It is softmax(f + a v), or 1 for the source `profile` whose base rates apply.
-        """
+        """Return p(q | listed classes) = softmax(f + a v) in N scenes, or 1 for `profile`."""
         if profile is not None:
             one = np.zeros((len(presence), self.spec.profiles))
             one[:, profile] = 1.0

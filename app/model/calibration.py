@@ -30,7 +30,7 @@ class CountSlope(Frozen):
     log_count: float = 0.0
 
 
-class CoverageFit(Frozen):
+class CoverageFit(CountSlope):
     """Calibration of a logit z about a scene of which a list of n classes is the share s:
 
         log-odds = intercept + slope·z + log_count·log n + log_share·log s
@@ -39,9 +39,6 @@ class CoverageFit(Frozen):
     A share below `LEAST_COVERAGE` counts as this share.
     """
 
-    intercept: float = 0.0
-    slope: float = 1.0
-    log_count: float = 0.0
     log_share: float = 0.0
     both: float = 0.0
     last: float = 0.0

@@ -87,10 +87,7 @@ class Places(TensorGroup):
     def supporters(
         self, subject: Int[Indices, "N"], other: Int[Indices, "M"]
     ) -> Float[Floats, "N M"]:
-        """Return the share of each class among the supporters of each subject class.
-
-        A supporter is an object on or in which the subject is.
-        """
+        """Return the share of each class among the objects on or in which each subject class is."""
         total, share = self._supporters
         V, of_pairs = len(self.frequency), _SUPPORTER * share[other]
         for a in SUPPORTS:
@@ -134,10 +131,7 @@ class Places(TensorGroup):
         return math.log(counts[UNDER] ** 2 / (counts[ON] + counts[IN] + _OTHER_ROLES))
 
     def means_under(self, upper: int, lower: int) -> bool:
-        """Return whether "upper on top of lower" means that the lower object is under the other.
-
-        A desk is on top of a bin in this sense. The roles of the two classes decide.
-        """
+        """Return whether "upper on top of lower" means lower under upper, as with desk and bin."""
         under = role_counts(self.roles, lower, upper)[UNDER]
         return bool(under >= _SHOWN and under > role_counts(self.roles, upper, lower)[ON])
 

@@ -60,10 +60,7 @@ class SceneModel:
 
     @cached_property
     def intruder_prior(self) -> Float[NDArray[np.float64], "V"]:
-        """Log prior that an intruder has each class, up to a constant: alpha · popularity.
-
-        A class that no training scene shows counts as the rarest other class.
-        """
+        """Log prior alpha · popularity of an intruder of each class; unseen ones as the rarest."""
         calibration, none = self.calibration, np.zeros(0, np.int64)
         if not calibration.popularity:
             return np.zeros(self.spec.V)

@@ -97,10 +97,7 @@ def rounded_number(number: float) -> float:
 
 
 def written_within(answer: Fields, most: int) -> bytes | None:
-    """Return an answer as JSON, or None if it has more than ``most`` bytes.
-
-    The longest lists could have 64 MiB, so parts of them are written and measured first.
-    """
+    """Return an answer as JSON, or None above ``most`` bytes, measured in parts."""
     size = 0
     for entries in answer.values():
         if isinstance(entries, list) and len(entries) > _PART:

@@ -53,33 +53,20 @@ def generate(
     model: SceneModel,
     scene: Scene,
     *,
-    count: int = 1,
-    seed: int,
-    steps: int = STEPS,
-    temperature: float = 1.0,
-    stop: Callable[[], bool] = lambda: False,
+    count: int = 1,  # number of scenes
+    seed: int,  # the same seed gives the same scenes
+    steps: int = STEPS,  # Gibbs sweeps for each draw
+    temperature: float = 1.0,  # of the chains; above 1, the scenes are more varied
+    stop: Callable[[], bool] = lambda: False,  # True between two draws: return the scenes so far
 ) -> Fields:
     """Draw scenes that contain the evidence, by Gibbs chains.
 
     The chains start at samples that the model stores. Every drawn scene contains all objects and
     relations of the evidence, whatever the confidence of the objects. Relations observed not to
     hold are never drawn. The chain draws all other objects and relations. Structural classes
-    (floor, wall) outside the evidence are left out of the answer.
-
-    Every scene has its own random stream. So scene k depends only on the seed and on k, and does
-    not depend on `count`.
-
-    `staying` removes drawn relations that contradict each other. Relations of the evidence are
-    never removed. A drawn scene contains one object of each class. So a drawn relation never
-    relates a class to itself. Structural classes have only the relations of the evidence.
-
-    Args:
-        count: number of scenes.
-        seed: seed of the random numbers. The same seed gives the same scenes.
-        steps: number of Gibbs sweeps for each draw.
-        temperature: temperature of the chains. Above 1, the scenes are more varied.
-        stop: function called between draws. After it returns True, `generate` returns the scenes
-            drawn so far.
+    (floor, wall) outside the evidence are left out of the answer. Every scene has its own random
+    stream, so scene k depends only on the seed and on k. A drawn scene contains one object of each
+    class. `staying` removes drawn relations that contradict each other.
 
     Returns:
         The fields of `scene_client.schemas.GenerateAnswer`. For `log_score`, see
@@ -118,10 +105,7 @@ def draw_plausible(
     stream: np.random.Generator,
     stop: Callable[[], bool] = lambda: False,
 ) -> ChainState:
-    """Draw scenes until one is plausible, at most `ATTEMPTS` times. Return the last one.
-
-    After ``stop`` returns True, the function draws no further scene.
-    """
+    """Draw scenes until one is plausible, `ATTEMPTS` times at most. Return the last one."""
     state = chains.draw(steps, stream)
     for _ in range(ATTEMPTS - 1):
         if is_plausible(model, evidence, state.classes, state.room) or stop():
@@ -145,10 +129,7 @@ def _scene(
     shown: Bool[NDArray[np.bool_], "n"],
     evidence: set[Triple],
 ) -> Fields:
-    """Return the fields of `scene_client.schemas.GeneratedScene` for a drawn scene.
-
-    ``shown`` is True for the classes of ``state`` that the answer lists.
-    """
+    """Return the `GeneratedScene` of a drawn scene, with the ``shown`` classes of its state."""
     labels, room_types = model.vocabulary.labels, model.vocabulary.room_types
     units = np.nonzero(state.r & shown[:, None] & shown)
     a, i, j = units
@@ -169,8 +150,10 @@ def _scene(
 
 
 def staying(
-    units: Int[NDArray[np.int64], "m 3"],
-    logits: Float[NDArray[np.floating[Any]], "m"],
+    units: Int[
+        NDArray[np.int64], "m 3"
+    ],  # distinct triples (relation, subject class, object class)
+    logits: Float[NDArray[np.floating[Any]], "m"],  # if equal, the smallest triple is tried first
     evidence: Collection[Triple],
     structure: Bool[NDArray[np.bool_], "V"],
 ) -> Bool[NDArray[np.bool_], "m"]:
@@ -186,13 +169,6 @@ def staying(
     - The subject class and the object class differ.
     - Neither class is structural (floor, wall). Training drops relations of structural classes, so
       a drawn relation of such a class has no meaning.
-
-    Args:
-        units: distinct triples (relation a, subject class i, object class j).
-        logits: logit of each triple. Of triples with equal logits, the smallest (a, i, j) is tried
-            first.
-        evidence: triples (a, i, j) of the evidence.
-        structure: True for structural classes.
     """
     fixed = np.array(sorted(evidence), dtype=np.int64).reshape(-1, 3)
     order = np.lexsort((*units.T[::-1], -logits))
@@ -255,10 +231,7 @@ def is_plausible(
 ) -> bool:
     """Return whether a drawn scene meets none of the three conditions of the module.
 
-    Args:
-        present: indices of the classes of the drawn scene. Structural classes count only if
-            the evidence lists them.
-        room: index of the room type of the drawn scene, or None if unknown.
+    Structural classes among the ``present`` classes count only if the evidence lists them.
     """
     listed = {thing.class_index for thing in evidence.objects}
     is_structure = model.vocabulary.structure
@@ -286,12 +259,7 @@ def is_within_limits(model: SceneModel, classes: list[int], room: int | None) ->
 
 
 def room_fit(model: SceneModel, classes: list[int], room: int) -> float:
-    """Return how well a scene fits a room type t: log p(v | t) / p(v), plus a constant of t.
-
-    Args:
-        classes: indices of the classes in the scene.
-        room: index t of the room type.
-    """
+    """Return how well a scene fits a room type t: log p(v | t) / p(v), plus a constant of t."""
     presence = np.ones(len(classes), np.float32)
     index = np.array(classes, dtype=np.int64)
     context = encode(model.weights, index, presence, np.zeros_like(presence))
@@ -333,15 +301,12 @@ _EXAMPLES: Final = {
 }
 _EXAMPLE_ANSWER: Final = {
     "seed": 7,
-    "scenes": [
-        {
-            "room_type": "bedroom",
-            "objects": ["bed", "nightstand", "lamp"],
-            "relations": [{"subject": "lamp", "relation": "on-top", "object": "nightstand"}],
-            "log_score": -6.1,
-        }
-    ],
-}
+    "scenes": [{
+        "room_type": "bedroom", "objects": ["bed", "nightstand", "lamp"],
+        "relations": [{"subject": "lamp", "relation": "on-top", "object": "nightstand"}],
+        "log_score": -6.1,
+    }],
+}  # fmt: skip
 
 GENERATE: Final = Question(
     generate,

@@ -99,10 +99,7 @@ _NO_ENTRIES: Final = Entries(
 
 
 def entries_of(model: SceneModel, posterior: Posterior, scene: Scene) -> Entries:
-    """Return the entries of a scene that the model can judge.
-
-    Relations of structural classes are left out, because training does not learn them.
-    """
+    """Return the entries that the model can judge. Training learns no relations of structure."""
     row, A, places = posterior.present.row, model.spec.A, model.places
     classes = model.vocabulary.stand_in[posterior.present.classes][row]
     is_thing = (~model.vocabulary.structure[classes]).tolist()

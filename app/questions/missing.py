@@ -54,8 +54,8 @@ def missing(
     top_k: int = 10,  # maximum of classes in each list
     candidates: Sequence[int] | None = None,  # class indices; None: all classes
     listed_as: Mapping[int, str] = MappingProxyType({}),  # the request's words for candidates
-    at: tuple[str, int] | None = None,
-    coverage: float | None = None,
+    at: tuple[str, int] | None = None,  # a place: (relation, index of the anchor object)
+    coverage: float | None = None,  # listed share of the classes of the scene; None: unknown
     axes: Axes | None = VIEWER,  # see `viewer_axes`; None: the viewing direction is unknown
     details: bool = True,  # whether the answer contains `placements` and `because`
 ) -> Fields:
@@ -68,13 +68,9 @@ def missing(
     kind of a listed class only if `candidates` names this kind, because an office chair may be the
     listed chair itself. Of two classes of one family, the list has the likelier.
 
-    Args:
-        at: a place, as (relation, index of the anchor object). If set, `probability` is the
-            probability that the class is present *and* has this relation to the anchor: the
-            probability of the class, multiplied by that of the place if the class is present.
-        coverage: listed share of the classes of the scene. At 1, at most one class is missing. None
-            means an unknown share: the base rates are those of the model's coverage, and the
-            calibration is that of lists of any share.
+    With ``at``, `probability` is the probability that the class is present *and* has this relation
+    to the anchor. At a coverage of 1, at most one class is missing. Without a coverage, the base
+    rates are those of the model's coverage, and the calibration is that of lists of any share.
 
     Returns:
         The fields `coverage`, `missing` and `more` of `scene_client.schemas.MissingAnswer`.
@@ -125,19 +121,16 @@ def more(
     listing: Present,
     *,
     top_k: int = 10,
-    candidates: Collection[int] | None = None,
-    coverage: float | None = None,
+    candidates: Collection[int] | None = None,  # listed at any probability; None: see `LIKELY`
+    coverage: float | None = None,  # probability that the request lists an object of the scene
 ) -> list[Fields]:
     """Return the listed classes with probably more instances than listed, likeliest first.
 
     Listed objects count as present, whatever their confidence. The answer never contains structural
     classes, classes without statistics, or classes with more listed objects than these cover.
 
-    Args:
-        candidates: class indices; the answer contains these classes at any probability. None means
-            all classes with a probability of at least `LIKELY`.
-        coverage: probability that the request lists an object of the scene. Only values above the
-            model's coverage change the answer. At 1, the scene has no further instances.
+    Only a coverage above that of the model changes the answer. At 1, the scene has no further
+    instances.
 
     Returns:
         The fields of `scene_client.schemas.MoreInstances`. The number of instances is from `low` to
@@ -188,11 +181,7 @@ def _ranked(
     place: Place | None,
     coverage: float | None,
 ) -> tuple[Int[Indices, "k"], Float[Floats, "k"], Float[Floats, "k"]]:
-    """Return the likeliest candidates, likeliest first.
-
-    The results are class indices, log-odds that the classes are present (and at the place), and
-    probabilities of the place if they are present (1 without a place).
-    """
+    """Return the likeliest classes, their log-odds (at the place) and p(place | present)."""
     vocabulary, listed = model.vocabulary, posterior.present.classes
     usable = ~vocabulary.structure
     usable[listed] = False
@@ -350,54 +339,32 @@ _EXAMPLES: Final = {
 }
 _EXAMPLE_ANSWER: Final = {
     "coverage": 0.5,
-    "missing": [
-        {
-            "label": "pillow",
-            "probability": 0.46,
-            "log_odds": -0.16,
-            "placements": [
-                {
-                    "relation": "on-top",
-                    "object": "bed",
-                    "probability": 0.91,
-                    "offset": {
-                        "mean": {"x": 0.005, "y": 0.012, "z": 0.421},
-                        "std": {"x": 0.466, "y": 0.491, "z": 0.242},
-                        "scenes": 1089,
-                    },
-                }
-            ],
-            "because": [
-                {"object": "bed", "log_odds_change": 1.7},
-                {"object": "lamp_1", "log_odds_change": -0.2},
-            ],
-        }
-    ],
-    "more": [
-        {
-            "label": "nightstand",
-            "listed_as": "bedside table",
-            "listed_count": 1,
-            "expected_count": 1.7,
-            "low": 1,
-            "high": 2,
-            "probability": 0.6,
-        }
-    ],
-}
+    "missing": [{
+        "label": "pillow", "probability": 0.46, "log_odds": -0.16,
+        "placements": [{
+            "relation": "on-top", "object": "bed", "probability": 0.91,
+            "offset": {
+                "mean": {"x": 0.005, "y": 0.012, "z": 0.421},
+                "std": {"x": 0.466, "y": 0.491, "z": 0.242}, "scenes": 1089,
+            },
+        }],
+        "because": [
+            {"object": "bed", "log_odds_change": 1.7},
+            {"object": "lamp_1", "log_odds_change": -0.2},
+        ],
+    }],
+    "more": [{
+        "label": "nightstand", "listed_as": "bedside table", "listed_count": 1,
+        "expected_count": 1.7, "low": 1, "high": 2, "probability": 0.6,
+    }],
+}  # fmt: skip
 
-MISSING: Final = Question(
-    missing,
-    _read,
-    MissingRequest,
-    MissingAnswer,
-    _EXAMPLES,
-    _EXAMPLE_ANSWER,
-    description="""
+_TEXT: Final = """
 Rank the classes that the scene does not list, most probable first, with likely places.
 
 The list `more` contains listed classes that probably have further instances, such as a second
 nightstand. It is empty for questions about a place.
-""",
-    ask_all=_ask_all,
+"""
+MISSING: Final = Question(
+    missing, _read, MissingRequest, MissingAnswer, _EXAMPLES, _EXAMPLE_ANSWER, _TEXT, _ask_all
 )

@@ -258,10 +258,7 @@ class Names:
         return [thing.id for thing in self._objects if PLAIN.fullmatch(thing.id.replace(" ", "_"))]
 
     def find(self, name: str, location: Location, errors: ErrorList) -> int | None:
-        """Return the index of the object with a name. On failure, add an error and return None.
-
-        Ids take precedence over labels. A label may have any spelling of its class.
-        """
+        """Return the index of the object with an id, or else a label. On failure, add an error."""
         if (index := self._by_id.get(name)) is not None:
             return index
         indices = self._by_name.get(name)

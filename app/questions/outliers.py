@@ -50,14 +50,11 @@ def outliers(
     scores keep the order of the request.
 
     The score of an object is the log-odds of its class given the rest of the scene, without the
-    instances of the class and their relations. So all instances of a class have the same score.
-    Intruders are often common objects in the wrong room. So the prior of an intruder is
-    proportional to popularity^alpha. The popularity of a class is the odds that a training scene
-    has the class. A class that no training scene shows counts as the rarest other class. Structural
-    classes, such as wall, and classes that belong anywhere, such as cat or bag, always have the
-    probability 0. A scene with few objects gives little evidence, so its threshold is higher. A
-    single class without structure is never an outlier, because no other object says whether it
-    belongs.
+    instances of the class and their relations. Intruders are often common objects in the wrong
+    room, so they have a prior (`SceneModel.intruder_prior`). Structural classes, such as wall, and
+    classes that belong anywhere, such as cat or bag, always have the probability 0. A scene with
+    few objects gives little evidence, so its threshold is higher. A single class without structure
+    is never an outlier.
 
     The model knows little about a class that few training scenes show (`rarely_shown`). At a
     sensitivity, an object of such a class is never an outlier. If its probability reaches the
@@ -278,49 +275,30 @@ _EXAMPLE_ANSWER: Final = {
     "threshold": 0.7,
     "outliers": [
         {
-            "object": "wc_1",
-            "label": "toilet",
-            "listed_as": "WC",
-            "probability": 0.94,
-            "log_odds": 2.75,
-            "is_outlier": True,
+            "object": "wc_1", "label": "toilet", "listed_as": "WC", "probability": 0.94,
+            "log_odds": 2.75, "is_outlier": True,
             "because": [{"object": "bed", "log_odds_change": 1.8}],
             "usually_with": ["toilet paper", "sink", "faucet"],
         },
         {
-            "object": "bed",
-            "label": "bed",
-            "probability": 0.03,
-            "log_odds": -3.48,
+            "object": "bed", "label": "bed", "probability": 0.03, "log_odds": -3.48,
             "is_outlier": False,
             "because": [{"object": "lamp_1", "log_odds_change": -0.6}],
             "usually_with": [],
         },
     ],
-    "misplaced": [
-        {
-            "subject": "lamp_1",
-            "relation": "on-top",
-            "object": "nightstand_1",
-            "probability": 0.05,
-            "is_misplaced": False,
-            "moved": "lamp_1",
-        }
-    ],
-}
+    "misplaced": [{
+        "subject": "lamp_1", "relation": "on-top", "object": "nightstand_1", "probability": 0.05,
+        "is_misplaced": False, "moved": "lamp_1",
+    }],
+}  # fmt: skip
 
-OUTLIERS: Final = Question(
-    outliers,
-    _read,
-    OutliersRequest,
-    OutliersAnswer,
-    _EXAMPLES,
-    _EXAMPLE_ANSWER,
-    description="""
+_TEXT: Final = """
 Return probabilities that each object is an outlier and that each observed relation is false.
 
 The list `outliers` starts with the most probable outlier. All instances of a class have the
 same probability. The list `misplaced` starts with the relation that is most probably false.
-""",
-    ask_all=_ask_all,
+"""
+OUTLIERS: Final = Question(
+    outliers, _read, OutliersRequest, OutliersAnswer, _EXAMPLES, _EXAMPLE_ANSWER, _TEXT, _ask_all
 )

@@ -133,10 +133,7 @@ def placements(
 
 
 def supported_objects(model: SceneModel, posterior: Posterior, scene: Scene) -> list[int]:
-    """Return the indices of the objects that stand on or in an object, by the scene's relations.
-
-    The list does not contain a desk with a bin under it, although its relation is on-top as well.
-    """
+    """Return the indices of the objects that stand on or in an object, without desks over bins."""
     places = model.places
     present = posterior.present
     classes = model.vocabulary.stand_in[present.classes][present.row].tolist()

@@ -160,10 +160,7 @@ class Posterior:
     def log_odds_of_pairs(
         self, i: Int[Indices, "P"], j: Int[Indices, "P"]
     ) -> tuple[Float[Floats, "A P"], Float[Floats, "A P"]]:
-        """Return the log-odds of all relations from classes i to j of the scene, and from j to i.
-
-        The observed relations of a pair are not evidence for the relations of the same pair.
-        """
+        """Return the log-odds from classes i to j and back, without the evidence of each pair."""
         log_odds = self._units.log_odds(self._between, leave_out_pair=True)
         # The compiled functions of the questions need contiguous arrays.
         forward, backward = np.ascontiguousarray(log_odds[:, [i, j], [j, i]].swapaxes(0, 1))
@@ -200,10 +197,7 @@ def calibrated(
 def calibrated_missing(
     calibration: Calibration, z: Float[Floats, "N"], n: int, coverage: float | None
 ) -> Float[Floats, "N"]:
-    """Return the calibrated log-odds that unlisted classes are present.
-
-    n is the number of listed classes without structure. A `coverage` of None is not stated.
-    """
+    """Return the calibrated log-odds that classes are present, beside n listed ones."""
     n = max(1, n)
     if coverage is None:
         return calibrated(calibration.missing, z, n)

@@ -76,28 +76,21 @@ BEDROOM: Final[dict[str, Any]] = {
 POSES: Final[dict[str, Any]] = {
     "objects": [
         {
-            "id": "desk_1",
-            "label": "desk",
-            "position": {"x": 2.0, "y": 0.0, "z": 0.4},
+            "id": "desk_1", "label": "desk", "position": {"x": 2.0, "y": 0.0, "z": 0.4},
             "size": {"x": 0.7, "y": 1.4, "z": 0.8},
         },
         {
-            "id": "lamp_1",
-            "label": "lamp",
-            "position": {"x": 2.0, "y": 0.5, "z": 1.0},
+            "id": "lamp_1", "label": "lamp", "position": {"x": 2.0, "y": 0.5, "z": 1.0},
             "size": {"x": 0.2, "y": 0.2, "z": 0.4},
         },
         {
-            "id": "chair_1",
-            "label": "chair",
-            "position": {"x": 1.2, "y": 0.0, "z": 0.45},
+            "id": "chair_1", "label": "chair", "position": {"x": 1.2, "y": 0.0, "z": 0.45},
             "size": {"x": 0.5, "y": 0.5, "z": 0.9},
             "orientation": {"x": 0.0, "y": 0.0, "z": 1.0, "w": 0.0},
         },
     ],
-    "frame_id": "base_link",
-    "stamp": {"sec": 12, "nanosec": 500000000},
-}
+    "frame_id": "base_link", "stamp": {"sec": 12, "nanosec": 500000000},
+}  # fmt: skip
 _CAMERA: Final[dict[str, Any]] = {
     "objects": [
         {"label": "desk", "position": {"x": 0.0, "y": 0.6, "z": 2.0}},

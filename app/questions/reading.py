@@ -220,11 +220,7 @@ def _scene_object(
 def _stated(
     request: SceneRequest, ids: Sequence[str]
 ) -> list[tuple[Location, str, RelationName, str]] | None:
-    """Return (location, subject, relation, object) of the stated relations and supports.
-
-    The result is None without stated relations, if all objects have positions or no object has a
-    support. The service then derives the relations from the positions.
-    """
+    """Return (location, subject, relation, object), or None if positions give the relations."""
     supports: list[tuple[Location, str, RelationName, str]] = []
     has_positions = True
     for index, (name, entry) in enumerate(zip(ids, request.objects, strict=True)):

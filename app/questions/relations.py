@@ -1,15 +1,12 @@
 """The question `relations`: which relations hold between objects, and which are unexpected?
 
 A disagreement is a pair of objects whose observed relation is not the relation that the rest of the
-scene suggests. To find disagreements, the module judges each pair with an observed relation a
-second time. It then treats all relations between the two classes as unobserved, in both directions.
-Otherwise an observation would be evidence for itself: if left is observed, the model also knows
-that front does not hold. The pair is a disagreement if the likeliest of the ten relations is
-unobserved and has a probability of at least `EXPECTED`.
+scene suggests. To find it, the module judges the pair a second time without its observations: if
+left is observed, the model also knows that front does not hold. The pair is a disagreement if the
+likeliest of the ten relations is unobserved and has a probability of at least `EXPECTED`.
 
 The model has relation units between classes. If a class has several instances, a relation of any
-instance counts as observed for all instances. Example: one chair is to the left of the table, and
-another chair is to the right. Then left and right both count as observed for each chair.
+instance counts as observed for all instances.
 """
 
 from collections.abc import Sequence
@@ -65,8 +62,7 @@ def relations(
 ) -> Fields:
     """Return the likeliest relations between the objects of a scene, and the disagreements.
 
-    A disagreement is an observed relation of two objects for which the model expects another
-    relation. The `probability` of an observed relation is that of its evidence. Its `expected` is
+    The `probability` of an observed relation is that of its evidence. Its `expected` is
     the probability of the model without this observation. The probability is at most .01 if the
     relation is observed not to hold, or if the boxes or other relations exclude it. Structural
     classes (floor, wall) are left out unless `pairs` contains them.
@@ -229,10 +225,7 @@ def _disagreements(
 def _named_relations(
     stated: RelationTable, row: Int[Indices, "N"], n: int, A: int
 ) -> tuple[Bool[Mask, "N N B"], Bool[Mask, "n n B"]]:
-    """Return which of the B = 2A relations hold from each object, and class, to each other one.
-
-    Relation A + a is the opposite of relation a.
-    """
+    """Return which relations hold between objects, and classes; A + a is opposite to a."""
     N, a = len(row), stated.relation
     holds, of_classes = np.zeros((N, N, 2 * A), np.bool_), np.zeros((n, n, 2 * A), np.bool_)
     for grid, i, j in (
@@ -246,10 +239,7 @@ def _named_relations(
 def _observed_pairs(
     holds: Bool[Mask, "N N B"], judged: Bool[Mask, "N N"], A: int
 ) -> tuple[Int[Indices, "P"], Int[Indices, "P"]]:
-    """Return the subjects and objects of the pairs with an observed relation, in either order.
-
-    The subject is that of the first of the pair's relations in `CANONICAL`.
-    """
+    """Return the pairs with a relation, as subjects and objects of the first in `CANONICAL`."""
     forward = holds[..., :A]
     first = np.where(forward.any(-1), forward.argmax(-1), A)
     x, y = np.triu(holds.any(-1) & (judged | judged.T), 1).nonzero()
@@ -260,10 +250,7 @@ def _observed_pairs(
 def _names(
     scene: Scene, A: int, subject: int, object_: int, observed_kinds: list[int], expected: int
 ) -> Fields:
-    """Return the names of a disagreement, from the subject of the relation in the request.
-
-    `observed_kinds` and `expected` are indices in `relation_names(A)`.
-    """
+    """Return the names of a disagreement, from the subject of the relation in the request."""
     names = relation_names(A)
     observed = [names[kind] for kind in observed_kinds]
     triples = {canonicalise(subject, relation, object_) for relation in observed}
@@ -404,44 +391,26 @@ _EXAMPLES: Final = {
 _EXAMPLE_ANSWER: Final = {
     "relations": [
         {
-            "subject": "lamp_1",
-            "relation": "on-top",
-            "object": "nightstand_1",
-            "probability": 0.92,
-            "observed": True,
-            "expected": 0.83,
+            "subject": "lamp_1", "relation": "on-top", "object": "nightstand_1",
+            "probability": 0.92, "observed": True, "expected": 0.83,
         },
         {
-            "subject": "nightstand_1",
-            "relation": "left",
-            "object": "bed",
-            "probability": 0.41,
+            "subject": "nightstand_1", "relation": "left", "object": "bed", "probability": 0.41,
             "observed": False,
         },
     ],
-    "disagreements": [
-        {
-            "subject": "lamp_1",
-            "object": "bed",
-            "observed": ["on-top"],
-            "expected": "left",
-            "probability": 0.36,
-            "observed_probability": 0.02,
-        }
-    ],
-}
+    "disagreements": [{
+        "subject": "lamp_1", "object": "bed", "observed": ["on-top"], "expected": "left",
+        "probability": 0.36, "observed_probability": 0.02,
+    }],
+}  # fmt: skip
 
-RELATIONS: Final = Question(
-    relations,
-    _read,
-    RelationsRequest,
-    RelationsAnswer,
-    _EXAMPLES,
-    _EXAMPLE_ANSWER,
-    description="""
+_TEXT: Final = """
 Rank the relations between the objects of a scene, most probable first.
 
 The answer also lists disagreements: pairs of objects whose observed relation differs from the
 relation that the model expects from the rest of the scene.
-""",
+"""
+RELATIONS: Final = Question(
+    relations, _read, RelationsRequest, RelationsAnswer, _EXAMPLES, _EXAMPLE_ANSWER, _TEXT
 )

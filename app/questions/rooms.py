@@ -116,19 +116,12 @@ _EXAMPLE_ANSWER: Final = {
     ],
 }
 
-ROOMS: Final = Question(
-    rooms,
-    _read,
-    RoomsRequest,
-    RoomsAnswer,
-    _EXAMPLES,
-    _EXAMPLE_ANSWER,
-    description="""
+_TEXT: Final = """
 Rank the room types by their probability given the objects, most probable first.
 
 For a single object, the answer is where such an object usually is. The probabilities of all room
 types, or of all candidates, sum to one. Candidates that name one room type, such as toilet and
 bathroom, share one entry and its probability. The entry lists these names in `listed_as`. The
 answer uses neither relations nor the room type of the request.
-""",
-)
+"""
+ROOMS: Final = Question(rooms, _read, RoomsRequest, RoomsAnswer, _EXAMPLES, _EXAMPLE_ANSWER, _TEXT)

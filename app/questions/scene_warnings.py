@@ -61,10 +61,7 @@ def scene_warnings(
     *,
     derived: bool,  # whether relations were derived from the poses
 ) -> list[SceneWarning]:
-    """Return the warnings about a scene in the request's frame, with axes of REP-103.
-
-    x points forward, y left and z up.
-    """
+    """Return the warnings about a scene in the frame of the request (x forward, y left, z up)."""
     # Python loops are fast enough, because most scenes have no poses or pass all checks.
     placed = [thing for thing in scene.objects if thing.position is not None]
     sized = _sized(scene, detections, vocabulary)
@@ -96,11 +93,7 @@ def scene_warnings(
 
 
 def _distant(placed: Sequence[SceneObject], request: SceneRequest) -> list[SceneObject]:
-    """Return the objects that are too far from the viewer.
-
-    In a world-fixed frame without a viewpoint, the position of the viewer is unknown. The median
-    position of the objects then replaces the position of the viewer.
-    """
+    """Return the objects too far from the viewer, or from the median of a map."""
     positions = [thing.position or _ORIGIN for thing in placed]
     centre = _ORIGIN
     if request.viewpoint is not None:
@@ -155,10 +148,7 @@ def _sized(
 
 
 def _scaled(sized: Sequence[_Sized]) -> tuple[float, list[SceneObject]]:
-    """Return the common factor between sizes and typical sizes, and its objects.
-
-    The list is empty if the factor is plausible or the objects do not agree.
-    """
+    """Return the common factor of sizes and typical sizes, and its objects if it is implausible."""
     if len(sized) < _LEAST:
         return 1.0, []
     # The mean log ratio of the three sides of each object.

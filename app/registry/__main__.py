@@ -93,16 +93,9 @@ def _copy(
 
 
 def _replacement(
-    old: AliasTarget,
-    new: AliasTarget,
-    source: Store,
-    target: Store,
-    added: set[tuple[str, str]],
+    old: AliasTarget, new: AliasTarget, source: Store, target: Store, added: set[tuple[str, str]]
 ) -> AliasTarget | None:
-    """Return the target that replaces a shipped model of an earlier release, if an alias moves.
-
-    An alias of an own version stays. So does one that was moved back, while the old model loads.
-    """
+    """Return the target that replaces a shipped model of an earlier release, if an alias moves."""
     versions = target.versions(old.name) if old.version is None else (old.version,)
     shipped = source.shipped()
     names = {shipped.replacement(old.name, v, target.digest(old.name, v)) for v in versions}

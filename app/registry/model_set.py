@@ -11,13 +11,7 @@ from typing import Final
 
 from app.registry.artifact import Artifact
 from app.registry.errors import OUTDATED, ArtifactError, StoreError
-from app.registry.references import (
-    NOTHING,
-    AliasTarget,
-    Shipped,
-    resolve_reference,
-    version_key,
-)
+from app.registry.references import NOTHING, AliasTarget, Shipped, resolve_reference, version_key
 from app.registry.store import Store
 
 _logger = logging.getLogger("app.registry")
@@ -25,10 +19,7 @@ _logger = logging.getLogger("app.registry")
 
 @dataclass(frozen=True, eq=False)
 class ModelSet:
-    """The state of a store at one moment, by the (name, version) of each published model.
-
-    The errors were never raised, so they keep no stack frames or weights in memory.
-    """
+    """The state of a store by (name, version). Its errors were never raised, so hold no frames."""
 
     entries: Mapping[tuple[str, str], Artifact | ArtifactError]
     aliases: Mapping[str, AliasTarget]
@@ -134,11 +125,7 @@ def with_default(
     previous: ModelSet = EMPTY,
     check: Callable[[Artifact], None] = lambda _: None,
 ) -> ModelSet:
-    """Add the default model of the release, if an alias needs it and the store does not have it.
-
-    An alias needs the model if it points at a model that only earlier releases could load. See
-    `load_model_set` for the arguments.
-    """
+    """Add the default model of the release, if an outdated alias needs it and it is missing."""
     if models.shipped.default is None or not any(map(models.is_outdated, models.aliases)):
         return models
     try:

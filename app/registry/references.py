@@ -14,6 +14,7 @@ and which models of earlier releases it replaces. Format of the file, with `_shi
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Final, NamedTuple, Self
@@ -146,10 +147,7 @@ def resolve_reference(
         StoreError: `invalid_reference`, `unknown_model`, `replaced_model`, `unknown_version`, or
             `dangling_alias` if the target of an alias does not exist and is not replaced.
     """
-
-    def pick(target: AliasTarget) -> tuple[str, str]:
-        return _pick(target, versions, replaced)
-
+    pick = partial(_pick, versions=versions, replaced=replaced)
     name, at, version = reference.partition("@")
     NAME.check(name, "model name")
     if at:

@@ -72,10 +72,7 @@ def unpack(data: bytes, entries: Mapping[str, TensorEntry]) -> dict[str, NDArray
 def require_equal(
     actual: Mapping[str, object], expected: Mapping[str, object], has: str, needs: str
 ) -> None:
-    """Raise ArtifactError `wrong_shape` unless both maps of tensors to dtype and shape are equal.
-
-    ``has`` and ``needs`` are the words of the message before the actual and the expected tensor.
-    """
+    """Raise ArtifactError `wrong_shape` unless both maps to dtype and shape are equal."""
     for name in sorted(actual.keys() | expected.keys()):
         entry, needed = actual.get(name, "none"), expected.get(name, "none")
         if entry != needed:

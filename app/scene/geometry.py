@@ -152,10 +152,7 @@ _NO_ROLES: Final = RoleCounts(
 def excluded_by_centres(
     points: Float[NDArray, "n 3"], sizes: Float[NDArray, "n 3"], *, horizontal: bool
 ) -> Bool[NDArray, "A n n"]:
-    """Return the relations that the centres of n boxes exclude.
-
-    Unknown centres exclude no relation. A footprint of unknown size has the radius `UNKNOWN_REACH`.
-    """
+    """Return the relations that the centres exclude. Unknown footprints reach `UNKNOWN_REACH`."""
     x, y = points[:, 0], points[:, 1]
     dx, dy = x[:, None] - x, y[:, None] - y
     excluded = np.zeros((len(CANONICAL), len(x), len(x)), np.bool_)

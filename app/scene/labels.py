@@ -64,18 +64,10 @@ _ONLY_S: Final = (
 _IRREGULAR: Final = {
     **{f"{word}s": word for word in _ONLY_S},
     **{f"{stem}ves": f"{stem}f" for stem in ("shel", "lea", "loa", "scar", "wol", "cal")},
-    "knives": "knife",
-    "women": "woman",
-    "men": "man",
-    "people": "person",
-    "children": "child",
-    "feet": "foot",
-    "teeth": "tooth",
-    "geese": "goose",
-    "mice": "mouse",
-    "buses": "bus",
+    "knives": "knife", "women": "woman", "men": "man", "people": "person", "children": "child",
+    "feet": "foot", "teeth": "tooth", "geese": "goose", "mice": "mouse", "buses": "bus",
     "lenses": "lens",
-}
+}  # fmt: skip
 _IRREGULAR_ENDINGS: Final = tuple(_IRREGULAR)
 
 _OF: Final = re.compile(r"[\s_\-.]of[\s_\-.]+", re.IGNORECASE)
@@ -103,10 +95,7 @@ def head_of(label: str) -> str | None:
 
 
 def singular(word: str) -> str:
-    """Return the singular of an English noun in lower case. Return other words unchanged.
-
-    docs/decisions/data.md compares the function with a general inflection library.
-    """
+    """Return the singular of an English noun in lower case, or another word unchanged."""
     if word.endswith(_IRREGULAR_ENDINGS):
         for plural, single in _IRREGULAR.items():
             if word.endswith(plural):
@@ -142,10 +131,7 @@ def label_key(label: str) -> str:
 
 
 def split_words(label: str) -> tuple[str, ...]:
-    """Return the words of a label in lower case and in the singular.
-
-    A label with more than `LONGEST` characters after Unicode normalisation has no words.
-    """
+    """Return the words of a label in lower case and singular; none of one longer than `LONGEST`."""
     folded = unicodedata.normalize("NFKC", label)
     if len(folded) > LONGEST:
         return ()
@@ -190,10 +176,7 @@ _IDS: Final = re.compile(
 
 
 def readings(label: str) -> Iterator[tuple[Rule, str]]:
-    """Yield pairs (rule, name) of the names in a detector's label, most certain name first.
-
-    A name can need two rules: "a photo of a sofa/couch". Its pair contains the first rule.
-    """
+    """Yield pairs (rule, name) of the names in a detector's label, most certain name first."""
     return islice(_readings(label), _MOST_READINGS)
 
 

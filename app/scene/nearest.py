@@ -73,10 +73,7 @@ class Match(NamedTuple):
 
 
 class NameIndex:
-    """Search for entries, such as object classes, with names similar to an unknown name.
-
-    ``names`` has pairs (name, index of the entry). An entry may have several names.
-    """
+    """Search for entries by similar names, from pairs (name, index). An entry may have several."""
 
     def __init__(self, names: Sequence[tuple[str, int]]) -> None:
         self._entries = [index for _, index in names]
@@ -111,10 +108,7 @@ class NameIndex:
         return self._by_head_words(words[:end])
 
     def _by_head_words(self, words: Sequence[str]) -> LookUp | None:
-        """Return the entry whose name is the longest end of a phrase, or None.
-
-        A phrase with an imitation, such as "toy trailer", stands for the imitation ("toy").
-        """
+        """Return the entry of the longest end of a phrase, or of its imitation ("toy"), or None."""
         imitations = [word for word in words[:-1] if word in _IMITATIONS]
         for start in range(len(words)):
             head = imitations[:1] or words[start:]
@@ -127,10 +121,7 @@ class NameIndex:
     def _by_corrections(
         self, words: Sequence[str], corrections: Mapping[str, Sequence[tuple[str, int]]]
     ) -> LookUp | None:
-        """Return the entry whose name is the phrase, perhaps with misspelt words.
-
-        The result is None if the edits cost too much, or if another entry costs about the same.
-        """
+        """Return the one entry that the phrase names with few enough misspellings, or None."""
         costs: dict[int, tuple[int, int]] = {}  # by entry: cost and maximum cost
         for spelling in itertools.product(*(corrections[word] for word in words)):
             entry = self._by_key.get("".join(word for word, _ in spelling))
@@ -150,10 +141,7 @@ class NameIndex:
         return LookUp(entry, round(1 - cost / 2 / len("".join(words)), 3), "spelling")
 
     def _corrections(self, word: str) -> list[tuple[str, int]]:
-        """Return at most `_MOST_CORRECTIONS` pairs (word of the lexicon, cost), cheapest first.
-
-        A short word, or a word without similar words, stands for itself: [(word, 0)].
-        """
+        """Return at most `_MOST_CORRECTIONS` pairs (word of the lexicon, cost), cheapest first."""
         if len(word) < _SHORTEST:
             return [(word, 0)]
         lengths = range(max(_SHORTEST, len(word) - _MOST_EDITS), len(word) + _MOST_EDITS + 1)

@@ -128,10 +128,7 @@ def _in_viewer_frame(
 def boxes_of(
     objects: Sequence[SceneObject], typical_sizes: Float[NDArray[np.float64], "V 3"] | None
 ) -> tuple[Float[NDArray[np.float64], "n 3"], Float[NDArray[np.float64], "n 3"]]:
-    """Return the centres and the extents of objects, NaN where unknown.
-
-    An object without a plausible size has the typical extents of its class (`Vocabulary.sizes`).
-    """
+    """Return centres and extents, typical ones for implausible sizes, and NaN where unknown."""
     centres = np.array([thing.position or _UNKNOWN for thing in objects]).reshape(-1, 3)
     indices = [-1 if thing.class_index is None else thing.class_index for thing in objects]
     extents = np.full((len(objects), 3), math.nan)

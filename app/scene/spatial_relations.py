@@ -21,12 +21,8 @@ LEFT, FRONT, ON_TOP, ABOVE, INSIDE = 0, 1, 2, 3, 4  # indices of the canonical r
 
 CANONICAL: Final[tuple[str, ...]] = ("left", "front", "on-top", "above", "inside")
 OPPOSITES: Final[dict[str, str]] = {
-    "left": "right",
-    "front": "behind",
-    "on-top": "under",
-    "above": "below",
-    "inside": "contains",
-}
+    "left": "right", "front": "behind", "on-top": "under", "above": "below", "inside": "contains",
+}  # fmt: skip
 RELATIONS: Final[tuple[str, ...]] = CANONICAL + tuple(OPPOSITES[name] for name in CANONICAL)
 
 # Indices of groups of relations:
@@ -79,10 +75,7 @@ def canonicalise(subject: End, relation: str, anchor: End) -> tuple[int, End, En
 
 
 def support_cycle(triples: Iterable[tuple[int, End, End]]) -> list[End] | None:
-    """Return objects that support each other in a circle, each on or in the next, or None.
-
-    The last object is the first one again. The triples are canonical.
-    """
+    """Return objects in a circle, each on or in the next and the last one first again, or None."""
     below: dict[End, list[End]] = {}
     for relation, subject, anchor in triples:
         if relation in SUPPORTS:

@@ -54,10 +54,7 @@ class Heights:
 
     @cached_property
     def around(self) -> Bool[NDArray, "n n"]:
-        """Whether box i reaches below a smaller box j, or far below its top.
-
-        "i is on top of j" then means that j is under i, as a bin is under a desk.
-        """
+        """Whether box i reaches below a smaller box j, or far below its top: then j is under i."""
         is_deep = self.bottoms[:, None] < np.maximum(self.bottoms, self.tops - CONTACT)
         return is_deep & (self.areas[:, None] >= self.areas)
 

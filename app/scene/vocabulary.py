@@ -221,10 +221,7 @@ class Vocabulary:
 
     @_remembered
     def read(self, label: str, *, is_room: bool = False) -> LookUp | None:
-        """Return the class or room type that a label names for certain, or None.
-
-        The method reads the syntax of detectors (`readings`) if `index` does not know the label.
-        """
+        """Return the class or room type that a label or one of its `readings` names, or None."""
         index_of = self.room_index if is_room else self.index
         if (index := index_of(label)) is not None:
             return LookUp(index, 1.0, self._rule_of(label, index, is_room=is_room))
@@ -291,11 +288,7 @@ class Vocabulary:
         return None
 
     def with_words(self, words: Sequence[Word]) -> "Vocabulary":
-        """Return a vocabulary with a further class for each word, in the order of the words.
-
-        Such a class is structure, or belongs anywhere, as its nearest class does. It has no
-        relatives and no known size. The methods that read labels do not find it.
-        """
+        """Return a vocabulary with a further class for each word, like its nearest class."""
         return _WithWords(self, words) if words else self
 
     def remembers(self, label: str, searches: Sequence[str], *, is_room: bool = False) -> bool:
@@ -325,10 +318,7 @@ class Vocabulary:
 
 
 class _WithWords(Vocabulary):
-    """A vocabulary and the classes of some words; see `Vocabulary.with_words`.
-
-    Its arrays extend those of the known classes, because a new vocabulary would take 0.1 s.
-    """
+    """A vocabulary and the classes of some words, faster than a new one; see `with_words`."""
 
     def __init__(self, base: Vocabulary, words: Sequence[Word]) -> None:
         vars(self).update({name: vars(base)[name] for name in _SHARED})
@@ -346,18 +336,6 @@ class _WithWords(Vocabulary):
         self.stand_in = _read_only([*base.stand_in, *self._nearest])
 
     @cached_property
-    def labels(self) -> tuple[str, ...]:
-        return (*self._base.labels, *(entry.label for entry in self.objects[self.trained :]))
-
-    @cached_property
-    def structure(self) -> NDArray[np.bool_]:
-        return _read_only(self._base.structure[self.stand_in])
-
-    @cached_property
-    def anywhere(self) -> NDArray[np.bool_]:
-        return _read_only(self._base.anywhere[self.stand_in])
-
-    @cached_property
     def sizes(self) -> NDArray[np.float64]:
         return np.pad(self._base.sizes, ((0, len(self._nearest)), (0, 0)), constant_values=math.nan)
 
@@ -368,10 +346,6 @@ class _WithWords(Vocabulary):
     @cached_property
     def broader(self) -> NDArray[np.bool_]:
         return np.pad(self._base.broader, (0, len(self._nearest)))
-
-    @cached_property
-    def related(self) -> NDArray[np.bool_]:
-        return np.pad(self._base.related, (0, len(self._nearest)))
 
     @cached_property
     def broader_labels(self) -> tuple[tuple[str, ...], ...]:

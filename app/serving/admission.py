@@ -238,10 +238,7 @@ async def in_thread(
 
 
 class Bodies:
-    """The bodies of all requests and answers in progress. Their total size is bounded.
-
-    One client holds at most a quarter of the budget, or a single body.
-    """
+    """The bodies in progress. A client holds at most a quarter of the budget, or a single body."""
 
     def __init__(self, settings: Settings) -> None:
         self._budget = settings.held_body_bytes

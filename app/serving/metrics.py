@@ -184,10 +184,7 @@ class Metrics:
             self._warnings.labels(*key, warning.code).inc()
 
     async def exposition(self) -> bytes:
-        """Return all metrics in the text format of Prometheus, at most `max_age` old.
-
-        The formatting runs in a thread, because it takes more than 10 ms for many series.
-        """
+        """Return all metrics as text, at most `max_age` old. A thread formats them."""
         if self._text is None or monotonic() - self._written_at >= self.max_age:
             self._written_at = monotonic()
             self._text = asyncio.ensure_future(asyncio.to_thread(generate_latest, self._registry))

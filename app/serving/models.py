@@ -149,10 +149,7 @@ class ServedModels:
 
     @cached_property
     def failures(self) -> Mapping[str, Failure]:
-        """Maps each unusable entry (an alias, "store" or ``name@version``) to its failure.
-
-        Versions come last, because readiness checks list only the first failures.
-        """
+        """Maps each unusable alias, "store" or, last, ``name@version`` to its failure."""
         causes: dict[str, ArtifactError | StoreError] = {}
         for alias in sorted({DEFAULT, *self.store.aliases}):
             try:
