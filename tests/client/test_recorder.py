@@ -19,13 +19,7 @@ from typer.testing import CliRunner
 
 from app.questions.reading import Limits, read_scene
 from app.scene import CANONICAL
-from scene_client import (
-    Client,
-    OfflineClient,
-    ProblemError,
-    Recorder,
-    recorder,
-)
+from scene_client import Client, OfflineClient, ProblemError, Recorder, recorder
 from scene_client.command import app
 from scene_client.recorded_scene import scene_of
 from scene_client.schemas import MissingRequest

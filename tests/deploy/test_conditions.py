@@ -17,9 +17,7 @@ pytestmark = [pytest.mark.system, pytest.mark.slow]
 
 @pytest.fixture(scope="module")
 def program(
-    repository: Path,
-    tmp_path_factory: pytest.TempPathFactory,
-    find_tool: FindTool,
+    repository: Path, tmp_path_factory: pytest.TempPathFactory, find_tool: FindTool
 ) -> Path:
     """Ticks one condition as a tree does."""
     here = Path(__file__).parent

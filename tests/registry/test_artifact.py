@@ -66,8 +66,7 @@ def test_round_trip_is_exact_in_float32(variant: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize(
-    "more",
-    [{}, {"C": 3, "N": 4, "G": 1}, {"states": 3, "C": 3, "profiles": 2, "coupled": True}],
+    "more", [{}, {"C": 3, "N": 4, "G": 1}, {"states": 3, "C": 3, "profiles": 2, "coupled": True}]
 )
 def test_the_layout_is_that_of_the_machines(variant: str, more: dict[str, Any]) -> None:
     sizes = {name: n for name, n in more.items() if name != "G" or variant == "triway"}

@@ -104,10 +104,7 @@ def own_version_among_shipped_ones(volume: Store) -> str:
     ],
 )
 def test_an_upgrade_never_moves_the_default_from_an_own_model(
-    volume: Store,
-    release: Store,
-    own: Callable[[Store], str],
-    capsys: pytest.CaptureFixture[str],
+    volume: Store, release: Store, own: Callable[[Store], str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     target = own(volume)
     volume.set_alias("default", AliasTarget.of(target))
