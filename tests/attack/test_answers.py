@@ -96,13 +96,7 @@ DRAWN = {"objects": LABELS[:8], "steps": 2, "seed": 0}
         ("generate", [DRAWN | {"count": count} for count in (1, 64)], "count"),
     ],
 )
-async def test_single_answers_have_a_limit(
-    client: AsyncClient,
-    limited: AsyncClient,
-    question: str,
-    bodies: list[dict[str, Any]],
-    parameter: str,
-) -> None:
+async def test_single_answers_have_a_limit(client, limited, question, bodies, parameter):
     small, large = [(await client.post(f"/{question}", json=body)).content for body in bodies]
     assert len(small) <= SMALL < len(large)
     assert len((await limited.post(f"/{question}", json=bodies[0])).content) == len(small)
@@ -180,9 +174,7 @@ async def test_unknown_ends_cost_little(client: AsyncClient, calls: Counter[str]
     ("question", "field", "count"),
     [("missing", "objects", 256), ("missing", "candidates", 4096), ("rooms", "candidates", 4096)],
 )
-async def test_unknown_labels_stop_early(
-    client: AsyncClient, calls: Counter[str], question: str, field: str, count: int
-) -> None:
+async def test_unknown_labels_stop_early(client, calls, question, field, count):
     name = "a/" + "b/" * (40 if field == "objects" else 3)
     body = {"objects": ["bed"]} | {field: [f"{name}{number}" for number in range(count)]}
     document = problem(await client.post(f"/{question}", json=body), 422, "unknown-labels")

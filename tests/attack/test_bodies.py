@@ -31,9 +31,7 @@ JSON = {"Content-Type": "application/json"}
         ("outliers/batch", "scenes", {}, 256),
     ],
 )
-async def test_entries_are_counted_before_validation(
-    client: AsyncClient, path: str, field: str, entry: Any, most: int
-) -> None:
+async def test_entries_are_counted_before_validation(client, path, field, entry, most):
     # pydantic would report the unknown field.
     body = {"objects": ["bed"], "unknown": 1, field: [entry] * (most + 1)}
     document = problem(await client.post(f"/{path}", json=body), 422, "invalid-request")
@@ -60,9 +58,7 @@ def batch(entry: bytes, size: int = 2**21) -> bytes:
 
 
 @pytest.mark.parametrize("entry", [b"[]", b"{}", b"[" * 99 + b"]" * 99])
-async def test_containers_are_counted_before_parsing(
-    client: AsyncClient, parsed: list[int], entry: bytes
-) -> None:
+async def test_containers_are_counted_before_parsing(client, parsed, entry):
     dense = b'{"scenes":[{"objects":["bed"],"candidates":[%b]}]}' % b",".join([entry] * 2**17)
     for body in (batch(entry), dense[: 2**21]):
         response = await client.post("/missing/batch", content=body, headers=JSON)
@@ -71,9 +67,7 @@ async def test_containers_are_counted_before_parsing(
 
 
 @pytest.mark.parametrize("entry", [b"1", b'""', b"9" * 4000])
-async def test_a_large_batch_is_parsed_scene_by_scene(
-    client: AsyncClient, parsed: list[int], entry: bytes
-) -> None:
+async def test_a_large_batch_is_parsed_scene_by_scene(client, parsed, entry):
     response = await client.post("/missing/batch", content=batch(entry), headers=JSON)
     document = problem(response, 422, "invalid-request")
     assert document["errors"][0]["message"] == "must have at most 256 entries"
@@ -129,9 +123,7 @@ AT = {"x": 1, "y": 0, "z": 0}
         ),
     ],
 )
-async def test_a_request_has_at_most_32_errors(
-    client: AsyncClient, body: dict[str, Any], first: str, last: str
-) -> None:
+async def test_a_request_has_at_most_32_errors(client, body, first, last):
     document = problem(await client.post("/missing", json=body), 422, "invalid-request")
     pointers = [error["pointer"] for error in document["errors"]]
     assert (len(pointers), pointers[0], pointers[-1]) == (32, f"#/{first}", f"#/{last}")
@@ -151,12 +143,8 @@ async def test_a_request_has_at_most_32_errors(
 )
 @pytest.mark.parametrize("question", ["outliers", "generate"])
 async def test_large_scenes_leave_the_event_loop(
-    shared_store: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    question: str,
-    scene: dict[str, Any],
-    is_large: bool,
-) -> None:
+    shared_store, monkeypatch, question, scene, is_large
+):
     threads = []
 
     def read(*args: Any, **options: Any) -> Any:

@@ -68,9 +68,7 @@ async def test_work_of_a_departed_client_ends(shared_store: Path, replace: Repla
         assert await asyncio.to_thread(ended.wait, 60)
 
 
-async def test_a_memory_error_gets_503(
-    shared_store: Path, replace: Replace, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_a_memory_error_gets_503(shared_store, replace, caplog):
     def fail(*_: Any, **__: Any) -> Any:
         raise MemoryError
 

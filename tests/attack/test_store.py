@@ -110,9 +110,7 @@ async def test_a_loaded_version_stays_usable(published: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [OverflowError, MemoryError, RecursionError, KeyError])
-def test_an_error_refuses_one_version(
-    published: Path, monkeypatch: pytest.MonkeyPatch, error: type[Exception]
-) -> None:
+def test_an_error_refuses_one_version(published, monkeypatch, error):
     load = Store.load
 
     def fail(self: Store, name: str, *rest: object) -> object:

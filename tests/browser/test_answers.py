@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import expect
 
 from tests.browser.driving import Board, OpenBoard, body_of, percent
-from tests.conftest import FindTool, run_program
+from tests.conftest import run_program
 
 pytestmark = pytest.mark.system
 
@@ -258,9 +258,7 @@ def test_aliases_of_room_types(open_board: OpenBoard, api: httpx.Client) -> None
     expect(board.page.locator("#room option:checked")).to_have_text(re.compile(r"Living Room \d"))
 
 
-def test_the_shown_calls_give_the_shown_answer(
-    open_board: OpenBoard, api: httpx.Client, find_tool: FindTool
-) -> None:
+def test_the_shown_calls_give_the_shown_answer(open_board, api, find_tool):
     find_tool("curl")
     board = open_board(permissions=["clipboard-read", "clipboard-write"])
     programs = ("sh", board.curl("missing")), (sys.executable, board.python("missing"))

@@ -50,9 +50,7 @@ LINE = {"scene_id": "a", "objects": [{"id": 0, "label": "bed"}], "counts": {"bed
         ("request.json", json.dumps(REQUEST)[:-1], set()),
     ],
 )
-def test_requests_stay_in_the_browser(
-    open_board: OpenBoard, tmp_path: Path, name: str, content: str, routes: set[str]
-) -> None:
+def test_requests_stay_in_the_browser(open_board, tmp_path, name, content, routes):
     board = open_board()
     sent = posted(board)
     (tmp_path / name).write_text(content)

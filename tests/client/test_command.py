@@ -158,14 +158,7 @@ FILES = {
         ("generate --count 64 --steps 500 --timeout 0.01", 4, []),
     ],
 )
-def test_exit_status_and_reason_of_a_failure(
-    scene: Any,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    line: str,
-    code: int,
-    words: list[str],
-) -> None:
+def test_exit_status_and_reason_of_a_failure(scene, tmp_path, monkeypatch, line, code, words):
     monkeypatch.chdir(tmp_path)
     for name, content in FILES.items():
         (tmp_path / name).write_bytes(content)

@@ -174,9 +174,7 @@ FRAMES = [
     st.lists(st.tuples(*[st.integers(-20, 20)] * 3), min_size=3, max_size=3),
     st.sampled_from([{}, {"yaw": 0.7}, {"orientation": {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8}}]),
 )
-def test_the_training_derives_the_relations_of_the_service(
-    frame: dict[str, Any], places: list[tuple[int, int, int]], turn: dict[str, Any]
-) -> None:
+def test_the_training_derives_the_relations_of_the_service(frame, places, turn):
     names = VOCABULARY.labels[:3]
     boxes = [
         box(name, x / 10, y / 10, z / 10, **turn)
@@ -348,9 +346,7 @@ writer.record([scene(20)])
     assert 100_000 * 2 / 3 < int(printed[1]) < 100_000
 
 
-def test_a_missing_folder_disturbs_no_question(
-    url: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_missing_folder_disturbs_no_question(url, tmp_path, caplog):
     file = tmp_path / "later" / "scenes.jsonl"
     writer = Recorder(file)
     with Client(url, record=writer) as scene:

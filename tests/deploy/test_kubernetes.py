@@ -127,9 +127,7 @@ def test_ports_are_those_of_the_image(repository: Path, overlay: Overlay) -> Non
         assert (port["port"], port["targetPort"]) == (exposed, opened["name"])
 
 
-def test_variables_are_valid_settings(
-    monkeypatch: pytest.MonkeyPatch, repository: Path, overlay: Overlay
-) -> None:
+def test_variables_are_valid_settings(monkeypatch, repository, overlay):
     assert set(re.findall(r"\bSCENE_[A-Z0-9_]+", overlay.text)) <= SETTINGS
     assert overlay.config["SCENE_STORE"] in {"/srv/scene/model_store", "/srv/scene/models"}
     # Kubernetes inserts only variables that stand earlier in `env`, so the hosts are last.

@@ -13,7 +13,6 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
 
 from tests.conftest import run_program
-from tests.services import LiveService
 
 
 @contextmanager
@@ -53,9 +52,7 @@ def run(repository: Path, *arguments: str) -> tuple[list[Any], list[str]]:
 
 
 @pytest.mark.parametrize("questions", [["missing"], ["relations", "rooms"]])
-def test_a_published_message_is_answered(
-    repository: Path, live: LiveService, envelope: Any, questions: list[str]
-) -> None:
+def test_a_published_message_is_answered(repository, live, envelope, questions):
     with bridge({"op": "status", "level": "info"}, envelope) as (url, heard):
         (answer,), errors = run(
             repository, url, "/detections_3d", "--service", live.url, "--questions", *questions

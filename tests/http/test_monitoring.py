@@ -282,9 +282,7 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[ExportTraceServiceRe
 
 
 @pytest.mark.system
-def test_spans_have_names_of_routes(
-    shared_store: Path, tmp_path: Path, taken: list[ExportTraceServiceRequest]
-) -> None:
+def test_spans_have_names_of_routes(shared_store, tmp_path, taken):
     with launch(shared_store, tmp_path / "log", SCENE_OPENTELEMETRY="true") as service:
         service.client.post("/missing", json=SCENE)
         for path in UNTRACED:

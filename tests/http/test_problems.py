@@ -13,7 +13,7 @@ from httpx import AsyncClient, Response
 from app.errors import ERRORS
 from app.questions import QUESTIONS
 from scene_client.schemas import Problem
-from tests.services import Replace, defect
+from tests.services import defect
 
 NAMES = [question.name for question in QUESTIONS]
 MARKER = "Zq7-marker"
@@ -363,9 +363,7 @@ async def test_valid_request_ids_are_kept(client: AsyncClient, given: Any, is_ke
 
 
 @pytest.mark.parametrize("question", NAMES)
-async def test_a_defect_is_a_problem_without_details(
-    client: AsyncClient, replace: Replace, caplog: pytest.LogCaptureFixture, question: str
-) -> None:
+async def test_a_defect_is_a_problem_without_details(client, replace, caplog, question):
     replace(question, defect)
     response = await client.post(f"/{question}", json={"objects": ["bed"]})
     document = problem(response, 500, "internal-error")

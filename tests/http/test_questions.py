@@ -20,7 +20,7 @@ from scene_client.frames import viewer_axes
 from tests.http.stores import PROFILES, VOCABULARY, C, V, publish
 from tests.http.test_problems import problem
 from tests.questions.test_placements import offsets_of_every_pair
-from tests.services import Replace, defect, serve
+from tests.services import defect, serve
 
 
 def at(x: float, y: float, z: float) -> dict[str, float]:
@@ -251,9 +251,7 @@ REQUEST: dict[str, Any] = {
         ("robot_1/map", None),
     ],
 )
-async def test_offsets_are_in_the_axes_of_the_frame(
-    measured: AsyncClient, own_store: Path, frame: str | None, viewpoint: Any
-) -> None:
+async def test_offsets_are_in_the_axes_of_the_frame(measured, own_store, frame, viewpoint):
     """In a map without a viewpoint, the relations left and front have no offset."""
     options = {"frame_id": frame, "viewpoint": viewpoint}
     options = {name: value for name, value in options.items() if value is not None}
@@ -311,9 +309,7 @@ async def test_a_batch_holds_1_to_256_scenes(client: AsyncClient, scenes: Any) -
 
 
 @pytest.mark.parametrize("fault", ["raised", math.nan])
-async def test_a_defect_affects_one_entry(
-    client: AsyncClient, replace: Replace, caplog: pytest.LogCaptureFixture, fault: Any
-) -> None:
+async def test_a_defect_affects_one_entry(client, replace, caplog, fault):
     def fail_on_sofas(outliers: Any, artifact: Any, scene: Any, **parameters: Any) -> Any:
         answer = outliers(artifact, scene, **parameters)
         if any(thing.label == "sofa" for thing in scene.objects):

@@ -47,9 +47,7 @@ def relation(subject: str, name: str, other: str) -> dict[str, str]:
         ([{"label": "lamp"}, {"label": "lamp"}], {"lamp_1": "lamp", "lamp_2": "lamp"}),
     ],
 )
-async def test_labels_are_ids_of_objects(
-    client: AsyncClient, objects: list[Any], expected: dict[str, str]
-) -> None:
+async def test_labels_are_ids_of_objects(client, objects, expected):
     assert (await read(client, objects=objects))[0] == expected
 
 
@@ -225,9 +223,7 @@ async def test_poses_of_words_give_relations(client: AsyncClient) -> None:
     ],
 )
 @pytest.mark.parametrize("treatment", ["error", "ignore", "nearest-or-ignore"])
-async def test_the_syntax_of_detectors_is_read(
-    client: AsyncClient, treatment: str, label: str, expected: str | None, rule: str | None
-) -> None:
+async def test_the_syntax_of_detectors_is_read(client, treatment, label, expected, rule):
     scene = {"objects": [{"id": "x", "label": label}, "lamp"], "unknown_labels": treatment}
     response = await client.post("/outliers", json=scene)
     if expected is None and treatment == "error":
@@ -435,9 +431,7 @@ BED = {"id": "b", "label": "bed", "position": at(2, 1, 0.3)}
         ({"objects": [*BARE, BED], "relations": []}, None, []),
     ],
 )
-async def test_implausible_scenes_get_warnings(
-    client: AsyncClient, scene: dict[str, Any], code: str | None, named: list[str]
-) -> None:
+async def test_implausible_scenes_get_warnings(client, scene, code, named):
     found = (await ask(client, "missing", **scene))["warnings"]
     assert [(one["code"], one["objects"]) for one in found] == ([(code, named)] if code else [])
     assert all(one["message"] for one in found)

@@ -239,9 +239,7 @@ OUT_OF_RANGE = [
         *OUT_OF_RANGE,
     ],
 )
-def test_refuses_tensors_that_do_not_fit_the_spec(
-    change: Callable[[dict[str, Any]], object], tensor: str, code: str, written: Path
-) -> None:
+def test_refuses_tensors_that_do_not_fit_the_spec(change, tensor, code, written):
     error = spoil(written, change)
     assert (error.code, f"'{tensor}'" in error.reason) == (code, code != "invalid_tensor")
 
@@ -255,9 +253,7 @@ def test_refuses_tensors_that_do_not_fit_the_spec(
         lambda t: t.update(extra={"dtype": "float32", "shape": []}),
     ],
 )
-def test_refuses_tensors_that_the_manifest_does_not_promise(
-    change: Callable[[dict[str, Any]], object], written: Path
-) -> None:
+def test_refuses_tensors_that_the_manifest_does_not_promise(change, written):
     rewrite_manifest(written, lambda members: change(members["tensors"]))
     assert refusal(written).code == "wrong_shape"
 

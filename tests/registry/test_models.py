@@ -114,9 +114,7 @@ def test_a_publication_between_two_looks_leaves_no_alias_dangling(store: Store) 
     assert models.resolve("default").manifest.name == "tiny"
 
 
-def test_one_unreadable_folder_does_not_take_the_others_down(
-    store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_one_unreadable_folder_does_not_take_the_others_down(store, monkeypatch):
     iterdir = Path.iterdir
 
     def deny(path: Path) -> object:

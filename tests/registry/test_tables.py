@@ -175,9 +175,7 @@ INVALID: list[tuple[Any, str, list[dict[str, Any]]]] = [
 @pytest.mark.parametrize(
     ("group", "code", "change"), [(group, code, c) for group, code, cs in INVALID for c in cs]
 )
-def test_invalid_tensors_are_refused(
-    tmp_path: Path, group: Any, code: str, change: dict[str, Any]
-) -> None:
+def test_invalid_tensors_are_refused(tmp_path, group, code, change):
     with refused(code):
         written(tmp_path / "a", group(**change))
 
@@ -214,9 +212,7 @@ def test_counts_at_their_limits_are_accepted() -> None:
         ((3, 0, 2), None, -1),
     ],
 )
-def test_offsets_are_those_of_the_pair_or_of_the_relation(
-    triple: tuple[int, int, int], offset: tuple[float, ...] | None, scenes: int
-) -> None:
+def test_offsets_are_those_of_the_pair_or_of_the_relation(triple, offset, scenes):
     values, numbers = offsets().find(*(np.array([index]) for index in triple))
     assert numbers.tolist() == [scenes]
     assert offset is None or values[0].tolist() == pytest.approx(offset)
@@ -225,9 +221,7 @@ def test_offsets_are_those_of_the_pair_or_of_the_relation(
 @pytest.mark.parametrize("relation", range(A))
 @pytest.mark.parametrize("anchor", range(V))
 @pytest.mark.parametrize("outgoing", [True, False])
-def test_the_ratio_of_a_place_is_that_of_smoothed_counts(
-    relation: int, anchor: int, outgoing: bool
-) -> None:
+def test_the_ratio_of_a_place_is_that_of_smoothed_counts(relation, anchor, outgoing):
     """Also for a relation without scenes: the place then changes nothing."""
 
     def held(a: int, i: int, j: int) -> float:

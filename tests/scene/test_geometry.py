@@ -99,9 +99,7 @@ STACKS = ALL - HORIZONTAL
         (box(2.0, 0.0, 0.0, 2.0, 3.0, 0.0), TABLE, NOTHING, ALL),
     ],
 )
-def test_relations_of_a_pair(
-    subject: Thing, anchor: Thing, holds: set[str], observed: set[str]
-) -> None:
+def test_relations_of_a_pair(subject, anchor, holds, observed):
     positions, sizes = zip(subject, anchor, strict=True)
     assert names(derive_relations(positions, sizes)) == (holds, observed)
 
@@ -152,8 +150,8 @@ BED = standing(2.0, 0.0, 0.0, 2.1, 1.6, 1.1)  # with its headboard
     ids=lambda value: " ".join(value) if isinstance(value[0], str) else "",
 )
 def test_counts_decide_the_role_of_boxes_that_reach_into_each_other(
-    smaller: Thing, larger: Thing, labels: tuple[str, str], relation: str
-) -> None:
+    smaller, larger, labels, relation
+):
     positions, sizes = zip(smaller, larger, strict=True)
     classes = np.array([LABELS.index(label) for label in labels])
     found = derive_relations(positions, sizes, classes=classes, roles=COUNTS)
@@ -219,9 +217,7 @@ def test_heights_exclude_roles(rise: float, height: float, expected: set[int]) -
         ((0.0, 1.0, 1.0), (0.0, 2.0, 1.0), False),
     ],
 )
-def test_the_footprint_and_then_the_volume_tell_the_smaller(
-    i: tuple[float, ...], j: tuple[float, ...], expected: bool
-) -> None:
+def test_the_footprint_and_then_the_volume_tell_the_smaller(i, j, expected):
     assert is_smaller(np.array(i), np.array(j)) is expected
 
 

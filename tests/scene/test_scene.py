@@ -101,9 +101,7 @@ def test_in_a_map_without_a_viewer_no_direction_is_excluded() -> None:
 
 
 @pytest.mark.parametrize(("distance", "is_far"), [(2.9, False), (3.1, True)])
-def test_boxes_of_unknown_size_are_not_stacked_from_far_apart(
-    distance: float, is_far: bool
-) -> None:
+def test_boxes_of_unknown_size_are_not_stacked_from_far_apart(distance, is_far):
     """A footprint of unknown size reaches at most 1.5 m."""
     ends = [
         SceneObject(name, name, 0, position=(x, 0, 0)) for name, x in (("a", 0), ("b", distance))
@@ -124,9 +122,7 @@ def instances(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.n
 
 
 @given(instances())
-def test_classes_are_the_or_over_instance_pairs(
-    drawn: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
-) -> None:
+def test_classes_are_the_or_over_instance_pairs(drawn):
     classes, confidence, holds, observed = drawn
     evidence = pool_instances(classes, holds, observed, room_type=3)
     *_, presence = pool_classes(classes, confidence)
@@ -166,9 +162,7 @@ def test_observations_are_stated_complete_or_from_boxes() -> None:
 
 
 @given(instances())
-def test_a_relation_of_classes_has_the_largest_probability_of_their_objects(
-    drawn: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
-) -> None:
+def test_a_relation_of_classes_has_the_largest_probability_of_their_objects(drawn):
     classes, _, holds, observed = drawn
     evidence = pool_instances(classes, holds & observed, observed)
     table = RelationTable.shown_by_boxes(holds & observed, observed, ~observed)
@@ -359,9 +353,7 @@ def test_quaternions_must_have_length_one(quaternion: tuple[float, float, float,
 
 
 @given(st.floats(-7, 7), st.booleans(), st.tuples(*[st.floats(-5, 5)] * 3))
-def test_viewer_axes_invert_the_conversion_to_the_viewer(
-    yaw: float, optical: bool, point: tuple[float, float, float]
-) -> None:
+def test_viewer_axes_invert_the_conversion_to_the_viewer(yaw, optical, point):
     """A point read into body axes, seen by the viewer, and told in the frame again."""
     body, _, _ = body_pose(point, optical=optical)
     (seen,), _ = to_viewer_frame([body], Viewpoint(0.0, 0.0, yaw))

@@ -181,9 +181,7 @@ SIMILAR = Vocabulary(
         ("toy mug", "toy", "head"),
     ],
 )
-def test_a_name_is_guessed_by_its_spelling_or_its_last_words(
-    label: str, expected: str, rule: str
-) -> None:
+def test_a_name_is_guessed_by_its_spelling_or_its_last_words(label, expected, rule):
     found = SIMILAR.guess(label)
     assert found is not None
     assert (SIMILAR.labels[found.entry], found.rule) == (expected, rule)

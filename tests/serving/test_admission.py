@@ -118,9 +118,7 @@ def begun() -> threading.Event:
     return threading.Event()
 
 
-async def test_work_in_a_thread_ends_the_wait_at_the_deadline(
-    admission: Admission, begun: threading.Event
-) -> None:
+async def test_work_in_a_thread_ends_the_wait_at_the_deadline(admission, begun):
     """The one under way is given up; the one behind it is dropped without being begun."""
     release, behind = threading.Event(), list[int]()
 
@@ -147,9 +145,7 @@ async def test_work_in_a_thread_ends_the_wait_at_the_deadline(
 
 
 @pytest.mark.parametrize("ending", ["deadline", "disconnect"])
-async def test_a_long_computation_learns_that_its_request_has_ended(
-    admission: Admission, begun: threading.Event, ending: str
-) -> None:
+async def test_a_long_computation_learns_that_its_request_has_ended(admission, begun, ending):
     heard, here = threading.Event(), True
 
     def endless(has_ended: Callable[[], bool]) -> None:

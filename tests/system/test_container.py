@@ -96,9 +96,7 @@ def test_ports_are_published_on_this_machine_only(compose: dict[str, Any]) -> No
     assert all(ports[name][0].startswith("127.0.0.1:") for name in ("prometheus", "grafana"))
 
 
-def test_an_upgrade_copies_the_shipped_models(
-    stages: dict[str, str], compose: dict[str, Any], tmp_path: Path, repository: Path
-) -> None:
+def test_an_upgrade_copies_the_shipped_models(stages, compose, tmp_path, repository):
     """The command of the compose file, on the paths of the image."""
     services = compose["services"]
     copy, scene = services["shipped-models"], services["scene"]

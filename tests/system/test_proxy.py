@@ -219,9 +219,7 @@ TRAILERS = CHUNKED + b"X-API-Key: 0123456789abcdef\r\nHost: evil.example\r\n\r\n
         (TRAILERS, 411),
     ],
 )
-def test_metrics_and_trailers_reach_no_service(
-    proxy: Proxy, service: LiveService, text: bytes, status: int
-) -> None:
+def test_metrics_and_trailers_reach_no_service(proxy, service, text, status):
     before = len(service.log.read_text().splitlines())
     (answer,), is_closed = exchange(proxy.port, Wire("", [text], (status,), closes=status == 404))
     assert (answer.status, is_closed) == (status, status == 404)
