@@ -73,14 +73,12 @@ def test_a_ghost_becomes_an_object_where_it_was_drawn(bedroom: Board) -> None:
     ghost = bedroom.page.locator("#board .ghost").first
     label = ghost.locator("text").text_content() or ""
     drawn = ghost.locator("rect").bounding_box()
-    assert drawn is not None
     ghost.press("Enter")
     bedroom.settle()
     assert bedroom.things[-1] == label
     box = bedroom.thing(label).locator(".box").bounding_box()
     focused = bedroom.page.evaluate("document.activeElement.getAttribute('aria-label')")
     assert focused.startswith(f"{label},")
-    assert box is not None
     # The view may have grown by what is suggested next; the proportions stay.
     assert box["width"] / box["height"] == pytest.approx(drawn["width"] / drawn["height"], rel=0.05)
     assert all(label != row.split(" ")[0] for row in bedroom.rows("missing"))

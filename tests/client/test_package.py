@@ -37,7 +37,6 @@ def test_the_blocking_client_is_up_to_date():
 )
 def test_every_file_states_the_version(repository: Path, path: str, pattern: str) -> None:
     match = re.search(pattern, (repository / path).read_text("utf-8"), re.MULTILINE)
-    assert match is not None
     assert match[1] == app.__version__
 
 

@@ -82,7 +82,6 @@ def test_a_group_comes_back_with_the_artifact(tmp_path: Path, group: Any) -> Non
     artifact = written(tmp_path / "a", group())
     groups = {name: getattr(artifact.model, name) for name in ("counts", "offsets", "places")}
     loaded = groups.pop(group.__name__)
-    assert loaded is not None
     assert [*groups.values()] == [None, None]
     for name, tensor in group().tensors().items():
         assert np.array_equal(loaded.tensors()[name], tensor)
@@ -194,7 +193,6 @@ def test_counts_at_their_limits_are_accepted() -> None:
     share, weights = np.array([(0, -64)] * 2, "f4"), counts().weights * 256
     at_limits = counts(most=np.array([1, 1]), log_share=share, weights=weights)
     loaded = read_group(Counts, at_limits.tensors(), A, V, C)
-    assert loaded is not None
     assert loaded.weights.max() == 64
 
 

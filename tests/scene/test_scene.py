@@ -39,7 +39,6 @@ CHAIR = SceneObject("chair", "chair", 2, position=(1.2, 0.0, 0.5))
 
 def excluded(scene: Scene) -> np.ndarray:
     """Which relations do not hold, (A, N, N)."""
-    assert scene.relations is not None
     off = scene.relations.rows(scene.relations.probability == 0)
     grid = np.zeros((len(CANONICAL), *[len(scene.objects)] * 2), bool)
     grid[off.relation, off.subject, off.object] = True
@@ -50,7 +49,6 @@ def test_poses_become_relations() -> None:
     seen = observe(Scene((DESK, MONITOR, CHAIR)))
     assert set(seen.triples) == {(ON_TOP, 1, 0), (FRONT, 2, 0), (FRONT, 2, 1)}
     assert seen.has_boxes
-    assert seen.relations is not None
     _, observed = seen.relations.grids(3)
     assert observed[LEFT, 0, 2]
     assert not observed[ABOVE, 0, 2]  # the chair has no size
@@ -202,7 +200,6 @@ def test_supports_in_a_circle_are_found() -> None:
     assert support_cycle(tower) is None
     assert support_cycle([*tower, (3, "desk", "box"), (0, "desk", "box")]) is None
     circle = support_cycle([*tower, (2, "desk", "book")])
-    assert circle is not None
     assert circle[0] == circle[-1]
     assert {*pairwise(circle)} == {
         ("book", "bag"), ("bag", "desk"), ("desk", "book"),
@@ -358,6 +355,5 @@ def test_viewer_axes_invert_the_conversion_to_the_viewer(yaw, optical, point):
     body, _, _ = body_pose(point, optical=optical)
     (seen,), _ = to_viewer_frame([body], Viewpoint(0.0, 0.0, yaw))
     axes = viewer_axes("camera_optical_frame" if optical else "map", yaw)
-    assert axes is not None
     told = [sum(seen[k] * axes[k][n] for k in range(3)) for n in range(3)]
     assert told == pytest.approx(point, abs=1e-9)
