@@ -76,7 +76,6 @@ async def test_the_answer_to_a_batch_has_a_limit(shared_store: Path, replace: Re
 
 
 def crowd(objects: int, letter: str = "😀") -> dict[str, Any]:
-    """Objects that all stand beside each other."""
     found = scene(objects, letter)
     for place, thing in enumerate(found["objects"]):
         thing["position"] = {"x": place % 16 * 0.02, "y": place // 16 * 0.02, "z": 0.0}
@@ -112,7 +111,6 @@ MAX_SUGGESTED, MAX_MAPPED = 32, 256
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
-    """The number of calls of each search."""
     found: Counter[str] = Counter()
 
     def count(owner: Any, name: str) -> None:

@@ -42,7 +42,6 @@ async def test_entries_are_counted_before_validation(client, path, field, entry,
 
 @pytest.fixture
 def parsed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """The length of each text that the JSON parser reads."""
     lengths = list[int]()
 
     def counted(text: str | bytes, **options: Any) -> Any:

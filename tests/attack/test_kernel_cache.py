@@ -28,7 +28,6 @@ print(json.dumps([sum(is_smaller.stats.cache_misses.values()), is_smaller.stats.
 
 @pytest.fixture
 def package(tmp_path: Path, repository: Path) -> Path:
-    """A copy of the package `app` with the loops of two modules."""
     for name in ("__init__", "compiling", "scene/__init__", "scene/roles", "scene/footprints"):
         copy = tmp_path / "service" / "app" / f"{name}.py"
         copy.parent.mkdir(parents=True, exist_ok=True)

@@ -83,7 +83,6 @@ def worst_texts(pattern: re.Pattern[Any]) -> Iterator[tuple[str, str, str]]:
 
 
 def nanoseconds(run: Callable[[], Any], repeats: int) -> int:
-    """Return the processor time of a call, the least of some."""
     times = []
     for _ in range(repeats):
         began = thread_time_ns()
@@ -126,7 +125,6 @@ PLAIN_LABELS: Final = ("zxqvwkpm" * 13, "zxqvw kpm " * 10, "Küchengroßgerät "
 
 
 def steps(call: Callable[[], Any]) -> int:
-    """Return how many instructions of Python a call takes."""
     count = 0
 
     def trace(frame: FrameType, event: str, _: object) -> Any:
@@ -146,7 +144,6 @@ def steps(call: Callable[[], Any]) -> int:
 
 
 def fresh() -> Vocabulary:
-    """Return a vocabulary that remembers no label."""
     return Vocabulary(VOCABULARY.objects, VOCABULARY.room_types, VOCABULARY.room_aliases)
 
 

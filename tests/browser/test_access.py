@@ -11,7 +11,6 @@ pytestmark = pytest.mark.system
 
 
 def focus(board: Board) -> str:
-    """What has the focus: its name, or its text."""
     found: str = board.page.evaluate(
         "document.activeElement.getAttribute('aria-label') ?? document.activeElement.innerText"
     )

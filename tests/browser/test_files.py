@@ -16,7 +16,6 @@ QUESTIONS = {"missing", "outliers", "relations", "rooms"}
 
 
 def choose(board: Board, path: Path) -> None:
-    """Open a file in the dialog."""
     board.page.get_by_role("button", name="Import, export").click()
     board.page.get_by_label("Open a file").set_input_files(path)
 

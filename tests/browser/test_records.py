@@ -47,7 +47,6 @@ def recorded(api: httpx.Client, tmp_path: Path) -> Path:
 
 
 def choose(board: Board, file: Path, line: int) -> None:
-    """Open a line of a file."""
     board.click("Import, export")
     board.page.locator("#upload").set_input_files(file)
     board.page.locator("#which").fill(str(line))
@@ -55,7 +54,6 @@ def choose(board: Board, file: Path, line: int) -> None:
 
 
 def downloaded(board: Board, tmp_path: Path, confirmed: int, name: str = "scenes.jsonl") -> Path:
-    """The opened file with its confirmed scenes."""
     board.click("Import, export")
     button = board.page.get_by_role("button", name=f"Download {name} ({confirmed} confirmed)")
     with board.page.expect_download() as download:
@@ -72,7 +70,6 @@ def lines(file: Path) -> list[Any]:
 
 
 def misplace(board: Board, subject: str, relation: str, other: str) -> None:
-    """Let the page receive one misplaced relation."""
     wrong = {"subject": subject, "relation": relation, "object": other, "log_odds": -3.0}
     wrong |= {"probability": 0.9, "is_misplaced": True, "moved": None, "expected": None}
     board.alter("outliers", lambda found: found | {"misplaced": [wrong]})

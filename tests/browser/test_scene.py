@@ -16,7 +16,6 @@ pytestmark = pytest.mark.system
 
 
 def place(board: Board, name: str, question: str = "missing") -> tuple[float, float, float]:
-    """The centre of an object in the request."""
     (found,) = [thing for thing in board.body(question)["objects"] if thing["id"] == name]
     return tuple(found["position"][axis] for axis in "xyz")
 
@@ -152,7 +151,6 @@ def test_unreadable_links(open_board: OpenBoard, api: httpx.Client, is_bomb: boo
 
 
 def placed(board: Board) -> list[str]:
-    """Objects whose position the request contains."""
     return [thing["id"] for thing in board.scene["objects"] if "position" in thing]
 
 

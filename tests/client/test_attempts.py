@@ -48,10 +48,7 @@ def refusal(status: int, retry_after: str | None = None) -> Received:
 
 
 class World:
-    """A service and a clock. Every attempt takes ``seconds``.
-
-    The attempts have the ``outcomes`` in turn; the last outcome repeats.
-    """
+    """A service and a clock. Every attempt takes ``seconds``; the last outcome repeats."""
 
     def __init__(self, *outcomes: Outcome, seconds: float = 0.0) -> None:
         self.outcomes = list(outcomes)

@@ -23,7 +23,6 @@ ANSWERED: dict[str, Any] = {
 
 @pytest.fixture
 def scene(url: str, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Runs ``scene`` against the live service."""
     monkeypatch.setenv("SCENE_URL", url)
     monkeypatch.delenv("SCENE_API_KEY", raising=False)
 

@@ -19,7 +19,6 @@ from tests.client.scene_files import EXAMPLES, REFUSED
 
 
 def rounded(value: Any) -> Any:
-    """A scene with numbers of six decimals."""
     if isinstance(value, dict):
         return {name: rounded(part) for name, part in value.items()}
     if isinstance(value, list):

@@ -25,7 +25,6 @@ from tests.client.peers import answer, answering, read_head, say_nothing
 
 
 def serve(connection: socket.socket, heads: list[bytes] | None = None) -> None:
-    """Answer each request, and record its head."""
     while True:
         head = read_head(connection)
         if heads is not None:

@@ -67,12 +67,10 @@ def array(*detections: dict[str, Any], frame: str = "base_link", **header: Any) 
 def in_space(
     *detections: Any, label_map: Any = None, frame: str = "base_link", **options: Any
 ) -> Any:
-    """The fields of detections with poses."""
     return from_detection3d_array(array(*detections, frame=frame), label_map, **options)
 
 
 def in_image(*detections: Any, frame: str = "base_link") -> SceneFields:
-    """The fields of detections in an image."""
     return from_detection2d_array(array(*detections, frame=frame))
 
 

@@ -62,7 +62,6 @@ def test_invalid_options_give_status_2(options, error, monkeypatch, capsys):
 
 @pytest.fixture(scope="module")
 def errors(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The standard error of the bridge."""
     return tmp_path_factory.mktemp("bridge") / "errors"
 
 

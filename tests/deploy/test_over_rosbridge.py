@@ -17,10 +17,7 @@ from tests.conftest import run_program
 
 @contextmanager
 def bridge(*published: Any) -> Iterator[tuple[str, list[Any]]]:
-    """Something that sends these messages at once to whoever subscribes, and hangs up.
-
-    Text and bytes are sent as they are, whatever else as JSON.
-    """
+    """A bridge that sends these messages (text, bytes or JSON) to a subscriber, and hangs up."""
     heard: list[Any] = []
 
     def handle(socket: ServerConnection) -> None:

@@ -35,7 +35,6 @@ def cluster(folder: Path) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def pods(cluster: dict[str, Any]) -> list[dict[str, Any]]:
-    """The specifications of the head's pod and of the workers' pods."""
     spec = cluster["rayClusterConfig"]
     groups = [spec["headGroupSpec"], *spec["workerGroupSpecs"]]
     return [group["template"]["spec"] for group in groups]

@@ -21,7 +21,6 @@ Run = Callable[..., "Running"]
 
 
 def new(name: str, **fields: Any) -> Any:
-    """Return a message of vision_msgs."""
     return blank(STORE, f"vision_msgs/msg/{name}", **fields)
 
 

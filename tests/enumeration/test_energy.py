@@ -152,7 +152,6 @@ CASES = [
 
 @pytest.mark.parametrize(("name", "room", "source"), CASES)
 def test_object_log_odds_are_those_of_the_joint(name, room, source):
-    """Of v_i, for every v and i."""
     machine = small_machine(name)
     joint = enumerate_joint(machine, *range(-1, machine.spec.C), source=source)
     for i, v, given in left_out(joint):

@@ -1,8 +1,4 @@
-"""Compiled chains draw from the machine, by enumeration of small machines.
-
-Stationarity is tested as in `test_gibbs`: states drawn from the enumerated joint, one sweep, and
-the histogram of v and h1 against p.
-"""
+"""Compiled chains leave p stationary (as in `test_gibbs`), and draw relations given v and h1."""
 
 import copy
 from itertools import product
@@ -84,10 +80,7 @@ def test_chains_are_stationary(name, beta):
 @pytest.mark.parametrize("profile", [None, 1])
 @pytest.mark.parametrize("name", SMALL)
 def test_chains_are_stationary_under_conditions(name, profile):
-    """A class present, a room type and a profile.
-
-    Without a profile, the base rates are their mean given the class.
-    """
+    """Without a profile, the base rates are their mean given the class."""
     spec = SMALL[name]
     room, profile = 1 if spec.C else None, profile if spec.profiles else None
 
@@ -131,10 +124,7 @@ def test_relations_are_drawn_given_objects_and_hidden_units(name, temperature):
 
 
 def implied_law(machine, observed):
-    """The law of r (64,) between three classes, drawn in groups, by a sum over all groups.
-
-    A group is drawn given the relations of all earlier groups. Observed relations come first.
-    """
+    """The law of r (64,) between three classes, where each group depends on earlier groups."""
     off = [(i, j) for i in range(3) for j in range(3) if i != j]
     v, h1 = torch.ones(1, 3).double(), torch.tensor([[1.0, 0, 1]]).double()
     edges = machine.edges(torch.arange(3)[None])

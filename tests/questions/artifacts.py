@@ -100,10 +100,7 @@ def artifact_of(
 
 
 def larger_artifact(name: str, scale: float = 0.7, **changes: object) -> SceneModel:
-    """An artifact with many states. All weights are random numbers from N(0, scale²).
-
-    Structure has no object weights, as in a trained machine.
-    """
+    """An artifact with weights from N(0, scale²), but without object weights of structure."""
     machine = random_machine(LARGER[name], scale)
     structure = [k for k, label in enumerate(LABELS) if label in STRUCTURE]
     for weights, parameter in machine.named_parameters():

@@ -83,7 +83,6 @@ def posterior_of(scene, alone=(), change=()):
 
 
 def stated(classes, triples, by_opposite=()):
-    """A scene without poses."""
     names = list(SIZES)
     objects = tuple(SceneObject(names[c], names[c], c) for c in classes)
     flags = [triple in by_opposite for triple in triples]
@@ -109,7 +108,6 @@ def entries(scene, alone=(), change=(), artifact=ARTIFACT):
 
 
 def test_the_terms_of_a_hand_computed_example():
-    """A monitor on a desk, a bin under the desk, and the bin to the left of the monitor."""
     on, under, left = (ON_TOP, 1, 0), (ON_TOP, 0, 2), (LEFT, 2, 1)
     scene = stated([DESK, MONITOR, BIN], [on, under, left], {under})
     alone = {on: 1.0, under: -2.0, (ABOVE, 0, 2): -0.5, left: 0.25, (ON_TOP, 1, 2): -1.0}

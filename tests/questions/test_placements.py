@@ -67,7 +67,6 @@ def test_only_likely_places_and_strong_reasons_are_listed():
 
 
 def test_no_place_is_listed_below_one_in_twenty():
-    """The place of `at` is always listed."""
     scene, log_odds = scene_of([0, 1, 2]), math.log(0.05 / 0.95)
     for change, count in ((-0.01, 0), (0.01, 3)):
         slopes = (CountSlope(intercept=log_odds + change, slope=0.0),) * A
@@ -119,7 +118,6 @@ VIEWER = viewer_axes()
 
 
 def offset_of(relation, missing, anchor, outgoing=True, axes=VIEWER, offsets=OFFSETS):
-    """The offset of one placement, or None if it is unknown."""
     ends = (np.array([value]) for value in (relation, missing, anchor, outgoing))
     rotation = np.eye(3) if axes is None else np.array(axes)
     values = rotated_offsets(offsets.tables, *ends, rotation, axes is not None)

@@ -32,7 +32,6 @@ def log_odds_by_tensors(artifact, classes, profile=None):
 
 
 def by_type(artifact, entries):
-    """The probabilities in the order of the room types, (C,)."""
     p = {entry.room_type: entry.probability for entry in entries}
     return np.array([p[name] for name in artifact.vocabulary.room_types])
 

@@ -26,7 +26,6 @@ def manifest(**changes: Any) -> Manifest:
 
 
 def stored() -> dict[str, Any]:
-    """The members of a stored manifest without the checksum."""
     members: dict[str, Any] = json.loads(manifest().to_bytes())
     del members["checksum"]
     return members

@@ -352,7 +352,6 @@ def copy(source: Store, target: Store, *references: str) -> int:
 
 @pytest.fixture
 def shipped(tmp_path: Path) -> Store:
-    """A store with two versions, as an image of a newer release has it."""
     store = Store(tmp_path / "shipped")
     publish(store, "1.0.0")
     publish_as(store, "default", description(version="2.0.0"), state(seed=1))

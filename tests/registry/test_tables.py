@@ -23,7 +23,6 @@ CLASSES = np.arange(V)
 
 
 def counts(**changes: Any) -> Counts:
-    """Counts of the classes bed and lamp."""
     weights = np.full((2, 2, 3 + C + V), 0.25, np.float32)
     weights[0, :, 3 + C] = weights[1, :, 4 + C] = 0
     values = {

@@ -233,7 +233,6 @@ rectangles = st.tuples(coordinates, coordinates, sides, sides, turns)
 
 
 def corners(rectangle: Rectangle) -> list[Point]:
-    """The corners, counter-clockwise."""
     x, y, length, width, yaw = rectangle
     cos, sin = math.cos(yaw) / 2, math.sin(yaw) / 2
     return [
@@ -269,7 +268,6 @@ def distance_of(a: list[Point], b: list[Point]) -> float:
 
 
 def border_distance(points: list[Point], polygon: list[Point]) -> float:
-    """Least distance of some points to the border of a polygon."""
     best = math.inf
     for px, py in points:
         for (ax, ay), (bx, by) in zip(polygon, polygon[1:] + polygon[:1], strict=True):

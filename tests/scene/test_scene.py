@@ -38,7 +38,6 @@ CHAIR = SceneObject("chair", "chair", 2, position=(1.2, 0.0, 0.5))
 
 
 def excluded(scene: Scene) -> np.ndarray:
-    """Which relations do not hold, (A, N, N)."""
     off = scene.relations.rows(scene.relations.probability == 0)
     grid = np.zeros((len(CANONICAL), *[len(scene.objects)] * 2), bool)
     grid[off.relation, off.subject, off.object] = True

@@ -114,7 +114,6 @@ def admission() -> Iterator[Admission]:
 
 @pytest.fixture
 def begun() -> threading.Event:
-    """Set by a computation when it begins."""
     return threading.Event()
 
 

@@ -21,7 +21,6 @@ def report(*entries: dict[str, Any]) -> str:
 
 
 def package(kind: str, name: str) -> dict[str, Any]:
-    """The entry of a package that is sound, flawed or skipped."""
     if kind == "skipped":
         return {"name": name, "skip_reason": f"Dependency not found on PyPI: {name} (1.0)"}
     return {"name": name, "version": "2.10", "vulns": [FLAW] if kind == "flawed" else []}

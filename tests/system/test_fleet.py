@@ -45,7 +45,6 @@ class Fleet:
         return str(answer["model"]["version"])
 
     def configuration(self, shipped: str) -> Path:
-        """The shipped configuration with these replicas as servers."""
         template = next(line for line in shipped.splitlines() if "server-template" in line)
         servers = "".join(
             f"    server replica{number} 127.0.0.1:{replica.port}\n"

@@ -3,7 +3,6 @@
 import json
 import resource
 import socket
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from http.server import BaseHTTPRequestHandler
@@ -39,8 +38,6 @@ service = live_service(SCENE_CLIENT_TIMEOUT="3")
 
 @pytest.fixture(scope="module")
 def behind(haproxy: StartProxy, configuration: Path) -> StartProxy:
-    """Return a function that starts the proxy in front of a service."""
-
     def start(service: LiveService, log: Path, **variables: str) -> Any:
         backend = f"127.0.0.1:{service.port}"
         return haproxy(configuration, log, PROXY_BACKEND=backend, PROXY_REPLICAS="1", **variables)
@@ -49,9 +46,7 @@ def behind(haproxy: StartProxy, configuration: Path) -> StartProxy:
 
 
 @pytest.fixture(scope="module")
-def proxy(
-    behind: StartProxy, service: LiveService, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Proxy]:
+def proxy(behind, service, tmp_path_factory):
     """A proxy without a limit on rates."""
     log = tmp_path_factory.mktemp("proxy") / "log"
     variables = {"PROXY_HEAD_TIMEOUT": "10s", "PROXY_TIMEOUT": "10s", "PROXY_REQUESTS": "1000000"}
