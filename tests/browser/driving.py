@@ -136,8 +136,7 @@ def link_to(scene: dict[str, Any]) -> str:
 
 def body_of(command: str) -> dict[str, Any]:
     words = shlex.split(command)
-    found: dict[str, Any] = json.loads(words[words.index("-d") + 1])
-    return found
+    return json.loads(words[words.index("-d") + 1])
 
 
 def plain(text: str | None) -> str:

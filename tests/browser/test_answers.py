@@ -286,8 +286,7 @@ def request(board: Board) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_a_drawn_scene_can_be_kept(open_board: OpenBoard, api: httpx.Client) -> None:
-    board = open_board()
+def test_a_drawn_scene_can_be_kept(board: Board, api: httpx.Client) -> None:
     board.page.locator("#room").select_option("kitchen")
     board.tab("Generate")
     seen = []
@@ -335,9 +334,8 @@ def suggest(board: Board, relation: str, anchor: str, *labels: str) -> dict[str,
     return place
 
 
-def test_a_suggestion_at_another_place_or_none_says_so(open_board: OpenBoard) -> None:
+def test_a_suggestion_at_another_place_or_none_says_so(board: Board) -> None:
     far = {"mean": {"x": 9.0, "y": 0.0, "z": 0.5}, "std": dict.fromkeys("xyz", 0.2), "scenes": 9}
-    board = open_board()
     place = suggest(board, "on-top", "desk", "cup")
     place["offset"] = far
     board.add("laptop")

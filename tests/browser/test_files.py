@@ -7,7 +7,7 @@ from urllib.parse import urlsplit
 import pytest
 from playwright.sync_api import expect
 
-from tests.browser.driving import Board, OpenBoard
+from tests.browser.driving import Board
 from tests.client.scene_files import EXAMPLES
 
 pytestmark = pytest.mark.system
@@ -49,8 +49,7 @@ LINE = {"scene_id": "a", "objects": [{"id": 0, "label": "bed"}], "counts": {"bed
         ("request.json", json.dumps(REQUEST)[:-1], set()),
     ],
 )
-def test_requests_stay_in_the_browser(open_board, tmp_path, name, content, routes):
-    board = open_board()
+def test_requests_stay_in_the_browser(board, tmp_path, name, content, routes):
     sent = posted(board)
     (tmp_path / name).write_text(content)
     choose(board, tmp_path / name)
@@ -66,8 +65,7 @@ def test_requests_stay_in_the_browser(open_board, tmp_path, name, content, route
 @pytest.mark.parametrize(
     "name", ["detections.csv", "labels.txt", "detection3d.json", "moveit.json"]
 )
-def test_the_service_reads_other_formats(open_board: OpenBoard, tmp_path: Path, name: str) -> None:
-    board = open_board()
+def test_the_service_reads_other_formats(board: Board, tmp_path: Path, name: str) -> None:
     sent = posted(board)
     (tmp_path / name).write_text(EXAMPLES[name].text, "utf-8")
     choose(board, tmp_path / name)
@@ -81,8 +79,7 @@ def test_the_service_reads_other_formats(open_board: OpenBoard, tmp_path: Path, 
     assert [thing["id"] for thing in board.exported()["objects"]] == names
 
 
-def test_scenes_and_class_ids_of_a_file(open_board: OpenBoard) -> None:
-    board = open_board()
+def test_scenes_and_class_ids_of_a_file(board: Board) -> None:
     page = board.page
     sent = posted(board)
     results = json.loads(EXAMPLES["coco_results.json"].text)
@@ -108,8 +105,8 @@ def test_scenes_and_class_ids_of_a_file(open_board: OpenBoard) -> None:
     assert board.things == ["stool_1"]
 
 
-def test_a_large_file_is_read_without_showing_it(open_board: OpenBoard, tmp_path: Path) -> None:
-    page = (board := open_board()).page
+def test_a_large_file_is_read_without_showing_it(board: Board, tmp_path: Path) -> None:
+    page = board.page
     path = tmp_path / "large.json"
     path.write_text(json.dumps(["bed", "lamp"]) + " " * 2**21)
     choose(board, path)

@@ -145,8 +145,7 @@ def test_the_cpp_block_compiles_and_runs(url: str, tmp_path: Path, find_tool: Fi
 def test_the_cpp_example(url: str, tmp_path: Path, bridge: Path, find_tool: FindTool) -> None:
     # Asking for `bridge` leaves this test out where the libraries are missing.
     folder = shutil.copytree(REPOSITORY / "clients" / "cpp", tmp_path / "cpp")
-    make = find_tool("make")
-    run_program(make, "-C", folder, "CXXFLAGS=-O0")
+    run_program(find_tool("make"), "-C", folder, "CXXFLAGS=-O0")
     example = folder / "example"
     answered = run_program(example, url, "30").stdout
     headings = re.findall(r"^\w.*:$", answered, re.MULTILINE)

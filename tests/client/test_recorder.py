@@ -341,8 +341,7 @@ writer.record([scene(20)])
     assert printed[0] == f"{warning}: [Errno 28] No space left on device"
     assert printed[2] == f"{warning}: [Errno 27] File too large"
     assert len(printed) == 3
-    written = [int(scene[0].split()[0]) for scene in labels(file)]
-    assert written == [0, 1, 19]
+    assert [int(scene[0].split()[0]) for scene in labels(file)] == [0, 1, 19]
     assert 100_000 * 2 / 3 < int(printed[1]) < 100_000
 
 

@@ -347,8 +347,7 @@ def test_invalid_boxes_are_reported() -> None:
 @pytest.mark.parametrize("number", [7.25, -1.0, 0.0, math.nan, math.inf, 1e300])
 def test_rosbridge_and_cdr_give_one_scene(store: Typestore, kind: str, number: float) -> None:
     """The first of two detections has this number in every field of a floating-point type."""
-    name = f"vision_msgs/msg/Detection{kind}Array"
-    message = filled(store, name, repeat(number), 2)
+    message = filled(store, f"vision_msgs/msg/Detection{kind}Array", repeat(number), 2)
     other = (number / 8 for number in count())
     message.detections[1] = filled(store, f"vision_msgs/msg/Detection{kind}", other, 2)
     convert = from_detection2d_array if kind == "2D" else from_detection3d_array

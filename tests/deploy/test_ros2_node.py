@@ -221,8 +221,7 @@ def test_ghosts_stand_at_the_offset(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_parameter_file_has_the_defaults(run: Run) -> None:
     given = yaml.safe_load((PACKAGE / "config" / "scene.yaml").read_text())
     parameters = given["scene"]["ros__parameters"]
-    declared = run(**parameters).ros.declared
-    assert set(declared) == set(parameters)
+    assert set(run(**parameters).ros.declared) == set(parameters)
     defaults = run().ros.declared
     for name, value in defaults.items():
         assert str(parameters[name]) == str(value), name

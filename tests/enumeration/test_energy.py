@@ -103,8 +103,7 @@ def test_free_energy_is_the_sum_over_states(name):
     machine = small_machine(name)
     source = machine.spec.profiles - 1
     joint = enumerate_joint(machine, *range(-1, machine.spec.C), source=source)
-    sources = torch.full((len(joint.v),), source)
-    free = machine.free_energy(joint.v, joint.room, sources)
+    free = machine.free_energy(joint.v, joint.room, torch.full((len(joint.v),), source))
     fixed = torch.cat((joint.v, joint.room.unsqueeze(1)), 1)
     _, group = fixed.unique(dim=0, return_inverse=True)
     for g in range(int(group.max()) + 1):
@@ -139,7 +138,6 @@ def test_conditionals_of_relations_and_hidden_units(name):
 # classes means v_j = 0 for every other class j: a log-odds is that of v_i given all other classes.
 # The joint of an unknown source has the mean base rates given the listed classes. The joint also
 # has the base rates u of whole scenes, which the answers leave out.
-
 
 # Each machine without and with a room type, and without and with a source.
 CASES = [

@@ -108,8 +108,7 @@ async def test_another_broken_version_is_listed_as_refused(store: Path) -> None:
         assert "card" not in details
         body = {"objects": ["bed"], "model": "plain"}
         problem(await client.post("/relations", json=body), 503, "model-unavailable")
-        path = "/models/plain/vocabulary"
-        problem(await client.get(path), 503, "model-unavailable")
+        problem(await client.get("/models/plain/vocabulary"), 503, "model-unavailable")
 
 
 async def test_an_empty_store_is_not_ready(tmp_path: Path) -> None:

@@ -52,5 +52,4 @@ def test_the_corpus_has_every_field() -> None:
     forms = {f"/{question.name}": question.request for question in QUESTIONS}
     for path, form in forms.items():
         assert set(corpus.VALID[path]) == set(form.model_fields)
-    detection = corpus.SCENE["objects"][1]
-    assert set(detection) == set(schemas.Detection.model_fields)
+    assert set(corpus.SCENE["objects"][1]) == set(schemas.Detection.model_fields)

@@ -141,8 +141,7 @@ async def test_an_error_keeps_the_served_models(own, store, monkeypatch, caplog)
     await load_changes(own)
     assert await default(own) == "home@1.0.0"
     assert "the service could not load the changes in the store" in caplog.text
-    counted = (await own.get("/metrics")).text
-    assert 'scene_reloads_total{outcome="failed"} 1.0' in counted
+    assert 'scene_reloads_total{outcome="failed"} 1.0' in (await own.get("/metrics")).text
 
 
 @pytest.mark.parametrize("log_odds", [None, math.inf], ids=["raises", "not finite"])

@@ -232,8 +232,7 @@ def test_the_documentation_lists_every_metric(live: LiveService) -> None:
 def line(service: LiveService, method: str, path: str, **arguments: Any) -> dict[str, Any]:
     """Send a request, and return its line of the log."""
     identity = uuid.uuid4().hex
-    headers = {"X-Request-Id": identity}
-    service.client.request(method, path, headers=headers, **arguments)
+    service.client.request(method, path, headers={"X-Request-Id": identity}, **arguments)
     # The service writes the line after the answer.
     wait_until(lambda: f'"{identity}"' in service.log.read_text(), service.log)
     lines = map(json.loads, service.log.read_text().splitlines())

@@ -191,8 +191,7 @@ async def test_poses_of_words_give_relations(client: AsyncClient) -> None:
         {"id": "p", "label": "spaceship", "position": at(2, -0.4, 0.85)},
     ]
     answer = await ask(client, "outliers", objects=placed, unknown_labels="by-meaning")
-    found = triples(answer["observed_relations"])
-    assert ("m", "on-top", "d") in found
+    assert ("m", "on-top", "d") in triples(answer["observed_relations"])
     unsized = [one for one in answer["warnings"] if one["code"] == "unknown-sizes"]
     assert [one["objects"] for one in unsized] == [["p"]]
 
@@ -336,8 +335,7 @@ async def test_a_training_scene_is_a_request(client: AsyncClient) -> None:
         "relations": [[1, "on-top", 0]],
     }
     answer = await ask(client, "outliers", **scene)
-    stated = {("1", "on-top", "0"), ("2", "on-top", "1")}
-    assert triples(answer["misplaced"]) == stated
+    assert triples(answer["misplaced"]) == {("1", "on-top", "0"), ("2", "on-top", "1")}
     assert answer["frame_id"] == "map"
     assert "frame_id" not in await ask(client, "outliers", **scene, viewer_frame=True)
     # The same boxes as arrays and as objects.

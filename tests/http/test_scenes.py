@@ -55,8 +55,7 @@ async def test_files_become_scenes(client: AsyncClient, tmp_path: Path, name: st
 async def test_files_are_refused_as_by_the_client(client: AsyncClient, name: str) -> None:
     text, words = REFUSED[name]
     if "choose one" in words:
-        answer = await read(client, text, name)
-        names = [one["name"] for one in answer["scenes"]]
+        names = [one["name"] for one in (await read(client, text, name))["scenes"]]
         assert f"{len(names)} scenes ({', '.join(names)})" in words
     else:
         detail = await refusal(client, text, name=name)

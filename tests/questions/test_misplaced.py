@@ -111,8 +111,7 @@ def test_the_terms_of_a_hand_computed_example():
     on, under, left = (ON_TOP, 1, 0), (ON_TOP, 0, 2), (LEFT, 2, 1)
     scene = stated([DESK, MONITOR, BIN], [on, under, left], {under})
     alone = {on: 1.0, under: -2.0, (ABOVE, 0, 2): -0.5, left: 0.25, (ON_TOP, 1, 2): -1.0}
-    change = {on: 0.5, under: -0.125, left: -1.5}
-    table = entries(scene, alone, change)
+    table = entries(scene, alone, {on: 0.5, under: -0.125, left: -1.5})
     # Nine scenes show the monitor on a desk. The counts of all supporters are smoothed by .5.
     q = math.log((9 + 10 * 9.5 / (9 + 0.5 * V)) / (9 + 10))
     assert table == {

@@ -244,8 +244,7 @@ def by_hand(artifact, scene, name, anchor, coverage):
     ]
     posterior = Posterior(artifact, scene)
     z = posterior.absent_log_odds(np.array(classes), coverage)
-    place = Place(relation, anchor, is_subject)
-    log_p = place_log_p(posterior, np.array(classes), place)
+    log_p = place_log_p(posterior, np.array(classes), Place(relation, anchor, is_subject))
     of_anchor = scene.objects[anchor].class_index
     ratio = artifact.places.log_ratio(relation, of_anchor, outgoing=is_subject)
     probabilities = {}

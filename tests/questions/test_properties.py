@@ -156,8 +156,7 @@ def test_outliers(artifact, scene, threshold):
     scores = [(-e.log_odds, e.object) for e in answer.outliers if e.label not in STRUCTURE]
     assert scores == sorted(scores)
     labels = {thing.label for thing in scene.objects}
-    entries_of_classes = {entry[1:] for entry in answer.outliers}
-    assert len(entries_of_classes) == len(labels)
+    assert len({entry[1:] for entry in answer.outliers}) == len(labels)
     for entry in answer.outliers:
         assert entry.label == scene.objects[entry.object].label
         assert (entry.log_odds is None) == (entry.label in STRUCTURE)
@@ -193,8 +192,7 @@ def test_the_order_of_the_objects_does_not_matter(artifact, scene, random):
     table, moved = scene.relations, np.array([new[k] for k in range(len(order))])
     if table is not None:
         table = replace(table, subject=moved[table.subject], object=moved[table.object])
-    objects = tuple(scene.objects[k] for k in order)
-    shuffled = Scene(objects, table, scene.room_type)
+    shuffled = Scene(tuple(scene.objects[k] for k in order), table, scene.room_type)
 
     def summaries(scene, order):
         answer = outliers(artifact, scene)

@@ -34,8 +34,7 @@ def weights(request):
 
 def test_rows_are_those_of_kernel_ridge_regression(weights) -> None:
     """The formula of the module, written out with loops over the classes."""
-    left_out = [LABELS.index("vase")]
-    row_map = RowMap.fit(weights, CLASSES, left_out)
+    row_map = RowMap.fit(weights, CLASSES, [LABELS.index("vase")])
     used = [k for k, label in enumerate(LABELS) if label not in ("vase", "wall")]
     vectors = CLASSES.vectors[0].astype(np.float64)
     centre = vectors[used].mean(0)
@@ -67,8 +66,7 @@ def test_a_left_out_row_has_no_effect(weights) -> None:
 
 
 def test_known_classes_keep_their_weights(weights) -> None:
-    found = words("ottoman", "mug")
-    larger = RowMap.fit(weights, CLASSES).with_words(weights, found)
+    larger = RowMap.fit(weights, CLASSES).with_words(weights, words("ottoman", "mug"))
     V = weights.spec.V
     assert larger.spec == replace(weights.spec, V=V + 2)
     for name, (_, shape) in layout(weights.spec).items():

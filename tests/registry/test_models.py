@@ -5,11 +5,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from app.registry import AliasTarget, ArtifactError, Store, load_model_set
-from app.registry.references import VERSION, resolve_reference, version_key
+from app.registry.references import resolve_reference
 from tests.registry.small_artifacts import description, publish_as, refused, state
 
 
@@ -180,13 +178,3 @@ def test_refuses(reference: str, code: str) -> None:
     with refused(code) as raised:
         resolve(reference)
     assert "script" not in str(raised.value), "a reason does not repeat an invalid reference"
-
-
-parts = st.tuples(*[st.integers(0, 10**9 - 1)] * 3)
-
-
-@given(parts, parts)
-def test_versions_are_ordered_as_numbers(one: tuple[int, ...], other: tuple[int, ...]) -> None:
-    first, second = (".".join(map(str, version)) for version in (one, other))
-    assert VERSION.fits(first)
-    assert (version_key(first) < version_key(second)) == (one < other)

@@ -18,6 +18,7 @@ from tests.registry.small_artifacts import (
 
 TERMS = "Any use,\nwith the sources named."
 REPLACED = {"old": "new", "old-rbm": "new-rbm"}
+PARENT = {"name": "old", "version": "3.5.0"}
 
 
 @pytest.fixture
@@ -136,13 +137,7 @@ def test_old_names_lead_to_the_new_ones_unless_the_store_has_the_old_model(volum
 @pytest.mark.parametrize(
     ("name", "version", "training", "code", "advice"),
     [
-        (
-            "home",
-            "2.0.0",
-            {"parent": {"name": "old", "version": "3.5.0"}},
-            "outdated_format",
-            "adapt the model",
-        ),
+        ("home", "2.0.0", {"parent": PARENT}, "outdated_format", "adapt the model"),
         ("lab", "1.0.0", {"seed": 7}, "outdated_format", "train the model again"),
         ("old", "3.6.0", {}, "outdated_format", "train the model again"),
         ("old", "3.5.0", None, "replaced_model", "'new' replaces this version"),

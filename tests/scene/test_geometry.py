@@ -268,14 +268,10 @@ def distance_of(a: list[Point], b: list[Point]) -> float:
 
 
 def border_distance(points: list[Point], polygon: list[Point]) -> float:
-    best = math.inf
-    for px, py in points:
-        for (ax, ay), (bx, by) in zip(polygon, polygon[1:] + polygon[:1], strict=True):
-            ux, uy = bx - ax, by - ay
-            t = ((px - ax) * ux + (py - ay) * uy) / (ux * ux + uy * uy)
-            t = min(max(t, 0.0), 1.0)
-            best = min(best, math.hypot(px - ax - t * ux, py - ay - t * uy))
-    return best
+    starts = np.array(polygon)
+    edges, offsets = np.roll(starts, -1, axis=0) - starts, np.array(points)[:, None] - starts
+    t = ((offsets * edges).sum(2) / (edges**2).sum(1)).clip(0, 1)
+    return float(np.linalg.norm(offsets - t[..., None] * edges, axis=2).min())
 
 
 def measure(a: Rectangle, b: Rectangle) -> tuple[float, float]:

@@ -34,6 +34,7 @@ from training.datasets.encoding import pool_instances
 
 DESK = SceneObject("desk", "desk", 0, position=(2.0, 0.0, 0.4), size=(0.8, 1.6, 0.8))
 MONITOR = SceneObject("monitor", "monitor", 1, position=(2.0, 0.2, 1.0), size=(0.1, 0.5, 0.4))
+SOFA = SceneObject("sofa", "sofa", 3, position=(6.0, 0.0, 0.4), size=(0.9, 2.0, 0.8))
 CHAIR = SceneObject("chair", "chair", 2, position=(1.2, 0.0, 0.5))
 
 
@@ -74,8 +75,7 @@ def test_typical_sizes_take_the_place_of_unknown_ones() -> None:
 
 def test_stated_relations_stay_and_poses_exclude_others() -> None:
     """The monitor stands on the desk, 20 cm to the left, and the sofa is far away."""
-    sofa = SceneObject("sofa", "sofa", 3, position=(6.0, 0.0, 0.4), size=(0.9, 2.0, 0.8))
-    objects = (DESK, MONITOR, sofa)
+    objects = (DESK, MONITOR, SOFA)
     stated = Scene(objects, RelationTable.stated([(ON_TOP, 2, 0), (LEFT, 1, 0)], [False, True]))
     seen, derived = observe(stated, viewpoint=Viewpoint(0, 0, 0)), observe(Scene(objects))
     assert (seen.objects, seen.triples, seen.opposites) == (
@@ -93,8 +93,7 @@ def test_stated_relations_stay_and_poses_exclude_others() -> None:
 
 
 def test_in_a_map_without_a_viewer_no_direction_is_excluded() -> None:
-    sofa = SceneObject("sofa", "sofa", 3, position=(6.0, 0.0, 0.4), size=(0.9, 2.0, 0.8))
-    assert not excluded(observe(Scene((DESK, sofa)), has_viewer=False))[[LEFT, FRONT]].any()
+    assert not excluded(observe(Scene((DESK, SOFA)), has_viewer=False))[[LEFT, FRONT]].any()
 
 
 @pytest.mark.parametrize(("distance", "is_far"), [(2.9, False), (3.1, True)])

@@ -36,8 +36,7 @@ VOCABULARY = Vocabulary(
     ],
 )
 def test_labels_are_found_under_any_spelling(label: str, expected: str) -> None:
-    index = VOCABULARY.index(label)
-    assert VOCABULARY.labels[index] == expected
+    assert VOCABULARY.labels[VOCABULARY.index(label)] == expected
 
 
 @pytest.mark.parametrize("label", ["", "  ", "sofa", "trash", "can", "curtain rod"])
@@ -216,6 +215,5 @@ def test_only_plausible_names_are_suggested_best_first() -> None:
 def test_similar_room_types_are_found() -> None:
     assert [match.entry for match in SIMILAR.nearest("bedrom", is_room=True)] == [0]
     assert SIMILAR.nearest("garage", is_room=True) == ()
-    found = SIMILAR.guess("bedrom", is_room=True)
-    assert found.entry == 0
+    assert SIMILAR.guess("bedrom", is_room=True).entry == 0
     assert SIMILAR.guess("garage", is_room=True) is None

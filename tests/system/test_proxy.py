@@ -139,8 +139,7 @@ def test_crashes_are_not_repeated(haproxy: StartProxy, configuration: Path, tmp_
             self.close_connection = True
 
     with http_server(Crashing) as url:
-        backend = url.removeprefix("http://")
-        variables = {"PROXY_BACKEND": backend, "PROXY_REPLICAS": "3"}
+        variables = {"PROXY_BACKEND": url.removeprefix("http://"), "PROXY_REPLICAS": "3"}
         with haproxy(configuration, tmp_path / "log", **variables) as proxy:
             answer = httpx.post(f"{proxy.address}/outliers", json=SCENE, timeout=PATIENCE)
     assert answer.status_code == 502
