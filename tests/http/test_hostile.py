@@ -14,7 +14,6 @@ pytestmark = pytest.mark.system
 MAX_GROWTH = 8 * 2**20
 """Bytes that the last 4,000 requests may add to what the allocator keeps of the first ones."""
 
-
 service = live_service(SCENE_CLIENT_TIMEOUT="5")
 
 

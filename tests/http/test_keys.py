@@ -15,7 +15,6 @@ API_KEY = "incorrect-zebra-capacitor-nail"
 OPEN_OPERATIONS = {"/health/live", "/health/ready"}
 SCENE = {"objects": ["bed", "lamp"]}
 
-
 # A service that needs a key; the client sends none.
 guarded = client_of_service(api_key=API_KEY)
 

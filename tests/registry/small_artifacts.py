@@ -51,7 +51,6 @@ JUDGING = {
     "misplaced": Misplaced(**dict.fromkeys(KINDS, WRONG)),
 }
 
-
 DATA = {
     "source": "generated",
     "scenes": 12,

@@ -138,7 +138,6 @@ ALIASES = {
     "halls": AliasTarget(name="rooms", version="1.0.0"),
 }
 
-
 INVALID = [
     *("", "@1.0.0", "rooms@", "rooms@latest", "rooms@1.0.0@1.0.0", "rooms@1.0.0\n"),
     *("../rooms", "Rooms", "a" * 65, "<script>"),

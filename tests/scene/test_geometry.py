@@ -15,7 +15,6 @@ NAN = math.nan
 Thing = tuple[tuple[float, ...], tuple[float, ...]]
 TABLE: Thing = ((2.0, 0.0, 0.4), (1.0, 1.6, 0.8))
 
-
 # How often the first class is on, under and in the second.
 SEEN = {
     ("bin", "desk"): (1, 20, 0),
