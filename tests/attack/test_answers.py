@@ -63,16 +63,13 @@ async def test_the_answer_to_a_batch_has_a_limit(shared_store: Path, replace: Re
     # The metrics of the model count only the answers that were sent.
     sent = sum(value for key, value in found.items() if key[0] == "scene_objects_total")
     assert sent == 23 * (computed - 1)
-    first, second = (
-        entry["problem"]["errors"][0] for entry in results[computed - 1 : computed + 1]
-    )
+    first, second = (one["problem"]["errors"][0] for one in results[computed - 1 : computed + 1])
     assert first["pointer"] == f"#/scenes/{computed - 1}/top_k"
     assert "Lower `top_k`" in first["message"]
     assert second["pointer"] == f"#/scenes/{computed}"
     assert "another request" in second["message"]
-    assert {entry["problem"]["type"] for entry in results[computed - 1 :]} == {
-        "/problems/answer-too-large"
-    }
+    types = {one["problem"]["type"] for one in results[computed - 1 :]}
+    assert types == {"/problems/answer-too-large"}
 
 
 def crowd(objects: int, letter: str = "😀") -> dict[str, Any]:

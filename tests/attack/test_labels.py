@@ -60,9 +60,7 @@ def _patterns_of(module: Any) -> Iterator[tuple[str, re.Pattern[Any], str]]:
             yield f"{module.__name__}:{node.lineno}", pattern, ast.unparse(node.func)[3:]
 
 
-PATTERNS: Final = list(
-    {(pattern, m): (place, pattern, m) for place, pattern, m in patterns()}.values()
-)
+PATTERNS: Final = list({(one, m): (place, one, m) for place, one, m in patterns()}.values())
 
 
 def characters(pattern: re.Pattern[Any]) -> list[str]:
@@ -216,9 +214,8 @@ def test_the_memory_for_labels_is_bounded(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 async def test_a_long_word_in_a_path_is_refused(client: AsyncClient) -> None:
-    document = problem(
-        await client.get(f"/models/default/vocabulary/the{'_' * 8000}"), 422, "invalid-request"
-    )
+    answer = await client.get(f"/models/default/vocabulary/the{'_' * 8000}")
+    document = problem(answer, 422, "invalid-request")
     assert "100 characters" in document["detail"]
     longest = "the" + "_" * (MAX_LABEL - 3)
     answer = await client.get(f"/models/default/vocabulary/{longest}")

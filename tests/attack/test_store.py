@@ -92,9 +92,8 @@ def test_hostile_versions(published: Path, spoil: Callable[[Path], None], code: 
     spoil(published)
     with at_most(32):
         models = load_model_set(Store(published))
-    assert {key: failure.code for key, failure in models.failures.items()} == {
-        ("hostile", "1.0.0"): code
-    }
+    failures = {key: failure.code for key, failure in models.failures.items()}
+    assert failures == {("hostile", "1.0.0"): code}
     models.resolve("default")
 
 

@@ -95,9 +95,7 @@ def test_the_menu_of_an_object(bedroom: Board, api: httpx.Client) -> None:
         f"{one['label']} {percent(one['probability'])}" for one in answer["missing"]
     ]
     expect(bedroom.page.locator("#at-words")).to_have_text("Missing on top of nightstand")
-    names = [
-        ghost.get_attribute("aria-label") for ghost in bedroom.page.locator("#board .ghost").all()
-    ]
+    names = [one.get_attribute("aria-label") for one in bedroom.page.locator("#board .ghost").all()]
     assert all("on top of nightstand" in str(name) for name in names)
     bedroom.click("Anywhere")
     assert "at" not in bedroom.body("missing")
@@ -150,9 +148,8 @@ def test_outliers_are_marked_with_reasons_in_words(bedroom: Board, api: httpx.Cl
         assert percent(one["probability"]) in row
         assert ("does not belong" in row) == one["is_outlier"]
         assert reasons(one["because"], -1) in row
-        assert ("usually seen with " + ", ".join(one["usually_with"]) in row) or not one[
-            "is_outlier"
-        ]
+        usual = "usually seen with " + ", ".join(one["usually_with"])
+        assert usual in row or not one["is_outlier"]
         assert not re.search(r"[+−-]\d", row)
     alarms = [one for one in answer["outliers"] if one["is_outlier"]]
     assert alarms, "the example has nothing wrong in it"
@@ -206,9 +203,7 @@ def test_relations_are_edges(bedroom: Board, api: httpx.Client) -> None:
         assert ("observed" in row) == one["observed"]
         kinds.add("holds" if one["observed"] else "expected")
     assert {kind for kind, _ in bedroom.edges} == kinds >= {"holds", "expected"}
-    texts = {
-        f"{SPOKEN[one['relation']]} {percent(one['probability'])}" for one in answer["relations"]
-    }
+    texts = {f"{SPOKEN[e['relation']]} {percent(e['probability'])}" for e in answer["relations"]}
     # Between an object and another one on top of it there is no room for words.
     words = {text for kind, text in bedroom.edges if text and kind != "disagrees"}
     assert words

@@ -39,11 +39,7 @@ LINE = {"scene_id": "a", "objects": [{"id": 0, "label": "bed"}], "counts": {"bed
         ("request.json", json.dumps(REQUEST, indent=1), QUESTIONS),
         ("labels.json", '["bed", "lamp"]', QUESTIONS),
         ("scenes.jsonl", json.dumps(LINE) + "\n\n", QUESTIONS),
-        (
-            "scenes.jsonl",
-            f"{json.dumps(LINE)}\n{json.dumps(LINE)}\n",
-            QUESTIONS | {"outliers/batch"},
-        ),
+        ("scenes.jsonl", f"{json.dumps(LINE)}\n" * 2, QUESTIONS | {"outliers/batch"}),
         # A recording whose last line is cut off, and a broken request.
         ("scenes.jsonl", f"{json.dumps(LINE)}\n{json.dumps(LINE)[:-9]}", QUESTIONS),
         ("request.json", json.dumps(REQUEST)[:-1], set()),

@@ -235,10 +235,8 @@ def test_a_download_has_one_file(board: Board, recorded: Path, tmp_path: Path) -
     choose(board, second, 2)
     board.click("This scene is right")
     saved = lines(downloaded(board, tmp_path, 1, "office.jsonl"))
-    assert [(line["scene_id"], "confirmed" in line) for line in saved] == [
-        ("a", False),
-        ("b", True),
-    ]
+    confirmed = [(line["scene_id"], "confirmed" in line) for line in saved]
+    assert confirmed == [("a", False), ("b", True)]
     # A scene that is drawn by hand goes with the opened file.
     board.click("Clear")
     board.add("sofa")

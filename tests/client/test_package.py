@@ -115,9 +115,8 @@ def test_a_generated_client_asks_all_five_questions(live: LiveService, tmp_path:
     lamp = {"label": "lamp", "id": "l", "position": {"x": 1.0, "y": 0.0, "z": 0.5}}
     scene = {"objects": ["bed", lamp], "relations": [["l", "left", "bed"]], "seed": 7}
     requests = dict.fromkeys(("relations", "missing", "outliers", "rooms", "generate"), scene)
-    done = run_program(
-        *(sys.executable, "-c", GENERATED, live.url, json.dumps(requests)), cwd=tmp_path
-    )
+    command = (sys.executable, "-c", GENERATED, live.url, json.dumps(requests))
+    done = run_program(*command, cwd=tmp_path)
     answers = dict(map(json.loads, done.stdout.splitlines()))
     assert answers.keys() == requests.keys()
     for question, answer in answers.items():

@@ -363,9 +363,8 @@ def test_a_missing_folder_disturbs_no_question(url, tmp_path, caplog):
         file.unlink()
         file.mkdir()
         scene.missing(["bed", "sofa"])
-    assert [one.levelno for one in caplog.records if one.name == recorder.__name__] == [
-        logging.WARNING
-    ] * 2
+    levels = [one.levelno for one in caplog.records if one.name == recorder.__name__]
+    assert levels == [logging.WARNING] * 2
 
 
 def test_a_pipe_is_refused(file: Path, caplog: pytest.LogCaptureFixture) -> None:

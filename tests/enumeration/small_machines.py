@@ -93,9 +93,8 @@ def code(*blocks: Tensor | np.ndarray) -> np.ndarray:
 def unit_states(spec: MachineSpec) -> Tensor:
     """All Z^units states of h1, (Z^units, H1) float64. The first state of a unit is all 0."""
     one = torch.eye(spec.states, dtype=torch.float64)[:, 1:]
-    return torch.stack(
-        [one[list(z)].flatten() for z in product(range(spec.states), repeat=spec.units)]
-    )
+    states = product(range(spec.states), repeat=spec.units)
+    return torch.stack([one[list(z)].flatten() for z in states])
 
 
 @dataclass(frozen=True)

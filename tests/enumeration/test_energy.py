@@ -157,9 +157,8 @@ def test_object_log_odds_are_those_of_the_joint(name, room, source):
         exact -= float(machine.u[source, i])
         if source < 0:
             exact += float(mean_rates(machine, v)[i])
-        ours = machine.object_log_odds(
-            v[None], room=torch.tensor([room]), source=torch.tensor([source])
-        )
+        conditions = {"room": torch.tensor([room]), "source": torch.tensor([source])}
+        ours = machine.object_log_odds(v[None], **conditions)
         assert float(ours[0, i]) == pytest.approx(exact, abs=1e-9)
 
 

@@ -136,9 +136,8 @@ def implied_law(machine, observed):
         x = (logits + implied_by_hand(machine, v[0], grid))[0]
         chance[mask] = [float(x[pair].sigmoid()) for pair in off]
     # Of the relations a(i, j) and a(j, i), one is in the groups 0 to 3, and the other in 4 to 7.
-    choices = [
-        (4 * late + n, 4 * (1 - late) + k) for late in (0, 1) for n in range(4) for k in range(4)
-    ]
+    groups = product((0, 1), range(4), range(4))
+    choices = [(4 * late + n, 4 * (1 - late) + k) for late, n, k in groups]
     group = np.zeros((32**3, 6), np.int64)
     for row, picked in zip(group, product(choices, repeat=3), strict=True):
         for (i, j), (first, second) in zip([(0, 1), (0, 2), (1, 2)], picked, strict=True):

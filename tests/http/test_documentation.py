@@ -70,10 +70,8 @@ def test_libraries_are_unchanged(repository: Path) -> None:
     folder = repository / "app" / "static" / "vendor"
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     assert [path.name for path in files].count("LICENSE") == len(files) / 2 == 6
-    lines = (
-        f"{sha256(path.read_bytes()).hexdigest()}  {path.relative_to(folder)}" for path in files
-    )
-    text = "".join(f"{line}\n" for line in lines)
+    digests = ((sha256(path.read_bytes()).hexdigest(), path.relative_to(folder)) for path in files)
+    text = "".join(f"{digest}  {path}\n" for digest, path in digests)
     assert sha256(text.encode()).hexdigest() == LIBRARIES
 
 

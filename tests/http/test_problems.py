@@ -238,10 +238,7 @@ async def test_contradictions_are_refused(client: AsyncClient, question: str) ->
 
 @pytest.mark.parametrize("question", NAMES)
 async def test_unknown_labels_have_suggestions(client: AsyncClient, question: str) -> None:
-    body: dict[str, Any] = {
-        "objects": ["nigthstand", "bed", {"label": MARKER}],
-        "room_type": "bedrom",
-    }
+    body: Any = {"objects": ["nigthstand", "bed", {"label": MARKER}], "room_type": "bedrom"}
     if question == "missing":
         body["candidates"] = ["sofa", "sofe"]
     document = problem(await client.post(f"/{question}", json=body), 422, "unknown-labels")

@@ -152,10 +152,8 @@ async def test_models_of_few_classes_answer(tmp_path: Path, variant: str, classe
 async def test_a_model_of_too_few_scenes_gives_no_judgement(tmp_path: Path) -> None:
     publish(tmp_path, "new", "1.0.0", alias="default", judges=False)
     async with serve(tmp_path) as client:
-        for relations, parts in (
-            ([], ["objects"]),
-            ([["lamp", "on-top", "bed"]], ["objects", "relations"]),
-        ):
+        on_top = [["lamp", "on-top", "bed"]]
+        for relations, parts in (([], ["objects"]), (on_top, ["objects", "relations"])):
             answer = await ask(client, "outliers", objects=["bed", "lamp"], relations=relations)
             assert answer["outliers"] == answer["misplaced"] == []
             assert "threshold" not in answer
@@ -263,9 +261,8 @@ async def test_offsets_are_in_the_axes_of_the_frame(measured, own_store, frame, 
         for k, label in enumerate(POSED)
     )
     model = Store(own_store).load("measured", "1.0.0").model
-    expected = questions.missing(
-        model, Scene(tuple(things), RelationTable.stated(())), top_k=11, axes=axes
-    )
+    scene = Scene(tuple(things), RelationTable.stated(()))
+    expected = questions.missing(model, scene, top_k=11, axes=axes)
     assert answer["missing"] == expected["missing"]
     places = [place for entry in answer["missing"] for place in entry["placements"]]
     kinds = {"offset" in place for place in places}

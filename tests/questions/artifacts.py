@@ -39,9 +39,7 @@ ROOMS = ("bedroom", "office", "kitchen")
 def lines(low: float, medium: float, high: float, log_count: float = 0.0) -> AlarmLines:
     """Alarm lines with these intercepts and one slope."""
     levels = {"low": low, "medium": medium, "high": high}
-    return AlarmLines(
-        **{name: AlarmLine(intercept=z, log_count=log_count) for name, z in levels.items()}
-    )
+    return AlarmLines(**{k: AlarmLine(intercept=z, log_count=log_count) for k, z in levels.items()})
 
 
 NO_ALARM = lines(1e3, 1e3, 1e3)

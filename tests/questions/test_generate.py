@@ -41,9 +41,8 @@ every_model = pytest.mark.parametrize("artifact", ARTIFACTS.values(), ids=NAMES)
 @given(st.sampled_from(NAMES), scenes(minimum=0), st.integers(0, 2**63 - 1))
 def test_scenes_contain_the_evidence_and_no_contradiction(name, scene, seed):
     evidence = {thing.label for thing in scene.objects}
-    stated = {
-        (scene.objects[i].label, CANONICAL[a], scene.objects[j].label) for a, i, j in scene.triples
-    }
+    labels = [thing.label for thing in scene.objects]
+    stated = {(labels[i], CANONICAL[a], labels[j]) for a, i, j in scene.triples}
     pairs = [{subject, object_} for subject, _, object_ in stated]
     for drawn in generate(ARTIFACTS[name], scene, count=9, seed=seed, steps=4):
         assert evidence <= set(drawn.objects)

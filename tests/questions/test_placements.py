@@ -195,9 +195,7 @@ def test_relations_that_training_never_shows_are_lowered_by_the_stand_of_the_sub
         classes = np.array([k for k in range(V - 1) if k != anchor])
         posterior, place = Posterior(artifact, scene), Place.of(name, 0)
         found = placements(artifact, posterior, scene, classes, None, place)
-        return {
-            k: logit(places[0]["probability"]) for k, places in zip(classes, found, strict=True)
-        }
+        return {k: logit(own[0]["probability"]) for k, own in zip(classes, found, strict=True)}
 
     for name, anchor in itertools.product(RELATIONS, range(V - 1)):
         before = log_odds(bare, anchor, name)
@@ -239,9 +237,7 @@ def by_hand(artifact, scene, name, anchor, coverage):
     relation = CANONICAL.index(name if name in CANONICAL else OPPOSITES_OF[name])
     fit, is_subject = artifact.calibration.at[relation], name in CANONICAL
     listed = {thing.label for thing in scene.objects}
-    classes = [
-        k for k, label in enumerate(LABELS) if label not in STRUCTURE and label not in listed
-    ]
+    classes = [k for k, label in enumerate(LABELS) if label not in {*STRUCTURE, *listed}]
     posterior = Posterior(artifact, scene)
     z = posterior.absent_log_odds(np.array(classes), coverage)
     log_p = place_log_p(posterior, np.array(classes), Place(relation, anchor, is_subject))

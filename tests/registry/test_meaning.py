@@ -76,9 +76,8 @@ def test_known_classes_keep_their_weights(weights) -> None:
         assert not larger["L"][:, V:].any()
     # A word is evidence, and known classes keep their log-odds without one.
     nothing = np.zeros(0, np.int64), np.zeros(0, np.float32)
-    of_known, of_all = (
-        ObjectScorer(w).absent(w["c1"], *nothing, None, 0.5) for w in (weights, larger)
-    )
+    scorers = ObjectScorer(weights), ObjectScorer(larger)
+    of_known, of_all = (one.absent(weights["c1"], *nothing, None, 0.5) for one in scorers)
     assert of_all[:V] == pytest.approx(of_known, abs=1e-5)
 
 

@@ -45,9 +45,7 @@ def test_publishes_what_a_reader_loads(store: Store) -> None:
     assert new.path == loaded.path == store.root / "tiny" / "1.0.0"
     assert new.digest == loaded.digest
     weights = new.model.weights
-    assert all(
-        np.array_equal(array, weights[k]) for k, array in loaded.model.weights.arrays.items()
-    )
+    assert all(np.array_equal(w, weights[k]) for k, w in loaded.model.weights.arrays.items())
     assert sorted(tree(store.root)) == [
         "aliases.json",
         "tiny/1.0.0/card.md",

@@ -121,30 +121,19 @@ def standing(x: float, y: float, bottom: float, *size: float) -> Thing:
 
 
 BED = standing(2.0, 0.0, 0.0, 2.1, 1.6, 1.1)  # with its headboard
+DESK_BOX = standing(2.0, 0.0, 0.0, 0.7, 1.4, 0.75)
+DINING_TABLE = standing(2.0, 0.0, 0.0, 0.9, 1.6, 0.75)
+FRIDGE = standing(2.0, 0.0, 0.0, 0.65, 0.7, 1.8)
 
 
 @pytest.mark.parametrize(
     ("smaller", "larger", "labels", "relation"),
     [
-        (
-            standing(2.1, 0.4, 0.0, 0.3, 0.3, 0.35),
-            standing(2.0, 0.0, 0.0, 0.7, 1.4, 0.75),
-            ("bin", "desk"),
-            "under",
-        ),
-        (  # with its back against the edge, higher than the table
-            standing(1.5, 0.3, 0.0, 0.5, 0.45, 0.92),
-            standing(2.0, 0.0, 0.0, 0.9, 1.6, 0.75),
-            ("chair", "table"),
-            "under",
-        ),
+        (standing(2.1, 0.4, 0.0, 0.3, 0.3, 0.35), DESK_BOX, ("bin", "desk"), "under"),
+        # With its back against the edge, higher than the table.
+        (standing(1.5, 0.3, 0.0, 0.5, 0.45, 0.92), DINING_TABLE, ("chair", "table"), "under"),
         (standing(2.7, 0.4, 0.5, 0.4, 0.6, 0.15), BED, ("pillow", "bed"), "on-top"),
-        (
-            standing(2.0, 0.1, 0.9, 0.09, 0.09, 0.25),
-            standing(2.0, 0.0, 0.0, 0.65, 0.7, 1.8),
-            ("milk", "fridge"),
-            "inside",
-        ),
+        (standing(2.0, 0.1, 0.9, 0.09, 0.09, 0.25), FRIDGE, ("milk", "fridge"), "inside"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value[0], str) else "",
 )
@@ -292,9 +281,8 @@ def test_a_footprint_too_small_for_its_area_is_a_point() -> None:
     """1e-300 m squared underflows to 0. The overlap is 1 with what it touches, and otherwise 0."""
     tiny, table = np.full((2, 2), 1e-300), np.ones((2, 2))
     centres = np.array([[0.0, 0.0], [3.0, 0.0]])
-    share, gap = overlap_and_gap(
-        centres, tiny, np.zeros(2), np.zeros((2, 2)), table, np.array([0.0, 0.3])
-    )
+    yaws = np.zeros(2), np.array([0.0, 0.3])
+    share, gap = overlap_and_gap(centres, tiny, yaws[0], np.zeros((2, 2)), table, yaws[1])
     assert share.tolist() == [1.0, 0.0]
     assert gap[0] == 0
     assert gap[1] > 2

@@ -99,9 +99,8 @@ def test_in_a_map_without_a_viewer_no_direction_is_excluded() -> None:
 @pytest.mark.parametrize(("distance", "is_far"), [(2.9, False), (3.1, True)])
 def test_boxes_of_unknown_size_are_not_stacked_from_far_apart(distance, is_far):
     """A footprint of unknown size reaches at most 1.5 m."""
-    ends = [
-        SceneObject(name, name, 0, position=(x, 0, 0)) for name, x in (("a", 0), ("b", distance))
-    ]
+    places = {"a": 0, "b": distance}.items()
+    ends = [SceneObject(name, name, 0, position=(x, 0, 0)) for name, x in places]
     assert excluded(observe(Scene(tuple(ends))))[[*STACKED], 0, 1].all() == is_far
 
 
@@ -212,6 +211,7 @@ Box = tuple[str, tuple[float, float, float], tuple[float, float, float]]
 """Label, extents, and position of the bottom."""
 
 DESK_BOX: Box = ("desk", (1.6, 0.8, 0.75), (0, 0, 0))
+FRIDGE: Box = ("fridge", (0.6, 0.6, 0.4), (0, 0, 0))
 
 
 def stands(*boxes: Box, floor: float = 0.0) -> list[int]:
@@ -254,11 +254,7 @@ def lamp(x: float, bottom: float) -> Box:
         # The relation is on-top of the desk to the bin.
         (("bin", (0.3, 0.3, 0.4), (0.3, 0, 0)), DESK_BOX, FLOOR),
         # The bottom of the milk is near the floor, but the milk is inside.
-        (
-            ("milk", (0.1, 0.1, 0.2), (0, 0, 0.05)),
-            ("fridge", (0.6, 0.6, 0.4), (0, 0, 0)),
-            SUPPORTED,
-        ),
+        (("milk", (0.1, 0.1, 0.2), (0, 0, 0.05)), FRIDGE, SUPPORTED),
         # A chair on a rug.
         (("chair", (0.5, 0.5, 0.9), (0, 0, 0.01)), ("towel", (2.0, 1.5, 0.01), (0, 0, 0)), FLOOR),
         (lamp(0, 0.75 + 0.13), DESK_BOX, UNKNOWN),

@@ -34,9 +34,7 @@ class Fleet:
         """Move the alias, and wait until both replicas serve the version."""
         self.store.set_alias("default", AliasTarget(name="home", version=version))
         wait_until(lambda: {self.default(replica) for replica in self.replicas} == {version})
-        generations = {
-            replica.client.get("/models").json()["generation"] for replica in self.replicas
-        }
+        generations = {one.client.get("/models").json()["generation"] for one in self.replicas}
         assert len(generations) == 1
 
     @staticmethod

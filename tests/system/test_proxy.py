@@ -64,9 +64,8 @@ def test_questions_and_pages_are_answered(proxy: Proxy) -> None:
         assert len(batch.json()["results"]) == 256
         # Refusals of the service arrive as they are.
         assert client.post("/missing", json={}).json()["type"] == "/problems/invalid-request"
-        large = client.post(
-            "/missing", content=b" " * 2_100_000, headers={"Content-Type": "application/json"}
-        )
+        media = {"Content-Type": "application/json"}
+        large = client.post("/missing", content=b" " * 2_100_000, headers=media)
         assert large.json()["type"] == "/problems/body-too-large"
         other_host = client.get("/models", headers={"Host": "evil.example"})
         assert other_host.json()["type"] == "/problems/host-refused"
