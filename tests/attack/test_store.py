@@ -120,9 +120,8 @@ def test_an_error_refuses_one_version(published, monkeypatch, error):
     monkeypatch.setattr(Store, "load", fail)
     models = load_model_set(Store(published))
     models.resolve("default")
-    assert {key: failure.code for key, failure in models.failures.items()} == {
-        ("hostile", "1.0.0"): "unexpected_error"
-    }
+    failures = {key: failure.code for key, failure in models.failures.items()}
+    assert failures == {("hostile", "1.0.0"): "unexpected_error"}
     assert error.__name__ in models.failures["hostile", "1.0.0"].reason
 
 

@@ -154,9 +154,8 @@ def test_outliers_are_marked_with_reasons_in_words(bedroom: Board, api: httpx.Cl
     alarms = [one for one in answer["outliers"] if one["is_outlier"]]
     assert alarms, "the example has nothing wrong in it"
     marked = bedroom.page.locator("#board .object.outlier").all()
-    assert [str(one.get_attribute("aria-label")).split(",")[0] for one in marked] == [
-        one["object"] for one in alarms
-    ]
+    names = [str(one.get_attribute("aria-label")).split(",")[0] for one in marked]
+    assert names == [one["object"] for one in alarms]
     assert bedroom.edges == []
     expect(bedroom.page.locator("#alarms")).to_have_text(str(len(alarms)))
     bedroom.page.get_by_label("Sensitivity").select_option("high")

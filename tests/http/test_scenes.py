@@ -46,9 +46,8 @@ async def test_files_become_scenes(client: AsyncClient, tmp_path: Path, name: st
     fields = from_file(tmp_path / name, example.labels, scene=example.scene)
     assert found == json.loads(json.dumps(fields))
     notes = [one for one in answer["notes"] if one["scene"] == number]
-    assert [(one["detection"], one["reason"], one["detail"]) for one in notes] == [
-        tuple(note) for note in fields.notes[:16]
-    ]
+    listed = [(one["detection"], one["reason"], one["detail"]) for one in notes]
+    assert listed == [tuple(note) for note in fields.notes[:16]]
 
 
 @pytest.mark.parametrize("name", REFUSED)

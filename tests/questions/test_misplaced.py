@@ -223,9 +223,8 @@ def test_the_answer_names_the_moved_object_of_each_entry():
         ("monitor", "under", "desk", 20.0 * math.exp(-0.5)),
     ]
     for entry, (subject, relation, object_, odds) in zip(answer, expected, strict=True):
-        assert [entry[name] for name in ("subject", "relation", "object")] == [
-            subject, relation, object_,
-        ]  # fmt: skip
+        named = [entry[name] for name in ("subject", "relation", "object")]
+        assert named == [subject, relation, object_]
         assert entry["moved"] == "monitor"
         assert entry["probability"] == pytest.approx(odds / (1 + odds), rel=1e-4)
         assert entry["is_misplaced"]

@@ -121,9 +121,8 @@ def test_one_unreadable_folder_does_not_take_the_others_down(store, monkeypatch)
 
     monkeypatch.setattr(Path, "iterdir", deny)
     models = load_model_set(store)
-    assert models.failure.reason == (
-        "the folder of model 'other' cannot be read: Permission denied"
-    )
+    reason = "the folder of model 'other' cannot be read: Permission denied"
+    assert models.failure.reason == reason
     assert models.resolve("default").manifest.name == "tiny"
     with refused("unreadable"):
         models.resolve("other")

@@ -198,9 +198,7 @@ def test_supports_in_a_circle_are_found() -> None:
     assert support_cycle([*tower, (3, "desk", "box"), (0, "desk", "box")]) is None
     circle = support_cycle([*tower, (2, "desk", "book")])
     assert circle[0] == circle[-1]
-    assert {*pairwise(circle)} == {
-        ("book", "bag"), ("bag", "desk"), ("desk", "book"),
-    }  # fmt: skip
+    assert {*pairwise(circle)} == {("book", "bag"), ("bag", "desk"), ("desk", "book")}
 
 
 NAN = math.nan
