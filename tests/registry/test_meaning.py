@@ -90,9 +90,9 @@ def test_stored_scenes_show_no_word() -> None:
     stored = replace(weights, spec=spec, arrays=arrays)
     for V in (9 + 23, 9 + 24):
         larger = stored.enlarged(V, spec.C)
-        assert larger.scenes.shape == (2, V)
-        assert np.array_equal(larger.scenes[:, :9], stored.scenes)
-        assert not larger.scenes[:, 9:].any()
+        assert larger.chain_samples.shape == (2, V)
+        assert np.array_equal(larger.chain_samples[:, :9], stored.chain_samples)
+        assert not larger.chain_samples[:, 9:].any()
 
 
 def test_a_model_without_word_vectors_has_no_map() -> None:
