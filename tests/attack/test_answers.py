@@ -29,10 +29,8 @@ limited = client_of_service(max_answer_bytes=SMALL)
 def scene(objects: int, letter: str = "x", **parameters: Any) -> dict[str, Any]:
     """A scene whose ids have 128 characters."""
     ids = [f"{number}".rjust(128, letter) for number in range(objects)]
-    things = [
-        {"id": name, "label": label}
-        for name, label in zip(ids, islice(cycle(LABELS), objects), strict=True)
-    ]
+    labelled = zip(ids, islice(cycle(LABELS), objects), strict=True)
+    things = [{"id": name, "label": label} for name, label in labelled]
     return {"objects": things, **parameters}
 
 
@@ -143,10 +141,8 @@ async def test_a_batch_has_few_suggestions(client: AsyncClient) -> None:
 async def test_batch_searches(client: AsyncClient, calls: Counter[str], treatment: str) -> None:
     rng = Random(0)
     labels = ("".join(rng.choices(string.ascii_lowercase, k=12)) for _ in range(64 * 20))
-    scenes = [
-        {"objects": ["bed", *(next(labels) for _ in range(20))], "unknown_labels": treatment}
-        for _ in range(64)
-    ]
+    listed = [["bed", *(next(labels) for _ in range(20))] for _ in range(64)]
+    scenes = [{"objects": objects, "unknown_labels": treatment} for objects in listed]
     answer = await client.post("/missing/batch", json={"scenes": scenes})
     ignores = treatment in ("nearest-or-ignore", "by-meaning")
     assert {entry["status"] for entry in answer.json()["results"]} == {200 if ignores else 422}

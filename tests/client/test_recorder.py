@@ -176,10 +176,8 @@ FRAMES = [
 )
 def test_the_training_derives_the_relations_of_the_service(frame, places, turn):
     names = VOCABULARY.labels[:3]
-    boxes = [
-        box(name, x / 10, y / 10, z / 10, **turn)
-        for name, (x, y, z) in zip(names, places, strict=True)
-    ]
+    placed = zip(names, places, strict=True)
+    boxes = [box(name, x / 10, y / 10, z / 10, **turn) for name, (x, y, z) in placed]
     asked = request(*boxes, **frame)
     observed = read_scene(asked, VOCABULARY, Limits()).observed or []
     with TemporaryDirectory() as folder:

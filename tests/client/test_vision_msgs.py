@@ -30,10 +30,8 @@ UNTURNED = (0.0, 0.0, 0.0, 1.0)
 
 
 def pose(position: Any = (0.0, 0.0, 0.0), turn: Any = UNTURNED) -> dict[str, Any]:
-    return {
-        "position": dict(zip("xyz", position, strict=True)),
-        "orientation": dict(zip("xyzw", turn, strict=True)),
-    }
+    axes, quaternion = zip("xyz", position, strict=True), zip("xyzw", turn, strict=True)
+    return {"position": dict(axes), "orientation": dict(quaternion)}
 
 
 def result(class_id: Any, score: Any = 0.9, where: Any = None) -> dict[str, Any]:

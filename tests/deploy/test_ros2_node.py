@@ -143,10 +143,8 @@ def test_class_ids_need_a_label_map(run: Run, live: LiveService, recorded: Any) 
     running.hear("detections", recorded)
     running.wait_for("/diagnostics")
     assert running.status().message.startswith("MessageError: the class ids are numbers")
-    classes = [
-        new("VisionClass", class_id=int(number), class_name=name)
-        for name, number in numbers.items()
-    ]
+    pairs = numbers.items()
+    classes = [new("VisionClass", class_id=int(n), class_name=name) for name, n in pairs]
     running.hear("label_info", new("LabelInfo", class_map=classes))
     answer = running.answer(recorded)
     assert {entry["label"] for entry in answer["outliers"]["outliers"]} == {"desk", "chair"}

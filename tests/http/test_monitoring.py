@@ -45,10 +45,8 @@ OPERATIONS = (REPOSITORY / "docs" / "operations.md").read_text("utf-8")
 def documented_metrics() -> dict[str, tuple[str, set[str], str]]:
     """The kind, labels and meaning of every metric, as the documentation lists them."""
     rows = re.findall(r"^\| `(scene_\w+)` \| (\w+) \|(.*?)\| (.+?) \|$", OPERATIONS, re.MULTILINE)
-    listed = {
-        name: (kind, set(re.findall(r"`(\w+)`", labels)), meaning)
-        for name, kind, labels, meaning in rows
-    }
+    label = re.compile(r"`(\w+)`")
+    listed = {name: (kind, set(label.findall(labels)), text) for name, kind, labels, text in rows}
     assert len(listed) == len(rows)
     return listed
 

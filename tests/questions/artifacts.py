@@ -118,9 +118,8 @@ def random_machine(spec: MachineSpec, scale: float) -> BoltzmannMachine:
     if spec.T:
         units = spec.A * spec.V**2
         keys = torch.randperm(units, generator=generator)[: spec.T].sort().values
-        machine.set_triples(
-            torch.stack([keys // spec.V**2, keys // spec.V % spec.V, keys % spec.V], 1)
-        )
+        triples = torch.stack([keys // spec.V**2, keys // spec.V % spec.V, keys % spec.V], 1)
+        machine.set_triples(triples)
     random_weights(machine, generator, scale)
     return machine.eval()
 

@@ -205,10 +205,7 @@ def spoil(written: Path, change: Callable[[dict[str, Any]], object]) -> Artifact
     weights: dict[str, Any] = state()
     change(weights)
     replace_file(written, WEIGHTS, save(weights))
-    entries = {
-        name: {"dtype": array.dtype.name, "shape": list(array.shape)}
-        for name, array in weights.items()
-    }
+    entries = {k: {"dtype": one.dtype.name, "shape": list(one.shape)} for k, one in weights.items()}
     rewrite_manifest(written, lambda members: members.update(tensors=entries))
     return refusal(written)
 

@@ -127,10 +127,9 @@ async def test_work_in_a_thread_ends_the_wait_at_the_deadline(admission, begun):
 
     places = ticket(), ticket()
     calls = slow, lambda _: behind.append(1)
-    waits = [
-        asyncio.ensure_future(in_thread(call, place, admission.drawing))
-        for call, place in zip(calls, places, strict=True)
-    ]
+    pairs = zip(calls, places, strict=True)
+    running = (in_thread(call, place, admission.drawing) for call, place in pairs)
+    waits = [asyncio.ensure_future(one) for one in running]
     assert await asyncio.to_thread(begun.wait, PATIENCE)
     for place in places:
         place.deadline = monotonic() + 0.1
