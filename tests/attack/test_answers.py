@@ -29,10 +29,8 @@ limited = client_of_service(max_answer_bytes=SMALL)
 def scene(objects: int, letter: str = "x", **parameters: Any) -> dict[str, Any]:
     """A scene whose ids have 128 characters."""
     ids = [f"{number}".rjust(128, letter) for number in range(objects)]
-    things = [
-        {"id": name, "label": label}
-        for name, label in zip(ids, islice(cycle(LABELS), objects), strict=True)
-    ]
+    labelled = zip(ids, islice(cycle(LABELS), objects), strict=True)
+    things = [{"id": name, "label": label} for name, label in labelled]
     return {"objects": things, **parameters}
 
 
@@ -63,20 +61,16 @@ async def test_the_answer_to_a_batch_has_a_limit(shared_store: Path, replace: Re
     # The metrics of the model count only the answers that were sent.
     sent = sum(value for key, value in found.items() if key[0] == "scene_objects_total")
     assert sent == 23 * (computed - 1)
-    first, second = (
-        entry["problem"]["errors"][0] for entry in results[computed - 1 : computed + 1]
-    )
+    first, second = (one["problem"]["errors"][0] for one in results[computed - 1 : computed + 1])
     assert first["pointer"] == f"#/scenes/{computed - 1}/top_k"
     assert "Lower `top_k`" in first["message"]
     assert second["pointer"] == f"#/scenes/{computed}"
     assert "another request" in second["message"]
-    assert {entry["problem"]["type"] for entry in results[computed - 1 :]} == {
-        "/problems/answer-too-large"
-    }
+    types = {one["problem"]["type"] for one in results[computed - 1 :]}
+    assert types == {"/problems/answer-too-large"}
 
 
 def crowd(objects: int, letter: str = "😀") -> dict[str, Any]:
-    """Objects that all stand beside each other."""
     found = scene(objects, letter)
     for place, thing in enumerate(found["objects"]):
         thing["position"] = {"x": place % 16 * 0.02, "y": place // 16 * 0.02, "z": 0.0}
@@ -96,13 +90,7 @@ DRAWN = {"objects": LABELS[:8], "steps": 2, "seed": 0}
         ("generate", [DRAWN | {"count": count} for count in (1, 64)], "count"),
     ],
 )
-async def test_single_answers_have_a_limit(
-    client: AsyncClient,
-    limited: AsyncClient,
-    question: str,
-    bodies: list[dict[str, Any]],
-    parameter: str,
-) -> None:
+async def test_single_answers_have_a_limit(client, limited, question, bodies, parameter):
     small, large = [(await client.post(f"/{question}", json=body)).content for body in bodies]
     assert len(small) <= SMALL < len(large)
     assert len((await limited.post(f"/{question}", json=bodies[0])).content) == len(small)
@@ -118,7 +106,6 @@ MAX_SUGGESTED, MAX_MAPPED = 32, 256
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
-    """The number of calls of each search."""
     found: Counter[str] = Counter()
 
     def count(owner: Any, name: str) -> None:
@@ -154,10 +141,8 @@ async def test_a_batch_has_few_suggestions(client: AsyncClient) -> None:
 async def test_batch_searches(client: AsyncClient, calls: Counter[str], treatment: str) -> None:
     rng = Random(0)
     labels = ("".join(rng.choices(string.ascii_lowercase, k=12)) for _ in range(64 * 20))
-    scenes = [
-        {"objects": ["bed", *(next(labels) for _ in range(20))], "unknown_labels": treatment}
-        for _ in range(64)
-    ]
+    listed = [["bed", *(next(labels) for _ in range(20))] for _ in range(64)]
+    scenes = [{"objects": objects, "unknown_labels": treatment} for objects in listed]
     answer = await client.post("/missing/batch", json={"scenes": scenes})
     ignores = treatment in ("nearest-or-ignore", "by-meaning")
     assert {entry["status"] for entry in answer.json()["results"]} == {200 if ignores else 422}
@@ -180,9 +165,7 @@ async def test_unknown_ends_cost_little(client: AsyncClient, calls: Counter[str]
     ("question", "field", "count"),
     [("missing", "objects", 256), ("missing", "candidates", 4096), ("rooms", "candidates", 4096)],
 )
-async def test_unknown_labels_stop_early(
-    client: AsyncClient, calls: Counter[str], question: str, field: str, count: int
-) -> None:
+async def test_unknown_labels_stop_early(client, calls, question, field, count):
     name = "a/" + "b/" * (40 if field == "objects" else 3)
     body = {"objects": ["bed"]} | {field: [f"{name}{number}" for number in range(count)]}
     document = problem(await client.post(f"/{question}", json=body), 422, "unknown-labels")

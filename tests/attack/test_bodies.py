@@ -31,20 +31,16 @@ JSON = {"Content-Type": "application/json"}
         ("outliers/batch", "scenes", {}, 256),
     ],
 )
-async def test_entries_are_counted_before_validation(
-    client: AsyncClient, path: str, field: str, entry: Any, most: int
-) -> None:
+async def test_entries_are_counted_before_validation(client, path, field, entry, most):
     # pydantic would report the unknown field.
     body = {"objects": ["bed"], "unknown": 1, field: [entry] * (most + 1)}
     document = problem(await client.post(f"/{path}", json=body), 422, "invalid-request")
-    assert [(error["pointer"], error["message"]) for error in document["errors"]] == [
-        (f"#/{field}", f"must have at most {most} entries")
-    ]
+    errors = [(error["pointer"], error["message"]) for error in document["errors"]]
+    assert errors == [(f"#/{field}", f"must have at most {most} entries")]
 
 
 @pytest.fixture
 def parsed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """The length of each text that the JSON parser reads."""
     lengths = list[int]()
 
     def counted(text: str | bytes, **options: Any) -> Any:
@@ -60,9 +56,7 @@ def batch(entry: bytes, size: int = 2**21) -> bytes:
 
 
 @pytest.mark.parametrize("entry", [b"[]", b"{}", b"[" * 99 + b"]" * 99])
-async def test_containers_are_counted_before_parsing(
-    client: AsyncClient, parsed: list[int], entry: bytes
-) -> None:
+async def test_containers_are_counted_before_parsing(client, parsed, entry):
     dense = b'{"scenes":[{"objects":["bed"],"candidates":[%b]}]}' % b",".join([entry] * 2**17)
     for body in (batch(entry), dense[: 2**21]):
         response = await client.post("/missing/batch", content=body, headers=JSON)
@@ -71,9 +65,7 @@ async def test_containers_are_counted_before_parsing(
 
 
 @pytest.mark.parametrize("entry", [b"1", b'""', b"9" * 4000])
-async def test_a_large_batch_is_parsed_scene_by_scene(
-    client: AsyncClient, parsed: list[int], entry: bytes
-) -> None:
+async def test_a_large_batch_is_parsed_scene_by_scene(client, parsed, entry):
     response = await client.post("/missing/batch", content=batch(entry), headers=JSON)
     document = problem(response, 422, "invalid-request")
     assert document["errors"][0]["message"] == "must have at most 256 entries"
@@ -115,6 +107,7 @@ async def test_the_body_of_one_scene_has_a_limit_of_its_own(client: AsyncClient)
 
 
 UNKNOWN = {f"u{k}": 0 for k in range(30)}
+RELATIONS = [["a", "left", "b"]] * 4096
 AT = {"x": 1, "y": 0, "z": 0}
 
 
@@ -122,16 +115,10 @@ AT = {"x": 1, "y": 0, "z": 0}
     ("body", "first", "last"),
     [
         ({"objects": ["bed", 7, *[{"label": "bed"} | UNKNOWN] * 200]}, "objects/1", "objects/3/u0"),
-        (
-            {"objects": ["bed"], "relations": [["a", "left", "b"]] * 4096},
-            "relations/0/0",
-            "relations/15/2",
-        ),
+        ({"objects": ["bed"], "relations": RELATIONS}, "relations/0/0", "relations/15/2"),
     ],
 )
-async def test_a_request_has_at_most_32_errors(
-    client: AsyncClient, body: dict[str, Any], first: str, last: str
-) -> None:
+async def test_a_request_has_at_most_32_errors(client, body, first, last):
     document = problem(await client.post("/missing", json=body), 422, "invalid-request")
     pointers = [error["pointer"] for error in document["errors"]]
     assert (len(pointers), pointers[0], pointers[-1]) == (32, f"#/{first}", f"#/{last}")
@@ -151,12 +138,8 @@ async def test_a_request_has_at_most_32_errors(
 )
 @pytest.mark.parametrize("question", ["outliers", "generate"])
 async def test_large_scenes_leave_the_event_loop(
-    shared_store: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    question: str,
-    scene: dict[str, Any],
-    is_large: bool,
-) -> None:
+    shared_store, monkeypatch, question, scene, is_large
+):
     threads = []
 
     def read(*args: Any, **options: Any) -> Any:

@@ -60,9 +60,7 @@ def _patterns_of(module: Any) -> Iterator[tuple[str, re.Pattern[Any], str]]:
             yield f"{module.__name__}:{node.lineno}", pattern, ast.unparse(node.func)[3:]
 
 
-PATTERNS: Final = list(
-    {(pattern, m): (place, pattern, m) for place, pattern, m in patterns()}.values()
-)
+PATTERNS: Final = list({(one, m): (place, one, m) for place, one, m in patterns()}.values())
 
 
 def characters(pattern: re.Pattern[Any]) -> list[str]:
@@ -83,7 +81,6 @@ def worst_texts(pattern: re.Pattern[Any]) -> Iterator[tuple[str, str, str]]:
 
 
 def nanoseconds(run: Callable[[], Any], repeats: int) -> int:
-    """Return the processor time of a call, the least of some."""
     times = []
     for _ in range(repeats):
         began = thread_time_ns()
@@ -126,7 +123,6 @@ PLAIN_LABELS: Final = ("zxqvwkpm" * 13, "zxqvw kpm " * 10, "Küchengroßgerät "
 
 
 def steps(call: Callable[[], Any]) -> int:
-    """Return how many instructions of Python a call takes."""
     count = 0
 
     def trace(frame: FrameType, event: str, _: object) -> Any:
@@ -146,7 +142,6 @@ def steps(call: Callable[[], Any]) -> int:
 
 
 def fresh() -> Vocabulary:
-    """Return a vocabulary that remembers no label."""
     return Vocabulary(VOCABULARY.objects, VOCABULARY.room_types, VOCABULARY.room_aliases)
 
 
@@ -219,9 +214,8 @@ def test_the_memory_for_labels_is_bounded(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 async def test_a_long_word_in_a_path_is_refused(client: AsyncClient) -> None:
-    document = problem(
-        await client.get(f"/models/default/vocabulary/the{'_' * 8000}"), 422, "invalid-request"
-    )
+    answer = await client.get(f"/models/default/vocabulary/the{'_' * 8000}")
+    document = problem(answer, 422, "invalid-request")
     assert "100 characters" in document["detail"]
     longest = "the" + "_" * (MAX_LABEL - 3)
     answer = await client.get(f"/models/default/vocabulary/{longest}")

@@ -92,9 +92,8 @@ def test_hostile_versions(published: Path, spoil: Callable[[Path], None], code: 
     spoil(published)
     with at_most(32):
         models = load_model_set(Store(published))
-    assert {key: failure.code for key, failure in models.failures.items()} == {
-        ("hostile", "1.0.0"): code
-    }
+    failures = {key: failure.code for key, failure in models.failures.items()}
+    assert failures == {("hostile", "1.0.0"): code}
     models.resolve("default")
 
 
@@ -110,9 +109,7 @@ async def test_a_loaded_version_stays_usable(published: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [OverflowError, MemoryError, RecursionError, KeyError])
-def test_an_error_refuses_one_version(
-    published: Path, monkeypatch: pytest.MonkeyPatch, error: type[Exception]
-) -> None:
+def test_an_error_refuses_one_version(published, monkeypatch, error):
     load = Store.load
 
     def fail(self: Store, name: str, *rest: object) -> object:
@@ -123,9 +120,8 @@ def test_an_error_refuses_one_version(
     monkeypatch.setattr(Store, "load", fail)
     models = load_model_set(Store(published))
     models.resolve("default")
-    assert {key: failure.code for key, failure in models.failures.items()} == {
-        ("hostile", "1.0.0"): "unexpected_error"
-    }
+    failures = {key: failure.code for key, failure in models.failures.items()}
+    assert failures == {("hostile", "1.0.0"): "unexpected_error"}
     assert error.__name__ in models.failures["hostile", "1.0.0"].reason
 
 

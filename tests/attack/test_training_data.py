@@ -4,7 +4,6 @@ import gzip
 import struct
 import tracemalloc
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -93,13 +92,7 @@ def nested(depth: int) -> bytes:
     ],
     ids=["text", "cells", "structs", "nested structs", "deep", "torn"],
 )
-def test_the_size_of_a_mat_file_is_limited(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    variable: Callable[[], bytes],
-    problem: str,
-    packed: bool,
-) -> None:
+def test_the_size_of_a_mat_file_is_limited(tmp_path, monkeypatch, variable, problem, packed):
     monkeypatch.setattr(sunrgbd_mat, "MAX_BYTES", 2**24)
     content = variable()
     if packed:

@@ -106,3 +106,9 @@ def open_board(chromium: Browser, shipped: LiveService) -> Iterator[Callable[...
         page.context.unroute_all(behavior="wait")
         page.context.close()
         assert found == []
+
+
+@pytest.fixture
+def board(open_board: Callable[..., Board]) -> Board:
+    """The page with a desk and a chair."""
+    return open_board()

@@ -28,38 +28,31 @@ class Board:
     # ------------------------------------------------------------------------------ doing
 
     def click(self, button: str) -> None:
-        """Click the button with this name."""
         self.page.get_by_role("button", name=button).click()
         self.settle()
 
     def press(self, thing: str, *keys: str) -> None:
-        """Press keys while an object of the board has the focus."""
         self.thing(thing).focus()
         for key in keys:
             self.page.keyboard.press(key)
         self.settle()
 
     def put(self, text: str) -> None:
-        """Import a scene."""
         self.click("Import, export")
         self.page.get_by_label("Scene, JSON").fill(text)
         self.click("Put on the board")
 
     def exported(self) -> dict[str, Any]:
-        """The scene as the dialog shows it."""
         self.click("Import, export")
         scene: dict[str, Any] = json.loads(self.page.get_by_label("Scene, JSON").input_value())
         self.click("Close")
         return scene
 
     def use_positions(self) -> None:
-        """Let positions count as evidence."""
         self.page.get_by_label("Positions count as evidence").check()
         self.settle()
 
     def alter(self, question: str, change: Callable[[Any], Any]) -> None:
-        """Let the page receive changed answers to a question."""
-
         def altered(route: Route) -> None:
             response = route.fetch()
             route.fulfill(response=response, json=change(response.json()))
@@ -74,19 +67,16 @@ class Board:
         self.settle()
 
     def tab(self, name: str) -> None:
-        """Go to a question."""
         self.page.get_by_role("tab", name=name).click()
         self.settle()
 
     # ---------------------------------------------------------------------------- seeing
 
     def thing(self, name: str) -> Locator:
-        """An object of the board."""
         return self.page.locator(f'#board .object[aria-label^="{name},"]')
 
     @property
     def things(self) -> list[str]:
-        """What the list shows."""
         return self.page.locator("#list .name b").all_text_contents()
 
     @property
@@ -106,7 +96,6 @@ class Board:
 
     @property
     def announced(self) -> str:
-        """The last text for screen readers."""
         return plain(self.page.locator("#live").text_content())
 
     def column(self, question: str) -> Locator:
@@ -119,11 +108,9 @@ class Board:
         return [plain(text) for text in texts]
 
     def curl(self, question: str) -> str:
-        """The command that the page shows."""
         return self.column(question).locator("pre").first.text_content() or ""
 
     def python(self, question: str) -> str:
-        """The program that the page shows."""
         return self.column(question).locator("pre").nth(1).text_content() or ""
 
     @property
@@ -142,17 +129,14 @@ OpenBoard = Callable[..., Board]
 
 
 def link_to(scene: dict[str, Any]) -> str:
-    """The fragment of an address that holds a scene."""
     packer = zlib.compressobj(wbits=-15)
     packed = packer.compress(json.dumps(scene).encode()) + packer.flush()
     return "#scene=" + base64.urlsafe_b64encode(packed).decode().rstrip("=")
 
 
 def body_of(command: str) -> dict[str, Any]:
-    """What a curl command posts."""
     words = shlex.split(command)
-    found: dict[str, Any] = json.loads(words[words.index("-d") + 1])
-    return found
+    return json.loads(words[words.index("-d") + 1])
 
 
 def plain(text: str | None) -> str:
@@ -161,7 +145,6 @@ def plain(text: str | None) -> str:
 
 
 def percent(probability: float) -> str:
-    """A probability as the page writes it."""
     if 0 < probability < 0.01:
         return "< 1 %"
     return f"{int(100 * probability + 0.5)} %"

@@ -11,11 +11,8 @@ pytestmark = pytest.mark.system
 
 
 def focus(board: Board) -> str:
-    """What has the focus: its name, or its text."""
-    found: str = board.page.evaluate(
-        "document.activeElement.getAttribute('aria-label') ?? document.activeElement.innerText"
-    )
-    return found
+    name = "document.activeElement.getAttribute('aria-label') ?? document.activeElement.innerText"
+    return board.page.evaluate(name)
 
 
 def complaints(board: Board) -> list[str]:
@@ -60,8 +57,7 @@ def test_axe_finds_nothing_in_any_state(open_board: OpenBoard, scheme: str) -> N
 
 
 @pytest.mark.slow
-def test_everything_can_be_done_by_keyboard(open_board: OpenBoard) -> None:
-    board = open_board()
+def test_everything_can_be_done_by_keyboard(board: Board) -> None:
     page = board.page
     press = page.keyboard.press
     page.evaluate("document.activeElement.blur()")
@@ -122,8 +118,7 @@ def test_everything_can_be_done_by_keyboard(open_board: OpenBoard) -> None:
     assert focus(board) != ""
 
 
-def test_answers_and_movements_are_announced(open_board: OpenBoard, api: httpx.Client) -> None:
-    board = open_board()
+def test_answers_and_movements_are_announced(board: Board, api: httpx.Client) -> None:
     best = api.post("/missing", json=board.scene).json()["missing"][0]["label"]
     assert f"Most likely missing: {best}" in board.announced
     board.thing("chair").focus()

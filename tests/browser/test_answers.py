@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import expect
 
 from tests.browser.driving import Board, OpenBoard, body_of, percent
-from tests.conftest import FindTool, run_program
+from tests.conftest import run_program
 
 pytestmark = pytest.mark.system
 
@@ -73,14 +73,12 @@ def test_a_ghost_becomes_an_object_where_it_was_drawn(bedroom: Board) -> None:
     ghost = bedroom.page.locator("#board .ghost").first
     label = ghost.locator("text").text_content() or ""
     drawn = ghost.locator("rect").bounding_box()
-    assert drawn is not None
     ghost.press("Enter")
     bedroom.settle()
     assert bedroom.things[-1] == label
     box = bedroom.thing(label).locator(".box").bounding_box()
     focused = bedroom.page.evaluate("document.activeElement.getAttribute('aria-label')")
     assert focused.startswith(f"{label},")
-    assert box is not None
     # The view may have grown by what is suggested next; the proportions stay.
     assert box["width"] / box["height"] == pytest.approx(drawn["width"] / drawn["height"], rel=0.05)
     assert all(label != row.split(" ")[0] for row in bedroom.rows("missing"))
@@ -97,9 +95,7 @@ def test_the_menu_of_an_object(bedroom: Board, api: httpx.Client) -> None:
         f"{one['label']} {percent(one['probability'])}" for one in answer["missing"]
     ]
     expect(bedroom.page.locator("#at-words")).to_have_text("Missing on top of nightstand")
-    names = [
-        ghost.get_attribute("aria-label") for ghost in bedroom.page.locator("#board .ghost").all()
-    ]
+    names = [one.get_attribute("aria-label") for one in bedroom.page.locator("#board .ghost").all()]
     assert all("on top of nightstand" in str(name) for name in names)
     bedroom.click("Anywhere")
     assert "at" not in bedroom.body("missing")
@@ -152,16 +148,14 @@ def test_outliers_are_marked_with_reasons_in_words(bedroom: Board, api: httpx.Cl
         assert percent(one["probability"]) in row
         assert ("does not belong" in row) == one["is_outlier"]
         assert reasons(one["because"], -1) in row
-        assert ("usually seen with " + ", ".join(one["usually_with"]) in row) or not one[
-            "is_outlier"
-        ]
+        usual = "usually seen with " + ", ".join(one["usually_with"])
+        assert usual in row or not one["is_outlier"]
         assert not re.search(r"[+−-]\d", row)
     alarms = [one for one in answer["outliers"] if one["is_outlier"]]
     assert alarms, "the example has nothing wrong in it"
     marked = bedroom.page.locator("#board .object.outlier").all()
-    assert [str(one.get_attribute("aria-label")).split(",")[0] for one in marked] == [
-        one["object"] for one in alarms
-    ]
+    names = [str(one.get_attribute("aria-label")).split(",")[0] for one in marked]
+    assert names == [one["object"] for one in alarms]
     assert bedroom.edges == []
     expect(bedroom.page.locator("#alarms")).to_have_text(str(len(alarms)))
     bedroom.page.get_by_label("Sensitivity").select_option("high")
@@ -208,9 +202,7 @@ def test_relations_are_edges(bedroom: Board, api: httpx.Client) -> None:
         assert ("observed" in row) == one["observed"]
         kinds.add("holds" if one["observed"] else "expected")
     assert {kind for kind, _ in bedroom.edges} == kinds >= {"holds", "expected"}
-    texts = {
-        f"{SPOKEN[one['relation']]} {percent(one['probability'])}" for one in answer["relations"]
-    }
+    texts = {f"{SPOKEN[e['relation']]} {percent(e['probability'])}" for e in answer["relations"]}
     # Between an object and another one on top of it there is no room for words.
     words = {text for kind, text in bedroom.edges if text and kind != "disagrees"}
     assert words
@@ -258,9 +250,7 @@ def test_aliases_of_room_types(open_board: OpenBoard, api: httpx.Client) -> None
     expect(board.page.locator("#room option:checked")).to_have_text(re.compile(r"Living Room \d"))
 
 
-def test_the_shown_calls_give_the_shown_answer(
-    open_board: OpenBoard, api: httpx.Client, find_tool: FindTool
-) -> None:
+def test_the_shown_calls_give_the_shown_answer(open_board, api, find_tool):
     find_tool("curl")
     board = open_board(permissions=["clipboard-read", "clipboard-write"])
     programs = ("sh", board.curl("missing")), (sys.executable, board.python("missing"))
@@ -290,8 +280,7 @@ def request(board: Board) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_a_drawn_scene_can_be_kept(open_board: OpenBoard, api: httpx.Client) -> None:
-    board = open_board()
+def test_a_drawn_scene_can_be_kept(board: Board, api: httpx.Client) -> None:
     board.page.locator("#room").select_option("kitchen")
     board.tab("Generate")
     seen = []
@@ -339,9 +328,8 @@ def suggest(board: Board, relation: str, anchor: str, *labels: str) -> dict[str,
     return place
 
 
-def test_a_suggestion_at_another_place_or_none_says_so(open_board: OpenBoard) -> None:
+def test_a_suggestion_at_another_place_or_none_says_so(board: Board) -> None:
     far = {"mean": {"x": 9.0, "y": 0.0, "z": 0.5}, "std": dict.fromkeys("xyz", 0.2), "scenes": 9}
-    board = open_board()
     place = suggest(board, "on-top", "desk", "cup")
     place["offset"] = far
     board.add("laptop")

@@ -7,7 +7,7 @@ from urllib.parse import urlsplit
 import pytest
 from playwright.sync_api import expect
 
-from tests.browser.driving import Board, OpenBoard
+from tests.browser.driving import Board
 from tests.client.scene_files import EXAMPLES
 
 pytestmark = pytest.mark.system
@@ -16,7 +16,6 @@ QUESTIONS = {"missing", "outliers", "relations", "rooms"}
 
 
 def choose(board: Board, path: Path) -> None:
-    """Open a file in the dialog."""
     board.page.get_by_role("button", name="Import, export").click()
     board.page.get_by_label("Open a file").set_input_files(path)
 
@@ -40,20 +39,13 @@ LINE = {"scene_id": "a", "objects": [{"id": 0, "label": "bed"}], "counts": {"bed
         ("request.json", json.dumps(REQUEST, indent=1), QUESTIONS),
         ("labels.json", '["bed", "lamp"]', QUESTIONS),
         ("scenes.jsonl", json.dumps(LINE) + "\n\n", QUESTIONS),
-        (
-            "scenes.jsonl",
-            f"{json.dumps(LINE)}\n{json.dumps(LINE)}\n",
-            QUESTIONS | {"outliers/batch"},
-        ),
+        ("scenes.jsonl", f"{json.dumps(LINE)}\n" * 2, QUESTIONS | {"outliers/batch"}),
         # A recording whose last line is cut off, and a broken request.
         ("scenes.jsonl", f"{json.dumps(LINE)}\n{json.dumps(LINE)[:-9]}", QUESTIONS),
         ("request.json", json.dumps(REQUEST)[:-1], set()),
     ],
 )
-def test_requests_stay_in_the_browser(
-    open_board: OpenBoard, tmp_path: Path, name: str, content: str, routes: set[str]
-) -> None:
-    board = open_board()
+def test_requests_stay_in_the_browser(board, tmp_path, name, content, routes):
     sent = posted(board)
     (tmp_path / name).write_text(content)
     choose(board, tmp_path / name)
@@ -69,8 +61,7 @@ def test_requests_stay_in_the_browser(
 @pytest.mark.parametrize(
     "name", ["detections.csv", "labels.txt", "detection3d.json", "moveit.json"]
 )
-def test_the_service_reads_other_formats(open_board: OpenBoard, tmp_path: Path, name: str) -> None:
-    board = open_board()
+def test_the_service_reads_other_formats(board: Board, tmp_path: Path, name: str) -> None:
     sent = posted(board)
     (tmp_path / name).write_text(EXAMPLES[name].text, "utf-8")
     choose(board, tmp_path / name)
@@ -84,8 +75,7 @@ def test_the_service_reads_other_formats(open_board: OpenBoard, tmp_path: Path, 
     assert [thing["id"] for thing in board.exported()["objects"]] == names
 
 
-def test_scenes_and_class_ids_of_a_file(open_board: OpenBoard) -> None:
-    board = open_board()
+def test_scenes_and_class_ids_of_a_file(board: Board) -> None:
     page = board.page
     sent = posted(board)
     results = json.loads(EXAMPLES["coco_results.json"].text)
@@ -111,8 +101,8 @@ def test_scenes_and_class_ids_of_a_file(open_board: OpenBoard) -> None:
     assert board.things == ["stool_1"]
 
 
-def test_a_large_file_is_read_without_showing_it(open_board: OpenBoard, tmp_path: Path) -> None:
-    page = (board := open_board()).page
+def test_a_large_file_is_read_without_showing_it(board: Board, tmp_path: Path) -> None:
+    page = board.page
     path = tmp_path / "large.json"
     path.write_text(json.dumps(["bed", "lamp"]) + " " * 2**21)
     choose(board, path)

@@ -47,7 +47,6 @@ def recorded(api: httpx.Client, tmp_path: Path) -> Path:
 
 
 def choose(board: Board, file: Path, line: int) -> None:
-    """Open a line of a file."""
     board.click("Import, export")
     board.page.locator("#upload").set_input_files(file)
     board.page.locator("#which").fill(str(line))
@@ -55,7 +54,6 @@ def choose(board: Board, file: Path, line: int) -> None:
 
 
 def downloaded(board: Board, tmp_path: Path, confirmed: int, name: str = "scenes.jsonl") -> Path:
-    """The opened file with its confirmed scenes."""
     board.click("Import, export")
     button = board.page.get_by_role("button", name=f"Download {name} ({confirmed} confirmed)")
     with board.page.expect_download() as download:
@@ -72,14 +70,12 @@ def lines(file: Path) -> list[Any]:
 
 
 def misplace(board: Board, subject: str, relation: str, other: str) -> None:
-    """Let the page receive one misplaced relation."""
     wrong = {"subject": subject, "relation": relation, "object": other, "log_odds": -3.0}
     wrong |= {"probability": 0.9, "is_misplaced": True, "moved": None, "expected": None}
     board.alter("outliers", lambda found: found | {"misplaced": [wrong]})
 
 
-def test_a_confirmed_scene_is_marked(open_board: OpenBoard, recorded: Path, tmp_path: Path) -> None:
-    board = open_board()
+def test_a_confirmed_scene_is_marked(board: Board, recorded: Path, tmp_path: Path) -> None:
     choose(board, recorded, 2)
     board.tab("Wrong")
     confirmed = board.page.get_by_text("Confirmed scene.")
@@ -107,8 +103,7 @@ def test_a_confirmed_scene_is_marked(open_board: OpenBoard, recorded: Path, tmp_
     assert downloaded(board, tmp_path, 1).read_text("utf-8") == file.read_text("utf-8")
 
 
-def test_an_intruder_is_removed(open_board: OpenBoard, recorded: Path, tmp_path: Path) -> None:
-    board = open_board()
+def test_an_intruder_is_removed(board: Board, recorded: Path, tmp_path: Path) -> None:
     choose(board, recorded, 2)
     board.press("toilet (track_5)", "Delete")
     board.click("This scene is right")
@@ -122,8 +117,7 @@ def test_an_intruder_is_removed(open_board: OpenBoard, recorded: Path, tmp_path:
     assert after == [before[0], kept, before[2]]
 
 
-def test_missing_objects_are_added(open_board: OpenBoard, recorded: Path, tmp_path: Path) -> None:
-    board = open_board()
+def test_missing_objects_are_added(board: Board, recorded: Path, tmp_path: Path) -> None:
     choose(board, recorded, 1)
     label = board.page.get_by_role("button", name="Is there: ").first.get_attribute("aria-label")
     added = (label or "").removeprefix("Is there: ")
@@ -174,8 +168,7 @@ def test_scenes_of_the_page_stay_in_the_browser(open_board: OpenBoard, tmp_path:
     assert board.page.evaluate("Object.keys(localStorage)") == []
 
 
-def test_alarms_need_a_confirmation(open_board: OpenBoard, recorded: Path, tmp_path: Path) -> None:
-    board = open_board()
+def test_alarms_need_a_confirmation(board: Board, recorded: Path, tmp_path: Path) -> None:
     misplace(board, "track_0", "left", "track_1")
     choose(board, recorded, 2)
     board.tab("Wrong")
@@ -192,8 +185,7 @@ def test_alarms_need_a_confirmation(open_board: OpenBoard, recorded: Path, tmp_p
     assert "toilet" not in [thing["label"] for thing in after[1]["objects"]]
 
 
-def test_the_list_of_scenes_marks_alarms(open_board: OpenBoard, recorded: Path) -> None:
-    board = open_board()
+def test_the_list_of_scenes_marks_alarms(board: Board, recorded: Path) -> None:
     choose(board, recorded, 1)
     scenes, status = board.page.locator("#scenes-of-file"), board.page.locator("#file-status")
     first, second, _ = (line["scene_id"] for line in lines(recorded))
@@ -214,8 +206,7 @@ def test_the_list_of_scenes_marks_alarms(open_board: OpenBoard, recorded: Path) 
     assert any("confirmed" in row for row in board.rows("outliers") if "toilet" in row)
 
 
-def test_additions_are_confirmed(open_board: OpenBoard, recorded: Path, tmp_path: Path) -> None:
-    board = open_board()
+def test_additions_are_confirmed(board: Board, recorded: Path, tmp_path: Path) -> None:
     choose(board, recorded, 1)
     board.add("oven")
     board.tab("Wrong")
@@ -234,21 +225,18 @@ def test_additions_are_confirmed(open_board: OpenBoard, recorded: Path, tmp_path
     assert sum("confirmed" in row for row in board.rows("outliers")) == 4
 
 
-def test_a_download_has_one_file(open_board: OpenBoard, recorded: Path, tmp_path: Path) -> None:
+def test_a_download_has_one_file(board: Board, recorded: Path, tmp_path: Path) -> None:
     first, second = tmp_path / "flat.jsonl", tmp_path / "office.jsonl"
     first.write_text(recorded.read_text("utf-8"), "utf-8")
     scenes = [{"scene_id": name, "objects": ["desk", "lamp"]} for name in "ab"]
     second.write_text("".join(f"{json.dumps(scene)}\n" for scene in scenes), "utf-8")
-    board = open_board()
     choose(board, first, 1)
     board.click("This scene is right")
     choose(board, second, 2)
     board.click("This scene is right")
     saved = lines(downloaded(board, tmp_path, 1, "office.jsonl"))
-    assert [(line["scene_id"], "confirmed" in line) for line in saved] == [
-        ("a", False),
-        ("b", True),
-    ]
+    confirmed = [(line["scene_id"], "confirmed" in line) for line in saved]
+    assert confirmed == [("a", False), ("b", True)]
     # A scene that is drawn by hand goes with the opened file.
     board.click("Clear")
     board.add("sofa")
@@ -282,8 +270,7 @@ def test_the_selected_object_is_visible_in_a_long_list(open_board: OpenBoard) ->
 
 
 @pytest.mark.parametrize("width", [1300, 390])
-def test_the_buttons_are_accessible(open_board: OpenBoard, recorded: Path, width: int) -> None:
-    board = open_board()
+def test_the_buttons_are_accessible(board: Board, recorded: Path, width: int) -> None:
     board.page.set_viewport_size({"width": width, "height": 900})
     choose(board, recorded, 2)
     for tab, button in (("Wrong", "Belongs here: toilet"), ("Missing", "Is there: ")):
@@ -298,9 +285,8 @@ def test_the_buttons_are_accessible(open_board: OpenBoard, recorded: Path, width
 
 
 @pytest.mark.parametrize("dismissed", [True, False])
-def test_an_open_page_notices_a_new_model(open_board: OpenBoard, dismissed: bool) -> None:
+def test_an_open_page_notices_a_new_model(board: Board, dismissed: bool) -> None:
     """The page lists the models again when its window gets the focus."""
-    board = open_board()
     choice = board.page.locator("#model option", has_text="home 1.0.0")
     expect(choice).to_have_count(0)
 
@@ -325,8 +311,7 @@ def test_an_open_page_notices_a_new_model(open_board: OpenBoard, dismissed: bool
     expect(news).to_be_hidden()
 
 
-def test_an_answer_of_another_version_reloads_the_models(open_board: OpenBoard) -> None:
-    board = open_board()
+def test_an_answer_of_another_version_reloads_the_models(board: Board) -> None:
 
     def promoted(route: Route) -> None:
         response = route.fetch()

@@ -16,13 +16,11 @@ pytestmark = pytest.mark.system
 
 
 def place(board: Board, name: str, question: str = "missing") -> tuple[float, float, float]:
-    """The centre of an object in the request."""
     (found,) = [thing for thing in board.body(question)["objects"] if thing["id"] == name]
     return tuple(found["position"][axis] for axis in "xyz")
 
 
-def test_an_object_is_found_by_any_of_its_names(open_board: OpenBoard) -> None:
-    board = open_board()
+def test_an_object_is_found_by_any_of_its_names(board: Board) -> None:
     box = board.page.get_by_role("combobox", name="Add an object")
     box.fill("trash can")
     options = board.page.locator("#found [role=option]")
@@ -39,14 +37,11 @@ def test_an_object_is_found_by_any_of_its_names(open_board: OpenBoard) -> None:
     assert board.things[-1] == "chair_2", "a second object of a class has a name of its own"
 
 
-def test_an_object_can_be_dropped_where_it_stands(open_board: OpenBoard, api: httpx.Client) -> None:
-    board = open_board()
+def test_an_object_can_be_dropped_where_it_stands(board: Board, api: httpx.Client) -> None:
     board.page.get_by_role("combobox", name="Add an object").fill("lamp")
     option = board.page.get_by_role("option", name="lamp", exact=True)
     desk = board.thing("desk").locator(".box").bounding_box()
     svg = board.page.locator("#board").bounding_box()
-    assert desk is not None
-    assert svg is not None
     at = {"x": desk["x"] - svg["x"] + 20, "y": desk["y"] - svg["y"] + desk["height"] / 2}
     option.drag_to(board.page.locator("#board"), target_position=at)
     board.settle()
@@ -55,13 +50,11 @@ def test_an_object_can_be_dropped_where_it_stands(open_board: OpenBoard, api: ht
     assert 0.5 < y < 0.8
     assert z > 0.74
     answer = api.post("/outliers", json=board.scene).json()
-    assert {"subject": "lamp", "relation": "on-top", "object": "desk"} in answer[
-        "observed_relations"
-    ]
+    seen = answer["observed_relations"]
+    assert {"subject": "lamp", "relation": "on-top", "object": "desk"} in seen
 
 
-def test_objects_on_a_support_move_with_it(open_board: OpenBoard) -> None:
-    board = open_board()
+def test_objects_on_a_support_move_with_it(board: Board) -> None:
     lamp = {"id": "lamp", "label": "lamp", "position": {"x": 2, "y": 0.5, "z": 0.94}}
     board.put(json.dumps({"objects": [*board.exported()["objects"], lamp]}))
     before, desk = place(board, "lamp"), place(board, "desk")
@@ -70,8 +63,7 @@ def test_objects_on_a_support_move_with_it(open_board: OpenBoard) -> None:
     assert place(board, "lamp") == pytest.approx((before[0], before[1] - 0.5, before[2]))
 
 
-def test_numbers_can_be_typed(open_board: OpenBoard) -> None:
-    board = open_board()
+def test_numbers_can_be_typed(board: Board) -> None:
     board.page.get_by_role("button", name="chair", exact=False).first.click()
     form = board.page.locator("#properties")
     form.get_by_label("ahead (x)").fill("1.25")
@@ -136,8 +128,7 @@ def test_a_link_holds_the_scene(open_board: OpenBoard) -> None:
     expect(board.page.locator("#share-done")).to_contain_text("copied")
     link = board.page.evaluate("navigator.clipboard.readText()")
     assert "#scene=" in link
-    other = open_board(scene=None, url=link)
-    assert other.exported() == scene
+    assert open_board(scene=None, url=link).exported() == scene
 
 
 @pytest.mark.parametrize("is_bomb", [False, True])
@@ -154,7 +145,6 @@ def test_unreadable_links(open_board: OpenBoard, api: httpx.Client, is_bomb: boo
 
 
 def placed(board: Board) -> list[str]:
-    """Objects whose position the request contains."""
     return [thing["id"] for thing in board.scene["objects"] if "position" in thing]
 
 
@@ -175,8 +165,7 @@ def test_positions_count_only_when_switched_on(open_board: OpenBoard, api: httpx
     assert api.post("/relations", json=board.scene).json()["observed_relations"]
 
 
-def test_positions_that_the_page_chose_do_not_count(open_board: OpenBoard) -> None:
-    board = open_board()
+def test_positions_that_the_page_chose_do_not_count(board: Board) -> None:
     assert board.page.get_by_label("Positions count as evidence").is_checked()
     board.add("monitor")
     board.page.locator("#board .ghost").first.press("Enter")
@@ -191,8 +180,7 @@ def test_positions_that_the_page_chose_do_not_count(open_board: OpenBoard) -> No
     assert placed(board) == ["desk", "chair", "monitor"]
 
 
-def test_labels_and_supports_are_read(open_board: OpenBoard) -> None:
-    board = open_board()
+def test_labels_and_supports_are_read(board: Board) -> None:
     for text in ("bed, lamp, mug", "bed\nlamp\nmug\n"):
         board.put(text)
         assert board.things == ["bed", "lamp", "mug"]

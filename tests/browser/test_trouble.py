@@ -22,8 +22,7 @@ for (let step = 0; step < 8; step += 1)
 
 
 @pytest.mark.slow
-def test_a_superseded_question_is_dropped(open_board: OpenBoard) -> None:
-    board = open_board()
+def test_a_superseded_question_is_dropped(board: Board) -> None:
     routes, held = list[str](), list[Route]()
 
     def hold_first(route: Route) -> None:
@@ -101,8 +100,7 @@ def test_the_page_sends_the_key(open_board: OpenBoard, repository: Path, tmp_pat
         board.page.get_by_label("API key").first.fill(key)
         board.page.get_by_label("API key").first.press("Enter")
         # The page opens with an example as soon as the service answers.
-        entries = board.column("missing").locator("ol > li")
-        expect(entries).not_to_have_count(0)
+        expect(board.column("missing").locator("ol > li")).not_to_have_count(0)
         assert board.things
         assert '-H "X-API-Key: $SCENE_API_KEY"' in board.curl("missing")
         assert key not in board.page.content()

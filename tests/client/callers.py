@@ -66,10 +66,7 @@ def async_caller(url: str, **options: Any) -> Iterator[Caller]:
 def compiled(
     find_tool: Callable[[str], Path], source: Path, program: Path, *headers_in: Path
 ) -> Path:
-    """Compile a C++ program with ``scene_client.hpp``, and headers in further folders.
-
-    Without its libraries, the test is skipped, or fails with REQUIRE_SYSTEM=1.
-    """
+    """Compile a C++ program. Without its libraries, skip, or fail with REQUIRE_SYSTEM=1."""
     libraries = [find_tool("pkg-config"), "--cflags", "--libs", "cpp-httplib", "nlohmann_json"]
     flags = subprocess.run(libraries, capture_output=True, text=True)
     if flags.returncode:

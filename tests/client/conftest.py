@@ -17,7 +17,6 @@ from tests.conftest import FindTool
 
 @pytest.fixture(scope="session")
 def bridge(tmp_path_factory: pytest.TempPathFactory, find_tool: FindTool) -> Path:
-    """The program that calls the C++ client."""
     source = Path(__file__).parent / "bridge.cpp"
     program = tmp_path_factory.mktemp("bridge") / "bridge"
     return callers.compiled(find_tool, source, program)

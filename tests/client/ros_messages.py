@@ -60,10 +60,7 @@ def _blank_field(store: Typestore, kind: int, detail: Any) -> Any:
 
 
 def filled(store: Typestore, name: str, numbers: Iterator[float], length: int) -> Any:
-    """A message with these floating-point numbers, and lists of this length.
-
-    Its integers and texts differ from each other.
-    """
+    """A message with these numbers, lists of this length, and distinct integers and texts."""
     made = {}
     for field, (kind, detail) in store.fielddefs[name][1]:
         made[field] = _blank_field(store, int(kind), detail)

@@ -1,8 +1,4 @@
-"""Small files in the layouts of detectors, annotation tools and simulators, with their scenes.
-
-The command and the Python functions (tests/client/test_files.py) and the service
-(tests/http/test_scenes.py) read the same files.
-"""
+"""Small files of detectors, annotation tools and simulators, which clients and service read."""
 
 import json
 from dataclasses import dataclass
@@ -12,28 +8,19 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Example:
-    """A file.
-
-    Attributes:
-        text: its content.
-        request: expected fields of the request.
-        notes: expected reasons of notes.
-        labels: name of the label map.
-        scene: name of the scene to read, if the file has several.
-    """
+    """A file, with the expected request and reasons of notes."""
 
     text: str
     request: dict[str, Any]
     notes: tuple[str, ...] = ()
-    labels: str | None = None
-    scene: str | None = None
+    labels: str | None = None  # name of the label map
+    scene: str | None = None  # name of the scene to read, if the file has several
 
 
 HERE = Path(__file__).parent
 
 
 def content(name: str) -> str:
-    """The content of a file of the folder `files`."""
     return (HERE / "files" / name).read_text("utf-8")
 
 

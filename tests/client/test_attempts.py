@@ -48,10 +48,7 @@ def refusal(status: int, retry_after: str | None = None) -> Received:
 
 
 class World:
-    """A service and a clock. Every attempt takes ``seconds``.
-
-    The attempts have the ``outcomes`` in turn; the last outcome repeats.
-    """
+    """A service and a clock. Every attempt takes ``seconds``; the last outcome repeats."""
 
     def __init__(self, *outcomes: Outcome, seconds: float = 0.0) -> None:
         self.outcomes = list(outcomes)
@@ -184,9 +181,7 @@ failures = [refusal(429, "1"), refusal(503), refusal(503, "0"), REFUSED, BROKEN]
     retries=st.integers(0, 10),
     jitter=st.floats(0, 1, exclude_max=True),
 )
-def test_no_call_outlasts_its_deadline(
-    outcomes: list[Outcome], seconds: float, timeout: float, retries: int, jitter: float
-) -> None:
+def test_no_call_outlasts_its_deadline(outcomes, seconds, timeout, retries, jitter):
     world = World(*outcomes, seconds=seconds)
     try:
         answer = world.run(timeout=timeout, retries=retries, jitter=jitter)

@@ -19,7 +19,6 @@ from tests.client.scene_files import EXAMPLES, REFUSED
 
 
 def rounded(value: Any) -> Any:
-    """A scene with numbers of six decimals."""
     if isinstance(value, dict):
         return {name: rounded(part) for name, part in value.items()}
     if isinstance(value, list):
@@ -115,7 +114,7 @@ def test_wrong_values_are_left_out_or_refused(tmp_path: Path) -> None:
         ("sofa/couch/lounge", False), ("a.json", True), ("a.jsonl:3", True), ("a.xml:0", True),
         ("a.yaml", True), ("./a", True), ("-", True),
         ("Bed|-01.0|+00.0", False), ("mug, cup", False),
-    ],
+    ]
 )  # fmt: skip
 def test_labels_are_not_files(argument: str, expected: bool) -> None:
     assert is_file(argument) is expected

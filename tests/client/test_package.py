@@ -37,7 +37,6 @@ def test_the_blocking_client_is_up_to_date():
 )
 def test_every_file_states_the_version(repository: Path, path: str, pattern: str) -> None:
     match = re.search(pattern, (repository / path).read_text("utf-8"), re.MULTILINE)
-    assert match is not None
     assert match[1] == app.__version__
 
 
@@ -116,9 +115,8 @@ def test_a_generated_client_asks_all_five_questions(live: LiveService, tmp_path:
     lamp = {"label": "lamp", "id": "l", "position": {"x": 1.0, "y": 0.0, "z": 0.5}}
     scene = {"objects": ["bed", lamp], "relations": [["l", "left", "bed"]], "seed": 7}
     requests = dict.fromkeys(("relations", "missing", "outliers", "rooms", "generate"), scene)
-    done = run_program(
-        *(sys.executable, "-c", GENERATED, live.url, json.dumps(requests)), cwd=tmp_path
-    )
+    command = (sys.executable, "-c", GENERATED, live.url, json.dumps(requests))
+    done = run_program(*command, cwd=tmp_path)
     answers = dict(map(json.loads, done.stdout.splitlines()))
     assert answers.keys() == requests.keys()
     for question, answer in answers.items():
@@ -146,8 +144,7 @@ def test_the_cpp_block_compiles_and_runs(url: str, tmp_path: Path, find_tool: Fi
 def test_the_cpp_example(url: str, tmp_path: Path, bridge: Path, find_tool: FindTool) -> None:
     # Asking for `bridge` leaves this test out where the libraries are missing.
     folder = shutil.copytree(REPOSITORY / "clients" / "cpp", tmp_path / "cpp")
-    make = find_tool("make")
-    run_program(make, "-C", folder, "CXXFLAGS=-O0")
+    run_program(find_tool("make"), "-C", folder, "CXXFLAGS=-O0")
     example = folder / "example"
     answered = run_program(example, url, "30").stdout
     headings = re.findall(r"^\w.*:$", answered, re.MULTILINE)

@@ -1,8 +1,4 @@
-"""The client on Python 3.10, the Python of ROS 2 Humble.
-
-`make checks` types the client for Python 3.10 everywhere. These tests need an interpreter, and
-install the client as a robot does.
-"""
+"""The client, installed as on a robot, on Python 3.10, the Python of ROS 2 Humble."""
 
 import json
 import os

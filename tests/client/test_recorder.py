@@ -19,13 +19,7 @@ from typer.testing import CliRunner
 
 from app.questions.reading import Limits, read_scene
 from app.scene import CANONICAL
-from scene_client import (
-    Client,
-    OfflineClient,
-    ProblemError,
-    Recorder,
-    recorder,
-)
+from scene_client import Client, OfflineClient, ProblemError, Recorder, recorder
 from scene_client.command import app
 from scene_client.recorded_scene import scene_of
 from scene_client.schemas import MissingRequest
@@ -180,14 +174,10 @@ FRAMES = [
     st.lists(st.tuples(*[st.integers(-20, 20)] * 3), min_size=3, max_size=3),
     st.sampled_from([{}, {"yaw": 0.7}, {"orientation": {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8}}]),
 )
-def test_the_training_derives_the_relations_of_the_service(
-    frame: dict[str, Any], places: list[tuple[int, int, int]], turn: dict[str, Any]
-) -> None:
+def test_the_training_derives_the_relations_of_the_service(frame, places, turn):
     names = VOCABULARY.labels[:3]
-    boxes = [
-        box(name, x / 10, y / 10, z / 10, **turn)
-        for name, (x, y, z) in zip(names, places, strict=True)
-    ]
+    placed = zip(names, places, strict=True)
+    boxes = [box(name, x / 10, y / 10, z / 10, **turn) for name, (x, y, z) in placed]
     asked = request(*boxes, **frame)
     observed = read_scene(asked, VOCABULARY, Limits()).observed or []
     with TemporaryDirectory() as folder:
@@ -349,14 +339,11 @@ writer.record([scene(20)])
     assert printed[0] == f"{warning}: [Errno 28] No space left on device"
     assert printed[2] == f"{warning}: [Errno 27] File too large"
     assert len(printed) == 3
-    written = [int(scene[0].split()[0]) for scene in labels(file)]
-    assert written == [0, 1, 19]
+    assert [int(scene[0].split()[0]) for scene in labels(file)] == [0, 1, 19]
     assert 100_000 * 2 / 3 < int(printed[1]) < 100_000
 
 
-def test_a_missing_folder_disturbs_no_question(
-    url: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_missing_folder_disturbs_no_question(url, tmp_path, caplog):
     file = tmp_path / "later" / "scenes.jsonl"
     writer = Recorder(file)
     with Client(url, record=writer) as scene:
@@ -374,9 +361,8 @@ def test_a_missing_folder_disturbs_no_question(
         file.unlink()
         file.mkdir()
         scene.missing(["bed", "sofa"])
-    assert [one.levelno for one in caplog.records if one.name == recorder.__name__] == [
-        logging.WARNING
-    ] * 2
+    levels = [one.levelno for one in caplog.records if one.name == recorder.__name__]
+    assert levels == [logging.WARNING] * 2
 
 
 def test_a_pipe_is_refused(file: Path, caplog: pytest.LogCaptureFixture) -> None:

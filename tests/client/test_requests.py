@@ -1,7 +1,6 @@
 """Requests of the clients: bodies, headers, and errors before a request is sent."""
 
 import json
-from collections.abc import Callable
 from typing import Any
 
 import httpx
@@ -89,9 +88,7 @@ LAMPS = {"objects": ["bed"], "candidates": ["lamp"]}
         ),
     ],
 )
-def test_scenes_of_every_form(
-    scene: Client, recorder: Recorder, ask: Callable[[Client], Any], path: str, body: Any
-) -> None:
+def test_scenes_of_every_form(scene, recorder, ask, path, body):
     """A request has only the fields that are set."""
     ask(scene)
     assert recorder.body == body
@@ -124,9 +121,7 @@ def test_the_model_of_the_client_is_the_default(recorder: Recorder) -> None:
         (lambda scene: scene.model("home", ""), "#", "name"),
     ],
 )
-def test_invalid_requests_are_not_sent(
-    scene: Client, recorder: Recorder, ask: Callable[[Client], Any], pointer: str, word: str
-) -> None:
+def test_invalid_requests_are_not_sent(scene, recorder, ask, pointer, word):
     with pytest.raises(InvalidRequestError, match=word) as raised:
         ask(scene)
     assert pointer in [error.pointer for error in raised.value.errors]

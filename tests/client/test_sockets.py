@@ -22,11 +22,9 @@ from scene_client import (
 )
 from tests.client.conftest import OVER_HTTP
 from tests.client.peers import answer, answering, read_head, say_nothing
-from tests.conftest import FindTool
 
 
 def serve(connection: socket.socket, heads: list[bytes] | None = None) -> None:
-    """Answer each request, and record its head."""
     while True:
         head = read_head(connection)
         if heads is not None:
@@ -78,12 +76,7 @@ def test_many_calls_share_one_connection(peer: Any, open_caller: Any) -> None:
 
 @every_client
 @pytest.mark.parametrize("behave", [drip, drip_head, say_nothing, flood])
-def test_a_call_ends_at_the_deadline(
-    peer: Any,
-    open_caller: Any,
-    behave: Callable[[socket.socket], None],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_call_ends_at_the_deadline(peer, open_caller, behave, monkeypatch):
     monkeypatch.setattr(sync, "MAX_ANSWER", 2**50)
     monkeypatch.setattr(asynchronous, "MAX_ANSWER", 2**50)
     # The test measures no time: a wait beyond the deadline would never end.
@@ -130,13 +123,7 @@ def test_the_key_and_the_time_left_are_sent(peer: Any, open_caller: Any) -> None
 
 @pytest.mark.system
 @every_client
-def test_tls(
-    peer: Any,
-    open_caller: Any,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    find_tool: FindTool,
-) -> None:
+def test_tls(peer, open_caller, tmp_path, monkeypatch, find_tool):
     key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
     command = [
         *(find_tool("openssl"), "req", "-x509", "-newkey", "ec"),

@@ -30,10 +30,8 @@ UNTURNED = (0.0, 0.0, 0.0, 1.0)
 
 
 def pose(position: Any = (0.0, 0.0, 0.0), turn: Any = UNTURNED) -> dict[str, Any]:
-    return {
-        "position": dict(zip("xyz", position, strict=True)),
-        "orientation": dict(zip("xyzw", turn, strict=True)),
-    }
+    axes, quaternion = zip("xyz", position, strict=True), zip("xyzw", turn, strict=True)
+    return {"position": dict(axes), "orientation": dict(quaternion)}
 
 
 def result(class_id: Any, score: Any = 0.9, where: Any = None) -> dict[str, Any]:
@@ -67,12 +65,10 @@ def array(*detections: dict[str, Any], frame: str = "base_link", **header: Any) 
 def in_space(
     *detections: Any, label_map: Any = None, frame: str = "base_link", **options: Any
 ) -> Any:
-    """The fields of detections with poses."""
     return from_detection3d_array(array(*detections, frame=frame), label_map, **options)
 
 
 def in_image(*detections: Any, frame: str = "base_link") -> SceneFields:
-    """The fields of detections in an image."""
     return from_detection2d_array(array(*detections, frame=frame))
 
 
@@ -349,8 +345,7 @@ def test_invalid_boxes_are_reported() -> None:
 @pytest.mark.parametrize("number", [7.25, -1.0, 0.0, math.nan, math.inf, 1e300])
 def test_rosbridge_and_cdr_give_one_scene(store: Typestore, kind: str, number: float) -> None:
     """The first of two detections has this number in every field of a floating-point type."""
-    name = f"vision_msgs/msg/Detection{kind}Array"
-    message = filled(store, name, repeat(number), 2)
+    message = filled(store, f"vision_msgs/msg/Detection{kind}Array", repeat(number), 2)
     other = (number / 8 for number in count())
     message.detections[1] = filled(store, f"vision_msgs/msg/Detection{kind}", other, 2)
     convert = from_detection2d_array if kind == "2D" else from_detection3d_array

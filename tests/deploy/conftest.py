@@ -18,7 +18,6 @@ def envelope(repository: Path) -> Any:
 
 @pytest.fixture
 def recorded(envelope: Any) -> Any:
-    """The message as a node receives it."""
     return from_json("vision_msgs/msg/Detection3DArray", envelope["msg"])
 
 

@@ -1,7 +1,6 @@
-"""A stand-in for rclpy with the published message types, as far as the example node needs them.
+"""A stand-in for rclpy, as far as the example node needs it.
 
-Messages are those of the parser that reads bags. A publisher writes each message in CDR and reads
-it back, so a message that does not fit its type fails here as in ROS.
+A publisher writes each message in CDR and reads it back: a message must fit its type, as in ROS.
 """
 
 import sys
@@ -52,17 +51,7 @@ class Publisher:
 
 @dataclass
 class Ros:
-    """One process with one node.
-
-    Attributes:
-        given: parameters, as from a file.
-        declared: parameters that the node declares.
-        subscriptions: (message type, callback) of each topic.
-        publishers: publisher of each topic.
-        timers: (period in seconds, callback).
-        spun: nodes that the program has run.
-        warned: warnings that the node logs.
-    """
+    """One process with one node. `given` are parameters, as from a file."""
 
     given: dict[str, Any]
     declared: dict[str, Any] = field(default_factory=dict)
@@ -74,7 +63,6 @@ class Ros:
     destroyed: bool = False
 
     def node_type(self) -> type:
-        """Return the base class of nodes, bound to this process."""
         ros = self
 
         class Node:
@@ -108,7 +96,6 @@ class Ros:
         return Node
 
     def modules(self) -> dict[str, Any]:
-        """Return the modules that the node imports, by name."""
         names = {
             "std_msgs": ["String"],
             "geometry_msgs": ["PoseWithCovarianceStamped"],
@@ -121,11 +108,8 @@ class Ros:
             for package, types in names.items()
         }
         members |= {package: {} for package in names}
-
-        def nothing() -> None:
-            """Do nothing."""
-
-        members["rclpy"] = {"init": nothing, "try_shutdown": nothing, "spin": self.spun.append}
+        members["rclpy"] = dict.fromkeys(("init", "try_shutdown"), lambda: None)
+        members["rclpy"]["spin"] = self.spun.append
         members["rclpy.node"] = {"Node": self.node_type()}
         shutdown = type("ExternalShutdownException", (Exception,), {})
         members["rclpy.executors"] = {"ExternalShutdownException": shutdown}
@@ -164,7 +148,6 @@ def load_package(monkeypatch: pytest.MonkeyPatch, ros: Ros | None = None) -> Non
 
 
 def from_json(name: str, values: Any) -> Any:
-    """A message from the JSON of rosbridge."""
     fields: dict[str, Any] = {}
     for field_name, (kind, detail) in STORE.fielddefs[name][1]:
         value = values[field_name]

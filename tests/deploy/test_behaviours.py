@@ -83,9 +83,7 @@ LAMP = {"candidates": ["lamp"], "at": {"relation": "on-top", "object": "desk"}, 
 @pytest.mark.parametrize(
     ("name", "found"), [("Couches", "s"), ("sofa", "s"), ("desk", "desk"), ("table", "desk")]
 )
-def test_an_object_has_its_label_and_its_classes(
-    make: Make, client: Client, name: str, found: str
-) -> None:
+def test_an_object_has_its_label_and_its_classes(make, client, name, found):
     scene = {"objects": ["bed", {"id": "s", "label": "Couches"}, "desk"]}
     condition = make("ObjectBelongs", client, scene, name, threshold=0.0)
     assert settle(condition) is Status.FAILURE

@@ -10,18 +10,13 @@ import pytest
 from scene_client import Client
 from scene_client.vision_msgs import SceneFields
 from tests.client import callers
-from tests.conftest import FindTool, run_program
+from tests.conftest import run_program
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")
-def program(
-    repository: Path,
-    tmp_path_factory: pytest.TempPathFactory,
-    find_tool: FindTool,
-) -> Path:
-    """Ticks one condition as a tree does."""
+def program(repository, tmp_path_factory, find_tool):
     here = Path(__file__).parent
     return callers.compiled(
         find_tool,

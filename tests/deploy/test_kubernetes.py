@@ -37,9 +37,7 @@ def folder(repository: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def rendered(
-    folder: Path, find_tool: FindTool, tmp_path_factory: pytest.TempPathFactory
-) -> dict[str, str]:
+def rendered(folder, find_tool, tmp_path_factory):
     """Each overlay, and `everything`: bucket, autoscaled and monitoring together."""
     kubectl = find_tool("kubectl")
     copy = tmp_path_factory.mktemp("kubernetes") / "copy"
@@ -61,7 +59,6 @@ class Overlay:
 
     @cached_property
     def manifests(self) -> Manifests:
-        """The manifests by kind and name."""
         found = list(yaml.safe_load_all(self.text))
         manifests = {(one["kind"], one["metadata"]["name"]): one for one in found}
         assert len(manifests) == len(found)
@@ -81,7 +78,6 @@ class Overlay:
 
     @property
     def config(self) -> dict[str, str]:
-        """The data of the ConfigMap with the settings."""
         data = [one.get("data", {}) for one in self.manifests.values()]
         (config,) = [one for one in data if "SCENE_STORE" in one]
         return config
@@ -127,9 +123,7 @@ def test_ports_are_those_of_the_image(repository: Path, overlay: Overlay) -> Non
         assert (port["port"], port["targetPort"]) == (exposed, opened["name"])
 
 
-def test_variables_are_valid_settings(
-    monkeypatch: pytest.MonkeyPatch, repository: Path, overlay: Overlay
-) -> None:
+def test_variables_are_valid_settings(monkeypatch, repository, overlay):
     assert set(re.findall(r"\bSCENE_[A-Z0-9_]+", overlay.text)) <= SETTINGS
     assert overlay.config["SCENE_STORE"] in {"/srv/scene/model_store", "/srv/scene/models"}
     # Kubernetes inserts only variables that stand earlier in `env`, so the hosts are last.

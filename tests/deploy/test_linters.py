@@ -37,9 +37,7 @@ def test_linters(find_tool: FindTool, monkeypatch: pytest.MonkeyPatch, command: 
     run_program(find_tool(program), *arguments)
 
 
-def test_the_queries_of_the_dashboard_can_be_parsed(
-    find_tool: FindTool, repository: Path, tmp_path: Path
-) -> None:
+def test_the_queries_of_the_dashboard_can_be_parsed(find_tool, repository, tmp_path):
     dashboard = (repository / "deploy/monitoring/grafana/dashboards/scene.json").read_text("utf-8")
     panels = json.loads(dashboard.replace("$__rate_interval", "1m"))["panels"]
     queries = [target["expr"] for panel in panels for target in panel.get("targets", ())]

@@ -53,9 +53,7 @@ def test_every_field_has_the_bytes_of_ros(length: int) -> None:
         (["/boxes", "--service", "robot:8000"], "the URL must start with http:// or https://"),
     ],
 )
-def test_invalid_options_give_status_2(
-    options: list[str], error: str, monkeypatch: pytest.MonkeyPatch, capsys: Any
-) -> None:
+def test_invalid_options_give_status_2(options, error, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["over_dds.py", *options])
     with pytest.raises(SystemExit, match="2"):
         over_dds.main()
@@ -64,7 +62,6 @@ def test_invalid_options_give_status_2(
 
 @pytest.fixture(scope="module")
 def errors(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The standard error of the bridge."""
     return tmp_path_factory.mktemp("bridge") / "errors"
 
 

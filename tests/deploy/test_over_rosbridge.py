@@ -13,15 +13,11 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
 
 from tests.conftest import run_program
-from tests.services import LiveService
 
 
 @contextmanager
 def bridge(*published: Any) -> Iterator[tuple[str, list[Any]]]:
-    """Something that sends these messages at once to whoever subscribes, and hangs up.
-
-    Text and bytes are sent as they are, whatever else as JSON.
-    """
+    """A bridge that sends these messages (text, bytes or JSON) to a subscriber, and hangs up."""
     heard: list[Any] = []
 
     def handle(socket: ServerConnection) -> None:
@@ -53,9 +49,7 @@ def run(repository: Path, *arguments: str) -> tuple[list[Any], list[str]]:
 
 
 @pytest.mark.parametrize("questions", [["missing"], ["relations", "rooms"]])
-def test_a_published_message_is_answered(
-    repository: Path, live: LiveService, envelope: Any, questions: list[str]
-) -> None:
+def test_a_published_message_is_answered(repository, live, envelope, questions):
     with bridge({"op": "status", "level": "info"}, envelope) as (url, heard):
         (answer,), errors = run(
             repository, url, "/detections_3d", "--service", live.url, "--questions", *questions

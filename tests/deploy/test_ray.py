@@ -35,7 +35,6 @@ def cluster(folder: Path) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def pods(cluster: dict[str, Any]) -> list[dict[str, Any]]:
-    """The specifications of the head's pod and of the workers' pods."""
     spec = cluster["rayClusterConfig"]
     groups = [spec["headGroupSpec"], *spec["workerGroupSpecs"]]
     return [group["template"]["spec"] for group in groups]
@@ -49,9 +48,7 @@ def test_manifest_and_configuration_agree(config: dict[str, Any], cluster: dict[
     assert copy == config
 
 
-def test_the_configuration_agrees_with_the_application(
-    folder: Path, repository: Path, config: dict[str, Any]
-) -> None:
+def test_the_configuration_agrees_with_the_application(folder, repository, config):
     (application,) = config["applications"]
     module, _, attribute = application["import_path"].partition(":")
     source = (repository / f"{module.replace('.', '/')}.py").read_text("utf-8")
@@ -67,9 +64,7 @@ def test_the_configuration_agrees_with_the_application(
     assert deployment["graceful_shutdown_timeout_s"] > fields["drain_timeout"].default
 
 
-def test_the_manifest_confines_pods_and_asks_for_a_token(
-    cluster: dict[str, Any], pods: list[dict[str, Any]], config: dict[str, Any], repository: Path
-) -> None:
+def test_the_manifest_confines_pods_and_asks_for_a_token(cluster, pods, config, repository):
     spec = cluster["rayClusterConfig"]
     assert spec["authOptions"] == {"mode": "token"}
     lock = (repository / "requirements-ray.lock").read_text("utf-8")

@@ -21,7 +21,6 @@ Run = Callable[..., "Running"]
 
 
 def new(name: str, **fields: Any) -> Any:
-    """Return a message of vision_msgs."""
     return blank(STORE, f"vision_msgs/msg/{name}", **fields)
 
 
@@ -144,10 +143,8 @@ def test_class_ids_need_a_label_map(run: Run, live: LiveService, recorded: Any) 
     running.hear("detections", recorded)
     running.wait_for("/diagnostics")
     assert running.status().message.startswith("MessageError: the class ids are numbers")
-    classes = [
-        new("VisionClass", class_id=int(number), class_name=name)
-        for name, number in numbers.items()
-    ]
+    pairs = numbers.items()
+    classes = [new("VisionClass", class_id=int(n), class_name=name) for name, n in pairs]
     running.hear("label_info", new("LabelInfo", class_map=classes))
     answer = running.answer(recorded)
     assert {entry["label"] for entry in answer["outliers"]["outliers"]} == {"desk", "chair"}
@@ -222,8 +219,7 @@ def test_ghosts_stand_at_the_offset(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_parameter_file_has_the_defaults(run: Run) -> None:
     given = yaml.safe_load((PACKAGE / "config" / "scene.yaml").read_text())
     parameters = given["scene"]["ros__parameters"]
-    declared = run(**parameters).ros.declared
-    assert set(declared) == set(parameters)
+    assert set(run(**parameters).ros.declared) == set(parameters)
     defaults = run().ros.declared
     for name, value in defaults.items():
         assert str(parameters[name]) == str(value), name

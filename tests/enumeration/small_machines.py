@@ -43,7 +43,6 @@ def small_machine(name: str, seed: int = 0, scale: float = 0.8) -> BoltzmannMach
 def random_weights(
     machine: BoltzmannMachine, generator: torch.Generator, scale: float = 1.0
 ) -> BoltzmannMachine:
-    """The machine with every weight drawn from N(0, scale²)."""
     for parameter in machine.parameters():
         noise = torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
         parameter.copy_(noise * scale)
@@ -61,10 +60,7 @@ def with_symmetric_couplings(machine: BoltzmannMachine) -> BoltzmannMachine:
 def mean_rates(
     machine: BoltzmannMachine, v: Iterable[float], *, whole_scenes: bool = False
 ) -> Tensor:
-    """sum_q p(q | v) a_q, (V,), by a loop over the sources; 0 for a machine without sources.
-
-    In whole scenes, the rates are a_q + u_q.
-    """
+    """sum_q p(q | v) a_q, (V,), or of a_q + u_q for whole scenes; 0 without sources."""
     total, weights, v = torch.zeros(machine.spec.V, dtype=torch.float64), 0.0, list(v)
     for f, a, u in zip(machine.f.double(), machine.a.double(), machine.u.double(), strict=False):
         weight = math.exp(f + sum(float(rate) for rate, on in zip(a, v, strict=True) if on))
@@ -97,18 +93,13 @@ def code(*blocks: Tensor | np.ndarray) -> np.ndarray:
 def unit_states(spec: MachineSpec) -> Tensor:
     """All Z^units states of h1, (Z^units, H1) float64. The first state of a unit is all 0."""
     one = torch.eye(spec.states, dtype=torch.float64)[:, 1:]
-    return torch.stack(
-        [one[list(z)].flatten() for z in product(range(spec.states), repeat=spec.units)]
-    )
+    states = product(range(spec.states), repeat=spec.units)
+    return torch.stack([one[list(z)].flatten() for z in states])
 
 
 @dataclass(frozen=True)
 class Joint:
-    """Every state of a small machine, with its energy.
-
-    v, r, h1: (N, units); room: (N,), -1 for "not listed"; energy: (N,); edges: the layout of r
-    between all classes.
-    """
+    """Every state of a small machine: v, r, h1 (N, units), room (N,), or -1, and energy (N,)."""
 
     machine: BoltzmannMachine
     edges: Edges
@@ -131,7 +122,6 @@ class Joint:
         return float((-self.energy[where]).logsumexp(0))
 
     def log_odds(self, on: Tensor, given: Tensor) -> float:
-        """log p(on | given) - log p(not on | given)."""
         return self.log_sum(given & on) - self.log_sum(given & ~on)
 
     def draw(self, count: int, generator: torch.Generator, given: Tensor | None = None) -> Tensor:
@@ -141,10 +131,7 @@ class Joint:
 
 
 def enumerate_joint(machine: BoltzmannMachine, *rooms: int | None, source: int = -1) -> Joint:
-    """All states with a finite energy; the room type t is a unit with the given states.
-
-    None and -1 mean "not listed". By default, it is the only state of t.
-    """
+    """All states with a finite energy. t is a unit with the states `rooms`, by default -1."""
     spec = machine.spec
     edges = machine.edges(torch.arange(spec.V).unsqueeze(0))
     visible, E = binary(spec.V), edges.valid.shape[1]
@@ -212,10 +199,7 @@ def features_by_hand(given: Tensor) -> Tensor:
 def implied_by_hand(
     machine: BoltzmannMachine, v: Tensor, given: Tensor, room: int = -1, *, apart: bool = False
 ) -> Tensor:
-    """x (A, n, n) of a machine at v (V,), given relations.
-
-    With `apart`, relations of the same pair have no effect.
-    """
+    """x (A, n, n) at v (V,), given relations; `apart` leaves out relations of the same pair."""
     spec = machine.spec
     gamma, B = machine.get_parameter("gamma"), machine.get_parameter("B")
     phi = features_by_hand(given)
@@ -233,13 +217,7 @@ def implied_by_hand(
 
 
 def relation_by_definition(joint: Joint, unit: int, where: Tensor, given: Tensor) -> float:
-    """p(r_e = 1 | v, given) = E[sigmoid(ℓ_e(h1) + x_e)], h1 from the joint.
-
-    Args:
-        unit: e, its place in `joint.edges`.
-        where: (N,) bool, the states with this v and the observed relations other than e.
-        given: (A, V, V), 1 where a relation is observed as holding.
-    """
+    """p(r_e = 1 | v, given) = E[sigmoid(ℓ_e(h1) + x_e)], h1 from the joint's states `where`."""
     e = joint.edges
     a, i, j = (int(end[0, unit]) for end in (e.relation, e.subject, e.object))
     v, h1 = joint.v[where], joint.h1[where]

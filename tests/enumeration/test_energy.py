@@ -103,8 +103,7 @@ def test_free_energy_is_the_sum_over_states(name):
     machine = small_machine(name)
     source = machine.spec.profiles - 1
     joint = enumerate_joint(machine, *range(-1, machine.spec.C), source=source)
-    sources = torch.full((len(joint.v),), source)
-    free = machine.free_energy(joint.v, joint.room, sources)
+    free = machine.free_energy(joint.v, joint.room, torch.full((len(joint.v),), source))
     fixed = torch.cat((joint.v, joint.room.unsqueeze(1)), 1)
     _, group = fixed.unique(dim=0, return_inverse=True)
     for g in range(int(group.max()) + 1):
@@ -140,7 +139,6 @@ def test_conditionals_of_relations_and_hidden_units(name):
 # The joint of an unknown source has the mean base rates given the listed classes. The joint also
 # has the base rates u of whole scenes, which the answers leave out.
 
-
 # Each machine without and with a room type, and without and with a source.
 CASES = [
     (name, room, source)
@@ -152,7 +150,6 @@ CASES = [
 
 @pytest.mark.parametrize(("name", "room", "source"), CASES)
 def test_object_log_odds_are_those_of_the_joint(name, room, source):
-    """Of v_i, for every v and i."""
     machine = small_machine(name)
     joint = enumerate_joint(machine, *range(-1, machine.spec.C), source=source)
     for i, v, given in left_out(joint):
@@ -160,9 +157,8 @@ def test_object_log_odds_are_those_of_the_joint(name, room, source):
         exact -= float(machine.u[source, i])
         if source < 0:
             exact += float(mean_rates(machine, v)[i])
-        ours = machine.object_log_odds(
-            v[None], room=torch.tensor([room]), source=torch.tensor([source])
-        )
+        conditions = {"room": torch.tensor([room]), "source": torch.tensor([source])}
+        ours = machine.object_log_odds(v[None], **conditions)
         assert float(ours[0, i]) == pytest.approx(exact, abs=1e-9)
 
 

@@ -74,10 +74,7 @@ def test_room_types_of_the_joint_are_those_of_its_states(name):
 
 @pytest.mark.parametrize("name", ["triway", "triway-states"])
 def test_observed_relations_change_the_joint_and_not_the_answers(name):
-    """All relations between listed classes are observed; other relations are summed out.
-
-    With 200,000 draws, the standard error of an estimate is below .004.
-    """
+    """With 200,000 draws, the standard error of an estimate is below .004."""
     machine = small_machine(name)
     joint = enumerate_joint(machine)
     edges, V = joint.edges, machine.spec.V

@@ -1,8 +1,4 @@
-"""Compiled chains draw from the machine, by enumeration of small machines.
-
-Stationarity is tested as in `test_gibbs`: states drawn from the enumerated joint, one sweep, and
-the histogram of v and h1 against p.
-"""
+"""Compiled chains leave p stationary (as in `test_gibbs`), and draw relations given v and h1."""
 
 import copy
 from itertools import product
@@ -84,10 +80,7 @@ def test_chains_are_stationary(name, beta):
 @pytest.mark.parametrize("profile", [None, 1])
 @pytest.mark.parametrize("name", SMALL)
 def test_chains_are_stationary_under_conditions(name, profile):
-    """A class present, a room type and a profile.
-
-    Without a profile, the base rates are their mean given the class.
-    """
+    """Without a profile, the base rates are their mean given the class."""
     spec = SMALL[name]
     room, profile = 1 if spec.C else None, profile if spec.profiles else None
 
@@ -131,10 +124,7 @@ def test_relations_are_drawn_given_objects_and_hidden_units(name, temperature):
 
 
 def implied_law(machine, observed):
-    """The law of r (64,) between three classes, drawn in groups, by a sum over all groups.
-
-    A group is drawn given the relations of all earlier groups. Observed relations come first.
-    """
+    """The law of r (64,) between three classes, where each group depends on earlier groups."""
     off = [(i, j) for i in range(3) for j in range(3) if i != j]
     v, h1 = torch.ones(1, 3).double(), torch.tensor([[1.0, 0, 1]]).double()
     edges = machine.edges(torch.arange(3)[None])
@@ -146,9 +136,8 @@ def implied_law(machine, observed):
         x = (logits + implied_by_hand(machine, v[0], grid))[0]
         chance[mask] = [float(x[pair].sigmoid()) for pair in off]
     # Of the relations a(i, j) and a(j, i), one is in the groups 0 to 3, and the other in 4 to 7.
-    choices = [
-        (4 * late + n, 4 * (1 - late) + k) for late in (0, 1) for n in range(4) for k in range(4)
-    ]
+    groups = product((0, 1), range(4), range(4))
+    choices = [(4 * late + n, 4 * (1 - late) + k) for late, n, k in groups]
     group = np.zeros((32**3, 6), np.int64)
     for row, picked in zip(group, product(choices, repeat=3), strict=True):
         for (i, j), (first, second) in zip([(0, 1), (0, 2), (1, 2)], picked, strict=True):

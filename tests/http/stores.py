@@ -53,9 +53,8 @@ def random_machine(
     """A machine for the first ``classes`` classes, with all weights drawn from N(0, 0.5²)."""
     generator = torch.Generator().manual_seed(seed)
     triples = TRIPLES[(TRIPLES[:, 1:] < classes).all(dim=1)]
-    machine = build(replace(SPECS[variant], V=classes, C=room_types, T=len(triples))).set_triples(
-        triples
-    )
+    spec = replace(SPECS[variant], V=classes, C=room_types, T=len(triples))
+    machine = build(spec).set_triples(triples)
     with torch.no_grad():
         for parameter in machine.parameters():
             parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.5)

@@ -11,7 +11,7 @@ import pytest
 from httpx import Client, ConnectError, Response
 
 from tests.http.test_problems import problem
-from tests.services import Pause, Replace, launch, serve, wait_until
+from tests.services import Pause, launch, serve, wait_until
 
 SCENE = {"objects": ["bed", "chair", "lamp"]}
 LONG = {"X-Request-Timeout-Ms": "60000"}
@@ -71,9 +71,7 @@ async def test_a_client_above_its_share_gets_429(shared_store: Path, pause: Paus
         assert "`steps` must be at most 32000" in document["errors"][0]["message"]
 
 
-async def test_a_batch_stops_at_its_deadline(
-    shared_store: Path, replace: Replace, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_batch_stops_at_its_deadline(shared_store, replace, monkeypatch):
     """Each entry that was not begun says so itself. The deadline passes during the third entry."""
     begun = 0
 

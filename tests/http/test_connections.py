@@ -20,7 +20,6 @@ HEAD = (
     b"Content-Length: %d\r\n\r\n"
 )
 
-
 service = live_service(SCENE_CLIENT_TIMEOUT="1", logs_errors=True)
 
 

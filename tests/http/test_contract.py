@@ -45,7 +45,7 @@ CONFIGURATION: dict[str, Any] = {
         {
             "include-path-regex": "/batch$",
             "checks": {"negative_data_rejection": {"expected-statuses": [*NEGATIVE, "200"]}},
-        },
+        }
     ],
 }
 # The document does not depend on the store, so it exists before the service starts. Batches differ

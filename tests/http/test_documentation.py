@@ -15,7 +15,7 @@ from app.errors import ERRORS
 from scene_client import schemas
 from scene_client.schemas import Problem
 from tests.http.test_problems import problem
-from tests.services import LiveService, Replace, defect, serve
+from tests.services import LiveService, defect, serve
 
 PAGES = ["/", "/docs", "/redoc", "/problems", "/problems/not-json"]
 # Digest of app/static/vendor, so that a change of a library's file is seen.
@@ -70,10 +70,8 @@ def test_libraries_are_unchanged(repository: Path) -> None:
     folder = repository / "app" / "static" / "vendor"
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     assert [path.name for path in files].count("LICENSE") == len(files) / 2 == 6
-    lines = (
-        f"{sha256(path.read_bytes()).hexdigest()}  {path.relative_to(folder)}" for path in files
-    )
-    text = "".join(f"{line}\n" for line in lines)
+    digests = ((sha256(path.read_bytes()).hexdigest(), path.relative_to(folder)) for path in files)
+    text = "".join(f"{digest}  {path}\n" for digest, path in digests)
     assert sha256(text.encode()).hexdigest() == LIBRARIES
 
 
@@ -120,9 +118,7 @@ QUESTIONS = [(operation, name) for operation, cases in REQUESTS.items() for name
 
 
 @pytest.mark.parametrize(("operation", "name"), QUESTIONS)
-async def test_examples_are_answered_as_documented(
-    client: AsyncClient, document: dict[str, Any], operation: str, name: str
-) -> None:
+async def test_examples_are_answered_as_documented(client, document, operation, name):
     case = REQUESTS[operation][name]
     address = "/" + operation.replace("_", "/")
     response = await client.post(address, json=case.value)
@@ -182,9 +178,7 @@ def check(response: Response) -> None:
 
 
 @pytest.mark.parametrize(("method", "path", "body"), COMPUTED)
-async def test_computed_answers_are_not_cached(
-    client: AsyncClient, replace: Replace, method: str, path: str, body: Any
-) -> None:
+async def test_computed_answers_are_not_cached(client, replace, method, path, body):
     replace("missing", defect)
     response = await client.request(method, path, json=body)
     check(response)

@@ -15,12 +15,9 @@ from tests.services import NAMED, load_changes, serve
 
 
 async def test_health_of_a_ready_service(client: AsyncClient) -> None:
-    answers = {
-        "/health/live": {"status": "live", "version": __version__},
-        "/health/ready": {"status": "ready"},
-    }
+    answers = {"live": {"status": "live", "version": __version__}, "ready": {"status": "ready"}}
     for path, expected in answers.items():
-        response = await client.get(path)
+        response = await client.get(f"/health/{path}")
         assert (response.status_code, response.json()) == (200, expected)
 
 
@@ -108,8 +105,7 @@ async def test_another_broken_version_is_listed_as_refused(store: Path) -> None:
         assert "card" not in details
         body = {"objects": ["bed"], "model": "plain"}
         problem(await client.post("/relations", json=body), 503, "model-unavailable")
-        path = "/models/plain/vocabulary"
-        problem(await client.get(path), 503, "model-unavailable")
+        problem(await client.get("/models/plain/vocabulary"), 503, "model-unavailable")
 
 
 async def test_an_empty_store_is_not_ready(tmp_path: Path) -> None:

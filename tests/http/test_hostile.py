@@ -14,7 +14,6 @@ pytestmark = pytest.mark.system
 MAX_GROWTH = 8 * 2**20
 """Bytes that the last 4,000 requests may add to what the allocator keeps of the first ones."""
 
-
 service = live_service(SCENE_CLIENT_TIMEOUT="5")
 
 
@@ -52,5 +51,4 @@ def test_the_corpus_has_every_field() -> None:
     forms = {f"/{question.name}": question.request for question in QUESTIONS}
     for path, form in forms.items():
         assert set(corpus.VALID[path]) == set(form.model_fields)
-    detection = corpus.SCENE["objects"][1]
-    assert set(detection) == set(schemas.Detection.model_fields)
+    assert set(corpus.SCENE["objects"][1]) == set(schemas.Detection.model_fields)

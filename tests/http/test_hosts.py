@@ -3,7 +3,6 @@
 import re
 from pathlib import Path
 from socket import gethostname
-from typing import Any
 
 import pytest
 from httpx import AsyncClient, Response
@@ -27,12 +26,7 @@ LOCAL = {"localhost", "pc-7.lab", "pc-7.local"}
         ({"allowed_hosts": "scene,*"}, None),
     ],
 )
-def test_accepted_hosts(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    settings: dict[str, Any],
-    expected: set[str] | None,
-) -> None:
+def test_accepted_hosts(tmp_path, monkeypatch, settings, expected):
     monkeypatch.setattr("app.settings.gethostname", lambda: "PC-7.lab")
     assert Settings(store=tmp_path, **settings).accepted_hosts == expected
 
@@ -142,9 +136,7 @@ async def test_only_listed_origins_ask_and_read_answers(shared: AsyncClient) -> 
         (LISTED, "POST", "x-anything"),
     ],
 )
-async def test_other_preflight_requests_are_refused(
-    shared: AsyncClient, origin: str, method: str, headers: str
-) -> None:
+async def test_other_preflight_requests_are_refused(shared, origin, method, headers):
     response = await preflight(shared, origin, method, headers)
     assert response.status_code == 400
     # After a status other than 2xx, a browser goes no further.

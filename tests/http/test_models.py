@@ -71,9 +71,7 @@ async def test_the_vocabulary_lists_every_class(client: AsyncClient) -> None:
         ("office lamp", "lamp", "head", False),
     ],
 )
-async def test_a_word_becomes_a_class(
-    client: AsyncClient, word: str, label: str, rule: str, certain: bool
-) -> None:
+async def test_a_word_becomes_a_class(client, word, label, rule, certain):
     answer = (await client.get(f"/models/default/vocabulary/{quote(word)}")).json()
     assert (answer["word"], answer["class"]["label"]) == (word, label)
     assert (answer["rule"], answer["certain"]) == (rule, certain)
@@ -96,9 +94,7 @@ async def test_unknown_models_are_not_found(client: AsyncClient, path: str) -> N
     problem(await client.get(f"/models/{path}"), 404, "model-not-found")
 
 
-async def test_changes_of_the_store_are_loaded(
-    own: AsyncClient, store: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_changes_of_the_store_are_loaded(own, store, caplog):
     caplog.set_level("INFO", "app.serving")
     await load_changes(own)
     assert not caplog.messages
@@ -118,9 +114,7 @@ async def test_changes_of_the_store_are_loaded(
         assert (await other.get("/models")).json()["generation"] == after != before
 
 
-async def test_a_broken_version_is_refused(
-    own: AsyncClient, store: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_a_broken_version_is_refused(own, store, caplog):
     publish(store, "plain", "2.0.0", seed=3)
     corrupt(store, "plain", "2.0.0")
     publish(store, "home", "2.0.0", seed=2, alias="default")
@@ -141,26 +135,17 @@ async def test_the_store_is_polled(store: Path) -> None:
                 await asyncio.sleep(0.05)
 
 
-async def test_an_error_keeps_the_served_models(
-    own: AsyncClient, store: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_an_error_keeps_the_served_models(own, store, monkeypatch, caplog):
     publish(store, "home", "2.0.0", seed=2, alias="default")
     monkeypatch.setattr(Store, "names", defect)
     await load_changes(own)
     assert await default(own) == "home@1.0.0"
     assert "the service could not load the changes in the store" in caplog.text
-    counted = (await own.get("/metrics")).text
-    assert 'scene_reloads_total{outcome="failed"} 1.0' in counted
+    assert 'scene_reloads_total{outcome="failed"} 1.0' in (await own.get("/metrics")).text
 
 
 @pytest.mark.parametrize("log_odds", [None, math.inf], ids=["raises", "not finite"])
-async def test_a_version_without_answers_is_refused(
-    own: AsyncClient,
-    store: Path,
-    replace: Replace,
-    caplog: pytest.LogCaptureFixture,
-    log_odds: float | None,
-) -> None:
+async def test_a_version_without_answers_is_refused(own, store, replace, caplog, log_odds):
     served = own.app.state.runtime.models.served.values()  # type: ignore[attr-defined]
 
     def fails(missing: Any, model: Any, *args: Any, **parameters: Any) -> Any:
@@ -182,9 +167,7 @@ async def test_a_version_without_answers_is_refused(
     assert 'scene_reloads_total{outcome="refused"} 1.0' in counted
 
 
-async def test_requests_are_answered_during_a_load(
-    own: AsyncClient, store: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_requests_are_answered_during_a_load(own, store, monkeypatch):
     started, go_on, load = threading.Event(), threading.Event(), Store.load
 
     def slow(*args: Any) -> Any:

@@ -45,10 +45,8 @@ OPERATIONS = (REPOSITORY / "docs" / "operations.md").read_text("utf-8")
 def documented_metrics() -> dict[str, tuple[str, set[str], str]]:
     """The kind, labels and meaning of every metric, as the documentation lists them."""
     rows = re.findall(r"^\| `(scene_\w+)` \| (\w+) \|(.*?)\| (.+?) \|$", OPERATIONS, re.MULTILINE)
-    listed = {
-        name: (kind, set(re.findall(r"`(\w+)`", labels)), meaning)
-        for name, kind, labels, meaning in rows
-    }
+    label = re.compile(r"`(\w+)`")
+    listed = {name: (kind, set(label.findall(labels)), text) for name, kind, labels, text in rows}
     assert len(listed) == len(rows)
     return listed
 
@@ -232,8 +230,7 @@ def test_the_documentation_lists_every_metric(live: LiveService) -> None:
 def line(service: LiveService, method: str, path: str, **arguments: Any) -> dict[str, Any]:
     """Send a request, and return its line of the log."""
     identity = uuid.uuid4().hex
-    headers = {"X-Request-Id": identity}
-    service.client.request(method, path, headers=headers, **arguments)
+    service.client.request(method, path, headers={"X-Request-Id": identity}, **arguments)
     # The service writes the line after the answer.
     wait_until(lambda: f'"{identity}"' in service.log.read_text(), service.log)
     lines = map(json.loads, service.log.read_text().splitlines())
@@ -282,9 +279,7 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[ExportTraceServiceRe
 
 
 @pytest.mark.system
-def test_spans_have_names_of_routes(
-    shared_store: Path, tmp_path: Path, taken: list[ExportTraceServiceRequest]
-) -> None:
+def test_spans_have_names_of_routes(shared_store, tmp_path, taken):
     with launch(shared_store, tmp_path / "log", SCENE_OPENTELEMETRY="true") as service:
         service.client.post("/missing", json=SCENE)
         for path in UNTRACED:

@@ -13,7 +13,7 @@ from httpx import AsyncClient, Response
 from app.errors import ERRORS
 from app.questions import QUESTIONS
 from scene_client.schemas import Problem
-from tests.services import Replace, defect
+from tests.services import defect
 
 NAMES = [question.name for question in QUESTIONS]
 MARKER = "Zq7-marker"
@@ -230,8 +230,7 @@ async def test_contradictions_are_refused(client: AsyncClient, question: str) ->
     circle = [("bed", "on-top", "lamp"), ("lamp", "inside", "desk"), ("desk", "on-top", "bed")]
     body = {"objects": ["bed", "lamp", "desk"], "relations": circle}
     response = await client.post(f"/{question}", json=body)
-    document = problem(response, 422, "contradictory-evidence")
-    (error,) = document["errors"]
+    (error,) = problem(response, 422, "contradictory-evidence")["errors"]
     assert error["pointer"] == "#/relations"
     names = error["message"].partition(": ")[2].split(" on or in ")
     assert {*pairwise(names)} == {("bed", "lamp"), ("lamp", "desk"), ("desk", "bed")}
@@ -239,10 +238,7 @@ async def test_contradictions_are_refused(client: AsyncClient, question: str) ->
 
 @pytest.mark.parametrize("question", NAMES)
 async def test_unknown_labels_have_suggestions(client: AsyncClient, question: str) -> None:
-    body: dict[str, Any] = {
-        "objects": ["nigthstand", "bed", {"label": MARKER}],
-        "room_type": "bedrom",
-    }
+    body: Any = {"objects": ["nigthstand", "bed", {"label": MARKER}], "room_type": "bedrom"}
     if question == "missing":
         body["candidates"] = ["sofa", "sofe"]
     document = problem(await client.post(f"/{question}", json=body), 422, "unknown-labels")
@@ -363,9 +359,7 @@ async def test_valid_request_ids_are_kept(client: AsyncClient, given: Any, is_ke
 
 
 @pytest.mark.parametrize("question", NAMES)
-async def test_a_defect_is_a_problem_without_details(
-    client: AsyncClient, replace: Replace, caplog: pytest.LogCaptureFixture, question: str
-) -> None:
+async def test_a_defect_is_a_problem_without_details(client, replace, caplog, question):
     replace(question, defect)
     response = await client.post(f"/{question}", json={"objects": ["bed"]})
     document = problem(response, 500, "internal-error")

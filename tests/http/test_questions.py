@@ -20,7 +20,7 @@ from scene_client.frames import viewer_axes
 from tests.http.stores import PROFILES, VOCABULARY, C, V, publish
 from tests.http.test_problems import problem
 from tests.questions.test_placements import offsets_of_every_pair
-from tests.services import Replace, defect, serve
+from tests.services import defect, serve
 
 
 def at(x: float, y: float, z: float) -> dict[str, float]:
@@ -152,10 +152,8 @@ async def test_models_of_few_classes_answer(tmp_path: Path, variant: str, classe
 async def test_a_model_of_too_few_scenes_gives_no_judgement(tmp_path: Path) -> None:
     publish(tmp_path, "new", "1.0.0", alias="default", judges=False)
     async with serve(tmp_path) as client:
-        for relations, parts in (
-            ([], ["objects"]),
-            ([["lamp", "on-top", "bed"]], ["objects", "relations"]),
-        ):
+        on_top = [["lamp", "on-top", "bed"]]
+        for relations, parts in (([], ["objects"]), (on_top, ["objects", "relations"])):
             answer = await ask(client, "outliers", objects=["bed", "lamp"], relations=relations)
             assert answer["outliers"] == answer["misplaced"] == []
             assert "threshold" not in answer
@@ -251,9 +249,7 @@ REQUEST: dict[str, Any] = {
         ("robot_1/map", None),
     ],
 )
-async def test_offsets_are_in_the_axes_of_the_frame(
-    measured: AsyncClient, own_store: Path, frame: str | None, viewpoint: Any
-) -> None:
+async def test_offsets_are_in_the_axes_of_the_frame(measured, own_store, frame, viewpoint):
     """In a map without a viewpoint, the relations left and front have no offset."""
     options = {"frame_id": frame, "viewpoint": viewpoint}
     options = {name: value for name, value in options.items() if value is not None}
@@ -265,9 +261,8 @@ async def test_offsets_are_in_the_axes_of_the_frame(
         for k, label in enumerate(POSED)
     )
     model = Store(own_store).load("measured", "1.0.0").model
-    expected = questions.missing(
-        model, Scene(tuple(things), RelationTable.stated(())), top_k=11, axes=axes
-    )
+    scene = Scene(tuple(things), RelationTable.stated(()))
+    expected = questions.missing(model, scene, top_k=11, axes=axes)
     assert answer["missing"] == expected["missing"]
     places = [place for entry in answer["missing"] for place in entry["placements"]]
     kinds = {"offset" in place for place in places}
@@ -311,9 +306,7 @@ async def test_a_batch_holds_1_to_256_scenes(client: AsyncClient, scenes: Any) -
 
 
 @pytest.mark.parametrize("fault", ["raised", math.nan])
-async def test_a_defect_affects_one_entry(
-    client: AsyncClient, replace: Replace, caplog: pytest.LogCaptureFixture, fault: Any
-) -> None:
+async def test_a_defect_affects_one_entry(client, replace, caplog, fault):
     def fail_on_sofas(outliers: Any, artifact: Any, scene: Any, **parameters: Any) -> Any:
         answer = outliers(artifact, scene, **parameters)
         if any(thing.label == "sofa" for thing in scene.objects):

@@ -46,17 +46,15 @@ async def test_files_become_scenes(client: AsyncClient, tmp_path: Path, name: st
     fields = from_file(tmp_path / name, example.labels, scene=example.scene)
     assert found == json.loads(json.dumps(fields))
     notes = [one for one in answer["notes"] if one["scene"] == number]
-    assert [(one["detection"], one["reason"], one["detail"]) for one in notes] == [
-        tuple(note) for note in fields.notes[:16]
-    ]
+    listed = [(one["detection"], one["reason"], one["detail"]) for one in notes]
+    assert listed == [tuple(note) for note in fields.notes[:16]]
 
 
 @pytest.mark.parametrize("name", REFUSED)
 async def test_files_are_refused_as_by_the_client(client: AsyncClient, name: str) -> None:
     text, words = REFUSED[name]
     if "choose one" in words:
-        answer = await read(client, text, name)
-        names = [one["name"] for one in answer["scenes"]]
+        names = [one["name"] for one in (await read(client, text, name))["scenes"]]
         assert f"{len(names)} scenes ({', '.join(names)})" in words
     else:
         detail = await refusal(client, text, name=name)

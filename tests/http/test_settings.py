@@ -89,14 +89,7 @@ def test_invalid_settings_are_refused(tmp_path: Path, name: str, value: object) 
         ("SCENE_PORT", "tcp://10.0.0.1:8000", "Input should be a valid integer"),
     ],
 )
-def test_unknown_names_stop_the_start(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    name: str,
-    value: str,
-    message: str,
-) -> None:
+def test_unknown_names_stop_the_start(tmp_path, monkeypatch, capsys, name, value, message):
     monkeypatch.setenv("SCENE_STORE", str(tmp_path))
     monkeypatch.setenv(name, value)
     assert main([]) == 2

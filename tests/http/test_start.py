@@ -17,15 +17,7 @@ import pytest
 
 from app.__main__ import _bind
 from tests.http.stores import corrupt, publish
-from tests.services import (
-    PATIENCE,
-    LiveService,
-    begin,
-    free_port,
-    is_ready,
-    launch,
-    wait_until,
-)
+from tests.services import PATIENCE, LiveService, begin, free_port, is_ready, launch, wait_until
 
 pytestmark = pytest.mark.system
 

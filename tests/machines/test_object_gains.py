@@ -97,8 +97,7 @@ class Case:
         self.profile = None if self.source < 0 else self.source
         self.scorer = ObjectScorer(weights)
         room = None if self.room < 0 else self.room
-        scene = self.classes, self.presence, self.presence
-        self.context = encode(weights, *scene, room)
+        self.context = encode(weights, self.classes, self.presence, self.presence, room)
         self.x = self.context.x
 
     def listed(self, *without):
@@ -129,8 +128,7 @@ def test_log_odds_equal_the_tensors(name, seed):
     kappa = case.machine.kappa.numpy()
     close(found[absent], (case.log_odds() + kappa[0])[absent])
     found, _ = case.scorer.given_rest(case.context, case.profile, room)
-    rest = [case.log_odds(k)[i] + kappa[-1, i] for k, i in enumerate(case.classes)]
-    close(found, rest)
+    close(found, [case.log_odds(k)[i] + kappa[-1, i] for k, i in enumerate(case.classes)])
     if case.room < 0:
         scene = case.x[None], case.classes, case.presence[None], case.profile
         expected = case.machine.room_log_p(case.listed(), torch.tensor([case.source]))

@@ -126,10 +126,7 @@ def in_service(machine, observed, n=V, room=None):
 @settings(max_examples=50)
 @given(relations(), st.sampled_from([-1, 0, 1]), st.sampled_from([2, 4]))
 def test_implications_equal_the_formula_by_hand(grid, room, states):
-    """The tensors and the service, which lists only relations that hold.
-
-    The service also leaves out the effects between relations of the same pair (`apart`).
-    """
+    """The tensors and the service, also without effects between relations of the same pair."""
     A, n, _ = grid.shape
     machine = coupled_machine(A, states)
     v = torch.zeros(1, V).double()

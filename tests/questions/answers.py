@@ -44,15 +44,11 @@ def _more(artifact: SceneModel, scene: Scene, **options: Any) -> Any:
     return more_instances(artifact, scene, present(scene, artifact.spec), **options)
 
 
-# The answer to `outliers` has all its fields. The other functions return one list of an answer.
-def _judged(entry: dict[str, Any]) -> dict[str, Any]:
-    return {"object": entry["object"], "log_odds": None} | entry
-
-
 def outliers(artifact: SceneModel, scene: Scene, **options: Any) -> Any:
     """Return the answer, with `log_odds` None for objects that are not judged."""
     answer = questions.outliers(artifact, scene, **options)
-    answer["outliers"] = [_judged(entry) for entry in answer["outliers"]]
+    for entry in answer["outliers"]:
+        entry.setdefault("log_odds", None)
     return _converted(answer, {thing.id: k for k, thing in enumerate(scene.objects)})
 
 

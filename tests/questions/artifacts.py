@@ -39,9 +39,7 @@ ROOMS = ("bedroom", "office", "kitchen")
 def lines(low: float, medium: float, high: float, log_count: float = 0.0) -> AlarmLines:
     """Alarm lines with these intercepts and one slope."""
     levels = {"low": low, "medium": medium, "high": high}
-    return AlarmLines(
-        **{name: AlarmLine(intercept=z, log_count=log_count) for name, z in levels.items()}
-    )
+    return AlarmLines(**{k: AlarmLine(intercept=z, log_count=log_count) for k, z in levels.items()})
 
 
 NO_ALARM = lines(1e3, 1e3, 1e3)
@@ -100,10 +98,7 @@ def artifact_of(
 
 
 def larger_artifact(name: str, scale: float = 0.7, **changes: object) -> SceneModel:
-    """An artifact with many states. All weights are random numbers from N(0, scale²).
-
-    Structure has no object weights, as in a trained machine.
-    """
+    """An artifact with weights from N(0, scale²), but without object weights of structure."""
     machine = random_machine(LARGER[name], scale)
     structure = [k for k, label in enumerate(LABELS) if label in STRUCTURE]
     for weights, parameter in machine.named_parameters():
@@ -123,9 +118,8 @@ def random_machine(spec: MachineSpec, scale: float) -> BoltzmannMachine:
     if spec.T:
         units = spec.A * spec.V**2
         keys = torch.randperm(units, generator=generator)[: spec.T].sort().values
-        machine.set_triples(
-            torch.stack([keys // spec.V**2, keys // spec.V % spec.V, keys % spec.V], 1)
-        )
+        triples = torch.stack([keys // spec.V**2, keys // spec.V % spec.V, keys % spec.V], 1)
+        machine.set_triples(triples)
     random_weights(machine, generator, scale)
     return machine.eval()
 

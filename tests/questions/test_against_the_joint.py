@@ -44,13 +44,10 @@ CASES = [
 
 @dataclass(frozen=True)
 class Exact:
-    """Conditional probabilities of a machine, as sums over its joint.
-
-    source: the data source of the joint, or -1 if the answers infer it.
-    """
+    """Conditional probabilities of a machine, as sums over its joint."""
 
     joint: Joint
-    source: int
+    source: int  # of the joint, or -1 if the answers infer it
 
     def unit(self, triple):
         """The index of a relation unit, or None if the machine does not have it."""
@@ -85,10 +82,7 @@ class Exact:
         return float(np.interp(coverage, middles, self.joint.machine.kappa[:, i].tolist()))
 
     def relation(self, triple, present, observed=()):
-        """p(r_e = 1), given the classes.
-
-        Observed relations act by implications only. Their logits define it, and not the joint.
-        """
+        """p(r_e = 1), given the classes. Observed relations act by implications only."""
         if (unit := self.unit(triple)) is None:
             return 0.0
         spec, where = self.joint.machine.spec, self.states(present)
@@ -168,10 +162,7 @@ def test_outliers(name, room, profile):
 
 @pytest.mark.parametrize(("classes", "stated"), SCENES[:5])
 def test_placements(case, classes, stated):
-    """The best three of p(r_e = 1 | the candidate is present), made exclusive.
-
-    The answer leaves out what the observed relations imply for relations of a candidate.
-    """
+    """The best three, without what observed relations imply for relations of a candidate."""
     artifact, exact = case
     for entry in missing(artifact, scene_of(classes, stated)):
         i = LABELS.index(entry.label)
@@ -215,10 +206,7 @@ def test_relations(case, classes, stated):
     ("classes", "stated"), [*SCENES[3:], ([2, 0, 1], [(0, 0, 1), (0, 1, 2), (0, 0, 2)])]
 )
 def test_disagreements(case, classes, stated, complete):
-    """Each pair with a stated relation, judged without all relations of the pair.
-
-    If two relations are about equally likely, either may be the expected relation.
-    """
+    """If two relations are about equally likely, either may be the expected relation."""
     artifact, exact = case
     scene = scene_of(classes, stated, complete=complete)
     entries = {(d.subject, d.object): d for d in disagreements(artifact, scene, top_k=100)}

@@ -55,10 +55,7 @@ def test_instances_count_in_relations():
     ("classes", "listed"), [([0, 1, 1, 8], 2), ([0, 1, 2], 3), ([8], 1), ([], 1)]
 )
 def test_missing_classes_by_log_odds_and_number_of_listed_classes(classes, listed):
-    """Structure and further instances do not count. The number is at least 1.
-
-    The second artifact has the entry without effect, so its `log_odds` are those of the machine.
-    """
+    """Structure and further instances do not count. The number is at least 1."""
     slope = CountSlope(intercept=0.4, slope=0.6, log_count=-0.5)
     z = {entry.label: entry.log_odds for entry in missing(PLAIN, scene_of(classes), top_k=9)}
     for entry in missing(larger_artifact("triway", missing=slope), scene_of(classes), top_k=9):

@@ -24,9 +24,9 @@ SIZE = (0.5, 0.5, 0.5)
 
 def boxes(*bottoms, stated=None):
     """Boxes of 50 cm, of a class each."""
+    centres = [(x, y, z + 0.25) for x, y, z in bottoms]
     objects = tuple(
-        SceneObject(LABELS[k], LABELS[k], k, 1.0, (x, y, z + 0.25), SIZE)
-        for k, (x, y, z) in enumerate(bottoms)
+        SceneObject(LABELS[k], LABELS[k], k, 1.0, p, SIZE) for k, p in enumerate(centres)
     )
     return Scene(objects, None if stated is None else RelationTable.stated(stated))
 
@@ -39,13 +39,10 @@ def entries(scene, **options):
 
 def test_an_observed_relation_has_the_confidence_of_its_objects():
     """`expected` is the probability without the observation. Machines have no implications."""
-    objects = tuple(
-        replace(thing, confidence=c)
-        for thing, c in zip(scene_of([0, 1, 2]).objects, (0.9, 0.5, 1.0), strict=True)
-    )
+    pairs = zip(scene_of([0, 1, 2]).objects, (0.9, 0.5, 1.0), strict=True)
+    objects = tuple(replace(thing, confidence=c) for thing, c in pairs)
     plain = entries(Scene(objects))
-    scene = Scene(objects, RelationTable.stated([(ON_TOP, 1, 2), (LEFT, 0, 1)]))
-    answer = entries(scene)
+    answer = entries(Scene(objects, RelationTable.stated([(ON_TOP, 1, 2), (LEFT, 0, 1)])))
     assert answer["on-top", 1, 2].probability == pytest.approx(0.5)
     assert answer["left", 0, 1].probability == pytest.approx(0.45)
     for key, entry in answer.items():
@@ -59,8 +56,7 @@ def test_an_observed_relation_has_the_confidence_of_its_objects():
 
 def test_the_opposite_of_an_observed_relation_cannot_hold():
     plain, answer = entries(scene_of([0, 1])), entries(scene_of([0, 1], [(LEFT, 0, 1)]))
-    p = plain["left", 1, 0].probability
-    assert p > 0.01
+    assert plain["left", 1, 0].probability > 0.01
     assert answer["left", 1, 0].probability == 0
     for i, j in ((0, 1), (1, 0)):
         assert answer["front", i, j] == plain["front", i, j]

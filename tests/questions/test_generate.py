@@ -41,9 +41,8 @@ every_model = pytest.mark.parametrize("artifact", ARTIFACTS.values(), ids=NAMES)
 @given(st.sampled_from(NAMES), scenes(minimum=0), st.integers(0, 2**63 - 1))
 def test_scenes_contain_the_evidence_and_no_contradiction(name, scene, seed):
     evidence = {thing.label for thing in scene.objects}
-    stated = {
-        (scene.objects[i].label, CANONICAL[a], scene.objects[j].label) for a, i, j in scene.triples
-    }
+    labels = [thing.label for thing in scene.objects]
+    stated = {(labels[i], CANONICAL[a], labels[j]) for a, i, j in scene.triples}
     pairs = [{subject, object_} for subject, _, object_ in stated]
     for drawn in generate(ARTIFACTS[name], scene, count=9, seed=seed, steps=4):
         assert evidence <= set(drawn.objects)
@@ -113,10 +112,7 @@ def test_generation_stops_at_the_end_of_the_request(artifact):
 
 @cache
 def with_joint(name, room=None, profile=None, evidence=()):
-    """An artifact, and the joint of its machine under a room type and a profile.
-
-    Without a profile, the joint has the mean base rates given the listed classes.
-    """
+    """An artifact, and its joint; without a profile, with the mean rates given the evidence."""
     machine = random_machine(EXACT[name], 1.3)
     double, source = copy.deepcopy(machine).double(), profile
     if source is None:
@@ -175,7 +171,6 @@ def test_too_small_scenes_are_drawn_again(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_last_attempt_is_accepted(name):
-    """Every scene has an intruder, and the answer is still complete."""
     scenes = draw(name, scene_of([0]), outlier_lines=ALL)
     assert len(scenes) == 24
     assert all("bed" in scene.objects for scene in scenes)
@@ -184,7 +179,6 @@ def test_the_last_attempt_is_accepted(name):
 
 
 def test_scenes_with_intruders_are_drawn_again():
-    """Fewer intruders remain."""
     plain, counts = ARTIFACTS["triway"], []
     for limits in (NONE, SOME):
         scenes = draw("triway", scene_of([]), outlier_lines=limits)

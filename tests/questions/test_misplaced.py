@@ -83,7 +83,6 @@ def posterior_of(scene, alone=(), change=()):
 
 
 def stated(classes, triples, by_opposite=()):
-    """A scene without poses."""
     names = list(SIZES)
     objects = tuple(SceneObject(names[c], names[c], c) for c in classes)
     flags = [triple in by_opposite for triple in triples]
@@ -109,12 +108,10 @@ def entries(scene, alone=(), change=(), artifact=ARTIFACT):
 
 
 def test_the_terms_of_a_hand_computed_example():
-    """A monitor on a desk, a bin under the desk, and the bin to the left of the monitor."""
     on, under, left = (ON_TOP, 1, 0), (ON_TOP, 0, 2), (LEFT, 2, 1)
     scene = stated([DESK, MONITOR, BIN], [on, under, left], {under})
     alone = {on: 1.0, under: -2.0, (ABOVE, 0, 2): -0.5, left: 0.25, (ON_TOP, 1, 2): -1.0}
-    change = {on: 0.5, under: -0.125, left: -1.5}
-    table = entries(scene, alone, change)
+    table = entries(scene, alone, {on: 0.5, under: -0.125, left: -1.5})
     # Nine scenes show the monitor on a desk. The counts of all supporters are smoothed by .5.
     q = math.log((9 + 10 * 9.5 / (9 + 0.5 * V)) / (9 + 10))
     assert table == {
@@ -226,9 +223,8 @@ def test_the_answer_names_the_moved_object_of_each_entry():
         ("monitor", "under", "desk", 20.0 * math.exp(-0.5)),
     ]
     for entry, (subject, relation, object_, odds) in zip(answer, expected, strict=True):
-        assert [entry[name] for name in ("subject", "relation", "object")] == [
-            subject, relation, object_,
-        ]  # fmt: skip
+        named = [entry[name] for name in ("subject", "relation", "object")]
+        assert named == [subject, relation, object_]
         assert entry["moved"] == "monitor"
         assert entry["probability"] == pytest.approx(odds / (1 + odds), rel=1e-4)
         assert entry["is_misplaced"]

@@ -31,9 +31,8 @@ def presence_of(artifact, scene):
 @pytest.mark.parametrize("alpha", [0.0, 0.5, 1.0])
 def test_the_popularity_of_a_class_counts_by_its_weight(alpha):
     popularity = tuple(np.linspace(-3, 2, len(LABELS)).tolist())
-    artifact = larger_artifact(
-        "triway", outlier=LINE, popularity=popularity, popularity_weight=alpha
-    )
+    options = {"popularity": popularity, "popularity_weight": alpha}
+    artifact = larger_artifact("triway", outlier=LINE, **options)
     scene = scene_of([0, 1, 1, 2])
     entries = outliers(artifact, scene).outliers
     presence = presence_of(artifact, scene)
@@ -49,9 +48,8 @@ def test_the_popularity_of_a_class_counts_by_its_weight(alpha):
 def test_a_class_without_training_scene_counts_as_the_rarest():
     unseen = LABELS.index("lamp")
     popularity = tuple(None if k == unseen else -1.0 - k for k in range(len(LABELS)))
-    artifact = larger_artifact(
-        "triway-states", outlier=LINE, popularity=popularity, popularity_weight=0.5
-    )
+    options = {"popularity": popularity, "popularity_weight": 0.5}
+    artifact = larger_artifact("triway-states", outlier=LINE, **options)
     empty = missing(artifact, scene_of([]), coverage=1.0, top_k=len(LABELS))
     (alone,) = (entry.log_odds for entry in empty if entry.label == "lamp")
     priors = {"bed": -0.5, "lamp": alone + 0.5 * 9, "desk": -1.5}

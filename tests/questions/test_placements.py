@@ -67,7 +67,6 @@ def test_only_likely_places_and_strong_reasons_are_listed():
 
 
 def test_no_place_is_listed_below_one_in_twenty():
-    """The place of `at` is always listed."""
     scene, log_odds = scene_of([0, 1, 2]), math.log(0.05 / 0.95)
     for change, count in ((-0.01, 0), (0.01, 3)):
         slopes = (CountSlope(intercept=log_odds + change, slope=0.0),) * A
@@ -119,7 +118,6 @@ VIEWER = viewer_axes()
 
 
 def offset_of(relation, missing, anchor, outgoing=True, axes=VIEWER, offsets=OFFSETS):
-    """The offset of one placement, or None if it is unknown."""
     ends = (np.array([value]) for value in (relation, missing, anchor, outgoing))
     rotation = np.eye(3) if axes is None else np.array(axes)
     values = rotated_offsets(offsets.tables, *ends, rotation, axes is not None)
@@ -197,9 +195,7 @@ def test_relations_that_training_never_shows_are_lowered_by_the_stand_of_the_sub
         classes = np.array([k for k in range(V - 1) if k != anchor])
         posterior, place = Posterior(artifact, scene), Place.of(name, 0)
         found = placements(artifact, posterior, scene, classes, None, place)
-        return {
-            k: logit(places[0]["probability"]) for k, places in zip(classes, found, strict=True)
-        }
+        return {k: logit(own[0]["probability"]) for k, own in zip(classes, found, strict=True)}
 
     for name, anchor in itertools.product(RELATIONS, range(V - 1)):
         before = log_odds(bare, anchor, name)
@@ -241,13 +237,10 @@ def by_hand(artifact, scene, name, anchor, coverage):
     relation = CANONICAL.index(name if name in CANONICAL else OPPOSITES_OF[name])
     fit, is_subject = artifact.calibration.at[relation], name in CANONICAL
     listed = {thing.label for thing in scene.objects}
-    classes = [
-        k for k, label in enumerate(LABELS) if label not in STRUCTURE and label not in listed
-    ]
+    classes = [k for k, label in enumerate(LABELS) if label not in {*STRUCTURE, *listed}]
     posterior = Posterior(artifact, scene)
     z = posterior.absent_log_odds(np.array(classes), coverage)
-    place = Place(relation, anchor, is_subject)
-    log_p = place_log_p(posterior, np.array(classes), place)
+    log_p = place_log_p(posterior, np.array(classes), Place(relation, anchor, is_subject))
     of_anchor = scene.objects[anchor].class_index
     ratio = artifact.places.log_ratio(relation, of_anchor, outgoing=is_subject)
     probabilities = {}

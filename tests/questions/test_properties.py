@@ -52,7 +52,6 @@ def triples_of(entries):
 @few
 @given(artifacts, scenes(), st.none() | st.floats(0, 1))
 def test_missing(artifact, scene, coverage):
-    """All unlisted classes, with their best placements and strongest reasons."""
     entries = missing(artifact, scene, top_k=len(LABELS), coverage=coverage)
     first = {thing.label: k for k, thing in reversed(list(enumerate(scene.objects)))}
     assert {entry.label for entry in entries} == set(LABELS) - first.keys() - STRUCTURE
@@ -85,7 +84,6 @@ def test_candidates_and_top_k_select_entries_without_changing_them(
 @few
 @given(artifacts, scenes(minimum=2))
 def test_relations(artifact, scene):
-    """All pairs of objects without structure; opposite relations exclude each other."""
     entries = relations(artifact, scene, top_k=ALL)
     objects = [k for k, thing in enumerate(scene.objects) if thing.label not in STRUCTURE]
     p = {(e.subject, CANONICAL.index(e.relation), e.object): e.probability for e in entries}
@@ -133,7 +131,6 @@ def test_opposites_have_the_same_probability_and_evidence(artifact, scene):
 @few
 @given(artifacts, scenes(minimum=2), st.data(), st.booleans())
 def test_pairs_select_ordered_pairs(artifact, scene, data, opposites):
-    """All relations of the subject to the object, also for structure, and no other pair."""
     index = st.integers(0, len(scene.objects) - 1)
     pair = st.tuples(index, index).filter(lambda pair: pair[0] != pair[1])
     pairs = data.draw(st.lists(pair, min_size=1, max_size=3))
@@ -159,8 +156,7 @@ def test_outliers(artifact, scene, threshold):
     scores = [(-e.log_odds, e.object) for e in answer.outliers if e.label not in STRUCTURE]
     assert scores == sorted(scores)
     labels = {thing.label for thing in scene.objects}
-    entries_of_classes = {entry[1:] for entry in answer.outliers}
-    assert len(entries_of_classes) == len(labels)
+    assert len({entry[1:] for entry in answer.outliers}) == len(labels)
     for entry in answer.outliers:
         assert entry.label == scene.objects[entry.object].label
         assert (entry.log_odds is None) == (entry.label in STRUCTURE)
@@ -196,8 +192,7 @@ def test_the_order_of_the_objects_does_not_matter(artifact, scene, random):
     table, moved = scene.relations, np.array([new[k] for k in range(len(order))])
     if table is not None:
         table = replace(table, subject=moved[table.subject], object=moved[table.object])
-    objects = tuple(scene.objects[k] for k in order)
-    shuffled = Scene(objects, table, scene.room_type)
+    shuffled = Scene(tuple(scene.objects[k] for k in order), table, scene.room_type)
 
     def summaries(scene, order):
         answer = outliers(artifact, scene)

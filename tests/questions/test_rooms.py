@@ -32,7 +32,6 @@ def log_odds_by_tensors(artifact, classes, profile=None):
 
 
 def by_type(artifact, entries):
-    """The probabilities in the order of the room types, (C,)."""
     p = {entry.room_type: entry.probability for entry in entries}
     return np.array([p[name] for name in artifact.vocabulary.room_types])
 
@@ -44,9 +43,8 @@ def test_probabilities_are_those_of_the_machine_to_a_power(artifact, profile):
     entries = rooms(artifact, scene_of(CLASSES, profile=profile))
     p = log_odds_by_tensors(artifact, CLASSES, profile).sigmoid() ** (0.8 + 0.3 * math.log(2))
     np.testing.assert_allclose(by_type(artifact, entries), p / p.sum(), rtol=2e-4)
-    assert [e.probability for e in entries] == sorted(
-        (e.probability for e in entries), reverse=True
-    )
+    probabilities = [entry.probability for entry in entries]
+    assert probabilities == sorted(probabilities, reverse=True)
 
 
 def test_probabilities_of_candidates_sum_to_one(artifact):

@@ -33,24 +33,16 @@ Detection = dict[str, Any]
 QUARTER = math.sqrt(0.5)
 
 
-def point(x: float, y: float, z: float) -> dict[str, float]:
-    return {"x": x, "y": y, "z": z}
-
-
-def turn(x: float, y: float, z: float, w: float) -> dict[str, float]:
-    return {"x": x, "y": y, "z": z, "w": w}
-
-
 def room(
     convert: Callable[[tuple[float, ...]], Any] = tuple, size: Callable[..., Any] | None = None
 ) -> list[Detection]:
     return [
-        {"label": label, "position": point(*convert(p)), "size": point(*(size or convert)(s))}
+        {"label": label, "position": [*convert(p)], "size": [*(size or convert)(s)]}
         for label, p, s in ROOM
     ]
 
 
-def turned(quaternion: dict[str, float], *labels: str) -> list[Detection]:
+def turned(quaternion: list[float], *labels: str) -> list[Detection]:
     """The room; these things have an orientation, and the others have none."""
     return [one | ({"orientation": quaternion} if one["label"] in labels else {}) for one in room()]
 
@@ -87,7 +79,7 @@ def test_sizes_in_another_unit(factor: float) -> None:
 
 def test_a_unit_needs_three_things_that_agree() -> None:
     bed, desk, *others = in_units(10.0)
-    robot = {"label": "robot", "size": point(4, 4, 10)}  # without a typical size
+    robot = {"label": "robot", "size": [4, 4, 10]}  # without a typical size
     assert warned([bed, desk, robot]) == {"implausible-size": ["bed"]}
     assert warned([bed, desk, *room()[2:]]) == {"implausible-size": ["bed"]}
     # A thing without a position has a unit too.
@@ -98,7 +90,7 @@ def test_a_unit_needs_three_things_that_agree() -> None:
 def test_a_frame_whose_y_axis_points_up() -> None:
     assert warned(room(exchanged)) == {"y-axis-up": FURNITURE}
     # A turn about the vertical, which is y.
-    upright = [one | {"orientation": turn(0, QUARTER, 0, QUARTER)} for one in room(exchanged)]
+    upright = [one | {"orientation": [0, QUARTER, 0, QUARTER]} for one in room(exchanged)]
     assert warned(upright) == {"y-axis-up": FURNITURE}
     assert warned(room(exchanged)[:2]) == {}
     assert warned([*room(exchanged)[:2], *room()[2:]]) == {}
@@ -106,14 +98,14 @@ def test_a_frame_whose_y_axis_points_up() -> None:
 
 def test_quaternions_with_w_first() -> None:
     """A quarter turn about z is then a quarter turn about x, and the identity a half turn."""
-    quarter = turn(QUARTER, 0, 0, QUARTER)
+    quarter = [QUARTER, 0, 0, QUARTER]
     assert warned(turned(quarter, "bed", "book")) == {"rolled-objects": ["bed"]}
     scene = turned(quarter, "bed")
-    scene[1]["orientation"] = turn(1, 0, 0, 0)
+    scene[1]["orientation"] = [1, 0, 0, 0]
     assert warned(scene) == {"rolled-objects": ["bed"]}
     # One chair may have fallen over, if the other quaternions are right.
     scene = turned(quarter, "chair")
-    scene[1]["orientation"] = turn(0, 0, QUARTER, QUARTER)
+    scene[1]["orientation"] = [0, 0, QUARTER, QUARTER]
     assert warned(scene) == {}
     for one in (scene[0], scene[3]):
         one["orientation"] = quarter
@@ -130,19 +122,19 @@ def test_sizes_with_z_as_height_in_an_optical_frame() -> None:
     [
         (room(), None),
         (room(), "map"),
-        (turned(turn(0, 0, QUARTER, QUARTER), *FURNITURE), "map"),
-        (turned(turn(0, 0, 0.4, math.sqrt(0.84)), *FURNITURE, "book"), None),
-        (turned(turn(0, 0, 0, 1), *FURNITURE), None),
+        (turned([0, 0, QUARTER, QUARTER], *FURNITURE), "map"),
+        (turned([0, 0, 0.4, math.sqrt(0.84)], *FURNITURE, "book"), None),
+        (turned([0, 0, 0, 1], *FURNITURE), None),
         ([one | {"yaw": 1.0} for one in room()], None),
         (room(optical), "camera_optical_frame"),
         (  # boxes with z as height, turned into optical axes
             [
-                one | {"orientation": turn(0.5, -0.5, 0.5, 0.5)}
+                one | {"orientation": [0.5, -0.5, 0.5, 0.5]}
                 for one in room(optical, size=lambda s: s)
             ],
             "camera_optical_frame",
         ),
-        ([one | {"size": one["size"] | {"y": 0.0}} for one in room()], None),
+        ([one | {"size": [one["size"][0], 0.0, one["size"][2]]} for one in room()], None),
     ],
 )
 def test_right_scenes_get_no_warning(objects: list[Detection], frame_id: str | None) -> None:

@@ -51,7 +51,6 @@ JUDGING = {
     "misplaced": Misplaced(**dict.fromkeys(KINDS, WRONG)),
 }
 
-
 DATA = {
     "source": "generated",
     "scenes": 12,
@@ -115,7 +114,6 @@ def rewrite_manifest(directory: Path, change: Callable[[dict[str, Any]], object]
 
 
 def make_outdated(store: Store, name: str, version: str) -> None:
-    """Give a version the format of the last release."""
     folder = store.root / name / version
     rewrite_manifest(folder, lambda members: members.update(format=FORMAT - 1))
 
@@ -142,14 +140,12 @@ def replace_file(directory: Path, name: str, data: bytes) -> None:
 
 
 def refused(code: str) -> pytest.RaisesExc[ArtifactError | StoreError]:
-    """Expect an error of the registry with this code."""
     return pytest.raises((ArtifactError, StoreError), check=lambda error: error.code == code)
 
 
 def publish_as(
     store: Store, alias: str, described: Description, weights: Any, **options: Any
 ) -> Artifact:
-    """Publish a version, and point an alias at it."""
     artifact = store.publish(described, weights, **options)
     name, version = artifact.key
     store.set_alias(alias, AliasTarget(name=name, version=version))

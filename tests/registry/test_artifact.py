@@ -66,8 +66,7 @@ def test_round_trip_is_exact_in_float32(variant: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize(
-    "more",
-    [{}, {"C": 3, "N": 4, "G": 1}, {"states": 3, "C": 3, "profiles": 2, "coupled": True}],
+    "more", [{}, {"C": 3, "N": 4, "G": 1}, {"states": 3, "C": 3, "profiles": 2, "coupled": True}]
 )
 def test_the_layout_is_that_of_the_machines(variant: str, more: dict[str, Any]) -> None:
     sizes = {name: n for name, n in more.items() if name != "G" or variant == "triway"}
@@ -206,10 +205,7 @@ def spoil(written: Path, change: Callable[[dict[str, Any]], object]) -> Artifact
     weights: dict[str, Any] = state()
     change(weights)
     replace_file(written, WEIGHTS, save(weights))
-    entries = {
-        name: {"dtype": array.dtype.name, "shape": list(array.shape)}
-        for name, array in weights.items()
-    }
+    entries = {k: {"dtype": one.dtype.name, "shape": list(one.shape)} for k, one in weights.items()}
     rewrite_manifest(written, lambda members: members.update(tensors=entries))
     return refusal(written)
 
@@ -240,9 +236,7 @@ OUT_OF_RANGE = [
         *OUT_OF_RANGE,
     ],
 )
-def test_refuses_tensors_that_do_not_fit_the_spec(
-    change: Callable[[dict[str, Any]], object], tensor: str, code: str, written: Path
-) -> None:
+def test_refuses_tensors_that_do_not_fit_the_spec(change, tensor, code, written):
     error = spoil(written, change)
     assert (error.code, f"'{tensor}'" in error.reason) == (code, code != "invalid_tensor")
 
@@ -256,9 +250,7 @@ def test_refuses_tensors_that_do_not_fit_the_spec(
         lambda t: t.update(extra={"dtype": "float32", "shape": []}),
     ],
 )
-def test_refuses_tensors_that_the_manifest_does_not_promise(
-    change: Callable[[dict[str, Any]], object], written: Path
-) -> None:
+def test_refuses_tensors_that_the_manifest_does_not_promise(change, written):
     rewrite_manifest(written, lambda members: change(members["tensors"]))
     assert refusal(written).code == "wrong_shape"
 

@@ -92,11 +92,7 @@ def leftovers(root: Path) -> list[Path]:
 
 
 def check_survivor(root: Path) -> tuple[str, str, bool]:
-    """Check that all visible versions verify, and that the next publication works and clears up.
-
-    Returns:
-        The newest version, the version of the alias, and whether a temporary file was left over.
-    """
+    """Check the store, and return newest version, default, and whether a temporary file is left."""
     models, left = load_model_set(Store(root)), bool(leftovers(root))
     assert models.failure is None
     assert not models.failures

@@ -12,21 +12,16 @@ from app.registry.manifest import FORMAT
 from tests.registry.small_artifacts import description, refused, resign
 
 DIGEST = "ab" * 32
-FILES = {
-    "model.safetensors": {"sha256": DIGEST, "bytes": 1},
-    "card.md": {"sha256": DIGEST, "bytes": 2},
-}
+FILES = {name: {"sha256": DIGEST, "bytes": 2} for name in ("model.safetensors", "card.md")}
 
 
 def manifest(**changes: Any) -> Manifest:
     tensors = {"b": {"dtype": "float32", "shape": [3]}}
-    return Manifest.model_validate(
-        {**dict(description()), "tensors": tensors, "files": FILES, **changes}
-    )
+    fields = {**dict(description()), "tensors": tensors, "files": FILES, **changes}
+    return Manifest.model_validate(fields)
 
 
 def stored() -> dict[str, Any]:
-    """The members of a stored manifest without the checksum."""
     members: dict[str, Any] = json.loads(manifest().to_bytes())
     del members["checksum"]
     return members

@@ -34,8 +34,7 @@ def weights(request):
 
 def test_rows_are_those_of_kernel_ridge_regression(weights) -> None:
     """The formula of the module, written out with loops over the classes."""
-    left_out = [LABELS.index("vase")]
-    row_map = RowMap.fit(weights, CLASSES, left_out)
+    row_map = RowMap.fit(weights, CLASSES, [LABELS.index("vase")])
     used = [k for k, label in enumerate(LABELS) if label not in ("vase", "wall")]
     vectors = CLASSES.vectors[0].astype(np.float64)
     centre = vectors[used].mean(0)
@@ -67,8 +66,7 @@ def test_a_left_out_row_has_no_effect(weights) -> None:
 
 
 def test_known_classes_keep_their_weights(weights) -> None:
-    found = words("ottoman", "mug")
-    larger = RowMap.fit(weights, CLASSES).with_words(weights, found)
+    larger = RowMap.fit(weights, CLASSES).with_words(weights, words("ottoman", "mug"))
     V = weights.spec.V
     assert larger.spec == replace(weights.spec, V=V + 2)
     for name, (_, shape) in layout(weights.spec).items():
@@ -78,9 +76,8 @@ def test_known_classes_keep_their_weights(weights) -> None:
         assert not larger["L"][:, V:].any()
     # A word is evidence, and known classes keep their log-odds without one.
     nothing = np.zeros(0, np.int64), np.zeros(0, np.float32)
-    of_known, of_all = (
-        ObjectScorer(w).absent(w["c1"], *nothing, None, 0.5) for w in (weights, larger)
-    )
+    scorers = ObjectScorer(weights), ObjectScorer(larger)
+    of_known, of_all = (one.absent(weights["c1"], *nothing, None, 0.5) for one in scorers)
     assert of_all[:V] == pytest.approx(of_known, abs=1e-5)
 
 
@@ -93,9 +90,9 @@ def test_stored_scenes_show_no_word() -> None:
     stored = replace(weights, spec=spec, arrays=arrays)
     for V in (9 + 23, 9 + 24):
         larger = stored.enlarged(V, spec.C)
-        assert larger.scenes.shape == (2, V)
-        assert np.array_equal(larger.scenes[:, :9], stored.scenes)
-        assert not larger.scenes[:, 9:].any()
+        assert larger.chain_samples.shape == (2, V)
+        assert np.array_equal(larger.chain_samples[:, :9], stored.chain_samples)
+        assert not larger.chain_samples[:, 9:].any()
 
 
 def test_a_model_without_word_vectors_has_no_map() -> None:

@@ -1,6 +1,5 @@
 """Models that a release replaces: the statement, the copy of an upgrade, and old names."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -19,6 +18,7 @@ from tests.registry.small_artifacts import (
 
 TERMS = "Any use,\nwith the sources named."
 REPLACED = {"old": "new", "old-rbm": "new-rbm"}
+PARENT = {"name": "old", "version": "3.5.0"}
 
 
 @pytest.fixture
@@ -63,8 +63,8 @@ def test_changes_of_aliases_keep_the_statement_of_the_release(release: Store) ->
     [("old@3.5.0", "new@4.0.0"), ("old", "new@4.0.0"), ("old-rbm@3.5.0", "new-rbm@4.0.0")],
 )
 def test_an_upgrade_moves_the_default_from_a_replaced_model_and_says_the_terms(
-    volume: Store, release: Store, target: str, moved: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+    volume, release, target, moved, capsys
+):
     volume.set_alias("default", AliasTarget.of(target))
     volume.set_alias("mine", AliasTarget.of("old@3.5.0"))
     assert upgrade(release, volume) == 0
@@ -103,12 +103,7 @@ def own_version_among_shipped_ones(volume: Store) -> str:
         own_version_among_shipped_ones,
     ],
 )
-def test_an_upgrade_never_moves_the_default_from_an_own_model(
-    volume: Store,
-    release: Store,
-    own: Callable[[Store], str],
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_an_upgrade_never_moves_the_default_from_an_own_model(volume, release, own, capsys):
     target = own(volume)
     volume.set_alias("default", AliasTarget.of(target))
     assert upgrade(release, volume) == 0
@@ -116,9 +111,7 @@ def test_an_upgrade_never_moves_the_default_from_an_own_model(
     assert f"alias 'default' still points at {target}, not at new@4.0.0" in capsys.readouterr().out
 
 
-def test_a_default_that_was_moved_back_stays_while_the_old_model_is_readable(
-    volume: Store, release: Store
-) -> None:
+def test_a_default_that_was_moved_back_stays_while_the_old_model_is_readable(volume, release):
     assert upgrade(release, volume) == 0
     volume.set_alias("default", AliasTarget.of("old@3.5.0"))
     assert upgrade(release, volume) == 0
@@ -129,9 +122,7 @@ def test_a_default_that_was_moved_back_stays_while_the_old_model_is_readable(
     assert default(volume) == "new@4.0.0"
 
 
-def test_old_names_lead_to_the_new_ones_unless_the_store_has_the_old_model(
-    volume: Store, release: Store
-) -> None:
+def test_old_names_lead_to_the_new_ones_unless_the_store_has_the_old_model(volume, release):
     for reference in ("old", "old@3.5.0"):
         for resolve in (release.resolve, load_model_set(release).resolve):
             with refused("replaced_model") as raised:
@@ -146,27 +137,15 @@ def test_old_names_lead_to_the_new_ones_unless_the_store_has_the_old_model(
 @pytest.mark.parametrize(
     ("name", "version", "training", "code", "advice"),
     [
-        (
-            "home",
-            "2.0.0",
-            {"parent": {"name": "old", "version": "3.5.0"}},
-            "outdated_format",
-            "adapt the model",
-        ),
+        ("home", "2.0.0", {"parent": PARENT}, "outdated_format", "adapt the model"),
         ("lab", "1.0.0", {"seed": 7}, "outdated_format", "train the model again"),
         ("old", "3.6.0", {}, "outdated_format", "train the model again"),
         ("old", "3.5.0", None, "replaced_model", "'new' replaces this version"),
     ],
 )
 def test_a_model_of_an_older_format_says_how_to_go_on(
-    volume: Store,
-    release: Store,
-    name: str,
-    version: str,
-    training: dict[str, object] | None,
-    code: str,
-    advice: str,
-) -> None:
+    volume, release, name, version, training, code, advice
+):
     if training is not None:
         volume.publish(description(name, version, training=training), state())
     make_outdated(volume, name, version)
@@ -177,9 +156,7 @@ def test_a_model_of_an_older_format_says_how_to_go_on(
     assert "\n" not in failure.reason
 
 
-def test_a_damaged_statement_of_the_release_takes_no_model_down(
-    volume: Store, release: Store
-) -> None:
+def test_a_damaged_statement_of_the_release_takes_no_model_down(volume, release):
     (release.root / "aliases.json").write_text("{")
     models = load_model_set(volume, release=release)
     assert models.failure is None

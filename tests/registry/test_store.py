@@ -45,9 +45,7 @@ def test_publishes_what_a_reader_loads(store: Store) -> None:
     assert new.path == loaded.path == store.root / "tiny" / "1.0.0"
     assert new.digest == loaded.digest
     weights = new.model.weights
-    assert all(
-        np.array_equal(array, weights[k]) for k, array in loaded.model.weights.arrays.items()
-    )
+    assert all(np.array_equal(w, weights[k]) for k, w in loaded.model.weights.arrays.items())
     assert sorted(tree(store.root)) == [
         "aliases.json",
         "tiny/1.0.0/card.md",
@@ -113,9 +111,7 @@ def test_waits_for_another_writer_but_not_for_ever(tmp_path: Path) -> None:
     assert published(store) == {"tiny": ("1.0.0",)}
 
 
-def test_everything_is_on_disk_before_it_is_pointed_at(
-    store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_everything_is_on_disk_before_it_is_pointed_at(store, monkeypatch):
     """A rename may outlive a power cut that the renamed bytes do not, unless these came first."""
     events: list[tuple[str, object]] = []
     fsync, rename = os.fsync, Path.rename
@@ -308,11 +304,8 @@ def test_a_missing_store_is_an_error_and_an_empty_one_is_not(store: Store) -> No
 
 
 def test_the_command_changes_the_store_of_the_service_and_creates_none(
-    store: Store,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    store, tmp_path, monkeypatch, capsys
+):
     publish(store)
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("SCENE_STORE", raising=False)
@@ -357,7 +350,6 @@ def copy(source: Store, target: Store, *references: str) -> int:
 
 @pytest.fixture
 def shipped(tmp_path: Path) -> Store:
-    """A store with two versions, as an image of a newer release has it."""
     store = Store(tmp_path / "shipped")
     publish(store, "1.0.0")
     publish_as(store, "default", description(version="2.0.0"), state(seed=1))
@@ -365,9 +357,7 @@ def shipped(tmp_path: Path) -> Store:
     return store
 
 
-def test_copies_of_a_store_are_equal_and_repeatable(
-    shipped: Store, store: Store, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_copies_of_a_store_are_equal_and_repeatable(shipped, store, capsys):
     store.root.mkdir()
     assert copy(shipped, store) == 0
     assert tree(store.root) == tree(shipped.root)
@@ -379,9 +369,7 @@ def test_copies_of_a_store_are_equal_and_repeatable(
 
 
 @pytest.mark.parametrize(("reference", "version"), [("tiny@1.0.0", "1.0.0"), ("default", "2.0.0")])
-def test_copies_one_version_and_no_alias(
-    shipped: Store, store: Store, reference: str, version: str
-) -> None:
+def test_copies_one_version_and_no_alias(shipped, store, reference, version):
     store.root.mkdir()
     assert copy(shipped, store, reference) == 0
     assert published(store) == {"tiny": (version,)}
@@ -389,9 +377,7 @@ def test_copies_one_version_and_no_alias(
     assert store.load("tiny", version).digest == shipped.load("tiny", version).digest
 
 
-def test_an_upgrade_moves_an_alias_forward_once_and_keeps_own_choices(
-    shipped: Store, store: Store, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_upgrade_moves_an_alias_forward_once_and_keeps_own_choices(shipped, store, capsys):
     publish_as(store, "default", description(version="1.5.0"), state(seed=3))
     publish_as(store, "spare", description("own"), state(seed=4))
     assert copy(shipped, store) == 0
@@ -407,9 +393,7 @@ def test_an_upgrade_moves_an_alias_forward_once_and_keeps_own_choices(
     assert published(store)["tiny"] == ("1.0.0", "1.5.0", "2.0.0")
 
 
-def test_a_copy_replaces_no_other_version_of_the_same_number(
-    shipped: Store, store: Store, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_copy_replaces_no_other_version_of_the_same_number(shipped, store, capsys):
     publish(store, "2.0.0", seed=5)
     before = store.load("tiny", "2.0.0").digest
     assert copy(shipped, store) == 1
@@ -420,9 +404,7 @@ def test_a_copy_replaces_no_other_version_of_the_same_number(
     assert published(store) == {"other": ("1.0.0",), "tiny": ("1.0.0", "2.0.0")}
 
 
-def test_damaged_versions_are_not_copied_nor_taken_for_copies(
-    shipped: Store, store: Store, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_damaged_versions_are_not_copied_nor_taken_for_copies(shipped, store, capsys):
     store.root.mkdir()
     assert copy(shipped, store) == 0
     for root, version in ((shipped.root, "1.0.0"), (store.root, "2.0.0")):
@@ -440,9 +422,7 @@ def test_damaged_versions_are_not_copied_nor_taken_for_copies(
     assert not [path for path in (store.root / "tiny").iterdir() if path.name.startswith(".")]
 
 
-def test_a_copy_names_the_store_that_is_missing(
-    shipped: Store, store: Store, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_copy_names_the_store_that_is_missing(shipped, store, capsys):
     assert copy(shipped, store) == 1
     assert f"store {store.root}: there is no folder" in capsys.readouterr().err
     assert copy(store, shipped) == 1

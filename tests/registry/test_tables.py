@@ -23,7 +23,6 @@ CLASSES = np.arange(V)
 
 
 def counts(**changes: Any) -> Counts:
-    """Counts of the classes bed and lamp."""
     weights = np.full((2, 2, 3 + C + V), 0.25, np.float32)
     weights[0, :, 3 + C] = weights[1, :, 4 + C] = 0
     values = {
@@ -82,7 +81,6 @@ def test_a_group_comes_back_with_the_artifact(tmp_path: Path, group: Any) -> Non
     artifact = written(tmp_path / "a", group())
     groups = {name: getattr(artifact.model, name) for name in ("counts", "offsets", "places")}
     loaded = groups.pop(group.__name__)
-    assert loaded is not None
     assert [*groups.values()] == [None, None]
     for name, tensor in group().tensors().items():
         assert np.array_equal(loaded.tensors()[name], tensor)
@@ -175,9 +173,7 @@ INVALID: list[tuple[Any, str, list[dict[str, Any]]]] = [
 @pytest.mark.parametrize(
     ("group", "code", "change"), [(group, code, c) for group, code, cs in INVALID for c in cs]
 )
-def test_invalid_tensors_are_refused(
-    tmp_path: Path, group: Any, code: str, change: dict[str, Any]
-) -> None:
+def test_invalid_tensors_are_refused(tmp_path, group, code, change):
     with refused(code):
         written(tmp_path / "a", group(**change))
 
@@ -195,9 +191,7 @@ def test_missing_and_unexpected_tensors_are_refused(group: Any) -> None:
 def test_counts_at_their_limits_are_accepted() -> None:
     share, weights = np.array([(0, -64)] * 2, "f4"), counts().weights * 256
     at_limits = counts(most=np.array([1, 1]), log_share=share, weights=weights)
-    loaded = read_group(Counts, at_limits.tensors(), A, V, C)
-    assert loaded is not None
-    assert loaded.weights.max() == 64
+    assert read_group(Counts, at_limits.tensors(), A, V, C).weights.max() == 64
 
 
 @pytest.mark.parametrize(
@@ -214,9 +208,7 @@ def test_counts_at_their_limits_are_accepted() -> None:
         ((3, 0, 2), None, -1),
     ],
 )
-def test_offsets_are_those_of_the_pair_or_of_the_relation(
-    triple: tuple[int, int, int], offset: tuple[float, ...] | None, scenes: int
-) -> None:
+def test_offsets_are_those_of_the_pair_or_of_the_relation(triple, offset, scenes):
     values, numbers = offsets().find(*(np.array([index]) for index in triple))
     assert numbers.tolist() == [scenes]
     assert offset is None or values[0].tolist() == pytest.approx(offset)
@@ -225,9 +217,7 @@ def test_offsets_are_those_of_the_pair_or_of_the_relation(
 @pytest.mark.parametrize("relation", range(A))
 @pytest.mark.parametrize("anchor", range(V))
 @pytest.mark.parametrize("outgoing", [True, False])
-def test_the_ratio_of_a_place_is_that_of_smoothed_counts(
-    relation: int, anchor: int, outgoing: bool
-) -> None:
+def test_the_ratio_of_a_place_is_that_of_smoothed_counts(relation, anchor, outgoing):
     """Also for a relation without scenes: the place then changes nothing."""
 
     def held(a: int, i: int, j: int) -> float:

@@ -15,7 +15,6 @@ NAN = math.nan
 Thing = tuple[tuple[float, ...], tuple[float, ...]]
 TABLE: Thing = ((2.0, 0.0, 0.4), (1.0, 1.6, 0.8))
 
-
 # How often the first class is on, under and in the second.
 SEEN = {
     ("bin", "desk"): (1, 20, 0),
@@ -99,9 +98,7 @@ STACKS = ALL - HORIZONTAL
         (box(2.0, 0.0, 0.0, 2.0, 3.0, 0.0), TABLE, NOTHING, ALL),
     ],
 )
-def test_relations_of_a_pair(
-    subject: Thing, anchor: Thing, holds: set[str], observed: set[str]
-) -> None:
+def test_relations_of_a_pair(subject, anchor, holds, observed):
     positions, sizes = zip(subject, anchor, strict=True)
     assert names(derive_relations(positions, sizes)) == (holds, observed)
 
@@ -124,36 +121,25 @@ def standing(x: float, y: float, bottom: float, *size: float) -> Thing:
 
 
 BED = standing(2.0, 0.0, 0.0, 2.1, 1.6, 1.1)  # with its headboard
+DESK_BOX = standing(2.0, 0.0, 0.0, 0.7, 1.4, 0.75)
+DINING_TABLE = standing(2.0, 0.0, 0.0, 0.9, 1.6, 0.75)
+FRIDGE = standing(2.0, 0.0, 0.0, 0.65, 0.7, 1.8)
 
 
 @pytest.mark.parametrize(
     ("smaller", "larger", "labels", "relation"),
     [
-        (
-            standing(2.1, 0.4, 0.0, 0.3, 0.3, 0.35),
-            standing(2.0, 0.0, 0.0, 0.7, 1.4, 0.75),
-            ("bin", "desk"),
-            "under",
-        ),
-        (  # with its back against the edge, higher than the table
-            standing(1.5, 0.3, 0.0, 0.5, 0.45, 0.92),
-            standing(2.0, 0.0, 0.0, 0.9, 1.6, 0.75),
-            ("chair", "table"),
-            "under",
-        ),
+        (standing(2.1, 0.4, 0.0, 0.3, 0.3, 0.35), DESK_BOX, ("bin", "desk"), "under"),
+        # With its back against the edge, higher than the table.
+        (standing(1.5, 0.3, 0.0, 0.5, 0.45, 0.92), DINING_TABLE, ("chair", "table"), "under"),
         (standing(2.7, 0.4, 0.5, 0.4, 0.6, 0.15), BED, ("pillow", "bed"), "on-top"),
-        (
-            standing(2.0, 0.1, 0.9, 0.09, 0.09, 0.25),
-            standing(2.0, 0.0, 0.0, 0.65, 0.7, 1.8),
-            ("milk", "fridge"),
-            "inside",
-        ),
+        (standing(2.0, 0.1, 0.9, 0.09, 0.09, 0.25), FRIDGE, ("milk", "fridge"), "inside"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value[0], str) else "",
 )
 def test_counts_decide_the_role_of_boxes_that_reach_into_each_other(
-    smaller: Thing, larger: Thing, labels: tuple[str, str], relation: str
-) -> None:
+    smaller, larger, labels, relation
+):
     positions, sizes = zip(smaller, larger, strict=True)
     classes = np.array([LABELS.index(label) for label in labels])
     found = derive_relations(positions, sizes, classes=classes, roles=COUNTS)
@@ -219,9 +205,7 @@ def test_heights_exclude_roles(rise: float, height: float, expected: set[int]) -
         ((0.0, 1.0, 1.0), (0.0, 2.0, 1.0), False),
     ],
 )
-def test_the_footprint_and_then_the_volume_tell_the_smaller(
-    i: tuple[float, ...], j: tuple[float, ...], expected: bool
-) -> None:
+def test_the_footprint_and_then_the_volume_tell_the_smaller(i, j, expected):
     assert is_smaller(np.array(i), np.array(j)) is expected
 
 
@@ -237,7 +221,6 @@ rectangles = st.tuples(coordinates, coordinates, sides, sides, turns)
 
 
 def corners(rectangle: Rectangle) -> list[Point]:
-    """The corners, counter-clockwise."""
     x, y, length, width, yaw = rectangle
     cos, sin = math.cos(yaw) / 2, math.sin(yaw) / 2
     return [
@@ -273,15 +256,10 @@ def distance_of(a: list[Point], b: list[Point]) -> float:
 
 
 def border_distance(points: list[Point], polygon: list[Point]) -> float:
-    """Least distance of some points to the border of a polygon."""
-    best = math.inf
-    for px, py in points:
-        for (ax, ay), (bx, by) in zip(polygon, polygon[1:] + polygon[:1], strict=True):
-            ux, uy = bx - ax, by - ay
-            t = ((px - ax) * ux + (py - ay) * uy) / (ux * ux + uy * uy)
-            t = min(max(t, 0.0), 1.0)
-            best = min(best, math.hypot(px - ax - t * ux, py - ay - t * uy))
-    return best
+    starts = np.array(polygon)
+    edges, offsets = np.roll(starts, -1, axis=0) - starts, np.array(points)[:, None] - starts
+    t = ((offsets * edges).sum(2) / (edges**2).sum(1)).clip(0, 1)
+    return float(np.linalg.norm(offsets - t[..., None] * edges, axis=2).min())
 
 
 def measure(a: Rectangle, b: Rectangle) -> tuple[float, float]:
@@ -303,9 +281,8 @@ def test_a_footprint_too_small_for_its_area_is_a_point() -> None:
     """1e-300 m squared underflows to 0. The overlap is 1 with what it touches, and otherwise 0."""
     tiny, table = np.full((2, 2), 1e-300), np.ones((2, 2))
     centres = np.array([[0.0, 0.0], [3.0, 0.0]])
-    share, gap = overlap_and_gap(
-        centres, tiny, np.zeros(2), np.zeros((2, 2)), table, np.array([0.0, 0.3])
-    )
+    yaws = np.zeros(2), np.array([0.0, 0.3])
+    share, gap = overlap_and_gap(centres, tiny, yaws[0], np.zeros((2, 2)), table, yaws[1])
     assert share.tolist() == [1.0, 0.0]
     assert gap[0] == 0
     assert gap[1] > 2

@@ -34,12 +34,11 @@ from training.datasets.encoding import pool_instances
 
 DESK = SceneObject("desk", "desk", 0, position=(2.0, 0.0, 0.4), size=(0.8, 1.6, 0.8))
 MONITOR = SceneObject("monitor", "monitor", 1, position=(2.0, 0.2, 1.0), size=(0.1, 0.5, 0.4))
+SOFA = SceneObject("sofa", "sofa", 3, position=(6.0, 0.0, 0.4), size=(0.9, 2.0, 0.8))
 CHAIR = SceneObject("chair", "chair", 2, position=(1.2, 0.0, 0.5))
 
 
 def excluded(scene: Scene) -> np.ndarray:
-    """Which relations do not hold, (A, N, N)."""
-    assert scene.relations is not None
     off = scene.relations.rows(scene.relations.probability == 0)
     grid = np.zeros((len(CANONICAL), *[len(scene.objects)] * 2), bool)
     grid[off.relation, off.subject, off.object] = True
@@ -50,7 +49,6 @@ def test_poses_become_relations() -> None:
     seen = observe(Scene((DESK, MONITOR, CHAIR)))
     assert set(seen.triples) == {(ON_TOP, 1, 0), (FRONT, 2, 0), (FRONT, 2, 1)}
     assert seen.has_boxes
-    assert seen.relations is not None
     _, observed = seen.relations.grids(3)
     assert observed[LEFT, 0, 2]
     assert not observed[ABOVE, 0, 2]  # the chair has no size
@@ -77,8 +75,7 @@ def test_typical_sizes_take_the_place_of_unknown_ones() -> None:
 
 def test_stated_relations_stay_and_poses_exclude_others() -> None:
     """The monitor stands on the desk, 20 cm to the left, and the sofa is far away."""
-    sofa = SceneObject("sofa", "sofa", 3, position=(6.0, 0.0, 0.4), size=(0.9, 2.0, 0.8))
-    objects = (DESK, MONITOR, sofa)
+    objects = (DESK, MONITOR, SOFA)
     stated = Scene(objects, RelationTable.stated([(ON_TOP, 2, 0), (LEFT, 1, 0)], [False, True]))
     seen, derived = observe(stated, viewpoint=Viewpoint(0, 0, 0)), observe(Scene(objects))
     assert (seen.objects, seen.triples, seen.opposites) == (
@@ -96,18 +93,14 @@ def test_stated_relations_stay_and_poses_exclude_others() -> None:
 
 
 def test_in_a_map_without_a_viewer_no_direction_is_excluded() -> None:
-    sofa = SceneObject("sofa", "sofa", 3, position=(6.0, 0.0, 0.4), size=(0.9, 2.0, 0.8))
-    assert not excluded(observe(Scene((DESK, sofa)), has_viewer=False))[[LEFT, FRONT]].any()
+    assert not excluded(observe(Scene((DESK, SOFA)), has_viewer=False))[[LEFT, FRONT]].any()
 
 
 @pytest.mark.parametrize(("distance", "is_far"), [(2.9, False), (3.1, True)])
-def test_boxes_of_unknown_size_are_not_stacked_from_far_apart(
-    distance: float, is_far: bool
-) -> None:
+def test_boxes_of_unknown_size_are_not_stacked_from_far_apart(distance, is_far):
     """A footprint of unknown size reaches at most 1.5 m."""
-    ends = [
-        SceneObject(name, name, 0, position=(x, 0, 0)) for name, x in (("a", 0), ("b", distance))
-    ]
+    places = {"a": 0, "b": distance}.items()
+    ends = [SceneObject(name, name, 0, position=(x, 0, 0)) for name, x in places]
     assert excluded(observe(Scene(tuple(ends))))[[*STACKED], 0, 1].all() == is_far
 
 
@@ -124,9 +117,7 @@ def instances(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.n
 
 
 @given(instances())
-def test_classes_are_the_or_over_instance_pairs(
-    drawn: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
-) -> None:
+def test_classes_are_the_or_over_instance_pairs(drawn):
     classes, confidence, holds, observed = drawn
     evidence = pool_instances(classes, holds, observed, room_type=3)
     *_, presence = pool_classes(classes, confidence)
@@ -166,9 +157,7 @@ def test_observations_are_stated_complete_or_from_boxes() -> None:
 
 
 @given(instances())
-def test_a_relation_of_classes_has_the_largest_probability_of_their_objects(
-    drawn: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
-) -> None:
+def test_a_relation_of_classes_has_the_largest_probability_of_their_objects(drawn):
     classes, _, holds, observed = drawn
     evidence = pool_instances(classes, holds & observed, observed)
     table = RelationTable.shown_by_boxes(holds & observed, observed, ~observed)
@@ -208,11 +197,8 @@ def test_supports_in_a_circle_are_found() -> None:
     assert support_cycle(tower) is None
     assert support_cycle([*tower, (3, "desk", "box"), (0, "desk", "box")]) is None
     circle = support_cycle([*tower, (2, "desk", "book")])
-    assert circle is not None
     assert circle[0] == circle[-1]
-    assert {*pairwise(circle)} == {
-        ("book", "bag"), ("bag", "desk"), ("desk", "book"),
-    }  # fmt: skip
+    assert {*pairwise(circle)} == {("book", "bag"), ("bag", "desk"), ("desk", "book")}
 
 
 NAN = math.nan
@@ -223,6 +209,7 @@ Box = tuple[str, tuple[float, float, float], tuple[float, float, float]]
 """Label, extents, and position of the bottom."""
 
 DESK_BOX: Box = ("desk", (1.6, 0.8, 0.75), (0, 0, 0))
+FRIDGE: Box = ("fridge", (0.6, 0.6, 0.4), (0, 0, 0))
 
 
 def stands(*boxes: Box, floor: float = 0.0) -> list[int]:
@@ -265,11 +252,7 @@ def lamp(x: float, bottom: float) -> Box:
         # The relation is on-top of the desk to the bin.
         (("bin", (0.3, 0.3, 0.4), (0.3, 0, 0)), DESK_BOX, FLOOR),
         # The bottom of the milk is near the floor, but the milk is inside.
-        (
-            ("milk", (0.1, 0.1, 0.2), (0, 0, 0.05)),
-            ("fridge", (0.6, 0.6, 0.4), (0, 0, 0)),
-            SUPPORTED,
-        ),
+        (("milk", (0.1, 0.1, 0.2), (0, 0, 0.05)), FRIDGE, SUPPORTED),
         # A chair on a rug.
         (("chair", (0.5, 0.5, 0.9), (0, 0, 0.01)), ("towel", (2.0, 1.5, 0.01), (0, 0, 0)), FLOOR),
         (lamp(0, 0.75 + 0.13), DESK_BOX, UNKNOWN),
@@ -359,13 +342,10 @@ def test_quaternions_must_have_length_one(quaternion: tuple[float, float, float,
 
 
 @given(st.floats(-7, 7), st.booleans(), st.tuples(*[st.floats(-5, 5)] * 3))
-def test_viewer_axes_invert_the_conversion_to_the_viewer(
-    yaw: float, optical: bool, point: tuple[float, float, float]
-) -> None:
+def test_viewer_axes_invert_the_conversion_to_the_viewer(yaw, optical, point):
     """A point read into body axes, seen by the viewer, and told in the frame again."""
     body, _, _ = body_pose(point, optical=optical)
     (seen,), _ = to_viewer_frame([body], Viewpoint(0.0, 0.0, yaw))
     axes = viewer_axes("camera_optical_frame" if optical else "map", yaw)
-    assert axes is not None
     told = [sum(seen[k] * axes[k][n] for k in range(3)) for n in range(3)]
     assert told == pytest.approx(point, abs=1e-9)

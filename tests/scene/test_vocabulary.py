@@ -36,9 +36,7 @@ VOCABULARY = Vocabulary(
     ],
 )
 def test_labels_are_found_under_any_spelling(label: str, expected: str) -> None:
-    index = VOCABULARY.index(label)
-    assert index is not None
-    assert VOCABULARY.labels[index] == expected
+    assert VOCABULARY.labels[VOCABULARY.index(label)] == expected
 
 
 @pytest.mark.parametrize("label", ["", "  ", "sofa", "trash", "can", "curtain rod"])
@@ -181,11 +179,8 @@ SIMILAR = Vocabulary(
         ("toy mug", "toy", "head"),
     ],
 )
-def test_a_name_is_guessed_by_its_spelling_or_its_last_words(
-    label: str, expected: str, rule: str
-) -> None:
+def test_a_name_is_guessed_by_its_spelling_or_its_last_words(label, expected, rule):
     found = SIMILAR.guess(label)
-    assert found is not None
     assert (SIMILAR.labels[found.entry], found.rule) == (expected, rule)
     assert 0.7 < found.similarity <= 1
 
@@ -220,7 +215,5 @@ def test_only_plausible_names_are_suggested_best_first() -> None:
 def test_similar_room_types_are_found() -> None:
     assert [match.entry for match in SIMILAR.nearest("bedrom", is_room=True)] == [0]
     assert SIMILAR.nearest("garage", is_room=True) == ()
-    found = SIMILAR.guess("bedrom", is_room=True)
-    assert found is not None
-    assert found.entry == 0
+    assert SIMILAR.guess("bedrom", is_room=True).entry == 0
     assert SIMILAR.guess("garage", is_room=True) is None

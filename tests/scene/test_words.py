@@ -51,7 +51,6 @@ def test_classes_have_the_mean_vector_of_label_and_aliases() -> None:
 def test_training_reads_the_vectors_of_the_repository(tmp_path: Path) -> None:
     data = DataConfig(sources=("rooms",), vocabulary="rooms", rooms=40, words=True)
     scenes = split_and_encode(data, read_sources(data, tmp_path), tmp_path)
-    assert scenes.words is not None
     words = dict(zip(scenes.vocabulary.labels, scenes.words, strict=True))
     assert words["sofa"] @ words["armchair"] > words["sofa"] @ words["toilet"] + 0.2
     parents = scenes.training_data().parents

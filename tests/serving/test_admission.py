@@ -114,13 +114,10 @@ def admission() -> Iterator[Admission]:
 
 @pytest.fixture
 def begun() -> threading.Event:
-    """Set by a computation when it begins."""
     return threading.Event()
 
 
-async def test_work_in_a_thread_ends_the_wait_at_the_deadline(
-    admission: Admission, begun: threading.Event
-) -> None:
+async def test_work_in_a_thread_ends_the_wait_at_the_deadline(admission, begun):
     """The one under way is given up; the one behind it is dropped without being begun."""
     release, behind = threading.Event(), list[int]()
 
@@ -130,10 +127,9 @@ async def test_work_in_a_thread_ends_the_wait_at_the_deadline(
 
     places = ticket(), ticket()
     calls = slow, lambda _: behind.append(1)
-    waits = [
-        asyncio.ensure_future(in_thread(call, place, admission.drawing))
-        for call, place in zip(calls, places, strict=True)
-    ]
+    pairs = zip(calls, places, strict=True)
+    running = (in_thread(call, place, admission.drawing) for call, place in pairs)
+    waits = [asyncio.ensure_future(one) for one in running]
     assert await asyncio.to_thread(begun.wait, PATIENCE)
     for place in places:
         place.deadline = monotonic() + 0.1
@@ -147,9 +143,7 @@ async def test_work_in_a_thread_ends_the_wait_at_the_deadline(
 
 
 @pytest.mark.parametrize("ending", ["deadline", "disconnect"])
-async def test_a_long_computation_learns_that_its_request_has_ended(
-    admission: Admission, begun: threading.Event, ending: str
-) -> None:
+async def test_a_long_computation_learns_that_its_request_has_ended(admission, begun, ending):
     heard, here = threading.Event(), True
 
     def endless(has_ended: Callable[[], bool]) -> None:

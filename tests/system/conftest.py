@@ -22,7 +22,6 @@ class Proxy:
 
     @property
     def address(self) -> str:
-        """Where to ask."""
         return f"http://127.0.0.1:{self.port}"
 
 
@@ -37,7 +36,6 @@ UNHURRIED = {
 
 @pytest.fixture(scope="session")
 def configuration(repository: Path) -> Path:
-    """The shipped configuration of the proxy."""
     return repository / "deploy" / "haproxy" / "haproxy.cfg"
 
 

@@ -2,7 +2,6 @@
 
 import json
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -22,7 +21,6 @@ def report(*entries: dict[str, Any]) -> str:
 
 
 def package(kind: str, name: str) -> dict[str, Any]:
-    """The entry of a package that is sound, flawed or skipped."""
     if kind == "skipped":
         return {"name": name, "skip_reason": f"Dependency not found on PyPI: {name} (1.0)"}
     return {"name": name, "version": "2.10", "vulns": [FLAW] if kind == "flawed" else []}
@@ -70,13 +68,7 @@ def test_missing_answers_are_not_run(output: str, trouble: str, reason: str) -> 
         ({"pypi": skipped, "osv": sound}, Verdict.NOT_RUN, []),
     ],
 )
-def test_a_database_needs_the_canary(
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    answers: dict[str, Any],
-    verdict: Verdict,
-    lock_services: list[str],
-) -> None:
+def test_a_database_needs_the_canary(monkeypatch, tmp_path, answers, verdict, lock_services):
     services = []
 
     def ask(service: str, *arguments: str) -> tuple[str, str]:

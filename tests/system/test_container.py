@@ -83,9 +83,7 @@ def test_the_context_has_every_copied_file(stages: dict[str, str], repository: P
     ignored, *included = (repository / ".dockerignore").read_text("utf-8").split("\n!")
     included[-1] = included[-1].partition("\n")[0]
     assert ignored.endswith("*")
-    copied = re.findall(
-        r"^COPY (?!--from)(?:--\S+ )?(.+) \S+$", "".join(stages.values()), re.MULTILINE
-    )
+    copied = re.findall(r"(?m)^COPY (?!--from)(?:--\S+ )?(.+) \S+$", "".join(stages.values()))
     assert {file for files in copied for file in files.split()} == set(included)
 
 
@@ -96,9 +94,7 @@ def test_ports_are_published_on_this_machine_only(compose: dict[str, Any]) -> No
     assert all(ports[name][0].startswith("127.0.0.1:") for name in ("prometheus", "grafana"))
 
 
-def test_an_upgrade_copies_the_shipped_models(
-    stages: dict[str, str], compose: dict[str, Any], tmp_path: Path, repository: Path
-) -> None:
+def test_an_upgrade_copies_the_shipped_models(stages, compose, tmp_path, repository):
     """The command of the compose file, on the paths of the image."""
     services = compose["services"]
     copy, scene = services["shipped-models"], services["scene"]
@@ -150,9 +146,8 @@ def test_only_torch_may_come_from_another_index(repository: Path) -> None:
 
 
 def test_the_base_image_may_have_a_digest() -> None:
-    assert (
-        first_base("# FROM no\nFROM python:3@sha256:ab AS base\nFROM base") == "python:3@sha256:ab"
-    )
+    text = "# FROM no\nFROM python:3@sha256:ab AS base\nFROM base"
+    assert first_base(text) == "python:3@sha256:ab"
 
 
 def test_settings_of_pip_become_one_file_and_its_paths() -> None:

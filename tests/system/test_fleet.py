@@ -34,9 +34,7 @@ class Fleet:
         """Move the alias, and wait until both replicas serve the version."""
         self.store.set_alias("default", AliasTarget(name="home", version=version))
         wait_until(lambda: {self.default(replica) for replica in self.replicas} == {version})
-        generations = {
-            replica.client.get("/models").json()["generation"] for replica in self.replicas
-        }
+        generations = {one.client.get("/models").json()["generation"] for one in self.replicas}
         assert len(generations) == 1
 
     @staticmethod
@@ -45,7 +43,6 @@ class Fleet:
         return str(answer["model"]["version"])
 
     def configuration(self, shipped: str) -> Path:
-        """The shipped configuration with these replicas as servers."""
         template = next(line for line in shipped.splitlines() if "server-template" in line)
         servers = "".join(
             f"    server replica{number} 127.0.0.1:{replica.port}\n"

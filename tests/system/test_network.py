@@ -51,7 +51,6 @@ def command(words: str) -> str:
 
 
 def on(machine: str, script: str) -> list[str]:
-    """Return the command that runs a shell script on a machine."""
     return ["ip", "netns", "exec", machine, "bash", "-euc", script]
 
 

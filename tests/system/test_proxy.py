@@ -3,7 +3,6 @@
 import json
 import resource
 import socket
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from http.server import BaseHTTPRequestHandler
@@ -39,8 +38,6 @@ service = live_service(SCENE_CLIENT_TIMEOUT="3")
 
 @pytest.fixture(scope="module")
 def behind(haproxy: StartProxy, configuration: Path) -> StartProxy:
-    """Return a function that starts the proxy in front of a service."""
-
     def start(service: LiveService, log: Path, **variables: str) -> Any:
         backend = f"127.0.0.1:{service.port}"
         return haproxy(configuration, log, PROXY_BACKEND=backend, PROXY_REPLICAS="1", **variables)
@@ -49,9 +46,7 @@ def behind(haproxy: StartProxy, configuration: Path) -> StartProxy:
 
 
 @pytest.fixture(scope="module")
-def proxy(
-    behind: StartProxy, service: LiveService, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Proxy]:
+def proxy(behind, service, tmp_path_factory):
     """A proxy without a limit on rates."""
     log = tmp_path_factory.mktemp("proxy") / "log"
     variables = {"PROXY_HEAD_TIMEOUT": "10s", "PROXY_TIMEOUT": "10s", "PROXY_REQUESTS": "1000000"}
@@ -69,9 +64,8 @@ def test_questions_and_pages_are_answered(proxy: Proxy) -> None:
         assert len(batch.json()["results"]) == 256
         # Refusals of the service arrive as they are.
         assert client.post("/missing", json={}).json()["type"] == "/problems/invalid-request"
-        large = client.post(
-            "/missing", content=b" " * 2_100_000, headers={"Content-Type": "application/json"}
-        )
+        media = {"Content-Type": "application/json"}
+        large = client.post("/missing", content=b" " * 2_100_000, headers=media)
         assert large.json()["type"] == "/problems/body-too-large"
         other_host = client.get("/models", headers={"Host": "evil.example"})
         assert other_host.json()["type"] == "/problems/host-refused"
@@ -144,8 +138,7 @@ def test_crashes_are_not_repeated(haproxy: StartProxy, configuration: Path, tmp_
             self.close_connection = True
 
     with http_server(Crashing) as url:
-        backend = url.removeprefix("http://")
-        variables = {"PROXY_BACKEND": backend, "PROXY_REPLICAS": "3"}
+        variables = {"PROXY_BACKEND": url.removeprefix("http://"), "PROXY_REPLICAS": "3"}
         with haproxy(configuration, tmp_path / "log", **variables) as proxy:
             answer = httpx.post(f"{proxy.address}/outliers", json=SCENE, timeout=PATIENCE)
     assert answer.status_code == 502
@@ -219,9 +212,7 @@ TRAILERS = CHUNKED + b"X-API-Key: 0123456789abcdef\r\nHost: evil.example\r\n\r\n
         (TRAILERS, 411),
     ],
 )
-def test_metrics_and_trailers_reach_no_service(
-    proxy: Proxy, service: LiveService, text: bytes, status: int
-) -> None:
+def test_metrics_and_trailers_reach_no_service(proxy, service, text, status):
     before = len(service.log.read_text().splitlines())
     (answer,), is_closed = exchange(proxy.port, Wire("", [text], (status,), closes=status == 404))
     assert (answer.status, is_closed) == (status, status == 404)
