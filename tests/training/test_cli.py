@@ -131,10 +131,7 @@ def test_from_rooms_to_answers(tmp_path):
             ("train", "places-triway", "--data", "nowhere"),
             "18 of 19 files of scenes are missing in nowhere: procthor.jsonl.gz",
         ),
-        (
-            ("train", "places-rbm", "--data", "nowhere"),
-            "docs/training.md (The public data sets)",
-        ),
+        (("train", "places-rbm", "--data", "nowhere"), "docs/training.md (The public data sets)"),
         (("publish", "nowhere", "1.0.0"), "no finished run"),
         (("publish", "nowhere@1.0.0", "1.0.1", "--promote"), "app.registry alias` moves"),
         (("publish", "nowhere", "1.0.0", "--alias", "lab"), "--alias belongs to --promote"),

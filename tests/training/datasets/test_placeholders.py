@@ -9,12 +9,7 @@ from hypothesis import strategies as st
 from tests.training.scenes import scene
 from training.datasets import AnnotatedObject, AnnotatedScene
 from training.datasets.inventories import shipped_things
-from training.datasets.placeholders import (
-    is_placeholder,
-    left_out_line,
-    plain_label,
-    plain_scenes,
-)
+from training.datasets.placeholders import is_placeholder, left_out_line, plain_label, plain_scenes
 from training.datasets.vocabulary import curated_names
 
 PLACEHOLDERS = (
