@@ -1,7 +1,5 @@
-"""HTTP as bytes: requests that no client library would write, and how the answers are read.
-
-The expected statuses are those of the proxy in front of the service.
-"""
+"""HTTP as bytes: requests that no client library would write, and how the answers are read. The
+expected statuses are those of the proxy in front of the service."""
 
 import socket
 from collections.abc import Iterator, Sequence

@@ -1,8 +1,6 @@
-"""The tables of messages in the documentation list the messages and problems of the service.
-
-A problem of a request also has a page of the service: `test_every_problem_type_has_a_page` in
-tests/http/test_problems.py.
-"""
+"""The tables of messages in the documentation list the messages and problems of the service. A
+problem of a request also has a page of the service: `test_every_problem_type_has_a_page` in
+tests/http/test_problems.py."""
 
 import ast
 import re

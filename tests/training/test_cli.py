@@ -1,5 +1,3 @@
-"""The command line end to end on generated rooms: train, publish and evaluate."""
-
 import json
 import re
 import subprocess

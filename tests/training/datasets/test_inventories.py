@@ -1,5 +1,3 @@
-"""Written inventories and things: the reader, its errors, and the law of the sampler."""
-
 import math
 from dataclasses import replace
 from pathlib import Path

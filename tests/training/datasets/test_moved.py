@@ -1,5 +1,3 @@
-"""Cases of moved objects by hand: what moves, where to, and what stays."""
-
 from collections import Counter
 from typing import Any
 

@@ -1,5 +1,3 @@
-"""Placeholders never become classes, and real names stay."""
-
 from collections import Counter
 
 import pytest

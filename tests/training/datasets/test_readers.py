@@ -1,7 +1,5 @@
-"""Every reader, on small files of the official layout written here.
-
-A reader is tested by being listed: `LAYOUTS` must name every format of `READERS`.
-"""
+"""Every reader, on small files of the official layout written here. A reader is tested by being
+listed: `LAYOUTS` must name every format of `READERS`."""
 
 import gzip
 import itertools

@@ -1,5 +1,3 @@
-"""Counts of roles in small scenes."""
-
 import numpy as np
 import pytest
 

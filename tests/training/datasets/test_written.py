@@ -1,5 +1,3 @@
-"""The vocabulary of written knowledge."""
-
 from collections import Counter
 
 import pytest

@@ -1,5 +1,3 @@
-"""`python -m training adapt`: a version of the shipped default for one home."""
-
 import json
 import shutil
 from dataclasses import replace
@@ -273,10 +271,8 @@ def tv_is_missing(artifact: SceneModel, labels: list[str]) -> float:
 
 @pytest.mark.slow
 def test_scenes_that_the_model_expects_change_no_weights(store, tmp_path):
-    """The scenes are samples of the model itself, so there is nothing to learn.
-
-    All are of one group, and scenes of one object are groups of their own.
-    """
+    """The scenes are samples of the model itself, so there is nothing to learn. All are of one
+    group, and scenes of one object are groups of their own."""
     model = default(store)
     labels, samples = model.vocabulary.labels, model.weights.chain_samples
     scenes = [

@@ -1,5 +1,3 @@
-"""Two models are compared on scenes that neither has learnt from."""
-
 from dataclasses import replace
 from pathlib import Path
 

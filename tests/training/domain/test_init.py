@@ -1,5 +1,3 @@
-"""`init` on files of scenes."""
-
 import json
 import math
 import re

@@ -1,5 +1,3 @@
-"""What `init` finds in scenes and labels."""
-
 from dataclasses import replace
 
 from tests.training.evaluation.scenes import scene as encoded_scene

@@ -1,5 +1,3 @@
-"""`init` on written inventories: alone, together with scenes, and from the file to answers."""
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
-"""The walk of `scripts/walk.py`, and the next steps of its user.
-
-The scenes are generated: 300 of laboratories, workshops and storerooms, and those of a home.
-"""
+"""The walk of `scripts/walk.py`, and the next steps of its user. The scenes are generated: 300 of
+laboratories, workshops and storerooms, and those of a home."""
 
 import json
 import os

@@ -1,5 +1,3 @@
-"""A model answers about scenes with other classes."""
-
 import pytest
 import torch
 

@@ -1,5 +1,3 @@
-"""Everyday facts: the same answers as a client of the service gets; only one module reads them."""
-
 import json
 import re
 import runpy

@@ -1,5 +1,3 @@
-"""Metrics with and without evidence; evidence and queried relations are disjoint."""
-
 from dataclasses import replace
 
 import pytest

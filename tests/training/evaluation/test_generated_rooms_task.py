@@ -1,5 +1,3 @@
-"""T4 rooms: refused shares and sizes against counts by hand."""
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""T4: each figure by hand, and the samplers."""
-
 import numpy as np
 import pytest
 import torch
@@ -61,10 +59,8 @@ def test_pair_correlation_by_hand():
 
 def test_contradictions_by_hand():
     """Mirrored pairs are counted by pair; cycles of on-top are found whatever their length.
-
     left(0,1), left(1,0), left(0,2), front(2,2): two related pairs, one of them both ways. Then a
-    tower of three; the same with its foot on its top; nothing but left, in a circle.
-    """
+    tower of three; the same with its foot on its top; nothing but left, in a circle."""
     holds = torch.zeros(4, 4, 3, 3)
     for a, i, j in [(0, 0, 1), (0, 1, 0), (0, 0, 2), (1, 2, 2)]:
         holds[3, a, i, j] = 1

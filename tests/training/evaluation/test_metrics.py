@@ -1,5 +1,3 @@
-"""Metrics by hand, pooled, through JSON; their statistics; the bootstrap and its pairing."""
-
 import json
 from dataclasses import replace
 

@@ -1,5 +1,3 @@
-"""T3c by hand: cases, metrics and thresholds."""
-
 from itertools import count
 
 import numpy as np

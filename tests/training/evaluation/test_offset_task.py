@@ -1,5 +1,3 @@
-"""The figures of offsets: shares and distances of known draws, source by source."""
-
 from dataclasses import replace
 
 import numpy as np

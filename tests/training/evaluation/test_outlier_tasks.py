@@ -1,5 +1,3 @@
-"""T3: the intruders and their distributions, hit@1, and the alarms in untouched parts."""
-
 import numpy as np
 import pytest
 import torch
@@ -68,10 +66,8 @@ def test_a_request_lists_the_things_of_a_scene_and_an_absent_one():
 
 
 def test_popular_intruders_follow_training():
-    """3 is in nine training scenes, 4 in three: three of four draws are 3.
-
-    Of 400 draws, outside 250 to 350 with probability below 1e-7.
-    """
+    """3 is in nine training scenes, 4 in three: three of four draws are 3. Of 400 draws, outside
+    250 to 350 with probability below 1e-7."""
     train = tensors([scene([0, 3])] * 6 + [scene([3, 4])] * 3)
     data = tensors([scene([0, 1, 2]) for _ in range(400)])
     added = draw_intruders(data, NO_STRUCTURE, by_popularity(data, train))

@@ -1,5 +1,3 @@
-"""Files of a user as tests: reading, metrics and marks of training data."""
-
 import json
 from dataclasses import asdict, replace
 from pathlib import Path

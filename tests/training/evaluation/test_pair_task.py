@@ -1,5 +1,3 @@
-"""T1 pairs by hand: questions, accuracy and log-loss, unseen pairs and rare classes."""
-
 from dataclasses import replace
 
 import numpy as np

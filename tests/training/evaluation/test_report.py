@@ -1,5 +1,3 @@
-"""Every task for one model, stored, resumed, pooled and published."""
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""New classes and room types of a home, and the fit to it."""
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Calibration: the choices on validation scenes, and the judgements of the fitted entries."""
-
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -118,10 +116,8 @@ def test_a_seed_gives_the_same_calibration(model, fitted):
 
 
 def test_scenes_count_by_weight_and_incomplete_ones_not_at_all():
-    """Of 300 scenes of weight 1/3 about 100 are kept: outside 60 to 140 with p < 1e-6.
-
-    If no scene lists all of its objects, as in photographs, all scenes count.
-    """
+    """Of 300 scenes of weight 1/3 about 100 are kept: outside 60 to 140 with p < 1e-6. If no scene
+    lists all of its objects, as in photographs, all scenes count."""
     scenes = [scene([0, 1]) for _ in range(20)]
     cut = [replace(scene([2, 3]), complete=False) for _ in range(20)]
     scenes += [replace(scene([4, 5]), weight=1 / 3) for _ in range(300)]
@@ -216,10 +212,8 @@ def test_alpha_weighs_all_kinds_of_intruders_alike():
 
 @pytest.mark.parametrize("share", ALARMS.values())
 def test_alarm_lines_keep_their_share_at_each_length(share):
-    """4,000 lists of each length. The share of one length has a standard error of .002 to .006.
-
-    The log-odds of each object are logistic. Given other objects they become more certain.
-    """
+    """4,000 lists of each length. The share of one length has a standard error of .002 to .006. The
+    log-odds of each object are logistic. Given other objects they become more certain."""
     rng = np.random.default_rng(0)
     entry = CountSlope(intercept=-1.0, slope=-1.2, log_count=-0.4)
 
@@ -336,10 +330,8 @@ def test_only_on_top_determines_the_fit_of_stacked_relations(random_artifact):
 
 @FITS
 def test_sources_without_false_relations_take_no_part(random_artifact, fit):
-    """People mention sides of some pairs, and do not mention those of others.
-
-    Sources are numbered in the order of their names, and count by themselves.
-    """
+    """People mention sides of some pairs, and do not mention those of others. Sources are numbered
+    in the order of their names, and count by themselves."""
     known = random_scenes(60, 8)
     vague = [
         replace(without(one, STACKED), source="coco_captions", instance_observed=one.instance_holds)

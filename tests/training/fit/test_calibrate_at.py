@@ -1,5 +1,3 @@
-"""The answers at a place, on classes whose distribution is known."""
-
 import numpy as np
 import pytest
 from scipy.special import expit as sigmoid

@@ -1,5 +1,3 @@
-"""The judgement of observed relations, in a world whose supports are known."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -70,9 +68,7 @@ def judging(artifact, judgement):
 
 def test_wrong_supports_get_a_higher_probability(artifact, fitted):
     """200 other scenes; a random answer ranks .5 of the pairs right, with a standard error of .03.
-
-    One of three supports is wrong. The machine knows only the log-odds of supports.
-    """
+    One of three supports is wrong. The machine knows only the log-odds of supports."""
     assert fitted.support.relation < 0
     assert fitted.support.change == fitted.support.stand == 0
     model, right, wrong = judging(artifact, fitted), [], []

@@ -1,5 +1,3 @@
-"""Calibration of room types: their sharpness, rare types, and limits of generated scenes."""
-
 import numpy as np
 import pytest
 

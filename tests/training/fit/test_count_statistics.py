@@ -1,5 +1,3 @@
-"""Statistics of counts on scenes with known laws, and classes without statistics."""
-
 import math
 from dataclasses import replace
 

@@ -1,5 +1,3 @@
-"""The fit of object weights, by sums over all states of small machines."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -182,10 +180,8 @@ def test_shares_of_random_parts():
 
 
 def source_logit(machine, shows, x, q):
-    """f_q plus the base rates of the list x in source q.
-
-    The rate of a class that q does not show is the mean of the sources that show it.
-    """
+    """f_q plus the base rates of the list x in source q. The rate of a class that q does not show
+    is the mean of the sources that show it."""
     total = machine.f[q]
     for i in x.nonzero().flatten().tolist():
         sources = [q] if shows[q, i] else [p for p in range(len(shows)) if shows[p, i]]
@@ -218,10 +214,8 @@ def masked_loss(machine, scenes, parts, index, listed_room):
 
 @pytest.mark.parametrize("name", SPECS)
 def test_the_masked_loss_and_its_gradient(name, monkeypatch):
-    """Equal to a formula of its own, with the weights of hidden classes and partial labels.
-
-    A class that a source does not show is no evidence for or against this source.
-    """
+    """Equal to a formula of its own, with the weights of hidden classes and partial labels. A class
+    that a source does not show is no evidence for or against this source."""
     machine = machine_of(name, scale=0.7).double()
     machine.u.requires_grad_(False).zero_()  # the answers leave u out
     scenes = scenes_of(PARTIAL)
@@ -270,11 +264,9 @@ KINDS = [(-1, 0), (-1, 1), (1, 0), (0, 1)]
 
 @pytest.mark.parametrize("name", SPECS)
 def test_the_generative_gradient_is_that_of_the_likelihood(name):
-    """-log p(v | room type, source) of the classes that a source shows.
-
-    With 40,000 chains of each kind, drawn exactly: every entry is a difference of means of values
-    in [-1, 1], so six standard errors are below .02; fails by chance with p < 1e-6.
-    """
+    """-log p(v | room type, source) of the classes that a source shows. With 40,000 chains of each
+    kind, drawn exactly: every entry is a difference of means of values in [-1, 1], so six standard
+    errors are below .02; fails by chance with p < 1e-6."""
     machine = machine_of(name, scale=0.8)
     fit = ObjectFit(machine, scenes_of(PARTIAL), CONFIG, seed=0)
     machine.double()
@@ -303,9 +295,7 @@ def test_the_generative_gradient_is_that_of_the_likelihood(name):
 
 def test_the_priors_decay_the_weights_and_couplings_stay_symmetric():
     """The first step of Adam moves each weight by its rate, against the sign of the gradient.
-
-    Without scenes of a second source, the row of its rates has the gradient of the prior alone.
-    """
+    Without scenes of a second source, the row of its rates has the gradient of the prior alone."""
     machine = machine_of("coupled", scale=1.0)
     scenes = replace(scenes_of(ALL), weight=(scenes_of(ALL).source == 0).float())
     config = CONFIG.model_copy(update={"generative_weight": 0.0, "source_loss": 0.0})
@@ -528,12 +518,10 @@ def test_the_served_mix_has_whole_rooms_only():
 
 
 def test_served_scenes_of_long_chains_are_the_plausible_ones():
-    """A scene of fewer than two classes is drawn again, seven times.
-
-    512 chains of 40 states; each share is within .03 of its enumerated value. Neighbouring states
-    are 50 sweeps apart, so the share of a chain has an error of at most .5 / sqrt(40 / 8), and the
-    mean over chains one of .01. A share fails by chance with a probability below .003.
-    """
+    """A scene of fewer than two classes is drawn again, seven times. 512 chains of 40 states; each
+    share is within .03 of its enumerated value. Neighbouring states are 50 sweeps apart, so the
+    share of a chain has an error of at most .5 / sqrt(40 / 8), and the mean over chains one of .01.
+    A share fails by chance with a probability below .003."""
     machine, scenes = fitted("coupled")
     *_, population = populations(scenes, SERVED)
     population = replace(population, room=np.full_like(population.room, -1))

@@ -1,5 +1,3 @@
-"""Offsets: their shrinkage is Bayes' rule, and draws are covered as promised."""
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Counts of where objects stand, by hand."""
-
 from dataclasses import replace
 
 import numpy as np

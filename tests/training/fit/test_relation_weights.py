@@ -1,5 +1,3 @@
-"""The fit of relations: offsets of sources, unknown units, shared weights and residuals."""
-
 import math
 from dataclasses import replace
 
@@ -167,10 +165,8 @@ def test_relations_have_the_layout_of_their_machine(machine):
 
 
 def test_hidden_units_depend_on_a_random_part_of_the_objects():
-    """W is such that x is the number of listed classes and the room type, minus 10.
-
-    Of 4,000 scenes of 39 objects: five standard errors of the mean, the spread and the room share.
-    """
+    """W is such that x is the number of listed classes and the room type, minus 10. Of 4,000 scenes
+    of 39 objects: five standard errors of the mean, the spread and the room share."""
     machine = build(MachineSpec("rbm", V=40, A=1, units=2, C=1)).requires_grad_(False)
     machine.W[:, 0], machine.Q[0, 1] = 0.1, 5.0
     scenes = tensors([toy(list(range(39)), room=0)], 40)

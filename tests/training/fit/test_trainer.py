@@ -1,5 +1,3 @@
-"""The trainer on generated rooms: determinism, the curve, the start of the weights."""
-
 from dataclasses import replace
 
 import numpy as np

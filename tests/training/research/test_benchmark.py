@@ -1,5 +1,3 @@
-"""The commands benchmark and ablate end to end on generated rooms, and their resumption."""
-
 import json
 
 import pytest

@@ -1,5 +1,3 @@
-"""Training data of a run: its digest, its parts, and the need for relations."""
-
 import gzip
 import json
 from dataclasses import replace

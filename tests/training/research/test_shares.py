@@ -1,5 +1,3 @@
-"""Variants of a model in which a part of the scores is left out."""
-
 import numpy as np
 import pytest
 

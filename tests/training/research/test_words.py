@@ -1,5 +1,3 @@
-"""`python -m training words` on a small model."""
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-"""Example scenes: their choice from a user's scenes, and their file."""
-
 import json
 from collections import defaultdict
 from dataclasses import replace

@@ -1,5 +1,3 @@
-"""`python -m training seed` on small files of scenes, and the scenes that it reads."""
-
 import json
 import subprocess
 import sys

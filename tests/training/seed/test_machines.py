@@ -1,5 +1,3 @@
-"""RBM, GBM and Triway of the paper against sums over all states of tiny machines."""
-
 import itertools
 import math
 
@@ -73,11 +71,9 @@ def test_an_update_adds_the_gradient_of_the_energy(kind, H2):
 
 @MACHINES
 def test_conditionals_are_those_of_the_energy(kind, H2):
-    """Each unit given all others: p = exp(-E on) / (exp(-E on) + exp(-E off)).
-
-    In a Triway, this holds in the states without relations of absent objects. Such relations are
-    off in each sample.
-    """
+    """Each unit given all others: p = exp(-E on) / (exp(-E on) + exp(-E off)). In a Triway, this
+    holds in the states without relations of absent objects. Such relations are off in each
+    sample."""
     machine = tiny(kind, H2)
     states = all_states(machine)
     weights = log_weight(machine, states, weights_of(machine)).exp().tolist()

@@ -1,5 +1,3 @@
-"""The four tasks of the paper on answers made by hand."""
-
 import pytest
 import torch
 

@@ -1,5 +1,3 @@
-"""Closed forms and counts against slow, independent ways of computing them."""
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""What every baseline of the registry promises, on scenes whose structure is known."""
-
 import re
 from collections import defaultdict
 from functools import cache

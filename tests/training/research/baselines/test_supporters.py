@@ -1,5 +1,3 @@
-"""The table of supporters by hand: counts and suspicion."""
-
 import numpy as np
 import torch
 
