@@ -300,6 +300,7 @@ MALFORMED_3DSSG = [
 
 TURN = math.radians(30)
 COS, SIN = math.cos(TURN), math.sin(TURN)
+TURNED = [[COS, SIN, 0.0], [-SIN, COS, 0.0], [0.0, 0.0, 1.0]]
 
 
 def box(classname: str, basis: Any, coeffs: list[float], centroid: list[float]) -> dict[str, Any]:
@@ -312,12 +313,7 @@ def box(classname: str, basis: Any, coeffs: list[float], centroid: list[float]) 
 BOXES = [
     box("bed", np.eye(3), [1.0, 0.5, 0.4], [0.5, 3.0, -0.6]),
     # Turned by 30 degrees against the clock, seen from above; a negative half extent occurs.
-    box(
-        "night_stand",
-        [[COS, SIN, 0.0], [-SIN, COS, 0.0], [0.0, 0.0, 1.0]],
-        [-0.2, 0.3, 0.25],
-        [1.2, 2.5, -0.7],
-    ),
+    box("night_stand", TURNED, [-0.2, 0.3, 0.25], [1.2, 2.5, -0.7]),
 ]
 
 

@@ -320,10 +320,7 @@ def test_finished_couplings_are_symmetric_to_the_last_bit():
     spec = MachineSpec("rbm", V=many, A=1, units=2, states=3, C=1, profiles=1, coupled=True)
     machine = build(spec).initialise(generator, 0.05)
     config = CONFIG.model_copy(update={"steps": 30})
-    fit = ObjectFit(machine, scenes, config, seed=0)
-    while not fit.finished:
-        fit.step()
-    fit.finish()
+    fit_objects(ObjectFit(machine, scenes, config, seed=0))
     couplings = machine.couplings.detach()
     assert couplings.any()
     assert torch.equal(couplings, couplings.T)
