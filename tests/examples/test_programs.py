@@ -46,8 +46,7 @@ def test_the_readme_lists_every_program() -> None:
 
 def test_curl_asks_the_five_questions(shipped: LiveService, find_tool: FindTool) -> None:
     find_tool("curl")
-    done = run(find_tool("bash"), "curl.sh", url=shipped.url)
-    lines = done.stdout.splitlines()
+    lines = run(find_tool("bash"), "curl.sh", url=shipped.url).stdout.splitlines()
     answers = dict(zip(lines[::2], map(json.loads, lines[1::2]), strict=True))
     assert list(answers) == ["relations", "missing", "outliers", "rooms", "generate"]
     assert answers["relations"]["relations"][0]["relation"] == "on-top"

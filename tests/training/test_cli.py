@@ -151,8 +151,7 @@ def test_a_stored_model_is_evaluated_on_files(tmp_path):
         files += ["--file", tmp_path / name]
     scenes = [replace(scene, source="seen") for scene in read_scenes(tmp_path / "seen.jsonl")]
     learnt = {"source": "seen", "scenes": 3, "digest": digest_of(scenes), "terms": "MIT"}
-    data = [learnt | {"research_only": False}]
-    Store(store).publish(description("tiny", data=data), state())
+    Store(store).publish(description("tiny", data=[learnt | {"research_only": False}]), state())
     figures = tmp_path / "figures.json"
     output = invoke("evaluate", "tiny", *files, "--store", store, "--json", figures)
     assert "tiny: seen is training data of this model" in output
@@ -193,8 +192,7 @@ def test_the_version_is_checked_before_training(tmp_path):
 
 
 def test_the_error_about_missing_own_scenes_names_their_folder(tmp_path):
-    lost = {"data.sources": ("../lost.jsonl",)}
-    config = write_config(tmp_path / "config.toml", CONFIG, lost)
+    config = write_config(tmp_path / "config.toml", CONFIG, {"data.sources": ("../lost.jsonl",)})
     assert "Pass this folder with --data" in invoke("train", config, code=1)
 
 
@@ -213,8 +211,7 @@ def test_a_final_run_is_not_promoted_by_comparison(tmp_path):
     assert "trained in" in output
     assert "next:" not in output
     folder = tmp_path / "runs/rooms-triway/final-seed-0"
-    store = tmp_path / "store"
-    text = invoke("publish", folder, "1.0.0", "--promote", "--store", store, code=1)
+    text = invoke("publish", folder, "1.0.0", "--promote", "--store", tmp_path / "store", code=1)
     assert "is a final run without test scenes" in text
     assert "`python -m app.registry alias` moves an alias without a comparison" in text
     assert "object classes" not in text  # refused before the scenes are read

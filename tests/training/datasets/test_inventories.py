@@ -202,8 +202,7 @@ def test_a_detector_lists_a_part_of_each_scene():
         Item("mugs", 1, 2, 2, "inside", "table"),
     )
     place = Place("den", "study", (Group("basics", 1, items),))
-    things = shipped_things()
-    shares = detection_rates([replace(things["table"], size=(0.5, 2.0, 0.7))])
+    shares = detection_rates([replace(shipped_things()["table"], size=(0.5, 2.0, 0.7))])
     assert shares["table"] == pytest.approx(1 - 0.7 * math.exp(-5))
     scenes = written_scenes([place], shares, 4000, seed=3)
     assert len({scene.scene_id for scene in scenes}) == 4000

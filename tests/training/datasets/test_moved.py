@@ -152,8 +152,7 @@ def test_scenes_without_a_wrong_place() -> None:
 
 
 def test_objects_without_a_box_stay() -> None:
-    objects = (*posed("table", "cup", "chair"), AnnotatedObject("3", "bed"))
-    scene = encoded(objects)
+    scene = encoded((*posed("table", "cup", "chair"), AnnotatedObject("3", "bed")))
     for seed in range(20):
         moved, i = move(scene, seed)
         assert i != 3

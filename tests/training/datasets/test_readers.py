@@ -168,8 +168,7 @@ def test_counts_name_labels_with_one_object(tmp_path: Path) -> None:
 
 def test_files_of_named_sources_are_read_from_the_folder_extra(tmp_path: Path) -> None:
     (tmp_path / "extra").mkdir()
-    scenes = read_scenes(write_scene(tmp_path))
-    jsonl.write_jsonl(scenes, tmp_path / "extra" / "nr3d.jsonl.gz")
+    jsonl.write_jsonl(read_scenes(write_scene(tmp_path)), tmp_path / "extra" / "nr3d.jsonl.gz")
     (scene,) = read_sources(DataConfig(sources=("nr3d",)), tmp_path)["nr3d"]
     assert scene.source == "nr3d"
     for source in ("vsr", "nr3d.jsonl.gz"):

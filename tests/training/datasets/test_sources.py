@@ -62,11 +62,9 @@ def test_denied_relations_are_false_and_contradicted_ones_unobserved() -> None:
 
 
 def test_3dssg_shows_all_supports_of_some_objects_and_sides_of_related_pairs() -> None:
-    listed = ((1, "on-top", 0), (2, "left", 0))
-    found = encoded("3dssg", relations=listed, supported=(1,))
+    found = encoded("3dssg", relations=((1, "on-top", 0), (2, "left", 0)), supported=(1,))
     for relation in (ON_TOP, INSIDE):
-        known = np.argwhere(found.instance_observed[relation]).tolist()
-        assert known == [[0, 1], [1, 0], [1, 2]]
+        assert np.argwhere(found.instance_observed[relation]).tolist() == [[0, 1], [1, 0], [1, 2]]
     related = np.array([[0, 1, 1], [1, 0, 0], [1, 0, 0]], dtype=bool)
     assert (found.instance_observed[LATERAL] == related).all()
     assert np.argwhere(found.instance_observed[ABOVE]).tolist() == [[0, 1], [1, 0]]
@@ -79,8 +77,7 @@ def test_a_listed_support_excludes_all_other_supports() -> None:
     objects = things("desk", "monitor", "pencil", "floor")
     found = encode_objects(objects, vocabulary, source="3dssg", **lists)
     assert found.instance_stands.tolist() == [FLOOR, HANGS, SUPPORTED, UNKNOWN]
-    apart = ~np.eye(3, dtype=bool)
-    assert (found.instance_observed[[*SUPPORTS], :3, :3] == apart).all()
+    assert (found.instance_observed[[*SUPPORTS], :3, :3] == ~np.eye(3, dtype=bool)).all()
     assert np.argwhere(found.instance_holds).tolist() == [[ON_TOP, 2, 0]]
 
 

@@ -191,8 +191,7 @@ def test_written_rooms_never_count_towards_the_scenes_of_a_home(store, tmp_path)
     scenes = [*scan_jsonl(write(home_scenes(19, 7), tmp_path / "scenes.jsonl"))]
     rows = [f"room {n},{label}" for n in range(30) for label in ("bed", "lamp", f"box {n}")]
     (tmp_path / "places.csv").write_text("\n".join(["room_type,label", *rows]))
-    places = read_inventory(tmp_path / "places.csv").places
-    with_places = Home.of(default(store), scenes, places)
+    with_places = Home.of(default(store), scenes, read_inventory(tmp_path / "places.csv").places)
     recorded = Home.of(default(store), scenes)
     assert len(with_places.scenes) == len(recorded.scenes) + 30
     assert with_places.measurable.tolist() == recorded.measurable.tolist()
@@ -238,8 +237,7 @@ def test_errors_name_the_reason(store, tmp_path):
 
 @pytest.mark.slow
 def test_five_habits_are_learnt_from_a_hundred_scenes(store, tmp_path):
-    scenes = write(home_scenes(100, 7), tmp_path / "scenes.jsonl")
-    output = adapt(store, scenes, "--promote")
+    output = adapt(store, write(home_scenes(100, 7), tmp_path / "scenes.jsonl"), "--promote")
     key = store.resolve("places-triway")
     before, after = store.load(*key).model, home(store)
     new = home_scenes(50, 8)

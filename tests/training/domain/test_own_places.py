@@ -43,8 +43,7 @@ def ward(repository) -> Path:
 def test_an_inventory_alone_makes_a_proposal(ward, tmp_path) -> None:
     folder = tmp_path / "ward"
     output = init(ward, folder=folder, options=("--terms", "ours"))
-    config = load_config(str(folder))
-    each = config.data.written
+    each = load_config(str(folder)).data.written
     assert f"5 written places, of which training draws {each} scenes each; 0 seen" in output
     assert "warning" not in output
     assert "no contradictions found" in output
@@ -167,8 +166,7 @@ def test_from_the_table_to_answers(ward, tmp_path) -> None:
     folder, store = tmp_path / "ward", Store(tmp_path / "store")
     init(ward, folder=folder)
     runs = ("--runs", tmp_path / "runs", "--store", store.root)
-    output = invoke("train", folder, "--publish", "1.0.0", *runs)
-    assert "published ward@1.0.0" in output
+    assert "published ward@1.0.0" in invoke("train", folder, "--publish", "1.0.0", *runs)
     artifact = store.load("ward", "1.0.0")
     model = artifact.model
     assert "Scenes drawn from written places have 100.0 %" in " ".join(artifact.card.split())

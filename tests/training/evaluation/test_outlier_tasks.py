@@ -16,8 +16,7 @@ from training.evaluation.setting import Setting
 
 def only_intruders(v):
     """The suspicion of a model that knows classes 0 to 2 as usual."""
-    suspicion = torch.tensor([-5.0, -5, -5, 5, 5]).expand_as(v)
-    return suspicion.masked_fill(v == 0, -torch.inf)
+    return torch.tensor([-5.0, -5, -5, 5, 5]).expand_as(v).masked_fill(v == 0, -torch.inf)
 
 
 def test_hit_at_1_of_a_perfect_a_wrong_and_an_ignorant_suspicion():

@@ -138,8 +138,7 @@ def test_rare_classes_are_those_that_training_relates_to_few():
         data = tensors([scene([0, other], [(ON, other, 0)])], V)
         metrics = pairs_task(Model(relations=flat), Setting(data, none, train)).metrics
         assert metrics["accuracy, rare classes"].n == 1
-    often = [scene([a, b], [(ON, a, b)]) for a in range(V) for b in range(a)]
-    train = tensors(often, V)
+    train = tensors([scene([a, b], [(ON, a, b)]) for a in range(V) for b in range(a)], V)
     metrics = pairs_task(Model(relations=flat), Setting(data, none, train)).metrics
     assert "accuracy, rare classes" not in metrics
 

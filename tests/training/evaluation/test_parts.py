@@ -124,8 +124,7 @@ def test_the_validation_score_gives_short_lists_their_bin():
             assert share[b][0] - 1e-6 <= listed <= share[b][1] + 1e-6
         return torch.zeros_like(v)
 
-    structure = torch.zeros(20, dtype=torch.bool)
-    value = validation_score(score, data, structure)
+    value = validation_score(score, data, torch.zeros(20, dtype=torch.bool))
     assert drawn == {0, 1, 3}
     # All candidates but the other hidden classes are equal, so the only candidate is first.
     assert value == 1.0

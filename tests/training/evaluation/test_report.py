@@ -51,8 +51,7 @@ def two_sources(scenes):
 def test_every_task_has_an_outcome():
     report = report_of(MODEL, SETTING)
     # The setting names no facts.
-    nothing = {task for task, outcome in report.outcomes.items() if outcome is None}
-    assert nothing == {"Everyday"}
+    assert {task for task, outcome in report.outcomes.items() if outcome is None} == {"Everyday"}
     assert all(np.isfinite(list(values_of(report).values())))
     assert "R-precision, zero-shot" in report.outcomes["T1a relations"].metrics
     assert "flagged, uniform" in report.outcomes["T3 outliers"].metrics
@@ -126,8 +125,7 @@ def test_the_floor_is_the_other_half_of_the_scenes():
     independent = values_of(report_of(independent_model(V), SETTING, tasks))
     assert independent[name] == pytest.approx(float(TRAIN.v.sum(1).mean()), abs=0.3)
     floor = values_of(report_of(floor_model(), SETTING, tasks))
-    sizes = held_out_halves(SETTING)[1].v.sum(1).mean()
-    assert floor[name] == pytest.approx(float(sizes))
+    assert floor[name] == pytest.approx(float(held_out_halves(SETTING)[1].v.sum(1).mean()))
 
 
 def test_publishing_measures_the_tasks_of_a_card_on_every_source():

@@ -45,8 +45,7 @@ HOME = [[0, 1, 2], [0, 1, 3], [0, 1, 2, 3], [0, 1]] * 6
 def test_the_home_becomes_likelier_and_other_classes_keep_their_weights(variant):
     parent, home = small(variant), scenes_of(*HOME)
     weights = adapt(parent, home)
-    recorded = [0, 1, 2, 3]
-    rest = np.setdiff1d(np.arange(V), recorded)
+    rest = np.setdiff1d(np.arange(V), [0, 1, 2, 3])
     np.testing.assert_array_equal(weights["W"][rest], parent["W"][rest])
     changed = [name for name in parent.arrays if not np.array_equal(weights[name], parent[name])]
     assert sorted(changed) == ["W", "b"]

@@ -52,8 +52,7 @@ def model():
 
 
 def data_of(validation) -> TrainingData:
-    train = rooms(ROOM_COUNT, 2)
-    return TrainingData(train, validation, validation, STRUCTURE, VOCABULARY)
+    return TrainingData(rooms(ROOM_COUNT, 2), validation, validation, STRUCTURE, VOCABULARY)
 
 
 @pytest.fixture(scope="module")
@@ -82,8 +81,7 @@ def test_every_entry_is_fitted(fitted):
     # The machine has no relation weights, so the counts tell what stands where.
     assert all(entry.counts > 0 for entry in fitted.at)
     scenes = ObjectScenes.of(rooms(ROOM_COUNT, 2), STRUCTURE, CONFIG)
-    popularity = served_popularity(scenes, CONFIG).numpy()
-    assert fitted.popularity == pytest.approx(popularity, abs=1e-4)
+    assert fitted.popularity == pytest.approx(served_popularity(scenes, CONFIG).numpy(), abs=1e-4)
 
 
 def test_chosen_values_are_copied(model, fitted):
@@ -294,8 +292,7 @@ def without(one, relations):
 @FITS
 def test_stacked_relations_take_the_fit_of_on_top(random_artifact, fit):
     """Complete sources show few pairs with inside and none with above."""
-    scenes = random_scenes(60, 8)
-    entries = fit(random_artifact, scenes)
+    entries = fit(random_artifact, random_scenes(60, 8))
     assert {entries[a] for a in STACKED} == {entries[ON_TOP]}
     assert {entries[a] for a in LATERAL} == {entries[LEFT]}
     assert len({entries[ON_TOP], entries[LEFT], CountSlope()}) == 3

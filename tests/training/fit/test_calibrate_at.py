@@ -37,8 +37,7 @@ def test_sources_count_alike():
     small, large = (
         PlaceFit(intercept=b, relation=TRUE.relation, counts=TRUE.counts) for b in (-2.0, 1.0)
     )
-    found = fit_place([places(50, 2, small), places(1500, 3, large)])
-    assert -1.5 < found.intercept < 0.5
+    assert -1.5 < fit_place([places(50, 2, small), places(1500, 3, large)]).intercept < 0.5
 
 
 def test_few_true_classes_keep_the_default_entry():
@@ -60,7 +59,6 @@ def test_relations_of_a_kind_share_an_entry():
 
 def test_scenes_without_relations_keep_the_default_entry():
     artifact = larger_artifact("triway")
-    V = len(artifact.vocabulary)
-    alone = tensors([scene([k % 7, (k + 1) % 7]) for k in range(30)], V)
+    alone = tensors([scene([k % 7, (k + 1) % 7]) for k in range(30)], len(artifact.vocabulary))
     assert set(fit_at(artifact, alone.scenes)) == {PlaceFit()}
     assert Calibration.neutral(5).at == (PlaceFit(),) * 5

@@ -104,8 +104,7 @@ def test_pairs_that_are_seldom_or_never_seen_are_covered_too():
     new = rng.normal(MEAN + rng.normal(0, 0.3, (1000, 3)), STD)
     inside["never"] = list(np.square((new - mean) / spread).sum(axis=1))
     for kind, distances in inside.items():
-        share = (np.array(distances) <= chi2.ppf(0.8, 3)).mean()
-        assert 0.7 <= share <= 0.9, kind
+        assert 0.7 <= (np.array(distances) <= chi2.ppf(0.8, 3)).mean() <= 0.9, kind
 
 
 def test_a_pair_never_seen_has_what_its_classes_have_elsewhere():
@@ -131,8 +130,7 @@ def test_the_things_of_a_scene_weigh_one_together():
     positions = np.tile([0.0, 3.0, 0.0], (51, 1))
     positions[50] = 0.0
     crowd = replace(crowd, instance_holds=holds, instance_positions=positions)
-    offsets = fit_offsets([*draws((0, 1, 0), 0.1, 49, 5), crowd], V)
-    mean, _, scenes = of_pair(offsets)
+    mean, _, scenes = of_pair(fit_offsets([*draws((0, 1, 0), 0.1, 49, 5), crowd], V))
     assert scenes == 50
     assert mean[1] == pytest.approx((49 * 1 + 3) / 50, abs=0.06)
 
@@ -161,8 +159,7 @@ def test_relations_and_objects_without_poses_mean_nothing():
 
 def test_the_model_file_holds_the_statistics_exactly():
     vocabulary = rooms_vocabulary()
-    scenes = encode(generate_rooms(150, seed=0), vocabulary)
-    offsets = fit_offsets(scenes, len(vocabulary))
+    offsets = fit_offsets(encode(generate_rooms(150, seed=0), vocabulary), len(vocabulary))
     again = read_group(Offsets, offsets.tensors(), len(CANONICAL), len(vocabulary), 0)
     assert again is not None
     for name, tensor in offsets.tensors().items():

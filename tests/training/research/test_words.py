@@ -52,8 +52,7 @@ def test_left_out_classes_are_read_as_words(lists: words_command.Lists) -> None:
     assert auc["predicted"] == pytest.approx(expected.tolist())
     trained = lists.auc(words_command.log_odds(artifact.weights, lists.listed, left_out), left_out)
     assert auc["trained"] == pytest.approx(trained.tolist())
-    text = "\n".join(words_command.summary("AUC", auc))
-    assert f"{np.mean(auc['predicted']):.3f}" in text
+    assert f"{np.mean(auc['predicted']):.3f}" in "\n".join(words_command.summary("AUC", auc))
 
 
 def test_a_table_of_parts_names_classes_of_the_model(tmp_path) -> None:

@@ -23,8 +23,7 @@ def scene(number, relations):
 
 def test_scenes_are_split_and_encoded(tmp_path):
     listed = ((1, "on-top", 0), (0, "on-top", 2))
-    scenes = [scene(k, listed if k % 2 else None) for k in range(80)]
-    write_jsonl(scenes, tmp_path / "lab.jsonl")
+    write_jsonl([scene(k, listed if k % 2 else None) for k in range(80)], tmp_path / "lab.jsonl")
     materials = read_material(str(tmp_path / "lab.jsonl"), tmp_path)
     for material in materials.values():
         labels = [entry.label for entry in material.vocabulary.objects]
@@ -32,8 +31,7 @@ def test_scenes_are_split_and_encoded(tmp_path):
         # The floor is an ordinary object.
         assert triples == {("lamp", "desk"), ("desk", "floor")}
         parts = material.train, material.validation, material.test
-        sizes = [len(part) for part in parts]
-        assert sizes == pytest.approx([48, 8, 24], abs=4)
+        assert [len(part) for part in parts] == pytest.approx([48, 8, 24], abs=4)
         for part in parts:
             assert part.v.sum(1).tolist() == [3] * len(part)
             assert part.r.sum(1).tolist() == part.labelled.tolist()
@@ -65,8 +63,7 @@ def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("seed")
     write_jsonl(generate_rooms(60, seed=0), folder / "rooms.jsonl")
     arguments = ("seed", folder / "rooms.jsonl", "--seeds", 2, "--epochs", 2, "--workers")
-    output = invoke(*arguments, 1, "--out", folder / "out")
-    return arguments, folder / "out" / "rooms", output
+    return arguments, folder / "out" / "rooms", invoke(*arguments, 1, "--out", folder / "out")
 
 
 @pytest.mark.slow

@@ -115,8 +115,7 @@ def test_the_gradient_is_that_of_the_likelihood_in_the_limit(kind, H2):
     many = visible.repeat(20_000, 1)
     always = torch.ones(len(many), dtype=torch.bool)
     scenes = Scenes(many[:, :V], many[:, V:], many[:, V:].sum(1), always)
-    generator = torch.Generator().manual_seed(1)
-    positive, negative, _, _ = phases(machine, scenes, generator, steps=15)
+    positive, negative, _, _ = phases(machine, scenes, torch.Generator().manual_seed(1), steps=15)
     machine.update(positive, negative, 1.0)
     for name, gradient in zip(leaves, exact, strict=True):
         step = own[name].data - leaves[name].data
@@ -216,8 +215,7 @@ def test_training_stops_early_and_keeps_the_best_weights(monkeypatch):
         return next(scores), 0.0
 
     monkeypatch.setattr("training.seed.learning.errors", keep)
-    history = train(machine, Parts, torch.Generator().manual_seed(0))
-    assert len(history) == 2 + PATIENCE
+    assert len(train(machine, Parts, torch.Generator().manual_seed(0))) == 2 + PATIENCE
     assert torch.equal(machine.b, weights[1])
 
 
@@ -243,7 +241,6 @@ def test_a_large_learning_rate_diverges_and_the_error_names_weight_and_rate(rate
 
 
 def test_training_at_the_rate_of_the_paper_does_not_diverge():
-    generator = torch.Generator().manual_seed(0)
-    history = train(many_units(Triway), SparseParts, generator, epochs=100)
+    history = train(many_units(Triway), SparseParts, torch.Generator().manual_seed(0), epochs=100)
     assert history[-1].objects < history[0].objects / 2
     assert history[-1].relations < history[0].relations / 2

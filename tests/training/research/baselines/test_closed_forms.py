@@ -79,8 +79,7 @@ def test_nearest_scenes_are_scikit_learns(v, sharpness):
     search = NearestNeighbors(n_neighbors=int(rows.sum()), metric="cosine").fit(train[rows])
     distance, place = search.kneighbors(query)
     vote = ((1 - distance) / (1 - distance[:, :1])) ** sharpness
-    popularity = frequency(train).numpy()
-    share = (vote[:, :, None] * train[rows].numpy()[place]).sum(1) + popularity
+    share = (vote[:, :, None] * train[rows].numpy()[place]).sum(1) + frequency(train).numpy()
     expected = share / (vote.sum(1, keepdims=True) + 1)
     assert score(query).sigmoid().numpy() == pytest.approx(expected, abs=1e-5)
 
@@ -111,8 +110,7 @@ def test_the_rbms_log_odds_are_scikit_learns_free_energies(v):
         on, off = scenes.v[:5].clone(), scenes.v[:5].clone()
         on[:, i], off[:, i] = 1.0, 0.0
         expected = rbm._free_energy(off.numpy()) - rbm._free_energy(on.numpy())
-        values = score(off)[:, i].numpy()
-        assert values == pytest.approx(expected, abs=1e-3)
+        assert score(off)[:, i].numpy() == pytest.approx(expected, abs=1e-3)
 
 
 @pytest.mark.parametrize(("loss", "expected"), [("softmax", np.log(3)), ("binary", 3 * np.log(2))])
@@ -207,8 +205,7 @@ def test_tables_are_looked_up_for_the_classes_of_a_scene(related):
 
 
 def test_closure_is_warshalls():
-    generator = torch.Generator().manual_seed(0)
-    given = torch.rand(20, 7, 7, generator=generator) < 0.15
+    given = torch.rand(20, 7, 7, generator=torch.Generator().manual_seed(0)) < 0.15
     expected = given.clone()
     for k in range(7):
         expected |= expected[:, :, k : k + 1] & expected[:, k : k + 1, :]
@@ -237,8 +234,7 @@ def test_complex_logits_by_einsum():
 
 def test_places_by_hand(related):
     counts = triples.count_triples(related, STRUCTURE)
-    popularity = torch.full((V,), 0.5)
-    log_p = triples.smoothed_log_p(counts, popularity, place=2.0, relation=1.0)
+    log_p = triples.smoothed_log_p(counts, torch.full((V,), 0.5), place=2.0, relation=1.0)
     assert log_p.exp().sum(-1) == pytest.approx(torch.ones(2, A, V), abs=1e-5)
     # Something on 1: 0 twice. Whatever is on something: 0 twice, and one case of 1/11 each.
     back_off = (2 + 1 / 11) / (2 + 1)
