@@ -94,7 +94,6 @@ def test_the_code_of_a_page_runs(
 
 
 def run_shell(block: Block, workplace: Workplace) -> str:
-    """What bash prints; a command that fails fails the test."""
     done = subprocess.run(
         ["bash", "-euo", "pipefail", "-c", ADDRESS.sub(workplace.address, block.source)],
         cwd=workplace.folder,

@@ -34,7 +34,6 @@ EXPLAINED = {
 
 @pytest.fixture(scope="module")
 def messages() -> str:
-    """The string constants of the service and the client, f-strings in pieces."""
     sources = [*REPOSITORY.glob("app/**/*.py"), *REPOSITORY.glob("clients/python/**/*.py")]
     return "\n".join(
         node.value

@@ -20,7 +20,6 @@ EXAMPLES = REPOSITORY / "examples"
 
 
 def run(*command: str | Path, url: str, **options: Any) -> Any:
-    """Run a program of the folder with the address of a service."""
     return run_program(*command, cwd=EXAMPLES, env=os.environ | {"SCENE_URL": url}, **options)
 
 

@@ -26,7 +26,6 @@ def encoded(objects: tuple[AnnotatedObject, ...], **fields: Any) -> Any:
 
 
 def triples(scene: Any) -> set[tuple[int, int, int]]:
-    """Relations between classes."""
     names = scene.evidence.classes
     return {(int(a), int(names[x]), int(names[y])) for a, x, y in np.argwhere(scene.evidence.holds)}
 

@@ -222,7 +222,6 @@ def test_a_detector_lists_a_part_of_each_scene():
 
 
 def test_things_stand_where_the_table_says():
-    """A thing whose anchor is absent has no relation."""
     table = Item("table", 1, 1, 1, "floor", "")
     items = (
         table,
@@ -247,7 +246,6 @@ def test_a_seed_gives_the_same_scenes():
 
 
 def test_places_are_a_data_source_without_a_data_folder(tmp_path):
-    """A place is in one part of the split. Labels without a class are left out and named."""
     data = DataConfig(sources=("inventories",), vocabulary="rooms", written=2)
     machine = MachineConfig(variant="triway")
     scenes = prepare(Config(name="written", data=data, machine=machine), tmp_path)

@@ -132,7 +132,6 @@ def test_a_truncated_gzip_file_is_an_error(tmp_path: Path) -> None:
 
 
 def write_scene(folder: Path, **fields: Any) -> Path:
-    """Write one scene of a cup and a table."""
     things = [{"id": 0, "label": "cup"}, {"id": 1, "label": "table"}]
     scene = {"scene_id": "a", "source": "alfred", "objects": things}
     return write_json(folder / "scene.jsonl", scene | fields)
@@ -317,7 +316,6 @@ BOXES = [
 
 
 def struct_array(entries: list[dict[str, Any]]) -> np.ndarray:
-    """A 1 x n MATLAB struct array."""
     if not entries:
         return np.zeros((0, 0))
     array = np.empty((1, len(entries)), dtype=[(name, object) for name in entries[0]])

@@ -140,7 +140,6 @@ def test_a_link_means_on_top_in_contact_and_else_the_role_of_the_classes(
 
 
 def annotated(found: EncodedScene) -> dict[int, set[tuple[int, int]]]:
-    """The annotated pairs of each relation that has some."""
     mask = annotated_relations(found)
     pairs = {a: {(int(i), int(j)) for i, j in np.argwhere(mask[a])} for a in range(len(mask))}
     return {a: every for a, every in pairs.items() if every}
@@ -184,7 +183,6 @@ def test_boxes_annotate_sides_of_all_pairs_and_no_above() -> None:
 
 
 def in_a_row(size: tuple[float, float, float] | None) -> tuple[AnnotatedObject, ...]:
-    """Two neighbours, and a distant pencil."""
     places = (("desk", 0.0), ("monitor", 0.5), ("pencil", 9.0))
     return tuple(AnnotatedObject(label, label, (x, 0.0, 0.5), size) for label, x in places)
 

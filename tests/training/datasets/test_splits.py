@@ -14,7 +14,6 @@ ROOMS = ("bedroom", "kitchen", "office", None)
 def collection(
     source: str, groups: int, seed: int = 0, prefix: str | None = None
 ) -> list[AnnotatedScene]:
-    """Groups of one to six scenes, most of one room type."""
     rng = random.Random(f"{source}{seed}")
     return [
         AnnotatedScene(f"{source}-{g}-{k}", source, f"{prefix or source}-{g}", room, ())

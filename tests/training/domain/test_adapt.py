@@ -25,7 +25,6 @@ INTRUDER = ["toilet", "bed", "nightstand", "pillow", "wardrobe", "lamp", "curtai
 
 @pytest.fixture
 def store(tmp_path, repository) -> Store:
-    """A store with the default model, which a person may change."""
     source = Store(repository / "model_store")
     name, version = source.resolve("default")
     root = tmp_path / "store"
@@ -203,7 +202,6 @@ def test_written_rooms_never_count_towards_the_scenes_of_a_home(store, tmp_path)
 
 
 def test_words_that_the_model_cannot_read_become_classes(store, tmp_path):
-    """They are accepted at once, and judged after three scenes."""
     darkroom = {"room_type": "darkroom", "objects": ["deck chair", "stairlift"]}
     others = ["plant", "lamp", "table"]
     output = adapt(store, write([darkroom], tmp_path / "scenes.jsonl"))

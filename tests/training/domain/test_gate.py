@@ -28,7 +28,6 @@ def difference(task: str, metric: str, low: float, high: float) -> Difference:
 
 
 def comparison(*rows: tuple[str, str, float, float]) -> Comparison:
-    """Of rows (task, metric, low, high)."""
     results = Results("new", (), tuple(difference(*row) for row in rows))
     return Comparison(results, "old", 40, 20, ())
 
@@ -104,7 +103,6 @@ def trained(scenes: SplitScenes, **objects: float) -> SceneModel:
 
 
 def with_random_classes(scenes: SplitScenes) -> SplitScenes:
-    """The training scenes with random classes, as many as before, in place of their own."""
     rng, train = np.random.default_rng(0), scenes.parts["train"]
     every = np.concatenate([scene.evidence.classes for scene in train])
     classes, count = np.unique(every, return_counts=True)

@@ -38,7 +38,6 @@ def file(tmp_path) -> Path:
 
 @pytest.fixture
 def lab(file) -> Path:
-    """The folder of a proposal for `file`."""
     init(file, folder=file.parent / "lab")
     return file.parent / "lab"
 
@@ -91,7 +90,6 @@ def test_files_are_overwritten_only_with_force(file, lab) -> None:
 
 
 def vocabulary(folder: Path) -> dict[str, dict]:
-    """The entries of the vocabulary file by label."""
     values = json.loads((folder / "vocabulary.json").read_text())
     return {entry["label"]: entry for entry in values["objects"]}
 
@@ -103,7 +101,6 @@ def edit(folder: Path, entries: list[dict], **others: object) -> str:
 
 
 def test_an_update_keeps_edits_and_adds_new_files(lab) -> None:
-    """A removed, a renamed, a merged and a flagged class, and a removed room type."""
     removed, renamed, merged, flagged, *_ = found = vocabulary(lab).values()
     old = [dict(entry) for entry in (removed, renamed, merged)]
     renamed["label"] = "my thing"

@@ -36,7 +36,6 @@ def material_of(folder: Path) -> SplitScenes:
 
 @pytest.fixture
 def ward(repository) -> Path:
-    """The example of the page: 63 rows of five places."""
     return repository / "examples" / "ward.csv"
 
 

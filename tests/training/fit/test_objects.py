@@ -327,7 +327,6 @@ def test_finished_couplings_are_symmetric_to_the_last_bit():
 
 
 def context(likely):
-    """Independent classes with these probabilities, (2^V,)."""
     p = torch.tensor(likely).double()
     return torch.where(EVERY > 0, p, 1 - p).prod(1)
 
@@ -481,7 +480,6 @@ def test_long_chains_have_the_shares_of_the_scenes(name):
 
 
 def test_a_population_weighs_scenes_by_source():
-    """The served mix counts sources by their served weights, whatever their numbers of scenes."""
     scenes = scenes_of(SHOWS)
     *by_source, mixed = long_chains.populations(scenes, SERVED)
     expected = (2 * by_source[0].p + by_source[1].p) / 3
@@ -539,7 +537,6 @@ def test_chains_start_at_each_room_type_in_proportion():
 
 
 def test_chains_continue_from_call_to_call():
-    """The states after two calls are those after one call, and each chain counts by itself."""
     machine, scenes = machine_of("coupled", scale=0.6), scenes_of(SHOWS)
     population = next(long_chains.populations(scenes, SERVED))
     chains = long_chains.scene_chains(weights_of(machine))

@@ -17,7 +17,6 @@ V = 6
 
 
 def apart(offset, i=0, j=1, *, relation=LEFT, source="toy"):
-    """A scene of two things, i in the relation to j, so far from it."""
     found = scene([i, j], [(relation, i, j)], source=source)
     return replace(found, instance_positions=np.array([offset, (0.0, 0.0, 0.0)]))
 
@@ -42,7 +41,6 @@ VALUES = (0.1, 0.5, 1.1)
 
 
 def joint(m, s):
-    """Density of prior and draws."""
     expected, kappa, alpha, beta = PRIOR
     prior = invgamma.pdf(s, alpha, scale=beta) * norm.pdf(m, expected, np.sqrt(s / kappa))
     return prior * np.prod([norm.pdf(value, m, np.sqrt(s)) for value in VALUES], axis=0)
@@ -70,7 +68,6 @@ MEAN, STD = np.array([0.1, 1.2, -0.3]), np.array([0.4, 0.2, 0.05])
 
 
 def many_pairs(number=30, seed=2):
-    """Pairs of many classes, each around a mean of its own; every fifth pair seen once."""
     rng = np.random.default_rng(seed)
     found = []
     for i in range(number):

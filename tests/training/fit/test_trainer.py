@@ -48,7 +48,6 @@ def same(first, second):
 
 @pytest.fixture(scope="module")
 def whole(data):
-    """An uninterrupted run, and its machine's weights."""
     result = Trainer(small_config(), data).run()
     return result, state(result.machine)
 

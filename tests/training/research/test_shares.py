@@ -11,7 +11,6 @@ A = 5
 
 
 def relation_of(artifact, classes):
-    """The log-odds of every relation between the classes 0 and 1."""
     return Posterior(artifact, scene_of(classes)).relation_log_odds()[:, :2, :2]
 
 
@@ -26,7 +25,6 @@ def test_without_context_the_other_objects_change_no_relation():
 
 @pytest.mark.parametrize("left_out", [{"relation": 0.0}, {"counts": 0.0}])
 def test_a_score_at_a_place_is_left_out(left_out):
-    """As in a model that was fitted without it."""
     fit = PlaceFit(relation=0.7, counts=0.4, intercept=-1.0)
     artifact = larger_artifact("triway-states", at=(fit,) * A)
     expected = larger_artifact("triway-states", at=(fit.model_copy(update=left_out),) * A)

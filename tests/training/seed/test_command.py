@@ -40,7 +40,6 @@ def test_scenes_are_split_and_encoded(tmp_path):
 
 
 def test_inside_is_left_out(tmp_path):
-    """Scenes that list inside or contains are the scenes without these triples."""
     listed = ((1, "on-top", 0), (1, "left", 2))
     for name, inside in (("with", ((1, "inside", 0), (2, "contains", 1))), ("without", ())):
         scenes = [scene(k, (*listed, *inside) if k % 2 else inside) for k in range(40)]
@@ -59,7 +58,6 @@ def test_inside_is_left_out(tmp_path):
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """A finished command: (its arguments, the folder of its results, its output)."""
     folder = tmp_path_factory.mktemp("seed")
     write_jsonl(generate_rooms(60, seed=0), folder / "rooms.jsonl")
     arguments = ("seed", folder / "rooms.jsonl", "--seeds", 2, "--epochs", 2, "--workers")
@@ -83,7 +81,6 @@ def test_the_page_has_every_row_and_the_figures_of_the_paper(finished):
 
 
 def without_times(folder):
-    """Each file of a machine, without the times."""
     runs = {path: json.loads(path.read_text()) for path in folder.glob("*/*.json")}
     for run in runs.values():
         del run["cpu"]

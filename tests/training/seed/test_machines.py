@@ -27,7 +27,6 @@ def tiny(kind: type[Machine], H2: int, scale: float = 1.0) -> Machine:
 
 
 def all_states(machine: Machine) -> State:
-    """Every state of the machine, including relations of absent objects."""
     sizes = [V, T, H1, len(machine.c2)]
     bits = torch.tensor(list(itertools.product([0.0, 1.0], repeat=sum(sizes)))).double()
     return State(*bits.split(sizes, 1))
@@ -220,14 +219,11 @@ def test_training_stops_early_and_keeps_the_best_weights(monkeypatch):
 
 
 def many_units(kind: type[Machine]) -> Machine:
-    """An untrained machine of the scenes below: 40 classes and 39 relations."""
     triples = torch.tensor([[0, i, i + 1] for i in range(39)])
     return kind(triples, 40, 20, 0, torch.Generator().manual_seed(0))
 
 
 class SparseParts:
-    """Sixteen scenes of three classes and two relations."""
-
     v = torch.eye(40)[:16] + torch.eye(40)[1:17] + torch.eye(40)[2:18]
     r = torch.eye(39)[:16] + torch.eye(39)[1:17]
     train = validation = Scenes(v, r, r.sum(1), torch.ones(16, dtype=torch.bool))

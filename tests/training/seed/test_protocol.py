@@ -21,7 +21,6 @@ def rng() -> torch.Generator:
 
 
 def everything(v, r, free, generator):
-    """Switch on all free units."""
     return torch.where(free.v, 1.0, v), torch.where(free.r, 1.0, r)
 
 

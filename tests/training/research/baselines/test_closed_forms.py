@@ -31,7 +31,6 @@ from training.research.baselines.relation_models import closure_score, complex_l
 
 
 def lists_of(v):
-    """Scenes of equal weight, of a source that can show every class."""
     everything = torch.ones(v.shape, dtype=torch.bool)
     return Lists(v, everything, torch.ones(len(v)), torch.arange(len(v)))
 
@@ -85,7 +84,6 @@ def test_nearest_scenes_are_scikit_learns(v, sharpness):
 
 
 def test_pairwise_weights_are_a_stationary_point(v):
-    """The gradient of the penalised pseudo-likelihood, written out, vanishes."""
     l2 = 5.0
     score = fit_pairwise(lists_of(v), l2, iterations=200)
     W, x = score.weights.double(), v.double()
