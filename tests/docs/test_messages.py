@@ -44,9 +44,7 @@ def messages() -> str:
 
 
 @pytest.mark.parametrize(("page", "message"), LISTED)
-def test_a_listed_message_is_a_problem_or_a_text_of_the_service(
-    page: str, message: str, messages: str
-) -> None:
+def test_a_listed_message_is_a_problem_or_a_text_of_the_service(page, message, messages):
     if match := re.fullmatch(r"(\d{3}) ([a-z-]+)", message):
         assert ERRORS[match[2]].status == int(match[1]), page
     else:

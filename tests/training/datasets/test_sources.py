@@ -94,9 +94,7 @@ PHRASES = [
 
 
 @pytest.mark.parametrize(("source", "phrase", "relation", "is_support"), PHRASES)
-def test_phrases_of_a_source(
-    source: str, phrase: str, relation: str | None, is_support: bool
-) -> None:
+def test_phrases_of_a_source(source, phrase, relation, is_support):
     listed = [(4, phrase, 0), (4, phrase, 4), (4, phrase, 0)]
     assert relations_of(source, listed) == (((4, relation, 0),) if relation else ())
     assert supported_subjects(source, listed) == ((4,) if is_support else ())
@@ -160,9 +158,7 @@ STACK = {(0, 1), (1, 0)}
         ("robot", dict.fromkeys((LEFT, FRONT, ON_TOP, ABOVE, INSIDE), ALL)),
     ],
 )
-def test_only_sources_that_show_false_relations_annotate_them(
-    source: str, pairs: dict[int, set[tuple[int, int]]]
-) -> None:
+def test_only_sources_that_show_false_relations_annotate_them(source, pairs):
     listed = ((1, "on-top", 0), (2, "left", 1))
     assert annotated(encoded(source, relations=listed, supported=(1,))) == pairs
 

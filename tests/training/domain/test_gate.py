@@ -72,9 +72,7 @@ def test_a_refusal_names_every_metric_that_is_worse() -> None:
         (("T2 missing",), "T2 missing", 0),
     ],
 )
-def test_a_model_without_relation_metrics_replaces_no_model_with_them(
-    measured, task, expected
-) -> None:
+def test_a_model_without_relation_metrics_replaces_no_model_with_them(measured, task, expected):
     holder = Candidate("old", None, {}, None, tasks=frozenset(measured))
     names = unmeasured([difference(task, "MRR", -0.1, 0.1)], holder)
     assert len(names) == expected

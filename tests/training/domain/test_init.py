@@ -164,9 +164,7 @@ def test_an_update_reads_a_file_that_has_grown(file, lab) -> None:
         (lambda lab: None, ("--terms", "x"), "--terms cannot be used with it"),
     ],
 )
-def test_an_update_without_a_usable_proposal_is_refused(
-    file, lab, break_it, options, message
-) -> None:
+def test_an_update_without_a_usable_proposal_is_refused(file, lab, break_it, options, message):
     break_it(lab)
     before = {path.name: path.read_text() for path in lab.iterdir()}
     assert message in init(file, folder=lab, options=["--update", *options], code=1)
