@@ -11,10 +11,10 @@ import pytest
 
 from app.registry import Store
 from app.registry.references import AliasTarget
-from app.scene import Scene, SceneObject
 from tests.questions.answers import generate, missing, outliers, relations
 from tests.registry.small_artifacts import description, state
 from tests.training.commands import invoke, small_config, write_config
+from tests.training.scenes import request
 from training.datasets import read_scenes
 from training.datasets.records import digest_of
 from training.fit.offset_statistics import fit_offsets
@@ -112,9 +112,8 @@ def test_from_rooms_to_answers(tmp_path):
     limits = [line.threshold(3) for line in (lines.low, lines.medium, lines.high)]
     assert limits == sorted(limits, reverse=True)
     assert 1 > limits[0] >= limits[2] > 0
-    things = ("bed", "nightstand", "lamp")
     model = artifact.model
-    scene = Scene(tuple(SceneObject(name, name, model.vocabulary.index(name)) for name in things))
+    scene = request(model, "bed", "nightstand", "lamp")
     assert missing(model, scene)
     assert relations(model, scene)
     assert len(outliers(model, scene).outliers) == 3

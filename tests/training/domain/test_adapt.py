@@ -14,6 +14,7 @@ from app.scene.spatial_relations import ON_TOP
 from tests.registry.small_artifacts import rewrite_manifest
 from tests.training.commands import invoke
 from tests.training.domain.homes import home_scenes, write
+from tests.training.scenes import request
 from training.datasets.inventories import read_inventory
 from training.datasets.jsonl import scan_jsonl
 from training.domain.adaptation import FEWEST, adapted
@@ -40,10 +41,8 @@ def adapt(store: Store, *arguments: object, code: int = 0) -> str:
 
 
 def alarms(artifact: SceneModel, labels: list[str], room: str | None = None) -> list[str]:
-    words = artifact.vocabulary
-    objects = tuple(SceneObject(x, x, words.index(x)) for x in dict.fromkeys(labels))
-    scene = Scene(objects, room_type=None if room is None else words.room_index(room))
-    return [words.labels[c] for c in alarms_of(artifact, scene)]
+    scene = request(artifact, *dict.fromkeys(labels), room=room)
+    return [artifact.vocabulary.labels[c] for c in alarms_of(artifact, scene)]
 
 
 def stored(store: Store, reference: str) -> Artifact:
@@ -259,9 +258,8 @@ def test_five_habits_are_learnt_from_a_hundred_scenes(store, tmp_path):
 
 
 def tv_is_missing(artifact: SceneModel, labels: list[str]) -> float:
-    words = artifact.vocabulary
-    scene = Scene(tuple(SceneObject(x, x, words.index(x)) for x in labels))
-    answer = questions.missing(artifact, scene, candidates=[words.index("tv")], coverage=0.8)
+    scene, tv = request(artifact, *labels), artifact.vocabulary.index("tv")
+    answer = questions.missing(artifact, scene, candidates=[tv], coverage=0.8)
     return answer["missing"][0]["probability"]
 
 

@@ -5,11 +5,10 @@ import numpy as np
 import pytest
 
 from app import questions
-from app.model import SceneModel
 from app.registry import Store
-from app.scene import Scene, SceneObject
+from app.scene import Scene
 from tests.training.commands import invoke
-from tests.training.scenes import scene
+from tests.training.scenes import request, scene
 from training.datasets import generate_rooms
 from training.datasets.inventories import read_inventory
 from training.datasets.jsonl import write_jsonl
@@ -179,18 +178,13 @@ def test_from_the_table_to_answers(ward, tmp_path) -> None:
         "patient bathroom": ["toilet", "mirror", "towel", "soap dispenser", "grab bar"],
     }
     for place, labels in asked.items():
-        answer = questions.missing(model, of(model, labels), top_k=5)
+        answer = questions.missing(model, request(model, *labels), top_k=5)
         own = {words.labels[index] for x in things[place] if (index := words.index(x)) is not None}
         assert {entry["label"] for entry in answer["missing"]} <= own
-    intruded = questions.outliers(model, of(model, [*asked["patient room"], "toilet"]))
+    intruded = questions.outliers(model, request(model, *asked["patient room"], "toilet"))
     assert [x["object"] for x in intruded["outliers"] if x["is_outlier"]] == ["toilet"]
-    rooms = questions.rooms(model, of(model, ["toilet", "mirror"]))["room_types"]
+    rooms = questions.rooms(model, request(model, "toilet", "mirror"))["room_types"]
     assert rooms[0]["room_type"] == "bathroom"
     room = words.room_index("nurse station")
     generated = questions.generate(model, Scene((), room_type=room), seed=1)["scenes"][0]
     assert len(generated["objects"]) > 2
-
-
-def of(model: SceneModel, labels: list[str]) -> Scene:
-    words = model.vocabulary
-    return Scene(tuple(SceneObject(x, x, words.index(x)) for x in labels))

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.special import expit as sigmoid
 
-from app.model import Calibration, PlaceFit
+from app.model import PlaceFit
 from app.scene.spatial_relations import LATERAL, STACKED
 from tests.questions.artifacts import larger_artifact
 from tests.training.evaluation.scenes import scene, tensors
@@ -55,10 +55,3 @@ def test_relations_of_a_kind_share_an_entry():
     assert {entries[a] for a in STACKED} == {entries[STACKED[0]]}
     assert entries[STACKED[0]] != PlaceFit()
     assert {entries[a] for a in LATERAL} == {PlaceFit()}
-
-
-def test_scenes_without_relations_keep_the_default_entry():
-    artifact = larger_artifact("triway")
-    alone = tensors([scene([k % 7, (k + 1) % 7]) for k in range(30)], len(artifact.vocabulary))
-    assert set(fit_at(artifact, alone.scenes)) == {PlaceFit()}
-    assert Calibration.neutral(5).at == (PlaceFit(),) * 5
