@@ -112,7 +112,7 @@ def test_a_class_that_the_parent_hardly_knows_is_learnt_from_few_scenes():
 def test_distillation_keeps_the_answers_about_stored_samples(monkeypatch):
     """Without it, the rooms of the parent change several times more."""
     parent, home = small(), scenes_of(*HOME)
-    samples = torch.from_numpy(parent.scenes)
+    samples = torch.from_numpy(parent.chain_samples)
     samples = samples[samples.sum(1) > 1]
     parts = random_parts(samples, 0.3, torch.Generator().manual_seed(1))
 
