@@ -1,7 +1,5 @@
 """Every benchmark at a tiny size: complete results, finite ratios, yardsticks doing the same work.
-
-No test here looks at speed: that is what the benchmarks are for.
-"""
+No test here looks at speed: that is what the benchmarks are for."""
 
 import io
 import math

@@ -1,10 +1,7 @@
-"""Hostile requests: every wrong value at every place of every kind of request.
-
-Whole bodies, header fields and addresses that are wrong: tests/http.
-
-Strings and numbers that are made up hold `MARKER` or `NUMBER`, so that a refusal which repeats any
-of the input shows. Everything is generated in the same order every time.
-"""
+"""Hostile requests: every wrong value at every place of every kind of request. Whole bodies, header
+fields and addresses that are wrong: tests/http. Strings and numbers that are made up hold `MARKER`
+or `NUMBER`, so that a refusal which repeats any of the input shows. Everything is generated in the
+same order every time."""
 
 import copy
 import json

@@ -104,8 +104,7 @@ class Judge:
         self.expected: dict[str, list[Any]] = {}
         for version in versions:
             for scene in SCENES:
-                body = scene | {"model": f"home@{version}"}
-                answer = client.post("/missing", json=body).json()
+                answer = client.post("/missing", json=scene | {"model": f"home@{version}"}).json()
                 assert answer["model"]["version"] == version
                 self.expected.setdefault(answer["model"]["digest"], []).append(answer["missing"])
 

@@ -1,7 +1,5 @@
-"""HTTP as bytes: requests that no client library would write, and how the answers are read.
-
-The expected statuses are those of the proxy in front of the service.
-"""
+"""HTTP as bytes: requests that no client library would write, and how the answers are read. The
+expected statuses are those of the proxy in front of the service."""
 
 import socket
 from collections.abc import Iterator, Sequence
@@ -194,8 +192,7 @@ def _heads() -> Iterator[Wire]:
     upgrade = (
         b"Host: localhost\r\nConnection: upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13"
     )
-    socket_wanted = LIVE.replace(b"Host: localhost", upgrade)
-    yield Wire("WebSocket without a key", [socket_wanted], (400,))
+    yield Wire("WebSocket without a key", [LIVE.replace(b"Host: localhost", upgrade)], (400,))
     for name, text in {
         "TLS": b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + b"\x07" * 500,
         "connect": b"CONNECT elsewhere:443 HTTP/1.1\r\nHost: localhost\r\n\r\n",

@@ -121,7 +121,6 @@ def check_output(block: Block, printed: str) -> None:
         return
     expected = block.output.source
     if block.output.language == "json":
-        found = json.loads(printed)
-        assert agrees(json.loads(expected), found), f"{block} answers {printed}"
+        assert agrees(json.loads(expected), json.loads(printed)), f"{block} answers {printed}"
     else:
         assert text_agrees(expected, printed), f"{block} prints\n{printed}"

@@ -9,9 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import FindTool
-from tests.services import LiveService
-
 _LEFT_OUT = shutil.ignore_patterns(
     ".git", ".venv", "build", "dist", "runs", ".hypothesis", ".*_cache"
 )
@@ -33,16 +30,9 @@ class Workplace:
 
 
 @pytest.fixture(scope="session")
-def workplace(
-    repository: Path,
-    shipped: LiveService,
-    tmp_path_factory: pytest.TempPathFactory,
-    find_tool: FindTool,
-) -> Workplace:
+def workplace(repository, shipped, tmp_path_factory, find_tool):
     """The shipped models as a service, and a fresh copy of the repository for the pages' commands.
-
-    All in the copy is as in a checkout but for `.venv`, see `install`.
-    """
+    All in the copy is as in a checkout but for `.venv`, see `install`."""
     for tool in ("make", "curl", "bash"):
         find_tool(tool)
     folder = tmp_path_factory.mktemp("checkout") / "scene"
@@ -52,11 +42,9 @@ def workplace(
 
 
 def install(folder: Path) -> None:
-    """Give the copy this interpreter's environment for its `.venv`, and programs of its own.
-
-    With the stamps of an installation: installing anew would take minutes and the internet
-    (tests/system installs for the image).
-    """
+    """Give the copy this interpreter's environment for its `.venv`, and programs of its own. With
+    the stamps of an installation: installing anew would take minutes and the internet (tests/system
+    installs for the image)."""
     environment = folder / ".venv"
     programs = environment / "bin"
     programs.mkdir(parents=True)

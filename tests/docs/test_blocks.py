@@ -74,9 +74,7 @@ def test_pages_run_by_scripts_are_named_there(page: str) -> None:
 
 @pytest.mark.system
 @pytest.mark.parametrize("page", WITH_CODE)
-def test_the_code_of_a_page_runs(
-    workplace: Workplace, page: str, eval_example: EvalExample, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_code_of_a_page_runs(workplace, page, eval_example, monkeypatch):
     monkeypatch.setattr(sys, "path", [*sys.path])  # a page may add to it
     # The house's rules, but that pages print, and bind names in one block for the next.
     eval_example.set_config(
@@ -94,7 +92,6 @@ def test_the_code_of_a_page_runs(
 
 
 def run_shell(block: Block, workplace: Workplace) -> str:
-    """What bash prints; a command that fails fails the test."""
     done = subprocess.run(
         ["bash", "-euo", "pipefail", "-c", ADDRESS.sub(workplace.address, block.source)],
         cwd=workplace.folder,

@@ -12,7 +12,6 @@ PAGE = (REPOSITORY / "docs" / "contributing.md").read_text("utf-8")
 
 
 def section(title: str) -> str:
-    """Return the text between a heading of the page and the next heading."""
     return PAGE.partition(f"## {title}\n")[2].partition("\n## ")[0]
 
 

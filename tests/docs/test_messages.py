@@ -1,8 +1,6 @@
-"""The tables of messages in the documentation list the messages and problems of the service.
-
-A problem of a request also has a page of the service: `test_every_problem_type_has_a_page` in
-tests/http/test_problems.py.
-"""
+"""The tables of messages in the documentation list the messages and problems of the service. A
+problem of a request also has a page of the service: `test_every_problem_type_has_a_page` in
+tests/http/test_problems.py."""
 
 import ast
 import re
@@ -36,7 +34,6 @@ EXPLAINED = {
 
 @pytest.fixture(scope="module")
 def messages() -> str:
-    """The string constants of the service and the client, f-strings in pieces."""
     sources = [*REPOSITORY.glob("app/**/*.py"), *REPOSITORY.glob("clients/python/**/*.py")]
     return "\n".join(
         node.value
@@ -47,9 +44,7 @@ def messages() -> str:
 
 
 @pytest.mark.parametrize(("page", "message"), LISTED)
-def test_a_listed_message_is_a_problem_or_a_text_of_the_service(
-    page: str, message: str, messages: str
-) -> None:
+def test_a_listed_message_is_a_problem_or_a_text_of_the_service(page, message, messages):
     if match := re.fullmatch(r"(\d{3}) ([a-z-]+)", message):
         assert ERRORS[match[2]].status == int(match[1]), page
     else:

@@ -23,7 +23,6 @@ CODE = re.compile(r"<(code|pre|script|style|math)\b.*?</\1>", re.DOTALL)
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The site, built as `make docs` does it."""
     folder = tmp_path_factory.mktemp("site")
     command = (sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", folder)
     done = run_program(*command, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"})
@@ -33,7 +32,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def pages(site: Path) -> dict[str, str]:
-    """The HTML of every page by its address in the site."""
     paths = sorted(site.rglob("*.html"))
     return {path.relative_to(site).as_posix(): path.read_text(encoding="utf-8") for path in paths}
 
@@ -72,7 +70,6 @@ def test_every_test_that_a_formula_names_exists() -> None:
 
 @pytest.fixture
 def served(site: Path) -> Iterator[str]:
-    """The address of a server of the built files."""
     with http_server(SimpleHTTPRequestHandler, directory=site) as url:
         yield url
 

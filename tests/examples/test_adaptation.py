@@ -27,14 +27,12 @@ LARGEST = 300_000  # bytes
 
 
 def environment() -> dict[str, str]:
-    """The environment of a shell with the programs of this interpreter."""
     programs = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     places = os.pathsep.join([str(REPOSITORY), str(REPOSITORY / "clients/python")])
     return os.environ | {"PATH": programs, "PYTHONPATH": places}
 
 
 def outputs(notebook: Any) -> list[list[str]]:
-    """The kinds of the outputs of each code cell."""
     cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
     return [[output["output_type"] for output in cell["outputs"]] for cell in cells]
 

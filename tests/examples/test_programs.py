@@ -20,7 +20,6 @@ EXAMPLES = REPOSITORY / "examples"
 
 
 def run(*command: str | Path, url: str, **options: Any) -> Any:
-    """Run a program of the folder with the address of a service."""
     return run_program(*command, cwd=EXAMPLES, env=os.environ | {"SCENE_URL": url}, **options)
 
 
@@ -46,8 +45,7 @@ def test_the_readme_lists_every_program() -> None:
 
 def test_curl_asks_the_five_questions(shipped: LiveService, find_tool: FindTool) -> None:
     find_tool("curl")
-    done = run(find_tool("bash"), "curl.sh", url=shipped.url)
-    lines = done.stdout.splitlines()
+    lines = run(find_tool("bash"), "curl.sh", url=shipped.url).stdout.splitlines()
     answers = dict(zip(lines[::2], map(json.loads, lines[1::2]), strict=True))
     assert list(answers) == ["relations", "missing", "outliers", "rooms", "generate"]
     assert answers["relations"]["relations"][0]["relation"] == "on-top"
@@ -83,9 +81,7 @@ def test_the_behaviour_tree_says_why_its_conditions_fail(shipped: LiveService) -
     assert printed[1].startswith("complete: missing: computer")
 
 
-def test_the_ros_node_publishes_outliers(
-    shipped: LiveService, repository: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_ros_node_publishes_outliers(shipped, repository, monkeypatch):
     recorded = json.loads((repository / "clients/ros2/detections.json").read_text("utf-8"))
     message = from_json("vision_msgs/msg/Detection3DArray", recorded["msg"])
     for url in (shipped.url, "http://127.0.0.1:9"):

@@ -50,8 +50,7 @@ def test_the_terms_of_each_model_are_those_of_its_data(artifact):
 
 
 def test_an_artifact_is_small(artifact):
-    size = sum(path.stat().st_size for path in artifact.path.iterdir())
-    assert size <= 12_000_000
+    assert sum(path.stat().st_size for path in artifact.path.iterdir()) <= 12_000_000
 
 
 def test_structure_has_no_object_weights(artifact):

@@ -2,7 +2,8 @@
 
 from typing import Any
 
-from app.scene import RoleCounts, Vocabulary
+from app.model import SceneModel
+from app.scene import RoleCounts, Scene, SceneObject, Vocabulary
 from training.datasets import AnnotatedObject, AnnotatedScene, EncodedScene, encode
 
 
@@ -30,3 +31,10 @@ def encode_objects(
     values: dict[str, Any] = {"scene_id": "s", "source": "t", "group": "g", "room_type": None}
     one = AnnotatedScene(**values | {"objects": objects} | fields)
     return encode([one], vocabulary, roles)[0]
+
+
+def request(model: SceneModel, *labels: str, room: str | None = None) -> Scene:
+    """The scene of a request with labels of the model."""
+    words = model.vocabulary
+    objects = tuple(SceneObject(label, label, words.index(label)) for label in labels)
+    return Scene(objects, room_type=None if room is None else words.room_index(room))

@@ -1,5 +1,3 @@
-"""The command line end to end on generated rooms: train, publish and evaluate."""
-
 import json
 import re
 import subprocess
@@ -13,10 +11,10 @@ import pytest
 
 from app.registry import Store
 from app.registry.references import AliasTarget
-from app.scene import Scene, SceneObject
 from tests.questions.answers import generate, missing, outliers, relations
 from tests.registry.small_artifacts import description, state
 from tests.training.commands import invoke, small_config, write_config
+from tests.training.scenes import request
 from training.datasets import read_scenes
 from training.datasets.records import digest_of
 from training.fit.offset_statistics import fit_offsets
@@ -114,9 +112,8 @@ def test_from_rooms_to_answers(tmp_path):
     limits = [line.threshold(3) for line in (lines.low, lines.medium, lines.high)]
     assert limits == sorted(limits, reverse=True)
     assert 1 > limits[0] >= limits[2] > 0
-    things = ("bed", "nightstand", "lamp")
     model = artifact.model
-    scene = Scene(tuple(SceneObject(name, name, model.vocabulary.index(name)) for name in things))
+    scene = request(model, "bed", "nightstand", "lamp")
     assert missing(model, scene)
     assert relations(model, scene)
     assert len(outliers(model, scene).outliers) == 3
@@ -131,10 +128,7 @@ def test_from_rooms_to_answers(tmp_path):
             ("train", "places-triway", "--data", "nowhere"),
             "18 of 19 files of scenes are missing in nowhere: procthor.jsonl.gz",
         ),
-        (
-            ("train", "places-rbm", "--data", "nowhere"),
-            "docs/training.md (The public data sets)",
-        ),
+        (("train", "places-rbm", "--data", "nowhere"), "docs/training.md (The public data sets)"),
         (("publish", "nowhere", "1.0.0"), "no finished run"),
         (("publish", "nowhere@1.0.0", "1.0.1", "--promote"), "app.registry alias` moves"),
         (("publish", "nowhere", "1.0.0", "--alias", "lab"), "--alias belongs to --promote"),
@@ -156,8 +150,7 @@ def test_a_stored_model_is_evaluated_on_files(tmp_path):
         files += ["--file", tmp_path / name]
     scenes = [replace(scene, source="seen") for scene in read_scenes(tmp_path / "seen.jsonl")]
     learnt = {"source": "seen", "scenes": 3, "digest": digest_of(scenes), "terms": "MIT"}
-    data = [learnt | {"research_only": False}]
-    Store(store).publish(description("tiny", data=data), state())
+    Store(store).publish(description("tiny", data=[learnt | {"research_only": False}]), state())
     figures = tmp_path / "figures.json"
     output = invoke("evaluate", "tiny", *files, "--store", store, "--json", figures)
     assert "tiny: seen is training data of this model" in output
@@ -198,8 +191,7 @@ def test_the_version_is_checked_before_training(tmp_path):
 
 
 def test_the_error_about_missing_own_scenes_names_their_folder(tmp_path):
-    lost = {"data.sources": ("../lost.jsonl",)}
-    config = write_config(tmp_path / "config.toml", CONFIG, lost)
+    config = write_config(tmp_path / "config.toml", CONFIG, {"data.sources": ("../lost.jsonl",)})
     assert "Pass this folder with --data" in invoke("train", config, code=1)
 
 
@@ -218,8 +210,7 @@ def test_a_final_run_is_not_promoted_by_comparison(tmp_path):
     assert "trained in" in output
     assert "next:" not in output
     folder = tmp_path / "runs/rooms-triway/final-seed-0"
-    store = tmp_path / "store"
-    text = invoke("publish", folder, "1.0.0", "--promote", "--store", store, code=1)
+    text = invoke("publish", folder, "1.0.0", "--promote", "--store", tmp_path / "store", code=1)
     assert "is a final run without test scenes" in text
     assert "`python -m app.registry alias` moves an alias without a comparison" in text
     assert "object classes" not in text  # refused before the scenes are read

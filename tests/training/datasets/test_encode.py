@@ -11,16 +11,9 @@ from tests.training.scenes import encode_objects, things
 from training.datasets import AnnotatedObject, annotated_classes, encode
 from training.datasets.encoding import derive_from_boxes, room_viewpoint
 
-VOCABULARY = Vocabulary(
-    [
-        ObjectClass("desk"),
-        ObjectClass("monitor", ("screen",)),
-        ObjectClass("pencil"),
-        ObjectClass("wall", structure=True),
-        ObjectClass("floor", structure=True),
-    ],
-    ["bathroom", "office"],
-)
+THINGS = [ObjectClass("desk"), ObjectClass("monitor", ("screen",)), ObjectClass("pencil")]
+STRUCTURE = [ObjectClass(label, structure=True) for label in ("wall", "floor")]
+VOCABULARY = Vocabulary([*THINGS, *STRUCTURE], ["bathroom", "office"])
 DESK, MONITOR, PENCIL, WALL, FLOOR = range(5)
 DESK_BOX: dict[str, Any] = {"position": (2.0, 0.0, 0.4), "size": (0.8, 1.6, 0.8)}
 MONITOR_BOX: dict[str, Any] = {"position": (2.0, 0.3, 1.0), "size": (0.1, 0.5, 0.4)}
@@ -33,7 +26,6 @@ def encoded(objects: tuple[AnnotatedObject, ...], **fields: Any) -> Any:
 
 
 def triples(scene: Any) -> set[tuple[int, int, int]]:
-    """Relations between classes."""
     names = scene.evidence.classes
     return {(int(a), int(names[x]), int(names[y])) for a, x, y in np.argwhere(scene.evidence.holds)}
 

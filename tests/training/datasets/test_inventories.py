@@ -1,5 +1,3 @@
-"""Written inventories and things: the reader, its errors, and the law of the sampler."""
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -33,7 +31,9 @@ from training.fit.configuration import Config, DataConfig, MachineConfig
 from training.runs.pipeline import prepare
 
 LAMP = "den,study,desk things,.5,lamp,.4,1-3,on-top,desk"
+LAMP_ITEM = Item("lamp", 0.4, 1, 3, "on-top", "desk")
 DESK = "den,study,basics,1,desk,.8,1,floor,"
+BASICS = Group("basics", 1, (Item("desk", 0.8, 1, 1, "floor", ""),))
 CUP = "cup,.1,.09,.1,1.3,surface .7 inside .3,no,yes,hand,vessel,mug"
 SPORT = (("bicycle", 0.25), ("helmet", 0.5))
 VESSEL = "vessel,.2,.2,.2,2,surface 1,no,yes,hand,,"
@@ -57,14 +57,7 @@ def test_places_are_read_in_order(tmp_path):
     (place,) = read_inventory(
         write(tmp_path, DESK, "", '"den", study ' + LAMP.removeprefix("den,study"))
     ).places
-    assert place == Place(
-        "den",
-        "study",
-        (
-            Group("basics", 1, (Item("desk", 0.8, 1, 1, "floor", ""),)),
-            Group("desk things", 0.5, (Item("lamp", 0.4, 1, 3, "on-top", "desk"),)),
-        ),
-    )
+    assert place == Place("den", "study", (BASICS, Group("desk things", 0.5, (LAMP_ITEM,))))
 
 
 @pytest.mark.parametrize(
@@ -112,14 +105,9 @@ def test_empty_cells_have_defaults(tmp_path):
     rows += ["hall;bicycle;0,25;sport;;;", "hall;helmet;;sport;0,5;;"]
     path.write_text("\ufeff" + "\r\n".join(rows), "utf-8")
     (place,) = read_inventory(path).places
-    assert place == Place(
-        "hall",
-        "hall",
-        (
-            Group("", 1.0, (Item("coat", 0.5, 1, 1, "", ""),)),
-            Group("sport", 0.5, tuple(Item(x, y, 1, 1, "", "") for x, y in SPORT)),
-        ),
-    )
+    coats = Group("", 1.0, (Item("coat", 0.5, 1, 1, "", ""),))
+    sport = Group("sport", 0.5, tuple(Item(x, y, 1, 1, "", "") for x, y in SPORT))
+    assert place == Place("hall", "hall", (coats, sport))
     scene = complete_scene(place)
     assert [thing.label for thing in scene.objects] == ["coat", "bicycle", "helmet", "floor"]
     assert (scene.relations, scene.supported) == ((), ())
@@ -185,18 +173,8 @@ def test_a_file_that_is_no_table_is_named(tmp_path, content, message):
 
 def test_scenes_follow_the_written_law():
     """Shares of 4,000 scenes are within .04 of the law; five standard errors, p < 1e-5."""
-    place = Place(
-        "den",
-        "study",
-        (
-            Group("basics", 1, (Item("desk", 0.8, 1, 1, "floor", ""),)),
-            Group(
-                "desk things",
-                0.5,
-                (Item("lamp", 0.4, 1, 3, "on-top", "desk"), Item("clock", 0.4, 2, 2, "wall", "")),
-            ),
-        ),
-    )
+    clock = Item("clock", 0.4, 2, 2, "wall", "")
+    place = Place("den", "study", (BASICS, Group("desk things", 0.5, (LAMP_ITEM, clock))))
     rng = np.random.default_rng(3)
     scenes = [draw_scene(place, "one", rng) for _ in range(4000)]
     assert {scene.room_type for scene in scenes} == {"study"}
@@ -224,8 +202,7 @@ def test_a_detector_lists_a_part_of_each_scene():
         Item("mugs", 1, 2, 2, "inside", "table"),
     )
     place = Place("den", "study", (Group("basics", 1, items),))
-    things = shipped_things()
-    shares = detection_rates([replace(things["table"], size=(0.5, 2.0, 0.7))])
+    shares = detection_rates([replace(shipped_things()["table"], size=(0.5, 2.0, 0.7))])
     assert shares["table"] == pytest.approx(1 - 0.7 * math.exp(-5))
     scenes = written_scenes([place], shares, 4000, seed=3)
     assert len({scene.scene_id for scene in scenes}) == 4000
@@ -245,7 +222,6 @@ def test_a_detector_lists_a_part_of_each_scene():
 
 
 def test_things_stand_where_the_table_says():
-    """A thing whose anchor is absent has no relation."""
     table = Item("table", 1, 1, 1, "floor", "")
     items = (
         table,
@@ -270,7 +246,6 @@ def test_a_seed_gives_the_same_scenes():
 
 
 def test_places_are_a_data_source_without_a_data_folder(tmp_path):
-    """A place is in one part of the split. Labels without a class are left out and named."""
     data = DataConfig(sources=("inventories",), vocabulary="rooms", written=2)
     machine = MachineConfig(variant="triway")
     scenes = prepare(Config(name="written", data=data, machine=machine), tmp_path)
@@ -280,9 +255,6 @@ def test_places_are_a_data_source_without_a_data_folder(tmp_path):
     assert "surgical light" in {x for scene in scenes.parts["train"] for x in scene.unknown}
     with pytest.raises(ValidationError, match=r"data\.written must be at least 1"):
         Config(name="written", data=DataConfig(sources=("inventories",)), machine=machine)
-
-
-# -- things ------------------------------------------------------------------------------------
 
 
 def test_things_are_read(tmp_path):

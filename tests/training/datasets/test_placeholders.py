@@ -1,5 +1,3 @@
-"""Placeholders never become classes, and real names stay."""
-
 from collections import Counter
 
 import pytest
@@ -9,12 +7,7 @@ from hypothesis import strategies as st
 from tests.training.scenes import scene
 from training.datasets import AnnotatedObject, AnnotatedScene
 from training.datasets.inventories import shipped_things
-from training.datasets.placeholders import (
-    is_placeholder,
-    left_out_line,
-    plain_label,
-    plain_scenes,
-)
+from training.datasets.placeholders import is_placeholder, left_out_line, plain_label, plain_scenes
 from training.datasets.vocabulary import curated_names
 
 PLACEHOLDERS = (
@@ -88,10 +81,8 @@ def test_placeholders_leave_a_scene_with_their_relations() -> None:
     untouched = scene("t", "cup", "plate")
     (part, same), left_out = plain_scenes([whole, untouched])
     assert same == untouched
-    assert [(x.id, x.label, x.supported_by) for x in part.objects] == [
-        ("b", "cup", None),
-        ("c", "table", None),
-    ]
+    kept = [(x.id, x.label, x.supported_by) for x in part.objects]
+    assert kept == [("b", "cup", None), ("c", "table", None)]
     assert part.relations == ((0, "left", 1),)
     assert part.false_relations == ((1, "left", 0),)
     assert part.supported == (0,)

@@ -1,7 +1,5 @@
-"""Every reader, on small files of the official layout written here.
-
-A reader is tested by being listed: `LAYOUTS` must name every format of `READERS`.
-"""
+"""Every reader, on small files of the official layout written here. A reader is tested by being
+listed: `LAYOUTS` must name every format of `READERS`."""
 
 import gzip
 import itertools
@@ -134,7 +132,6 @@ def test_a_truncated_gzip_file_is_an_error(tmp_path: Path) -> None:
 
 
 def write_scene(folder: Path, **fields: Any) -> Path:
-    """Write one scene of a cup and a table."""
     things = [{"id": 0, "label": "cup"}, {"id": 1, "label": "table"}]
     scene = {"scene_id": "a", "source": "alfred", "objects": things}
     return write_json(folder / "scene.jsonl", scene | fields)
@@ -170,8 +167,7 @@ def test_counts_name_labels_with_one_object(tmp_path: Path) -> None:
 
 def test_files_of_named_sources_are_read_from_the_folder_extra(tmp_path: Path) -> None:
     (tmp_path / "extra").mkdir()
-    scenes = read_scenes(write_scene(tmp_path))
-    jsonl.write_jsonl(scenes, tmp_path / "extra" / "nr3d.jsonl.gz")
+    jsonl.write_jsonl(read_scenes(write_scene(tmp_path)), tmp_path / "extra" / "nr3d.jsonl.gz")
     (scene,) = read_sources(DataConfig(sources=("nr3d",)), tmp_path)["nr3d"]
     assert scene.source == "nr3d"
     for source in ("vsr", "nr3d.jsonl.gz"):
@@ -302,6 +298,7 @@ MALFORMED_3DSSG = [
 
 TURN = math.radians(30)
 COS, SIN = math.cos(TURN), math.sin(TURN)
+TURNED = [[COS, SIN, 0.0], [-SIN, COS, 0.0], [0.0, 0.0, 1.0]]
 
 
 def box(classname: str, basis: Any, coeffs: list[float], centroid: list[float]) -> dict[str, Any]:
@@ -314,17 +311,11 @@ def box(classname: str, basis: Any, coeffs: list[float], centroid: list[float]) 
 BOXES = [
     box("bed", np.eye(3), [1.0, 0.5, 0.4], [0.5, 3.0, -0.6]),
     # Turned by 30 degrees against the clock, seen from above; a negative half extent occurs.
-    box(
-        "night_stand",
-        [[COS, SIN, 0.0], [-SIN, COS, 0.0], [0.0, 0.0, 1.0]],
-        [-0.2, 0.3, 0.25],
-        [1.2, 2.5, -0.7],
-    ),
+    box("night_stand", TURNED, [-0.2, 0.3, 0.25], [1.2, 2.5, -0.7]),
 ]
 
 
 def struct_array(entries: list[dict[str, Any]]) -> np.ndarray:
-    """A 1 x n MATLAB struct array."""
     if not entries:
         return np.zeros((0, 0))
     array = np.empty((1, len(entries)), dtype=[(name, object) for name in entries[0]])

@@ -1,5 +1,3 @@
-"""Counts of roles in small scenes."""
-
 import numpy as np
 import pytest
 
@@ -9,15 +7,8 @@ from tests.training.scenes import things
 from training.datasets import AnnotatedObject, AnnotatedScene
 from training.datasets.roles import count_roles, lift_of
 
-VOCABULARY = Vocabulary(
-    [
-        ObjectClass("desk"),
-        ObjectClass("bin"),
-        ObjectClass("lamp"),
-        ObjectClass("table lamp", parent="lamp"),
-        ObjectClass("wall", structure=True),
-    ]
-)
+KINDS = [ObjectClass("table lamp", parent="lamp"), ObjectClass("wall", structure=True)]
+VOCABULARY = Vocabulary([*map(ObjectClass, ("desk", "bin", "lamp")), *KINDS])
 DESK, BIN, LAMP, TABLE_LAMP, WALL = range(5)
 Triple = tuple[str, str, str]
 

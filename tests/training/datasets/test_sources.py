@@ -62,11 +62,9 @@ def test_denied_relations_are_false_and_contradicted_ones_unobserved() -> None:
 
 
 def test_3dssg_shows_all_supports_of_some_objects_and_sides_of_related_pairs() -> None:
-    listed = ((1, "on-top", 0), (2, "left", 0))
-    found = encoded("3dssg", relations=listed, supported=(1,))
+    found = encoded("3dssg", relations=((1, "on-top", 0), (2, "left", 0)), supported=(1,))
     for relation in (ON_TOP, INSIDE):
-        known = np.argwhere(found.instance_observed[relation]).tolist()
-        assert known == [[0, 1], [1, 0], [1, 2]]
+        assert np.argwhere(found.instance_observed[relation]).tolist() == [[0, 1], [1, 0], [1, 2]]
     related = np.array([[0, 1, 1], [1, 0, 0], [1, 0, 0]], dtype=bool)
     assert (found.instance_observed[LATERAL] == related).all()
     assert np.argwhere(found.instance_observed[ABOVE]).tolist() == [[0, 1], [1, 0]]
@@ -79,8 +77,7 @@ def test_a_listed_support_excludes_all_other_supports() -> None:
     objects = things("desk", "monitor", "pencil", "floor")
     found = encode_objects(objects, vocabulary, source="3dssg", **lists)
     assert found.instance_stands.tolist() == [FLOOR, HANGS, SUPPORTED, UNKNOWN]
-    apart = ~np.eye(3, dtype=bool)
-    assert (found.instance_observed[[*SUPPORTS], :3, :3] == apart).all()
+    assert (found.instance_observed[[*SUPPORTS], :3, :3] == ~np.eye(3, dtype=bool)).all()
     assert np.argwhere(found.instance_holds).tolist() == [[ON_TOP, 2, 0]]
 
 
@@ -97,9 +94,7 @@ PHRASES = [
 
 
 @pytest.mark.parametrize(("source", "phrase", "relation", "is_support"), PHRASES)
-def test_phrases_of_a_source(
-    source: str, phrase: str, relation: str | None, is_support: bool
-) -> None:
+def test_phrases_of_a_source(source, phrase, relation, is_support):
     listed = [(4, phrase, 0), (4, phrase, 4), (4, phrase, 0)]
     assert relations_of(source, listed) == (((4, relation, 0),) if relation else ())
     assert supported_subjects(source, listed) == ((4,) if is_support else ())
@@ -143,7 +138,6 @@ def test_a_link_means_on_top_in_contact_and_else_the_role_of_the_classes(
 
 
 def annotated(found: EncodedScene) -> dict[int, set[tuple[int, int]]]:
-    """The annotated pairs of each relation that has some."""
     mask = annotated_relations(found)
     pairs = {a: {(int(i), int(j)) for i, j in np.argwhere(mask[a])} for a in range(len(mask))}
     return {a: every for a, every in pairs.items() if every}
@@ -164,9 +158,7 @@ STACK = {(0, 1), (1, 0)}
         ("robot", dict.fromkeys((LEFT, FRONT, ON_TOP, ABOVE, INSIDE), ALL)),
     ],
 )
-def test_only_sources_that_show_false_relations_annotate_them(
-    source: str, pairs: dict[int, set[tuple[int, int]]]
-) -> None:
+def test_only_sources_that_show_false_relations_annotate_them(source, pairs):
     listed = ((1, "on-top", 0), (2, "left", 1))
     assert annotated(encoded(source, relations=listed, supported=(1,))) == pairs
 
@@ -187,7 +179,6 @@ def test_boxes_annotate_sides_of_all_pairs_and_no_above() -> None:
 
 
 def in_a_row(size: tuple[float, float, float] | None) -> tuple[AnnotatedObject, ...]:
-    """Two neighbours, and a distant pencil."""
     places = (("desk", 0.0), ("monitor", 0.5), ("pencil", 9.0))
     return tuple(AnnotatedObject(label, label, (x, 0.0, 0.5), size) for label, x in places)
 

@@ -14,7 +14,6 @@ ROOMS = ("bedroom", "kitchen", "office", None)
 def collection(
     source: str, groups: int, seed: int = 0, prefix: str | None = None
 ) -> list[AnnotatedScene]:
-    """Groups of one to six scenes, most of one room type."""
     rng = random.Random(f"{source}{seed}")
     return [
         AnnotatedScene(f"{source}-{g}-{k}", source, f"{prefix or source}-{g}", room, ())
@@ -33,9 +32,7 @@ def parts_of(scenes: list[AnnotatedScene], **options: object) -> dict[str, str]:
 
 
 @given(st.integers(0, 40), st.integers(0, 5), st.sampled_from(list(FRACTIONS)))
-def test_every_scene_has_one_part_whatever_the_order(
-    groups: int, seed: int, protocol: Protocol
-) -> None:
+def test_every_scene_has_one_part_whatever_the_order(groups, seed, protocol):
     scenes = collection("a", groups)
     parts = split(scenes, seed=seed, protocol=protocol)
     ids = sorted(scene.scene_id for members in parts.values() for scene in members)

@@ -160,8 +160,6 @@ def test_the_curated_synonyms_of_rooms_are_added() -> None:
 @pytest.mark.parametrize(
     ("room", "index"), [("WC", 0), ("Toilet", 1), ("home", None), ("cave", None), (None, None)]
 )
-def test_room_types_of_scenes_are_read_by_the_vocabulary_first(
-    room: str | None, index: int | None
-) -> None:
+def test_room_types_of_scenes_are_read_by_the_vocabulary_first(room, index):
     words = Vocabulary([ObjectClass("chair")], ["bathroom", "toilet"])
     assert curated_names().room_index(room, words) == index

@@ -1,5 +1,3 @@
-"""`python -m training adapt`: a version of the shipped default for one home."""
-
 import json
 import shutil
 from dataclasses import replace
@@ -16,6 +14,7 @@ from app.scene.spatial_relations import ON_TOP
 from tests.registry.small_artifacts import rewrite_manifest
 from tests.training.commands import invoke
 from tests.training.domain.homes import home_scenes, write
+from tests.training.scenes import request
 from training.datasets.inventories import read_inventory
 from training.datasets.jsonl import scan_jsonl
 from training.domain.adaptation import FEWEST, adapted
@@ -27,7 +26,6 @@ INTRUDER = ["toilet", "bed", "nightstand", "pillow", "wardrobe", "lamp", "curtai
 
 @pytest.fixture
 def store(tmp_path, repository) -> Store:
-    """A store with the default model, which a person may change."""
     source = Store(repository / "model_store")
     name, version = source.resolve("default")
     root = tmp_path / "store"
@@ -43,10 +41,8 @@ def adapt(store: Store, *arguments: object, code: int = 0) -> str:
 
 
 def alarms(artifact: SceneModel, labels: list[str], room: str | None = None) -> list[str]:
-    words = artifact.vocabulary
-    objects = tuple(SceneObject(x, x, words.index(x)) for x in dict.fromkeys(labels))
-    scene = Scene(objects, room_type=None if room is None else words.room_index(room))
-    return [words.labels[c] for c in alarms_of(artifact, scene)]
+    scene = request(artifact, *dict.fromkeys(labels), room=room)
+    return [artifact.vocabulary.labels[c] for c in alarms_of(artifact, scene)]
 
 
 def stored(store: Store, reference: str) -> Artifact:
@@ -193,8 +189,7 @@ def test_written_rooms_never_count_towards_the_scenes_of_a_home(store, tmp_path)
     scenes = [*scan_jsonl(write(home_scenes(19, 7), tmp_path / "scenes.jsonl"))]
     rows = [f"room {n},{label}" for n in range(30) for label in ("bed", "lamp", f"box {n}")]
     (tmp_path / "places.csv").write_text("\n".join(["room_type,label", *rows]))
-    places = read_inventory(tmp_path / "places.csv").places
-    with_places = Home.of(default(store), scenes, places)
+    with_places = Home.of(default(store), scenes, read_inventory(tmp_path / "places.csv").places)
     recorded = Home.of(default(store), scenes)
     assert len(with_places.scenes) == len(recorded.scenes) + 30
     assert with_places.measurable.tolist() == recorded.measurable.tolist()
@@ -206,7 +201,6 @@ def test_written_rooms_never_count_towards_the_scenes_of_a_home(store, tmp_path)
 
 
 def test_words_that_the_model_cannot_read_become_classes(store, tmp_path):
-    """They are accepted at once, and judged after three scenes."""
     darkroom = {"room_type": "darkroom", "objects": ["deck chair", "stairlift"]}
     others = ["plant", "lamp", "table"]
     output = adapt(store, write([darkroom], tmp_path / "scenes.jsonl"))
@@ -240,8 +234,7 @@ def test_errors_name_the_reason(store, tmp_path):
 
 @pytest.mark.slow
 def test_five_habits_are_learnt_from_a_hundred_scenes(store, tmp_path):
-    scenes = write(home_scenes(100, 7), tmp_path / "scenes.jsonl")
-    output = adapt(store, scenes, "--promote")
+    output = adapt(store, write(home_scenes(100, 7), tmp_path / "scenes.jsonl"), "--promote")
     key = store.resolve("places-triway")
     before, after = store.load(*key).model, home(store)
     new = home_scenes(50, 8)
@@ -265,18 +258,15 @@ def test_five_habits_are_learnt_from_a_hundred_scenes(store, tmp_path):
 
 
 def tv_is_missing(artifact: SceneModel, labels: list[str]) -> float:
-    words = artifact.vocabulary
-    scene = Scene(tuple(SceneObject(x, x, words.index(x)) for x in labels))
-    answer = questions.missing(artifact, scene, candidates=[words.index("tv")], coverage=0.8)
+    scene, tv = request(artifact, *labels), artifact.vocabulary.index("tv")
+    answer = questions.missing(artifact, scene, candidates=[tv], coverage=0.8)
     return answer["missing"][0]["probability"]
 
 
 @pytest.mark.slow
 def test_scenes_that_the_model_expects_change_no_weights(store, tmp_path):
-    """The scenes are samples of the model itself, so there is nothing to learn.
-
-    All are of one group, and scenes of one object are groups of their own.
-    """
+    """The scenes are samples of the model itself, so there is nothing to learn. All are of one
+    group, and scenes of one object are groups of their own."""
     model = default(store)
     labels, samples = model.vocabulary.labels, model.weights.chain_samples
     scenes = [

@@ -28,7 +28,6 @@ def difference(task: str, metric: str, low: float, high: float) -> Difference:
 
 
 def comparison(*rows: tuple[str, str, float, float]) -> Comparison:
-    """Of rows (task, metric, low, high)."""
     results = Results("new", (), tuple(difference(*row) for row in rows))
     return Comparison(results, "old", 40, 20, ())
 
@@ -73,9 +72,7 @@ def test_a_refusal_names_every_metric_that_is_worse() -> None:
         (("T2 missing",), "T2 missing", 0),
     ],
 )
-def test_a_model_without_relation_metrics_replaces_no_model_with_them(
-    measured, task, expected
-) -> None:
+def test_a_model_without_relation_metrics_replaces_no_model_with_them(measured, task, expected):
     holder = Candidate("old", None, {}, None, tasks=frozenset(measured))
     names = unmeasured([difference(task, "MRR", -0.1, 0.1)], holder)
     assert len(names) == expected
@@ -104,7 +101,6 @@ def trained(scenes: SplitScenes, **objects: float) -> SceneModel:
 
 
 def with_random_classes(scenes: SplitScenes) -> SplitScenes:
-    """The training scenes with random classes, as many as before, in place of their own."""
     rng, train = np.random.default_rng(0), scenes.parts["train"]
     every = np.concatenate([scene.evidence.classes for scene in train])
     classes, count = np.unique(every, return_counts=True)

@@ -1,5 +1,3 @@
-"""`init` on files of scenes."""
-
 import json
 import math
 import re
@@ -40,7 +38,6 @@ def file(tmp_path) -> Path:
 
 @pytest.fixture
 def lab(file) -> Path:
-    """The folder of a proposal for `file`."""
     init(file, folder=file.parent / "lab")
     return file.parent / "lab"
 
@@ -93,7 +90,6 @@ def test_files_are_overwritten_only_with_force(file, lab) -> None:
 
 
 def vocabulary(folder: Path) -> dict[str, dict]:
-    """The entries of the vocabulary file by label."""
     values = json.loads((folder / "vocabulary.json").read_text())
     return {entry["label"]: entry for entry in values["objects"]}
 
@@ -105,7 +101,6 @@ def edit(folder: Path, entries: list[dict], **others: object) -> str:
 
 
 def test_an_update_keeps_edits_and_adds_new_files(lab) -> None:
-    """A removed, a renamed, a merged and a flagged class, and a removed room type."""
     removed, renamed, merged, flagged, *_ = found = vocabulary(lab).values()
     old = [dict(entry) for entry in (removed, renamed, merged)]
     renamed["label"] = "my thing"
@@ -169,9 +164,7 @@ def test_an_update_reads_a_file_that_has_grown(file, lab) -> None:
         (lambda lab: None, ("--terms", "x"), "--terms cannot be used with it"),
     ],
 )
-def test_an_update_without_a_usable_proposal_is_refused(
-    file, lab, break_it, options, message
-) -> None:
+def test_an_update_without_a_usable_proposal_is_refused(file, lab, break_it, options, message):
     break_it(lab)
     before = {path.name: path.read_text() for path in lab.iterdir()}
     assert message in init(file, folder=lab, options=["--update", *options], code=1)
@@ -249,8 +242,7 @@ def test_many_scenes_get_a_larger_machine(copies, states) -> None:
     config, n = proposal.config, proposal.parts["train"]
     assert config.machine.variant == "triway"
     assert (config.machine.states, config.machine.coupled) == (states, False)
-    updates = config.relations.epochs * math.ceil(n / config.relations.batch_size)
-    assert 200 <= updates <= 900
+    assert 200 <= config.relations.epochs * math.ceil(n / config.relations.batch_size) <= 900
     assert 8 <= math.ceil(n / config.relations.batch_size) <= 25
 
 

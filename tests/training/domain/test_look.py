@@ -1,5 +1,3 @@
-"""What `init` finds in scenes and labels."""
-
 from dataclasses import replace
 
 from tests.training.evaluation.scenes import scene as encoded_scene
@@ -104,23 +102,13 @@ def test_spellings_and_aliases_count_as_one_label() -> None:
 
 
 def test_likely_typing_errors_are_found() -> None:
-    counts = {
-        "oscilloscope": 30,
-        "osciloscope": 2,
-        # Names that are short, curated or numbered are different objects.
-        "blad": 9,
-        "blat": 1,
-        "table": 9,
-        "tables top": 3,
-        "conveyor 1": 8,
-        "conveyor 2": 1,
-    }
+    counts = {"oscilloscope": 30, "osciloscope": 2}
+    # Names that are short, curated or numbered are different objects.
+    counts |= {"blad": 9, "blat": 1, "table": 9, "tables top": 3, "conveyor 1": 8, "conveyor 2": 1}
     scenes = [scene(f"{label} {k}", label) for label, n in counts.items() for k in range(n)]
     (pair,) = similar_labels(count_labels(scenes))
-    assert [(label.name, label.mentions) for label in pair] == [
-        ("osciloscope", 2),
-        ("oscilloscope", 30),
-    ]
+    found = [(label.name, label.mentions) for label in pair]
+    assert found == [("osciloscope", 2), ("oscilloscope", 30)]
 
 
 def test_labels_outside_the_vocabulary_are_one_line() -> None:

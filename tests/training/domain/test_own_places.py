@@ -1,5 +1,3 @@
-"""`init` on written inventories: alone, together with scenes, and from the file to answers."""
-
 import json
 from pathlib import Path
 
@@ -7,11 +5,10 @@ import numpy as np
 import pytest
 
 from app import questions
-from app.model import SceneModel
 from app.registry import Store
-from app.scene import Scene, SceneObject
+from app.scene import Scene
 from tests.training.commands import invoke
-from tests.training.scenes import scene
+from tests.training.scenes import request, scene
 from training.datasets import generate_rooms
 from training.datasets.inventories import read_inventory
 from training.datasets.jsonl import write_jsonl
@@ -38,15 +35,13 @@ def material_of(folder: Path) -> SplitScenes:
 
 @pytest.fixture
 def ward(repository) -> Path:
-    """The example of the page: 63 rows of five places."""
     return repository / "examples" / "ward.csv"
 
 
 def test_an_inventory_alone_makes_a_proposal(ward, tmp_path) -> None:
     folder = tmp_path / "ward"
     output = init(ward, folder=folder, options=("--terms", "ours"))
-    config = load_config(str(folder))
-    each = config.data.written
+    each = load_config(str(folder)).data.written
     assert f"5 written places, of which training draws {each} scenes each; 0 seen" in output
     assert "warning" not in output
     assert "no contradictions found" in output
@@ -169,8 +164,7 @@ def test_from_the_table_to_answers(ward, tmp_path) -> None:
     folder, store = tmp_path / "ward", Store(tmp_path / "store")
     init(ward, folder=folder)
     runs = ("--runs", tmp_path / "runs", "--store", store.root)
-    output = invoke("train", folder, "--publish", "1.0.0", *runs)
-    assert "published ward@1.0.0" in output
+    assert "published ward@1.0.0" in invoke("train", folder, "--publish", "1.0.0", *runs)
     artifact = store.load("ward", "1.0.0")
     model = artifact.model
     assert "Scenes drawn from written places have 100.0 %" in " ".join(artifact.card.split())
@@ -184,18 +178,13 @@ def test_from_the_table_to_answers(ward, tmp_path) -> None:
         "patient bathroom": ["toilet", "mirror", "towel", "soap dispenser", "grab bar"],
     }
     for place, labels in asked.items():
-        answer = questions.missing(model, of(model, labels), top_k=5)
+        answer = questions.missing(model, request(model, *labels), top_k=5)
         own = {words.labels[index] for x in things[place] if (index := words.index(x)) is not None}
         assert {entry["label"] for entry in answer["missing"]} <= own
-    intruded = questions.outliers(model, of(model, [*asked["patient room"], "toilet"]))
+    intruded = questions.outliers(model, request(model, *asked["patient room"], "toilet"))
     assert [x["object"] for x in intruded["outliers"] if x["is_outlier"]] == ["toilet"]
-    rooms = questions.rooms(model, of(model, ["toilet", "mirror"]))["room_types"]
+    rooms = questions.rooms(model, request(model, "toilet", "mirror"))["room_types"]
     assert rooms[0]["room_type"] == "bathroom"
     room = words.room_index("nurse station")
     generated = questions.generate(model, Scene((), room_type=room), seed=1)["scenes"][0]
     assert len(generated["objects"]) > 2
-
-
-def of(model: SceneModel, labels: list[str]) -> Scene:
-    words = model.vocabulary
-    return Scene(tuple(SceneObject(x, x, words.index(x)) for x in labels))

@@ -1,7 +1,5 @@
-"""The walk of `scripts/walk.py`, and the next steps of its user.
-
-The scenes are generated: 300 of laboratories, workshops and storerooms, and those of a home.
-"""
+"""The walk of `scripts/walk.py`, and the next steps of its user. The scenes are generated: 300 of
+laboratories, workshops and storerooms, and those of a home."""
 
 import json
 import os
@@ -22,8 +20,6 @@ BENCH = ["electronics bench", "soldering irons", "multimeter", "lab stool"]
 
 
 class Workplace:
-    """A user's folder, with a trained run in it."""
-
     def __init__(self, folder: Path) -> None:
         self.folder, self.store = folder, folder / "my-store"
         self.places = ("--runs", folder / "runs")
@@ -39,7 +35,6 @@ class Workplace:
 
     @property
     def state(self) -> tuple[str, tuple[str, ...]]:
-        """The served version and all versions."""
         store = Store(self.store)
         return str(store.aliases()["default"]), store.versions("my-lab")
 

@@ -1,5 +1,3 @@
-"""A model answers about scenes with other classes."""
-
 import pytest
 import torch
 
@@ -58,8 +56,7 @@ def test_the_same_classes_in_another_order_get_the_same_answers(model) -> None:
         turned = ours[:, :, [2, 1, 0]][:, :, :, [2, 1, 0]]
         apart = ~torch.eye(3, dtype=torch.bool)
         # Translated scores are at least -BEYOND.
-        bounded = turned.clamp(min=-BEYOND)
-        torch.testing.assert_close(theirs[..., apart], bounded[..., apart])
+        torch.testing.assert_close(theirs[..., apart], turned.clamp(min=-BEYOND)[..., apart])
     there = Places(v[:1], v[:1], *(torch.tensor([x]) for x in (2, 0)), torch.tensor([True]))
     here = Places(own[:1], own[:1], *(torch.tensor([x]) for x in (2, 3)), torch.tensor([True]))
     absent = v[0] == 0
@@ -68,13 +65,11 @@ def test_the_same_classes_in_another_order_get_the_same_answers(model) -> None:
 
 
 def test_aliases_are_matched_and_unknown_classes_rank_last(model) -> None:
-    scenes = vocabulary("mug", "bed", "unicorn")
-    translation = Translation.between(scenes, MODEL)
+    translation = Translation.between(vocabulary("mug", "bed", "unicorn"), MODEL)
     assert translation.model_class.tolist() == [1, 0, -1]
     v = torch.tensor([[0.0, 1.0, 1.0]])
     proposed = translation.translate(model).missing(v)
-    shown = model.missing(torch.tensor([[1.0, 0.0, 0.0, 0.0, 0.0]]))
-    assert proposed[0, 0] == shown[0, 1]
+    assert proposed[0, 0] == model.missing(torch.tensor([[1.0, 0.0, 0.0, 0.0, 0.0]]))[0, 1]
     assert proposed[0, 2] == -BEYOND
     assert translation.translate(model).suspicion(v)[0, 2] == -BEYOND
     false = translation.translate(model).false_relations(batch([0, 1, 2], 3, (0, 0, 2)))
@@ -82,16 +77,14 @@ def test_aliases_are_matched_and_unknown_classes_rank_last(model) -> None:
 
 
 def test_at_an_unknown_anchor_all_classes_are_unknown(model) -> None:
-    scenes = vocabulary("cup", "unicorn", "bed")
-    asked = Translation.between(scenes, MODEL).translate(model)
+    asked = Translation.between(vocabulary("cup", "unicorn", "bed"), MODEL).translate(model)
     v = torch.tensor([[0.0, 1.0, 0.0]])
     places = Places(v, v, torch.tensor([0]), torch.tensor([1]), torch.tensor([True]))
     assert bool((asked.at_place(places) == -BEYOND).all())
 
 
 def test_two_scene_classes_of_one_model_class_have_no_relation(model) -> None:
-    scenes = vocabulary("cup", "mug", "bed")
-    asked = Translation.between(scenes, MODEL).translate(model)
+    asked = Translation.between(vocabulary("cup", "mug", "bed"), MODEL).translate(model)
     values = asked.relations(batch([0, 1, 2], 3))
     assert bool((values[0, :, 0, 1] == -BEYOND).all())
     assert bool((values[0, :, 0, 2] > -BEYOND).all())

@@ -1,5 +1,3 @@
-"""The gate of false alarms: exact bounds, and a model that judges upside down."""
-
 from dataclasses import replace
 
 from tests.training.evaluation.furnished_rooms import room_model, rooms

@@ -1,5 +1,3 @@
-"""Calibration: the right answers are collected, with the right truth."""
-
 from dataclasses import replace
 from functools import partial
 
@@ -88,10 +86,8 @@ def test_classes_that_a_source_cannot_show_are_left_out():
 
 
 def test_intruders_are_of_every_kind():
-    """Uniform, popular, and typical of another room type; without training, uniform alone.
-
-    Half of the 40 scenes have one. Fewer than 7 or more than 33 happen with probability below 1e-4.
-    """
+    """Uniform, popular, and typical of another room type; without training, uniform alone. Half of
+    the 40 scenes have one. Fewer than 7 or more than 33 happen with probability below 1e-4."""
     data, train = rooms(40, 1), rooms(400, 2)
     found = draw_intruder_choices(data, STRUCTURE, train)
     assert set(found) == {(entry.source, entry.scene_id) for entry in data.scenes}

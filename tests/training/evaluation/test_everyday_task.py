@@ -1,5 +1,3 @@
-"""Everyday facts: the same answers as a client of the service gets; only one module reads them."""
-
 import json
 import re
 import runpy
@@ -33,17 +31,12 @@ FACTS = {
         {"objects": ["zeppelin"], "expected": ["pillow"]},
     ],
     "missing_at": [
-        {
-            "objects": ["bed", "nightstand"],
-            "at": {"relation": "on-top", "object": "nightstand"},
-            "expected": ["lamp", "book"],
-        },
-        {"objects": ["bed"], "at": {"relation": "on-top", "object": "desk"}, "expected": ["lamp"]},
-        {
-            "objects": ["bed", "nightstand"],
-            "at": {"relation": "on-top", "object": "night stand"},
-            "expected": ["lamp", "book"],
-        },
+        {"objects": objects, "at": {"relation": "on-top", "object": anchor}, "expected": expected}
+        for objects, anchor, expected in (
+            (["bed", "nightstand"], "nightstand", ["lamp", "book"]),
+            (["bed"], "desk", ["lamp"]),
+            (["bed", "nightstand"], "night stand", ["lamp", "book"]),
+        )
     ],
     "plain": [{"room": ROOM, "objects": ["bed", "pillow", "lamp"]}],
     "intruders": [

@@ -1,5 +1,3 @@
-"""T4 rooms: refused shares and sizes against counts by hand."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -27,8 +25,7 @@ def test_refused_rooms_are_those_below_the_limits():
     artifact = larger_artifact("triway", smallest=(2, 1, 0))
     small, large = scene([0, V - 1], room=0), scene([0, 1, 2], room=0)
     office, bare = scene([2], room=1), scene([V - 1], room=0)
-    unknown = scene([0, 1])
-    scenes = [small] * 4 + [large] * 12 + [office] * 12 + [bare] + [unknown] * 5
+    scenes = [small] * 4 + [large] * 12 + [office] * 12 + [bare] + [scene([0, 1])] * 5
     found, outcome = metrics_of(artifact, scenes)
     assert found["refused"] == pytest.approx(4 / 28)
     assert found["refused, bedroom"] == pytest.approx(1 / 4)

@@ -1,5 +1,3 @@
-"""T4: each figure by hand, and the samplers."""
-
 import numpy as np
 import pytest
 import torch
@@ -7,21 +5,7 @@ import torch
 from tests.enumeration.small_machines import small_machine
 from tests.questions.artifacts import artifact_of
 from tests.training.evaluation.scenes import WIDE, random_scenes, scene, tensors
-from training.evaluation.generation_task import (
-    contradiction_metrics,
-    copies,
-    count_contradictions,
-    discrepancy,
-    generation_metrics,
-    hamming,
-    held_out_halves,
-    independent_sampler,
-    machine_sampler,
-    marginal_error,
-    median_distance,
-    pair_correlation,
-    scene_sampler,
-)
+from training.evaluation import generation_task
 from training.evaluation.model import Drawn
 from training.evaluation.setting import Setting
 
@@ -30,21 +14,21 @@ Y = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, 1, 1]])
 
 
 def test_distances_and_copies_by_hand():
-    assert hamming(X, Y).tolist() == [[0, 2, 3], [1, 3, 2]]
+    assert generation_task.hamming(X, Y).tolist() == [[0, 2, 3], [1, 3, 2]]
     # 2, 3 and 1 between the rows of Y.
-    assert median_distance(Y) == 2.0
-    assert copies(X, Y).tolist() == [1.0, 0.0]
+    assert generation_task.median_distance(Y) == 2.0
+    assert generation_task.copies(X, Y).tolist() == [1.0, 0.0]
 
 
 def test_discrepancy_and_marginal_error_by_hand():
     k = lambda d: np.exp(-np.asarray(d) / 2.0)  # noqa: E731
     expected = k(1) + k([2, 3, 1]).mean() - 2 * k([[0, 2, 3], [1, 3, 2]]).mean()
-    at = discrepancy(Y, X, 2.0)
+    at = generation_task.discrepancy(Y, X, 2.0)
     assert at(np.ones(3)) == pytest.approx(expected)
     # A scene drawn twice is no pair of its own.
     twice = k(1) + k(2) - 2 * (2 * k([0, 1]).mean() + k([2, 3]).mean()) / 3
     assert at(np.array([2.0, 1, 0])) == pytest.approx(twice)
-    marginal = marginal_error(Y.numpy().astype(float), X.numpy().astype(float))
+    marginal = generation_task.marginal_error(Y.numpy().astype(float), X.numpy().astype(float))
     assert marginal(np.ones(3)) == pytest.approx((2 / 3 + 1 / 6 + 2 / 3) / (4 / 3))
 
 
@@ -55,16 +39,14 @@ def test_pair_correlation_by_hand():
     pairs = [(0, 1), (0, 2), (1, 2)]
     cov = [[np.cov(v.T, bias=True)[p] for p in pairs] for v in (x, y)]
     expected = np.corrcoef(*cov)[0, 1]
-    assert pair_correlation(y, x)(np.ones(30)) == pytest.approx(expected)
-    assert pair_correlation(y, y)(np.ones(30)) == pytest.approx(1.0)
+    assert generation_task.pair_correlation(y, x)(np.ones(30)) == pytest.approx(expected)
+    assert generation_task.pair_correlation(y, y)(np.ones(30)) == pytest.approx(1.0)
 
 
 def test_contradictions_by_hand():
     """Mirrored pairs are counted by pair; cycles of on-top are found whatever their length.
-
     left(0,1), left(1,0), left(0,2), front(2,2): two related pairs, one of them both ways. Then a
-    tower of three; the same with its foot on its top; nothing but left, in a circle.
-    """
+    tower of three; the same with its foot on its top; nothing but left, in a circle."""
     holds = torch.zeros(4, 4, 3, 3)
     for a, i, j in [(0, 0, 1), (0, 1, 0), (0, 0, 2), (1, 2, 2)]:
         holds[3, a, i, j] = 1
@@ -72,19 +54,21 @@ def test_contradictions_by_hand():
         holds[k, 2, i, j] = 1
     holds[2, 0] = torch.eye(3).roll(1, 1)
     holds[:, 2, 1, 1] = 1  # of itself: two books, one on the other
-    counts = count_contradictions(holds)
+    counts = generation_task.count_contradictions(holds)
     mirrored, related, cyclic, stacked = counts.T.tolist()
     assert (related[3], mirrored[3]) == (2, 1)
     assert stacked == [True, True, False, False]
     assert cyclic == [False, True, False, False]
-    metrics = contradiction_metrics(counts)
+    metrics = generation_task.contradiction_metrics(counts)
     assert metrics["mirrored relations"].value == sum(mirrored) / sum(related)
     assert metrics["on-top cycles"].value == 1 / 2
 
 
 def test_halves_keep_groups_together():
     scenes = tensors([scene([0, 1], group=f"g{k // 2}") for k in range(40)])
-    first, second = held_out_halves(Setting(scenes, torch.zeros(5, dtype=torch.bool)))
+    first, second = generation_task.held_out_halves(
+        Setting(scenes, torch.zeros(5, dtype=torch.bool))
+    )
     assert len(first) + len(second) == 40
     assert min(len(first), len(second)) >= 5
     assert not {s.group for s in first.scenes} & {s.group for s in second.scenes}
@@ -92,7 +76,7 @@ def test_halves_keep_groups_together():
 
 def test_scenes_that_fit_are_their_own_sampler():
     scenes = tensors([scene([0, 1], room=0), scene([1, 2], room=1), scene([3], room=1)], WIDE)
-    sample, given = scene_sampler(scenes), torch.zeros(3, WIDE, dtype=torch.bool)
+    sample, given = generation_task.scene_sampler(scenes), torch.zeros(3, WIDE, dtype=torch.bool)
     assert bool((sample(given, scenes.room, 0).v == scenes.v).all())
     given[:, 2] = True
     assert bool((sample(given, torch.full((3,), -1), 0).v == scenes.v[1]).all())
@@ -112,7 +96,7 @@ def test_given_one_class_scenes_count_by_their_size():
     size = held_out.sum(1)
     generated = Drawn(torch.stack(drawn), torch.zeros(len(drawn), 4))
     for emphasis, expected in ((size, 0.0), (None, 1 / 6)):
-        metrics = generation_metrics(
+        metrics = generation_task.generation_metrics(
             generated, held_out, np.arange(3), held_out, asked, 2.0, emphasis
         )
         assert metrics["marginal error"].value == pytest.approx(expected, abs=1e-9)
@@ -123,7 +107,7 @@ def test_independent_classes_have_the_frequencies_of_training():
     train = tensors(random_scenes(50), WIDE)
     given = torch.zeros(2000, WIDE, dtype=torch.bool)
     given[:, 3] = True
-    v = independent_sampler(train)(given, torch.full((2000,), -1), 0).v
+    v = generation_task.independent_sampler(train)(given, torch.full((2000,), -1), 0).v
     p = train.v.mean(0)
     error = (v.mean(0) - p).abs()
     error[3] = 0
@@ -134,6 +118,6 @@ def test_independent_classes_have_the_frequencies_of_training():
 def test_given_classes_stay():
     artifact = artifact_of(small_machine("triway").float())
     given = torch.tensor([[True, False]]).expand(50, -1)
-    drawn = machine_sampler(artifact)(given, torch.full((50,), -1), 1)
+    drawn = generation_task.machine_sampler(artifact)(given, torch.full((50,), -1), 1)
     assert bool((drawn.v[:, 0] == 1).all())
     assert 0 < float(drawn.v[:, 1].mean()) < 1

@@ -1,20 +1,10 @@
-"""Metrics by hand, pooled, through JSON; their statistics; the bootstrap and its pairing."""
-
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from training.evaluation.metrics import (
-    BINS,
-    STATISTICS,
-    Figure,
-    Ratio,
-    Resampled,
-    Scored,
-    paired_difference,
-)
+from training.evaluation import metrics
 from training.evaluation.report import metric_from_dict, metric_to_dict, pool
 from training.evaluation.results import mean_over_seeds
 
@@ -28,14 +18,14 @@ def floats(*values):
 
 
 def mean_of(values):
-    return Ratio.of_scenes(np.asarray(values, dtype=np.float64))
+    return metrics.Ratio.of_scenes(np.asarray(values, dtype=np.float64))
 
 
-RATIO = Ratio(floats(1, 0, 3), floats(2, 0, 4))
-SCORED = Scored(
+RATIO = metrics.Ratio(floats(1, 0, 3), floats(2, 0, 4))
+SCORED = metrics.Scored(
     "Brier skill", ints(0, 0, 1), floats(0.9, 0.1, 0.4), np.array([True, False, False]), ints(0, 1)
 )
-RESAMPLED = Resampled.of(lambda weight: float(weight @ [1, 2]) / 2, ints(4, 7), 9, 50)
+RESAMPLED = metrics.Resampled.of(lambda weight: float(weight @ [1, 2]) / 2, ints(4, 7), 9, 50)
 POOLABLE = {"ratio": RATIO, "scored": SCORED}
 each = pytest.mark.parametrize("metric", POOLABLE.values(), ids=POOLABLE)
 
@@ -80,12 +70,12 @@ def test_metrics_of_whole_sets_do_not_pool():
     ("compute", "message"),
     [
         (lambda: pool([RATIO, SCORED]), "2 types"),
-        (lambda: Ratio(np.zeros(2), np.zeros(2)), "no scene"),
+        (lambda: metrics.Ratio(np.zeros(2), np.zeros(2)), "no scene"),
         (lambda: mean_of([1, 2]).by(ints(3, 3)).figure(), "at least two groups"),
         (lambda: mean_of([1, 2]) - RATIO, "different items"),
         *(
             (
-                lambda groups=groups: paired_difference(
+                lambda groups=groups: metrics.paired_difference(
                     mean_of([1, 2, 3]).by(ints(0, 1, 4)), mean_of(np.ones(3)).by(groups)
                 ),
                 f"cannot pair 3 groups with {len(set(groups))} other",
@@ -114,10 +104,10 @@ TRUTH = RNG.random(60) < 0.3
 def scored(statistic, p, truth):
     """The statistic of items that have a group each."""
     groups = np.arange(len(p))
-    return Scored(statistic, groups, np.asarray(p, dtype=float), np.asarray(truth), groups)
+    return metrics.Scored(statistic, groups, np.asarray(p, dtype=float), np.asarray(truth), groups)
 
 
-@pytest.mark.parametrize("statistic", STATISTICS)
+@pytest.mark.parametrize("statistic", metrics.STATISTICS)
 def test_weights_are_copies(statistic):
     weight = RNG.integers(0, 3, size=60)
     copied = scored(statistic, np.repeat(P, weight), np.repeat(TRUTH, weight))
@@ -126,7 +116,7 @@ def test_weights_are_copies(statistic):
 
 def test_calibration_error_by_hand():
     """Ten bins of one item each: |p - y| of each."""
-    p = np.linspace(0.05, 0.95, BINS)
+    p = np.linspace(0.05, 0.95, metrics.BINS)
     y = p > 0.5
     assert scored("ECE", p, y).value == pytest.approx(np.abs(p - y).mean())
     # 20 items in two levels: .2 with 3 of 10 true, .9 with 8 of 10 true.
@@ -143,7 +133,7 @@ def test_calibration_error_by_hand():
 def test_the_calibration_error_is_the_mean_gap_of_the_reliability_curve():
     error = scored("ECE", P, TRUTH)
     probability, frequency = error.reliability()
-    assert len(probability) == BINS
+    assert len(probability) == metrics.BINS
     assert (probability.mean(), frequency.mean()) == pytest.approx((P.mean(), TRUTH.mean()))
     assert np.abs(probability - frequency).mean() == pytest.approx(error.value)
 
@@ -154,7 +144,7 @@ def test_an_interval_holds_a_value_that_moves_under_resampling(seed):
     rng = np.random.default_rng(seed)
     probability = rng.random(300)
     truth = rng.random(300) < probability
-    figure = Scored("ECE", np.arange(300) % 50, probability, truth, np.arange(50)).figure()
+    figure = metrics.Scored("ECE", np.arange(300) % 50, probability, truth, np.arange(50)).figure()
     assert figure.low < figure.value < figure.high
 
 
@@ -163,24 +153,24 @@ def test_a_paired_difference_has_a_narrower_interval_than_the_metrics():
     shared = 3 * np.random.default_rng(0).normal(size=100)
     a, b = mean_of(shared + 0.1), mean_of(shared)
     assert a.figure().low < b.figure().high
-    difference = paired_difference(a, b)
+    difference = metrics.paired_difference(a, b)
     assert (difference.value, difference.low) == pytest.approx((0.1, 0.1))
-    assert paired_difference(b, a).high < 0
-    assert paired_difference(a, a) == Figure(0.0, 0.0, 0.0, 100)
+    assert metrics.paired_difference(b, a).high < 0
+    assert metrics.paired_difference(a, a) == metrics.Figure(0.0, 0.0, 0.0, 100)
 
 
 def test_copies_of_a_scene_in_a_group_narrow_no_interval():
     """Ten frames of each place tell what one frame of each does; groups of one are scenes."""
     x, y, places = RNG.random(20), RNG.random(20), np.arange(20)
-    one = paired_difference(mean_of(x), mean_of(y))
+    one = metrics.paired_difference(mean_of(x), mean_of(y))
     # Student's t with 19 degrees of freedom instead of a normal distribution; n - 1 instead of n.
     wider = 2.0930 / 1.9600 * np.sqrt(20 / 19)
     limits = np.percentile(mean_of(x).draws - mean_of(y).draws, [2.5, 97.5]) - one.value
     assert (one.low, one.high) == pytest.approx(tuple(one.value + wider * limits), rel=1e-4)
     a, b = mean_of(np.repeat(x, 10)), mean_of(np.repeat(y, 10))
-    ten = paired_difference(*(metric.by(np.repeat(places, 10)) for metric in (a, b)))
+    ten = metrics.paired_difference(*(metric.by(np.repeat(places, 10)) for metric in (a, b)))
     assert (ten.low, ten.high) == pytest.approx((one.low, one.high))
-    naive = paired_difference(a, b)
+    naive = metrics.paired_difference(a, b)
     assert naive.high - naive.low < 0.6 * (one.high - one.low)
 
 
@@ -189,5 +179,5 @@ def test_a_mean_over_seeds_is_resampled_scene_by_scene():
     together = mean_of([0.5, 1.0, 0.5, 0.0])
     assert mean.value == together.value
     np.testing.assert_allclose(mean.draws, together.draws)
-    difference = paired_difference(mean, together)
+    difference = metrics.paired_difference(mean, together)
     assert (difference.low, difference.high) == pytest.approx((0.0, 0.0))

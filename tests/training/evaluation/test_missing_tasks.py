@@ -1,5 +1,3 @@
-"""T2 and T2-at by hand, and that nothing of a hidden object can leak."""
-
 import numpy as np
 import pytest
 import torch
@@ -36,11 +34,9 @@ DATA = tensors(random_scenes(20), WIDE)
 
 
 def test_metrics_by_hand():
-    """The only hidden class is first in one scene, and third in the other one.
-
-    The first scene has one unknown label besides two known ones, so a removed object of it is
-    unknown in a third of the cases.
-    """
+    """The only hidden class is first in one scene, and third in the other one. The first scene has
+    one unknown label besides two known ones, so a removed object of it is unknown in a third of the
+    cases."""
     data = tensors([scene([0, 1], unknown=("x",)), scene([3, 4]), scene([2], unknown=("x",) * 5)])
     outcome = missing_task(in_order, Setting(data, NO_STRUCTURE))
     values = values_of(outcome)

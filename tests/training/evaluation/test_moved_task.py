@@ -1,5 +1,3 @@
-"""T3c by hand: cases, metrics and thresholds."""
-
 from itertools import count
 
 import numpy as np
@@ -62,8 +60,7 @@ def test_each_scene_gives_a_moved_and_an_untouched_case(scenes, structure):
     [(("moved", "subject"), 1, 1), (("moved",), 1, 1), (("subject",), 0, 1), ((), 0, 0)],
 )
 def test_the_field_moved_names_and_a_subject_flags(scenes, structure, names, named, is_flagged):
-    model = oracle(scenes, structure, names=names)
-    outcome = moved_task(model, Setting(scenes, structure))
+    outcome = moved_task(oracle(scenes, structure, names=names), Setting(scenes, structure))
     # The second entry is about object 0, which moves in some rooms.
     zero = np.mean([case.object == "0" for case in moved_cases(scenes, structure)])
     assert values_of(outcome) == {

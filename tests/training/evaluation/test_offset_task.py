@@ -1,5 +1,3 @@
-"""The figures of offsets: shares and distances of known draws, source by source."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -31,8 +29,7 @@ def test_the_regions_cover_80_percent_of_normal_draws():
     """2,000 scenes: .8 within .05 is 5.6 standard errors of .009, and 400 draws are learnt from,
     which moves the share by less than .02; the seeds are fixed, and others would fail with
     probability below 1e-3."""
-    test = draws(MEAN, STD, 2000, 1)
-    found = outcome(draws(MEAN, STD, 400, 0), test)
+    found = outcome(draws(MEAN, STD, 400, 0), draws(MEAN, STD, 2000, 1))
     share = values_of(found)
     assert share["in the ellipse, left"] == pytest.approx(0.8, abs=0.05)
     assert share["in the ellipsoid, left"] == pytest.approx(0.8, abs=0.05)

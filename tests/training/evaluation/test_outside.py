@@ -1,5 +1,3 @@
-"""Files of a user as tests: reading, metrics and marks of training data."""
-
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -36,11 +34,9 @@ def test_files_have_the_metrics_of_all_tasks_without_training_scenes(tmp_path):
     pairs = [replace(s, group=f"home {k // 2}") for k, s in enumerate(generate_rooms(12, 3))]
     test = read_test(room_file(tmp_path, pairs))
     encoded = encode([replace(s, source="homes") for s in pairs], VOCABULARY)
-    annotated = annotated_classes(encoded, VOCABULARY)
-    scenes = scene_tensors(encoded, annotated, VOCABULARY)
+    scenes = scene_tensors(encoded, annotated_classes(encoded, VOCABULARY), VOCABULARY)
     setting = Setting(scenes, STRUCTURE, train=scenes, limit=None)
-    model = artifact_model(room_model())
-    outcomes = measure(model, setting, "homes", tasks=ROOM_TASKS).outcomes
+    outcomes = measure(artifact_model(room_model()), setting, "homes", tasks=ROOM_TASKS).outcomes
     rows = test.measure(room_model())
     assert {row.source for row in rows} == {"homes"}
     assert len(rows) == len({(row.task, row.metric) for row in rows})
@@ -75,15 +71,13 @@ def test_one_group_leaves_intervals_over_rooms(tmp_path):
 
 
 def test_training_data_is_no_outside_test(tmp_path):
-    scenes = generate_rooms(5, 3)
-    path = room_file(tmp_path, scenes)
+    path = room_file(tmp_path, generate_rooms(5, 3))
     # The file may have another name now than in training.
     digest = digest_of([replace(scene, source="before") for scene in read_scenes(path)])
     rooms = read_test(path)
     assert rooms.trained(learnt(("sunrgbd", 5, "x"), ("before", 5, digest))) == ["homes"]
     assert rooms.trained(learnt(("before", 5, "x"))) == []
-    fewer = RoomList("homes", rooms.scenes[:4])
-    assert fewer.trained(learnt(("before", 5, digest))) == []
+    assert RoomList("homes", rooms.scenes[:4]).trained(learnt(("before", 5, digest))) == []
 
 
 @pytest.mark.parametrize(

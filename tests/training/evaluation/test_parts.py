@@ -1,5 +1,3 @@
-"""Random parts of scenes, ranks of hidden classes, and the validation score, by hand."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -96,10 +94,8 @@ def test_bins_of_the_listed_share():
 
 def test_the_validation_score_counts_real_sources_alike():
     """The score finds the classes of sunrgbd first, and those of 3dssg last; procthor is left out.
-
     Scenes {0, 1} of sunrgbd hide one class, which is first. Scenes {3, 4} of 3dssg hide one class,
-    which is last of four candidates.
-    """
+    which is last of four candidates."""
     few = [scene([0, 1], source="sunrgbd", name=f"s{k}") for k in range(3)]
     many = [scene([3, 4], source="3dssg", name=f"d{k}") for k in range(9)]
     other = [scene([0, 4], source="procthor")]
@@ -128,8 +124,7 @@ def test_the_validation_score_gives_short_lists_their_bin():
             assert share[b][0] - 1e-6 <= listed <= share[b][1] + 1e-6
         return torch.zeros_like(v)
 
-    structure = torch.zeros(20, dtype=torch.bool)
-    value = validation_score(score, data, structure)
+    value = validation_score(score, data, torch.zeros(20, dtype=torch.bool))
     assert drawn == {0, 1, 3}
     # All candidates but the other hidden classes are equal, so the only candidate is first.
     assert value == 1.0

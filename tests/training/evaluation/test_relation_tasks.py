@@ -1,5 +1,3 @@
-"""T1a, T1b and T3b by hand: evidence, candidates and metrics."""
-
 import numpy as np
 import pytest
 import torch

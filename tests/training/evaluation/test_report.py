@@ -1,5 +1,3 @@
-"""Every task for one model, stored, resumed, pooled and published."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -10,19 +8,12 @@ from tests.questions.artifacts import LARGER, larger_artifact
 from tests.training.evaluation.scenes import flat, random_scenes, scene, tensors
 from training.datasets.batches import seen_triples
 from training.datasets.cases import some_scenes
+from training.evaluation import report as reports
 from training.evaluation.artifact_model import artifact_model, floor_model, independent_model
 from training.evaluation.calibration_task import QUESTIONS
 from training.evaluation.generation_task import held_out_halves
 from training.evaluation.model import Model
 from training.evaluation.relation_tasks import completion_task
-from training.evaluation.report import (
-    SourceReport,
-    digest,
-    evaluate,
-    measure,
-    pooled,
-    settings_by_source,
-)
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import EVERY_TASK, TASKS, WHOLE_SET
 
@@ -38,7 +29,7 @@ OF_OBJECTS = {name for name, task in TASKS.items() if task.of_objects}
 
 
 def report_of(model, setting, tasks=tuple(TASKS)):
-    report = measure(model, setting, "toy", tasks=tasks)
+    report = reports.measure(model, setting, "toy", tasks=tasks)
     assert list(report.outcomes) == list(tasks)
     return report
 
@@ -60,8 +51,7 @@ def two_sources(scenes):
 def test_every_task_has_an_outcome():
     report = report_of(MODEL, SETTING)
     # The setting names no facts.
-    nothing = {task for task, outcome in report.outcomes.items() if outcome is None}
-    assert nothing == {"Everyday"}
+    assert {task for task, outcome in report.outcomes.items() if outcome is None} == {"Everyday"}
     assert all(np.isfinite(list(values_of(report).values())))
     assert "R-precision, zero-shot" in report.outcomes["T1a relations"].metrics
     assert "flagged, uniform" in report.outcomes["T3 outliers"].metrics
@@ -75,13 +65,13 @@ def test_reports_are_stored(tmp_path):
     path = tmp_path / "model" / "seed-0" / "toy.json"
     report = report_of(MODEL, SETTING, ("T2 missing", "T3b placement", "T4 generate", "Everyday"))
     report.write(path)
-    again = SourceReport.read(path)
+    again = reports.SourceReport.read(path)
     assert values_of(again) == pytest.approx(values_of(report))
     assert again.outcomes["T4 generate"].notes == report.outcomes["T4 generate"].notes
     assert again.outcomes["Everyday"] is None
     assert list(path.parent.iterdir()) == [path]
     for other in (replace(SETTING, seed=1), replace(SETTING, limit=3)):
-        assert digest(other) != again.scenes
+        assert reports.digest(other) != again.scenes
 
 
 @pytest.mark.parametrize("name", LARGER)
@@ -122,8 +112,8 @@ def test_tasks_about_objects_see_scenes_with_complete_object_lists_alone():
 def test_pooled_sources_are_their_union():
     union, train = two_sources(DATA), two_sources(TRAIN)
     tasks = ("T1a relations", "T2 missing", "T3 alarms")
-    settings = settings_by_source(union, NO_STRUCTURE, train, SEEN)
-    together = pooled([report_of(MODEL, setting, tasks) for _, setting in settings])
+    settings = reports.settings_by_source(union, NO_STRUCTURE, train, SEEN)
+    together = reports.pooled([report_of(MODEL, setting, tasks) for _, setting in settings])
     whole = report_of(MODEL, Setting(union, NO_STRUCTURE, train, SEEN), tasks)
     assert values_of(together) == pytest.approx(values_of(whole))
 
@@ -135,13 +125,12 @@ def test_the_floor_is_the_other_half_of_the_scenes():
     independent = values_of(report_of(independent_model(V), SETTING, tasks))
     assert independent[name] == pytest.approx(float(TRAIN.v.sum(1).mean()), abs=0.3)
     floor = values_of(report_of(floor_model(), SETTING, tasks))
-    sizes = held_out_halves(SETTING)[1].v.sum(1).mean()
-    assert floor[name] == pytest.approx(float(sizes))
+    assert floor[name] == pytest.approx(float(held_out_halves(SETTING)[1].v.sum(1).mean()))
 
 
 def test_publishing_measures_the_tasks_of_a_card_on_every_source():
     """Of the calibrated artifact, on each source; generation on all together."""
-    rows = evaluate(ARTIFACT, two_sources(DATA), NO_STRUCTURE, two_sources(TRAIN))
+    rows = reports.evaluate(ARTIFACT, two_sources(DATA), NO_STRUCTURE, two_sources(TRAIN))
     found = {(row.task, row.source, row.metric) for row in rows}
     assert len(found) == len(rows)
     # These scenes of at most five classes have no poses, offsets, counts or facts.
@@ -173,7 +162,7 @@ def test_completion_has_recall_and_zero_shot_precision():
 def test_a_skill_that_is_undefined_is_left_out(tmp_path, monkeypatch):
     """No answer was true: the calibration error stands, and the report can be written."""
     monkeypatch.setitem(QUESTIONS, "misplaced", lambda *_: [(0.25, False), (0.5, False)])
-    report = measure(MODEL, SETTING, "toy", tasks=("Calibration",))
+    report = reports.measure(MODEL, SETTING, "toy", tasks=("Calibration",))
     metrics = report.outcomes["Calibration"].metrics
     assert metrics["ECE, misplaced"].value == pytest.approx(0.375)
     assert "Brier skill, misplaced" not in metrics

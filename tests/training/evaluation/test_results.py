@@ -1,5 +1,3 @@
-"""Tables, verdicts and differences."""
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-"""The task about room types: its lists, figures and rows."""
-
 from dataclasses import replace
 from functools import partial
 

@@ -1,5 +1,3 @@
-"""New classes and room types of a home, and the fit to it."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +8,8 @@ from app import questions
 from app.inference import MachineSpec, Weights
 from app.model import SceneModel
 from app.registry import Store
-from app.scene import ObjectClass, Scene, SceneObject
+from app.scene import ObjectClass
+from tests.training.scenes import request
 from training.fit.adapt import HomeScenes, TrainedOn, adapt
 from training.fit.extend import extended
 from training.fit.objects import random_parts
@@ -47,8 +46,7 @@ HOME = [[0, 1, 2], [0, 1, 3], [0, 1, 2, 3], [0, 1]] * 6
 def test_the_home_becomes_likelier_and_other_classes_keep_their_weights(variant):
     parent, home = small(variant), scenes_of(*HOME)
     weights = adapt(parent, home)
-    recorded = [0, 1, 2, 3]
-    rest = np.setdiff1d(np.arange(V), recorded)
+    rest = np.setdiff1d(np.arange(V), [0, 1, 2, 3])
     np.testing.assert_array_equal(weights["W"][rest], parent["W"][rest])
     changed = [name for name in parent.arrays if not np.array_equal(weights[name], parent[name])]
     assert sorted(changed) == ["W", "b"]
@@ -114,7 +112,7 @@ def test_a_class_that_the_parent_hardly_knows_is_learnt_from_few_scenes():
 def test_distillation_keeps_the_answers_about_stored_samples(monkeypatch):
     """Without it, the rooms of the parent change several times more."""
     parent, home = small(), scenes_of(*HOME)
-    samples = torch.from_numpy(parent.scenes)
+    samples = torch.from_numpy(parent.chain_samples)
     samples = samples[samples.sum(1) > 1]
     parts = random_parts(samples, 0.3, torch.Generator().manual_seed(1))
 
@@ -146,17 +144,11 @@ def model(request, repository) -> SceneModel:
 NEW = [ObjectClass("stairlift"), ObjectClass("oxygen concentrator")]
 
 
-def scene(artifact: SceneModel, *labels: str, room: str | None = None) -> Scene:
-    words = artifact.vocabulary
-    things = [SceneObject(label, label, words.index(label)) for label in labels]
-    return Scene(tuple(things), room_type=None if room is None else words.room_index(room))
-
-
 def test_known_objects_get_the_same_answers_beside_new_classes(model):
     larger = extended(model, NEW, ["darkroom"])
     labels = ["bed", "nightstand", "lamp", "pillow", "oven"]
     for room in (None, "bedroom"):
-        asked = [(side, scene(side, *labels, room=room)) for side in (model, larger)]
+        asked = [(side, request(side, *labels, room=room)) for side in (model, larger)]
         for question, options, key in (
             (questions.relations, {"top_k": 50}, "relations"),
             (questions.outliers, {}, "outliers"),
@@ -164,7 +156,7 @@ def test_known_objects_get_the_same_answers_beside_new_classes(model):
         ):
             before, after = (question(*each, **options)[key] for each in asked)
             assert [_close(x) for x in before] == [_close(x) for x in after]
-    before, after = (questions.rooms(s, scene(s, *labels), top_k=3) for s in (model, larger))
+    before, after = (questions.rooms(s, request(s, *labels), top_k=3) for s in (model, larger))
     assert [x["room_type"] for x in before["room_types"]] == [
         x["room_type"] for x in after["room_types"]
     ]
@@ -180,10 +172,10 @@ def _close(value: object) -> object:
 
 def test_a_new_class_is_rare_and_has_relations(model):
     larger = extended(model, NEW, ["darkroom"])
-    seen = scene(larger, "stairlift", "lamp", room="darkroom")
+    seen = request(larger, "stairlift", "lamp", room="darkroom")
     found = questions.relations(larger, seen, top_k=10)["relations"]
     assert {entry["subject"] for entry in found} == {"stairlift", "lamp"}
-    ranked = questions.missing(larger, scene(larger, "bed"), top_k=len(larger.vocabulary))
+    ranked = questions.missing(larger, request(larger, "bed"), top_k=len(larger.vocabulary))
     p = {entry["label"]: entry["probability"] for entry in ranked["missing"]}
     assert p["stairlift"] < 0.01
 
@@ -201,7 +193,7 @@ def test_a_new_room_is_recognised_by_its_objects(repository):
         torch.ones(len(words), dtype=torch.bool), len(model.vocabulary.room_types)
     )
     adapted = replace(larger, weights=adapt(larger.weights, home, trained_on=trained_on))
-    answer = questions.rooms(adapted, scene(adapted, "deck chair", "flower pot"), top_k=1)
+    answer = questions.rooms(adapted, request(adapted, "deck chair", "flower pot"), top_k=1)
     assert answer["room_types"][0]["room_type"] == "darkroom"
-    answer = questions.rooms(adapted, scene(adapted, "bed", "nightstand"), top_k=1)
+    answer = questions.rooms(adapted, request(adapted, "bed", "nightstand"), top_k=1)
     assert answer["room_types"][0]["room_type"] == "bedroom"

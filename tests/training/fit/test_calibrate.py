@@ -1,5 +1,3 @@
-"""Calibration: the choices on validation scenes, and the judgements of the fitted entries."""
-
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -30,23 +28,6 @@ from training.fit.calibrate import (
     fit_with_observed,
     with_lower_lateral,
 )
-from training.fit.calibrate_objects import (
-    ALPHAS,
-    COVERAGES,
-    JUDGED_LENGTHS,
-    LENGTHS,
-    MARGIN,
-    ListScores,
-    calibration_scenes,
-    choose_alpha,
-    complete_scenes,
-    fit_line,
-    fit_missing,
-    fit_outliers,
-    score_intruders,
-    score_lists,
-    worst_log_odds,
-)
 from training.fit.configuration import ObjectsConfig
 from training.fit.draft import draft_artifact, fit_places
 from training.fit.objects import ObjectFit, ObjectScenes, served_popularity, start_objects
@@ -71,8 +52,7 @@ def model():
 
 
 def data_of(validation) -> TrainingData:
-    train = rooms(ROOM_COUNT, 2)
-    return TrainingData(train, validation, validation, STRUCTURE, VOCABULARY)
+    return TrainingData(rooms(ROOM_COUNT, 2), validation, validation, STRUCTURE, VOCABULARY)
 
 
 @pytest.fixture(scope="module")
@@ -90,8 +70,8 @@ def test_every_entry_is_fitted(fitted):
     # No room type is rare or written here; see test_calibrate_rooms.
     entries = set(Calibration.model_fields) - {"popularity_weight", "rare_rooms", "written_rooms"}
     assert {name for name in entries if getattr(fitted, name) == getattr(neutral, name)} == set()
-    assert fitted.popularity_weight in ALPHAS
-    assert fitted.coverage in COVERAGES
+    assert fitted.popularity_weight in of_objects.ALPHAS
+    assert fitted.coverage in of_objects.COVERAGES
     # The likelier a class, the likelier it is missing, and the less likely it is an intruder.
     assert fitted.missing.slope > 0
     assert fitted.covered.slope > 0
@@ -101,8 +81,7 @@ def test_every_entry_is_fitted(fitted):
     # The machine has no relation weights, so the counts tell what stands where.
     assert all(entry.counts > 0 for entry in fitted.at)
     scenes = ObjectScenes.of(rooms(ROOM_COUNT, 2), STRUCTURE, CONFIG)
-    popularity = served_popularity(scenes, CONFIG).numpy()
-    assert fitted.popularity == pytest.approx(popularity, abs=1e-4)
+    assert fitted.popularity == pytest.approx(served_popularity(scenes, CONFIG).numpy(), abs=1e-4)
 
 
 def test_chosen_values_are_copied(model, fitted):
@@ -118,19 +97,17 @@ def test_a_seed_gives_the_same_calibration(model, fitted):
 
 
 def test_scenes_count_by_weight_and_incomplete_ones_not_at_all():
-    """Of 300 scenes of weight 1/3 about 100 are kept: outside 60 to 140 with p < 1e-6.
-
-    If no scene lists all of its objects, as in photographs, all scenes count.
-    """
+    """Of 300 scenes of weight 1/3 about 100 are kept: outside 60 to 140 with p < 1e-6. If no scene
+    lists all of its objects, as in photographs, all scenes count."""
     scenes = [scene([0, 1]) for _ in range(20)]
     cut = [replace(scene([2, 3]), complete=False) for _ in range(20)]
     scenes += [replace(scene([4, 5]), weight=1 / 3) for _ in range(300)]
-    kept = complete_scenes(tensors([*scenes, *cut], WIDE))
+    kept = of_objects.complete_scenes(tensors([*scenes, *cut], WIDE))
     first = [int(one.evidence.classes[0]) for one in kept.scenes]
     assert first.count(0) == 20
     assert first.count(2) == 0
     assert 60 <= first.count(4) <= 140
-    assert len(complete_scenes(tensors(cut, WIDE))) == 20
+    assert len(of_objects.complete_scenes(tensors(cut, WIDE))) == 20
 
 
 def test_the_named_sources_calibrate_answers():
@@ -139,16 +116,16 @@ def test_the_named_sources_calibrate_answers():
     real = [scene([0, 1], source=name) for name in ["3dssg"] * 30 + ["sunrgbd"] * 450]
     few = [scene([0, 1], source="nr3d") for _ in range(19)]
     named = ["3dssg", "sunrgbd", "nr3d"]
-    kept = calibration_scenes(tensors([*made, *real, *few], WIDE), named)
+    kept = of_objects.calibration_scenes(tensors([*made, *real, *few], WIDE), named)
     sources = [one.source for one in kept.scenes]
     assert {name: sources.count(name) for name in set(sources)} == {"3dssg": 30, "sunrgbd": 200}
-    assert len(calibration_scenes(tensors(made, WIDE), named)) == 200
-    assert len(calibration_scenes(tensors(made, WIDE), [])) == 200
+    assert len(of_objects.calibration_scenes(tensors(made, WIDE), named)) == 200
+    assert len(of_objects.calibration_scenes(tensors(made, WIDE), [])) == 200
 
 
 def hidden_of(scenes, v):
     """The hidden classes of lists v, in scenes of which each has a list of each length."""
-    lengths = [n for n in LENGTHS if n < scenes.v[0].sum()]
+    lengths = [n for n in of_objects.LENGTHS if n < scenes.v[0].sum()]
     assert v.sum(1).tolist() == [n for n in lengths for _ in range(len(scenes))]
     return (scenes.v.repeat(len(lengths), 1) > v).numpy()
 
@@ -167,9 +144,9 @@ def test_the_coverage_that_ranks_best_is_chosen(monkeypatch):
     monkeypatch.setattr(of_objects, "unlisted_log_odds", log_odds)
     monkeypatch.setattr(of_objects, "_fit_covered", lambda *_: CoverageFit())
     model = SimpleNamespace(vocabulary=SimpleNamespace(structure=np.zeros(WIDE, np.bool_)))
-    assert fit_missing(model, scenes)["coverage"] == 0.45
+    assert of_objects.fit_missing(model, scenes)["coverage"] == 0.45
     chosen = Calibration.neutral(A).model_copy(update={"coverage": 0.8})
-    assert fit_missing(model, scenes, chosen)["coverage"] == 0.8
+    assert of_objects.fit_missing(model, scenes, chosen)["coverage"] == 0.8
 
 
 @pytest.mark.parametrize(
@@ -188,7 +165,7 @@ def scores_of(log_odds, intruder, popularity=None, can_alarm=True):
     """Scores of lists, of which each row of log_odds, (lists, n), has the listed classes."""
     lists, n = log_odds.shape
     popularity = np.zeros(log_odds.shape) if popularity is None else popularity
-    return ListScores(
+    return of_objects.ListScores(
         row=np.repeat(np.arange(lists), n),
         log_odds=log_odds.ravel(),
         popularity=np.broadcast_to(popularity, log_odds.shape).ravel(),
@@ -210,26 +187,24 @@ def intruders(log_odds, popularity):
 def test_alpha_weighs_all_kinds_of_intruders_alike():
     """A large alpha hides rare intruders, and a small one popular intruders."""
     rare, popular = intruders(-0.2, -1.0), intruders(0.1, 1.0)
-    assert choose_alpha([CLEAN], [rare, popular, popular]) == 0.125
-    assert choose_alpha([CLEAN], [rare, rare, popular]) in (0, 0.125)
+    assert of_objects.choose_alpha([CLEAN], [rare, popular, popular]) == 0.125
+    assert of_objects.choose_alpha([CLEAN], [rare, rare, popular]) in (0, 0.125)
 
 
 @pytest.mark.parametrize("share", ALARMS.values())
 def test_alarm_lines_keep_their_share_at_each_length(share):
-    """4,000 lists of each length. The share of one length has a standard error of .002 to .006.
-
-    The log-odds of each object are logistic. Given other objects they become more certain.
-    """
+    """4,000 lists of each length. The share of one length has a standard error of .002 to .006. The
+    log-odds of each object are logistic. Given other objects they become more certain."""
     rng = np.random.default_rng(0)
     entry = CountSlope(intercept=-1.0, slope=-1.2, log_count=-0.4)
 
     def lists(n):
         return scores_of(rng.logistic(2 + 0.8 * np.log(n), 1.0, (4000, n)), False)
 
-    worst = worst_log_odds({n: lists(n) for n in JUDGED_LENGTHS}, entry, 0.0)
-    line = fit_line(worst, share / MARGIN)
+    worst = of_objects.worst_log_odds({n: lists(n) for n in of_objects.JUDGED_LENGTHS}, entry, 0.0)
+    line = of_objects.fit_line(worst, share / of_objects.MARGIN)
     shares = []
-    for n in JUDGED_LENGTHS:
+    for n in of_objects.JUDGED_LENGTHS:
         scores = lists(n)
         z = calibrated(entry, scores.log_odds, scores.size[scores.row])
         alarm = 1 / (1 + np.exp(-z)) >= line.threshold(n)
@@ -244,7 +219,7 @@ def test_alarm_lines_of_few_lengths_are_straight():
     lengths = [*worst]
     for number, curved in ((5, True), (4, False), (3, False), (2, False), (1, False)):
         some = {n: worst[n] for n in lengths[:number]}
-        low, medium, high = (fit_line(some, share) for share in ALARMS.values())
+        low, medium, high = (of_objects.fit_line(some, share) for share in ALARMS.values())
         assert (medium.curve != 0, medium.log_count != 0) == (curved, number > 2)
         assert low.intercept > medium.intercept > high.intercept
         assert {(one.curve, one.log_count) for one in (low, high)} == {
@@ -256,10 +231,10 @@ def test_a_class_that_raises_no_alarm_does_not_raise_the_line():
     """The last class of each list is the most suspicious, but the service never flags it."""
     entry = CountSlope(slope=-1.0)
     log_odds = np.tile([0.1, 0.2, -5.0], (50, 1))
-    silent = worst_log_odds({3: scores_of(log_odds, False, can_alarm=~LAST)}, entry, 0.0)
-    assert fit_line(silent, 0.1).intercept == pytest.approx(-0.1)
-    every = worst_log_odds({3: scores_of(log_odds, False)}, entry, 0.0)
-    assert fit_line(every, 0.1).intercept == 5.0
+    silent = of_objects.worst_log_odds({3: scores_of(log_odds, False, can_alarm=~LAST)}, entry, 0.0)
+    assert of_objects.fit_line(silent, 0.1).intercept == pytest.approx(-0.1)
+    every = of_objects.worst_log_odds({3: scores_of(log_odds, False)}, entry, 0.0)
+    assert of_objects.fit_line(every, 0.1).intercept == 5.0
 
 
 def test_intruders_are_as_likely_as_the_answer_states(judging):
@@ -280,12 +255,12 @@ def test_structure_and_classes_that_belong_anywhere_are_never_judged(judging):
     judged = vocabulary.judged
     assert judged.sum() == len(judged) - int(STRUCTURE.sum()) - 2
     parts = draw_parts(rooms(100, 3), STRUCTURE, exactly(4))
-    scores = score_lists(artifact, parts)
+    scores = of_objects.score_lists(artifact, parts)
     row, classes = np.nonzero(parts.v.numpy() * judged)
     assert scores.row.tolist() == row.tolist()
     assert scores.popularity.tolist() == np.array(artifact.calibration.popularity)[classes].tolist()
     assert scores.size.tolist() == [4] * len(parts.v)
-    altered = score_intruders(artifact, rooms(100, 3), torch.from_numpy(~judged + 1e-9))
+    altered = of_objects.score_intruders(artifact, rooms(100, 3), torch.from_numpy(~judged + 1e-9))
     popularity = altered.popularity[altered.intruder]
     assert np.isin(popularity, np.array(artifact.calibration.popularity)[judged]).all()
     assert np.bincount(altered.row, altered.intruder).tolist() == [1.0] * len(altered.size)
@@ -293,8 +268,8 @@ def test_structure_and_classes_that_belong_anywhere_are_never_judged(judging):
 
 @pytest.mark.parametrize("count", [19, 20])
 def test_few_scenes_give_no_judgement_of_objects(judging, count):
-    some = tensors(calibration_scenes(rooms(60, 1), []).scenes[:count], len(VOCABULARY))
-    entries = fit_outliers(judging, some, rooms(ROOM_COUNT, 2))
+    some = tensors(of_objects.calibration_scenes(rooms(60, 1), []).scenes[:count], len(VOCABULARY))
+    entries = of_objects.fit_outliers(judging, some, rooms(ROOM_COUNT, 2))
     judged = {"popularity_weight", "outlier", "outlier_lines", "room_lines"}
     assert set(entries) == (judged if count == 20 else set())
 
@@ -317,8 +292,7 @@ def without(one, relations):
 @FITS
 def test_stacked_relations_take_the_fit_of_on_top(random_artifact, fit):
     """Complete sources show few pairs with inside and none with above."""
-    scenes = random_scenes(60, 8)
-    entries = fit(random_artifact, scenes)
+    entries = fit(random_artifact, random_scenes(60, 8))
     assert {entries[a] for a in STACKED} == {entries[ON_TOP]}
     assert {entries[a] for a in LATERAL} == {entries[LEFT]}
     assert len({entries[ON_TOP], entries[LEFT], CountSlope()}) == 3
@@ -336,10 +310,8 @@ def test_only_on_top_determines_the_fit_of_stacked_relations(random_artifact):
 
 @FITS
 def test_sources_without_false_relations_take_no_part(random_artifact, fit):
-    """People mention sides of some pairs, and do not mention those of others.
-
-    Sources are numbered in the order of their names, and count by themselves.
-    """
+    """People mention sides of some pairs, and do not mention those of others. Sources are numbered
+    in the order of their names, and count by themselves."""
     known = random_scenes(60, 8)
     vague = [
         replace(without(one, STACKED), source="coco_captions", instance_observed=one.instance_holds)

@@ -1,10 +1,8 @@
-"""The answers at a place, on classes whose distribution is known."""
-
 import numpy as np
 import pytest
 from scipy.special import expit as sigmoid
 
-from app.model import Calibration, PlaceFit
+from app.model import PlaceFit
 from app.scene.spatial_relations import LATERAL, STACKED
 from tests.questions.artifacts import larger_artifact
 from tests.training.evaluation.scenes import scene, tensors
@@ -39,8 +37,7 @@ def test_sources_count_alike():
     small, large = (
         PlaceFit(intercept=b, relation=TRUE.relation, counts=TRUE.counts) for b in (-2.0, 1.0)
     )
-    found = fit_place([places(50, 2, small), places(1500, 3, large)])
-    assert -1.5 < found.intercept < 0.5
+    assert -1.5 < fit_place([places(50, 2, small), places(1500, 3, large)]).intercept < 0.5
 
 
 def test_few_true_classes_keep_the_default_entry():
@@ -58,11 +55,3 @@ def test_relations_of_a_kind_share_an_entry():
     assert {entries[a] for a in STACKED} == {entries[STACKED[0]]}
     assert entries[STACKED[0]] != PlaceFit()
     assert {entries[a] for a in LATERAL} == {PlaceFit()}
-
-
-def test_scenes_without_relations_keep_the_default_entry():
-    artifact = larger_artifact("triway")
-    V = len(artifact.vocabulary)
-    alone = tensors([scene([k % 7, (k + 1) % 7]) for k in range(30)], V)
-    assert set(fit_at(artifact, alone.scenes)) == {PlaceFit()}
-    assert Calibration.neutral(5).at == (PlaceFit(),) * 5

@@ -1,5 +1,3 @@
-"""The judgement of observed relations, in a world whose supports are known."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -70,9 +68,7 @@ def judging(artifact, judgement):
 
 def test_wrong_supports_get_a_higher_probability(artifact, fitted):
     """200 other scenes; a random answer ranks .5 of the pairs right, with a standard error of .03.
-
-    One of three supports is wrong. The machine knows only the log-odds of supports.
-    """
+    One of three supports is wrong. The machine knows only the log-odds of supports."""
     assert fitted.support.relation < 0
     assert fitted.support.change == fitted.support.stand == 0
     model, right, wrong = judging(artifact, fitted), [], []
@@ -105,8 +101,7 @@ def test_untouched_scenes_keep_the_share_of_alarms(artifact, fitted):
             request = scene_of(one, range(len(one.instance_classes)), triples)
             entries = misplaced(model, request, sensitivity=name)
             alarms += any(entry["is_misplaced"] for entry in entries)
-        error = np.sqrt(share * (1 - share) * (1 / 400 + 1 / 200))
-        assert alarms / 400 <= share + 3 * error
+        assert alarms / 400 <= share + 3 * np.sqrt(share * (1 - share) * (1 / 400 + 1 / 200))
 
 
 @pytest.mark.parametrize(("count", "is_judged"), [(19, False), (20, True)])
@@ -134,8 +129,7 @@ def test_a_machine_that_finds_true_supports_unlikely_does_not_judge(artifact):
 def test_moved_boxes_stand_at_less_likely_places():
     """Of rooms with boxes, and a machine that knows only what objects of each class stand on."""
     spec = MachineSpec("triway", V=len(VOCABULARY), A=A, units=1, K=1)
-    train = rooms(200, 2).scenes
-    places = fit_places(train, count_roles((), VOCABULARY), VOCABULARY)
+    places = fit_places(rooms(200, 2).scenes, count_roles((), VOCABULARY), VOCABULARY)
     model = draft_artifact(build(spec).eval().requires_grad_(False), VOCABULARY, places=places)
     fitted = fit_misplaced(model, rooms(80, 1).scenes)
     assert fitted.stand.stand < 0
@@ -180,8 +174,7 @@ def test_lines_keep_the_share_at_each_length(budget):
         share, line = budget * promise, getattr(lines, name)
         error = np.sqrt(2 * share * (1 - share) / 4000)
         for n in (1, 2, 8, 32):
-            drawn = lists(4000, n, n)
-            p = expit(wrong_log_odds(BY_RELATION, drawn.terms)).reshape(-1, n)
+            p = expit(wrong_log_odds(BY_RELATION, lists(4000, n, n).terms)).reshape(-1, n)
             assert (p >= line.threshold(n)).any(1).mean() <= 1.1 * share + 4 * error
         # The quantile of each length has a standard error of .7 / sqrt(4000 share).
         assert line.log_count == pytest.approx(0.7, abs=0.03 + 1 / np.sqrt(4000 * share))
@@ -202,8 +195,7 @@ def test_the_share_is_kept_in_each_large_source(share):
 def test_small_sources_count_as_one_and_equal_values_raise_no_alarm():
     """59 and 50 scenes; each alone would have another quantile."""
     values = np.concatenate([np.zeros(100), np.arange(59.0), np.full(50, 500.0)])
-    sources = np.repeat(["large", "a", "b"], [100, 59, 50])
-    limit = hardest_quantile(values, sources, 0.5)
+    limit = hardest_quantile(values, np.repeat(["large", "a", "b"], [100, 59, 50]), 0.5)
     assert limit == pytest.approx(np.median(values[100:]))
     assert not (np.full(3, np.median(values[100:])) >= limit).any()
 

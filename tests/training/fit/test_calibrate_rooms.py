@@ -1,5 +1,3 @@
-"""Calibration of room types: their sharpness, rare types, and limits of generated scenes."""
-
 import numpy as np
 import pytest
 
@@ -11,13 +9,6 @@ from tests.questions.artifacts import LABELS, larger_artifact
 from tests.training.evaluation.scenes import scene, tensors
 from training.evaluation.asking import of_classes
 from training.fit import calibrate_rooms
-from training.fit.calibrate_rooms import (
-    fit_rooms,
-    limits,
-    rare_rooms,
-    refitted_limits,
-    written_rooms,
-)
 from training.fit.regression import recalibrated
 
 V = len(LABELS)
@@ -45,21 +36,21 @@ def test_the_sharpness_that_draws_the_room_types_is_fitted(model, sharpness):
         )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(calibrate_rooms, "_LENGTHS", ())  # whole scenes only
-        fitted = fit_rooms(model, tensors(made, V))
+        fitted = calibrate_rooms.fit_rooms(model, tensors(made, V))
     for n in (1, 6):
         assert fitted.of(n) == pytest.approx(sharpness.of(n), abs=0.15)
 
 
 def test_few_scenes_leave_the_room_types_as_they_are(model):
     few = [scene([0, 1], room=0)] * 19 + [scene([0, 1])] * 50
-    assert fit_rooms(model, tensors(few, V)) == Sharpness()
+    assert calibrate_rooms.fit_rooms(model, tensors(few, V)) == Sharpness()
 
 
 def test_written_room_types_are_those_without_other_scenes():
     rooms = (("inventories", 0), ("inventories", 1), ("virtualhome", 1), ("virtualhome", 2))
     scenes = [scene([0, 1], room=room, source=source) for source, room in rooms]
     scenes.append(scene([0, 1], source="inventories"))
-    assert written_rooms(tensors(scenes, V)) == (0,)
+    assert calibrate_rooms.written_rooms(tensors(scenes, V)) == (0,)
 
 
 def test_rare_room_types_are_those_that_samples_do_not_resemble(model):
@@ -68,9 +59,9 @@ def test_rare_room_types_are_those_that_samples_do_not_resemble(model):
     like = [scene(np.flatnonzero(row).tolist() or [0], room=1) for row in samples]
     unlike = [scene([int(np.argmin(samples[:, : V - 1].mean(0)))], room=1)] * 20
     few, enough = [scene(OFFICE, room=0)] * 9, [scene(OFFICE, room=0)] * 50
-    assert rare_rooms(model, tensors(few + like, V)) == (0,)
-    assert rare_rooms(model, tensors(enough + like, V)) == ()
-    assert rare_rooms(model, tensors(enough + unlike, V)) == (1,)
+    assert calibrate_rooms.rare_rooms(model, tensors(few + like, V)) == (0,)
+    assert calibrate_rooms.rare_rooms(model, tensors(enough + like, V)) == ()
+    assert calibrate_rooms.rare_rooms(model, tensors(enough + unlike, V)) == (1,)
 
 
 def test_the_fit_does_not_see_structure(model):
@@ -80,7 +71,7 @@ def test_the_fit_does_not_see_structure(model):
         made = [
             scene([k % 6, (k + 1) % 6, *structure], room=k % 2, name=f"room {k}") for k in range(60)
         ]
-        return fit_rooms(model, tensors(made, V))
+        return calibrate_rooms.fit_rooms(model, tensors(made, V))
 
     both = [fit([]), fit([V - 1])]
     assert both[0] == both[1]
@@ -88,7 +79,7 @@ def test_the_fit_does_not_see_structure(model):
 
 
 def limits_of(model, scenes):
-    return limits(model, tensors(scenes, V))
+    return calibrate_rooms.limits(model, tensors(scenes, V))
 
 
 def test_limits_are_those_of_short_lists_of_a_room_type(model):
@@ -125,7 +116,7 @@ def test_the_fit_of_a_room_type_is_the_low_quantile(model):
     scenes = [scene([high], room=1)] * 18 + [scene([low], room=1)] * 2
     limit = limits_of(model, scenes)["room_fit"][1]
     assert (limit.intercept, limit.log_count) == (pytest.approx(fits[low], abs=1e-4), 0.0)
-    limited = refitted_limits(model, tensors([scene([high], room=1)] * 20, V))
+    limited = calibrate_rooms.refitted_limits(model, tensors([scene([high], room=1)] * 20, V))
     assert is_within_limits(limited, [high], 1)
     assert not is_within_limits(limited, [low], 1)
     assert limited.calibration.rare_rooms == model.calibration.rare_rooms

@@ -1,5 +1,3 @@
-"""Statistics of counts on scenes with known laws, and classes without statistics."""
-
 import math
 from dataclasses import replace
 
@@ -75,8 +73,7 @@ def test_a_listed_number_needs_twenty_groups_that_have_it(groups, most):
         for k in range(groups)
         for chairs in (2, 7 + k)
     ]
-    counts = fit_counts([*furnished(400, 0), *many], WORDS)
-    assert counts.most.tolist() == [most]
+    assert fit_counts([*furnished(400, 0), *many], WORDS).most.tolist() == [most]
 
 
 def test_a_part_lists_what_its_docstring_says():
@@ -104,8 +101,7 @@ def test_a_source_counts_only_if_labels_repeat_and_lists_are_complete():
 
 def test_alfred_counts_only_movable_objects(monkeypatch):
     monkeypatch.setitem(SOURCES, "toy", SOURCES["alfred"])
-    counting = counted_classes(furnished(40, 0), WORDS)
-    assert counting["toy"].tolist() == [True, False, False, False]
+    assert counted_classes(furnished(40, 0), WORDS)["toy"].tolist() == [True, False, False, False]
 
 
 def test_no_statistics_where_the_data_cannot_tell():
@@ -147,8 +143,7 @@ def test_every_source_weighs_as_much_as_the_others():
 def test_generated_rooms_beat_the_class_mean():
     """400 rooms to learn from, 200 others to test; the seeds are fixed."""
     train, test = rooms(400, 0), rooms(200, 2)
-    counts = fit_counts(train.scenes, VOCABULARY)
-    artifact = replace(room_model(), counts=counts)
+    artifact = replace(room_model(), counts=fit_counts(train.scenes, VOCABULARY))
     found = counts_task(artifact, Setting(test, None, train)).metrics
     change = found["change of error, class mean"].figure()
     assert change.high < 0

@@ -1,5 +1,3 @@
-"""The fit of object weights, by sums over all states of small machines."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -16,13 +14,6 @@ from tests.training.evaluation.scenes import scene, tensors
 from training.evaluation.parts import ALL_BUT_ONE
 from training.fit import long_chains, objects
 from training.fit.configuration import ObjectsConfig
-from training.fit.long_chains import (
-    LongChains,
-    measure_drift,
-    populations,
-    scene_chains,
-    served_frequencies,
-)
 from training.fit.objects import ObjectFit, ObjectScenes, random_parts, start_objects
 from training.fit.samples import fit_scene_rates, store_samples
 from training.machines import MachineSpec, build
@@ -182,10 +173,8 @@ def test_shares_of_random_parts():
 
 
 def source_logit(machine, shows, x, q):
-    """f_q plus the base rates of the list x in source q.
-
-    The rate of a class that q does not show is the mean of the sources that show it.
-    """
+    """f_q plus the base rates of the list x in source q. The rate of a class that q does not show
+    is the mean of the sources that show it."""
     total = machine.f[q]
     for i in x.nonzero().flatten().tolist():
         sources = [q] if shows[q, i] else [p for p in range(len(shows)) if shows[p, i]]
@@ -218,10 +207,8 @@ def masked_loss(machine, scenes, parts, index, listed_room):
 
 @pytest.mark.parametrize("name", SPECS)
 def test_the_masked_loss_and_its_gradient(name, monkeypatch):
-    """Equal to a formula of its own, with the weights of hidden classes and partial labels.
-
-    A class that a source does not show is no evidence for or against this source.
-    """
+    """Equal to a formula of its own, with the weights of hidden classes and partial labels. A class
+    that a source does not show is no evidence for or against this source."""
     machine = machine_of(name, scale=0.7).double()
     machine.u.requires_grad_(False).zero_()  # the answers leave u out
     scenes = scenes_of(PARTIAL)
@@ -270,11 +257,9 @@ KINDS = [(-1, 0), (-1, 1), (1, 0), (0, 1)]
 
 @pytest.mark.parametrize("name", SPECS)
 def test_the_generative_gradient_is_that_of_the_likelihood(name):
-    """-log p(v | room type, source) of the classes that a source shows.
-
-    With 40,000 chains of each kind, drawn exactly: every entry is a difference of means of values
-    in [-1, 1], so six standard errors are below .02; fails by chance with p < 1e-6.
-    """
+    """-log p(v | room type, source) of the classes that a source shows. With 40,000 chains of each
+    kind, drawn exactly: every entry is a difference of means of values in [-1, 1], so six standard
+    errors are below .02; fails by chance with p < 1e-6."""
     machine = machine_of(name, scale=0.8)
     fit = ObjectFit(machine, scenes_of(PARTIAL), CONFIG, seed=0)
     machine.double()
@@ -303,9 +288,7 @@ def test_the_generative_gradient_is_that_of_the_likelihood(name):
 
 def test_the_priors_decay_the_weights_and_couplings_stay_symmetric():
     """The first step of Adam moves each weight by its rate, against the sign of the gradient.
-
-    Without scenes of a second source, the row of its rates has the gradient of the prior alone.
-    """
+    Without scenes of a second source, the row of its rates has the gradient of the prior alone."""
     machine = machine_of("coupled", scale=1.0)
     scenes = replace(scenes_of(ALL), weight=(scenes_of(ALL).source == 0).float())
     config = CONFIG.model_copy(update={"generative_weight": 0.0, "source_loss": 0.0})
@@ -337,17 +320,13 @@ def test_finished_couplings_are_symmetric_to_the_last_bit():
     spec = MachineSpec("rbm", V=many, A=1, units=2, states=3, C=1, profiles=1, coupled=True)
     machine = build(spec).initialise(generator, 0.05)
     config = CONFIG.model_copy(update={"steps": 30})
-    fit = ObjectFit(machine, scenes, config, seed=0)
-    while not fit.finished:
-        fit.step()
-    fit.finish()
+    fit_objects(ObjectFit(machine, scenes, config, seed=0))
     couplings = machine.couplings.detach()
     assert couplings.any()
     assert torch.equal(couplings, couplings.T)
 
 
 def context(likely):
-    """Independent classes with these probabilities, (2^V,)."""
     p = torch.tensor(likely).double()
     return torch.where(EVERY > 0, p, 1 - p).prod(1)
 
@@ -494,16 +473,15 @@ def exact_shares(machine, scenes, population):
 def test_long_chains_have_the_shares_of_the_scenes(name):
     """Of each source and of the served mix, without classes that the source cannot show."""
     machine, scenes = fitted(name)
-    for population in populations(scenes, SERVED):
+    for population in long_chains.populations(scenes, SERVED):
         exact = exact_shares(machine, scenes, population)[population.shows]
         np.testing.assert_allclose(exact, population.p[population.shows], atol=0.02)
     assert not machine.u[1, 3]
 
 
 def test_a_population_weighs_scenes_by_source():
-    """The served mix counts sources by their served weights, whatever their numbers of scenes."""
     scenes = scenes_of(SHOWS)
-    *by_source, mixed = populations(scenes, SERVED)
+    *by_source, mixed = long_chains.populations(scenes, SERVED)
     expected = (2 * by_source[0].p + by_source[1].p) / 3
     np.testing.assert_allclose(mixed.p, expected)
     for q, population in enumerate(by_source):
@@ -513,8 +491,8 @@ def test_a_population_weighs_scenes_by_source():
 
 def test_served_sources_without_scenes_leave_a_mix_of_all():
     elsewhere = ObjectsConfig(served_sources={"3dssg": 1.0})
-    *_, mixed = populations(scenes_of(SHOWS), elsewhere)
-    *_, equal = populations(scenes_of(SHOWS), ObjectsConfig())
+    *_, mixed = long_chains.populations(scenes_of(SHOWS), elsewhere)
+    *_, equal = long_chains.populations(scenes_of(SHOWS), ObjectsConfig())
     np.testing.assert_array_equal(mixed.p, equal.p)
 
 
@@ -522,25 +500,25 @@ def test_the_served_mix_has_whole_rooms_only():
     """Beside a source of whole rooms, lists of camera frames do not count."""
     scenes = replace(scenes_of(SHOWS), sources=("sunrgbd", "virtualhome"))
     config = ObjectsConfig(served_sources={"sunrgbd": 2.0, "virtualhome": 1.0})
-    *_, whole, mixed = populations(scenes, config)
+    *_, whole, mixed = long_chains.populations(scenes, config)
     np.testing.assert_allclose(mixed.p, whole.p)
     np.testing.assert_array_equal(mixed.shows, whole.shows)
 
 
 def test_served_scenes_of_long_chains_are_the_plausible_ones():
-    """A scene of fewer than two classes is drawn again, seven times.
-
-    512 chains of 40 states; each share is within .03 of its enumerated value. Neighbouring states
-    are 50 sweeps apart, so the share of a chain has an error of at most .5 / sqrt(40 / 8), and the
-    mean over chains one of .01. A share fails by chance with a probability below .003.
-    """
+    """A scene of fewer than two classes is drawn again, seven times. 512 chains of 40 states; each
+    share is within .03 of its enumerated value. Neighbouring states are 50 sweeps apart, so the
+    share of a chain has an error of at most .5 / sqrt(40 / 8), and the mean over chains one of .01.
+    A share fails by chance with a probability below .003."""
     machine, scenes = fitted("coupled")
-    *_, population = populations(scenes, SERVED)
+    *_, population = long_chains.populations(scenes, SERVED)
     population = replace(population, room=np.full_like(population.room, -1))
     artifact = artifact_of(machine, smallest=(2,) * (machine.spec.C + 1))
-    long = LongChains(scene_chains(weights_of(machine)), scenes, population, 512, seed=2)
+    long = long_chains.LongChains(
+        long_chains.scene_chains(weights_of(machine)), scenes, population, 512, seed=2
+    )
     long.run(100)
-    drawn = served_frequencies(artifact, long, 40).mean(0)
+    drawn = long_chains.served_frequencies(artifact, long, 40).mean(0)
     p = log_p(machine, -1, -1).double().exp()
     is_small = EVERY.sum(1) < 2
     refused = float(p[is_small].sum())
@@ -552,18 +530,17 @@ def test_served_scenes_of_long_chains_are_the_plausible_ones():
 
 def test_chains_start_at_each_room_type_in_proportion():
     scenes = scenes_of(SHOWS)
-    mixed = list(populations(scenes, SERVED))[-1]
+    mixed = list(long_chains.populations(scenes, SERVED))[-1]
     rooms = mixed.room[mixed.draw(300, np.random.default_rng(0))]
     for room in (-1, 0, 1):
         assert abs((rooms == room).sum() - 300 * mixed.weight[mixed.room == room].sum()) <= 1
 
 
 def test_chains_continue_from_call_to_call():
-    """The states after two calls are those after one call, and each chain counts by itself."""
     machine, scenes = machine_of("coupled", scale=0.6), scenes_of(SHOWS)
-    population = next(populations(scenes, SERVED))
-    chains = scene_chains(weights_of(machine))
-    once, twice = (LongChains(chains, scenes, population, 6, seed=3) for _ in range(2))
+    population = next(long_chains.populations(scenes, SERVED))
+    chains = long_chains.scene_chains(weights_of(machine))
+    once, twice = (long_chains.LongChains(chains, scenes, population, 6, seed=3) for _ in range(2))
     share = once.run(20)
     halves = twice.run(10), twice.run(10)
     np.testing.assert_array_equal(once.on, twice.on)
@@ -574,14 +551,14 @@ def test_chains_continue_from_call_to_call():
 def test_only_a_drift_beyond_its_limit_is_an_objection(monkeypatch):
     monkeypatch.setattr(long_chains, "_CHAINS", 64)
     machine, scenes = fitted("coupled")
-    assert measure_drift(artifact_of(machine), scenes, SERVED).objection() is None
+    assert long_chains.measure_drift(artifact_of(machine), scenes, SERVED).objection() is None
     mix = machine.u[-1].clone()
     machine.u[-1] -= 3.0
-    drift = measure_drift(artifact_of(machine), scenes, SERVED)
+    drift = long_chains.measure_drift(artifact_of(machine), scenes, SERVED)
     assert drift.size < -0.5
     assert "after 3000 sweeps, generated scenes have -" in drift.objection()
     machine.u[-1] = mix + torch.tensor([9.0, -9.0, 0.0, 0.0])
-    drift = measure_drift(artifact_of(machine), scenes, SERVED)
+    drift = long_chains.measure_drift(artifact_of(machine), scenes, SERVED)
     assert drift.label == "lamp"
     assert drift.share == pytest.approx(-1, abs=0.01)
     metrics = {metric.metric: metric for metric in drift.metrics()}

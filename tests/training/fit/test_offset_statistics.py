@@ -1,5 +1,3 @@
-"""Offsets: their shrinkage is Bayes' rule, and draws are covered as promised."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +17,6 @@ V = 6
 
 
 def apart(offset, i=0, j=1, *, relation=LEFT, source="toy"):
-    """A scene of two things, i in the relation to j, so far from it."""
     found = scene([i, j], [(relation, i, j)], source=source)
     return replace(found, instance_positions=np.array([offset, (0.0, 0.0, 0.0)]))
 
@@ -44,7 +41,6 @@ VALUES = (0.1, 0.5, 1.1)
 
 
 def joint(m, s):
-    """Density of prior and draws."""
     expected, kappa, alpha, beta = PRIOR
     prior = invgamma.pdf(s, alpha, scale=beta) * norm.pdf(m, expected, np.sqrt(s / kappa))
     return prior * np.prod([norm.pdf(value, m, np.sqrt(s)) for value in VALUES], axis=0)
@@ -72,7 +68,6 @@ MEAN, STD = np.array([0.1, 1.2, -0.3]), np.array([0.4, 0.2, 0.05])
 
 
 def many_pairs(number=30, seed=2):
-    """Pairs of many classes, each around a mean of its own; every fifth pair seen once."""
     rng = np.random.default_rng(seed)
     found = []
     for i in range(number):
@@ -106,8 +101,7 @@ def test_pairs_that_are_seldom_or_never_seen_are_covered_too():
     new = rng.normal(MEAN + rng.normal(0, 0.3, (1000, 3)), STD)
     inside["never"] = list(np.square((new - mean) / spread).sum(axis=1))
     for kind, distances in inside.items():
-        share = (np.array(distances) <= chi2.ppf(0.8, 3)).mean()
-        assert 0.7 <= share <= 0.9, kind
+        assert 0.7 <= (np.array(distances) <= chi2.ppf(0.8, 3)).mean() <= 0.9, kind
 
 
 def test_a_pair_never_seen_has_what_its_classes_have_elsewhere():
@@ -133,8 +127,7 @@ def test_the_things_of_a_scene_weigh_one_together():
     positions = np.tile([0.0, 3.0, 0.0], (51, 1))
     positions[50] = 0.0
     crowd = replace(crowd, instance_holds=holds, instance_positions=positions)
-    offsets = fit_offsets([*draws((0, 1, 0), 0.1, 49, 5), crowd], V)
-    mean, _, scenes = of_pair(offsets)
+    mean, _, scenes = of_pair(fit_offsets([*draws((0, 1, 0), 0.1, 49, 5), crowd], V))
     assert scenes == 50
     assert mean[1] == pytest.approx((49 * 1 + 3) / 50, abs=0.06)
 
@@ -163,8 +156,7 @@ def test_relations_and_objects_without_poses_mean_nothing():
 
 def test_the_model_file_holds_the_statistics_exactly():
     vocabulary = rooms_vocabulary()
-    scenes = encode(generate_rooms(150, seed=0), vocabulary)
-    offsets = fit_offsets(scenes, len(vocabulary))
+    offsets = fit_offsets(encode(generate_rooms(150, seed=0), vocabulary), len(vocabulary))
     again = read_group(Offsets, offsets.tensors(), len(CANONICAL), len(vocabulary), 0)
     assert again is not None
     for name, tensor in offsets.tensors().items():

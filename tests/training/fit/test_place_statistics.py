@@ -1,5 +1,3 @@
-"""Counts of where objects stand, by hand."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -12,16 +10,9 @@ from tests.training.evaluation.scenes import scene
 from training.datasets.roles import count_roles
 from training.fit.draft import fit_places
 
-VOCABULARY = Vocabulary(
-    [
-        ObjectClass("desk"),
-        ObjectClass("lamp"),
-        ObjectClass("table lamp", parent="lamp"),
-        ObjectClass("picture"),
-        ObjectClass("wall", structure=True),
-    ]
-)
-DESK, LAMP, TABLE_LAMP, PICTURE, WALL = range(5)
+KINDS = [ObjectClass("table lamp", parent="lamp"), ObjectClass("wall", structure=True)]
+VOCABULARY = Vocabulary([*map(ObjectClass, ("desk", "lamp", "picture")), *KINDS])
+DESK, LAMP, PICTURE, TABLE_LAMP, WALL = range(5)
 V = len(VOCABULARY)
 ROLES = count_roles((), VOCABULARY)
 
@@ -41,12 +32,10 @@ def test_each_scene_counts_once_for_each_triple():
     triples = {key(ON_TOP, LAMP, DESK): 2, key(LEFT, DESK, LAMP): 1, key(INSIDE, PICTURE, LAMP): 1}
     assert dict(zip(places.triple.tolist(), places.held.tolist(), strict=True)) == triples
     assert places.triple.tolist() == sorted(triples)
-    # One more for each class: three, three, none, one and none of the four scenes list it.
-    assert places.frequency == pytest.approx(np.array([4, 4, 1, 2, 1]) / 12)
-    assert places.shows(ON_TOP, np.array([LAMP, PICTURE]), np.array([DESK])).tolist() == [
-        [True],
-        [False],
-    ]
+    # One more for each class: three, three, one, none and none of the four scenes list it.
+    assert places.frequency == pytest.approx(np.array([4, 4, 2, 1, 1]) / 12)
+    shows = places.shows(ON_TOP, np.array([LAMP, PICTURE]), np.array([DESK]))
+    assert shows.tolist() == [[True], [False]]
 
 
 def test_structure_and_pairs_of_one_class_do_not_count():
@@ -71,14 +60,9 @@ def test_stands_are_smoothed_towards_the_parent_and_all_classes():
     shares = fit_places([*scenes, hanging], ROLES, VOCABULARY).stands
     usual = np.array([7, 3, 5]) / 15
     lamp, picture = np.array([6, 0, 4]), np.array([0, 2, 0])
-    expected = {
-        DESK: usual,
-        LAMP: (lamp + 5 * usual) / 15,
-        # None was seen, so it has the shares of its parent.
-        TABLE_LAMP: (lamp + 5 * usual) / 15,
-        PICTURE: (picture + 5 * usual) / 7,
-        WALL: usual,
-    }
+    expected = {DESK: usual, WALL: usual, PICTURE: (picture + 5 * usual) / 7}
+    # No scene shows a table lamp, so it has the shares of its parent.
+    expected |= dict.fromkeys((LAMP, TABLE_LAMP), (lamp + 5 * usual) / 15)
     for index, row in expected.items():
         assert shares[index] == pytest.approx(row, rel=1e-6)
 

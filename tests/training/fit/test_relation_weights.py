@@ -1,5 +1,3 @@
-"""The fit of relations: offsets of sources, unknown units, shared weights and residuals."""
-
 import math
 from dataclasses import replace
 
@@ -46,7 +44,6 @@ def machine_of(name, seed=0):
 
 
 def annotated(triple, holds, source):
-    """A scene of all classes, which observes one relation."""
     one = toy([0, 1, 2, 3, 4], [triple] if holds else [], source=source)
     observed = np.zeros_like(one.evidence.observed)
     observed[triple] = True
@@ -68,7 +65,6 @@ def whole(scenes):
 
 
 def trained(machine, scenes, **changes):
-    """The finished machine, and the fit."""
     fit = RelationFit(machine, scenes, CONFIG.model_copy(update=changes), seed=0)
     while not fit.finished:
         fit.epoch(lambda *_: None)
@@ -125,7 +121,6 @@ def test_a_source_without_weight_teaches_nothing():
 
 
 def test_unknown_units_do_not_change_the_loss(machine):
-    """Whatever their values are."""
     scenes = scenes_of({"captions": 0.5})
     batch = whole(scenes)
     unknown = torch.rand(batch.holds.shape, generator=torch.Generator().manual_seed(1)) < 0.5
@@ -167,10 +162,8 @@ def test_relations_have_the_layout_of_their_machine(machine):
 
 
 def test_hidden_units_depend_on_a_random_part_of_the_objects():
-    """W is such that x is the number of listed classes and the room type, minus 10.
-
-    Of 4,000 scenes of 39 objects: five standard errors of the mean, the spread and the room share.
-    """
+    """W is such that x is the number of listed classes and the room type, minus 10. Of 4,000 scenes
+    of 39 objects: five standard errors of the mean, the spread and the room share."""
     machine = build(MachineSpec("rbm", V=40, A=1, units=2, C=1)).requires_grad_(False)
     machine.W[:, 0], machine.Q[0, 1] = 0.1, 5.0
     scenes = tensors([toy(list(range(39)), room=0)], 40)
@@ -318,7 +311,6 @@ KINDS = torch.tensor([-1, -1, LAMP, LAMP, -1])
 
 
 def lowered(scenes, parents):
-    """The classes with lower weights as subject and as object, by relation."""
     spec = MachineSpec("triway", V=V, A=len(CANONICAL), units=2, states=3, K=2)
     machine = build(spec).initialise(torch.Generator().manual_seed(0), 0.1)
     before = {name: machine.get_parameter(name).detach().clone() for name in ("s", "o")}
@@ -331,7 +323,6 @@ def lowered(scenes, parents):
 
 
 def shown(*triples, count=10, classes=range(V), **options):
-    """Scenes in which the relations of all classes are annotated."""
     return [scene(list(classes), triples, **options) for _ in range(count)]
 
 

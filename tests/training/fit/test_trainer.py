@@ -1,5 +1,3 @@
-"""The trainer on generated rooms: determinism, the curve, the start of the weights."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -35,8 +33,7 @@ def _few_steps():
 def data(tmp_path_factory):
     """Scenes with word vectors of their classes, and with structure."""
     scenes = prepare(small_config(), tmp_path_factory.mktemp("none")).training_data()
-    generator = torch.Generator().manual_seed(9)
-    vectors = torch.randn(scenes.train.v.shape[1], 5, generator=generator)
+    vectors = torch.randn(scenes.train.v.shape[1], 5, generator=torch.Generator().manual_seed(9))
     structure = torch.arange(len(vectors)) == scenes.train.v.sum(0).argmax()
     return replace(scenes, words=vectors, structure=structure)
 
@@ -51,7 +48,6 @@ def same(first, second):
 
 @pytest.fixture(scope="module")
 def whole(data):
-    """An uninterrupted run, and its machine's weights."""
     result = Trainer(small_config(), data).run()
     return result, state(result.machine)
 
@@ -72,8 +68,7 @@ def test_relation_biases_start_at_log_odds(data):
     scenes = [s.evidence for s in data.train.scenes if s.evidence.observed.any()]
 
     def check(bias, held, total):
-        expected = np.log((held + 0.5) / (total - held + 0.5))
-        assert bias == pytest.approx(expected, abs=1e-4)
+        assert bias == pytest.approx(np.log((held + 0.5) / (total - held + 0.5)), abs=1e-4)
 
     for a, bias in enumerate(Trainer(small_config(), data).machine.d.tolist()):
         check(bias, sum(e.holds[a].sum() for e in scenes), sum(e.observed[a].sum() for e in scenes))

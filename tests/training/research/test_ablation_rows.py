@@ -1,5 +1,3 @@
-"""The rows of an ablation: valid and invalid TOML files."""
-
 import pytest
 
 from training.fit.configuration import ConfigError

@@ -1,5 +1,3 @@
-"""The commands benchmark and ablate end to end on generated rooms, and their resumption."""
-
 import json
 
 import pytest
@@ -43,7 +41,6 @@ def write(folder, *, variant="triway", rooms=60):
 
 
 def read(folder):
-    """The results, and their figures by row, source, task and metric."""
     results = json.loads((folder / "results.json").read_text())
     keys = ("row", "source", "task", "metric")
     cells = {tuple(cell[key] for key in keys): cell["figure"]["value"] for cell in results["cells"]}
@@ -56,7 +53,6 @@ def trained(folder):
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """A finished small benchmark: (its arguments, the folder of its results)."""
     folder = tmp_path_factory.mktemp("benchmark")
     named = [("--baseline", name) for name in BASELINES] + [("--task", x) for x in TASK_NAMES]
     arguments = (
@@ -157,7 +153,6 @@ def ablation(folder):
 
 @pytest.fixture(scope="module")
 def ablated(tmp_path_factory):
-    """The folder of a finished ablation, made by two workers."""
     folder = tmp_path_factory.mktemp("ablation")
     invoke(*ablation(folder), "--workers", "2")
     return folder / "ablation/rooms-triway"

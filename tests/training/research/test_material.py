@@ -1,5 +1,3 @@
-"""Training data of a run: its digest, its parts, and the need for relations."""
-
 import gzip
 import json
 from dataclasses import replace
@@ -14,7 +12,6 @@ LABELS = ["bed", "sink", "lamp", "oven", "sofa", "desk", "shelf", "towel", "plan
 
 
 def write_scenes(folder, source, *, seed=0, relations=False):
-    """A file of 140 scenes of 3 to 6 objects; the same ids whatever the seed."""
     rng = np.random.default_rng(seed)
     lines = []
     for k in range(140):

@@ -1,5 +1,3 @@
-"""Errors of other processes, and folders of other experiments."""
-
 import io
 from types import SimpleNamespace
 

@@ -1,5 +1,3 @@
-"""The tune command end to end on generated rooms, and its search spaces."""
-
 from dataclasses import replace
 
 import pytest

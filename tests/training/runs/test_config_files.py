@@ -1,5 +1,3 @@
-"""The configurations that come with the package."""
-
 import pytest
 
 from training.datasets.files import DATA

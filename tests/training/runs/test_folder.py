@@ -1,5 +1,3 @@
-"""The folder of a run: it holds the last finished run, whatever stops the next one."""
-
 import csv
 import re
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""`python -m training seed` on small files of scenes, and the scenes that it reads."""
-
 import json
 import subprocess
 import sys
@@ -25,8 +23,7 @@ def scene(number, relations):
 
 def test_scenes_are_split_and_encoded(tmp_path):
     listed = ((1, "on-top", 0), (0, "on-top", 2))
-    scenes = [scene(k, listed if k % 2 else None) for k in range(80)]
-    write_jsonl(scenes, tmp_path / "lab.jsonl")
+    write_jsonl([scene(k, listed if k % 2 else None) for k in range(80)], tmp_path / "lab.jsonl")
     materials = read_material(str(tmp_path / "lab.jsonl"), tmp_path)
     for material in materials.values():
         labels = [entry.label for entry in material.vocabulary.objects]
@@ -34,8 +31,7 @@ def test_scenes_are_split_and_encoded(tmp_path):
         # The floor is an ordinary object.
         assert triples == {("lamp", "desk"), ("desk", "floor")}
         parts = material.train, material.validation, material.test
-        sizes = [len(part) for part in parts]
-        assert sizes == pytest.approx([48, 8, 24], abs=4)
+        assert [len(part) for part in parts] == pytest.approx([48, 8, 24], abs=4)
         for part in parts:
             assert part.v.sum(1).tolist() == [3] * len(part)
             assert part.r.sum(1).tolist() == part.labelled.tolist()
@@ -44,7 +40,6 @@ def test_scenes_are_split_and_encoded(tmp_path):
 
 
 def test_inside_is_left_out(tmp_path):
-    """Scenes that list inside or contains are the scenes without these triples."""
     listed = ((1, "on-top", 0), (1, "left", 2))
     for name, inside in (("with", ((1, "inside", 0), (2, "contains", 1))), ("without", ())):
         scenes = [scene(k, (*listed, *inside) if k % 2 else inside) for k in range(40)]
@@ -63,12 +58,10 @@ def test_inside_is_left_out(tmp_path):
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """A finished command: (its arguments, the folder of its results, its output)."""
     folder = tmp_path_factory.mktemp("seed")
     write_jsonl(generate_rooms(60, seed=0), folder / "rooms.jsonl")
     arguments = ("seed", folder / "rooms.jsonl", "--seeds", 2, "--epochs", 2, "--workers")
-    output = invoke(*arguments, 1, "--out", folder / "out")
-    return arguments, folder / "out" / "rooms", output
+    return arguments, folder / "out" / "rooms", invoke(*arguments, 1, "--out", folder / "out")
 
 
 @pytest.mark.slow
@@ -88,7 +81,6 @@ def test_the_page_has_every_row_and_the_figures_of_the_paper(finished):
 
 
 def without_times(folder):
-    """Each file of a machine, without the times."""
     runs = {path: json.loads(path.read_text()) for path in folder.glob("*/*.json")}
     for run in runs.values():
         del run["cpu"]

@@ -1,5 +1,3 @@
-"""RBM, GBM and Triway of the paper against sums over all states of tiny machines."""
-
 import itertools
 import math
 
@@ -29,7 +27,6 @@ def tiny(kind: type[Machine], H2: int, scale: float = 1.0) -> Machine:
 
 
 def all_states(machine: Machine) -> State:
-    """Every state of the machine, including relations of absent objects."""
     sizes = [V, T, H1, len(machine.c2)]
     bits = torch.tensor(list(itertools.product([0.0, 1.0], repeat=sum(sizes)))).double()
     return State(*bits.split(sizes, 1))
@@ -73,11 +70,9 @@ def test_an_update_adds_the_gradient_of_the_energy(kind, H2):
 
 @MACHINES
 def test_conditionals_are_those_of_the_energy(kind, H2):
-    """Each unit given all others: p = exp(-E on) / (exp(-E on) + exp(-E off)).
-
-    In a Triway, this holds in the states without relations of absent objects. Such relations are
-    off in each sample.
-    """
+    """Each unit given all others: p = exp(-E on) / (exp(-E on) + exp(-E off)). In a Triway, this
+    holds in the states without relations of absent objects. Such relations are off in each
+    sample."""
     machine = tiny(kind, H2)
     states = all_states(machine)
     weights = log_weight(machine, states, weights_of(machine)).exp().tolist()
@@ -119,8 +114,7 @@ def test_the_gradient_is_that_of_the_likelihood_in_the_limit(kind, H2):
     many = visible.repeat(20_000, 1)
     always = torch.ones(len(many), dtype=torch.bool)
     scenes = Scenes(many[:, :V], many[:, V:], many[:, V:].sum(1), always)
-    generator = torch.Generator().manual_seed(1)
-    positive, negative, _, _ = phases(machine, scenes, generator, steps=15)
+    positive, negative, _, _ = phases(machine, scenes, torch.Generator().manual_seed(1), steps=15)
     machine.update(positive, negative, 1.0)
     for name, gradient in zip(leaves, exact, strict=True):
         step = own[name].data - leaves[name].data
@@ -220,20 +214,16 @@ def test_training_stops_early_and_keeps_the_best_weights(monkeypatch):
         return next(scores), 0.0
 
     monkeypatch.setattr("training.seed.learning.errors", keep)
-    history = train(machine, Parts, torch.Generator().manual_seed(0))
-    assert len(history) == 2 + PATIENCE
+    assert len(train(machine, Parts, torch.Generator().manual_seed(0))) == 2 + PATIENCE
     assert torch.equal(machine.b, weights[1])
 
 
 def many_units(kind: type[Machine]) -> Machine:
-    """An untrained machine of the scenes below: 40 classes and 39 relations."""
     triples = torch.tensor([[0, i, i + 1] for i in range(39)])
     return kind(triples, 40, 20, 0, torch.Generator().manual_seed(0))
 
 
 class SparseParts:
-    """Sixteen scenes of three classes and two relations."""
-
     v = torch.eye(40)[:16] + torch.eye(40)[1:17] + torch.eye(40)[2:18]
     r = torch.eye(39)[:16] + torch.eye(39)[1:17]
     train = validation = Scenes(v, r, r.sum(1), torch.ones(16, dtype=torch.bool))
@@ -247,7 +237,6 @@ def test_a_large_learning_rate_diverges_and_the_error_names_weight_and_rate(rate
 
 
 def test_training_at_the_rate_of_the_paper_does_not_diverge():
-    generator = torch.Generator().manual_seed(0)
-    history = train(many_units(Triway), SparseParts, generator, epochs=100)
+    history = train(many_units(Triway), SparseParts, torch.Generator().manual_seed(0), epochs=100)
     assert history[-1].objects < history[0].objects / 2
     assert history[-1].relations < history[0].relations / 2

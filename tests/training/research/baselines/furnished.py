@@ -17,11 +17,9 @@ tensors = partial(evaluation.tensors, classes=V)
 
 
 def furnished(count: int, seed: int) -> SceneTensors:
-    """Kitchens and bedrooms, each class of the room there with probability .7.
-
-    The room types are 0 and 1. In both, the first class is on top of the second and left of the
-    third, and the third is left of the fourth (so, by transitivity, the first is too).
-    """
+    """Kitchens and bedrooms, each class of the room there with probability .7. The room types are 0
+    and 1. In both, the first class is on top of the second and left of the third, and the third is
+    left of the fourth (so, by transitivity, the first is too)."""
     rng = np.random.default_rng(seed)
     scenes = []
     while len(scenes) < count:

@@ -1,5 +1,3 @@
-"""Closed forms and counts against slow, independent ways of computing them."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -17,14 +15,8 @@ from tests.training.research.baselines.furnished import (
     scene,
     tensors,
 )
+from training.evaluation.baselines import triples
 from training.evaluation.baselines.classes import Lists, fit_ease, frequency, training_lists
-from training.evaluation.baselines.triples import (
-    count_triples,
-    place_score,
-    smoothed_log_odds,
-    smoothed_log_p,
-    table_score,
-)
 from training.evaluation.generation_task import transitive_closure
 from training.evaluation.model import Places
 from training.evaluation.relation_tasks import with_observed
@@ -39,7 +31,6 @@ from training.research.baselines.relation_models import closure_score, complex_l
 
 
 def lists_of(v):
-    """Scenes of equal weight, of a source that can show every class."""
     everything = torch.ones(v.shape, dtype=torch.bool)
     return Lists(v, everything, torch.ones(len(v)), torch.arange(len(v)))
 
@@ -87,14 +78,12 @@ def test_nearest_scenes_are_scikit_learns(v, sharpness):
     search = NearestNeighbors(n_neighbors=int(rows.sum()), metric="cosine").fit(train[rows])
     distance, place = search.kneighbors(query)
     vote = ((1 - distance) / (1 - distance[:, :1])) ** sharpness
-    popularity = frequency(train).numpy()
-    share = (vote[:, :, None] * train[rows].numpy()[place]).sum(1) + popularity
+    share = (vote[:, :, None] * train[rows].numpy()[place]).sum(1) + frequency(train).numpy()
     expected = share / (vote.sum(1, keepdims=True) + 1)
     assert score(query).sigmoid().numpy() == pytest.approx(expected, abs=1e-5)
 
 
 def test_pairwise_weights_are_a_stationary_point(v):
-    """The gradient of the penalised pseudo-likelihood, written out, vanishes."""
     l2 = 5.0
     score = fit_pairwise(lists_of(v), l2, iterations=200)
     W, x = score.weights.double(), v.double()
@@ -119,8 +108,7 @@ def test_the_rbms_log_odds_are_scikit_learns_free_energies(v):
         on, off = scenes.v[:5].clone(), scenes.v[:5].clone()
         on[:, i], off[:, i] = 1.0, 0.0
         expected = rbm._free_energy(off.numpy()) - rbm._free_energy(on.numpy())
-        values = score(off)[:, i].numpy()
-        assert values == pytest.approx(expected, abs=1e-3)
+        assert score(off)[:, i].numpy() == pytest.approx(expected, abs=1e-3)
 
 
 @pytest.mark.parametrize(("loss", "expected"), [("softmax", np.log(3)), ("binary", 3 * np.log(2))])
@@ -180,7 +168,7 @@ def related():
 
 
 def test_triples_by_hand(related):
-    counts = count_triples(related, STRUCTURE)
+    counts = triples.count_triples(related, STRUCTURE)
     assert counts.holds.nonzero().tolist() == [[LEFT, 0, 2], [ON_TOP, 0, 1]]
     assert counts.holds[ON_TOP, 0, 1] == 2
     assert counts.together[0, 1] == counts.together[1, 0] == 3
@@ -190,8 +178,8 @@ def test_triples_by_hand(related):
 
 
 def test_the_frequency_table_by_hand(related):
-    counts = count_triples(related, STRUCTURE)
-    p = smoothed_log_odds(counts, of_pair=4.0, of_class=2.0).sigmoid()
+    counts = triples.count_triples(related, STRUCTURE)
+    p = triples.smoothed_log_odds(counts, of_pair=4.0, of_class=2.0).sigmoid()
     # Ordered pairs together: 3 + 3 of (0, 1), 1 + 1 each of (0, 2) and (1, 2).
     overall = (2 + 1) / (10 + 2)
     subject = (2 + 2 * overall) / (4 + 2)
@@ -205,18 +193,17 @@ def test_the_frequency_table_by_hand(related):
 def test_tables_are_looked_up_for_the_classes_of_a_scene(related):
     table = torch.randn(A, V, V, generator=torch.Generator().manual_seed(0))
     batch = related.batch(torch.tensor([1, 0]))
-    values = table_score(table)(batch)
+    values = triples.table_score(table)(batch)
     assert values[1, LEFT, 2, 0] == table[LEFT, 2, 0]
     assert values[0, ON_TOP, 0, 1] == table[ON_TOP, 0, 1]
-    more = table_score(table, multiplicity=0.5)(batch) - values
+    more = triples.table_score(table, multiplicity=0.5)(batch) - values
     assert float(more[0, LEFT, 0, 1]) == pytest.approx(0.5 * np.log(3), abs=1e-6)
     assert float(more[0, LEFT, 1, 1]) == pytest.approx(np.log(3), abs=1e-6)
     assert not more[1].any()
 
 
 def test_closure_is_warshalls():
-    generator = torch.Generator().manual_seed(0)
-    given = torch.rand(20, 7, 7, generator=generator) < 0.15
+    given = torch.rand(20, 7, 7, generator=torch.Generator().manual_seed(0)) < 0.15
     expected = given.clone()
     for k in range(7):
         expected |= expected[:, :, k : k + 1] & expected[:, k : k + 1, :]
@@ -226,7 +213,7 @@ def test_closure_is_warshalls():
 def test_closure_changes_implied_relations_and_mirror_images_alone():
     batch = tensors([scene([0, 1, 2, 3], [(LEFT, 0, 1), (LEFT, 1, 2)])]).batch(torch.tensor([0]))
     given = with_observed(batch, batch.holds > 0)
-    moved = closure_score(table_score(torch.zeros(A, V, V)), bonus=2.0, penalty=3.0)(given)
+    moved = closure_score(triples.table_score(torch.zeros(A, V, V)), bonus=2.0, penalty=3.0)(given)
     expected = torch.zeros(1, A, 4, 4)
     expected[0, LEFT, 0, 2] = 2.0
     for i, j in ((1, 0), (2, 1), (2, 0)):
@@ -244,15 +231,14 @@ def test_complex_logits_by_einsum():
 
 
 def test_places_by_hand(related):
-    counts = count_triples(related, STRUCTURE)
-    popularity = torch.full((V,), 0.5)
-    log_p = smoothed_log_p(counts, popularity, place=2.0, relation=1.0)
+    counts = triples.count_triples(related, STRUCTURE)
+    log_p = triples.smoothed_log_p(counts, torch.full((V,), 0.5), place=2.0, relation=1.0)
     assert log_p.exp().sum(-1) == pytest.approx(torch.ones(2, A, V), abs=1e-5)
     # Something on 1: 0 twice. Whatever is on something: 0 twice, and one case of 1/11 each.
     back_off = (2 + 1 / 11) / (2 + 1)
     # Second, something under 0: 1 twice.
     v, relation = torch.zeros(2, V), torch.tensor([ON_TOP, ON_TOP])
     places = Places(v, v, relation, torch.tensor([1, 0]), torch.tensor([True, False]))
-    first, second = place_score(log_p)(places)
+    first, second = triples.place_score(log_p)(places)
     assert float(first[0].exp()) == pytest.approx((2 + 2 * back_off) / (2 + 2), abs=1e-5)
     assert second.argmax() == 1

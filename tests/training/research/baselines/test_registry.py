@@ -1,5 +1,3 @@
-"""What every baseline of the registry promises, on scenes whose structure is known."""
-
 import re
 from collections import defaultdict
 from functools import cache
@@ -50,13 +48,11 @@ def fitted(baseline: Baseline):
 
 @cache
 def value(baseline: Baseline) -> float:
-    """The validation metric of `fitted`."""
     score = getattr(fitted(baseline), baseline.answer.fields[0])
     return baseline.answer.judge(furnished(60, seed=2), STRUCTURE, score)
 
 
 def answers(baseline: Baseline, score, scenes):
-    """What a score says of some scenes."""
     if baseline in OBJECTS:
         return score(scenes.v)
     if baseline is PLACED:
@@ -158,7 +154,6 @@ def test_relations_beat_popularity(baseline):
 
 @named(OF_RELATIONS)
 def test_relation_scores_ignore_the_true_relations(baseline, validation):
-    """The truth in a batch changes nothing."""
     batch = validation.batch(torch.arange(10))
     blank = with_observed(batch)
     score = fitted(baseline).relations

@@ -1,5 +1,3 @@
-"""The table of supporters by hand: counts and suspicion."""
-
 import numpy as np
 import torch
 
@@ -53,7 +51,6 @@ SUSPICION[[TABLE, BED], NOTHING] = 0.0, -1.0
 
 
 def judged(scene):
-    """Suspicion by id, in the order of the entries."""
     entries = supporter_score(SUSPICION, VOCABULARY.structure)(scene)
     assert all(entry["moved"] == entry["subject"] for entry in entries)
     logit = [np.log(p / (1 - p)) for p in (entry["probability"] for entry in entries)]
