@@ -229,7 +229,7 @@ def _select_consistent(relation, ends, order, fixed, count):
 def is_plausible(
     model: SceneModel, evidence: Scene, present: Int[NDArray[np.int64], "n"], room: int | None
 ) -> bool:
-    """Return whether a drawn scene meets none of the three conditions of the module.
+    """Return whether a drawn scene is within its limits and has no intruder but those listed.
 
     Structural classes among the ``present`` classes count only if the evidence lists them.
     """

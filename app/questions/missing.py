@@ -197,7 +197,7 @@ def _ranked(
     used_coverage = calibration.coverage if coverage is None else coverage
     raw = posterior.absent_log_odds(np.arange(len(usable)), used_coverage).astype(np.float64)
     log_odds = calibrated_missing(calibration, raw, posterior.listed, coverage)
-    # Relatives of likelier classes are left out of twice as many, unless candidates are named.
+    # Without named candidates, relatives of likelier classes are dropped later, so rank more.
     count = 2 * top_k if candidates is None else top_k
     while True:
         score = log_odds

@@ -207,7 +207,10 @@ _Place = Callable[[_Boxes, int, int, Rng], NDArray[np.float64] | None]
 
 
 def _moves(boxes: _Boxes, rng: Rng) -> Iterator[tuple[Bool[NDArray, "n n"], _Place]]:
-    """Yield the kinds of moves in random order: pairs (moved, other instance), and the place."""
+    """Yield the kinds of moves in random order: pairs (moved, other instance), and the place.
+
+    A moved instance is lifted onto another one, put on the floor, or under its support.
+    """
     usable, area, bottom, height = boxes.usable, boxes.area, boxes.bottom, boxes.size[:, 2]
     smaller = usable[:, None] & usable & (area[:, None] < area)
     supported = boxes.supports & smaller
@@ -223,6 +226,7 @@ def _moves(boxes: _Boxes, rng: Rng) -> Iterator[tuple[Bool[NDArray, "n n"], _Pla
     on_floor = (bottom <= boxes.floor + CONTACT) & ~boxes.supports.any(1)
     carries = boxes.strange & (height >= _LEAST_STEP) & (_LEAST_AREA * area[:, None] <= area)
     lifted = carries & on_floor[:, None], _onto
+    # Objects of the floor are lifted first with the probability `_LIFTED`, otherwise last.
     kinds.insert(0 if rng.random() < _LIFTED else len(kinds), lifted)
     yield from kinds
 

@@ -62,7 +62,7 @@ def update(name: str, folder: Path, files: Sequence[Path]) -> Update:
     proposal = propose(name, material, (*data.sources, *added))
     scenes = [*material.scenes, *material.drawn(proposal.config.data.written)]
     proposed = _proposed(folder / PROPOSED)
-    values, edited = _edited(folder / data.vocabulary)
+    values, edited = _read_vocabulary(folder / data.vocabulary)
     classes = _new_classes(edited, proposed, scenes, proposal.minimum, material.things)
     rooms = tuple(
         room
@@ -129,8 +129,8 @@ def _proposed(path: Path) -> dict[str, set[str]]:
         raise ConfigError(f"{path} cannot be used: {error!r}") from None
 
 
-def _edited(path: Path) -> tuple[dict[str, Any], Vocabulary]:
-    """Return the values of a vocabulary file, and the vocabulary."""
+def _read_vocabulary(path: Path) -> tuple[dict[str, Any], Vocabulary]:
+    """Return the JSON values of a vocabulary file, and the vocabulary. Raises ConfigError."""
     try:
         values = json.loads(path.read_bytes())
         return values, VocabularyEntry.model_validate(values).vocabulary()

@@ -122,6 +122,7 @@ def machine_sampler(artifact: SceneModel) -> Sampler:
     chains = artifact.scene_chains
 
     def sample(given: Bool[Tensor, "B V"], room: Int[Tensor, " B"], seed: int) -> Drawn:
+        """Draw a plausible scene for each row of given classes; room type -1 is unknown."""
         objects, contradictions = torch.zeros(given.shape), []
         for row, (classes, room_type) in enumerate(zip(given, room.tolist(), strict=True)):
             index = classes.nonzero().squeeze(1)
@@ -223,6 +224,7 @@ def pair_correlation(
     held_out_common = held_out[:, common]
 
     def correlation(weight: Float[NDArray, " scenes"]) -> float:
+        """Return the correlation over pairs of classes; NaN without variance."""
         if not weight.sum() > 0:
             return float("nan")
         of_held_out = covariances(held_out_common, weight)

@@ -76,7 +76,11 @@ def place_terms(artifact: SceneModel, question: PlaceQuestion) -> PlaceTerms:
 
 
 def fit_place(sources: Sequence[Sequence[PlaceTerms]]) -> PlaceFit:
-    """Return the entry of the largest likelihood, with equal weights of the sources."""
+    """Fit log P(at the place) = log P(present) + log σ(a + b·relation + c·counts), see `PlaceFit`.
+
+    The penalised likelihood is maximal. A source has one group of terms for each question, and all
+    sources have equal weight.
+    """
     columns = [map(np.concatenate, zip(*terms, strict=True)) for terms in sources]
     if not columns:
         return PlaceFit()

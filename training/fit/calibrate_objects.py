@@ -127,7 +127,7 @@ def fit_missing(
     structure = structure_of(artifact)
     seen = subset(scenes, ~of_sources(scenes, "written"))
     used = seen if len(seen) >= LEAST_SCENES else scenes
-    lists = _joined(used, structure, map(exactly, LENGTHS))
+    lists = _draw_lists(used, structure, map(exactly, LENGTHS))
     if not len(lists.v):
         return {}
     coverages = COVERAGES if chosen is None else (chosen.coverage,)
@@ -138,7 +138,7 @@ def fit_missing(
     entries: dict[str, Any] = {"coverage": coverages[best]}
     if (missing := fit_count_slope(z, log_n[row], truth)) is not None:
         entries["missing"] = missing
-    parts = _joined(scenes, structure, (*map(share_of, COVERED), all_but_one))
+    parts = _draw_lists(scenes, structure, (*map(share_of, COVERED), all_but_one))
     if len(parts.v):
         entries["covered"] = _fit_covered(artifact, parts)
     return entries
@@ -171,8 +171,10 @@ class _Lists(NamedTuple):
     annotated: Bool[NDArray, "N V"]  # classes that the data source of the scene can show
 
 
-def _joined(scenes: SceneTensors, structure: Bool[Tensor, "V"], sizes: Iterable[Size]) -> _Lists:
-    """Draw parts of each of the sizes."""
+def _draw_lists(
+    scenes: SceneTensors, structure: Bool[Tensor, "V"], sizes: Iterable[Size]
+) -> _Lists:
+    """Draw a part of each scene for each size. Relatives of listed classes are no candidates."""
     drawn = [draw_parts(scenes, structure, size) for size in sizes]
     v, hidden, related, scene = (
         torch.cat([getattr(parts, name) for parts in drawn])
@@ -394,7 +396,10 @@ def fit_line(worst: Mapping[int, Float[NDArray, "N"]], share: float) -> AlarmLin
 def worst_log_odds(
     untouched: Mapping[int, ListScores], entry: CountSlope, alpha: float
 ) -> dict[int, Float[NDArray, "N"]]:
-    """Return the largest log-odds of an alarm in each list, by the length of the lists."""
+    """Return the largest log-odds of an intruder in each of N lists without one, by their length.
+
+    `alpha` is the exponent of the popularity of intruders.
+    """
     worst = {}
     for n, scores in untouched.items():
         log_odds = calibrated(entry, scores.score(alpha), scores.size[scores.row])

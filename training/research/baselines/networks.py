@@ -117,7 +117,11 @@ def draw_lists(v: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
 def hidden_loss(
     network: nn.Module, v: Float[Tensor, "B V"], labelled: Bool[Tensor, "B V"], loss: str
 ) -> Float[Tensor, ""]:
-    """Return the mean loss of the hidden classes of random parts of the scenes."""
+    """Return the mean loss over B scenes, of which the network sees a random part.
+
+    With the loss "binary", it is the cross-entropy summed over the unlisted labelled classes;
+    otherwise the mean -log p of the hidden classes under a softmax over these classes.
+    """
     listed = draw_lists(v)
     candidate, hidden = (listed == 0) & labelled, v - listed
     logits = network(listed)
