@@ -39,7 +39,7 @@ class GBM(RBM):
 
     @staticmethod
     def shapes(spec: "MachineSpec") -> Shapes:
-        """See `RBM`."""
+        """Return the arrays of the RBM, and the two-way weights g."""
         return {**RBM.shapes(spec), "g": (spec.T, 2)}
 
 
@@ -57,7 +57,7 @@ class Triway:
 
     @staticmethod
     def shapes(spec: "MachineSpec") -> Shapes:
-        """See `RBM`."""
+        """Return the names and shapes of the shared weights and of the residual."""
         V, A, K, H1 = spec.V, spec.A, spec.K, spec.H1
         shapes: Shapes = {
             "d": (A,), "s": (A, V), "o": (A, V), "S": (V, K), "O": (V, K), "R": (A, K),
