@@ -21,8 +21,13 @@ class Board:
         """Wait for the answers to all changes."""
         expect(self.page.locator("main[aria-busy=true], #import:disabled")).to_have_count(0)
         self.page.evaluate("window.quiet()")
+        self.frame()  # The page draws a change in the next frame, also that it asks.
         busy = self.page.locator("article:not([hidden])[aria-busy=true], #drawn[aria-busy=true]")
         expect(busy).to_have_count(0)
+        self.frame()
+
+    def frame(self) -> None:
+        """Wait until the page has drawn its next frame."""
         self.page.evaluate("() => new Promise((done) => requestAnimationFrame(() => done()))")
 
     # ------------------------------------------------------------------------------ doing

@@ -88,11 +88,12 @@ export function createActions(store, say, menu) {
   /** Moves the focus to the next object after a removal, so that keyboard users keep their place. */
   function refocus(index) {
     const all = document.activeElement?.closest('#board') ? '#board .object' : '#list .name';
-    setTimeout(() => {
+    // The caller changes the state first; its frame draws before this one.
+    queueMicrotask(() => requestAnimationFrame(() => {
       if (document.activeElement !== document.body) return;
       const left = document.querySelectorAll(all);
       (left[Math.min(index, left.length - 1)] ?? document.getElementById('search')).focus();
-    }, 50);
+    }));
   }
 
   /** @param {boolean} [again] whether the change continues a movement that undo already covers */
