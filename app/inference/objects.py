@@ -174,28 +174,23 @@ class ObjectScorer:
         The change by class j is the log-odds minus their value without class j. `rows` are the
         indices of listed targets among the listed classes: a class is not evidence for itself.
         """
-        weights, classes, presence = self._weights, scene.classes, scene.presence
-        n, others = len(classes) if explained else 0, self._states - 1
-        x = scene.x - scene.contributions[rows] if len(rows) else scene.x[None]
-        raised, removed = np.exp(weights["W"][targets]), np.exp(-scene.contributions[:n])
-        log_odds, change = _hidden_changes(
-            all_states(x, self._states),
-            raised.reshape(len(targets), weights.spec.units, others),
-            removed.reshape(n, weights.spec.units, others),
-        )
+        weights, coupled = self._weights, self._weights.spec.coupled
         possible = slice(None) if profile is None else slice(profile, profile + 1)
-        mean, change_by_source = _source_effects(
-            weights["f"][possible], weights["a"][possible], classes, presence, rows, targets, n
+        return _explained_log_odds(
+            bias,
+            weights["W"],
+            weights["L"] if coupled else weights["W"][:0],
+            weights["f"][possible],
+            weights["a"][possible],
+            scene.x,
+            scene.contributions,
+            scene.classes,
+            scene.presence,
+            rows,
+            targets,
+            self._states,
+            explained,
         )
-        log_odds += bias[targets] + mean
-        change += change_by_source
-        if weights.spec.coupled:
-            couplings = weights["L"][targets[:, None], classes] * presence
-            log_odds += couplings.sum(1)
-            change += couplings[:, :n]
-        if n and len(rows):
-            change[np.arange(len(rows)), rows] = 0
-        return log_odds, change
 
     def increases(self, i: int) -> tuple[Float[NDArray, " V"], Float[NDArray, " V"]]:
         """Return how much the presence of class i increases the log-odds of each class j.
@@ -326,6 +321,53 @@ def _hidden_changes(
             for m in range(units):
                 change[c, j] += log(ratio[m])
     return total, change
+
+
+@compiled
+def _explained_log_odds(
+    bias: Float[NDArray, " V"],
+    W: Float[NDArray, "V H1"],
+    L: Float[NDArray, "V|0 V|H1"],  # empty without couplings
+    f: Float[NDArray, " Q"],  # of the possible data sources
+    a: Float[NDArray, "Q V"],
+    x: Float[NDArray, " H1"],
+    contributions: Float[NDArray, "listed H1"],
+    classes: Int[NDArray, " listed"],
+    presence: Float[NDArray, " listed"],
+    rows: Int[NDArray, " N|0"],
+    targets: Int[NDArray, " N"],
+    states: int,
+    explained: bool,
+) -> tuple[Float[NDArray, " N"], Float[NDArray, "N n"]]:
+    """Return the result of `ObjectScorer._explained`."""
+    N, n, others = len(targets), len(classes) if explained else 0, states - 1
+    without = np.empty((max(len(rows), 1), len(x)), np.float32)
+    without[0] = x
+    for i in range(len(rows)):
+        without[i] = x - contributions[rows[i]]
+    raised, removed = W[targets], -contributions[:n]
+    for factors in (raised.reshape(-1), removed.reshape(-1)):
+        for k in range(len(factors)):
+            factors[k] = exp(factors[k])
+    log_odds, change = _hidden_changes(
+        all_states(without, states),
+        raised.reshape(N, len(x) // others, others),
+        removed.reshape(n, len(x) // others, others),
+    )
+    mean, of_source = _source_effects(f, a, classes, presence, rows, targets, n)
+    for i in range(N):
+        coupled = np.float32(0.0)
+        for j in range(len(classes) if len(L) else 0):
+            part = L[targets[i], classes[j]] * presence[j]
+            coupled += part
+            if j < n:
+                change[i, j] += part
+        log_odds[i] += bias[targets[i]] + mean[i] + coupled
+        for j in range(n):
+            change[i, j] += of_source[i, j]
+        if n and len(rows):
+            change[i, rows[i]] = np.float32(0.0)
+    return log_odds, change
 
 
 @compiled

@@ -157,14 +157,9 @@ class Posterior:
         """Return the change of every logit by observed relations of other pairs."""
         return self._between.shift_by_others
 
-    def log_odds_of_pairs(
-        self, i: Int[Indices, "P"], j: Int[Indices, "P"]
-    ) -> tuple[Float[Floats, "A P"], Float[Floats, "A P"]]:
-        """Return the log-odds from classes i to j and back, without the evidence of each pair."""
-        log_odds = self._units.log_odds(self._between, leave_out_pair=True)
-        # The compiled functions of the questions need contiguous arrays.
-        forward, backward = np.ascontiguousarray(log_odds[:, [i, j], [j, i]].swapaxes(0, 1))
-        return forward, backward
+    def pair_log_odds(self) -> Float[Floats, "A n n"]:
+        """Return the log-odds of every relation without the evidence of its pair of classes."""
+        return self._units.log_odds(self._between, leave_out_pair=True)
 
     def placement_log_odds(
         self, candidates: Int[Indices, "N"], anchors: Int[Indices, "m"], only: int | None = None

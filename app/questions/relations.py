@@ -26,7 +26,6 @@ from app.questions.placements import supported_objects
 from app.questions.posterior import Posterior, Present, exclusive, relation_probability
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
 from app.questions.reading import Reading
-from app.scene.relation_table import RelationTable
 from app.scene.scene import Scene
 from app.scene.spatial_relations import (
     CANONICAL,
@@ -145,7 +144,7 @@ def _evidence(
         excluded[a, supported] = True
     evidence = np.where(excluded[:A], _EXCLUDED, np.float32(np.nan))
     confidence = np.array([thing.confidence for thing in scene.objects], np.float32)
-    observed = holds.rows(holds.relation < A)
+    observed = holds.known(A)
     p = observed.probability * confidence[observed.subject] * confidence[observed.object]
     evidence[observed.relation, observed.subject, observed.object] = p
     return evidence
@@ -183,68 +182,28 @@ def _disagreements(
     A, row = model.spec.A, posterior.present.row
     if scene.relations is None or not scene.triples:
         return []
-    observed = scene.relations.holding
-    of_model = observed.rows(observed.relation < A)
-    holds, of_classes = _named_relations(of_model, row, len(posterior.present.classes), A)
-    subjects, objects = _observed_pairs(holds, judged, A)
-    if not len(subjects):
-        return []
-    i, j = row[subjects], row[objects]
-    log_odds, log_counts = posterior.log_odds_of_pairs(i, j), posterior.present.log_counts
-    slopes, counts = model.relation_slopes.relation_given, log_counts[i] + log_counts[j]
-    to, back = (relation_probability(slopes, part[None], counts)[0] for part in log_odds)
-    # A relation cannot hold in both directions; see `exclusive`.
-    total = np.maximum(to + back, np.float32(1.0))
-    p = np.concatenate([to / total, back / total]).T.astype(np.float64)
-    has_unit = np.concatenate(log_odds).T > NO_UNIT
-    expected, every = np.where(has_unit, p, -1.0).argmax(1), np.arange(len(p))
-    p_observed = np.where(holds[subjects, objects], p, 0.0).max(1)
-    likeliest = p[every, expected]
-    usable = has_unit.any(1) & ~of_classes[i, j, expected] & (likeliest > p_observed)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = likeliest / p_observed
-    chosen = best(ratio, usable & (likeliest >= max(least, EXPECTED)), top_k)
-    columns = subjects[chosen].tolist(), objects[chosen].tolist(), expected[chosen].tolist()
-    names = holds[subjects, objects][chosen]
+    stated = scene.relations.holding.known(A)
+    *pairs, likely, observed, kinds = _expected_relations(
+        model.relation_slopes.relation_given,
+        posterior.pair_log_odds(),
+        posterior.present.log_counts,
+        row,
+        judged,
+        np.stack([stated.relation, stated.subject, stated.object], axis=1),
+        max(least, EXPECTED),
+        top_k,
+    )
+    columns = *(column.tolist() for column in pairs), significant(likely), significant(observed)
     return [
         {
             **_names(scene, A, subject, object_, flags.nonzero()[0].tolist(), kind),
             "probability": probability,
             "observed_probability": observed_probability,
         }
-        for subject, object_, kind, flags, probability, observed_probability in zip(
-            *columns,
-            names,
-            significant(likeliest[chosen]),
-            significant(p_observed[chosen]),
-            strict=True,
+        for subject, object_, kind, probability, observed_probability, flags in zip(
+            *columns, kinds, strict=True
         )
     ]
-
-
-def _named_relations(
-    stated: RelationTable, row: Int[Indices, "N"], n: int, A: int
-) -> tuple[Bool[Mask, "N N B"], Bool[Mask, "n n B"]]:
-    """Return which relations hold between objects, and classes; A + a is opposite to a."""
-    N, a = len(row), stated.relation
-    holds, of_classes = np.zeros((N, N, 2 * A), np.bool_), np.zeros((n, n, 2 * A), np.bool_)
-    for grid, i, j in (
-        (holds, stated.subject, stated.object),
-        (of_classes, row[stated.subject], row[stated.object]),
-    ):
-        grid[i, j, a] = grid[j, i, A + a] = True
-    return holds, of_classes
-
-
-def _observed_pairs(
-    holds: Bool[Mask, "N N B"], judged: Bool[Mask, "N N"], A: int
-) -> tuple[Int[Indices, "P"], Int[Indices, "P"]]:
-    """Return the pairs with a relation, as subjects and objects of the first in `CANONICAL`."""
-    forward = holds[..., :A]
-    first = np.where(forward.any(-1), forward.argmax(-1), A)
-    x, y = np.triu(holds.any(-1) & (judged | judged.T), 1).nonzero()
-    swapped = first[y, x] < first[x, y]
-    return np.where(swapped, y, x), np.where(swapped, x, y)
 
 
 def _names(
@@ -317,13 +276,7 @@ def _likeliest_relations(
 
     The results are subjects, objects, relations, probabilities, and probabilities without evidence.
     """
-    (A, n), size = log_odds.shape[:2], len(row)
-    counts = np.empty((n, n), log_counts.dtype)
-    for i in range(n):
-        for j in range(n):
-            counts[i, j] = log_counts[i] + log_counts[j]
-    log_odds = log_odds.reshape(1, A, n * n)
-    p = relation_probability(slopes, log_odds, counts.reshape(-1)).reshape(A, n, n)
+    A, size, p = len(log_odds), len(row), _between_classes(slopes, log_odds, log_counts)
     names = 2 * A if opposites else A
     grid, usable = np.zeros((size, size, names), p.dtype), np.zeros((size, size, names), np.bool_)
     expected = np.zeros((size, size, names), p.dtype)
@@ -349,6 +302,80 @@ def _likeliest_relations(
     of_model = expected.reshape(-1)[indices].astype(np.float64)
     probabilities = values[indices].astype(np.float64)
     return pair // size, pair % size, indices % names, probabilities, of_model
+
+
+@inlined
+def _between_classes(slopes, log_odds, log_counts):
+    """Return the probability (A, n, n) of each relation between objects of n classes."""
+    A, n = log_odds.shape[:2]
+    counts = np.empty((n, n), log_counts.dtype)
+    for i in range(n):
+        for j in range(n):
+            counts[i, j] = log_counts[i] + log_counts[j]
+    flat = log_odds.reshape(1, A, n * n)
+    return relation_probability(slopes, flat, counts.reshape(-1)).reshape(A, n, n)
+
+
+@compiled
+def _expected_relations(
+    slopes: Float[NDArray, "A 3"],  # table of `RelationSlopes`
+    log_odds: Float[NDArray, "A n n"],  # without the observations of each pair
+    log_counts: Float[NDArray, " n"],  # of the instances of each class
+    row: Int[NDArray, " N"],  # class of each object, below n
+    judged: Bool[NDArray, "N N"],
+    stated: Int[NDArray, "T 3"],  # relations that hold: relation, subject, object
+    least: float,  # minimum probability of an expected relation
+    count: int,  # maximum number k of pairs
+) -> tuple[
+    Int[NDArray, " k"], Int[NDArray, " k"], Int[NDArray, " k"], Float[NDArray, " k"],
+    Float[NDArray, " k"], Bool[NDArray, "k 2*A"],
+]:  # fmt: skip
+    """Return the pairs of objects whose observed relations differ most from the expected one.
+
+    The results are subject, object, expected relation, its probability, that of the likeliest
+    observed relation, and the observed relations. A + a is the opposite of relation a. The subject
+    is that of the first observed relation.
+    """
+    (A, n), size, p = log_odds.shape[:2], len(row), _between_classes(slopes, log_odds, log_counts)
+    holds, of_classes = np.zeros((size, size, 2 * A), np.bool_), np.zeros((n, n, 2 * A), np.bool_)
+    for a, x, y in stated:
+        i, j = row[x], row[y]
+        holds[x, y, a] = holds[y, x, A + a] = True
+        of_classes[i, j, a] = of_classes[j, i, A + a] = True
+    expected, subject = np.zeros((size, size), np.int64), np.zeros((size, size), np.int64)
+    likely, observed = np.zeros((size, size)), np.zeros((size, size))
+    usable = np.zeros((size, size), np.bool_)
+    for x in range(size):
+        for y in range(x + 1, size):
+            if not ((judged[x, y] or judged[y, x]) and holds[x, y].any()):
+                continue
+            s, o = x, y
+            for a in range(A):
+                if holds[x, y, a] or holds[y, x, a]:
+                    s, o = (x, y) if holds[x, y, a] else (y, x)
+                    break
+            i, j = row[s], row[o]
+            for kind in range(2 * A):
+                a = kind % A
+                to, back = exclusive(p[a, i, j], p[a, j, i])
+                value, z = (to, log_odds[a, i, j]) if kind < A else (back, log_odds[a, j, i])
+                if z > NO_UNIT and value > likely[x, y]:
+                    likely[x, y], expected[x, y] = value, kind
+                if holds[s, o, kind]:
+                    observed[x, y] = max(observed[x, y], value)
+            is_new = not of_classes[i, j, expected[x, y]]
+            usable[x, y] = is_new and likely[x, y] > observed[x, y] and likely[x, y] >= least
+            subject[x, y] = s
+    chosen = best((likely / observed).reshape(-1), usable.reshape(-1), count)
+    subjects = subject.reshape(-1)[chosen]
+    objects, kinds = (
+        chosen // size + chosen % size - subjects,
+        np.empty((len(chosen), 2 * A), np.bool_),
+    )
+    for k in range(len(chosen)):
+        kinds[k] = holds[subjects[k], objects[k]]
+    grids = expected.reshape(-1)[chosen], likely.reshape(-1)[chosen], observed.reshape(-1)[chosen]
+    return subjects, objects, *grids, kinds
 
 
 @inlined

@@ -90,7 +90,12 @@ class RelationTable:
 
     def rows(self, chosen: Bool[Array, "R"]) -> "RelationTable":
         """Return the chosen rows."""
-        return replace(self, **{name: getattr(self, name)[chosen] for name in _COLUMNS})
+        index = chosen.nonzero()[0]
+        return replace(self, **{name: getattr(self, name).take(index) for name in _COLUMNS})
+
+    def known(self, A: int) -> "RelationTable":
+        """Return the rows whose relation a machine with A relations knows."""
+        return self if A == _A else self.rows(self.relation < A)
 
     @cached_property
     def holding(self) -> "RelationTable":
@@ -100,9 +105,8 @@ class RelationTable:
     @cached_property
     def triples(self) -> tuple[Triple, ...]:
         """The relations that hold."""
-        holds = self.probability > 0
-        columns = self.relation, self.subject, self.object
-        return tuple(zip(*(column[holds].tolist() for column in columns), strict=True))
+        columns = self.holding.relation, self.holding.subject, self.holding.object
+        return tuple(zip(*(column.tolist() for column in columns), strict=True))
 
     @cached_property
     def opposites(self) -> frozenset[Triple]:
