@@ -12,7 +12,6 @@ from app.scene import ObjectClass
 from tests.training.scenes import request
 from training.fit.adapt import HomeScenes, TrainedOn, adapt
 from training.fit.extend import extended
-from training.fit.objects import random_parts
 from training.machines import build
 from training.machines.arrays import machine_of, weights_of
 
@@ -107,23 +106,6 @@ def test_a_class_that_the_parent_hardly_knows_is_learnt_from_few_scenes():
     )
     assert common < 0.2
     assert 0.3 < rare < 0.7
-
-
-def test_distillation_keeps_the_answers_about_stored_samples(monkeypatch):
-    """Without it, the rooms of the parent change several times more."""
-    parent, home = small(), scenes_of(*HOME)
-    samples = torch.from_numpy(parent.chain_samples)
-    samples = samples[samples.sum(1) > 1]
-    parts = random_parts(samples, 0.3, torch.Generator().manual_seed(1))
-
-    def change() -> float:
-        sides = parent, adapt(parent, home)
-        p, q = (machine_of(x).object_log_odds(parts.listed).sigmoid() for x in sides)
-        return float((p - q).abs()[parts.listed == 0].mean())
-
-    kept = change()
-    monkeypatch.setattr("training.fit.adapt._DISTILLATION", 0.0)
-    assert change() > 1.5 * kept
 
 
 def test_a_home_without_pairs_or_a_model_without_samples_is_refused():
