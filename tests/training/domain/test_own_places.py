@@ -13,8 +13,6 @@ from training.datasets import generate_rooms
 from training.datasets.inventories import read_inventory
 from training.datasets.jsonl import write_jsonl
 from training.datasets.rooms import DOMAINS
-from training.domain.home import Home
-from training.domain.material import read_material
 from training.fit.count_statistics import fit_counts
 from training.fit.objects import ObjectScenes
 from training.runs.config_files import load_config
@@ -118,24 +116,6 @@ def test_an_update_adds_an_inventory_to_scenes(tmp_path) -> None:
     assert "attic" in values["room_types"]
     again = init(tmp_path / "new.csv", folder=tmp_path / "ward", options=["--update"])
     assert "no new classes" in again
-
-
-def test_junk_labels_become_no_classes(tmp_path, repository) -> None:
-    """A quarter of the labels of the recordings are placeholders. The others are read."""
-    junk = ["REMOVE", "SPLIT", "unknown", "Undefined", "object_7", "n03001627", "/m/01mzpv"]
-    named = ["sofa.n.01", "couch_v2", "chair_12", "objects/bed_a1b2", "kitchen::table_1::link"]
-    rooms = [scene(f"s{k}", *named, junk[k % 7], "BACKGROUND", "ground_plane") for k in range(40)]
-    write_jsonl(rooms, path := tmp_path / "scenes.jsonl")
-    output = init(path, folder=tmp_path / "ward")
-    assert "BACKGROUND (40), ground_plane (40), REMOVE (6)" in output
-    scenes = prepared(tmp_path / "ward")
-    assert len(scenes.vocabulary) == 4, "a couch is a sofa"
-    for name in ("sofa", "couch", "chair", "bed", "table"):
-        assert scenes.vocabulary.index(name) is not None
-    store = Store(repository / "model_store")
-    recorded = read_material([path], recorded=True)
-    assert Home.of(store.load(*store.resolve("default")).model, recorded.scenes).new_classes == ()
-    assert recorded.left_out["/m/01mzpv"] == 5
 
 
 @pytest.mark.slow

@@ -76,8 +76,9 @@ def test_every_entry_is_fitted(fitted):
     assert fitted.missing.slope > 0
     assert fitted.covered.slope > 0
     assert fitted.outlier.slope < 0
-    # The likelier a stand, the less probably it is wrong.
+    # The likelier a stand, the less probably it is wrong: moved boxes stand at unlikely places.
     assert fitted.misplaced.stand.stand < 0
+    assert fitted.misplaced.support.stand < 0
     # The machine has no relation weights, so the counts tell what stands where.
     assert all(entry.counts > 0 for entry in fitted.at)
     scenes = ObjectScenes.of(rooms(ROOM_COUNT, 2), STRUCTURE, CONFIG)

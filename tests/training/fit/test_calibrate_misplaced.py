@@ -7,18 +7,15 @@ import torch
 from app.model import Misplaced
 from app.questions import misplaced
 from app.questions.misplaced import BESIDE, STAND, SUPPORT
-from app.scene import observe
 from app.scene.spatial_relations import ON_TOP
 from tests.questions.artifacts import artifact_of
-from tests.training.evaluation.furnished_rooms import VOCABULARY, A, rooms
+from tests.training.evaluation.furnished_rooms import A
 from tests.training.evaluation.scenes import scene
 from training.datasets.cases import draw_true_relations, scene_of, scene_rng
-from training.datasets.moved import moved_by_triple, moved_scene, posed_scene
-from training.datasets.roles import count_roles
+from training.datasets.moved import moved_by_triple
 from training.evaluation.alarms import ALARMS
 from training.fit import calibrate_misplaced as module
 from training.fit.calibrate_misplaced import fit_misplaced, hardest_quantile
-from training.fit.draft import draft_artifact, fit_places
 from training.machines import MachineSpec, build
 
 V, SUPPORTERS = 9, 4
@@ -122,30 +119,6 @@ def test_a_machine_that_finds_true_supports_unlikely_does_not_judge(artifact):
     weights["residual"] = -weights["residual"]
     inverted = replace(artifact, weights=replace(artifact.weights, arrays=weights))
     assert fit_misplaced(inverted, world(60, 0)).support is None
-
-
-@pytest.mark.slow
-def test_moved_boxes_stand_at_less_likely_places():
-    """Of rooms with boxes, and a machine that knows only what objects of each class stand on."""
-    spec = MachineSpec("triway", V=len(VOCABULARY), A=A, units=1, K=1)
-    places = fit_places(rooms(200, 2).scenes, count_roles((), VOCABULARY), VOCABULARY)
-    model = draft_artifact(build(spec).eval().requires_grad_(False), VOCABULARY, places=places)
-    fitted = fit_misplaced(model, rooms(80, 1).scenes)
-    assert fitted.stand.stand < 0
-    assert fitted.support.stand < 0
-    model, sizes = judging(model, fitted), VOCABULARY.sizes
-    before, after = [], []
-    for one in rooms(60, 3).scenes:
-        moved = moved_scene(one, VOCABULARY.structure, scene_rng(one, 0))
-        if moved is None:
-            continue
-        for request, values in ((posed_scene(one), before), (moved[0], after)):
-            entries = misplaced(model, observe(request, typical_sizes=sizes, roles=places.roles))
-            values.append(
-                max((e["probability"] for e in entries if e["moved"] == str(moved[1])), default=0.0)
-            )
-    assert len(after) > 40
-    assert np.mean(after) > np.mean(before) + 0.1
 
 
 @pytest.mark.parametrize("share", ALARMS.values())

@@ -120,12 +120,3 @@ def test_a_base_gives_the_entries_that_a_file_lacks(tmp_path) -> None:
     path.write_text(text.replace("places-triway", "nowhere"))
     with pytest.raises(ConfigError, match=r"mine\.toml: base must be one of .*places-triway"):
         load_config(str(path))
-
-
-def test_knowledge_alone_needs_no_data(tmp_path) -> None:
-    config = with_settings(load_config("knowledge-triway"), {"data.written": 1})
-    scenes = prepare(config, tmp_path)
-    assert {scene.source for scenes_ in scenes.parts.values() for scene in scenes_} == {
-        "inventories"
-    }
-    assert len(scenes.vocabulary) > 1500
