@@ -197,7 +197,7 @@ def test_labels_outside_the_vocabulary_are_named(tmp_path):
 
 
 def test_a_final_run_is_not_promoted_by_comparison(tmp_path):
-    config = write_config(tmp_path / "config.toml", CONFIG)
+    config = write_config(tmp_path / "config.toml", CONFIG, {"objects.steps": 1})
     output = invoke("train", config, "--final", "--runs", tmp_path / "runs")
     assert "trained in" in output
     assert "next:" not in output
