@@ -92,11 +92,6 @@ def test_chosen_values_are_copied(model, fitted):
     assert again.missing != fitted.missing
 
 
-@pytest.mark.slow
-def test_a_seed_gives_the_same_calibration(model, fitted):
-    assert calibrate(model, data_of(rooms(200, 1)), CONFIG) == fitted
-
-
 def test_scenes_count_by_weight_and_incomplete_ones_not_at_all():
     """Of 300 scenes of weight 1/3 about 100 are kept: outside 60 to 140 with p < 1e-6. If no scene
     lists all of its objects, as in photographs, all scenes count."""

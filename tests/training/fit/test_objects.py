@@ -531,18 +531,6 @@ def test_chains_start_at_each_room_type_in_proportion():
         assert abs((rooms == room).sum() - 300 * mixed.weight[mixed.room == room].sum()) <= 1
 
 
-def test_chains_continue_from_call_to_call():
-    machine, scenes = machine_of("coupled", scale=0.6), scenes_of(SHOWS)
-    population = next(long_chains.populations(scenes, SERVED))
-    chains = long_chains.scene_chains(weights_of(machine))
-    once, twice = (long_chains.LongChains(chains, scenes, population, 6, seed=3) for _ in range(2))
-    share = once.run(20)
-    halves = twice.run(10), twice.run(10)
-    np.testing.assert_array_equal(once.on, twice.on)
-    np.testing.assert_allclose(share, (halves[0] + halves[1]) / 2)
-    assert share.shape == (6, V)
-
-
 def test_only_a_drift_beyond_its_limit_is_an_objection(monkeypatch):
     monkeypatch.setattr(long_chains, "_CHAINS", 64)
     machine, scenes = fitted("coupled")
