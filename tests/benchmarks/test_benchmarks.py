@@ -29,6 +29,8 @@ def check_complete(result: Result, rounds: int) -> None:
     assert all(name in text for name in [*seconds, *result.facts])
 
 
+# `rbms` compiles with torch.jit as it is imported, which torch calls deprecated.
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_gibbs_yardsticks_sample_the_same_machine():
     """Means over 4,000 chains within more than 6 standard errors: chance fails below 1e-8."""
     # Imported here, because every worker imports every module of tests, and this takes seconds.

@@ -45,26 +45,15 @@ DEADLINE = re.compile(r"\btimeout=[\d.]+")
 
 
 @pytest.mark.parametrize("block", EVERY, ids=str)
-def test_every_block_says_what_it_is(block: Block) -> None:
+def test_every_block_says_what_it_is_and_its_data_can_be_read(block: Block) -> None:
     assert block.language in EXECUTED | READERS.keys() | SHOWN, f"{block}: {block.language!r}"
     if block.mark == "not run":
         assert len(block.reason) > 10, f"{block} is not run: say why"
     if block.mark == "keeps running":
         assert block.source.strip() == "make run", f"{block}: only `make run` is kept running"
-
-
-@pytest.mark.parametrize(
-    "block",
-    [
-        b
-        for found in EVERY
-        for b in (found, found.output)
-        if b is not None and b.language in READERS
-    ],
-    ids=str,
-)
-def test_data_can_be_read(block: Block) -> None:
-    READERS[block.language](block.source)
+    for data in (block, block.output):
+        if data is not None and data.language in READERS:
+            READERS[data.language](data.source)
 
 
 @pytest.mark.parametrize("page", sorted(RUN_BY.keys() & BLOCKS.keys()))

@@ -81,8 +81,8 @@ def test_the_behaviour_tree_says_why_its_conditions_fail(shipped: LiveService) -
     assert printed[1].startswith("complete: missing: computer")
 
 
-def test_the_ros_node_publishes_outliers(shipped, repository, monkeypatch):
-    recorded = json.loads((repository / "clients/ros2/detections.json").read_text("utf-8"))
+def test_the_ros_node_publishes_outliers(shipped, monkeypatch):
+    recorded = json.loads((REPOSITORY / "clients/ros2/detections.json").read_text("utf-8"))
     message = from_json("vision_msgs/msg/Detection3DArray", recorded["msg"])
     for url in (shipped.url, "http://127.0.0.1:9"):
         ros = Ros({})

@@ -7,7 +7,8 @@ from typer.testing import CliRunner
 
 from training.cli import app
 from training.fit.configuration import Config
-from training.runs.config_files import config_toml, with_settings
+from training.runs.config_files import config_toml, data_folder, load_config, with_settings
+from training.runs.pipeline import SplitScenes, prepare
 
 
 def invoke(*arguments: object, code: int = 0) -> str:
@@ -15,6 +16,17 @@ def invoke(*arguments: object, code: int = 0) -> str:
     result = CliRunner().invoke(app, [str(argument) for argument in arguments])
     assert result.exit_code == code, result.output
     return " ".join(result.output.split())
+
+
+def init(*files: Path, folder: Path, name: str = "", code: int = 0, options: Any = ()) -> str:
+    """Propose a configuration for files. By default, the model has the name of the folder."""
+    return invoke("init", name or folder.name, *files, "--output", folder, *options, code=code)
+
+
+def prepared(folder: Path) -> SplitScenes:
+    """The scenes of the configuration in a folder."""
+    config = load_config(str(folder))
+    return prepare(config, data_folder(str(folder), config))
 
 
 def small_config(name: str = "rooms-triway", variant: str = "triway", **data: Any) -> Config:

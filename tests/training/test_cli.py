@@ -1,6 +1,5 @@
 import json
 import re
-import subprocess
 import sys
 from dataclasses import replace
 from importlib.metadata import packages_distributions
@@ -11,6 +10,7 @@ import pytest
 
 from app.registry import Store
 from app.registry.references import AliasTarget
+from tests.conftest import REPOSITORY, run_program
 from tests.questions.answers import generate, missing, outliers, relations
 from tests.registry.small_artifacts import description, state
 from tests.training.commands import invoke, small_config, write_config
@@ -22,8 +22,6 @@ from training.runs.config_files import load_config, with_settings
 from training.runs.folder import RunError
 from training.runs.pipeline import prepare
 from training.runs.publish import refit
-
-ROOT = Path(__file__).parents[2]
 
 SIZES = {"machine.units": 4, "machine.states": 4, "machine.K": 4}
 CONFIG = with_settings(
@@ -70,7 +68,7 @@ def check_refit(artifact, store) -> None:
 @pytest.mark.slow
 def test_training_imports_nothing_that_only_checks_need():
     """The training image has `requirements-training.lock` alone."""
-    files = (ROOT / f"requirements-{name}.lock" for name in ("dev", "training"))
+    files = (REPOSITORY / f"requirements-{name}.lock" for name in ("dev", "training"))
     pinned = (set(re.findall(r"^([^=\s]+)==", file.read_text(), re.MULTILINE)) for file in files)
     checks = next(pinned) - next(pinned)
     modules = [
@@ -80,8 +78,7 @@ def test_training_imports_nothing_that_only_checks_need():
     ]
     assert "pytest" in modules
     blocked = f"import sys; sys.modules.update(dict.fromkeys({modules!r}))"
-    code = f"{blocked}; import training.cli"
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+    run_program(sys.executable, "-c", f"{blocked}; import training.cli")
 
 
 @pytest.mark.slow
@@ -107,11 +104,6 @@ def test_from_rooms_to_answers(tmp_path):
     }  # fmt: skip
     check_offsets(artifact, load_config(str(config)))
     check_refit(artifact, tmp_path / "store")
-    assert artifact.model.calibration.outlier.slope < 0  # likely objects are no intruders
-    lines = artifact.model.calibration.outlier_lines
-    limits = [line.threshold(3) for line in (lines.low, lines.medium, lines.high)]
-    assert limits == sorted(limits, reverse=True)
-    assert 1 > limits[0] >= limits[2] > 0
     model = artifact.model
     scene = request(model, "bed", "nightstand", "lamp")
     assert missing(model, scene)
@@ -205,7 +197,7 @@ def test_labels_outside_the_vocabulary_are_named(tmp_path):
 
 
 def test_a_final_run_is_not_promoted_by_comparison(tmp_path):
-    config = write_config(tmp_path / "config.toml", CONFIG)
+    config = write_config(tmp_path / "config.toml", CONFIG, {"objects.steps": 1})
     output = invoke("train", config, "--final", "--runs", tmp_path / "runs")
     assert "trained in" in output
     assert "next:" not in output

@@ -43,14 +43,6 @@ def test_unlisted_relations_of_mentions_are_unobserved_except_of_stacked_pairs(s
     assert off(found) == stacked | beside
 
 
-@pytest.mark.parametrize("other", ["left", "above"])
-def test_two_listed_relations_of_one_pair_both_hold(other: str) -> None:
-    found = encoded("nr3d", relations=((1, "on-top", 0), (1, other, 0)))
-    both = [ON_TOP, LEFT if other == "left" else ABOVE]
-    assert found.instance_holds[both, 1, 0].all()
-    assert off(found) >= {(a, 0, 1) for a in both}
-
-
 def test_denied_relations_are_false_and_contradicted_ones_unobserved() -> None:
     one = ((1, "on-top", 0),)
     assert not encoded("vsr", relations=one, false_relations=one).instance_observed.any()

@@ -5,7 +5,7 @@ import pytest
 
 from app.scene import ObjectClass, Vocabulary, label_key
 from tests.training.scenes import scene
-from training.datasets import AnnotatedObject, AnnotatedScene, source_vocabulary
+from training.datasets import AnnotatedScene, source_vocabulary
 from training.datasets.vocabulary import (
     INDOOR_FILE,
     MINIMUM_MENTIONS,
@@ -79,10 +79,8 @@ def test_typical_sizes_are_medians_of_square_footprints() -> None:
     vocabulary = build_vocabulary(scenes("chair", "lamp"), Names(), minimum=1)
     boxes = []
     for k in range(1, 6):
-        chair = AnnotatedObject("0", "Chairs", size=(0.2 * k, 0.8 * k, 1.0 * k))
-        throne = AnnotatedObject("1", "throne", size=(9.0, 9.0, 9.0))
-        things = (chair, throne, AnnotatedObject("2", "lamp"))
-        boxes.append(AnnotatedScene(f"s{k}", "t", "g", None, things))
+        sizes = [(0.2 * k, 0.8 * k, 1.0 * k), (9.0, 9.0, 9.0), None]
+        boxes.append(scene(f"s{k}", "Chairs", "throne", "lamp", size=sizes))
     found = with_typical_sizes(vocabulary, boxes)
     assert found.objects[0].size == pytest.approx((1.2, 1.2, 3.0))
     assert found.objects[1].size is None

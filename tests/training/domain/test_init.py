@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.training.commands import invoke
+from tests.training.commands import init, prepared
 from tests.training.scenes import scene
 from training.datasets import generate_rooms
 from training.datasets.jsonl import write_jsonl
@@ -15,7 +15,7 @@ from training.datasets.rooms import DOMAINS
 from training.domain.material import Material
 from training.domain.proposal import propose
 from training.fit.configuration import ConfigError
-from training.runs.config_files import data_folder, load_config
+from training.runs.config_files import load_config
 from training.runs.pipeline import prepare
 
 SCENES = generate_rooms(80, 0, DOMAINS["workplaces"])
@@ -23,10 +23,6 @@ SCENES = generate_rooms(80, 0, DOMAINS["workplaces"])
 
 def of_scenes(scenes: list) -> Material:
     return Material((tuple(scenes),), {}, Counter())
-
-
-def init(*files: Path, folder: Path, code: int = 0, name: str = "lab", options=()) -> str:
-    return invoke("init", name, *files, "--output", folder, *options, code=code)
 
 
 @pytest.fixture
@@ -49,7 +45,7 @@ def test_a_proposed_configuration_can_be_trained(file, tmp_path) -> None:
     config = load_config(str(folder))
     assert config == load_config(str(folder / "lab.toml"))
     assert (config.data.terms, config.data.split) == ("ours", "stable")
-    scenes = prepare(config, data_folder(str(folder), config))
+    scenes = prepared(folder)
     assert sum(map(len, scenes.parts.values())) == 80
     assert all(scenes.parts.values())
     assert "positions 100%" in output
@@ -132,7 +128,7 @@ def test_an_update_keeps_edits_and_adds_new_files(lab) -> None:
     kept_out = output.split("not added again: ")[1].split(" new sources: ../new.jsonl")[0]
     assert {f"{entry['label']} (" in kept_out for entry in old[:2]} == {True}
     assert f"{merged['label']} (" not in kept_out
-    assert prepare(load_config(str(lab)), lab).counts == {"scenes": 80, "new": 20}
+    assert prepared(lab).counts == {"scenes": 80, "new": 20}
 
     # An added class that the person removes stays removed, too. Nothing else is new.
     text = edit(lab, entries)

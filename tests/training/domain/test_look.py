@@ -36,13 +36,6 @@ def test_facts_are_counted() -> None:
     assert not look([scene("a", "cup", "table"), scene("b", "lamp", "bed")]).related
 
 
-def test_similar_labels_are_found() -> None:
-    some = [scene(str(k), "soldering iron") for k in range(3)]
-    slip = scene("slip", "soldering irom")
-    pair = "soldering irom (1) and soldering iron (3)"
-    assert finding("one or two letters", *some, slip) == (1, [pair])
-
-
 def test_relations_in_both_directions_are_found_in_either_wording() -> None:
     count, examples = finding(
         "both directions", scene("a", "cup", "pot", relations=[(0, "left", 1), (0, "right", 1)])

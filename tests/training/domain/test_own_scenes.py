@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from app.registry import Store
-from tests.services import launch, serve
+from tests.services import serve
 from tests.training.commands import invoke
 
 pytestmark = [pytest.mark.slow, pytest.mark.anyio]
@@ -52,12 +52,6 @@ def workplace(tmp_path_factory, repository, find_tool) -> Workplace:
     return Workplace(record / "work")
 
 
-def shortened(text: str, steps: int) -> str:
-    """A configuration with too little training."""
-    text = re.sub(r"^steps = \d+", f"steps = {steps}", text, flags=re.MULTILINE)
-    return re.sub(r"^epochs = \d+", "epochs = 1", text, flags=re.MULTILINE)
-
-
 def test_the_walk_is_recorded(workplace) -> None:
     record = (workplace.folder.parent / "walk.md").read_text()
     for words in (
@@ -95,8 +89,6 @@ async def test_the_service_answers_with_the_model(workplace) -> None:
     assert answer["ignored"] == []
     assert "oscilloscope" in [entry["label"] for entry in answer["missing"]]
     assert any(entry["placements"] for entry in answer["missing"])
-    with launch(workplace.store, workplace.folder / "log") as service:
-        assert service.client.post("/missing", json=question).json()["missing"] == answer["missing"]
 
 
 def test_the_card_has_the_stated_terms(workplace) -> None:
@@ -110,21 +102,17 @@ def test_the_card_has_the_stated_terms(workplace) -> None:
 def test_a_worse_version_is_refused_without_even_if_worse(workplace) -> None:
     text = (workplace.folder / "my-lab" / "my-lab.toml").read_text()
     hasty = workplace.folder / "my-lab" / "hasty.toml"
-    hasty.write_text(shortened(text, steps=1))
+    text = re.sub(r"^steps = \d+", "steps = 1", text, flags=re.MULTILINE)
+    hasty.write_text(re.sub(r"^epochs = \d+", "epochs = 1", text, flags=re.MULTILINE))
     invoke("train", hasty, "--seed", 1, *workplace.places)
     run = workplace.run.with_name("seed-1")
     before, versions = workplace.state
 
     # The walk has a refusal for the served alias.
     output = workplace.publish(run, "2.0.0", "--promote", "--alias", "new-alias", code=3)
-    assert "refused: the new version is not clearly better than popularity" in output
     assert "the new version is worse than EASE" in output
     assert "nothing was published" in output
     assert workplace.state == (before, versions)
-
-    comparison = workplace.compare(run, before)
-    figures = {(x["task"], x["metric"]): x["figure"] for x in comparison["differences"]}
-    assert figures["T2 missing", "MRR, one removed"]["high"] < -0.02
 
     output = workplace.publish(run, "2.0.0", "--promote", "--even-if-worse")
     assert f"accepted by --even-if-worse: the new version is worse than {before}" in output
@@ -143,17 +131,3 @@ def test_a_run_is_not_published_with_an_edited_vocabulary(workplace) -> None:
         assert "vocabulary or split have changed" in output
     finally:
         path.write_text(before)
-
-
-def test_versions_of_a_growing_data_set_are_compared_on_common_test_scenes(workplace) -> None:
-    """The new vocabulary has another order. Two steps of training are too few."""
-    grown = workplace.folder / "grown"
-    invoke("example", grown / "scenes.jsonl", "--scenes", 360)
-    invoke("init", "my-lab", grown / "scenes.jsonl", "--output", grown / "my-lab")
-    config = grown / "my-lab" / "my-lab.toml"
-    text = config.read_text()
-    config.write_text(shortened(text, steps=2))
-    invoke("train", config, "--runs", grown / "runs")
-    comparison = workplace.compare(grown / "runs" / "my-lab" / "seed-0", "my-lab@1.0.0")
-    assert comparison["scenes"] > 10
-    assert comparison["differences"][0]["verdict"] == "worse"

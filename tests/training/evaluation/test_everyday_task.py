@@ -9,6 +9,7 @@ import pytest
 
 from app.registry import Store, load_model_set
 from app.scene import Scene, SceneObject, opposite
+from tests.conftest import REPOSITORY
 from tests.questions.answers import relations
 from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
 from training.evaluation import everyday_task as everyday
@@ -16,7 +17,6 @@ from training.evaluation.everyday_task import EVERYDAY, LINES, everyday_task, fa
 from training.evaluation.report import digest, evaluate
 from training.evaluation.setting import Setting
 
-REPOSITORY = Path(__file__).resolve().parents[3]
 FOLDER = REPOSITORY / EVERYDAY
 STORE = REPOSITORY / "model_store"
 ROOM = "bedroom"

@@ -1,6 +1,5 @@
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
@@ -9,7 +8,6 @@ from tests.questions.artifacts import LARGER, larger_artifact
 from tests.training.evaluation.scenes import scene, tensors, values_of
 from tests.training.fit.test_offset_statistics import MEAN, STD, apart, draws
 from training.evaluation.offset_task import offsets_task
-from training.evaluation.report import evaluate
 from training.evaluation.setting import Setting
 from training.fit.offset_statistics import fit_offsets
 
@@ -57,15 +55,3 @@ def test_models_and_sources_without_poses_have_no_figures():
     plain = [scene([0, 1], [(LEFT, 0, 1)])]
     assert outcome(draws(MEAN, STD, 20, 0), plain) is None
     assert outcome(plain, draws(MEAN, STD, 5, 1)) is None
-
-
-def test_a_published_model_has_the_offsets_of_each_source():
-    train = draws(MEAN, STD, 40, 0)
-    artifact = artifact_of(train)
-    test = draws(MEAN, STD, 6, 1, source="a") + draws(MEAN, STD, 6, 2, source="b")
-    rows = evaluate(artifact, tensors(test, V), NO_STRUCTURE, tensors(train, V), limit=4)
-    offsets = [(row.source, row.metric, row.n) for row in rows if row.task == "Offsets"]
-    assert ("a", "in the ellipse, left", 6) in offsets
-    assert ("b", "distance (m)", 6) in offsets
-    assert len(offsets) == 8
-    assert np.isfinite([row.value for row in rows]).all()

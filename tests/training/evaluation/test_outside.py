@@ -1,17 +1,15 @@
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, room_model
-from training.datasets import DatasetError, annotated_classes, encode, generate_rooms, read_scenes
+from training.datasets import DatasetError, annotated_classes, encode, generate_rooms
 from training.datasets.batches import scene_tensors
 from training.datasets.jsonl import write_jsonl
-from training.datasets.records import digest_of
 from training.evaluation.artifact_model import artifact_model
-from training.evaluation.outside import ROOM_TASKS, RoomList, read_test
+from training.evaluation.outside import ROOM_TASKS, read_test
 from training.evaluation.report import measure
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import TASKS
@@ -21,12 +19,6 @@ def room_file(folder: Path, scenes) -> Path:
     path = folder / "homes.jsonl"
     write_jsonl(scenes, path)
     return path
-
-
-def learnt(*sources):
-    """An artifact with these data sources in its manifest."""
-    entries = [SimpleNamespace(source=s, scenes=n, digest=d) for s, n, d in sources]
-    return SimpleNamespace(manifest=SimpleNamespace(data=entries))
 
 
 def test_files_have_the_metrics_of_all_tasks_without_training_scenes(tmp_path):
@@ -54,30 +46,17 @@ def test_labels_of_the_vocabulary_only(tmp_path):
     scenes = [{"objects": ["bed", "lamp", "pillow", "zeppelin"]}, {"objects": ["zeppelin"]}]
     path = tmp_path / "mine.jsonl"
     path.write_text("\n".join(map(json.dumps, scenes * 2)))
-    test = read_test(path)
-    artifact = room_model()
-    assert test.remark(artifact) == "4 of 10 objects are left out, because their labels are unknown"
-    mrr = {row.metric: row for row in test.measure(artifact) if row.task == "T2 missing"}
+    mrr = {x.metric: x for x in read_test(path).measure(room_model()) if x.task == "T2 missing"}
     assert mrr["MRR, one removed"].n == 6  # three draws for both rooms that have known objects
     alone = tmp_path / "none.jsonl"
     alone.write_text(json.dumps(scenes[1]))
-    assert read_test(alone).measure(artifact) == []
+    assert read_test(alone).measure(room_model()) == []
 
 
 def test_one_group_leaves_intervals_over_rooms(tmp_path):
     rooms = [replace(scene, group="home") for scene in generate_rooms(4, 3)]
     rows = read_test(room_file(tmp_path, rooms)).measure(room_model())
     assert any(row.task == "T2 missing" for row in rows)
-
-
-def test_training_data_is_no_outside_test(tmp_path):
-    path = room_file(tmp_path, generate_rooms(5, 3))
-    # The file may have another name now than in training.
-    digest = digest_of([replace(scene, source="before") for scene in read_scenes(path)])
-    rooms = read_test(path)
-    assert rooms.trained(learnt(("sunrgbd", 5, "x"), ("before", 5, digest))) == ["homes"]
-    assert rooms.trained(learnt(("before", 5, "x"))) == []
-    assert RoomList("homes", rooms.scenes[:4]).trained(learnt(("before", 5, digest))) == []
 
 
 @pytest.mark.parametrize(

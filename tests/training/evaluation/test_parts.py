@@ -60,14 +60,6 @@ def test_parts_depend_on_the_scene_and_the_seed_alone():
     assert not torch.equal(whole[:8], whole[8:])
 
 
-def test_other_hidden_classes_are_no_errors():
-    """Of {0, 1, 3} one class is listed: only classes 2 and 4 compete with a hidden one."""
-    parts = draw_parts(tensors([scene([0, 1, 3])]), NO_STRUCTURE, one_quarter)
-    ranking = rank_hidden(parts, NO_STRUCTURE, in_order(parts.v))
-    assert ranking.above.tolist() == [sum(c < h for c in (2, 4)) for h in ranking.target.tolist()]
-    assert len(ranking.target) == 2
-
-
 def test_ties_score_their_expectation_under_random_order():
     """All four candidates are equal: the rank is uniform on 1..4."""
     parts = draw_parts(tensors([scene([0, 2])]), NO_STRUCTURE, all_but_one)

@@ -11,6 +11,11 @@ def figure(value):
     return Figure(value, value, value, 1)
 
 
+def report(source, **metrics):
+    ratios = {name: Ratio.of_scenes(np.array(values)) for name, values in metrics.items()}
+    return {source: SourceReport(source, "", {"T2 missing": Outcome(ratios, 3, 0)})}
+
+
 def test_tables_of_relations_say_that_unlisted_relations_count_as_wrong():
     for task, metric in (("T1b completion", "R-precision"), ("T2 missing", "MRR, one removed")):
         text = Results("a", (Cell("a", task, "x", metric, figure(0.5), (0.5,)),), ()).markdown()
@@ -56,14 +61,9 @@ def test_skipped_scenes_are_listed_by_source():
 
 def test_a_row_is_compared_by_scene_where_the_reference_row_has_the_metric():
     """Differences (.5, .5, -.25) of three scenes; the metric of one row alone is not compared."""
-
-    def report(**metrics):
-        outcome = Outcome({n: Ratio.of_scenes(np.array(v)) for n, v in metrics.items()}, 3, 0)
-        return {"x": SourceReport("x", "", {"T2 missing": outcome})}
-
     reports = {
-        ("ours", 0): report(MRR=[1.0, 0.5, 0.25]),
-        ("other", 0): report(MRR=[0.5, 0.0, 0.5], extra=[1.0, 1.0, 1.0]),
+        ("ours", 0): report("x", MRR=[1.0, 0.5, 0.25]),
+        ("other", 0): report("x", MRR=[0.5, 0.0, 0.5], extra=[1.0, 1.0, 1.0]),
     }
     results = summarise(reports, "ours")
     assert {(cell.row, cell.metric) for cell in results.cells} == {
@@ -81,9 +81,6 @@ def test_a_summary_needs_our_row_and_pairs_equal_scenes():
     """A metric that one row has on two sources, and another row on one of them."""
     with pytest.raises(ValueError, match="no metric of the reference row ours"):
         summarise({}, "ours")
-    both, one = Ratio.of_scenes(np.ones(4)), Ratio.of_scenes(np.ones(2))
-    reports = {
-        (name, 0): {"pooled": SourceReport("pooled", "", {"T2": Outcome({"MRR": metric}, 4, 0)})}
-        for name, metric in (("ours", both), ("other", one))
-    }
+    scenes = {"ours": 4, "other": 2}
+    reports = {(name, 0): report("pooled", MRR=[1.0] * n) for name, n in scenes.items()}
     assert summarise(reports, "ours").differences == ()

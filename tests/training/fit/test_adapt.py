@@ -12,7 +12,6 @@ from app.scene import ObjectClass
 from tests.training.scenes import request
 from training.fit.adapt import HomeScenes, TrainedOn, adapt
 from training.fit.extend import extended
-from training.fit.objects import random_parts
 from training.machines import build
 from training.machines.arrays import machine_of, weights_of
 
@@ -39,6 +38,13 @@ def scenes_of(*classes: list[int], rooms: list[int] | None = None, size: int = V
     return HomeScenes(v, observed, torch.tensor(rooms or [-1] * len(classes)))
 
 
+def probabilities(weights: Weights, *listed: int) -> torch.Tensor:
+    """(V,), of each class beside the listed ones."""
+    v = torch.zeros(1, V)
+    v[0, list(listed)] = 1
+    return machine_of(weights).object_log_odds(v).sigmoid()[0]
+
+
 HOME = [[0, 1, 2], [0, 1, 3], [0, 1, 2, 3], [0, 1]] * 6
 
 
@@ -50,11 +56,7 @@ def test_the_home_becomes_likelier_and_other_classes_keep_their_weights(variant)
     np.testing.assert_array_equal(weights["W"][rest], parent["W"][rest])
     changed = [name for name in parent.arrays if not np.array_equal(weights[name], parent[name])]
     assert sorted(changed) == ["W", "b"]
-    listed = torch.zeros(1, V)
-    listed[0, 0] = 1
-    before, after = (
-        machine_of(side).object_log_odds(listed).sigmoid()[0] for side in (parent, weights)
-    )
+    before, after = (probabilities(side, 0) for side in (parent, weights))
     assert after[1] > before[1] + 0.2
     assert (after[rest] < before[rest] + 0.02).all()
 
@@ -82,12 +84,8 @@ def test_a_class_that_is_left_out_keeps_its_log_odds():
 def test_more_scenes_without_a_class_make_it_less_likely():
     """The target is the answer of the parent over 1 + the expected number of its scenes."""
     parent = small()
-    listed = torch.zeros(1, V)
-    listed[0, 0] = 1
-    before, few, many = (
-        float(machine_of(side).object_log_odds(listed).sigmoid()[0, 5])
-        for side in (parent, *(adapt(parent, scenes_of(*HOME[:n])) for n in (2, 24)))
-    )
+    sides = parent, *(adapt(parent, scenes_of(*HOME[:n])) for n in (2, 24))
+    before, few, many = (float(probabilities(side, 0)[5]) for side in sides)
     assert few > 0.9 * before
     assert many < 0.8 * before
 
@@ -99,31 +97,11 @@ def test_a_class_that_the_parent_hardly_knows_is_learnt_from_few_scenes():
     weights["b"][3] = -10
     parent, home = Weights(small().spec, weights), scenes_of(*HOME)
     trained_on = TrainedOn(torch.arange(V) != 3, C)
-    listed = torch.zeros(1, V)
-    listed[0, :2] = 1
     rare, common = (
-        float(machine_of(adapt(parent, home, trained_on=x)).object_log_odds(listed).sigmoid()[0, 3])
-        for x in (trained_on, None)
+        float(probabilities(adapt(parent, home, trained_on=x), 0, 1)[3]) for x in (trained_on, None)
     )
     assert common < 0.2
     assert 0.3 < rare < 0.7
-
-
-def test_distillation_keeps_the_answers_about_stored_samples(monkeypatch):
-    """Without it, the rooms of the parent change several times more."""
-    parent, home = small(), scenes_of(*HOME)
-    samples = torch.from_numpy(parent.chain_samples)
-    samples = samples[samples.sum(1) > 1]
-    parts = random_parts(samples, 0.3, torch.Generator().manual_seed(1))
-
-    def change() -> float:
-        sides = parent, adapt(parent, home)
-        p, q = (machine_of(x).object_log_odds(parts.listed).sigmoid() for x in sides)
-        return float((p - q).abs()[parts.listed == 0].mean())
-
-    kept = change()
-    monkeypatch.setattr("training.fit.adapt._DISTILLATION", 0.0)
-    assert change() > 1.5 * kept
 
 
 def test_a_home_without_pairs_or_a_model_without_samples_is_refused():

@@ -76,8 +76,9 @@ def test_every_entry_is_fitted(fitted):
     assert fitted.missing.slope > 0
     assert fitted.covered.slope > 0
     assert fitted.outlier.slope < 0
-    # The likelier a stand, the less probably it is wrong.
+    # The likelier a stand, the less probably it is wrong: moved boxes stand at unlikely places.
     assert fitted.misplaced.stand.stand < 0
+    assert fitted.misplaced.support.stand < 0
     # The machine has no relation weights, so the counts tell what stands where.
     assert all(entry.counts > 0 for entry in fitted.at)
     scenes = ObjectScenes.of(rooms(ROOM_COUNT, 2), STRUCTURE, CONFIG)
@@ -89,11 +90,6 @@ def test_chosen_values_are_copied(model, fitted):
     again = calibrate(model, data_of(rooms(60, 1)), CONFIG, chosen=chosen)
     assert (again.coverage, again.popularity_weight) == (0.15, 0.25)
     assert again.missing != fitted.missing
-
-
-@pytest.mark.slow
-def test_a_seed_gives_the_same_calibration(model, fitted):
-    assert calibrate(model, data_of(rooms(200, 1)), CONFIG) == fitted
 
 
 def test_scenes_count_by_weight_and_incomplete_ones_not_at_all():
@@ -145,8 +141,6 @@ def test_the_coverage_that_ranks_best_is_chosen(monkeypatch):
     monkeypatch.setattr(of_objects, "_fit_covered", lambda *_: CoverageFit())
     model = SimpleNamespace(vocabulary=SimpleNamespace(structure=np.zeros(WIDE, np.bool_)))
     assert of_objects.fit_missing(model, scenes)["coverage"] == 0.45
-    chosen = Calibration.neutral(A).model_copy(update={"coverage": 0.8})
-    assert of_objects.fit_missing(model, scenes, chosen)["coverage"] == 0.8
 
 
 @pytest.mark.parametrize(
@@ -322,22 +316,18 @@ def test_sources_without_false_relations_take_no_part(random_artifact, fit):
         assert fit(random_artifact, [*known, *vague]) == pytest.approx(fit(random_artifact, known))
 
 
-@pytest.mark.parametrize(("intercept", "shift"), [(-0.2, 0.0), (0.2, -0.4), (0.5, -0.8), (5, 0)])
-def test_sides_are_lowered_until_the_listed_relation_of_stacked_objects_is_likeliest(
-    intercept, shift
-):
-    """On-top has the log-odds .05. If no shift is enough, nothing changes."""
+def test_sides_are_lowered_until_the_listed_relation_of_stacked_objects_is_likeliest():
+    """On-top has the log-odds .05. Other values of the sides: test_pair_task."""
     machine = build(MachineSpec("triway", V=9, A=A, units=1, K=1, T=1))
     machine.set_triples(torch.tensor([[ON_TOP, 1, 0]]))
     with torch.no_grad():
         machine.residual.fill_(0.05)
     artifact = artifact_of(machine.eval().requires_grad_(False))
-    sides = CountSlope(intercept=intercept)
+    sides = CountSlope(intercept=0.2)
     slopes = tuple(sides if a in LATERAL else CountSlope() for a in range(A))
     stacked = scene([0, 1, 2], [(ON_TOP, 1, 0), (LEFT, 2, 0)])
     lowered = with_lower_lateral(artifact, slopes, tensors([stacked] * 3, 9))
     for a in range(A):
-        expected = intercept + shift if a in LATERAL else 0.0
-        assert lowered[a].intercept == pytest.approx(expected)
+        assert lowered[a].intercept == pytest.approx(0.2 - 0.4 if a in LATERAL else 0.0)
     beside = scene([0, 1], [(LEFT, 1, 0)])
     assert with_lower_lateral(artifact, slopes, tensors([beside], 9)) == slopes

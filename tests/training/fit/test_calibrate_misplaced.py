@@ -3,23 +3,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy.special import expit
 
-from app.model import AlarmLine, AlarmLines, Judgement, Misplaced
+from app.model import Misplaced
 from app.questions import misplaced
-from app.questions.misplaced import BESIDE, STAND, SUPPORT, wrong_log_odds
-from app.scene import observe
+from app.questions.misplaced import BESIDE, STAND, SUPPORT
 from app.scene.spatial_relations import ON_TOP
 from tests.questions.artifacts import artifact_of
-from tests.training.evaluation.furnished_rooms import VOCABULARY, A, rooms
+from tests.training.evaluation.furnished_rooms import A
 from tests.training.evaluation.scenes import scene
 from training.datasets.cases import draw_true_relations, scene_of, scene_rng
-from training.datasets.moved import moved_by_triple, moved_scene, posed_scene
-from training.datasets.roles import count_roles
+from training.datasets.moved import moved_by_triple
 from training.evaluation.alarms import ALARMS
 from training.fit import calibrate_misplaced as module
 from training.fit.calibrate_misplaced import fit_misplaced, hardest_quantile
-from training.fit.draft import draft_artifact, fit_places
 from training.machines import MachineSpec, build
 
 V, SUPPORTERS = 9, 4
@@ -123,61 +119,6 @@ def test_a_machine_that_finds_true_supports_unlikely_does_not_judge(artifact):
     weights["residual"] = -weights["residual"]
     inverted = replace(artifact, weights=replace(artifact.weights, arrays=weights))
     assert fit_misplaced(inverted, world(60, 0)).support is None
-
-
-@pytest.mark.slow
-def test_moved_boxes_stand_at_less_likely_places():
-    """Of rooms with boxes, and a machine that knows only what objects of each class stand on."""
-    spec = MachineSpec("triway", V=len(VOCABULARY), A=A, units=1, K=1)
-    places = fit_places(rooms(200, 2).scenes, count_roles((), VOCABULARY), VOCABULARY)
-    model = draft_artifact(build(spec).eval().requires_grad_(False), VOCABULARY, places=places)
-    fitted = fit_misplaced(model, rooms(80, 1).scenes)
-    assert fitted.stand.stand < 0
-    assert fitted.support.stand < 0
-    model, sizes = judging(model, fitted), VOCABULARY.sizes
-    before, after = [], []
-    for one in rooms(60, 3).scenes:
-        moved = moved_scene(one, VOCABULARY.structure, scene_rng(one, 0))
-        if moved is None:
-            continue
-        for request, values in ((posed_scene(one), before), (moved[0], after)):
-            entries = misplaced(model, observe(request, typical_sizes=sizes, roles=places.roles))
-            values.append(
-                max((e["probability"] for e in entries if e["moved"] == str(moved[1])), default=0.0)
-            )
-    assert len(after) > 40
-    assert np.mean(after) > np.mean(before) + 0.1
-
-
-SILENT = AlarmLines(**dict.fromkeys(ALARMS, AlarmLine(intercept=0.0)))
-BY_RELATION = Judgement(
-    intercept=0.0, relation=-1.0, change=0.0, stand=0.0, supporter=0.0, lines=SILENT
-)
-
-
-def lists(count: int, size: int, seed: int, scale: float = 0.7):
-    """Untouched scenes with entries whose log-odds to be wrong are logistic."""
-    terms = np.zeros((count * size, 4))
-    terms[:, 0] = -np.random.default_rng(seed).logistic(0.0, scale, count * size)
-    number, every = np.repeat(np.arange(count), size), np.ones(count * size, dtype=np.bool_)
-    constants = np.full(len(every), "toy"), every, every, np.full(len(every), SUPPORT)
-    return module._Cases(number, number, *constants, terms, ~every, np.ones(len(every)))
-
-
-@pytest.mark.parametrize("budget", [0.1, 0.45])
-def test_lines_keep_the_share_at_each_length(budget):
-    """4,000 scenes of each length. The deviation from a line is below a tenth of the share."""
-    lines = module._alarm_lines(BY_RELATION, lists(4000, 32, 0), budget)
-    for n in (1, 4, 16):
-        assert lines.low.threshold(n) > lines.medium.threshold(n) > lines.high.threshold(n)
-    for name, promise in ALARMS.items():
-        share, line = budget * promise, getattr(lines, name)
-        error = np.sqrt(2 * share * (1 - share) / 4000)
-        for n in (1, 2, 8, 32):
-            p = expit(wrong_log_odds(BY_RELATION, lists(4000, n, n).terms)).reshape(-1, n)
-            assert (p >= line.threshold(n)).any(1).mean() <= 1.1 * share + 4 * error
-        # The quantile of each length has a standard error of .7 / sqrt(4000 share).
-        assert line.log_count == pytest.approx(0.7, abs=0.03 + 1 / np.sqrt(4000 * share))
 
 
 @pytest.mark.parametrize("share", ALARMS.values())

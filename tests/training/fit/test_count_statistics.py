@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from app.model import Counts
+from app.model.fields import TensorGroup
 from app.registry.tensors import read_group
 from app.scene import CANONICAL, ObjectClass, Vocabulary
 from tests.training.evaluation.furnished_rooms import VOCABULARY, room_model, rooms
@@ -57,9 +58,13 @@ def test_the_scene_moves_the_expected_number():
             assert expected(counts, anchor, listed) == pytest.approx(
                 exact(law, listed), abs=0.15
             ), (anchor, listed)
-    again = read_group(Counts, counts.tensors(), len(CANONICAL), len(WORDS), 2)
+    check_stored_exactly(counts, len(WORDS), 2)
+
+
+def check_stored_exactly(group: TensorGroup, classes: int, rooms: int) -> None:
+    again = read_group(type(group), group.tensors(), len(CANONICAL), classes, rooms)
     assert again is not None
-    for name, tensor in counts.tensors().items():
+    for name, tensor in group.tensors().items():
         assert np.array_equal(again.tensors()[name], tensor)
         if tensor.ndim > 1:
             assert np.array_equal(tensor.astype(np.float16), tensor), "half precision changes it"

@@ -479,30 +479,25 @@ def test_long_chains_have_the_shares_of_the_scenes(name):
     assert not machine.u[1, 3]
 
 
-def test_a_population_weighs_scenes_by_source():
-    scenes = scenes_of(SHOWS)
-    *by_source, mixed = long_chains.populations(scenes, SERVED)
-    expected = (2 * by_source[0].p + by_source[1].p) / 3
-    np.testing.assert_allclose(mixed.p, expected)
+@pytest.mark.parametrize(
+    ("second", "served", "weights"),
+    [
+        ("procthor", {"sunrgbd": 2.0, "procthor": 1.0}, [2 / 3, 1 / 3]),
+        ("procthor", {"3dssg": 1.0}, [1 / 2, 1 / 2]),  # no served source has scenes
+        # Beside a source of whole rooms, lists of camera frames do not count.
+        ("virtualhome", {"sunrgbd": 2.0, "virtualhome": 1.0}, [0, 1]),
+    ],
+)
+def test_the_served_mix_weighs_its_sources(second, served, weights):
+    scenes = replace(scenes_of(SHOWS), sources=("sunrgbd", second))
+    config = ObjectsConfig(served_sources=served)
+    *by_source, mixed = long_chains.populations(scenes, config)
     for q, population in enumerate(by_source):
         own = scenes.v[scenes.source == q].double().mean(0)
         np.testing.assert_allclose(population.p, own)
-
-
-def test_served_sources_without_scenes_leave_a_mix_of_all():
-    elsewhere = ObjectsConfig(served_sources={"3dssg": 1.0})
-    *_, mixed = long_chains.populations(scenes_of(SHOWS), elsewhere)
-    *_, equal = long_chains.populations(scenes_of(SHOWS), ObjectsConfig())
-    np.testing.assert_array_equal(mixed.p, equal.p)
-
-
-def test_the_served_mix_has_whole_rooms_only():
-    """Beside a source of whole rooms, lists of camera frames do not count."""
-    scenes = replace(scenes_of(SHOWS), sources=("sunrgbd", "virtualhome"))
-    config = ObjectsConfig(served_sources={"sunrgbd": 2.0, "virtualhome": 1.0})
-    *_, whole, mixed = long_chains.populations(scenes, config)
-    np.testing.assert_allclose(mixed.p, whole.p)
-    np.testing.assert_array_equal(mixed.shows, whole.shows)
+    np.testing.assert_allclose(mixed.p, weights @ np.stack([one.p for one in by_source]))
+    shown = SHOWS[np.array(weights) > 0].any(0)
+    np.testing.assert_array_equal(mixed.shows, shown)
 
 
 def test_served_scenes_of_long_chains_are_the_plausible_ones():
@@ -534,18 +529,6 @@ def test_chains_start_at_each_room_type_in_proportion():
     rooms = mixed.room[mixed.draw(300, np.random.default_rng(0))]
     for room in (-1, 0, 1):
         assert abs((rooms == room).sum() - 300 * mixed.weight[mixed.room == room].sum()) <= 1
-
-
-def test_chains_continue_from_call_to_call():
-    machine, scenes = machine_of("coupled", scale=0.6), scenes_of(SHOWS)
-    population = next(long_chains.populations(scenes, SERVED))
-    chains = long_chains.scene_chains(weights_of(machine))
-    once, twice = (long_chains.LongChains(chains, scenes, population, 6, seed=3) for _ in range(2))
-    share = once.run(20)
-    halves = twice.run(10), twice.run(10)
-    np.testing.assert_array_equal(once.on, twice.on)
-    np.testing.assert_allclose(share, (halves[0] + halves[1]) / 2)
-    assert share.shape == (6, V)
 
 
 def test_only_a_drift_beyond_its_limit_is_an_objection(monkeypatch):

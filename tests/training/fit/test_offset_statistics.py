@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, invgamma, norm
 
-from app.model import Offsets
-from app.registry.tensors import read_group
-from app.scene import CANONICAL
 from app.scene.spatial_relations import LEFT, ON_TOP
 from tests.training.evaluation.scenes import scene
+from tests.training.fit.test_count_statistics import check_stored_exactly
 from training.datasets import encode, generate_rooms, rooms_vocabulary
 from training.datasets.cases import observed_offsets
 from training.fit.offset_statistics import fit_offsets, log_likelihood, posterior
@@ -157,9 +155,4 @@ def test_relations_and_objects_without_poses_mean_nothing():
 def test_the_model_file_holds_the_statistics_exactly():
     vocabulary = rooms_vocabulary()
     offsets = fit_offsets(encode(generate_rooms(150, seed=0), vocabulary), len(vocabulary))
-    again = read_group(Offsets, offsets.tensors(), len(CANONICAL), len(vocabulary), 0)
-    assert again is not None
-    for name, tensor in offsets.tensors().items():
-        assert np.array_equal(again.tensors()[name], tensor)
-        if tensor.ndim > 1:
-            assert np.array_equal(tensor.astype(np.float16), tensor), "half precision changes it"
+    check_stored_exactly(offsets, len(vocabulary), 0)

@@ -1,10 +1,10 @@
-import gzip
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from tests.training.scenes import scene
+from training.datasets.jsonl import write_jsonl
 from training.fit.configuration import ConfigError, DataConfig
 from training.runs.pipeline import read_sources, split_and_encode
 
@@ -13,18 +13,13 @@ LABELS = ["bed", "sink", "lamp", "oven", "sofa", "desk", "shelf", "towel", "plan
 
 def write_scenes(folder, source, *, seed=0, relations=False):
     rng = np.random.default_rng(seed)
-    lines = []
-    for k in range(140):
-        names = rng.choice(LABELS, size=rng.integers(3, 7), replace=False)
-        objects = [{"id": i, "label": str(name)} for i, name in enumerate(names)]
-        scene = {
-            "scene_id": f"{source}-{k}", "source": source, "group": f"{source}-{k}",
-            "room_type": None, "objects": objects,
-            "relations": [[0, "on-top", 1]] if relations else None,
-        }  # fmt: skip
-        lines.append(json.dumps(scene))
-    with gzip.open(folder / f"{source}.jsonl.gz", "wt") as file:
-        file.write("\n".join(lines))
+    listed = [(0, "on-top", 1)] if relations else None
+    lists = (rng.choice(LABELS, size=rng.integers(3, 7), replace=False) for _ in range(140))
+    scenes = [
+        replace(scene(f"{source}-{k}", *labels.tolist(), relations=listed), source=source)
+        for k, labels in enumerate(lists)
+    ]
+    write_jsonl(scenes, folder / f"{source}.jsonl.gz")
 
 
 def material(folder, **settings):

@@ -1,10 +1,10 @@
 import pytest
 
+from tests.training.commands import small_config, write_config
 from training.datasets.files import DATA
 from training.datasets.sources import SOURCES
-from training.fit.configuration import Config, ConfigError, source_name
+from training.fit.configuration import ConfigError, source_name
 from training.runs.config_files import (
-    config_toml,
     data_folder,
     load_config,
     shipped_configs,
@@ -29,41 +29,30 @@ def test_the_shipped_variants_learn_from_the_same_scenes() -> None:
     assert len({config.data.model_dump_json() for config in variants}) == 1
 
 
-def small(variant="triway", rooms=10, **machine):
-    return {
-        "name": "small",
-        "data": {"sources": ["rooms"], "rooms": rooms},
-        "machine": {"variant": variant, **machine},
-        "objects": {"steps": 300},
-    }
-
-
 @pytest.mark.parametrize(
-    ("values", "message"),
+    ("settings", "message"),
     [
-        (small("rbm", G=2), "machine.G is defined for the Triway only"),
-        (small("rbm", without=["S"]), "a rbm has no weights S"),
-        (small(rooms=0), "data.rooms must be at least 1"),
+        ({"machine.variant": "rbm", "machine.G": 2}, "machine.G is defined for the Triway only"),
+        ({"machine.variant": "rbm", "machine.without": ["S"]}, "a rbm has no weights S"),
+        ({"data.rooms": 0}, "data.rooms must be at least 1"),
     ],
 )
-def test_settings_that_exclude_each_other_are_refused(values, message) -> None:
-    with pytest.raises(ValueError, match=message):
-        Config.model_validate(values)
+def test_settings_that_exclude_each_other_are_refused(settings, message) -> None:
+    with pytest.raises(ConfigError, match=message):
+        with_settings(small_config(), settings)
 
 
 def test_a_configuration_is_written_and_read_back(tmp_path) -> None:
-    path = tmp_path / "small.toml"
     changes = {"objects.source_weights": {"rooms": 0.5}, "objects.open_sources": ("rooms",)}
-    config = with_settings(Config.model_validate(small()), changes)
-    path.write_text(config_toml(config))
+    config = with_settings(small_config(), changes)
+    path = write_config(tmp_path / "small.toml", config)
     assert load_config(str(path)) == config
 
 
 def test_a_shortened_training_keeps_at_least_one_step() -> None:
-    config = Config.model_validate(small())
-    tenth = shortened(config, 0.1)
-    assert (tenth.objects.steps, tenth.relations.epochs) == (30, 1)
-    assert shortened(config, 1e-6).objects.steps == 1
+    tenth = shortened(small_config(), 0.1)
+    assert (tenth.objects.steps, tenth.relations.epochs) == (20, 1)
+    assert shortened(small_config(), 1e-6).objects.steps == 1
 
 
 FILES = """
@@ -131,12 +120,3 @@ def test_a_base_gives_the_entries_that_a_file_lacks(tmp_path) -> None:
     path.write_text(text.replace("places-triway", "nowhere"))
     with pytest.raises(ConfigError, match=r"mine\.toml: base must be one of .*places-triway"):
         load_config(str(path))
-
-
-def test_knowledge_alone_needs_no_data(tmp_path) -> None:
-    config = with_settings(load_config("knowledge-triway"), {"data.written": 1})
-    scenes = prepare(config, tmp_path)
-    assert {scene.source for scenes_ in scenes.parts.values() for scene in scenes_} == {
-        "inventories"
-    }
-    assert len(scenes.vocabulary) > 1500

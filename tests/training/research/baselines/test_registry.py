@@ -21,8 +21,9 @@ from training.evaluation.baselines.fitting import TRIALS, Baseline, drawn_settin
 from training.evaluation.missing_tasks import removed_places
 from training.evaluation.moved_task import moved_cases
 from training.evaluation.relation_tasks import with_observed
-from training.research.baselines import BASELINES
+from training.research.baselines import BASELINES, networks
 
+TRAIN, VALIDATION = furnished(300, seed=1), furnished(60, seed=2)
 EVERY = tuple(BASELINES.values())
 OBJECTS, OF_ROOMS, OF_RELATIONS, COMPLETIONS, (SUPPORTERS,) = (
     [one for one in EVERY if one.answer is answer]
@@ -35,6 +36,14 @@ OBJECTS, OF_ROOMS, OF_RELATIONS, COMPLETIONS, (SUPPORTERS,) = (
 PROGRESS = defaultdict(list)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _short_courses():
+    """A few steps suffice for two kinds of rooms."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(networks, "_STEPS", 60)
+        yield
+
+
 def named(baselines):
     return pytest.mark.parametrize("baseline", baselines, ids=lambda baseline: baseline.name)
 
@@ -42,27 +51,27 @@ def named(baselines):
 @cache
 def fitted(baseline: Baseline):
     """One fit of each, shared by the tests."""
-    parts, say = (furnished(300, seed=1), furnished(60, seed=2)), PROGRESS[baseline.name].append
-    return baseline.fit(*parts, STRUCTURE, seed=0, progress=say)
+    say = PROGRESS[baseline.name].append
+    return baseline.fit(TRAIN, VALIDATION, STRUCTURE, seed=0, progress=say)
 
 
 @cache
 def value(baseline: Baseline) -> float:
     score = getattr(fitted(baseline), baseline.answer.fields[0])
-    return baseline.answer.judge(furnished(60, seed=2), STRUCTURE, score)
+    return baseline.answer.judge(VALIDATION, STRUCTURE, score)
 
 
-def answers(baseline: Baseline, score, scenes):
+def answers(baseline: Baseline, score):
     if baseline in OBJECTS:
-        return score(scenes.v)
+        return score(VALIDATION.v)
     if baseline is PLACED:
-        return score(removed_places(scenes, STRUCTURE)[2])
+        return score(removed_places(VALIDATION, STRUCTURE)[2])
     if baseline is SUPPORTERS:
-        cases = moved_cases(scenes, STRUCTURE)
+        cases = moved_cases(VALIDATION, STRUCTURE)
         return torch.tensor([entry["probability"] for case in cases for entry in score(case.moved)])
     if baseline in OF_ROOMS:
-        return score(scenes.v, "toy")
-    return score(scenes.batch(torch.arange(20)))
+        return score(VALIDATION.v, "toy")
+    return score(VALIDATION.batch(torch.arange(20)))
 
 
 # These have few settings, or none.
@@ -122,9 +131,9 @@ def test_objects_belong_to_their_room(baseline):
 
 
 @named(OBJECTS)
-def test_object_scores_are_numbers_and_scenes_do_not_mix(baseline, validation):
+def test_object_scores_are_numbers_and_scenes_do_not_mix(baseline):
     score = fitted(baseline).missing
-    scenes = torch.cat([validation.v[:20], torch.zeros(1, V)])
+    scenes = torch.cat([VALIDATION.v[:20], torch.zeros(1, V)])
     values = score(scenes)
     assert values.shape == (21, V)
     candidates = (scenes == 0) & ~STRUCTURE
@@ -134,12 +143,12 @@ def test_object_scores_are_numbers_and_scenes_do_not_mix(baseline, validation):
 
 
 @named(EVERY)
-def test_stochastic_fits_depend_on_the_seed_alone(baseline, validation):
+def test_stochastic_fits_depend_on_the_seed_alone(baseline):
     """By the first setting that a baseline tries."""
     torch.manual_seed(123)
     state = torch.get_rng_state()
     first, again, other = (
-        answers(baseline, next(baseline.propose(validation, STRUCTURE, seed))[1], validation)
+        answers(baseline, next(baseline.propose(VALIDATION, STRUCTURE, seed))[1])
         for seed in (0, 0, 1)
     )
     assert torch.equal(torch.get_rng_state(), state), "the global generator was disturbed"
@@ -153,8 +162,8 @@ def test_relations_beat_popularity(baseline):
 
 
 @named(OF_RELATIONS)
-def test_relation_scores_ignore_the_true_relations(baseline, validation):
-    batch = validation.batch(torch.arange(10))
+def test_relation_scores_ignore_the_true_relations(baseline):
+    batch = VALIDATION.batch(torch.arange(10))
     blank = with_observed(batch)
     score = fitted(baseline).relations
     assert score(batch).shape == batch.holds.shape
@@ -183,32 +192,26 @@ def test_closure_completes_chains_that_the_table_cannot():
     assert closure > table + 0.1
 
 
-def test_the_placed_table_finds_the_missing_class(train, validation):
+def test_the_placed_table_finds_the_missing_class():
     """On the second class lies the first of its room; the product with EASE is no worse."""
     assert value(PLACED) > 0.8
     ease, table = (fitted(b) for b in (BASELINES["EASE"], PLACED))
     product = placed_product("EASE", ease, table)
     assert "× EASE" in product.name
-    score = product.fit(train, validation, STRUCTURE).at_place
-    assert product.answer.judge(validation, STRUCTURE, score) >= value(PLACED) - 0.02
+    score = product.fit(TRAIN, VALIDATION, STRUCTURE).at_place
+    assert product.answer.judge(VALIDATION, STRUCTURE, score) >= value(PLACED) - 0.02
 
 
 @named(EVERY)
-def test_nothing_to_learn_from_is_an_error(baseline, validation):
-    empty = tensors([scene([], annotated=False)])
-    with pytest.raises(ValueError, match="the 1 training scenes contain no objects"):
-        baseline.fit(empty, validation, STRUCTURE)
+def test_nothing_to_learn_from_is_an_error(baseline):
+    related = [("observed relation", [0, 1])] if baseline.answer.of_relations else []
+    for what, classes in (("objects", []), *related):
+        with pytest.raises(ValueError, match=f"the 1 training scenes contain no {what}"):
+            baseline.fit(tensors([scene(classes, annotated=False)]), VALIDATION, STRUCTURE)
 
 
-@named([one for one in EVERY if one.answer.of_relations])
-def test_no_relation_to_learn_from_is_an_error(baseline, validation):
-    bare = tensors([scene([0, 1], annotated=False)])
-    with pytest.raises(ValueError, match="the 1 training scenes contain no observed relation"):
-        baseline.fit(bare, validation, STRUCTURE)
-
-
-def test_a_score_that_is_no_number_is_an_error(train, validation):
+def test_a_score_that_is_no_number_is_an_error():
     answer = fitting.Answer((), lambda *_: float("nan"))
     broken = Baseline("broken", lambda *_: iter([({}, None)]), answer)
     with pytest.raises(FloatingPointError, match="broken"):
-        broken.fit(train, validation, STRUCTURE)
+        broken.fit(TRAIN, VALIDATION, STRUCTURE)

@@ -1,9 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import torch
 
 from app.scene import ObjectClass, Vocabulary
 from app.scene.spatial_relations import INSIDE, LEFT, ON_TOP
-from training.datasets import AnnotatedObject, AnnotatedScene, annotated_classes, encode
+from tests.training.scenes import scene
+from training.datasets import annotated_classes, encode
 from training.datasets.batches import scene_tensors
 from training.datasets.cases import scene_of
 from training.datasets.moved import posed_scene
@@ -25,19 +28,15 @@ BOXES = {
 }
 
 
-def bare(number, source="virtualhome", relations=((1, "on-top", 0),)):
-    things = tuple(AnnotatedObject(str(k), x) for k, x in enumerate(("table", "cup", "bed")))
-    return AnnotatedScene(f"{source} {number}", source, f"g{number}", None, things, relations)
+def bare(number, relations=((1, "on-top", 0),)):
+    listed = scene(f"bare {number}", "table", "cup", "bed", relations=relations)
+    return replace(listed, source="virtualhome")
 
 
-def posed(number, labels=tuple(BOXES)):
-    things = tuple(
-        AnnotatedObject(str(k), label, position=BOXES[label][0], size=BOXES[label][1])
-        for k, label in enumerate(labels)
-    )
-    return AnnotatedScene(
-        f"posed {number}", "procthor", f"p{number}", None, things, viewer_frame=True
-    )
+def posed(number):
+    positions, sizes = zip(*BOXES.values(), strict=True)
+    whole = scene(f"posed {number}", *BOXES, position=positions, size=sizes)
+    return replace(whole, source="procthor", viewer_frame=True)
 
 
 def tensors(*scenes):
@@ -50,8 +49,8 @@ SUSPICION[CUP, [TABLE, BED, NOTHING]] = 1.0, 2.0, 3.0
 SUSPICION[[TABLE, BED], NOTHING] = 0.0, -1.0
 
 
-def judged(scene):
-    entries = supporter_score(SUSPICION, VOCABULARY.structure)(scene)
+def judged(asked):
+    entries = supporter_score(SUSPICION, VOCABULARY.structure)(asked)
     assert all(entry["moved"] == entry["subject"] for entry in entries)
     logit = [np.log(p / (1 - p)) for p in (entry["probability"] for entry in entries)]
     assert logit == sorted(logit, reverse=True)
