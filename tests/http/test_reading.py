@@ -5,11 +5,11 @@ from typing import Any
 
 import pytest
 from httpx import AsyncClient
+from scipy.spatial.transform import Rotation
 
 from scene_client.schemas import RoomsAnswer
 from tests.http.test_problems import pointers, problem
 from tests.http.test_questions import LAMP_ON_DESK, ask, at, triples
-from tests.scene.turns import Turn, about, after
 
 CAMERA = "camera_optical_frame"
 Triples = set[tuple[str, str, str]]
@@ -346,23 +346,23 @@ async def test_a_training_scene_is_a_request(client: AsyncClient) -> None:
 async def test_a_scene_in_three_frames_has_equal_relations(client: AsyncClient) -> None:
     """A lying board beside a desk with a lamp, by a robot, by its camera, and in a map."""
     robot = (3.0, -1.0, 2.0)
-    to_optical: Turn = (0.5, -0.5, 0.5, 0.5)
-    lying: Turn = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
-    cos, sin = math.cos(robot[2]), math.sin(robot[2])
+    to_map, to_optical = Rotation.from_euler("z", robot[2]), Rotation.from_quat([1, -1, 1, 1])
+    lying = math.pi / 2
     seen: dict[str, list[Any]] = {"base_link": [], CAMERA: [], "map": []}
     for name, (x, y, z), size, turn in (
-        ("desk", (2.0, 0.0, 0.4), (0.7, 1.4, 0.8), about((0, 0, 1), 0.3)),
-        ("lamp", (2.0, 0.2, 1.0), (0.2, 0.2, 0.4), about((0, 0, 1), -1.0)),
-        ("chair", (1.5, 1.4, 0.3), (0.5, 1.2, 0.4), after(about((0, 0, 1), 1.0), lying)),
+        ("desk", (2.0, 0.0, 0.4), (0.7, 1.4, 0.8), [0.3, 0.0]),
+        ("lamp", (2.0, 0.2, 1.0), (0.2, 0.2, 0.4), [-1.0, 0.0]),
+        ("chair", (1.5, 1.4, 0.3), (0.5, 1.2, 0.4), [1.0, lying]),
     ):
-        in_map = (robot[0] + cos * x - sin * y, robot[1] + sin * x + cos * y, z)
-        for frame, place, turned in (
-            ("base_link", (x, y, z), turn),
-            (CAMERA, (-y, -z, x), after(to_optical, turn)),
-            ("map", in_map, after(about((0, 0, 1), robot[2]), turn)),
+        x_map, y_map, _ = to_map.apply([x, y, z])
+        for frame, place, frame_turn in (
+            ("base_link", (x, y, z), Rotation.identity()),
+            (CAMERA, (-y, -z, x), to_optical),
+            ("map", (robot[0] + x_map, robot[1] + y_map, z), to_map),
         ):
+            turned = (frame_turn * Rotation.from_euler("ZX", turn)).as_quat().tolist()
             thing = {"label": name, "position": at(*place), "size": at(*size)}
-            seen[frame].append(thing | {"orientation": dict(zip("xyzw", turned, strict=True))})
+            seen[frame].append(thing | {"orientation": turned})
     here = await observed(client, objects=seen["base_link"], frame_id="base_link")
     assert here >= {("lamp", "on-top", "desk"), ("chair", "left", "desk")}
     assert await observed(client, objects=seen[CAMERA], frame_id=CAMERA) == here
