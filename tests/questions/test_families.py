@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from app.questions.missing import missing
@@ -78,17 +77,3 @@ def test_places_follow_the_same_rule(at):
     answers = ask("desk", "bed", at=at)
     assert not {"lamp", "shelf", "desk", "bed"} & answers.keys()
     assert len({"sofa", "vase"} & answers.keys()) == 1
-
-
-def test_families_are_transitive():
-    index = VOCABULARY.labels.index
-    expected = {
-        *(("desk", "lamp"), ("shelf", "desk"), ("shelf", "lamp"), ("chair", "lamp")),
-        ("vase", "sofa"),
-    }
-    found = {
-        (VOCABULARY.labels[i], VOCABULARY.labels[j]) for i, j in np.argwhere(VOCABULARY.broader)
-    }
-    assert found == expected
-    assert VOCABULARY.related[index("lamp"), index("shelf")]
-    assert not VOCABULARY.related[index("desk"), index("chair")]
