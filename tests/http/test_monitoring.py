@@ -118,7 +118,7 @@ async def test_unknown_paths_and_methods_add_no_metrics(client: AsyncClient) -> 
 
 async def test_alarms_unknown_labels_and_warnings_are_counted(tmp_path: Path) -> None:
     publish(tmp_path, "home", "1.0.0", alias="default")
-    publish(tmp_path, "unsure", "1.0.0", judges=False)
+    publish(tmp_path, "unsure", "1.0.0", calibration={})
     labels = ["sofa", "nightstand", "nigthstand", "toilet", "bed lamp", "flux capacitor"]
     relations = [{"subject": "sofa", "relation": "front", "object": "nightstand"}]
     scene = {"objects": labels, "relations": relations, "unknown_labels": "nearest-or-ignore"}
