@@ -18,7 +18,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
+from socketserver import BaseServer
+from typing import Any, TypeVar
 
 import httpx
 import pytest
@@ -33,6 +34,7 @@ CONTROL = {"objects": ["bed", "lamp", {"id": "desk_1", "label": "desk"}], "seed"
 NAMED = {"allowed_hosts": ["service"]}
 """Settings of a service in process; its clients use the URL http://service."""
 
+Server = TypeVar("Server", bound=BaseServer)
 Replace = Callable[[str, Callable[..., Any]], None]
 
 WITHOUT_TRAINING = """
@@ -268,16 +270,24 @@ def launch(
 
 
 @contextmanager
-def http_server(handler: type[BaseHTTPRequestHandler], **options: Any) -> Iterator[str]:
-    """Run a server of the standard library in a thread without a log, and yield its URL."""
-    quiet = type("Quiet", (handler,), {"log_message": lambda *_: None})
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(quiet, **options))
-    thread = threading.Thread(target=server.serve_forever)
+def in_thread(server: Server) -> Iterator[Server]:
+    """Run a server of the standard library in a thread."""
+    thread = threading.Thread(target=server.serve_forever, args=(0.01,))
     thread.start()
-    yield f"http://127.0.0.1:{server.server_port}"
-    server.shutdown()
-    thread.join()
-    server.server_close()
+    try:
+        yield server
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+@contextmanager
+def http_server(handler: type[BaseHTTPRequestHandler], **options: Any) -> Iterator[str]:
+    """Run a server without a log, and yield its URL."""
+    quiet = type("Quiet", (handler,), {"log_message": lambda *_: None})
+    with in_thread(ThreadingHTTPServer(("127.0.0.1", 0), partial(quiet, **options))) as server:
+        yield f"http://127.0.0.1:{server.server_port}"
 
 
 def is_ready(port: int) -> bool:
