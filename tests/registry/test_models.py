@@ -21,16 +21,6 @@ def store(tmp_path: Path) -> Store:
     return store
 
 
-def test_holds_every_version_and_alias(store: Store) -> None:
-    models = load_model_set(store)
-    assert dict(models.versions) == {"other": ("1.0.0",), "tiny": ("1.0.0", "2.0.0")}
-    assert models.failure is None
-    assert not models.failures
-    assert models.resolve("default") is models.resolve("tiny@2.0.0") is models.resolve("tiny")
-    assert models.resolve("tiny@1.0.0").manifest.version == "1.0.0"
-    assert dict(models.aliases) == {"default": AliasTarget(name="tiny")}
-
-
 def test_a_name_means_the_newest_usable_version(store: Store) -> None:
     for version, wanted in (("2.0.0", "1.0.0"), ("1.0.0", None)):
         (store.root / "tiny" / version / "model.safetensors").write_bytes(b"")
