@@ -79,11 +79,6 @@ async def test_a_word_becomes_a_class(client, word, label, rule, certain):
     assert (answer["word"], answer["class"]["label"]) == (word, label)
     assert (answer["rule"], answer["certain"]) == (rule, certain)
     assert (answer["class"].get("parent") == "table") == (label == "desk")
-    # A request accepts the label by the same rule.
-    body = {"objects": [word], "unknown_labels": "error" if certain else "nearest"}
-    mapped = (await client.post("/missing", json=body)).json()["mapped"]
-    expected = [] if rule in ("label", "alias", "phrase") else [(label, rule)]
-    assert [(entry["class"], entry["rule"]) for entry in mapped] == expected
 
 
 @pytest.mark.parametrize(
