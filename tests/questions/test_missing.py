@@ -12,13 +12,7 @@ from app.model import Counts
 from app.questions.missing import LIKELY, missing
 from app.scene import ObjectClass, Scene, SceneObject, Vocabulary
 from tests.questions.answers import more
-from tests.questions.artifacts import (
-    LARGER,
-    artifact_of,
-    larger_artifact,
-    random_machine,
-    scene_of,
-)
+from tests.questions.artifacts import LARGER, artifact_of, larger_artifact, random_machine, scene_of
 
 SPEC = LARGER["triway"]
 V, C, M = SPEC.V, SPEC.C, 5

@@ -19,15 +19,7 @@ from app.model.offset_statistics import UNOBSERVED, rotated_offsets
 from app.questions.placements import Place, place_log_p, placements
 from app.questions.posterior import Posterior
 from app.scene import RELATIONS, ObjectClass, Scene, SceneObject, Vocabulary
-from app.scene.spatial_relations import (
-    ABOVE,
-    CANONICAL,
-    FRONT,
-    INSIDE,
-    LEFT,
-    ON_TOP,
-    canonicalise,
-)
+from app.scene.spatial_relations import ABOVE, CANONICAL, FRONT, INSIDE, LEFT, ON_TOP, canonicalise
 from app.scene.stands import HANGS, SUPPORTED
 from scene_client.frames import viewer_axes
 from tests.questions.answers import missing, without_minimums
