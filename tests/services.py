@@ -224,19 +224,24 @@ class LiveService:
 
 
 def begin(
-    store: Path, log: Path, *, program: tuple[str, ...] = ("-m", "app"), **variables: str
+    store: Path,
+    log: Path,
+    *,
+    program: tuple[str, ...] = ("-m", "app"),
+    stdin: int | None = None,
+    **variables: str,
 ) -> subprocess.Popen[str]:
     """Start ``python -m app`` (or another program) without waiting for it."""
     environment = {
         name: value for name, value in os.environ.items() if not name.startswith("SCENE_")
     }
     # Without a load balancer, nothing has to notice the end.
-    own = {"SCENE_STORE": str(store), "SCENE_DRAIN_SECONDS": "0"}
-    own |= {"SCENE_REQUEST_TIMEOUT_MS": str(DEADLINE_MS), "SCENE_CLIENT_TIMEOUT": "120"}
-    environment |= own | variables
+    environment |= {"SCENE_STORE": str(store), "SCENE_DRAIN_SECONDS": "0"}
+    environment |= {"SCENE_REQUEST_TIMEOUT_MS": str(DEADLINE_MS), "SCENE_CLIENT_TIMEOUT": "120"}
+    environment |= variables
     with log.open("w") as stream:
         return subprocess.Popen(
-            [sys.executable, *program], env=environment, stderr=stream, text=True
+            [sys.executable, *program], env=environment, stdin=stdin, stderr=stream, text=True
         )
 
 

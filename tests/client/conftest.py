@@ -35,16 +35,14 @@ OVER_HTTP = ("sync", "async", pytest.param("cpp", marks=pytest.mark.system))
 EVERY = (*OVER_HTTP, "offline")
 
 
-@pytest.fixture
-def open_caller(request: pytest.FixtureRequest) -> Callable[..., AbstractContextManager[Caller]]:
-    """Return a function that opens a client at a URL; the parameter of the test is its kind."""
-    return opener(request)
-
-
 def opener(request: pytest.FixtureRequest) -> Callable[..., AbstractContextManager[Caller]]:
+    """Return a function that opens a client at a URL; the parameter of the test is its kind."""
     if request.param == "cpp":
         return partial(callers.cpp_caller, request.getfixturevalue("bridge"))
     return callers.async_caller if request.param == "async" else callers.sync_caller
+
+
+open_caller = pytest.fixture(opener)
 
 
 @pytest.fixture(scope="session")

@@ -27,10 +27,6 @@ async def observed(client: AsyncClient, **scene: Any) -> Triples:
     return triples((await ask(client, "outliers", **scene)).get("observed_relations", []))
 
 
-def relation(subject: str, name: str, other: str) -> dict[str, str]:
-    return {"subject": subject, "relation": name, "object": other}
-
-
 @pytest.mark.parametrize(
     ("objects", "expected"),
     [
@@ -51,15 +47,15 @@ async def test_labels_are_ids_of_objects(client, objects, expected):
 
 async def test_ids_come_before_labels(client: AsyncClient) -> None:
     objects = [{"id": "lamp", "label": "bed"}, {"id": "x", "label": "lamp"}, "trash can"]
-    stated = [relation("lamp", "left", "x"), relation("Garbage_Bins", "behind", "beds")]
+    stated = [["lamp", "left", "x"], ["Garbage_Bins", "behind", "beds"]]
     answer = await ask(client, "relations", objects=objects, relations=stated, top_k=4096)
     marked = triples([entry for entry in answer["relations"] if entry["observed"]])
     assert marked == {("lamp", "left", "x"), ("lamp", "front", "trash can")}
 
 
 async def test_a_repeated_relation_is_no_contradiction(client: AsyncClient) -> None:
-    stated = [relation("bed", "left", "lamp"), relation("lamp", "right", "bed")]
-    stated.append(relation("bed", "front", "lamp"))
+    stated = [["bed", "left", "lamp"], ["lamp", "right", "bed"]]
+    stated.append(["bed", "front", "lamp"])
     _, found = await read(client, objects=["bed", "lamp"], relations=stated)
     assert {("bed", "front", "lamp")} < found
     assert len(found) == 2
@@ -69,9 +65,9 @@ async def test_ignored_labels_remove_their_relations(client: AsyncClient) -> Non
     scene = {
         "objects": ["bed", "flux capacitor", {"id": "r2", "label": "droid"}, "lamp"],
         "relations": [
-            relation("lamp", "left", "Flux_Capacitor"),
-            relation("r2", "left", "bed"),
-            relation("lamp", "left", "bed"),
+            ["lamp", "left", "Flux_Capacitor"],
+            ["r2", "left", "bed"],
+            ["lamp", "left", "bed"],
         ],
         "room_type": "hangar",
         "unknown_labels": "ignore",
@@ -88,7 +84,7 @@ async def test_ignored_labels_remove_their_relations(client: AsyncClient) -> Non
 async def test_unknown_labels_become_the_nearest_class(client: AsyncClient) -> None:
     scene: dict[str, Any] = {
         "objects": ["bed", "nigthstand", {"id": "x", "label": "big lamp"}, "nigthstand"],
-        "relations": [relation("big lamp", "left", "bed"), relation("lamp", "front", "bed")],
+        "relations": [["big lamp", "left", "bed"], ["lamp", "front", "bed"]],
         "room_type": "bedrom",
         "unknown_labels": "nearest",
     }
@@ -101,7 +97,7 @@ async def test_unknown_labels_become_the_nearest_class(client: AsyncClient) -> N
         client,
         "outliers",
         objects=["bed", own[0], {"id": "x", "label": "lamp"}, own[1]],
-        relations=[relation("x", "left", "bed"), relation("x", "front", "bed")],
+        relations=[["x", "left", "bed"], ["x", "front", "bed"]],
         room_type="bedroom",
     )
     stated = {(one["relation"], one["probability"]) for one in expected["misplaced"]}
@@ -125,7 +121,7 @@ WORDS: dict[str, Any] = {
 @pytest.mark.parametrize("model", ["home", "candidate", "plain"])
 async def test_words_are_read_by_meaning(client: AsyncClient, model: str) -> None:
     """Two spellings are one word. A spelling is corrected first, and nonsense is left out."""
-    scene = WORDS | {"model": model, "relations": [relation("o", "on-top", "bed")]}
+    scene = WORDS | {"model": model, "relations": [["o", "on-top", "bed"]]}
     answer = await ask(client, "outliers", **scene)
     assert answer["ignored"] == ["zxqvw"]
     *read, spelt = answer["mapped"]
