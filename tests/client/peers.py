@@ -38,12 +38,13 @@ def read_head(connection: socket.socket) -> bytes:
 def answering(
     *arguments: bytes, heads: list[bytes] | None = None
 ) -> Callable[[socket.socket], None]:
-    """Return a function that answers one request as `answer` does, and records its head."""
+    """Return a function that answers each request as `answer` does, and records its head."""
     heads = [] if heads is None else heads
 
     def behave(connection: socket.socket) -> None:
-        heads.append(read_head(connection))
-        answer(connection, *arguments)
+        while True:
+            heads.append(read_head(connection))
+            answer(connection, *arguments)
 
     return behave
 
