@@ -294,13 +294,6 @@ async def test_batch_entries_are_single_answers(client: AsyncClient, question: s
         assert entry == {"status": alone.status_code, part: expected}
 
 
-@pytest.mark.parametrize("scenes", [[], [{"objects": ["bed"]}] * 257, {}, None])
-async def test_a_batch_holds_1_to_256_scenes(client: AsyncClient, scenes: Any) -> None:
-    response = await client.post("/relations/batch", json={"scenes": scenes})
-    assert response.status_code == 422
-    assert response.json()["errors"][0]["pointer"] == "#/scenes"
-
-
 @pytest.mark.parametrize("fault", ["raised", math.nan])
 async def test_a_defect_affects_one_entry(client, replace, caplog, fault):
     def fail_on_sofas(outliers: Any, artifact: Any, scene: Any, **parameters: Any) -> Any:
