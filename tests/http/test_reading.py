@@ -61,7 +61,7 @@ async def test_a_repeated_relation_is_no_contradiction(client: AsyncClient) -> N
 
 
 async def test_ignored_labels_remove_their_relations(client: AsyncClient) -> None:
-    scene = {
+    scene: dict[str, Any] = {
         "objects": ["bed", "flux capacitor", {"id": "r2", "label": "droid"}, "lamp"],
         "relations": [
             ["lamp", "left", "Flux_Capacitor"],
