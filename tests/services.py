@@ -18,7 +18,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
+from socketserver import BaseServer
+from typing import Any, TypeVar
 
 import httpx
 import pytest
@@ -33,6 +34,7 @@ CONTROL = {"objects": ["bed", "lamp", {"id": "desk_1", "label": "desk"}], "seed"
 NAMED = {"allowed_hosts": ["service"]}
 """Settings of a service in process; its clients use the URL http://service."""
 
+Server = TypeVar("Server", bound=BaseServer)
 Replace = Callable[[str, Callable[..., Any]], None]
 
 WITHOUT_TRAINING = """
@@ -222,19 +224,24 @@ class LiveService:
 
 
 def begin(
-    store: Path, log: Path, *, program: tuple[str, ...] = ("-m", "app"), **variables: str
+    store: Path,
+    log: Path,
+    *,
+    program: tuple[str, ...] = ("-m", "app"),
+    stdin: int | None = None,
+    **variables: str,
 ) -> subprocess.Popen[str]:
     """Start ``python -m app`` (or another program) without waiting for it."""
     environment = {
         name: value for name, value in os.environ.items() if not name.startswith("SCENE_")
     }
     # Without a load balancer, nothing has to notice the end.
-    own = {"SCENE_STORE": str(store), "SCENE_DRAIN_SECONDS": "0"}
-    own |= {"SCENE_REQUEST_TIMEOUT_MS": str(DEADLINE_MS), "SCENE_CLIENT_TIMEOUT": "120"}
-    environment |= own | variables
+    environment |= {"SCENE_STORE": str(store), "SCENE_DRAIN_SECONDS": "0"}
+    environment |= {"SCENE_REQUEST_TIMEOUT_MS": str(DEADLINE_MS), "SCENE_CLIENT_TIMEOUT": "120"}
+    environment |= variables
     with log.open("w") as stream:
         return subprocess.Popen(
-            [sys.executable, *program], env=environment, stderr=stream, text=True
+            [sys.executable, *program], env=environment, stdin=stdin, stderr=stream, text=True
         )
 
 
@@ -268,16 +275,24 @@ def launch(
 
 
 @contextmanager
-def http_server(handler: type[BaseHTTPRequestHandler], **options: Any) -> Iterator[str]:
-    """Run a server of the standard library in a thread without a log, and yield its URL."""
-    quiet = type("Quiet", (handler,), {"log_message": lambda *_: None})
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(quiet, **options))
-    thread = threading.Thread(target=server.serve_forever)
+def in_thread(server: Server) -> Iterator[Server]:
+    """Run a server of the standard library in a thread."""
+    thread = threading.Thread(target=server.serve_forever, args=(0.01,))
     thread.start()
-    yield f"http://127.0.0.1:{server.server_port}"
-    server.shutdown()
-    thread.join()
-    server.server_close()
+    try:
+        yield server
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+@contextmanager
+def http_server(handler: type[BaseHTTPRequestHandler], **options: Any) -> Iterator[str]:
+    """Run a server without a log, and yield its URL."""
+    quiet = type("Quiet", (handler,), {"log_message": lambda *_: None})
+    with in_thread(ThreadingHTTPServer(("127.0.0.1", 0), partial(quiet, **options))) as server:
+        yield f"http://127.0.0.1:{server.server_port}"
 
 
 def is_ready(port: int) -> bool:

@@ -6,6 +6,7 @@ import re
 import shlex
 import zlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from playwright.sync_api import Locator, Page, Route, expect
@@ -46,6 +47,10 @@ class Board:
         self.click("Import, export")
         self.page.get_by_label("Scene, JSON").fill(text)
         self.click("Put on the board")
+
+    def open_file(self, path: Path) -> None:
+        self.click("Import, export")
+        self.page.get_by_label("Open a file").set_input_files(path)
 
     def exported(self) -> dict[str, Any]:
         self.click("Import, export")

@@ -15,11 +15,6 @@ pytestmark = pytest.mark.system
 QUESTIONS = {"missing", "outliers", "relations", "rooms"}
 
 
-def choose(board: Board, path: Path) -> None:
-    board.page.get_by_role("button", name="Import, export").click()
-    board.page.get_by_label("Open a file").set_input_files(path)
-
-
 def posted(board: Board) -> list[str]:
     """The list of what the page posts from now on: routes, in order."""
     routes = list[str]()
@@ -48,7 +43,7 @@ LINE = {"scene_id": "a", "objects": [{"id": 0, "label": "bed"}], "counts": {"bed
 def test_requests_stay_in_the_browser(board, tmp_path, name, content, routes):
     sent = posted(board)
     (tmp_path / name).write_text(content)
-    choose(board, tmp_path / name)
+    board.open_file(tmp_path / name)
     expect(board.page.locator("#travels")).to_be_hidden()
     board.click("Put on the board")
     assert set(sent) == routes
@@ -64,7 +59,7 @@ def test_requests_stay_in_the_browser(board, tmp_path, name, content, routes):
 def test_the_service_reads_other_formats(board: Board, tmp_path: Path, name: str) -> None:
     sent = posted(board)
     (tmp_path / name).write_text(EXAMPLES[name].text, "utf-8")
-    choose(board, tmp_path / name)
+    board.open_file(tmp_path / name)
     expect(board.page.locator("#travels")).to_contain_text("sends the text to it")
     assert sent == []
     board.click("Put on the board")
@@ -105,12 +100,12 @@ def test_a_large_file_is_read_without_showing_it(board: Board, tmp_path: Path) -
     page = board.page
     path = tmp_path / "large.json"
     path.write_text(json.dumps(["bed", "lamp"]) + " " * 2**21)
-    choose(board, path)
+    board.open_file(path)
     expect(page.locator("#share-done")).to_contain_text("large.json is open")
     expect(page.get_by_label("Scene, JSON")).to_have_value("")
     with path.open("r+b") as file:
         file.truncate(64 * 2**20 + 1)
     board.click("Put on the board")
     assert board.things == ["bed", "lamp"]
-    choose(board, path)
+    board.open_file(path)
     expect(page.locator("#json-error")).to_contain_text("more than 64 MiB")

@@ -47,8 +47,7 @@ def recorded(api: httpx.Client, tmp_path: Path) -> Path:
 
 
 def choose(board: Board, file: Path, line: int) -> None:
-    board.click("Import, export")
-    board.page.locator("#upload").set_input_files(file)
+    board.open_file(file)
     board.page.locator("#which").fill(str(line))
     board.click("Put on the board")
 

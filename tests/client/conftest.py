@@ -13,6 +13,7 @@ from tests.client import callers
 from tests.client.callers import Caller
 from tests.client.peers import Peer
 from tests.conftest import FindTool
+from tests.services import in_thread
 
 
 @pytest.fixture(scope="session")
@@ -26,7 +27,7 @@ def bridge(tmp_path_factory: pytest.TempPathFactory, find_tool: FindTool) -> Pat
 def peer() -> Iterator[Callable[[Callable[[socket.socket], None]], Peer]]:
     """Return a function that starts a server, which calls a function for each connection."""
     with ExitStack() as stack:
-        yield lambda behave: stack.enter_context(Peer(behave))
+        yield lambda behave: stack.enter_context(in_thread(Peer(behave)))
 
 
 # The contract tests ask every client of these lists.
@@ -34,16 +35,14 @@ OVER_HTTP = ("sync", "async", pytest.param("cpp", marks=pytest.mark.system))
 EVERY = (*OVER_HTTP, "offline")
 
 
-@pytest.fixture
-def open_caller(request: pytest.FixtureRequest) -> Callable[..., AbstractContextManager[Caller]]:
-    """Return a function that opens a client at a URL; the parameter of the test is its kind."""
-    return opener(request)
-
-
 def opener(request: pytest.FixtureRequest) -> Callable[..., AbstractContextManager[Caller]]:
+    """Return a function that opens a client at a URL; the parameter of the test is its kind."""
     if request.param == "cpp":
         return partial(callers.cpp_caller, request.getfixturevalue("bridge"))
     return callers.async_caller if request.param == "async" else callers.sync_caller
+
+
+open_caller = pytest.fixture(opener)
 
 
 @pytest.fixture(scope="session")

@@ -1,49 +1,29 @@
 """Defective servers on real sockets."""
 
 import socket
-import threading
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Self
+from socketserver import BaseRequestHandler, ThreadingTCPServer
+from typing import Any
 
 READY = b'{"status":"ready"}'
 
 
-class Peer:
+class Peer(ThreadingTCPServer):
     """A server that calls the function ``behave`` for each connection, in a thread."""
 
+    daemon_threads = True
+
     def __init__(self, behave: Callable[[socket.socket], None]) -> None:
+        super().__init__(("127.0.0.1", 0), BaseRequestHandler)
         self.connections = 0
+        self.url = f"http://127.0.0.1:{self.server_address[1]}"
         self._behave = behave
-        self._socket = socket.create_server(("127.0.0.1", 0))
-        self._accepted: list[socket.socket] = []
-        self.url = f"http://127.0.0.1:{self._socket.getsockname()[1]}"
-        self._threads = [threading.Thread(target=self._accept)]
-        self._threads[0].start()
 
-    def _accept(self) -> None:
+    def finish_request(self, request: Any, client_address: Any) -> None:
+        self.connections += 1
         with suppress(OSError):
-            while True:
-                connection, _ = self._socket.accept()
-                self.connections += 1
-                self._accepted.append(connection)
-                self._threads.append(threading.Thread(target=self._serve, args=(connection,)))
-                self._threads[-1].start()
-
-    def _serve(self, connection: socket.socket) -> None:
-        with suppress(OSError), connection:
-            self._behave(connection)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for connection in (self._socket, *self._accepted):
-            with suppress(OSError):
-                connection.shutdown(socket.SHUT_RDWR)
-        self._socket.close()
-        for thread in self._threads:
-            thread.join()
+            self._behave(request)
 
 
 def read_head(connection: socket.socket) -> bytes:
@@ -58,12 +38,13 @@ def read_head(connection: socket.socket) -> bytes:
 def answering(
     *arguments: bytes, heads: list[bytes] | None = None
 ) -> Callable[[socket.socket], None]:
-    """Return a function that answers one request as `answer` does, and records its head."""
+    """Return a function that answers each request as `answer` does, and records its head."""
     heads = [] if heads is None else heads
 
     def behave(connection: socket.socket) -> None:
-        heads.append(read_head(connection))
-        answer(connection, *arguments)
+        while True:
+            heads.append(read_head(connection))
+            answer(connection, *arguments)
 
     return behave
 

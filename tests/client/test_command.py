@@ -111,7 +111,6 @@ def test_everything_has_a_table(scene: Any, line: str, words: tuple[str, ...]) -
 FILES = {
     "two.jsonl": b"{}\n{}",
     "bare.jsonl": b'{"scene_id": "a"}',
-    "images.json": b'[{"category_id": 59, "image_id": 1}, {"category_id": 59, "image_id": 2}]',
     **{
         f"names{k}": text
         for k, text in enumerate((b"", b"[1, 2]", b'[{"id": 1}]', b"7", b"\0\xd8"))
@@ -132,11 +131,10 @@ FILES = {
         ("missing bed --timeout 0", 2, ["the timeout must be"]),
         ("--url robot missing bed", 2, ["http://"]),
         ("missing bed --offline nowhere", 2, ["directory"]),
-        ("missing ./two.jsonl", 2, ["has 2 scenes (1, 2): choose one, such as"]),
+        ("missing ./two.jsonl", 2, ["has 2 scenes (1, 2): choose one, such as ./two.jsonl:1"]),
         ("missing ./two.jsonl:3", 2, ["no scene 3; it has 2 scenes (1, 2)"]),
         ("missing ./bare.jsonl:1", 2, ["neither a request with a list of objects"]),
         *[(f"missing 59 --label-map ./names{k}", 2, ["--label-map"]) for k in range(5)],
-        ("missing ./images.json", 2, ["2 scenes (1, 2): choose one, such as ./images.json:1"]),
         (
             "missing bed nightstnad",
             1,

@@ -1,4 +1,4 @@
-"""The package of the Python client, generated clients, and the C++ client."""
+"""The package of the Python client, also on Python 3.10, generated clients, and the C++ client."""
 
 import json
 import os
@@ -40,10 +40,14 @@ def test_every_file_states_the_version(repository: Path, path: str, pattern: str
     assert match[1] == app.__version__
 
 
-def test_the_wheel_has_only_the_client(repository: Path, tmp_path: Path):
-    # A copy: pip leaves its build folder in the source, and takes old modules from it.
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    """A copy: pip leaves its build folder in the source, and takes old modules from it."""
     ignored = shutil.ignore_patterns("build", "*.egg-info")
-    source = shutil.copytree(repository / "clients" / "python", tmp_path / "source", ignore=ignored)
+    return shutil.copytree(REPOSITORY / "clients/python", tmp_path / "source", ignore=ignored)
+
+
+def test_the_wheel_has_only_the_client(source: Path, tmp_path: Path) -> None:
     command = (sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation")
     subprocess.run([*command, "-w", tmp_path, source], check=True, timeout=120)
     (wheel,) = tmp_path.glob("scene_client-*.whl")
@@ -81,6 +85,64 @@ def test_the_client_needs_no_package_of_the_service() -> None:
     done = run_program(sys.executable, "-W", "error", "-c", PROGRAM)
     # An offline client says which packages it needs.
     assert "pip install '.[service]' in the repository" in done.stdout
+
+
+ON_A_ROBOT = """
+import asyncio, importlib, json, pkgutil, sys
+from pathlib import Path
+import scene_client
+from scene_client import AsyncClient, Client
+
+assert sys.version_info[:2] == (3, 10)
+for module in pkgutil.walk_packages(scene_client.__path__, "scene_client."):
+    if not module.name.endswith("__main__"):
+        importlib.import_module(module.name)
+
+async def ask():
+    async with AsyncClient(sys.argv[1], timeout=30) as client:
+        return await client.missing(["bed"])
+
+
+package = Path("clients/ros2/scene_reasoning/scene_reasoning")
+for module in package.glob("*.py"):
+    compile(module.read_text("utf-8"), str(module), "exec")
+sys.path.insert(0, str(package.parent))
+from scene_reasoning.advisor import Advisor
+from scene_reasoning.ghosts import ghosts
+from scene_reasoning.latest import Latest
+
+message = json.loads(Path("clients/ros2/detections.json").read_text("utf-8"))
+with Client(sys.argv[1], timeout=30) as client:
+    assert client.missing(["bed"]).missing == asyncio.run(ask()).missing
+    latest = Latest(Advisor(client).advise)
+    latest.see(message)
+    while (outcome := latest.tick()) is None:
+        pass
+    latest.close()
+advice = outcome.future.result()
+print(json.dumps([sorted(advice.answers), len(ghosts(advice, 3))]))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.system
+def test_python_310(source: Path, tmp_path: Path, live: LiveService) -> None:
+    """Client, command and parts of the node, installed as on a robot with ROS 2 Humble."""
+    pyenv = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv")
+    installed = sorted(pyenv.glob("versions/3.10.*/bin/python3.10"))
+    found = installed[0] if installed else shutil.which("python3.10")
+    if found is None:
+        pytest.skip("Python 3.10 is not installed")
+    run_program(found, "-m", "venv", tmp_path / "venv")
+    python = tmp_path / "venv/bin/python"
+    pip = ("-m", "pip", "--disable-pip-version-check", "install", "-qq")
+    run_program(python, *pip, source, timeout=300)
+    scene = ("-m", "scene_client", "missing", "bed", "lamp", "--json", "--url", live.url)
+    done = run_program(python, *scene)
+    assert json.loads(done.stdout)["missing"]
+    plain = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    done = run_program(python, "-W", "error", "-c", ON_A_ROBOT, live.url, env=plain)
+    assert json.loads(done.stdout) == [["missing", "outliers"], 3]
 
 
 GENERATED = """

@@ -5,7 +5,6 @@ import ssl
 import subprocess
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +20,7 @@ from scene_client import (
     sync,
 )
 from tests.client.conftest import OVER_HTTP
-from tests.client.peers import answer, answering, read_head, say_nothing
-
-
-def serve(connection: socket.socket, heads: list[bytes] | None = None) -> None:
-    while True:
-        head = read_head(connection)
-        if heads is not None:
-            heads.append(head)
-        answer(connection)
+from tests.client.peers import answering, read_head, say_nothing
 
 
 def drip(connection: socket.socket) -> None:
@@ -67,7 +58,7 @@ every_client = pytest.mark.parametrize("open_caller", OVER_HTTP, indirect=True)
 
 @every_client
 def test_many_calls_share_one_connection(peer: Any, open_caller: Any) -> None:
-    started = peer(serve)
+    started = peer(answering())
     with open_caller(started.url) as call:
         for _ in range(20):
             assert call("is_ready") is True
@@ -109,7 +100,7 @@ def test_a_refused_connection_is_unreachable(open_caller: Any) -> None:
 @every_client
 def test_the_key_and_the_time_left_are_sent(peer: Any, open_caller: Any) -> None:
     heads: list[bytes] = []
-    url = peer(partial(serve, heads=heads)).url + "/robot/"
+    url = peer(answering(heads=heads)).url + "/robot/"
     with open_caller(url, api_key="k" * 16, timeout=60.0) as call:
         call("is_ready")
     (head,) = heads
@@ -142,10 +133,10 @@ def test_tls(peer, open_caller, tmp_path, monkeypatch, find_tool):
 
         return str(peer(behave_secured).url.replace("http:", "https:"))
 
-    with open_caller(secured(serve), retries=0) as call, pytest.raises(UnreachableError):
+    with open_caller(secured(answering()), retries=0) as call, pytest.raises(UnreachableError):
         call("models")
     monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
-    with open_caller(secured(serve)) as call:
+    with open_caller(secured(answering())) as call:
         assert call("is_ready") is True
         assert call("is_ready") is True
     with open_caller(secured(drip), timeout=0.5) as call, pytest.raises(DeadlineError):

@@ -15,7 +15,7 @@ from scene_client.vision_msgs import SceneFields
 from tests.client.peers import Peer, answering
 from tests.client.ros_messages import blank
 from tests.deploy.ros import PACKAGE, STORE, Ros, Slow, load_package
-from tests.services import PATIENCE, LiveService, wait_until
+from tests.services import PATIENCE, LiveService, in_thread, wait_until
 
 Run = Callable[..., "Running"]
 
@@ -104,7 +104,7 @@ def test_the_api_key_comes_from_a_file(run: Run, recorded: Any, tmp_path: Path) 
     (tmp_path / "key").write_text("incorrect-zebra-capacitor-nail\n")
     for file in (str(tmp_path / "key"), ""):
         heads: list[bytes] = []
-        with Peer(answering(heads=heads)) as peer:
+        with in_thread(Peer(answering(heads=heads))) as peer:
             running = run(url=peer.url, api_key_file=file)
             running.hear("detections", recorded)
             running.wait_for("/diagnostics")

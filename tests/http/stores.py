@@ -1,15 +1,18 @@
 """Model stores for tests: real artifacts of small machines with random weights."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from app.model import Calibration, Counts, Offsets
+from app.model import Calibration
+from app.model.fields import TensorGroup
 from app.registry import AliasTarget, Store, VocabularyEntry
 from app.scene.spatial_relations import CANONICAL
 from app.scene.vocabulary import ObjectClass, Vocabulary
-from tests.enumeration.small_machines import with_symmetric_couplings
+from tests.enumeration.small_machines import random_weights
 from tests.registry.small_artifacts import JUDGING, description
 from training.machines import BoltzmannMachine, MachineSpec, build
 
@@ -51,14 +54,10 @@ def random_machine(
     variant: str, seed: int = 0, classes: int = V, room_types: int = C
 ) -> BoltzmannMachine:
     """A machine for the first ``classes`` classes, with all weights drawn from N(0, 0.5²)."""
-    generator = torch.Generator().manual_seed(seed)
     triples = TRIPLES[(TRIPLES[:, 1:] < classes).all(dim=1)]
     spec = replace(SPECS[variant], V=classes, C=room_types, T=len(triples))
     machine = build(spec).set_triples(triples)
-    with torch.no_grad():
-        for parameter in machine.parameters():
-            parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.5)
-    return with_symmetric_couplings(machine).requires_grad_(False)
+    return random_weights(machine, torch.Generator().manual_seed(seed), 0.5)
 
 
 LAMP = {"label": "lamp", "position": {"x": 1, "y": 0.5, "z": 1}}
@@ -75,12 +74,13 @@ def publish(
     classes: int = V,
     room_types: int = C,
     alias: str | None = None,
-    offsets: Offsets | None = None,
-    counts: Counts | None = None,
-    judges: bool = True,
-    rare_rooms: tuple[int, ...] = (),
+    groups: Sequence[TensorGroup] = (),
+    calibration: Mapping[str, Any] = JUDGING,
 ) -> None:
-    """Publish a machine with random weights for the first classes and room types."""
+    """Publish a machine with random weights for the first classes and room types.
+
+    `calibration` has the fields that are not neutral. Without `JUDGING`, the model judges nothing.
+    """
     machine = random_machine(variant, seed, classes, room_types)
     names = VOCABULARY.room_types[:room_types]
     aliases = {name: VOCABULARY.room_aliases.get(name, ()) for name in names}
@@ -91,14 +91,10 @@ def publish(
             version,
             spec=machine.spec.to_dict(),
             vocabulary=VocabularyEntry.of(vocabulary, profiles=PROFILES[: machine.spec.profiles]),
-            calibration=Calibration.neutral(A).model_copy(
-                update={"rare_rooms": rare_rooms} | (JUDGING if judges else {})
-            ),
+            calibration=Calibration.neutral(A).model_copy(update=calibration),
             examples=EXAMPLES if classes == V else (),
         ),
-        machine.state_dict()
-        | ({} if offsets is None else offsets.tensors())
-        | ({} if counts is None else counts.tensors()),
+        machine.state_dict() | {k: t for group in groups for k, t in group.tensors().items()},
     )
     if alias is not None:
         Store(root).set_alias(alias, AliasTarget(name=name, version=version))

@@ -1,4 +1,4 @@
-"""Slow and incomplete requests to the service without a proxy."""
+"""The service without a proxy: slow, incomplete, hostile and concurrent requests."""
 
 import json
 import select
@@ -9,7 +9,13 @@ from pathlib import Path
 import pytest
 from httpx import Response
 
-from tests.chaos.wire import BODY, LIVE, Wire, exchange
+from app.questions import QUESTIONS
+from benchmarks.load.connections import prepared
+from scene_client import schemas
+from tests.chaos import corpus
+from tests.chaos.attack import attack, faults_of_answer
+from tests.chaos.load import ConstantLoad
+from tests.chaos.wire import BODY, LIVE, Wire, exchange, framing
 from tests.http.test_problems import problem
 from tests.services import PATIENCE, LiveService, launch, live_service, wait_until
 
@@ -21,6 +27,7 @@ HEAD = (
 )
 
 service = live_service(SCENE_CLIENT_TIMEOUT="1", logs_errors=True)
+patient = live_service(SCENE_CLIENT_TIMEOUT="5")
 
 
 @pytest.mark.parametrize(
@@ -88,3 +95,71 @@ def test_unfinished_bodies_use_bounded_memory(shared_store: Path, tmp_path: Path
         stack.close()
         # The service notices the end of the connections after the client.
         wait_until(lambda: post_batch().status_code == 200)
+
+
+MAX_GROWTH = 8 * 2**20
+"""Bytes that the last 4,000 requests may add to what the allocator keeps of the first ones."""
+
+
+# A prime, so that each wrong value comes to stand at many places.
+@pytest.mark.parametrize("every", [37, pytest.param(5, marks=pytest.mark.slow)])
+def test_hostile_requests(patient: LiveService, every: int) -> None:
+    before = patient.control()
+    requests = list(corpus.requests())[::every]
+    # The first round takes some eighty megabytes, the later ones next to nothing.
+    for _ in range(2 if every == 5 else 0):
+        attack(patient.port, requests)
+    resident, files = patient.memory, patient.descriptors
+    report = attack(patient.port, requests)
+    assert report.faults == []
+    assert report.statuses.total() >= 10_000 / every
+    assert 500 not in report.statuses
+    assert patient.control() == before
+    assert every > 5 or patient.memory - resident < MAX_GROWTH
+    assert patient.descriptors <= files + 8
+    assert corpus.MARKER.split()[0] not in patient.log.read_text()
+
+
+def test_framing_without_a_proxy(patient: LiveService) -> None:
+    for wire in framing():
+        answers, closed = exchange(patient.port, wire)
+        for answer in answers:
+            # What is not HTTP the server refuses itself, in plain text.
+            if answer.body != b"Invalid HTTP request received.":
+                assert not faults_of_answer(answer.status, answer.headers, answer.body), wire.name
+        assert wire.expected in (None, tuple(answer.status for answer in answers)), wire.name
+        assert closed or not wire.closes, wire.name
+
+
+def test_the_corpus_has_every_field() -> None:
+    forms = {f"/{question.name}": question.request for question in QUESTIONS}
+    for path, form in forms.items():
+        assert set(corpus.VALID[path]) == set(form.model_fields)
+    assert set(corpus.SCENE["objects"][1]) == set(schemas.Detection.model_fields)
+
+
+BATCHES = [f"/{question}/batch" for question in ("relations", "missing", "outliers", "rooms")]
+SINGLE = ["/relations", "/missing", "/outliers", "/rooms", "/generate"]
+LABELS = ("bed", "lamp", "desk", "chair", "sofa", "sink", "book", "pillow", "table")
+
+
+def others() -> list[bytes]:
+    """Requests of each kind that differ from each other."""
+    made = []
+    for path in (*SINGLE, *BATCHES):
+        for k in range(8):
+            scene = {"objects": [LABELS[(k + j) % 9] for j in range(1 + k)], "seed": k}
+            if path == "/generate":
+                scene |= {"count": 1 + k % 3, "steps": 5 + k}
+            made.append(prepared(path, {"scenes": [scene]} if path in BATCHES else scene))
+    return made
+
+
+def test_answers_under_load_are_the_same(live: LiveService) -> None:
+    def judge(_: int, status: int, __: object) -> str | None:
+        return None if status == 200 else f"status {status}"
+
+    alone = live.control()
+    with ConstantLoad(live.port, others(), judge, connections=24):
+        for _ in range(3):
+            assert live.control() == alone

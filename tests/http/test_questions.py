@@ -14,7 +14,6 @@ from httpx import AsyncClient
 from app import questions
 from app.model import Counts
 from app.questions import QUESTIONS
-from app.registry import Store
 from app.scene import RelationTable, Scene, SceneObject
 from scene_client.frames import viewer_axes
 from tests.http.stores import PROFILES, VOCABULARY, C, V, publish
@@ -114,7 +113,7 @@ async def test_a_model_without_room_types_names_none(tmp_path: Path) -> None:
 
 async def test_rare_room_types_are_named_and_not_sampled(tmp_path: Path) -> None:
     """The other questions accept them. Without a room type, no scene has a rare one."""
-    publish(tmp_path, "home", "1.0.0", rare_rooms=(1,), alias="default")
+    publish(tmp_path, "home", "1.0.0", calibration={"rare_rooms": (1,)}, alias="default")
     async with serve(tmp_path) as client:
         words = (await client.get("/models/default/vocabulary")).json()
         (rare,) = words["rare_room_types"]
@@ -150,7 +149,7 @@ async def test_models_of_few_classes_answer(tmp_path: Path, variant: str, classe
 
 
 async def test_a_model_of_too_few_scenes_gives_no_judgement(tmp_path: Path) -> None:
-    publish(tmp_path, "new", "1.0.0", alias="default", judges=False)
+    publish(tmp_path, "new", "1.0.0", alias="default", calibration={})
     async with serve(tmp_path) as client:
         on_top = [["lamp", "on-top", "bed"]]
         for relations, parts in (([], ["objects"]), (on_top, ["objects", "relations"])):
@@ -198,19 +197,16 @@ CHAIR, NIGHTSTAND = VOCABULARY.index("chair"), VOCABULARY.index("nightstand")
 
 
 @pytest.fixture(scope="module")
-def own_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A model whose scenes usually have one nightstand and four chairs."""
+async def measured(
+    tmp_path_factory: pytest.TempPathFactory, anyio_backend: str
+) -> AsyncIterator[AsyncClient]:
+    """A service with a model whose scenes usually have one nightstand and four chairs."""
     root, share = tmp_path_factory.mktemp("store"), [[0.8, 0.1, 0.05, 0.05], [0.1, 0.1, 0.1, 0.7]]
     log_share, weights = np.log(share).astype("f4"), np.zeros((2, 2, 3 + C + V), np.float32)
     counts = Counts(np.array([NIGHTSTAND, CHAIR]), np.array([3, 3]), log_share, weights)
-    offsets = offsets_of_every_pair(V)
-    publish(root, "measured", "1.0.0", alias="default", counts=counts, offsets=offsets)
-    return root
-
-
-@pytest.fixture(scope="module")
-async def measured(own_store: Path, anyio_backend: str) -> AsyncIterator[AsyncClient]:
-    async with serve(own_store) as client:
+    groups = counts, offsets_of_every_pair(V)
+    publish(root, "measured", "1.0.0", alias="default", groups=groups)
+    async with serve(root) as client:
         yield client
 
 
@@ -249,7 +245,7 @@ REQUEST: dict[str, Any] = {
         ("robot_1/map", None),
     ],
 )
-async def test_offsets_are_in_the_axes_of_the_frame(measured, own_store, frame, viewpoint):
+async def test_offsets_are_in_the_axes_of_the_frame(measured, frame, viewpoint):
     """In a map without a viewpoint, the relations left and front have no offset."""
     options = {"frame_id": frame, "viewpoint": viewpoint}
     options = {name: value for name, value in options.items() if value is not None}
@@ -260,7 +256,7 @@ async def test_offsets_are_in_the_axes_of_the_frame(measured, own_store, frame, 
         SceneObject(str(k), label, VOCABULARY.index(label), position=position)
         for k, label in enumerate(POSED)
     )
-    model = Store(own_store).load("measured", "1.0.0").model
+    model = measured.app.state.runtime.models.served["measured", "1.0.0"].model
     scene = Scene(tuple(things), RelationTable.stated(()))
     expected = questions.missing(model, scene, top_k=11, axes=axes)
     assert answer["missing"] == expected["missing"]
@@ -296,13 +292,6 @@ async def test_batch_entries_are_single_answers(client: AsyncClient, question: s
             error["pointer"] = error["pointer"].replace("#", f"#/scenes/{number}")
         part = "result" if alone.is_success else "problem"
         assert entry == {"status": alone.status_code, part: expected}
-
-
-@pytest.mark.parametrize("scenes", [[], [{"objects": ["bed"]}] * 257, {}, None])
-async def test_a_batch_holds_1_to_256_scenes(client: AsyncClient, scenes: Any) -> None:
-    response = await client.post("/relations/batch", json={"scenes": scenes})
-    assert response.status_code == 422
-    assert response.json()["errors"][0]["pointer"] == "#/scenes"
 
 
 @pytest.mark.parametrize("fault", ["raised", math.nan])

@@ -111,21 +111,18 @@ def test_help_lists_the_settings(capsys: pytest.CaptureFixture[str]) -> None:
     assert ["SCENE_PORT", "8000"] in shown
 
 
+OTHERS = (
+    "SCENE_STOER= SCENE_URL=http://127.0.0.1 SCENE_SERVICE_HOST=10.0.0.1 SCENE_SERVICE_PORT=8000 "
+    "SCENE_SERVICE_PORT_HTTP=8000 SCENE_PORT_8000_TCP=tcp://10.0.0.1:8000 "
+    "SCENE_PORT_8000_TCP_ADDR=10.0.0.1 SCENE_HEADLESS_SERVICE_HOST=10.0.0.1 "
+    "SCENE_HEADLESS_PORT=tcp://10.0.0.1:8000"
+)
+"""Variables of clients, and of Kubernetes for a service with the name scene."""
+
+
 def test_other_variables_are_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    variables = {
-        "STORE": str(tmp_path),
-        "STOER": "",
-        "URL": "http://127.0.0.1",
-        "SERVICE_HOST": "10.0.0.1",
-        "SERVICE_PORT": "8000",
-        "SERVICE_PORT_HTTP": "8000",
-        "PORT_8000_TCP": "tcp://10.0.0.1:8000",
-        "PORT_8000_TCP_ADDR": "10.0.0.1",
-        "HEADLESS_SERVICE_HOST": "10.0.0.1",
-        "HEADLESS_PORT": "tcp://10.0.0.1:8000",
-    }
-    for name, value in variables.items():
-        monkeypatch.setenv(f"SCENE_{name}", value)
+    for variable in (f"SCENE_STORE={tmp_path}", *OTHERS.split()):
+        monkeypatch.setenv(*variable.split("=", 1))
     assert Settings().port == 8000
 
 

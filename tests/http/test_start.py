@@ -7,7 +7,6 @@ import re
 import signal
 import socket
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -176,13 +175,7 @@ def test_sighup_loads_the_store_at_once(store: Path, log: Path) -> None:
 
 def test_a_closed_terminal_ends_the_service(shared_store: Path, log: Path) -> None:
     terminal, side = pty.openpty()
-    with log.open("w") as stream:
-        environment = {
-            "SCENE_STORE": str(shared_store), "SCENE_PORT": "0", "SCENE_DRAIN_SECONDS": "0"
-        }  # fmt: skip
-        process = subprocess.Popen(
-            [sys.executable, "-m", "app"], env=os.environ | environment, stdin=side, stderr=stream
-        )
+    process = begin(shared_store, log, stdin=side, SCENE_PORT="0")
     try:
         wait_for("ready: ", log, process)
         process.send_signal(signal.SIGHUP)

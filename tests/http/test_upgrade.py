@@ -7,9 +7,9 @@ import pytest
 from httpx import AsyncClient
 
 from app.registry import DEFAULT_STORE, AliasTarget, Store
-from app.registry.__main__ import main
 from tests.http.test_problems import problem
 from tests.registry.small_artifacts import (
+    copy,
     description,
     make_outdated,
     publish_as,
@@ -44,10 +44,6 @@ def release(tmp_path: Path, volume: Store, monkeypatch: pytest.MonkeyPatch) -> S
     return store
 
 
-def copy(source: Store, target: Store) -> None:
-    assert main(["copy", "--from", str(source.root), "--to", str(target.root)]) == 0
-
-
 async def answering(client: AsyncClient, **fields: Any) -> str:
     response = await client.post("/missing", json=OBJECTS | fields)
     assert response.status_code == 200, response.text
@@ -58,7 +54,7 @@ async def answering(client: AsyncClient, **fields: Any) -> str:
 @pytest.mark.parametrize("is_copied", [True, False], ids=["volume", "own folder"])
 async def test_the_shipped_default_answers(volume: Store, release: Store, is_copied: bool) -> None:
     if is_copied:
-        copy(release, volume)
+        assert copy(release, volume) == 0
     assert str(volume.aliases()["default"]) == "home@1.0.0", "an own model keeps the alias"
     async with serve(volume.root, store_poll=0) as client:
         ready = await client.get("/health/ready")

@@ -1,7 +1,5 @@
 """Relations in the service: moments of logits, the quadrature, and implications by hand."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -147,15 +145,3 @@ def test_implications_equal_the_formula_by_hand(grid, room, states):
     for shift, law in ((found.shift, expected), (found.shift_by_others, alone)):
         law = law[:, :n, :n].numpy()[:, between]
         np.testing.assert_allclose(shift[:, between], law, rtol=1e-4, atol=1e-4)
-
-
-def test_without_observed_relations_nothing_changes():
-    machine = coupled_machine(2)
-    edges = machine.edges(torch.arange(V).unsqueeze(0))
-    none = torch.zeros(1, 2 * V * V)
-    assert not machine.implied(edges, none, torch.full((1, 3), 0.3)).any()
-    plain = build(replace(machine.spec, G=0))
-    assert not plain.implied(edges, none + 1, torch.full((1, 3), 0.3)).any()
-    off = ObservedRelations(*(np.array([k]) for k in (0, 1, 2)), np.zeros(1, np.float32))
-    for observed in (None, off):
-        assert not in_service(machine, observed).shift.any()

@@ -79,22 +79,6 @@ def test_missing_classes_at_a_stated_coverage(coverage):
         assert found.probability == pytest.approx(sigmoid(expected), rel=1e-4)
 
 
-@pytest.mark.parametrize("coverage", [None, 0.4])
-@pytest.mark.parametrize("name", ["on-top", "left", "contains"])
-@pytest.mark.usefixtures("without_minimums")
-def test_a_class_at_a_place_has_the_product_of_both_probabilities(artifact, name, coverage):
-    scene = scene_of([0, 1, 2])
-    alone = {e.label: e.probability for e in missing(artifact, scene, coverage=coverage, top_k=9)}
-    entries = missing(artifact, scene, at=(name, 1), coverage=coverage, top_k=9)
-    assert {entry.label for entry in entries} == set(alone)
-    for entry in entries:
-        product = alone[entry.label] * entry.placements[0].probability
-        assert entry.probability == pytest.approx(product, rel=1e-5, abs=1e-6)
-        assert entry.probability == pytest.approx(sigmoid(entry.log_odds), rel=1e-4)
-    order = [entry.probability for entry in entries]
-    assert order == sorted(order, reverse=True)
-
-
 # Every calibration depends on the number of classes.
 COUNTED = CountSlope(intercept=-0.3, slope=0.8, log_count=-0.2)
 COUNTS = {

@@ -54,14 +54,6 @@ def test_an_observed_relation_has_the_confidence_of_its_objects():
             assert "expected" not in entry._fields
 
 
-def test_the_opposite_of_an_observed_relation_cannot_hold():
-    plain, answer = entries(scene_of([0, 1])), entries(scene_of([0, 1], [(LEFT, 0, 1)]))
-    assert plain["left", 1, 0].probability > 0.01
-    assert answer["left", 1, 0].probability == 0
-    for i, j in ((0, 1), (1, 0)):
-        assert answer["front", i, j] == plain["front", i, j]
-
-
 def test_stacked_objects_do_not_stand_beside_each_other():
     """A stacked relation excludes the pair's other relations, and left excludes stacked ones."""
     plain = entries(scene_of([0, 1, 2]))

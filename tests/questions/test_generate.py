@@ -2,7 +2,6 @@
 
 import copy
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
@@ -74,28 +73,6 @@ def test_scenes_depend_on_the_seed_and_not_on_the_count(artifact):
     assert other != few
     # Neighbouring seeds share no random stream.
     assert other[:2] != many[1:3]
-
-
-SCENES = {
-    "empty": (scene_of([]), {}),
-    "classes": (scene_of([0, 1, 4]), {}),
-    "relations": (scene_of([0, 1, 4], [(2, 1, 0), (0, 2, 1)]), {}),
-    "complete": (scene_of([0, 1, 1], [(2, 1, 0), (0, 1, 2)], complete=True), {"temperature": 1.5}),
-}
-
-
-def test_scenes_do_not_depend_on_other_requests():
-    """Neither on earlier requests nor on requests in other threads."""
-
-    def ask(name):
-        scene, options = SCENES[name]
-        return generate(ARTIFACTS["triway-states"], scene, count=3, seed=5, steps=6, **options)
-
-    answers = {name: ask(name) for name in SCENES}
-    assert {name: ask(name) for name in reversed(SCENES)} == answers
-    with ThreadPoolExecutor(4) as pool:
-        for name, scenes in zip([*SCENES] * 3, pool.map(ask, [*SCENES] * 3), strict=True):
-            assert scenes == answers[name]
 
 
 @every_model

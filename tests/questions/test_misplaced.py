@@ -27,42 +27,32 @@ from app.scene.spatial_relations import ABOVE, INSIDE, LEFT, ON_TOP
 from tests.questions.answers import misplaced
 from tests.questions.artifacts import judging, larger_artifact, lines, places_of, scene_of
 
-SIZES = {
-    "desk": (1.6, 0.8, 0.75),
-    "monitor": (0.6, 0.2, 0.4),
-    "bin": (0.3, 0.3, 0.4),
-    "stove": (0.6, 0.6, 0.9),
-    "pot": (0.25, 0.25, 0.2),
-    "sofa": (2.0, 0.9, 0.8),
-    "rug": (2.0, 1.4, 0.01),
-    "shelf": (1.0, 0.4, 2.0),
-    "wall": (4.0, 0.1, 2.5),
+# Sizes, and the shares of the floor, of the wall and of supports.
+THINGS = {
+    "desk": ((1.6, 0.8, 0.75), (0.95, 0.01, 0.04)),
+    "monitor": ((0.6, 0.2, 0.4), (0.05, 0.15, 0.8)),
+    "bin": ((0.3, 0.3, 0.4), (0.9, 0.02, 0.08)),
+    "stove": ((0.6, 0.6, 0.9), (0.96, 0.01, 0.03)),
+    "pot": ((0.25, 0.25, 0.2), (0.02, 0.08, 0.9)),
+    "sofa": ((2.0, 0.9, 0.8), (0.97, 0.01, 0.02)),
+    "rug": ((2.0, 1.4, 0.01), (0.9, 0.04, 0.06)),
+    "shelf": ((1.0, 0.4, 2.0), (0.6, 0.35, 0.05)),
+    "wall": ((4.0, 0.1, 2.5), (1.0, 0.0, 0.0)),
 }
-DESK, MONITOR, BIN, STOVE, POT, SOFA, RUG, SHELF, WALL = range(len(SIZES))
-V = len(SIZES)
-# Shares of the floor, of the wall and of supports, in this order.
-STANDS = {
-    DESK: (0.95, 0.01, 0.04),
-    MONITOR: (0.05, 0.15, 0.8),
-    BIN: (0.9, 0.02, 0.08),
-    STOVE: (0.96, 0.01, 0.03),
-    POT: (0.02, 0.08, 0.9),
-    SOFA: (0.97, 0.01, 0.02),
-    RUG: (0.9, 0.04, 0.06),
-    SHELF: (0.6, 0.35, 0.05),
-    WALL: (1.0, 0.0, 0.0),
-}
+NAMES, (SIZES, STANDS) = tuple(THINGS), zip(*THINGS.values(), strict=True)
+DESK, MONITOR, BIN, STOVE, POT, SOFA, RUG, SHELF, WALL = range(len(THINGS))
+V = len(THINGS)
 # A bin is under a desk, and a monitor is on it.
 PLACES = places_of(
     V,
     {(ON_TOP, MONITOR, DESK): 9},
-    stands=np.array([*STANDS.values()], np.float32),
+    stands=np.array(STANDS, np.float32),
     role_pair=np.array([MONITOR * V + DESK, BIN * V + DESK], np.int32),
     role_counts=np.array([(9, 0, 0), (0, 5, 0)], np.float32),
     role_anchor=np.array([(9, 5, 0), *[(0, 0, 0)] * (V - 1)], np.float32),
 )
 VOCABULARY = Vocabulary(
-    [ObjectClass(name, structure=name == "wall", size=size) for name, size in SIZES.items()],
+    [ObjectClass(name, structure=name == "wall", size=size) for name, (size, _) in THINGS.items()],
     ("office", "kitchen"),
 )
 ARTIFACT = replace(larger_artifact("triway"), vocabulary=VOCABULARY, places=PLACES)
@@ -83,17 +73,15 @@ def posterior_of(scene, alone=(), change=()):
 
 
 def stated(classes, triples, by_opposite=()):
-    names = list(SIZES)
-    objects = tuple(SceneObject(names[c], names[c], c) for c in classes)
+    objects = tuple(SceneObject(NAMES[c], NAMES[c], c) for c in classes)
     flags = [triple in by_opposite for triple in triples]
     return Scene(objects, RelationTable.stated(triples, flags))
 
 
 def posed(*bottoms, artifact=ARTIFACT):
     """A scene of pairs of a class and the centre of its bottom, with relations from the poses."""
-    names = list(SIZES)
     objects = tuple(
-        SceneObject(names[c], names[c], c, position=(x, y, z + SIZES[names[c]][2] / 2))
+        SceneObject(NAMES[c], NAMES[c], c, position=(x, y, z + SIZES[c][2] / 2))
         for c, (x, y, z) in bottoms
     )
     roles = None if artifact.places is None else artifact.places.roles

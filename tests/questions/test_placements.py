@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.special import logit
+from scipy.special import expit, logit
 
 from app.model import CountSlope, Offsets
 from app.model.calibration import PlaceFit
@@ -19,16 +19,7 @@ from app.model.offset_statistics import UNOBSERVED, rotated_offsets
 from app.questions.placements import Place, place_log_p, placements
 from app.questions.posterior import Posterior
 from app.scene import RELATIONS, ObjectClass, Scene, SceneObject, Vocabulary
-from app.scene.spatial_relations import (
-    ABOVE,
-    CANONICAL,
-    FRONT,
-    INSIDE,
-    LEFT,
-    ON_TOP,
-    OPPOSITES,
-    canonicalise,
-)
+from app.scene.spatial_relations import ABOVE, CANONICAL, FRONT, INSIDE, LEFT, ON_TOP, canonicalise
 from app.scene.stands import HANGS, SUPPORTED
 from scene_client.frames import viewer_axes
 from tests.questions.answers import missing, without_minimums
@@ -233,9 +224,9 @@ STATED = [(2, 1, 0), (0, 0, 3)]
 
 
 def by_hand(artifact, scene, name, anchor, coverage):
-    """A dictionary from the label of every unlisted class to its probability."""
-    relation = CANONICAL.index(name if name in CANONICAL else OPPOSITES_OF[name])
-    fit, is_subject = artifact.calibration.at[relation], name in CANONICAL
+    """Dictionaries from the label of every unlisted class to its probability and to its place's."""
+    relation, subject, _ = canonicalise("missing", name, "anchor")
+    fit, is_subject = artifact.calibration.at[relation], subject == "missing"
     listed = {thing.label for thing in scene.objects}
     classes = [k for k, label in enumerate(LABELS) if label not in {*STRUCTURE, *listed}]
     posterior = Posterior(artifact, scene)
@@ -243,28 +234,31 @@ def by_hand(artifact, scene, name, anchor, coverage):
     log_p = place_log_p(posterior, np.array(classes), Place(relation, anchor, is_subject))
     of_anchor = scene.objects[anchor].class_index
     ratio = artifact.places.log_ratio(relation, of_anchor, outgoing=is_subject)
-    probabilities = {}
-    for k, odds, p in zip(classes, z.tolist(), log_p.tolist(), strict=True):
-        value = fit.intercept + fit.relation * p + fit.counts * float(ratio[k])
-        probabilities[LABELS[k]] = 1 / (1 + math.exp(-odds)) / (1 + math.exp(-value))
-    return probabilities
-
-
-OPPOSITES_OF = {opposite: name for name, opposite in OPPOSITES.items()}
+    of_place = expit(fit.intercept + fit.relation * log_p + fit.counts * ratio[classes])
+    labels = [LABELS[k] for k in classes]
+    of_class = (expit(z) * of_place).tolist()
+    return dict(zip(labels, of_class, strict=True)), dict(zip(labels, of_place, strict=True))
 
 
 @pytest.mark.parametrize("machine", NAMES)
-@pytest.mark.parametrize("name", [*OPPOSITES, *OPPOSITES_OF])
-@pytest.mark.parametrize("block", [32, 2])
-def test_all_classes_have_the_probability_of_the_formula(monkeypatch, machine, name, block):
+@pytest.mark.parametrize("name", RELATIONS)
+@pytest.mark.parametrize(("block", "coverage"), [(32, 0.5), (2, 0.4)])
+def test_all_classes_have_the_probability_of_the_formula(
+    monkeypatch, machine, name, block, coverage
+):
+    """The product of the probabilities of class and place. The default coverage is 1/2."""
     monkeypatch.setattr(module, "_BLOCK", block)
     artifact, scene = larger_artifact(machine, at=FITS), scene_of([0, 1, 2, 3], STATED)
-    expected = by_hand(artifact, scene, name, 2, 0.5)
-    answer = {entry.label: entry for entry in missing(artifact, scene, at=(name, 2), top_k=9)}
-    assert answer.keys() == expected.keys()
-    for label, entry in answer.items():
-        assert entry.probability == pytest.approx(expected[label], rel=1e-4)
-    assert [*answer] == sorted(expected, key=expected.__getitem__, reverse=True)
+    expected, of_place = by_hand(artifact, scene, name, 2, coverage)
+    options = {} if coverage == 0.5 else {"coverage": coverage}
+    entries = missing(artifact, scene, at=(name, 2), top_k=9, **options)
+    assert [entry.label for entry in entries] == sorted(
+        expected, key=expected.__getitem__, reverse=True
+    )
+    for entry in entries:
+        assert entry.probability == pytest.approx(expected[entry.label], rel=1e-4)
+        assert entry.probability == pytest.approx(expit(entry.log_odds), rel=1e-4)
+        assert entry.placements[0].probability == pytest.approx(of_place[entry.label], rel=1e-4)
 
 
 def count_scored(monkeypatch):

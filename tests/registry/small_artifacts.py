@@ -20,6 +20,7 @@ from app.registry import (
     StoreError,
     VocabularyEntry,
 )
+from app.registry.__main__ import main
 from app.registry.manifest import FORMAT, MANIFEST
 from app.registry.references import Replacement, Shipped, aliases_to_bytes
 from app.scene.vocabulary import ObjectClass, Vocabulary
@@ -130,6 +131,11 @@ def state_replaced(
     shipped = Shipped(default=release.aliases()["default"], replaced=entries)
     text = aliases_to_bytes(release.aliases(), shipped)
     (release.root / "aliases.json").write_bytes(text)
+
+
+def copy(source: Store, target: Store, *references: str) -> int:
+    """The exit status of the command that copies models."""
+    return main(["copy", *references, "--from", str(source.root), "--to", str(target.root)])
 
 
 def replace_file(directory: Path, name: str, data: bytes) -> None:

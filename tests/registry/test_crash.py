@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from app.registry import AliasTarget, ModelSet, Store, StoreError, load_model_set
-from app.registry.__main__ import main
+from tests.registry import small_artifacts
 from tests.registry.small_artifacts import description, publish_as, state
 from tests.services import PATIENCE
 
@@ -32,7 +32,7 @@ def publish(root: Path) -> None:
 
 
 def copy(root: Path) -> None:
-    assert main(["copy", "--from", str(root.parent / "newer"), "--to", str(root)]) == 0
+    assert small_artifacts.copy(Store(root.parent / "newer"), Store(root)) == 0
 
 
 def run_until(write: Callable[[Path], None], root: Path, steps: int) -> None:

@@ -2,6 +2,8 @@
 
 import json
 import math
+from functools import reduce
+from operator import getitem
 from typing import Any
 
 import pytest
@@ -64,49 +66,39 @@ def test_refuses_malformed_manifests(data: bytes, code: str) -> None:
         Manifest.from_bytes(data)
 
 
-@pytest.mark.parametrize(
-    ("path", "value"),
-    [
-        ("surplus", 1),
-        ("calibration.outlier.surplus", 1),
-        ("name", "../up"),
-        ("name", "Upper"),
-        ("name", "a\n"),
-        ("version", "1.0"),
-        ("version", "01.0.0"),
-        ("version", "1.0.0\n"),
-        ("created", "2020-02-02T20:20:20"),  # no time zone
-        ("created", "yesterday"),
-        ("spec.V", 4),
-        ("spec.A", 2),
-        ("spec.C", 5),
-        ("spec.profiles", 1),
-        ("vocabulary.profiles", ["homes"]),
-        ("vocabulary.relations", ["left", "front", "above", "on-top"]),
-        ("vocabulary.objects.1.label", "beds"),  # the plural of another one
-        ("vocabulary.objects.0.size", [1.0, 2.0]),
-        ("vocabulary.objects.0.size", [1.0, 2.0, -3.0]),
-        ("calibration.relation", []),
-        ("calibration.at", []),
-        ("calibration.at.0.slope", 0),
-        ("calibration.misplaced.under.lines", None),
-        ("calibration.outlier_lines", None),  # the fit needs its lines
-        ("calibration.outlier", None),  # without a fit, there are no lines
-        ("training.rate", math.nan),
-        ("examples", [{"name": "a", "scene": {"objects": ["bed"], "model": "other"}}]),
-        ("examples", [{"name": "a", "scene": {"objects": ["bed"]}}] * 9),
-        ("files", {}),
-        ("files", {**FILES, "model.pkl": FILES["card.md"]}),
-        ("files", {**FILES, "../card.md": FILES["card.md"]}),
+INVALID: dict[str, list[Any]] = {
+    **{key: [1] for key in ("surplus", "calibration.outlier.surplus", "spec.profiles")},
+    "name": ["../up", "Upper", "a\n"],
+    "version": ["1.0", "01.0.0", "1.0.0\n"],
+    "created": ["2020-02-02T20:20:20", "yesterday"],  # no time zone
+    "spec.V": [4],
+    "spec.A": [2],
+    "spec.C": [5],
+    "vocabulary.profiles": [["homes"]],
+    "vocabulary.relations": [["left", "front", "above", "on-top"]],
+    "vocabulary.objects.1.label": ["beds"],  # the plural of another one
+    "vocabulary.objects.0.size": [[1.0, 2.0], [1.0, 2.0, -3.0]],
+    **{key: [[]] for key in ("calibration.relation", "calibration.at")},
+    "calibration.at.0.slope": [0],
+    "calibration.misplaced.under.lines": [None],
+    "calibration.outlier_lines": [None],  # the fit needs its lines
+    "calibration.outlier": [None],  # without a fit, there are no lines
+    "training.rate": [math.nan],
+    "examples": [
+        [{"name": "a", "scene": {"objects": ["bed"], "model": "other"}}],
+        [{"name": "a", "scene": {"objects": ["bed"]}}] * 9,
     ],
+    "files": [{}, *({**FILES, name: FILES["card.md"]} for name in ("model.pkl", "../card.md"))],
+}
+
+
+@pytest.mark.parametrize(
+    ("path", "value"), [(path, value) for path, values in INVALID.items() for value in values]
 )
 def test_refuses_a_field_that_does_not_fit(path: str, value: object) -> None:
     members = stored()
-    target: Any = members
-    *outer, last = path.split(".")
-    for step in outer:
-        target = target[int(step) if step.isdigit() else step]
-    target[last] = value
+    *outer, last = (int(step) if step.isdigit() else step for step in path.split("."))
+    reduce(getitem, outer, members)[last] = value
     with refused("invalid_manifest"):
         Manifest.from_bytes(resign(json.dumps(members).encode()))
 

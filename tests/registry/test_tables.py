@@ -105,73 +105,49 @@ def with_zero(array: Any) -> Any:
 
 EMPTY = np.zeros(0, "i4")
 NO_CLASS = {"classes": EMPTY, "most": EMPTY, "log_share": full(-1, 0, M)}
-INVALID: list[tuple[Any, str, list[dict[str, Any]]]] = [
-    (counts, "wrong_shape", [{"weights": full(0, 2, 2, 2 + C + V)}]),
-    (
-        counts,
-        "invalid_tensor",
-        [
-            *({"classes": np.array(c)} for c in ([1, 0], [0, 0], [-1, 1], [0, V], [0, -(2**63)])),
-            NO_CLASS | {"weights": full(0, 0, 2, 3 + C + V)},
-            {"most": np.array([0, 1])},
-            {"most": np.array([1, M])},
-            *({"log_share": full(-1, 2, columns)} for columns in (1, 300)),
-            *({"log_share": full(value, 2, M)} for value in (0.5, -1e4)),
-            {"weights": counts().weights * 1e5},
-            {"weights": full(0.5, 2, 2, 3 + C + V)},  # of a class on itself
-        ],
-    ),
-    (counts, "not_finite", [{"weights": full(np.nan, 2, 2, 3 + C + V)}]),
-    (offsets, "wrong_shape", [{"relation": full(0, A, 5)}, {"pair": np.int64(3)}]),
-    (
-        offsets,
-        "invalid_tensor",
-        [
-            *({"pair": np.array([3, key])} for key in (2, 3, -(2**63), A * V * V)),
-            {"pair": np.array([-1, 3])},
-            {"pair_scenes": np.array([0, 12], "i4")},
-            {"relation_scenes": np.array([-1, 0, 0, 0, 0], "i4")},
-            {"pair_offset": with_zero(offsets().pair_offset)},
-            {
-                "relation": with_zero(offsets().relation),
-                "relation_scenes": np.array([1, 0, 9, 0, 0]),
-            },
-            {"relation": full(0, A, 6)},
-        ],
-    ),
-    (offsets, "not_finite", [{"relation": full(np.nan, A, 6)}]),
-    (
-        places,
-        "wrong_shape",
-        [
-            {"held": full(0, 3)},
-            {"frequency": full(1, 2)},
-            {"role_counts": full(0, 2, 2)},
-            {"role_anchor": full(0, 2, 3)},
-            {"stands": full(0, V, 2)},
-        ],
-    ),
-    (
-        places,
-        "invalid_tensor",
-        [
-            *({"triple": np.array([1, *keys, 4], "i4")} for keys in ((3, 2), (2, 2))),
-            {"triple": np.array([-1, 2, 3, 4], "i4")},
-            {"triple": np.array([1, 2, 3, A * V * V], "i4")},
-            {"triple": EMPTY, "held": full(0, 0)},
-            *({"role_pair": np.array([2, key], "i4")} for key in (V * V, 1)),
-            {"held": np.array([4, -1, 1, 2], "f4")},
-            {"frequency": np.array([0.5, 0, 0.1], "f4")},
-            {"role_counts": np.array([(7, 1, 0), (0, -3, 0)], "f4")},
-            *({name: full(-1, V, 3)} for name in ("role_anchor", "stands")),
-        ],
-    ),
-    (places, "not_finite", [{"stands": full(np.nan, V, 3)}]),
-]
+INVALID: dict[tuple[Any, str], list[dict[str, Any]]] = {
+    (counts, "wrong_shape"): [{"weights": full(0, 2, 2, 2 + C + V)}],
+    (counts, "invalid_tensor"): [
+        *({"classes": np.array(c)} for c in ([1, 0], [0, 0], [-1, 1], [0, V], [0, -(2**63)])),
+        NO_CLASS | {"weights": full(0, 0, 2, 3 + C + V)},
+        *({"most": np.array(most)} for most in ([0, 1], [1, M])),
+        *({"log_share": full(-1, 2, columns)} for columns in (1, 300)),
+        *({"log_share": full(value, 2, M)} for value in (0.5, -1e4)),
+        {"weights": counts().weights * 1e5},
+        {"weights": full(0.5, 2, 2, 3 + C + V)},  # of a class on itself
+    ],
+    (counts, "not_finite"): [{"weights": full(np.nan, 2, 2, 3 + C + V)}],
+    (offsets, "wrong_shape"): [{"relation": full(0, A, 5)}, {"pair": np.int64(3)}],
+    (offsets, "invalid_tensor"): [
+        *({"pair": np.array([3, key])} for key in (2, 3, -(2**63), A * V * V)),
+        {"pair": np.array([-1, 3])},
+        {"pair_scenes": np.array([0, 12], "i4")},
+        {"relation_scenes": np.array([-1, 0, 0, 0, 0], "i4")},
+        {"pair_offset": with_zero(offsets().pair_offset)},
+        {"relation": with_zero(offsets().relation), "relation_scenes": np.array([1, 0, 9, 0, 0])},
+        {"relation": full(0, A, 6)},
+    ],
+    (offsets, "not_finite"): [{"relation": full(np.nan, A, 6)}],
+    (places, "wrong_shape"): [
+        *({"held": full(0, 3)}, {"frequency": full(1, 2)}, {"role_counts": full(0, 2, 2)}),
+        *({"role_anchor": full(0, 2, 3)}, {"stands": full(0, V, 2)}),
+    ],
+    (places, "invalid_tensor"): [
+        *({"triple": np.array([1, *keys, 4], "i4")} for keys in ((3, 2), (2, 2))),
+        *({"triple": np.array([key, 2, 3, last], "i4")} for key, last in ((-1, 4), (1, A * V * V))),
+        {"triple": EMPTY, "held": full(0, 0)},
+        *({"role_pair": np.array([2, key], "i4")} for key in (V * V, 1)),
+        {"held": np.array([4, -1, 1, 2], "f4")},
+        {"frequency": np.array([0.5, 0, 0.1], "f4")},
+        {"role_counts": np.array([(7, 1, 0), (0, -3, 0)], "f4")},
+        *({name: full(-1, V, 3)} for name in ("role_anchor", "stands")),
+    ],
+    (places, "not_finite"): [{"stands": full(np.nan, V, 3)}],
+}
 
 
 @pytest.mark.parametrize(
-    ("group", "code", "change"), [(group, code, c) for group, code, cs in INVALID for c in cs]
+    ("group", "code", "change"), [(*key, c) for key, changes in INVALID.items() for c in changes]
 )
 def test_invalid_tensors_are_refused(tmp_path, group, code, change):
     with refused(code):

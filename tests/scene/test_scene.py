@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from scipy.spatial.transform import Rotation
 
 from app.scene import RelationTable, Scene, SceneObject, observe
 from app.scene.geometry import Viewpoint, derive_relations, to_viewer_frame
@@ -28,8 +29,7 @@ from app.scene.spatial_relations import (
 from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN, Heights, floor_level, stands_of
 from scene_client.frames import body_pose, is_optical, is_world_fixed, viewer_axes
 from scene_client.schemas import RelationName
-from tests.scene.role_counts import LABELS, role_counts
-from tests.scene.turns import about, after
+from tests.scene.test_geometry import LABELS, role_counts
 from training.datasets.encoding import pool_instances
 
 DESK = SceneObject("desk", "desk", 0, position=(2.0, 0.0, 0.4), size=(0.8, 1.6, 0.8))
@@ -314,14 +314,13 @@ def test_optical_axes() -> None:
 def test_a_box_on_its_side(angle: float, tilt: float) -> None:
     """Tipped about x the box heads along its z axis, tipped about y along its y axis."""
     for axis, size, heading in (
-        ((1, 0, 0), (3.0, 1.0, 2.0), angle - math.pi / 2),
-        ((0, 1, 0), (2.0, 3.0, 1.0), angle + math.pi / 2),
+        ("X", (3.0, 1.0, 2.0), angle - math.pi / 2),
+        ("Y", (2.0, 3.0, 1.0), angle + math.pi / 2),
     ):
         # A tilt about the heading leaves it level.
-        lean = after(about((0, 0, 1), heading), about((1, 0, 0), tilt))
-        lean = after(lean, about((0, 0, 1), -heading))
-        tipped = after(about((0, 0, 1), angle), about(axis, math.pi / 2))
-        _, upright, yaw = body_pose((0.0, 0.0, 0.0), (1.0, 2.0, 3.0), after(lean, tipped))
+        lean = Rotation.from_euler("ZXZ", [heading, tilt, -heading])
+        turn = lean * Rotation.from_euler(f"Z{axis}", [angle, math.pi / 2])
+        _, upright, yaw = body_pose((0.0, 0.0, 0.0), (1.0, 2.0, 3.0), turn.as_quat().tolist())
         assert upright == size
         assert same_turn(yaw, heading)
 
@@ -329,8 +328,8 @@ def test_a_box_on_its_side(angle: float, tilt: float) -> None:
 @given(st.floats(-0.6, 0.6), st.floats(-3, 3))
 def test_a_tilt_is_dropped(tilt: float, angle: float) -> None:
     # Yaw after a tilt about the box's own x axis leaves that axis horizontal.
-    both = after(about((0, 0, 1), angle), about((1, 0, 0), tilt))
-    _, size, yaw = body_pose((0.0, 0.0, 0.0), (1.0, 2.0, 3.0), both)
+    both = Rotation.from_euler("ZX", [angle, tilt])
+    _, size, yaw = body_pose((0.0, 0.0, 0.0), (1.0, 2.0, 3.0), both.as_quat().tolist())
     assert size == (1.0, 2.0, 3.0)
     assert same_turn(yaw, angle)
 

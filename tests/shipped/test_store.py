@@ -1,11 +1,16 @@
-"""The shipped store: models, sizes, words, and answers to known facts."""
+"""The shipped store: models, sizes, words, examples, and answers to known facts."""
 
 import re
+from doctest import DocTestFinder, DocTestRunner
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
+from app import questions
 from app.registry import Artifact, Store, load_model_set
+from app.scene import RelationTable, Scene
+from app.scene.spatial_relations import ON_TOP
 from tests.conftest import REPOSITORY
 from training.evaluation.everyday_task import EVERYDAY, LINES, ask_everyday, facts_file
 from training.runs.config_files import load_config
@@ -75,6 +80,16 @@ def test_an_artifact_has_its_examples(artifact):
     assert examples
     assert accepted_examples(examples, artifact.model.vocabulary) == (examples, [])
     assert artifact.manifest.examples == examples
+
+
+@pytest.mark.parametrize("name", [name for name in questions.__all__ if name.islower()])
+def test_the_example_in_the_docstring_of_a_question_runs(name, models):
+    function, model = getattr(questions, name), models.resolve("default").model
+    names = {"model": model, "Scene": Scene, "RelationTable": RelationTable, "ON_TOP": ON_TOP}
+    names = vars(import_module(function.__module__)) | names
+    (example,) = DocTestFinder(recurse=False).find(function, name, globs=names)
+    assert example.examples
+    assert not DocTestRunner().run(example).failed
 
 
 # Scenes are drawn with fixed seeds, so the counts of a version of numpy and numba are always the
