@@ -30,8 +30,7 @@ from training.domain.terminal import StorePath, console, fail, print_lines
 from training.evaluation.report import Progress
 from training.fit.configuration import Config, ConfigError
 from training.fit.trainer import Trainer
-from training.research.ablate import ablate
-from training.research.benchmark import benchmark
+from training.research.benchmark import ablate, benchmark
 from training.research.tune import tune
 from training.research.words import words
 from training.runs.config_files import data_folder, load_config, with_settings

@@ -1,4 +1,4 @@
-"""Models for the evaluation: a trained model, and two references for generated scenes."""
+"""A trained model, as the tasks of the evaluation ask it."""
 
 from __future__ import annotations
 
@@ -25,20 +25,13 @@ from training.evaluation.asking import (
     score_rooms,
     score_suspicion,
 )
-from training.evaluation.generation_task import (
-    held_out_halves,
-    independent_sampler,
-    machine_sampler,
-    scene_sampler,
-)
-from training.evaluation.model import Model, Places, Sampler
-from training.evaluation.setting import Setting
+from training.evaluation.generation_task import machine_scenes
+from training.evaluation.model import Model, Places
 from training.machines.arrays import machine_of
 
 
 def artifact_model(artifact: SceneModel, *, profiles: Sequence[str] = ()) -> Model:
     """Return the answers of a trained model. Requests about rooms may name the `profiles`."""
-    sampler = machine_sampler(artifact)
     judges_relations = artifact.calibration.misplaced.judges_relations
     return Model(
         missing=partial(score_missing, artifact),
@@ -50,7 +43,7 @@ def artifact_model(artifact: SceneModel, *, profiles: Sequence[str] = ()) -> Mod
         false_relations=partial(score_false_relations, artifact),
         misplaced=partial(score_misplaced, artifact) if judges_relations else None,
         rooms=partial(score_rooms, artifact, profiles) if artifact.spec.C else None,
-        generate=lambda _: sampler,
+        generate=partial(machine_scenes, artifact),
         parameters=machine_of(artifact.weights).parameter_count,
         scene_model=artifact,
     )
@@ -116,21 +109,3 @@ def score_placed(artifact: SceneModel, places: Places) -> Float[Tensor, "B V"]:
         anchor = int(first[classes == places.anchor[row]])
         log_p[row] = torch.from_numpy(missing_log_p_at(artifact, scene, name, anchor))
     return log_p
-
-
-def floor_model() -> Model:
-    """Return a model whose samples are held-out scenes: the best possible value of T4."""
-
-    def sampler(setting: Setting) -> Sampler | None:
-        _, second = held_out_halves(setting)
-        return scene_sampler(second) if len(second) else None
-
-    return Model(generate=sampler)
-
-
-def independent_model(classes: int) -> Model:
-    """Return a model that samples classes independently at their training frequencies."""
-    return Model(
-        generate=lambda s: None if s.train is None else independent_sampler(s.train),
-        parameters=classes,
-    )

@@ -63,8 +63,8 @@ from training.evaluation.asking import (
     thing_instances,
     with_intruder,
 )
-from training.evaluation.intruders import draw_intruder_choices
 from training.evaluation.metrics import Metric, Scored
+from training.evaluation.outlier_tasks import draw_intruder_choices
 from training.evaluation.parts import (
     Size,
     all_but_one,

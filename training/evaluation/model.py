@@ -12,8 +12,7 @@ from torch import Tensor
 
 from app.model import SceneModel, Sensitivity
 from app.scene import Scene
-from training.datasets.batches import Batch
-from training.evaluation.setting import Setting
+from training.datasets.batches import Batch, SceneTensors
 
 ObjectScore: TypeAlias = Callable[[Float[Tensor, "B V"]], Float[Tensor, "B V"]]
 """Function from lists of classes to the log-odds of all classes."""
@@ -59,11 +58,19 @@ class Drawn:
     contradictions: Int[Tensor, "B 4"]
 
 
-Sampler: TypeAlias = Callable[[Bool[Tensor, "B V"], Int[Tensor, "B"], int], Drawn]
-"""Function that generates scenes from their required classes, room types (-1: any) and a seed."""
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Evidence of B scenes to generate, and the scenes from which a reference draws."""
 
-SamplerOf: TypeAlias = Callable[[Setting], Sampler | None]
-"""Function of the setting; None if its scenes allow no answer."""
+    given: Bool[Tensor, "B V"]  # required classes
+    room: Int[Tensor, " B"]  # room type; -1: any
+    seed: int
+    train: SceneTensors
+    held_out: SceneTensors
+
+
+Sampler: TypeAlias = Callable[[Evidence], Drawn]
+"""Function that generates scenes."""
 
 Parameters: TypeAlias = Mapping[str, float | int | str]
 
@@ -85,7 +92,7 @@ class Model:
     misplaced: MisplacedScore | None = None  # T3c: moved objects
     lateral: float = 0.0  # T1 pairs: change of the log-odds of left and front, `lateral_shift`
     rooms: RoomScore | None = None
-    generate: SamplerOf | None = None  # T4
+    generate: Sampler | None = None  # T4
     scene_model: SceneModel | None = None  # for Calibration and all questions to the service
     parameters: int | None = None  # number of trained weights; None if it has no meaning
 

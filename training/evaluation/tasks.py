@@ -12,28 +12,24 @@ from typing import Any
 from training.evaluation import evidence_tasks as evidence
 from training.evaluation.asking import SENSITIVITIES
 from training.evaluation.calibration_task import NAMES, calibration_task
-from training.evaluation.count_task import METRICS as COUNTS
-from training.evaluation.count_task import counts_task
 from training.evaluation.everyday_task import LINES, everyday_task
-from training.evaluation.generated_rooms_task import (
+from training.evaluation.generation_task import (
     FREE,
     REFUSED,
     ROOMS,
     SIZE,
     generated_rooms_task,
+    generation_task,
 )
-from training.evaluation.generation_task import generation_task
-from training.evaluation.intruders import LAWS
 from training.evaluation.missing_tasks import SIZES, missing_task, placed_task
 from training.evaluation.model import Model
 from training.evaluation.moved_task import METRICS, moved_task
-from training.evaluation.offset_task import METRICS as OFFSETS
-from training.evaluation.offset_task import offsets_task
-from training.evaluation.outlier_tasks import LENGTHS, alarms_task, outliers_task
+from training.evaluation.outlier_tasks import LAWS, LENGTHS, alarms_task, outliers_task
 from training.evaluation.pair_task import pairs_task
 from training.evaluation.relation_tasks import completion_task, placement_task, relations_task
 from training.evaluation.room_task import FIGURES, LISTS, rooms_task
 from training.evaluation.setting import Outcome, Setting
+from training.evaluation.statistics_tasks import COUNTS, OFFSETS, counts_task, offsets_task
 
 
 @dataclass(frozen=True)

@@ -14,14 +14,14 @@ import torch
 from app.scene.spatial_relations import STACKED
 from training.datasets.batches import SceneTensors, TrainingData, subset
 from training.datasets.cases import some_scenes
-from training.evaluation.artifact_model import artifact_model, floor_model, independent_model
+from training.evaluation.artifact_model import artifact_model
 from training.evaluation.asking import ask_rows
 from training.evaluation.baselines import PLACED, placed_product
 from training.evaluation.baselines.classes import frequency
 from training.evaluation.baselines.fitting import TRIALS, Baseline
-from training.evaluation.intruders import intruder_weights
+from training.evaluation.generation_task import held_out_scenes, independent_scenes
 from training.evaluation.model import Model, ObjectScore, suspicion_of
-from training.evaluation.outlier_tasks import expected_hit_at_1, with_intruders
+from training.evaluation.outlier_tasks import expected_hit_at_1, intruder_weights, with_intruders
 from training.evaluation.pair_task import SHIFTS, baseline_log_odds, lateral_shift, listed_pairs
 from training.evaluation.report import Progress, silent
 from training.evaluation.setting import Structure
@@ -78,13 +78,17 @@ def baseline_entries(
 
 def reference_entries() -> Iterator[Entry]:
     """Generate the untrained references for the evaluation of generated scenes."""
-    for name in ("independent classes", "held-out scenes (floor)"):
-        yield Entry(name, 0, name, partial(_reference_model, name))
+    makers = {"independent classes": _independent, "held-out scenes (floor)": _held_out}
+    for name, make in makers.items():
+        yield Entry(name, 0, name, make)
 
 
-def _reference_model(name: str, data: TrainingData, folder: Path, say: Progress) -> Model:  # noqa: ARG001
-    classes = data.train.v.shape[1]
-    return independent_model(classes) if name == "independent classes" else floor_model()
+def _independent(data: TrainingData, *_: object) -> Model:
+    return Model(generate=independent_scenes, parameters=data.train.v.shape[1])
+
+
+def _held_out(*_: object) -> Model:
+    return Model(generate=held_out_scenes)
 
 
 def machine_entry(config: Config) -> Entry:

@@ -31,8 +31,8 @@ from app.registry import DEFAULT_STORE, Store
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import some_scenes
 from training.domain.terminal import StorePath
-from training.evaluation.outside import read_test
 from training.evaluation.parts import draw_parts, exactly, rank_hidden
+from training.evaluation.report import read_test
 from training.evaluation.setting import Structure, with_relations
 from training.machines import BoltzmannMachine
 from training.machines.arrays import machine_of

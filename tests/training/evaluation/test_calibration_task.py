@@ -20,7 +20,7 @@ from training.evaluation.calibration_task import (
     collect_missing,
     uncalibrated,
 )
-from training.evaluation.intruders import draw_intruder_choices
+from training.evaluation.outlier_tasks import draw_intruder_choices
 from training.evaluation.parts import draw_parts, exactly
 
 ARTIFACT = larger_artifact("triway")

@@ -9,9 +9,9 @@ from tests.training.evaluation.scenes import flat, random_scenes, scene, tensors
 from training.datasets.batches import seen_triples
 from training.datasets.cases import some_scenes
 from training.evaluation import report as reports
-from training.evaluation.artifact_model import artifact_model, floor_model, independent_model
+from training.evaluation.artifact_model import artifact_model
 from training.evaluation.calibration_task import QUESTIONS
-from training.evaluation.generation_task import held_out_halves
+from training.evaluation.generation_task import held_out_halves, held_out_scenes, independent_scenes
 from training.evaluation.model import Model
 from training.evaluation.relation_tasks import completion_task
 from training.evaluation.setting import Setting
@@ -122,9 +122,9 @@ def test_the_floor_is_the_other_half_of_the_scenes():
     """The samples of independent classes have the mean size of the training scenes."""
     tasks = ("T4 generate",)
     name = "T4 generate", "classes per scene, free"
-    independent = values_of(report_of(independent_model(V), SETTING, tasks))
+    independent = values_of(report_of(Model(generate=independent_scenes), SETTING, tasks))
     assert independent[name] == pytest.approx(float(TRAIN.v.sum(1).mean()), abs=0.3)
-    floor = values_of(report_of(floor_model(), SETTING, tasks))
+    floor = values_of(report_of(Model(generate=held_out_scenes), SETTING, tasks))
     assert floor[name] == pytest.approx(float(held_out_halves(SETTING)[1].v.sum(1).mean()))
 
 

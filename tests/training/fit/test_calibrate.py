@@ -16,9 +16,8 @@ from tests.training.evaluation.scenes import WIDE, random_scenes, scene, tensors
 from tests.training.fit.test_objects import fit_objects
 from training.datasets.batches import TrainingData
 from training.datasets.roles import count_roles
-from training.evaluation.alarms import ALARMS
 from training.evaluation.calibration_task import ask_outliers, collect, collect_missing
-from training.evaluation.intruders import draw_intruder_choices
+from training.evaluation.outlier_tasks import ALARMS, draw_intruder_choices
 from training.evaluation.parts import draw_parts, exactly, up_to_longest
 from training.fit import calibrate_objects as of_objects
 from training.fit.calibrate import (

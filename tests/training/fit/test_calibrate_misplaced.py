@@ -16,7 +16,7 @@ from tests.training.evaluation.scenes import scene
 from training.datasets.cases import draw_true_relations, scene_of, scene_rng
 from training.datasets.moved import moved_by_triple, moved_scene, posed_scene
 from training.datasets.roles import count_roles
-from training.evaluation.alarms import ALARMS
+from training.evaluation.outlier_tasks import ALARMS
 from training.fit import calibrate_misplaced as module
 from training.fit.calibrate_misplaced import fit_misplaced, hardest_quantile
 from training.fit.draft import draft_artifact, fit_places

@@ -6,13 +6,7 @@ from typing import Final
 
 from training.evaluation.baselines import EASE, FREQUENCY_TABLE, PLACED, POPULARITY, triples
 from training.evaluation.baselines.fitting import COMPLETION, MISPLACED, RELATIONS, ROOMS, Baseline
-from training.research.baselines import (
-    networks,
-    object_models,
-    relation_models,
-    room_models,
-    supporters,
-)
+from training.research.baselines import object_models, relation_models, room_models
 
 _EVERY: tuple[Baseline, ...] = (
     POPULARITY,
@@ -21,7 +15,7 @@ _EVERY: tuple[Baseline, ...] = (
     EASE,
     Baseline("pairwise logistic", object_models.pairwise),
     Baseline("scikit-learn BernoulliRBM", object_models.bernoulli_rbm, stochastic=True),
-    Baseline("denoising autoencoder", networks.autoencoder, stochastic=True),
+    Baseline("denoising autoencoder", object_models.autoencoder, stochastic=True),
     Baseline("most common room type", room_models.most_common, ROOMS),
     Baseline("naive Bayes of rooms", room_models.naive_bayes, ROOMS),
     Baseline("relation popularity", relation_models.relation_popularity, RELATIONS),
@@ -34,7 +28,7 @@ _EVERY: tuple[Baseline, ...] = (
         COMPLETION,
     ),
     PLACED,
-    Baseline("frequency table of supporters", supporters.supporter_table, MISPLACED),
+    Baseline("frequency table of supporters", relation_models.supporter_table, MISPLACED),
 )
 
 BASELINES: Final[dict[str, Baseline]] = {entry.name: entry for entry in _EVERY}

@@ -4,14 +4,14 @@ import pytest
 
 from tests.training.research.baselines.furnished import furnished
 from training.datasets.batches import SceneTensors
-from training.research.baselines import networks
+from training.research.baselines import object_models
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _short_courses() -> Iterator[None]:
     """A few steps suffice for two kinds of rooms."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(networks, "_STEPS", 60)
+        patch.setattr(object_models, "_STEPS", 60)
         yield
 
 

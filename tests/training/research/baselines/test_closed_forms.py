@@ -20,11 +20,11 @@ from training.evaluation.baselines.classes import Lists, fit_ease, frequency, tr
 from training.evaluation.generation_task import transitive_closure
 from training.evaluation.model import Places
 from training.evaluation.relation_tasks import with_observed
-from training.research.baselines.networks import hidden_loss
 from training.research.baselines.object_models import (
     bernoulli_rbm,
     evidence,
     fit_pairwise,
+    hidden_loss,
     nearest_score,
 )
 from training.research.baselines.relation_models import closure_score, complex_logits
