@@ -59,7 +59,6 @@ from training.evaluation.asking import (
     canonical_triple,
     index_of_ids,
     labels_alone,
-    of_classes,
     thing_instances,
     with_intruder,
 )
@@ -70,6 +69,7 @@ from training.evaluation.parts import (
     all_but_one,
     draw_parts,
     exactly,
+    of_classes,
     share_of,
     up_to_longest,
 )

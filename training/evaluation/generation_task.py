@@ -47,10 +47,9 @@ from app.scene import CANONICAL, Scene
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.cases import some_scenes
 from training.datasets.sources import source_of
-from training.evaluation.asking import of_classes
 from training.evaluation.metrics import Metric, Ratio, Resampled, Statistic
-from training.evaluation.model import Drawn, Evidence, Sampler
-from training.evaluation.setting import Outcome, Setting
+from training.evaluation.parts import of_classes
+from training.evaluation.setting import Drawn, Evidence, Outcome, Sampler, Setting
 
 _RESAMPLES = 200
 _BANDWIDTH_SCENES = 1000  # maximum number of held-out scenes for the bandwidth

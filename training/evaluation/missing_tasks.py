@@ -28,7 +28,6 @@ from training.datasets.batches import SceneTensors
 from training.datasets.cases import scene_rng
 from training.evaluation.asking import ask_rows
 from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.model import ObjectScore, PlacedScore, Places
 from training.evaluation.parts import (
     Ranking,
     Size,
@@ -37,7 +36,14 @@ from training.evaluation.parts import (
     one_quarter,
     rank_hidden,
 )
-from training.evaluation.setting import Outcome, Setting, Structure
+from training.evaluation.setting import (
+    ObjectScore,
+    Outcome,
+    PlacedScore,
+    Places,
+    Setting,
+    Structure,
+)
 
 SEEDS: Final = (0, 1, 2)  # seeds of the draws of a question, for each scene
 

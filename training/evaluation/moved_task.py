@@ -31,8 +31,7 @@ from training.datasets.cases import scene_rng, some_scenes
 from training.datasets.moved import moved_scene, untouched_scene
 from training.evaluation.asking import ask_every
 from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.model import MisplacedScore
-from training.evaluation.setting import Outcome, Setting, Structure
+from training.evaluation.setting import MisplacedScore, Outcome, Setting, Structure
 
 ALARMS: Final = 0.05  # share of untouched scenes with an alarm at the threshold
 

@@ -57,9 +57,8 @@ from training.datasets.cases import draw_true_relations, scene_of, scene_rng
 from training.evaluation.asking import SENSITIVITIES, ask_rows, thing_instances
 from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.missing_tasks import SEEDS
-from training.evaluation.model import Flagged, Model, ObjectScore
 from training.evaluation.parts import LONGEST, draw_parts, exactly
-from training.evaluation.setting import Outcome, Setting, Structure
+from training.evaluation.setting import Flagged, Model, ObjectScore, Outcome, Setting, Structure
 
 LENGTHS: Final = (1, 2, 3, 5, 8)  # numbers of listed classes in which alarms are measured
 

@@ -32,9 +32,8 @@ from training.datasets import EncodedScene
 from training.datasets.batches import SceneTensors, seen_triples
 from training.evaluation.asking import ask_every, labels_alone, relation_probabilities
 from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.model import Model, RelationScore
 from training.evaluation.relation_tasks import with_observed
-from training.evaluation.setting import Outcome, Setting, Structure
+from training.evaluation.setting import Model, Outcome, RelationScore, Setting, Structure
 
 RARE = 10  # A class is rare if training relates it to at most this many classes
 SHIFTS = (0.0, -0.4, -0.8, -1.2)  # tested changes of the log-odds of left and front

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from app.inference.weights import SHARES
+from app.scene import Scene, SceneObject
 from training.datasets.array_types import Rng
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.cases import scene_rng, some_scenes
@@ -111,6 +112,11 @@ def draw_parts(
         mask[row, torch.from_numpy(classes)] = True
     v = scenes.v[index].masked_fill(mask | structure, 0.0)
     return Parts(index, v, mask, scenes.relatives_of(v) & (v == 0), len(scenes))
+
+
+def of_classes(classes: Sequence[int]) -> Scene:
+    """Return a scene with one object for each entry of `classes`."""
+    return Scene(tuple(SceneObject(str(k), str(c), c) for k, c in enumerate(classes)))
 
 
 def share_bin(listed: Float[Tensor, " B"], classes: Float[Tensor, " B"]) -> Int[Tensor, " B"]:

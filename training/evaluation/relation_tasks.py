@@ -35,8 +35,7 @@ from training.datasets.array_types import Rng
 from training.datasets.batches import Batch, SceneTensors
 from training.datasets.cases import Triple, scene_rng
 from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.model import RelationScore
-from training.evaluation.setting import Outcome, Setting, Structure
+from training.evaluation.setting import Outcome, RelationScore, Setting, Structure
 from training.machines.edges import triple_keys
 
 FIRST = (20, 50, 100)  # numbers of predictions per scene for recall

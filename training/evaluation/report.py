@@ -30,11 +30,10 @@ from training.datasets import AnnotatedScene, DatasetError, annotated_classes, e
 from training.datasets.batches import SceneTensors, scene_tensors, subset
 from training.datasets.files import write_whole
 from training.datasets.records import digest_of
-from training.evaluation.artifact_model import artifact_model
+from training.evaluation.asking import artifact_model
 from training.evaluation.everyday_task import SOURCE, facts_file
 from training.evaluation.metrics import Metric, Ratio, Resampled, Scored
-from training.evaluation.model import Model
-from training.evaluation.setting import Outcome, Setting, Structure
+from training.evaluation.setting import Model, Outcome, Setting, Structure
 from training.evaluation.tasks import EVERY_TASK, ONCE, TASKS, WHOLE_SET
 
 _LIMIT = 200  # maximum number of scenes per data source in slow tasks

@@ -26,7 +26,6 @@ from training.datasets.batches import SceneTensors, subset
 from training.evaluation.asking import ask_rows
 from training.evaluation.metrics import Metric, Ratio, Scored
 from training.evaluation.missing_tasks import SEEDS
-from training.evaluation.model import RoomScore
 from training.evaluation.parts import (
     REAL_SOURCES,
     Parts,
@@ -36,7 +35,7 @@ from training.evaluation.parts import (
     exactly,
     real_sources,
 )
-from training.evaluation.setting import Outcome, Setting, Structure
+from training.evaluation.setting import Outcome, RoomScore, Setting, Structure
 
 LEAST: Final = 1e-4  # least probability of a room type in the log-loss
 

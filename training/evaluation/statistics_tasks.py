@@ -32,8 +32,8 @@ from app.questions.posterior import present
 from app.scene import CANONICAL
 from training.datasets import EncodedScene
 from training.datasets.cases import MOST, counted_classes, listed_cases, observed_offsets
-from training.evaluation.asking import of_classes
 from training.evaluation.metrics import Metric, Ratio
+from training.evaluation.parts import of_classes
 from training.evaluation.setting import Outcome, Setting
 
 SHARE: Final = 0.8  # share of the offsets that each ellipse or ellipsoid should contain

@@ -22,13 +22,12 @@ from training.evaluation.generation_task import (
     generation_task,
 )
 from training.evaluation.missing_tasks import SIZES, missing_task, placed_task
-from training.evaluation.model import Model
 from training.evaluation.moved_task import METRICS, moved_task
 from training.evaluation.outlier_tasks import LAWS, LENGTHS, alarms_task, outliers_task
 from training.evaluation.pair_task import pairs_task
 from training.evaluation.relation_tasks import completion_task, placement_task, relations_task
 from training.evaluation.room_task import FIGURES, LISTS, rooms_task
-from training.evaluation.setting import Outcome, Setting
+from training.evaluation.setting import Model, Outcome, Setting
 from training.evaluation.statistics_tasks import COUNTS, OFFSETS, counts_task, offsets_task
 
 

@@ -14,17 +14,14 @@ import torch
 from app.scene.spatial_relations import STACKED
 from training.datasets.batches import SceneTensors, TrainingData, subset
 from training.datasets.cases import some_scenes
-from training.evaluation.artifact_model import artifact_model
-from training.evaluation.asking import ask_rows
-from training.evaluation.baselines import PLACED, placed_product
-from training.evaluation.baselines.classes import frequency
-from training.evaluation.baselines.fitting import TRIALS, Baseline
+from training.evaluation.asking import artifact_model, ask_rows
+from training.evaluation.baselines import PLACED, frequency, placed_product
 from training.evaluation.generation_task import held_out_scenes, independent_scenes
-from training.evaluation.model import Model, ObjectScore, suspicion_of
 from training.evaluation.outlier_tasks import expected_hit_at_1, intruder_weights, with_intruders
 from training.evaluation.pair_task import SHIFTS, baseline_log_odds, lateral_shift, listed_pairs
 from training.evaluation.report import Progress, silent
-from training.evaluation.setting import Structure
+from training.evaluation.selection import TRIALS, Baseline
+from training.evaluation.setting import Model, ObjectScore, Structure, suspicion_of
 from training.fit.calibrate import calibrate
 from training.fit.configuration import Config, ObjectsConfig
 from training.fit.draft import placed_draft

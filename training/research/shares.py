@@ -28,7 +28,7 @@ from app.model import SceneModel
 from app.model.calibration import KINDS
 from app.registry import DEFAULT_STORE, Store
 from training.domain.terminal import StorePath
-from training.evaluation.artifact_model import artifact_model
+from training.evaluation.asking import artifact_model
 from training.evaluation.report import read_test
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import TASKS

@@ -32,11 +32,10 @@ from rich.console import Console
 
 from training.datasets.batches import TrainingData
 from training.datasets.files import write_whole
-from training.evaluation.artifact_model import score_relations
-from training.evaluation.asking import score_missing
+from training.evaluation.asking import score_missing, score_relations
 from training.evaluation.metrics import Metric, paired_difference
-from training.evaluation.model import Model
 from training.evaluation.report import SourceReport, measure, pooled, settings_by_source
+from training.evaluation.setting import Model
 from training.fit.configuration import Config, ConfigError, first_error
 from training.fit.curve import SCORES, CurvePoint
 from training.fit.draft import draft_artifact

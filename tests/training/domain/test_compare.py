@@ -12,7 +12,7 @@ from training.datasets.splits import stable_part
 from training.domain.candidates import BASELINES, Candidate, held_out
 from training.domain.compare import COMPARED, compare, side_by_side
 from training.evaluation.baselines import EASE, FREQUENCY_TABLE, POPULARITY
-from training.evaluation.model import Model
+from training.evaluation.setting import Model
 from training.fit.configuration import ConfigError
 from training.fit.draft import as_stored, draft_artifact
 from training.fit.objects import ObjectScenes

@@ -6,8 +6,7 @@ from tests.enumeration.small_machines import small_machine
 from tests.questions.artifacts import artifact_of
 from tests.training.evaluation.scenes import WIDE, random_scenes, scene, tensors
 from training.evaluation import generation_task
-from training.evaluation.model import Drawn, Evidence
-from training.evaluation.setting import Setting
+from training.evaluation.setting import Drawn, Evidence, Setting
 
 X = torch.tensor([[1.0, 0, 0], [1, 1, 0]])
 Y = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, 1, 1]])

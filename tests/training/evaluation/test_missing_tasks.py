@@ -17,8 +17,7 @@ from tests.training.evaluation.scenes import (
     tensors,
     values_of,
 )
-from training.evaluation.artifact_model import score_placed
-from training.evaluation.asking import LeakError
+from training.evaluation.asking import LeakError, score_placed
 from training.evaluation.missing_tasks import (
     SEEDS,
     leave_one_out_at,
@@ -26,9 +25,8 @@ from training.evaluation.missing_tasks import (
     rank_missing,
     removed_places,
 )
-from training.evaluation.model import Places
 from training.evaluation.parts import all_but_one, draw_parts
-from training.evaluation.setting import Setting
+from training.evaluation.setting import Places, Setting
 
 DATA = tensors(random_scenes(20), WIDE)
 

@@ -4,10 +4,8 @@ import torch
 
 from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
 from tests.training.evaluation.scenes import FLOOR, NO_STRUCTURE, scene, tensors, values_of
-from training.evaluation.artifact_model import artifact_model
-from training.evaluation.asking import SENSITIVITIES, judge, of_classes
+from training.evaluation.asking import SENSITIVITIES, artifact_model, judge
 from training.evaluation.missing_tasks import SEEDS
-from training.evaluation.model import Model, suspicion_of
 from training.evaluation.outlier_tasks import (
     LAWS,
     alarms_task,
@@ -19,8 +17,8 @@ from training.evaluation.outlier_tasks import (
     signatures,
     with_intruders,
 )
-from training.evaluation.parts import draw_parts, exactly
-from training.evaluation.setting import Setting
+from training.evaluation.parts import draw_parts, exactly, of_classes
+from training.evaluation.setting import Model, Setting, suspicion_of
 
 
 def only_intruders(v):

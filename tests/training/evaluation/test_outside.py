@@ -10,7 +10,7 @@ from training.datasets import DatasetError, annotated_classes, encode, generate_
 from training.datasets.batches import scene_tensors
 from training.datasets.jsonl import write_jsonl
 from training.datasets.records import digest_of
-from training.evaluation.artifact_model import artifact_model
+from training.evaluation.asking import artifact_model
 from training.evaluation.report import ROOM_TASKS, RoomList, measure, read_test
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import TASKS

@@ -19,7 +19,7 @@ from tests.training.evaluation.scenes import (
 )
 from training.datasets import AnnotatedObject, AnnotatedScene, encode
 from training.datasets.batches import seen_triples
-from training.evaluation.artifact_model import score_relations
+from training.evaluation.asking import score_relations
 from training.evaluation.relation_tasks import (
     complete_scenes,
     draw_false_triple,

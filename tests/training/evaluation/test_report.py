@@ -9,12 +9,11 @@ from tests.training.evaluation.scenes import flat, random_scenes, scene, tensors
 from training.datasets.batches import seen_triples
 from training.datasets.cases import some_scenes
 from training.evaluation import report as reports
-from training.evaluation.artifact_model import artifact_model
+from training.evaluation.asking import artifact_model
 from training.evaluation.calibration_task import QUESTIONS
 from training.evaluation.generation_task import held_out_halves, held_out_scenes, independent_scenes
-from training.evaluation.model import Model
 from training.evaluation.relation_tasks import completion_task
-from training.evaluation.setting import Setting
+from training.evaluation.setting import Model, Setting
 from training.evaluation.tasks import EVERY_TASK, TASKS, WHOLE_SET
 
 V = LARGER["triway"].V

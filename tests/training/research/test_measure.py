@@ -5,8 +5,7 @@ import pytest
 from rich.console import Console
 
 from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
-from training.evaluation.model import Model
-from training.evaluation.setting import Setting
+from training.evaluation.setting import Model, Setting
 from training.research.entries import Entry
 from training.research.measure import POOLED, Plan, measure_entries
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from training.evaluation.baselines import EASE, FREQUENCY_TABLE, PLACED, POPULARITY, triples
-from training.evaluation.baselines.fitting import COMPLETION, MISPLACED, RELATIONS, ROOMS, Baseline
+from training.evaluation.baselines import EASE, FREQUENCY_TABLE, PLACED, POPULARITY
+from training.evaluation.selection import COMPLETION, MISPLACED, RELATIONS, ROOMS, Baseline
 from training.research.baselines import object_models, relation_models, room_models
 
 _EVERY: tuple[Baseline, ...] = (
@@ -21,7 +21,7 @@ _EVERY: tuple[Baseline, ...] = (
     Baseline("relation popularity", relation_models.relation_popularity, RELATIONS),
     FREQUENCY_TABLE,
     Baseline("ComplEx", relation_models.complex_embedding, RELATIONS, stochastic=True),
-    Baseline("frequency table, completing", triples.frequency_table, COMPLETION),
+    Baseline("frequency table, completing", FREQUENCY_TABLE.propose, COMPLETION),
     Baseline(
         "frequency table + closure, completing",
         relation_models.frequency_table_with_closure,

@@ -17,10 +17,9 @@ from torch.optim.lr_scheduler import OneCycleLR
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from training.datasets.batches import SceneTensors
-from training.evaluation.baselines.classes import LinearScore, Lists, frequency, training_lists
-from training.evaluation.baselines.fitting import TRIALS, Proposals, drawn_settings, halving
-from training.evaluation.model import ObjectScore, Parameters
-from training.evaluation.setting import Structure
+from training.evaluation.baselines import LinearScore, Lists, frequency, training_lists
+from training.evaluation.selection import TRIALS, Proposals, drawn_settings, halving
+from training.evaluation.setting import ObjectScore, Parameters, Structure
 
 # Co-occurrence: Bernoulli naive Bayes, with the present classes as evidence.
 #

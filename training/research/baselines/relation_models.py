@@ -20,16 +20,15 @@ from training.datasets import EncodedScene
 from training.datasets.batches import Batch, SceneTensors
 from training.datasets.cases import scene_of
 from training.datasets.moved import has_boxes, posed_scene
-from training.evaluation.baselines.fitting import Proposals
-from training.evaluation.baselines.triples import (
+from training.evaluation.baselines import (
     TripleCounts,
     count_triples,
     smoothed_log_odds,
     table_score,
 )
 from training.evaluation.generation_task import transitive_closure
-from training.evaluation.model import MisplacedScore, RelationScore
-from training.evaluation.setting import Structure
+from training.evaluation.selection import Proposals
+from training.evaluation.setting import MisplacedScore, RelationScore, Structure
 
 
 def relation_popularity(

@@ -12,11 +12,10 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from training.datasets.batches import SceneTensors
-from training.evaluation.baselines.classes import Lists, training_lists
-from training.evaluation.baselines.fitting import Proposals
-from training.evaluation.model import Parameters, RoomScore
+from training.evaluation.baselines import Lists, training_lists
 from training.evaluation.room_task import with_room_type
-from training.evaluation.setting import Structure
+from training.evaluation.selection import Proposals
+from training.evaluation.setting import Parameters, RoomScore, Structure
 
 # Naive Bayes over room types:
 #

@@ -16,18 +16,20 @@ from tests.training.research.baselines.furnished import (
     scene,
     tensors,
 )
-from training.evaluation.baselines import PLACED, fitting, placed_product
-from training.evaluation.baselines.fitting import TRIALS, Baseline, drawn_settings, halving
+from training.evaluation import selection
+from training.evaluation.baselines import PLACED, placed_product
 from training.evaluation.missing_tasks import removed_places
 from training.evaluation.moved_task import moved_cases
 from training.evaluation.relation_tasks import with_observed
+from training.evaluation.selection import TRIALS, Baseline, drawn_settings, halving
 from training.research.baselines import BASELINES
 
 EVERY = tuple(BASELINES.values())
 OBJECTS, OF_ROOMS, OF_RELATIONS, COMPLETIONS, (SUPPORTERS,) = (
     [one for one in EVERY if one.answer is answer]
     for answer in (
-        fitting.OBJECTS, fitting.ROOMS, fitting.RELATIONS, fitting.COMPLETION, fitting.MISPLACED,
+        selection.OBJECTS, selection.ROOMS, selection.RELATIONS, selection.COMPLETION,
+        selection.MISPLACED,
     )
 )  # fmt: skip
 
@@ -208,7 +210,7 @@ def test_no_relation_to_learn_from_is_an_error(baseline, validation):
 
 
 def test_a_score_that_is_no_number_is_an_error(train, validation):
-    answer = fitting.Answer((), lambda *_: float("nan"))
+    answer = selection.Answer((), lambda *_: float("nan"))
     broken = Baseline("broken", lambda *_: iter([({}, None)]), answer)
     with pytest.raises(FloatingPointError, match="broken"):
         broken.fit(train, validation, STRUCTURE)

@@ -7,7 +7,7 @@ from training.datasets import AnnotatedObject, AnnotatedScene, annotated_classes
 from training.datasets.batches import scene_tensors
 from training.datasets.cases import scene_of
 from training.datasets.moved import posed_scene
-from training.evaluation.baselines.fitting import named_moved
+from training.evaluation.selection import named_moved
 from training.research.baselines import BASELINES
 from training.research.baselines.relation_models import supporter_score, supporter_table
 

@@ -20,14 +20,6 @@ from torch import Tensor
 from training.datasets.batches import SceneTensors, has_relations
 from training.datasets.cases import some_scenes
 from training.evaluation.missing_tasks import leave_one_out_at
-from training.evaluation.model import (
-    MisplacedScore,
-    Model,
-    ObjectScore,
-    Parameters,
-    PlacedScore,
-    RelationScore,
-)
 from training.evaluation.moved_task import ask_moved, moved_cases
 from training.evaluation.parts import validation_score
 from training.evaluation.relation_tasks import (
@@ -37,7 +29,15 @@ from training.evaluation.relation_tasks import (
     score_scenes,
 )
 from training.evaluation.room_task import mean_log_p
-from training.evaluation.setting import Structure
+from training.evaluation.setting import (
+    MisplacedScore,
+    Model,
+    ObjectScore,
+    Parameters,
+    PlacedScore,
+    RelationScore,
+    Structure,
+)
 
 _SCENES = 1000
 
