@@ -147,16 +147,9 @@ def held_out_halves(setting: Setting) -> tuple[SceneTensors, SceneTensors]:
     return first, second
 
 
-def hamming(x: Float[Tensor, "N V"], y: Float[Tensor, "M V"]) -> Float[Tensor, "N M"]:
-    """Return the Hamming distances between binary rows."""
-    return (x.sum(1, keepdim=True) + y.sum(1) - 2 * x @ y.T).clamp(min=0)
-
-
 def median_distance(v: Float[Tensor, "scenes V"]) -> float:
     """Return the median Hamming distance between two scenes, at least 1."""
-    v = v[:_BANDWIDTH_SCENES]
-    row, column = torch.triu_indices(len(v), len(v), 1)
-    return max(1.0, float(hamming(v, v)[row, column].median()))
+    return max(1.0, float(torch.pdist(v[:_BANDWIDTH_SCENES], p=0).median()))
 
 
 def discrepancy(
@@ -168,7 +161,7 @@ def discrepancy(
     """
 
     def kernel(x: Float[Tensor, "N V"], y: Float[Tensor, "M V"]) -> Float[NDArray, "N M"]:
-        return torch.exp(-hamming(x, y) / bandwidth).double().numpy()
+        return torch.exp(-torch.cdist(x, y, p=0) / bandwidth).double().numpy()
 
     # MMD² = E k(x, x') + E k(y, y') - 2 E k(x, y) for generated scenes x and held-out scenes y.
     xx, yy = kernel(drawn, drawn), kernel(held_out, held_out)

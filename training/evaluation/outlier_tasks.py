@@ -57,7 +57,7 @@ from training.datasets.cases import draw_true_relations, scene_of, scene_rng
 from training.evaluation.asking import SENSITIVITIES, ask_rows, thing_instances
 from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.missing_tasks import SEEDS
-from training.evaluation.parts import LONGEST, draw_parts, exactly
+from training.evaluation.parts import LONGEST, Ranking, draw_parts, exactly
 from training.evaluation.setting import Flagged, Model, ObjectScore, Outcome, Setting, Structure
 
 LENGTHS: Final = (1, 2, 3, 5, 8)  # numbers of listed classes in which alarms are measured
@@ -82,20 +82,10 @@ def with_intruders(
     return Cases(scene, v, intruder)
 
 
-def expected_hit_at_1(
-    values: Float[Tensor, "N V"], target: Int[Tensor, " N"]
-) -> Float[NDArray, " N"]:
-    """Return 1 where the target has the highest value of its row; 1/m for m highest values."""
-    is_highest = values == values.max(1, keepdim=True).values
-    hit = is_highest.gather(1, target.unsqueeze(1)).squeeze(1)
-    return (hit / is_highest.sum(1)).double().numpy()
-
-
 def hit_at_1(scenes: SceneTensors, cases: Cases, suspicion: ObjectScore) -> Ratio:
     """Return the share of cases whose intruder ranks first."""
     values = ask_rows(suspicion, cases.v, block=32).masked_fill(cases.v == 0, -torch.inf)
-    hits = expected_hit_at_1(values, cases.intruder)
-    return Ratio.of_items(cases.scene.numpy(), hits, len(scenes))
+    return Ranking.of(cases.scene, cases.intruder, values, len(scenes)).top(1)
 
 
 def outliers_task(model: Model, setting: Setting) -> Outcome | None:

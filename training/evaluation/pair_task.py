@@ -94,12 +94,6 @@ def baseline_log_odds(scenes: SceneTensors, relations: RelationScore) -> PairSco
     return score
 
 
-def baseline_score(scenes: SceneTensors, relations: RelationScore, lateral: float) -> PairScore:
-    """Return the probabilities of a score of relations, after a `lateral_shift`."""
-    log_odds = baseline_log_odds(scenes, relations)
-    return lambda question: expit(_shifted(log_odds(question), lateral))
-
-
 def lateral_shift(log_odds: PairScore, questions: Sequence[ScenePairs]) -> float:
     """Return the change of the log-odds of left and front for questions about stacked objects.
 
@@ -160,12 +154,11 @@ def pairs_task(model: Model, setting: Setting) -> Outcome | None:
     count = 0
     if answers := _ask(model, setting, VERTICAL):
         p, listed = without_inside(answers.p), without_inside(answers.listed)
-        hits, loss = accuracy(p, listed), log_loss(p, listed)
-        metrics = {"accuracy": answers.mean(hits), "log-loss": answers.mean(loss)}
-        for name, mask in _hard_pairs(answers.classes, setting).items():
+        values = {"accuracy": accuracy(p, listed), "log-loss": log_loss(p, listed)}
+        every = {"": np.ones(len(p), np.bool_)} | _hard_pairs(answers.classes, setting)
+        for kind, mask in every.items():
             if mask.any():
-                metrics[f"accuracy, {name}"] = answers.mean(hits, mask)
-                metrics[f"log-loss, {name}"] = answers.mean(loss, mask)
+                metrics |= {name + kind: answers.mean(x, mask) for name, x in values.items()}
         count = len(answers.scenes)
     if answers := _ask(model, setting, (INSIDE,)):
         hits = accuracy(answers.p, answers.listed)
@@ -184,10 +177,11 @@ class _Answers:
     p: Float[NDArray, "N 2*A"]
     listed: Bool[NDArray, "N 2*A"]
 
-    def mean(self, values: Float[NDArray, " N"], mask: Bool[NDArray, " N"] | None = None) -> Ratio:
+    def mean(
+        self, values: Float[NDArray, " N"], mask: Bool[NDArray, " N"] | slice = slice(None)
+    ) -> Ratio:
         """Return the mean of the values of pairs in `mask`, with one value for each group."""
-        chosen = np.ones(len(values), dtype=np.bool_) if mask is None else mask
-        ratio = Ratio.of_items(self.scene[chosen], values[chosen], len(self.scenes))
+        ratio = Ratio.of_items(self.scene[mask], values[mask], len(self.scenes))
         return ratio.by(self.scenes.group_ids)
 
 
@@ -201,7 +195,8 @@ def _ask(model: Model, setting: Setting, relations: Sequence[int]) -> _Answers |
     if model.scene_model is not None:
         score = service_score(model.scene_model)
     elif model.relations is not None:
-        score = baseline_score(scenes, model.relations, model.lateral)
+        log_odds = baseline_log_odds(scenes, model.relations)
+        score = lambda question: expit(_shifted(log_odds(question), model.lateral))  # noqa: E731
     else:
         return None
     return _Answers(
@@ -227,4 +222,5 @@ def _hard_pairs(classes: Int[NDArray, "N 2"], setting: Setting) -> dict[str, Boo
     related = np.unique(np.sort(triples.numpy()[:, 1:].astype(np.int64), axis=1), axis=0)
     partners = np.bincount(related.ravel(), minlength=V)
     is_unseen = ~np.isin(classes @ np.array([V, 1]), related @ np.array([V, 1]))
-    return {"unseen pairs": is_unseen, "rare classes": np.any(partners[classes] <= RARE, axis=1)}
+    is_rare = np.any(partners[classes] <= RARE, axis=1)
+    return {", unseen pairs": is_unseen, ", rare classes": is_rare}

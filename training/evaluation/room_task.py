@@ -22,7 +22,7 @@ from typing import Final
 import numpy as np
 import torch
 
-from training.datasets.batches import SceneTensors, subset
+from training.datasets.batches import SceneTensors
 from training.evaluation.asking import ask_rows
 from training.evaluation.metrics import Metric, Ratio, Scored
 from training.evaluation.missing_tasks import SEEDS
@@ -35,7 +35,7 @@ from training.evaluation.parts import (
     exactly,
     real_sources,
 )
-from training.evaluation.setting import Outcome, RoomScore, Setting, Structure
+from training.evaluation.setting import Outcome, RoomScore, Setting, Structure, with_room_type
 
 LEAST: Final = 1e-4  # least probability of a room type in the log-loss
 
@@ -49,11 +49,6 @@ LISTS: Final[dict[str, tuple[Size, tuple[int, ...]]]] = {
 FIGURES: Final = ("top-1", "top-3", "log-loss", "ECE")
 
 
-def with_room_type(scenes: SceneTensors) -> SceneTensors:
-    """Return the scenes with a room type."""
-    return subset(scenes, scenes.room >= 0)
-
-
 def room_figures(
     scenes: SceneTensors, parts: Parts, score: RoomScore, profile: str = ""
 ) -> dict[str, Metric]:
@@ -65,7 +60,7 @@ def room_figures(
     lowest, added = torch.finfo(log_p.dtype).min, int(target.max()) + 4
     log_p = torch.nn.functional.pad(log_p, (0, added), value=lowest)
     log_p = torch.where(is_named, log_p, log_p.scatter(1, target.unsqueeze(1), -torch.inf))
-    ranking = Ranking.of(parts.scene, target, log_p, count, parts.skipped)
+    ranking = Ranking.of(parts.scene, target, log_p, count)
     p, likeliest = log_p.exp().double().max(1)
     hit = (likeliest == target).numpy()
     loss = -log_p.gather(1, target.unsqueeze(1)).squeeze(1).clamp(min=float(np.log(LEAST)))

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
@@ -89,18 +90,17 @@ def placed_mrr(scenes: SceneTensors, structure: Structure, score: PlacedScore) -
     return leave_one_out_at(some_scenes(scenes, _SCENES), structure, score)[0].mrr().value
 
 
-def relation_precision(scenes: SceneTensors, structure: Structure, score: RelationScore) -> float:
-    """Return the R-precision of relations, given the instance counts of classes (task T1a)."""
-    return _precision(score_scenes(scenes, structure, score), scenes)
+def relation_precision(
+    scenes: SceneTensors,
+    structure: Structure,
+    score: RelationScore,
+    ask: Callable[..., list[Candidates]] = score_scenes,
+) -> float:
+    """Return the R-precision of relations, given the instance counts of classes (task T1a).
 
-
-def completion_precision(scenes: SceneTensors, structure: Structure, score: RelationScore) -> float:
-    """Return the R-precision of half of the relations, given the other half (task T1b)."""
-    return _precision(complete_scenes(scenes, structure, score), scenes)
-
-
-def _precision(scored: list[Candidates], scenes: SceneTensors) -> float:
-    ratio = r_precision(scored, len(scenes))
+    With `ask=complete_scenes`, it is that of half of the relations, given the other half (T1b).
+    """
+    ratio = r_precision(ask(scenes, structure, score), len(scenes))
     if ratio is None:
         raise ValueError("no scene has an annotated relation between two things")
     return ratio.value
@@ -129,7 +129,7 @@ class Answer(NamedTuple):
 OBJECTS: Final = Answer(("missing",), missing_mrr, of_relations=False)
 ROOMS: Final = Answer(("rooms",), mean_log_p, of_relations=False)
 RELATIONS: Final = Answer(("relations", "false_relations"), relation_precision)
-COMPLETION: Final = Answer(("completion",), completion_precision)
+COMPLETION: Final = Answer(("completion",), partial(relation_precision, ask=complete_scenes))
 AT_PLACE: Final = Answer(("at_place",), placed_mrr)
 MISPLACED: Final = Answer(("misplaced",), named_moved)
 

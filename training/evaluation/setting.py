@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from app.model import SceneModel, Sensitivity
 from app.scene import Scene
+from training.datasets.array_types import Table
 from training.datasets.batches import Batch, SceneTensors, subset
 from training.datasets.cases import some_scenes
 from training.evaluation.metrics import Metric
@@ -45,6 +47,12 @@ class Setting:
         """Return the setting with only the scenes at the given indices."""
         return replace(self, scenes=subset(self.scenes, index))
 
+    def by_source(self) -> Iterator[tuple[str, Setting]]:
+        """Iterate over the data sources, by name, and their scenes and training scenes."""
+        training = {} if self.train is None else dict(by_source(self.train))
+        for source, scenes in by_source(self.scenes):
+            yield source, replace(self, scenes=scenes, train=training.get(source))
+
     @cached_property
     def complete(self) -> Setting:
         """The scenes with complete object lists; in other scenes unlisted objects may exist."""
@@ -56,6 +64,18 @@ def with_relations(scenes: SceneTensors) -> SceneTensors:
     """Return the scenes with a relation that holds."""
     related = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.holds.any()]
     return subset(scenes, torch.tensor(related, dtype=torch.int64))
+
+
+def with_room_type(scenes: SceneTensors) -> SceneTensors:
+    """Return the scenes with a room type."""
+    return subset(scenes, scenes.room >= 0)
+
+
+def by_source(scenes: SceneTensors) -> Iterator[tuple[str, SceneTensors]]:
+    """Iterate over the data sources, by name, and their scenes."""
+    names = np.array([scene.source for scene in scenes.scenes], dtype=np.str_)
+    for name in np.unique(names).tolist():
+        yield name, subset(scenes, torch.from_numpy(names == name))
 
 
 def _complete(scenes: SceneTensors) -> SceneTensors:
@@ -93,7 +113,7 @@ Flagged: TypeAlias = Callable[[Float[Tensor, "B V"], Sensitivity], Bool[Tensor, 
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class Places(Table):
     """B scenes with a removed class, and the place of the removed class."""
 
     v: Float[Tensor, "B V"]  # presence of the remaining classes
@@ -101,10 +121,6 @@ class Places:
     relation: Int[Tensor, " B"]  # canonical
     anchor: Int[Tensor, " B"]  # class at the other end of the relation
     outgoing: Bool[Tensor, " B"]  # True if the removed class is the subject
-
-    def rows(self, index: Tensor) -> Places:
-        """Select the scenes at the given indices."""
-        return Places(*(column[index] for column in vars(self).values()))
 
 
 PlacedScore: TypeAlias = Callable[[Places], Float[Tensor, "B V"]]

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from training.evaluation import evidence_tasks as evidence
 from training.evaluation.asking import SENSITIVITIES
 from training.evaluation.calibration_task import NAMES, calibration_task
 from training.evaluation.everyday_task import LINES, everyday_task
@@ -21,11 +20,23 @@ from training.evaluation.generation_task import (
     generated_rooms_task,
     generation_task,
 )
-from training.evaluation.missing_tasks import SIZES, missing_task, placed_task
+from training.evaluation.missing_tasks import (
+    OF_OBJECTS,
+    SIZES,
+    missing_evidence_task,
+    missing_task,
+    placed_task,
+)
 from training.evaluation.moved_task import METRICS, moved_task
 from training.evaluation.outlier_tasks import LAWS, LENGTHS, alarms_task, outliers_task
 from training.evaluation.pair_task import pairs_task
-from training.evaluation.relation_tasks import completion_task, placement_task, relations_task
+from training.evaluation.relation_tasks import (
+    OF_RELATIONS,
+    completion_task,
+    placement_task,
+    relations_evidence_task,
+    relations_task,
+)
 from training.evaluation.room_task import FIGURES, LISTS, rooms_task
 from training.evaluation.setting import Model, Outcome, Setting
 from training.evaluation.statistics_tasks import COUNTS, OFFSETS, counts_task, offsets_task
@@ -83,9 +94,9 @@ TASKS: dict[str, Task] = {
     ),
     "T1 with evidence": Task(
         "relations, with more evidence",
-        evidence.relations_evidence_task,
+        relations_evidence_task,
         "scene_model",
-        card=_each(["change of R-precision"], evidence.OF_RELATIONS),
+        card=_each(["change of R-precision"], OF_RELATIONS),
         of_objects=False,
     ),
     "T1b completion": Task(
@@ -100,9 +111,9 @@ TASKS: dict[str, Task] = {
     ),
     "T2 with evidence": Task(
         "missing object, with the room type",
-        evidence.missing_evidence_task,
+        missing_evidence_task,
         "scene_model",
-        card=_each(["change of MRR"], evidence.OF_OBJECTS),
+        card=_each(["change of MRR"], OF_OBJECTS),
     ),
     "T2-at missing at a place": Task(
         "missing object at a place", placed_task, "at_place", ("MRR",), ("MRR", "MRR, on-top")

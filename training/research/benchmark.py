@@ -8,6 +8,7 @@ probability against the observed frequency.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,7 +20,6 @@ from training.datasets.batches import seen_triples
 from training.evaluation.calibration_task import NAMES
 from training.evaluation.everyday_task import EVERYDAY, facts_file
 from training.evaluation.metrics import Scored
-from training.evaluation.report import settings_by_source
 from training.evaluation.results import SHOWN, Reports, Shown, grid, summarise, write
 from training.evaluation.setting import Outcome, Setting
 from training.evaluation.tasks import TASKS
@@ -174,11 +174,10 @@ def compare_machines(
 def _plan(folder: Path, scenes: SplitScenes, limit: int, tasks: tuple[str, ...]) -> Plan:
     """Return the questions about the test scenes of each data source, and of all together."""
     data = scenes.complete_data()
-    common = data.structure, data.train, seen_triples(data.train.scenes, data.train.v.shape[1])
-    settings = dict(settings_by_source(data.test, *common, limit=limit))
-    facts = EVERYDAY if facts_file() else None
-    settings[POOLED] = Setting(data.test, *common, limit, everyday=facts)
-    return Plan(folder, data, settings, tasks)
+    seen = seen_triples(data.train.scenes, data.train.v.shape[1])
+    every = Setting(data.test, data.structure, data.train, seen, limit)
+    pooled = replace(every, everyday=EVERYDAY if facts_file() else None)
+    return Plan(folder, data, {**dict(every.by_source()), POOLED: pooled}, tasks)
 
 
 PRIMARY: dict[str, tuple[str, ...]] = {

@@ -17,8 +17,9 @@ from training.datasets.cases import some_scenes
 from training.evaluation.asking import artifact_model, ask_rows
 from training.evaluation.baselines import PLACED, frequency, placed_product
 from training.evaluation.generation_task import held_out_scenes, independent_scenes
-from training.evaluation.outlier_tasks import expected_hit_at_1, intruder_weights, with_intruders
+from training.evaluation.outlier_tasks import intruder_weights, with_intruders
 from training.evaluation.pair_task import SHIFTS, baseline_log_odds, lateral_shift, listed_pairs
+from training.evaluation.parts import Ranking
 from training.evaluation.report import Progress, silent
 from training.evaluation.selection import TRIALS, Baseline
 from training.evaluation.setting import Model, ObjectScore, Structure, suspicion_of
@@ -162,7 +163,8 @@ def tuned_suspicion(score: ObjectScore, data: TrainingData, seed: int) -> Object
             plain = ask_rows(suspicion_of(score), cases.v, block=32)
             for weight in _WEIGHTS:
                 values = plain + weight * log_popularity
-                hits[weight] += float(expected_hit_at_1(values, cases.intruder).mean())
+                first = Ranking.of(cases.scene, cases.intruder, values, len(scenes)).top(1)
+                hits[weight] += first.value
     return suspicion_of(score, log_popularity, max(hits, key=lambda weight: hits[weight]))
 
 

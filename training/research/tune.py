@@ -1,6 +1,6 @@
 """`python -m training tune`: search for settings on validation scenes with optuna.
 
-<folder>/<configuration>/<digest>/  curve and reports of the settings of a trial
+<folder>/<configuration>/<digest>/  curve and report of the settings of a trial
                          best.toml  the best configuration
 
 The same seed draws the same settings. So the same command repeats its trials from these folders.
@@ -34,8 +34,8 @@ from training.datasets.batches import TrainingData
 from training.datasets.files import write_whole
 from training.evaluation.asking import score_missing, score_relations
 from training.evaluation.metrics import Metric, paired_difference
-from training.evaluation.report import SourceReport, measure, pooled, settings_by_source
-from training.evaluation.setting import Model
+from training.evaluation.report import SourceReport, measure, pooled
+from training.evaluation.setting import Model, Setting
 from training.fit.configuration import Config, ConfigError, first_error
 from training.fit.curve import SCORES, CurvePoint
 from training.fit.draft import draft_artifact
@@ -216,7 +216,7 @@ class Search:
     ) -> dict[str, Metric]:
         """Return `FIGURES` of a machine with changed settings, over all validation scenes.
 
-        A machine without finished reports is trained. `passed` gets the points of its curve.
+        A machine without a finished report is trained. `passed` gets the points of its curve.
 
         Raises:
             FloatingPointError: the training diverged.
@@ -224,31 +224,29 @@ class Search:
         config = with_settings(self.config, settings)
         digest = sha256(f"{config.digest} {self.data.digest}".encode()).hexdigest()
         folder = self.folder / digest[:12]
-        if (curve := folder / "curve.json").exists():
+        curve, path = folder / "curve.json", folder / "report.json"
+        if path.exists():
             for values in json.loads(curve.read_text(encoding="utf-8")):
                 passed(CurvePoint(**values))
         else:
             result = Trainer(config, self.data).run(passed=passed)
-            self._measure(result.machine, folder)
             write_whole(curve, json.dumps([asdict(point) for point in result.curve]))
-        sources = sorted({scene.source for scene in self.data.validation.scenes})
-        paths = [folder / f"{source}.json" for source in sources]
-        report = pooled([SourceReport.read(path) for path in paths])
+            self._measure(result.machine).write(path)
+        report = SourceReport.read(path)
         return {
             name: outcome.metrics[metric]
             for name, (task, metric) in FIGURES.items()
             if (outcome := report.outcomes.get(task))
         }
 
-    def _measure(self, machine: BoltzmannMachine, folder: Path) -> None:
-        """Write the reports of a machine on the validation scenes of each data source."""
+    def _measure(self, machine: BoltzmannMachine) -> SourceReport:
+        """Measure a machine on the validation scenes of each data source."""
         data, artifact = self.data, draft_artifact(machine, self.data.vocabulary)
         relations = partial(score_relations, artifact, given=False)
         model = Model(missing=partial(score_missing, artifact), relations=relations)
         tasks = [task for task, _ in FIGURES.values()]
-        settings = settings_by_source(data.validation, data.structure, data.train, seen=None)
-        for source, setting in settings:
-            measure(model, setting, source, tasks=tasks).write(folder / f"{source}.json")
+        every = Setting(data.validation, data.structure, data.train)
+        return pooled([measure(model, own, name, tasks=tasks) for name, own in every.by_source()])
 
 
 def shown(settings: Mapping[str, Any]) -> str:

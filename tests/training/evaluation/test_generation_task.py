@@ -13,7 +13,6 @@ Y = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, 1, 1]])
 
 
 def test_distances_and_copies_by_hand():
-    assert generation_task.hamming(X, Y).tolist() == [[0, 2, 3], [1, 3, 2]]
     # 2, 3 and 1 between the rows of Y.
     assert generation_task.median_distance(Y) == 2.0
     assert generation_task.copies(X, Y).tolist() == [1.0, 0.0]

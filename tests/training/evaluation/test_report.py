@@ -111,9 +111,9 @@ def test_tasks_about_objects_see_scenes_with_complete_object_lists_alone():
 def test_pooled_sources_are_their_union():
     union, train = two_sources(DATA), two_sources(TRAIN)
     tasks = ("T1a relations", "T2 missing", "T3 alarms")
-    settings = reports.settings_by_source(union, NO_STRUCTURE, train, SEEN)
-    together = reports.pooled([report_of(MODEL, setting, tasks) for _, setting in settings])
-    whole = report_of(MODEL, Setting(union, NO_STRUCTURE, train, SEEN), tasks)
+    every = Setting(union, NO_STRUCTURE, train, SEEN)
+    together = reports.pooled([report_of(MODEL, own, tasks) for _, own in every.by_source()])
+    whole = report_of(MODEL, every, tasks)
     assert values_of(together) == pytest.approx(values_of(whole))
 
 

@@ -13,9 +13,8 @@ from torch.nn.functional import one_hot
 
 from training.datasets.batches import SceneTensors
 from training.evaluation.baselines import Lists, training_lists
-from training.evaluation.room_task import with_room_type
 from training.evaluation.selection import Proposals
-from training.evaluation.setting import Parameters, RoomScore, Structure
+from training.evaluation.setting import Parameters, RoomScore, Structure, with_room_type
 
 # Naive Bayes over room types:
 #
