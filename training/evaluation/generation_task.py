@@ -329,7 +329,8 @@ def generated_rooms_task(artifact: SceneModel, setting: Setting) -> Outcome | No
     for name, mask in {FREE: whole, **{n: m & whole for n, m in of_type.items()}}.items():
         if mask.sum() >= _FEWEST:
             drawn = _drawn_size(artifact, types.get(name), things, setting.seed)
-            metrics[f"{SIZE}, {name}"] = _change(drawn, sizes[mask], scenes.group_ids[mask])
+            change, groups = _size_change(drawn, sizes[mask]), scenes.group_ids[mask]
+            metrics[f"{SIZE}, {name}"] = Resampled.of(change, groups, _DRAWS, _RESAMPLES)
     return Outcome.over(scenes, metrics, int((~is_common).sum()))
 
 
@@ -346,12 +347,6 @@ def _drawn_size(
     return float(np.mean(sizes))
 
 
-def _change(
-    drawn: float, sizes: Float[NDArray, " scenes"], groups: Int[NDArray, " scenes"]
-) -> Metric:
-    """Return the relative change of a mean size against held-out sizes."""
-
-    def change(weight: Float[NDArray, " scenes"]) -> float:
-        return float(drawn * weight.sum() / (weight @ sizes) - 1)
-
-    return Resampled.of(change, groups, _DRAWS, _RESAMPLES)
+def _size_change(drawn: float, sizes: Float[NDArray, " scenes"]) -> Statistic:
+    """Return the relative change of a mean size against held-out sizes, by scene weights."""
+    return lambda weight: float(drawn * weight.sum() / (weight @ sizes) - 1)

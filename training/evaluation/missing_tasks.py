@@ -86,20 +86,21 @@ def missing_task(score: ObjectScore, setting: Setting) -> Outcome | None:
         metrics[f"MRR, {name}"] = ranking.mrr()
         parts = draw_parts(scenes, structure, size, SEEDS)
         skipped = parts.skipped
-        metrics[f"hidden classes of listed families, {name}"] = parts.of_listed_families()
+        row, target = parts.hidden.nonzero(as_tuple=True)
+        is_related = parts.related[row, target].numpy()
+        of_family = Ratio.of_items(parts.scene[row].numpy(), is_related, len(scenes))
+        metrics[f"hidden classes of listed families, {name}"] = of_family
         if size is all_but_one:
             metrics |= {f"top-{k}": ranking.top(k) for k in TOP}
-            metrics["MRR, unknown labels score 0"] = _with_unknown(ranking.mrr(), scenes, structure)
+            # The targets of a scene with unknown labels are more, and these score 0.
+            things = ((scenes.v > 0) & ~structure).sum(1).clamp(min=1).double().numpy()
+            share = 1 + np.array([len(scene.unknown) for scene in scenes.scenes]) / things
+            mrr = ranking.mrr()
+            unknown = Ratio(mrr.numerators, mrr.denominators * share)
+            metrics["MRR, unknown labels score 0"] = unknown
         listed = rank_missing(scenes, structure, score, size, structure_listed=True)
         metrics[f"MRR, {name}, structure listed"] = listed.mrr()
     return Outcome.over(scenes, metrics, skipped)
-
-
-def _with_unknown(mrr: Ratio, scenes: SceneTensors, structure: Structure) -> Ratio:
-    """Return the MRR if unknown labels are removed too, which score 0."""
-    things = ((scenes.v > 0) & ~structure).sum(1).clamp(min=1).double().numpy()
-    unknown = np.array([len(scene.unknown) for scene in scenes.scenes])
-    return Ratio(mrr.numerators, mrr.denominators * (1 + unknown / things))
 
 
 def removed_places(

@@ -8,7 +8,7 @@ the default sensitivity. Each intruder is drawn three times from one of these di
 absent classes:
 
     uniform     all classes have the same probability
-    popularity  see `by_popularity`
+    popularity  the probability is proportional to the number of training scenes with the class
     signature   a class that is typical of another room type
 
 Structure classes such as walls are never intruders. Scenes with fewer than three other classes are
@@ -136,11 +136,6 @@ _OFTEN = 0.2
 _FOREIGN = 0.01
 
 
-def by_popularity(scenes: SceneTensors, train: SceneTensors) -> Float[Tensor, "scenes V"]:
-    """Return the number of training scenes with each class as weights of each scene."""
-    return train.v.sum(0).expand(len(scenes), -1)
-
-
 def draw_intruders(
     scenes: SceneTensors,
     structure: Structure,
@@ -196,8 +191,8 @@ def intruder_weights(
     """Return the sampling weights of each law; only uniform without `train`."""
     if train is None:
         return {"uniform": None}
-    weights = (None, by_popularity(scenes, train), by_signature(scenes, train))
-    return dict(zip(LAWS, weights, strict=True))
+    popularity = train.v.sum(0).expand(len(scenes), -1)
+    return dict(zip(LAWS, (None, popularity, by_signature(scenes, train)), strict=True))
 
 
 def draw_intruder_choices(
@@ -260,13 +255,18 @@ def untouched_alarms(artifact: SceneModel, scenes: Sequence[EncodedScene]) -> It
         scene_of_group.setdefault((scenes[k].source, scenes[k].group), scenes[k])
     groups = Counter(source for source, _ in scene_of_group)
     cases: dict[str, list[tuple[Scene, bool]]] = {}
-    for scene in scene_of_group.values():
-        listed = _random_part(scene, artifact.vocabulary.structure, rng)
-        is_small = len(groups) > 1 and groups[scene.source] < _GROUPS
-        source = "the smaller sources" if is_small else scene.source
-        cases.setdefault(source, []).append((listed, scene.complete))
+    for encoded in scene_of_group.values():
+        listed = _random_part(encoded, artifact.vocabulary.structure, rng)
+        is_small = len(groups) > 1 and groups[encoded.source] < _GROUPS
+        source = "the smaller sources" if is_small else encoded.source
+        cases.setdefault(source, []).append((listed, encoded.complete))
     for source, sensitivity in product(sorted(cases), ALARMS):
-        alarms = [_alarms(artifact, *case, sensitivity) for case in cases[source]]
+        alarms = []
+        for scene, complete in cases[source]:
+            answer = questions.outliers(artifact, scene, sensitivity=sensitivity, details=False)
+            of_objects = complete and any(entry["is_outlier"] for entry in answer["outliers"])
+            of_relations = any(entry["is_misplaced"] for entry in answer["misplaced"])
+            alarms.append((of_objects, of_relations))
         for about, flags in zip(("objects", "relations"), zip(*alarms, strict=True), strict=True):
             yield Alarms(source, about, sensitivity, len(flags), sum(flags))
 
@@ -284,12 +284,3 @@ def _random_part(encoded: EncodedScene, structure: Bool[NDArray, " V"], rng: Rng
         if i in index_of and j in index_of
     ]
     return replace(scene_of(encoded, kept, triples), room_type=None)
-
-
-def _alarms(
-    artifact: SceneModel, scene: Scene, complete: bool, sensitivity: Sensitivity
-) -> tuple[bool, bool]:
-    """Return whether the model raises an alarm about an object, and about a relation."""
-    answer = questions.outliers(artifact, scene, sensitivity=sensitivity, details=False)
-    of_objects = complete and any(entry["is_outlier"] for entry in answer["outliers"])
-    return of_objects, any(entry["is_misplaced"] for entry in answer["misplaced"])

@@ -59,12 +59,6 @@ class Parts:
         """Number of scenes without a part."""
         return self.scenes - len(self.scene.unique())
 
-    def of_listed_families(self) -> Ratio:
-        """Return the share of hidden classes of one family with a listed class."""
-        row, target = self.hidden.nonzero(as_tuple=True)
-        is_related = self.related[row, target].numpy()
-        return Ratio.of_items(self.scene[row].numpy(), is_related, self.scenes)
-
 
 def all_but_one(classes: int, _: Rng) -> int:
     """List all classes but one."""

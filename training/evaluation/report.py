@@ -218,20 +218,22 @@ class RoomList:
     source: str
     scenes: Sequence[AnnotatedScene]
 
-    def tensors(self, vocabulary: Vocabulary) -> SceneTensors:
-        """Return the scenes in the classes of a vocabulary; a single group is split into rooms."""
+    def setting(self, vocabulary: Vocabulary, limit: int | None = None) -> Setting:
+        """Return the scenes in the classes of a vocabulary; a single group is split into rooms.
+
+        T3 intruders have the popularity of the file.
+        """
         encoded = encode(self.scenes, vocabulary)
         if len({scene.group for scene in encoded}) == 1:
             encoded = [replace(scene, group=scene.scene_id) for scene in encoded]
-        return scene_tensors(encoded, annotated_classes(encoded, vocabulary), vocabulary)
+        scenes = scene_tensors(encoded, annotated_classes(encoded, vocabulary), vocabulary)
+        structure = torch.from_numpy(vocabulary.structure.copy())
+        return Setting(scenes, structure, train=scenes, limit=limit)
 
     def measure(self, model: SceneModel, progress: Progress = silent) -> list[CardMetric]:
-        """Return the metrics of `ROOM_TASKS`; T3 intruders have the popularity of the file."""
-        scenes = self.tensors(model.vocabulary)
-        structure = torch.from_numpy(model.vocabulary.structure.copy())
-        setting = Setting(scenes, structure, train=scenes, limit=None)
-        answers, tasks = artifact_model(model), ROOM_TASKS
-        return card_figures(measure(answers, setting, self.source, tasks=tasks, progress=progress))
+        """Return the metrics of `ROOM_TASKS`."""
+        asked = artifact_model(model), self.setting(model.vocabulary), self.source
+        return card_figures(measure(*asked, tasks=ROOM_TASKS, progress=progress))
 
     def trained(self, artifact: Artifact) -> list[str]:
         """Return the source if the model learnt from exactly these scenes."""

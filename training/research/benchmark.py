@@ -7,6 +7,7 @@ probability against the observed frequency.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,18 +15,28 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from pydantic import BaseModel, Field, ValidationError
-from rich.console import Console
 
 from training.datasets.batches import seen_triples
+from training.datasets.files import write_whole
+from training.domain.terminal import console
 from training.evaluation.calibration_task import NAMES
 from training.evaluation.everyday_task import EVERYDAY, facts_file
 from training.evaluation.metrics import Scored
-from training.evaluation.results import SHOWN, Reports, Shown, grid, summarise, write
+from training.evaluation.results import SHOWN, Reports, Shown, grid, summarise
 from training.evaluation.setting import Outcome, Setting
 from training.evaluation.tasks import TASKS
 from training.fit.configuration import Config, ConfigError, first_error
-from training.research.entries import Entry, baseline_entries, machine_entry, reference_entries
-from training.research.measure import POOLED, Plan, measure_entries, resumable, slug
+from training.research.measure import (
+    POOLED,
+    Entry,
+    Plan,
+    baseline_entries,
+    machine_entry,
+    measure_entries,
+    reference_entries,
+    resumable,
+    slug,
+)
 from training.runs.config_files import (
     data_folder,
     load_config,
@@ -33,7 +44,7 @@ from training.runs.config_files import (
     read_toml,
     with_settings,
 )
-from training.runs.pipeline import SplitScenes, prepare
+from training.runs.pipeline import prepare
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,12 +52,11 @@ if TYPE_CHECKING:
 DEFAULT = ("places-triway", "places-gbm", "places-rbm")
 """Configurations that the command measures if it is called without configurations."""
 
+Folder = Annotated[Path, typer.Option("--folder", help="folder for the results")]
 Data = Annotated[Path | None, typer.Option("--data", help="folder with the scene files")]
 Limit = Annotated[int, typer.Option(min=1, help="maximum scenes per data source in slow tasks")]
 Workers = Annotated[int, typer.Option(min=1, help="processes with one thread each")]
 Fresh = Annotated[bool, typer.Option("--fresh", help="delete earlier runs and reports")]
-
-console = Console()
 
 
 def benchmark(
@@ -58,9 +68,7 @@ def benchmark(
         ),
     ] = None,
     data: Data = None,
-    folder: Annotated[Path, typer.Option("--folder", help="folder for the results")] = Path(
-        "runs/benchmark"
-    ),
+    folder: Folder = Path("runs/benchmark"),
     seeds: Annotated[
         int, typer.Option(min=1, help="training seeds, for models with random training")
     ] = 3,
@@ -79,7 +87,7 @@ def benchmark(
     The command writes results.json, results.md and plots into a folder with the first word of the
     first configuration. After Ctrl-C, run the same command again: it skips finished reports.
     """
-    with resumable(console):
+    with resumable():
         shown = {name: SHOWN[name] for name in chosen_tasks(task)}
         baselines = None if baseline is None else [name for name in baseline if name != "none"]
         names = machines or DEFAULT
@@ -150,34 +158,30 @@ def compare_machines(
     """
     with console.status("reading and encoding scenes"):
         scenes = prepare(configs[0], root)
-        plan = _plan(folder, scenes, limit, tuple(shown))
-    related, learning = plan.data.related, configs[0].objects
+        data = scenes.complete_data()
+        seen = seen_triples(data.train.scenes, data.train.v.shape[1])
+    every = Setting(data.test, data.structure, data.train, seen, limit)
+    pooled = replace(every, everyday=EVERYDAY if facts_file() else None)
+    plan = Plan(folder, data, {**dict(every.by_source()), POOLED: pooled}, tuple(shown))
+    related, learning = data.related, configs[0].objects
     entries: list[Entry] = []
     for seed in range(seeds):
         seeded = [with_settings(config, {"training.seed": seed}) for config in configs]
         entries += [machine_entry(config) for config in seeded]
         entries += baseline_entries(seed, baselines, related=related, learning=learning)
     entries += reference_entries()
-    reports, failures = measure_entries(plan, entries, console, workers=workers, fresh=fresh)
+    reports, failures = measure_entries(plan, entries, workers=workers, fresh=fresh)
     with console.status("resampling scenes"):
         results = summarise(reports, configs[0].name)
     contents = {"contents": dict(scenes.digests), "failures": failures}
     remarks = [f"{name} could not be measured: {reason}" for name, reason in failures.items()]
     table = grid(["", ""], ([config.name, config.description] for config in configs))
     text = "\n\n".join([f"# {folder.name}", table, *remarks, results.markdown(shown)])
-    write(folder, contents | results.to_dict(), text)
+    write_whole(folder / "results.md", text)
+    write_whole(folder / "results.json", json.dumps(contents | results.to_dict(), indent=1) + "\n")
     console.print(*remarks, sep="\n", markup=False, soft_wrap=True)
     write_plots(folder, [config.name for config in configs], reports)
     console.print(f"all results: results.md, results.json and plots in {folder}", soft_wrap=True)
-
-
-def _plan(folder: Path, scenes: SplitScenes, limit: int, tasks: tuple[str, ...]) -> Plan:
-    """Return the questions about the test scenes of each data source, and of all together."""
-    data = scenes.complete_data()
-    seen = seen_triples(data.train.scenes, data.train.v.shape[1])
-    every = Setting(data.test, data.structure, data.train, seen, limit)
-    pooled = replace(every, everyday=EVERYDAY if facts_file() else None)
-    return Plan(folder, data, {**dict(every.by_source()), POOLED: pooled}, tasks)
 
 
 PRIMARY: dict[str, tuple[str, ...]] = {
@@ -214,22 +218,17 @@ def ablate(
     an ablation diverges, the results contain the error in place of its metrics. After Ctrl-C, run
     the same command again: it skips finished models and tasks.
     """
-    with resumable(console):
-        configs = _configs(configuration, rows, row)
+    with resumable():
+        full = load_config(configuration)
+        ablations = load_rows(own_or_shipped(rows, full, "ablations", "--rows"), full)
+        names = [ablation.name for ablation in ablations]
+        if unknown := sorted(set(row or ()) - set(names)):
+            raise ConfigError(f"unknown rows {unknown}: choose from {', '.join(names)}")
+        configs = [full, *(one for one in ablations if not row or one.name in row)]
         compare_machines(
-            configs, data_folder(configuration, configs[0], data), folder / configs[0].name,
+            configs, data_folder(configuration, full, data), folder / full.name,
             PRIMARY, seeds=seeds, baselines=(), limit=limit, workers=workers, fresh=fresh,
         )  # fmt: skip
-
-
-def _configs(reference: str, path: Path | None, names: Sequence[str] | None) -> list[Config]:
-    """Return the configurations of the full model and of the selected ablations."""
-    full = load_config(reference)
-    rows = load_rows(own_or_shipped(path, full, "ablations", "--rows"), full)
-    all_names = [row.name for row in rows]
-    if unknown := sorted(set(names or ()) - set(all_names)):
-        raise ConfigError(f"unknown rows {unknown}: choose from {', '.join(all_names)}")
-    return [full, *(row for row in rows if not names or row.name in names)]
 
 
 class _Change(BaseModel, extra="forbid", frozen=True):

@@ -28,10 +28,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 from pydantic import BaseModel, ValidationError
-from rich.console import Console
 
 from training.datasets.batches import TrainingData
 from training.datasets.files import write_whole
+from training.domain.terminal import console
 from training.evaluation.asking import score_missing, score_relations
 from training.evaluation.metrics import Metric, paired_difference
 from training.evaluation.report import SourceReport, measure, pooled
@@ -41,6 +41,7 @@ from training.fit.curve import SCORES, CurvePoint
 from training.fit.draft import draft_artifact
 from training.fit.trainer import Trainer
 from training.machines import BoltzmannMachine
+from training.research.benchmark import Data, Folder
 from training.research.measure import resumable
 from training.runs.config_files import (
     config_toml,
@@ -68,8 +69,6 @@ _FIXED = ("data.", "training.seed", "training.threads")
 _RIVALS = 4  # finished trials before pruning starts
 _WARM_UP = 33  # percentage of the first phase before pruning starts
 
-console = Console()
-
 
 class _Interval(BaseModel, extra="forbid", frozen=True, strict=True):
     low: int | float
@@ -89,10 +88,8 @@ def tune(
     length: Annotated[
         float, typer.Option(min=0.001, max=1, help="share of the steps and epochs of a trial")
     ] = 1.0,
-    data: Annotated[Path | None, typer.Option("--data", help="folder with the scene files")] = None,
-    folder: Annotated[Path, typer.Option("--folder", help="folder for the results")] = Path(
-        "runs/tuning"
-    ),
+    data: Data = None,
+    folder: Folder = Path("runs/tuning"),
     fresh: Annotated[bool, typer.Option("--fresh", help="delete earlier trials")] = False,
 ) -> None:
     """Search for better settings on validation scenes only.
@@ -102,7 +99,7 @@ def tune(
     FOLDER/CONFIGURATION/best.toml. After Ctrl-C, run the same command again: it keeps finished
     trials.
     """
-    with resumable(console):
+    with resumable():
         original = load_config(configuration)
         distributions = load_space(own_or_shipped(space, original, "spaces", "--space"), original)
         results = folder / original.name

@@ -27,8 +27,7 @@ from rich.console import Console
 
 from training.datasets import DatasetError
 from training.datasets.files import DATA, write_whole
-from training.seed.learning import EPOCHS, KINDS, LEARNING_RATE, train
-from training.seed.machines import VARIANTS
+from training.seed.machines import EPOCHS, KINDS, LEARNING_RATE, VARIANTS, train
 from training.seed.protocol import (
     ANNEALED,
     ONE_PASS,
@@ -95,10 +94,7 @@ def seed(
     console.print(f"results: {folder}/results.md, results.json, errors.png", soft_wrap=True)
 
 
-@cache
-def _materials(source: str, data: Path) -> dict[str, Material]:
-    """Read the scenes once in each process."""
-    return read_material(source, data)
+_materials = cache(read_material)  # the scenes are read once in each process
 
 
 def _train_all(

@@ -9,10 +9,10 @@ from training.evaluation.missing_tasks import SEEDS
 from training.evaluation.outlier_tasks import (
     LAWS,
     alarms_task,
-    by_popularity,
     by_signature,
     draw_intruders,
     hit_at_1,
+    intruder_weights,
     outliers_task,
     signatures,
     with_intruders,
@@ -70,7 +70,7 @@ def test_popular_intruders_follow_training():
     250 to 350 with probability below 1e-7."""
     train = tensors([scene([0, 3])] * 6 + [scene([3, 4])] * 3)
     data = tensors([scene([0, 1, 2]) for _ in range(400)])
-    added = draw_intruders(data, NO_STRUCTURE, by_popularity(data, train))
+    added = draw_intruders(data, NO_STRUCTURE, intruder_weights(data, train)["by popularity"])
     assert set(added.tolist()) == {3, 4}
     assert 250 <= int((added == 3).sum()) <= 350
 

@@ -187,11 +187,8 @@ class RbmScore:
 
     def __call__(self, v: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
         """Return the log-odds of each unlisted class."""
-        blocks = [self._hidden_log_odds(self.c + x @ self.W.T) for x in v.split(_BLOCK)]
-        return torch.cat(blocks) + self.b
-
-    def _hidden_log_odds(self, x: Float[Tensor, "B H1"]) -> Float[Tensor, "B V"]:
-        return (softplus(x.unsqueeze(2) + self.W) - softplus(x).unsqueeze(2)).sum(1)
+        hidden = ((self.c + block @ self.W.T).unsqueeze(2) for block in v.split(_BLOCK))
+        return torch.cat([(softplus(x + self.W) - softplus(x)).sum(1) for x in hidden]) + self.b
 
 
 def fit_annealed(
