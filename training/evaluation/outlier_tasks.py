@@ -56,7 +56,7 @@ from training.datasets.batches import SceneTensors
 from training.datasets.cases import draw_true_relations, scene_of, scene_rng
 from training.evaluation.asking import SENSITIVITIES, ask_rows, thing_instances
 from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.missing_tasks import SEEDS
+from training.evaluation.object_tasks import SEEDS
 from training.evaluation.parts import LONGEST, Ranking, draw_parts, exactly
 from training.evaluation.setting import Flagged, Model, ObjectScore, Outcome, Setting, Structure
 

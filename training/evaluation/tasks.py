@@ -20,14 +20,17 @@ from training.evaluation.generation_task import (
     generated_rooms_task,
     generation_task,
 )
-from training.evaluation.missing_tasks import (
+from training.evaluation.moved_task import METRICS, moved_task
+from training.evaluation.object_tasks import (
+    FIGURES,
+    LISTS,
     OF_OBJECTS,
     SIZES,
     missing_evidence_task,
     missing_task,
     placed_task,
+    rooms_task,
 )
-from training.evaluation.moved_task import METRICS, moved_task
 from training.evaluation.outlier_tasks import LAWS, LENGTHS, alarms_task, outliers_task
 from training.evaluation.pair_task import pairs_task
 from training.evaluation.relation_tasks import (
@@ -37,7 +40,6 @@ from training.evaluation.relation_tasks import (
     relations_evidence_task,
     relations_task,
 )
-from training.evaluation.room_task import FIGURES, LISTS, rooms_task
 from training.evaluation.setting import Model, Outcome, Setting
 from training.evaluation.statistics_tasks import COUNTS, OFFSETS, counts_task, offsets_task
 

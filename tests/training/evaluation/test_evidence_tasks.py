@@ -4,7 +4,7 @@ import pytest
 
 from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, room_model, rooms
 from tests.training.evaluation.scenes import scene, tensors
-from training.evaluation.missing_tasks import OF_OBJECTS, missing_evidence_task
+from training.evaluation.object_tasks import OF_OBJECTS, missing_evidence_task
 from training.evaluation.relation_tasks import (
     OF_RELATIONS,
     evidence_cases,

@@ -18,7 +18,7 @@ from tests.training.evaluation.scenes import (
     values_of,
 )
 from training.evaluation.asking import LeakError, score_placed
-from training.evaluation.missing_tasks import (
+from training.evaluation.object_tasks import (
     SEEDS,
     leave_one_out_at,
     missing_task,

@@ -5,7 +5,7 @@ import torch
 from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
 from tests.training.evaluation.scenes import FLOOR, NO_STRUCTURE, scene, tensors, values_of
 from training.evaluation.asking import SENSITIVITIES, artifact_model, judge
-from training.evaluation.missing_tasks import SEEDS
+from training.evaluation.object_tasks import SEEDS
 from training.evaluation.outlier_tasks import (
     LAWS,
     alarms_task,
