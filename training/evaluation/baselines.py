@@ -8,7 +8,7 @@ place, count triples.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 from typing import Final
@@ -264,15 +264,22 @@ def placed_table(train: SceneTensors, structure: Structure, _seed: int) -> Propo
         yield {"place": place, "relation": relation}, place_score(log_p)
 
 
-def propose_products(
-    objects: ObjectScore | None, table: PlacedScore | None
-) -> Callable[[SceneTensors, Tensor, int], Proposals[PlacedScore]]:
-    """Return a generator function for objects(v) + weight · table - correction · log popularity.
+POPULARITY: Final = Baseline("popularity", popularity)
+EASE: Final = Baseline("EASE", ease)
+FREQUENCY_TABLE: Final = Baseline("frequency table", frequency_table, RELATIONS)
+PLACED: Final = Baseline("frequency table p(i | a, j)", placed_table, AT_PLACE)
+
+
+def placed_product(name: str, objects: Model, table: Model) -> Baseline:
+    """Return the baseline of T2-at that multiplies a score of missing objects by `PLACED`.
+
+    Its score is objects(v) + weight · table - correction · log popularity.
 
     Raises:
         ValueError: a score is missing.
     """
-    if objects is None or table is None:
+    missing, at_place = objects.missing, table.at_place
+    if missing is None or at_place is None:
         raise ValueError("the product needs an object score and a table of places")
 
     def product_score(
@@ -280,7 +287,7 @@ def propose_products(
     ) -> PlacedScore:
         # Both factors depend on the class frequency, so the correction subtracts it.
         return lambda places: (
-            objects(places.v) + (weight * table(places) - correction * log_popularity)
+            missing(places.v) + (weight * at_place(places) - correction * log_popularity)
         )
 
     def propose(train: SceneTensors, _structure: Structure, _seed: int) -> Proposals[PlacedScore]:
@@ -289,16 +296,4 @@ def propose_products(
             score = product_score(weight, correction, log_popularity)
             yield {"weight": weight, "correction": correction}, score
 
-    return propose
-
-
-POPULARITY: Final = Baseline("popularity", popularity)
-EASE: Final = Baseline("EASE", ease)
-FREQUENCY_TABLE: Final = Baseline("frequency table", frequency_table, RELATIONS)
-PLACED: Final = Baseline("frequency table p(i | a, j)", placed_table, AT_PLACE)
-
-
-def placed_product(name: str, objects: Model, table: Model) -> Baseline:
-    """Return the baseline of T2-at that multiplies a score of missing objects by `PLACED`."""
-    propose = propose_products(objects.missing, table.at_place)
     return Baseline(f"{PLACED.name} × {name}", propose, AT_PLACE)

@@ -1,4 +1,4 @@
-"""Task T3: add an absent class to a scene as an intruder, and look for alarms in untouched parts.
+"""Tasks T3: add an absent class to a scene as an intruder, and look for alarms in untouched parts.
 
 A request lists the classes of a scene and one intruder, without structure and relations. The model
 ranks the listed classes by suspicion. The suspicion of a published model is the probability of
@@ -28,6 +28,21 @@ Before publication, a part also states the relations of its two to twelve classe
 refused only if its share of parts with an alarm is certainly too large: the exact 95 % lower bound
 must exceed `EXCESS` times the promise of the sensitivity.
 
+T3c: one object of a scene stands at a wrong place. Each scene is asked twice: with a moved object,
+and untouched. Scenes with boxes are asked as poses, without relations. An object then stands on
+another object, on the floor or under its supporter. Other scenes state at most 40 relations, one of
+them an altered support. See `training.datasets.moved`. The room type is not stated. Scenes without
+a possible move are skipped.
+
+    named first             share of scenes whose first misplaced relation names the moved object in
+                            the field `moved`
+    flagged at 5 % alarms   share of scenes in which the highest probability about the moved object
+                            exceeds a threshold. At this threshold, at most 5 % of the untouched
+                            scenes of the same source have an alarm
+
+A misplaced relation is about the object in its field `moved`. Without this field, it is about its
+subject.
+
 Source: Clopper and Pearson, "The use of confidence or fiducial limits illustrated in the case of
 the binomial" (1934).
 """
@@ -35,10 +50,10 @@ the binomial" (1934).
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
@@ -53,12 +68,21 @@ from app.scene import Scene
 from training.datasets import EncodedScene
 from training.datasets.array_types import Rng
 from training.datasets.batches import SceneTensors
-from training.datasets.cases import draw_true_relations, scene_of, scene_rng
-from training.evaluation.asking import SENSITIVITIES, ask_rows, thing_instances
+from training.datasets.cases import draw_true_relations, scene_of, scene_rng, some_scenes
+from training.datasets.moved import moved_scene, untouched_scene
+from training.evaluation.asking import SENSITIVITIES, ask_every, ask_rows, thing_instances
 from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.object_tasks import SEEDS
 from training.evaluation.parts import LONGEST, Ranking, draw_parts, exactly
-from training.evaluation.setting import Flagged, Model, ObjectScore, Outcome, Setting, Structure
+from training.evaluation.setting import (
+    Flagged,
+    MisplacedScore,
+    Model,
+    ObjectScore,
+    Outcome,
+    Setting,
+    Structure,
+)
 
 LENGTHS: Final = (1, 2, 3, 5, 8)  # numbers of listed classes in which alarms are measured
 
@@ -103,8 +127,8 @@ def outliers_task(model: Model, setting: Setting) -> Outcome | None:
         hits = metrics[f"hit@1, {distribution}"] = hit_at_1(scenes, cases, model.suspicion)
         skipped = min(skipped, hits.skipped)
         if (flags := model.flags) is not None:
-            flagged = ask_rows(lambda v: flags(v, "medium").float(), cases.v)
-            is_flagged = flagged.gather(1, cases.intruder.unsqueeze(1)).squeeze(1).numpy()
+            is_flagged = ask_rows(lambda v: flags(v, "medium").float(), cases.v)
+            is_flagged = is_flagged.gather(1, cases.intruder.unsqueeze(1)).squeeze(1).numpy()
             share = Ratio.of_items(cases.scene.numpy(), is_flagged, len(scenes))
             metrics[f"flagged, {distribution}"] = share
     return Outcome.over(scenes, metrics, skipped)
@@ -284,3 +308,86 @@ def _random_part(encoded: EncodedScene, structure: Bool[NDArray, " V"], rng: Rng
         if i in index_of and j in index_of
     ]
     return replace(scene_of(encoded, kept, triples), room_type=None)
+
+
+MOVED: Final = ("named first", "flagged at 5 % alarms")
+
+_ALARM_SHARE: Final = 0.05  # of untouched scenes with an alarm at the threshold
+_MOVED_SCENES: Final = 300  # maximum number of scenes of a source
+
+
+@dataclass(frozen=True, eq=False)
+class MovedCase:
+    """A scene with the moved object `object`, and the same scene without the move."""
+
+    scene_index: int
+    moved: Scene
+    object: str
+    untouched: Scene
+
+
+def moved_cases(scenes: SceneTensors, structure: Structure, seed: int = 0) -> list[MovedCase]:
+    """Return a case for each scene in which an object can move."""
+    is_structure = structure.numpy()
+    cases = []
+    for scene_index, encoded in enumerate(scenes.scenes):
+        case = moved_scene(encoded, is_structure, scene_rng(encoded, seed))
+        untouched = untouched_scene(encoded, is_structure, scene_rng(encoded, seed))
+        if case is not None and untouched is not None:
+            scene, index = case
+            scene, untouched = (replace(entry, room_type=None) for entry in (scene, untouched))
+            cases.append(MovedCase(scene_index, scene, scene.objects[index].id, untouched))
+    return cases
+
+
+def ask_moved(score: MisplacedScore, cases: Sequence[MovedCase]) -> Float[NDArray, "N 3"]:
+    """Return the answers to N cases.
+
+    The columns are 1 if the moved object is named first, the highest probability about the moved
+    object, and that in the untouched scene; 0 without an entry.
+    """
+
+    def ask(case: MovedCase) -> Float[NDArray, " 3"]:
+        entries, untouched = score(case.moved), score(case.untouched)
+        is_first = bool(entries) and entries[0].get("moved") == case.object
+        return np.array([is_first, _highest(entries, case.object), _highest(untouched)])
+
+    return np.array(ask_every(ask, cases)).reshape(-1, 3)
+
+
+def _highest(entries: Sequence[Mapping[str, Any]], object_: str | None = None) -> float:
+    """Return the highest probability of the entries about an object; None means all entries."""
+    values = [
+        float(entry["probability"])
+        for entry in entries
+        if object_ is None or (entry.get("moved") or entry["subject"]) == object_
+    ]
+    return max(values, default=0.0)
+
+
+def flagged(
+    suspicion: Float[NDArray, " N"], untouched: Float[NDArray, " N"], source: Int[NDArray, " N"]
+) -> Bool[NDArray, " N"]:
+    """Return whether each suspicion exceeds the threshold of its source; see `ask_moved`."""
+    is_flagged = np.zeros(len(source), dtype=np.bool_)
+    for name in np.unique(source):
+        in_source = source == name
+        threshold = np.sort(untouched[in_source])[-1 - int(_ALARM_SHARE * in_source.sum())]
+        is_flagged[in_source] = suspicion[in_source] > threshold
+    return is_flagged
+
+
+def moved_task(score: MisplacedScore, setting: Setting) -> Outcome | None:
+    """Measure T3c: the shares of moved objects that are named first, and flagged."""
+    scenes = some_scenes(setting.some(related=True), _MOVED_SCENES, setting.seed)
+    cases = moved_cases(scenes, setting.structure, setting.seed)
+    if not cases:
+        return None
+    first, suspicion, untouched = ask_moved(score, cases).T
+    index = np.array([case.scene_index for case in cases])
+    values = first, flagged(suspicion, untouched, scenes.source.numpy()[index])
+    metrics: dict[str, Metric] = {
+        name: Ratio.of_items(index, value, len(scenes))
+        for name, value in zip(MOVED, values, strict=True)
+    }
+    return Outcome.over(scenes, metrics, len(scenes) - len(cases))

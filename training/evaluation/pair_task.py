@@ -17,7 +17,7 @@ Pairs with structure classes are excluded. Scenes without such a pair are skippe
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -29,7 +29,7 @@ from scipy.special import expit
 from app.model import SceneModel
 from app.scene.spatial_relations import INSIDE, LATERAL, VERTICAL
 from training.datasets import EncodedScene
-from training.datasets.batches import SceneTensors, seen_triples
+from training.datasets.batches import SceneTensors, seen_triples, subset
 from training.evaluation.asking import ask_every, labels_alone, relation_probabilities
 from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.relation_tasks import with_observed
@@ -190,7 +190,8 @@ def _ask(model: Model, setting: Setting, relations: Sequence[int]) -> _Answers |
     pairs = listed_pairs(setting.scenes, setting.structure, relations)
     if not pairs:
         return None
-    scenes = setting.at(torch.tensor([question.scene_index for question in pairs])).some()
+    index = torch.tensor([question.scene_index for question in pairs])
+    scenes = replace(setting, scenes=subset(setting.scenes, index)).some()
     questions = listed_pairs(scenes, setting.structure, relations)
     if model.scene_model is not None:
         score = service_score(model.scene_model)

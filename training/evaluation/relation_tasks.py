@@ -123,28 +123,24 @@ def score_scenes(
 def complete_scenes(
     scenes: SceneTensors, structure: Structure, score: RelationScore, *, seed: int = 0
 ) -> list[Candidates]:
-    """Score the T1b candidates of scenes with at least two triples, given half of the triples."""
+    """Score the T1b candidates of scenes with at least two triples.
+
+    Half of the triples of each scene, rounded down, is given.
+    """
 
     def ask(batch: Batch, index: list[int]) -> tuple[Tensor, Tensor]:
         mask = scorable(batch, structure)
-        observed = random_half((batch.holds > 0) & mask, scenes, index, seed)
+        truth = (batch.holds > 0) & mask
+        observed = torch.zeros_like(truth)
+        for row, k in enumerate(index):
+            triples = truth[row].nonzero()
+            order = scene_rng(scenes.scenes[k], seed).permutation(len(triples))
+            observed[row][tuple(triples[torch.from_numpy(order[: len(triples) // 2])].T)] = True
         # With a single triple the observed half is empty: the scene is left out.
         has_evidence = observed.flatten(1).any(1)[:, None, None, None]
         return score(with_observed(batch, observed)), mask & ~observed & ~observed.mT & has_evidence
 
     return _scored(scenes, 2, ask)
-
-
-def random_half(
-    truth: Bool[Tensor, "B A n n"], scenes: SceneTensors, index: Sequence[int], seed: int
-) -> Bool[Tensor, "B A n n"]:
-    """Return half of each scene's triples, rounded down."""
-    half = torch.zeros_like(truth)
-    for row, k in enumerate(index):
-        triples = truth[row].nonzero()
-        order = scene_rng(scenes.scenes[k], seed).permutation(len(triples))
-        half[row][tuple(triples[torch.from_numpy(order[: len(triples) // 2])].T)] = True
-    return half
 
 
 def r_precision(

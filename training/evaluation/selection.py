@@ -20,8 +20,8 @@ from torch import Tensor
 
 from training.datasets.batches import SceneTensors, has_relations
 from training.datasets.cases import some_scenes
-from training.evaluation.moved_task import ask_moved, moved_cases
 from training.evaluation.object_tasks import leave_one_out_at, mean_log_p
+from training.evaluation.outlier_tasks import ask_moved, moved_cases
 from training.evaluation.parts import validation_score
 from training.evaluation.relation_tasks import (
     Candidates,

@@ -43,10 +43,6 @@ class Setting:
         limit = None if self.limit is None else max(1, self.limit // share)
         return some_scenes(scenes, limit, self.seed)
 
-    def at(self, index: Int[Tensor, " N"]) -> Setting:
-        """Return the setting with only the scenes at the given indices."""
-        return replace(self, scenes=subset(self.scenes, index))
-
     def by_source(self) -> Iterator[tuple[str, Setting]]:
         """Iterate over the data sources, by name, and their scenes and training scenes."""
         training = {} if self.train is None else dict(by_source(self.train))

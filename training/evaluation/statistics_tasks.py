@@ -15,7 +15,6 @@ instances the source does not count, are left out.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -31,6 +30,7 @@ from app.questions.missing import LIKELY, more
 from app.questions.posterior import present
 from app.scene import CANONICAL
 from training.datasets import EncodedScene
+from training.datasets.batches import subset
 from training.datasets.cases import MOST, counted_classes, listed_cases, observed_offsets
 from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.parts import of_classes
@@ -93,7 +93,7 @@ def counts_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
         return None
     counted = counted_classes(train.scenes, artifact.vocabulary)
     is_counted = torch.tensor([scene.source in counted for scene in setting.scenes.scenes])
-    scenes = setting.at(is_counted.nonzero().squeeze(1)).scenes
+    scenes = subset(setting.scenes, is_counted)
     answers = [
         (k, *answer)
         for k, scene in enumerate(scenes.scenes)
@@ -109,7 +109,11 @@ def counts_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
 
     row = np.searchsorted(artifact.counts.classes, index)
     of_class = mean(np.abs(class_mean(artifact.counts, row, listed_number) - number))
-    source_mean = np.maximum(_mean_counts(train.scenes, artifact)[index], listed)
+    times, total = np.zeros((2, len(artifact.vocabulary)))
+    for evidence in (encoded.evidence for encoded in train.scenes):
+        times[evidence.classes] += 1
+        total[evidence.classes] += np.minimum(evidence.counts, MOST)
+    source_mean = np.maximum((total / np.maximum(times, 1))[index], listed)
     error = mean(np.abs(expected - number))
     metrics: dict[str, Metric] = {
         "error of the expected count": error,
@@ -139,15 +143,6 @@ def _ask_counts(
     entries = more(artifact, request, listing, top_k=len(candidates), candidates=candidates)
     fields = ("listed_count", "expected_count", "low", "high", "probability")
     return [(*number_of[entry["label"]], *(entry[name] for name in fields)) for entry in entries]
-
-
-def _mean_counts(scenes: Sequence[EncodedScene], artifact: SceneModel) -> Float[NDArray, " V"]:
-    """Return the mean number of instances of each class in the scenes with the class."""
-    times, total = np.zeros((2, len(artifact.vocabulary)))
-    for scene in scenes:
-        times[scene.evidence.classes] += 1
-        total[scene.evidence.classes] += np.minimum(scene.evidence.counts, MOST)
-    return total / np.maximum(times, 1)
 
 
 def class_mean(

@@ -20,7 +20,6 @@ from training.evaluation.generation_task import (
     generated_rooms_task,
     generation_task,
 )
-from training.evaluation.moved_task import METRICS, moved_task
 from training.evaluation.object_tasks import (
     FIGURES,
     LISTS,
@@ -31,7 +30,14 @@ from training.evaluation.object_tasks import (
     placed_task,
     rooms_task,
 )
-from training.evaluation.outlier_tasks import LAWS, LENGTHS, alarms_task, outliers_task
+from training.evaluation.outlier_tasks import (
+    LAWS,
+    LENGTHS,
+    MOVED,
+    alarms_task,
+    moved_task,
+    outliers_task,
+)
 from training.evaluation.pair_task import pairs_task
 from training.evaluation.relation_tasks import (
     OF_RELATIONS,
@@ -126,7 +132,7 @@ TASKS: dict[str, Task] = {
     "T3b placement": Task(
         "false relation", placement_task, "false_relations", ("hit@1",), of_objects=False
     ),
-    "T3c moved": Task("moved object", moved_task, "misplaced", METRICS, of_objects=False),
+    "T3c moved": Task("moved object", moved_task, "misplaced", MOVED, of_objects=False),
     "T4 generate": Task(
         "generated scenes",
         generation_task,

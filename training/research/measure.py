@@ -23,7 +23,7 @@ import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import sha256
@@ -57,7 +57,6 @@ from training.fit.configuration import Config, ConfigError, ObjectsConfig
 from training.fit.draft import placed_draft
 from training.fit.objects import ObjectScenes
 from training.fit.trainer import Trainer
-from training.machines import BoltzmannMachine
 from training.research.baselines import BASELINES
 from training.runs.folder import RunError, load_run, save_run
 
@@ -105,9 +104,8 @@ def baseline_entries(
 
 def reference_entries() -> Iterator[Entry]:
     """Generate the untrained references for the evaluation of generated scenes."""
-    makers = {"independent classes": _independent, "held-out scenes (floor)": _held_out}
-    for name, make in makers.items():
-        yield Entry(name, 0, name, make)
+    yield Entry("independent classes", 0, "independent classes", _independent)
+    yield Entry("held-out scenes (floor)", 0, "held-out scenes (floor)", _held_out)
 
 
 def _independent(data: TrainingData, *_: object) -> Model:
@@ -200,7 +198,16 @@ def tuned_suspicion(score: ObjectScore, data: TrainingData, seed: int) -> Object
 def _machine_model(config: Config, data: TrainingData, folder: Path, say: Progress) -> Model:
     """Train or load a machine, and calibrate it. Its weights that are held at 0 do not count."""
     run, seed = folder / "run", config.training.seed
-    machine = train_once(config, data, run, say)
+    try:
+        machine = load_run(run).machine
+    except RunError:  # no finished run
+
+        def progress(phase: str, done: float, loss: float) -> None:
+            say(f"{phase} {done:.0%}, {loss:.3f}")
+
+        result = Trainer(config, data).run(progress)
+        save_run(run, config, result)
+        machine = result.machine
     draft = placed_draft(machine, data)
     say("calibrating")
     artifact = replace(draft, calibration=calibrate(draft, data, config.objects, seed))
@@ -208,21 +215,6 @@ def _machine_model(config: Config, data: TrainingData, folder: Path, say: Progre
     model = artifact_model(artifact, profiles=profiles)
     zero = sum(machine.get_parameter(name).numel() for name in config.machine.without)
     return replace(model, parameters=machine.parameter_count - zero)
-
-
-def train_once(
-    config: Config, data: TrainingData, run: Path, say: Progress = silent
-) -> BoltzmannMachine:
-    """Return the machine of the finished run in a folder. Without such a run, train it."""
-    with suppress(RunError):
-        return load_run(run).machine
-
-    def progress(phase: str, done: float, loss: float) -> None:
-        say(f"{phase} {done:.0%}, {loss:.3f}")
-
-    result = Trainer(config, data).run(progress)
-    save_run(run, config, result)
-    return result.machine
 
 
 # Linear algebra libraries read these variables when a process loads them.

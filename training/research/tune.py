@@ -40,7 +40,6 @@ from training.fit.configuration import Config, ConfigError, first_error
 from training.fit.curve import SCORES, CurvePoint
 from training.fit.draft import draft_artifact
 from training.fit.trainer import Trainer
-from training.machines import BoltzmannMachine
 from training.research.benchmark import Data, Folder
 from training.research.measure import resumable
 from training.runs.config_files import (
@@ -228,22 +227,19 @@ class Search:
         else:
             result = Trainer(config, self.data).run(passed=passed)
             write_whole(curve, json.dumps([asdict(point) for point in result.curve]))
-            self._measure(result.machine).write(path)
+            artifact = draft_artifact(result.machine, self.data.vocabulary)
+            relations = partial(score_relations, artifact, given=False)
+            model = Model(missing=partial(score_missing, artifact), relations=relations)
+            every = Setting(self.data.validation, self.data.structure, self.data.train)
+            tasks = [task for task, _ in FIGURES.values()]
+            reports = [measure(model, s, name, tasks=tasks) for name, s in every.by_source()]
+            pooled(reports).write(path)
         report = SourceReport.read(path)
         return {
             name: outcome.metrics[metric]
             for name, (task, metric) in FIGURES.items()
             if (outcome := report.outcomes.get(task))
         }
-
-    def _measure(self, machine: BoltzmannMachine) -> SourceReport:
-        """Measure a machine on the validation scenes of each data source."""
-        data, artifact = self.data, draft_artifact(machine, self.data.vocabulary)
-        relations = partial(score_relations, artifact, given=False)
-        model = Model(missing=partial(score_missing, artifact), relations=relations)
-        tasks = [task for task, _ in FIGURES.values()]
-        every = Setting(data.validation, data.structure, data.train)
-        return pooled([measure(model, own, name, tasks=tasks) for name, own in every.by_source()])
 
 
 def shown(settings: Mapping[str, Any]) -> str:

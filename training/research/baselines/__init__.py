@@ -6,7 +6,7 @@ from typing import Final
 
 from training.evaluation.baselines import EASE, FREQUENCY_TABLE, PLACED, POPULARITY
 from training.evaluation.selection import COMPLETION, MISPLACED, RELATIONS, ROOMS, Baseline
-from training.research.baselines import object_models, relation_models, room_models
+from training.research.baselines import count_models, object_models
 
 _EVERY: tuple[Baseline, ...] = (
     POPULARITY,
@@ -16,19 +16,19 @@ _EVERY: tuple[Baseline, ...] = (
     Baseline("pairwise logistic", object_models.pairwise),
     Baseline("scikit-learn BernoulliRBM", object_models.bernoulli_rbm, stochastic=True),
     Baseline("denoising autoencoder", object_models.autoencoder, stochastic=True),
-    Baseline("most common room type", room_models.most_common, ROOMS),
-    Baseline("naive Bayes of rooms", room_models.naive_bayes, ROOMS),
-    Baseline("relation popularity", relation_models.relation_popularity, RELATIONS),
+    Baseline("most common room type", count_models.most_common_room, ROOMS),
+    Baseline("naive Bayes of rooms", count_models.room_naive_bayes, ROOMS),
+    Baseline("relation popularity", count_models.relation_popularity, RELATIONS),
     FREQUENCY_TABLE,
-    Baseline("ComplEx", relation_models.complex_embedding, RELATIONS, stochastic=True),
+    Baseline("ComplEx", count_models.complex_embedding, RELATIONS, stochastic=True),
     Baseline("frequency table, completing", FREQUENCY_TABLE.propose, COMPLETION),
     Baseline(
         "frequency table + closure, completing",
-        relation_models.frequency_table_with_closure,
+        count_models.frequency_table_with_closure,
         COMPLETION,
     ),
     PLACED,
-    Baseline("frequency table of supporters", relation_models.supporter_table, MISPLACED),
+    Baseline("frequency table of supporters", count_models.supporter_table, MISPLACED),
 )
 
 BASELINES: Final[dict[str, Baseline]] = {entry.name: entry for entry in _EVERY}

@@ -20,6 +20,7 @@ from training.evaluation.baselines import Lists, fit_ease, frequency, training_l
 from training.evaluation.generation_task import transitive_closure
 from training.evaluation.relation_tasks import with_observed
 from training.evaluation.setting import Places
+from training.research.baselines.count_models import closure_score, complex_logits
 from training.research.baselines.object_models import (
     bernoulli_rbm,
     evidence,
@@ -27,7 +28,6 @@ from training.research.baselines.object_models import (
     hidden_loss,
     nearest_score,
 )
-from training.research.baselines.relation_models import closure_score, complex_logits
 
 
 def lists_of(v):

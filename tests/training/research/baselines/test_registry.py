@@ -18,8 +18,8 @@ from tests.training.research.baselines.furnished import (
 )
 from training.evaluation import selection
 from training.evaluation.baselines import PLACED, placed_product
-from training.evaluation.moved_task import moved_cases
 from training.evaluation.object_tasks import removed_places
+from training.evaluation.outlier_tasks import moved_cases
 from training.evaluation.relation_tasks import with_observed
 from training.evaluation.selection import TRIALS, Baseline, drawn_settings, halving
 from training.research.baselines import BASELINES

@@ -9,7 +9,7 @@ from training.datasets.cases import scene_of
 from training.datasets.moved import posed_scene
 from training.evaluation.selection import named_moved
 from training.research.baselines import BASELINES
-from training.research.baselines.relation_models import supporter_score, supporter_table
+from training.research.baselines.count_models import supporter_score, supporter_table
 
 VOCABULARY = Vocabulary(
     [*map(ObjectClass, ("table", "cup", "bed")), ObjectClass("floor", structure=True)], []
