@@ -148,22 +148,19 @@ class Ranking:
         above, ties = (values > target_score).sum(1), (values == target_score).sum(1) - 1
         return cls(scene.numpy(), target.numpy(), above.numpy(), ties.numpy(), scenes)
 
-    def reciprocal_rank(self) -> Float[NDArray, " N"]:
-        """Return the expectation of 1 / rank under random order of ties."""
+    def mrr(self, selection: Bool[NDArray, " N"] | slice = slice(None)) -> Ratio:
+        """Return the mean of 1 / rank of the selected targets, expected over ties."""
         # Mean of 1/r over r = above + 1 .. above + ties + 1, by harmonic numbers.
         last = self.above + self.ties + 1
         ranks = np.arange(1, int(last.max(initial=1)) + 1)
         harmonic = np.concatenate([[0.0], np.cumsum(1.0 / ranks)])
-        return (harmonic[last] - harmonic[self.above]) / (self.ties + 1)
+        values = (harmonic[last] - harmonic[self.above]) / (self.ties + 1)
+        return Ratio.of_items(self.scene[selection], values[selection], self.scenes)
 
     def top(self, k: int) -> Ratio:
         """Return the share of targets among the first k candidates."""
         share = np.clip((k - self.above) / (self.ties + 1), 0.0, 1.0)
         return Ratio.of_items(self.scene, share, self.scenes)
-
-    def mrr(self, selection: Bool[NDArray, " N"] | slice = slice(None)) -> Ratio:
-        """Return the mean reciprocal rank of the selected targets."""
-        return Ratio.of_items(self.scene[selection], self.reciprocal_rank()[selection], self.scenes)
 
 
 def rank_hidden(parts: Parts, structure: Structure, values: Float[Tensor, "N V"]) -> Ranking:
