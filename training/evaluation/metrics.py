@@ -184,8 +184,8 @@ class Ratio(Metric):
 
     def by(self, groups: Int[NDArray, " G"]) -> Ratio:
         ids, index = np.unique(groups, return_inverse=True)
-        sums = (np.bincount(index, x, len(ids)) for x in (self.numerators, self.denominators))
-        return Ratio(*sums, groups=ids)
+        top = np.bincount(index, self.numerators, len(ids))
+        return Ratio(top, np.bincount(index, self.denominators, len(ids)), ids)
 
     @cached_property
     def draws(self) -> Float[NDArray, " resamples"]:  # type: ignore[override]

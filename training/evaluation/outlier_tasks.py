@@ -127,8 +127,8 @@ def outliers_task(model: Model, setting: Setting) -> Outcome | None:
         hits = metrics[f"hit@1, {distribution}"] = hit_at_1(scenes, cases, model.suspicion)
         skipped = min(skipped, hits.skipped)
         if (flags := model.flags) is not None:
-            is_flagged = ask_rows(lambda v: flags(v, "medium").float(), cases.v)
-            is_flagged = is_flagged.gather(1, cases.intruder.unsqueeze(1)).squeeze(1).numpy()
+            alarm = ask_rows(lambda v: flags(v, "medium").float(), cases.v)
+            is_flagged = alarm.gather(1, cases.intruder.unsqueeze(1)).squeeze(1).numpy()
             share = Ratio.of_items(cases.scene.numpy(), is_flagged, len(scenes))
             metrics[f"flagged, {distribution}"] = share
     return Outcome.over(scenes, metrics, skipped)
