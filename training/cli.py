@@ -30,8 +30,7 @@ from training.domain.terminal import StorePath, console, fail, print_lines
 from training.evaluation.report import Progress
 from training.fit.configuration import Config, ConfigError
 from training.fit.trainer import Trainer
-from training.research.ablate import ablate
-from training.research.benchmark import benchmark
+from training.research.benchmark import ablate, benchmark
 from training.research.tune import tune
 from training.research.words import words
 from training.runs.config_files import data_folder, load_config, with_settings
@@ -72,8 +71,6 @@ StoredData = Annotated[
         f"of its configuration file; default: {DATA}, or for a run, the folder of its training",
     ),
 ]
-Runs = Annotated[Path, typer.Option("--runs", help="folder of the training runs")]
-_RUNS = Path("runs")
 _ALIAS = "`python -m app.registry alias` moves an alias without a comparison"
 
 
@@ -81,7 +78,7 @@ _ALIAS = "`python -m app.registry alias` moves an alias without a comparison"
 def train(
     configuration: Annotated[str, typer.Argument(help="a TOML file, or a shipped configuration")],
     data: Data = None,
-    runs: Runs = _RUNS,
+    runs: Annotated[Path, typer.Option(help="folder of the training runs")] = Path("runs"),
     seed: Annotated[int | None, typer.Option(help="seed, overrides the configuration")] = None,
     final: Annotated[
         bool,
@@ -109,7 +106,12 @@ def train(
             config = with_settings(config, {"data.split": "final"})
             folder = folder.with_name(f"final-{folder.name}")
         scenes = _prepare(config, root)
-        _train(config, scenes, folder, root)
+        trainer = Trainer(config, scenes.training_data())
+        console.print(f"{config.name}: {trainer.machine.parameter_count:,} weights")
+        with Display(trainer, console) as display:
+            result = trainer.run(display.progress)
+        save_run(folder, config, result, data=root, scenes=scenes.digest)
+        summarise(result, folder, console)
         if publish is None and not final:
             next_steps(folder, console)
         if publish is not None:
@@ -212,15 +214,6 @@ def _prepare(config: Config, data: Path) -> SplitScenes:
     for reason in reasons:
         console.print(f"[yellow]note:[/yellow] an example is left out: {reason}", soft_wrap=True)
     return replace(scenes, examples=examples)
-
-
-def _train(config: Config, scenes: SplitScenes, folder: Path, root: Path) -> None:
-    trainer = Trainer(config, scenes.training_data())
-    console.print(f"{config.name}: {trainer.machine.parameter_count:,} weights")
-    with Display(trainer, console) as display:
-        result = trainer.run(display.progress)
-    save_run(folder, config, result, data=root, scenes=scenes.digest)
-    summarise(result, folder, console)
 
 
 def _publish(

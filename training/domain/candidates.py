@@ -19,11 +19,11 @@ from training.datasets.batches import TrainingData, has_relations
 from training.datasets.records import digest_of
 from training.datasets.splits import stable_part
 from training.domain.translation import Translation, same_classes
-from training.evaluation.artifact_model import artifact_model
+from training.evaluation.asking import artifact_model
 from training.evaluation.baselines import EASE, FREQUENCY_TABLE, PLACED, placed_product
-from training.evaluation.baselines.fitting import Baseline
-from training.evaluation.model import Model
 from training.evaluation.report import Progress
+from training.evaluation.selection import Baseline
+from training.evaluation.setting import Model
 from training.fit.configuration import Config, ConfigError, source_name
 from training.runs.folder import RunError, load_run
 from training.runs.pipeline import prepare

@@ -23,10 +23,9 @@ from training.domain.candidates import BASELINES, Candidate, find, held_out
 from training.domain.terminal import StorePath, console, fail, print_lines
 from training.domain.translation import Translation, same_classes
 from training.evaluation.metrics import Figure
-from training.evaluation.model import Model
 from training.evaluation.report import Progress, measure, silent
 from training.evaluation.results import Difference, Results, only, summarise
-from training.evaluation.setting import Setting
+from training.evaluation.setting import Model, Setting
 from training.evaluation.tasks import in_words
 from training.fit.configuration import ConfigError
 from training.runs.folder import RunError

@@ -18,8 +18,7 @@ from training.datasets.files import DATA
 from training.domain.terminal import StorePath, console, fail, print_lines
 from training.evaluation.everyday_task import EVERYDAY
 from training.evaluation.metrics import Figure
-from training.evaluation.outside import RoomList, read_test
-from training.evaluation.report import Progress, evaluate
+from training.evaluation.report import Progress, RoomList, evaluate, read_test
 from training.evaluation.tasks import in_words
 from training.fit.configuration import ConfigError, source_name
 from training.runs.config_files import stored_config

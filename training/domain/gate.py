@@ -24,9 +24,9 @@ from training.domain.compare import SCENES, Comparison, difference_text
 from training.evaluation.asking import score_missing
 from training.evaluation.baselines import EASE, POPULARITY
 from training.evaluation.metrics import FEWEST_GROUPS, Figure, Ratio, paired_difference
-from training.evaluation.missing_tasks import rank_missing
-from training.evaluation.model import ObjectScore
+from training.evaluation.object_tasks import rank_missing
 from training.evaluation.report import Progress
+from training.evaluation.setting import ObjectScore
 from training.evaluation.tasks import in_words
 
 MARGIN = 0.02  # accepted loss of a primary metric when a new version replaces the served version

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from app.scene import Vocabulary
 from training.datasets.batches import Batch
-from training.evaluation.model import Model, ObjectScore, PlacedScore, Places, RelationScore
+from training.evaluation.setting import Model, ObjectScore, PlacedScore, Places, RelationScore
 
 BEYOND = 1e9  # absolute score of unknown classes: finite, and larger than all log-odds
 

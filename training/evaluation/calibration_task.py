@@ -22,13 +22,13 @@ does not return are left out.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from numpy.typing import NDArray
 
 from app.model import (
@@ -59,17 +59,17 @@ from training.evaluation.asking import (
     canonical_triple,
     index_of_ids,
     labels_alone,
-    of_classes,
     thing_instances,
     with_intruder,
 )
-from training.evaluation.intruders import draw_intruder_choices
 from training.evaluation.metrics import Metric, Scored
+from training.evaluation.outlier_tasks import draw_intruder_choices
 from training.evaluation.parts import (
     Size,
     all_but_one,
     draw_parts,
     exactly,
+    of_classes,
     share_of,
     up_to_longest,
 )
@@ -83,25 +83,12 @@ Answers = list[tuple[float, bool]]  # probability and truth value of each answer
 Ask = Callable[[SceneModel, EncodedScene, Rng], Answers | None]
 
 
-@dataclass(frozen=True, eq=False)
-class Items:
-    """N scored items of some scenes, such as answers."""
-
-    scene: Int[NDArray, " N"]
-    score: Float[NDArray, " N"]
-    truth: Bool[NDArray, " N"]
-    scenes: int
-    skipped: int = 0  # scenes that could not be scored
-
-    @classmethod
-    def of(cls, answers: list[tuple[int, float, bool]], scenes: int, skipped: int) -> Items:
-        """Return the items of answers with the index of their scene."""
-        index, probability, truth = np.array(answers, dtype=np.float64).reshape(-1, 3).T
-        return cls(index.astype(np.int64), probability, truth > 0, scenes, skipped)
-
-    def metric(self, statistic: str) -> Scored:
-        """Return one of `STATISTICS`."""
-        return Scored(statistic, self.scene, self.score, self.truth, np.arange(self.scenes))
+def scored(answers: list[tuple[int, float, bool]], scenes: int) -> Scored | None:
+    """Return the ECE of answers with the index of their scene; None without answers."""
+    if not answers:
+        return None
+    index, probability, truth = np.array(answers, dtype=np.float64).T
+    return Scored("ECE", index.astype(np.int64), probability, truth > 0, np.arange(scenes))
 
 
 def uncalibrated(artifact: SceneModel) -> SceneModel:
@@ -123,11 +110,13 @@ def uncalibrated(artifact: SceneModel) -> SceneModel:
     return replace(artifact, calibration=neutral)
 
 
-def collect(artifact: SceneModel, scenes: SceneTensors, ask: Ask, seed: int = 0) -> Items:
-    """Ask one of `QUESTIONS` about every scene, and collect the answers with their truth."""
+def collect(
+    artifact: SceneModel, scenes: SceneTensors, ask: Ask, seed: int = 0
+) -> tuple[Scored | None, int]:
+    """Ask one of `QUESTIONS` about every scene. Return the answers, and the skipped scenes."""
     answers = [ask(artifact, scene, scene_rng(scene, seed)) for scene in scenes.scenes]
     items = [(k, *answer) for k, of_scene in enumerate(answers) for answer in of_scene or ()]
-    return Items.of(items, len(scenes), answers.count(None))
+    return scored(items, len(scenes)), answers.count(None)
 
 
 def ask_relations(artifact: SceneModel, encoded: EncodedScene, rng: Rng) -> Answers | None:  # noqa: ARG001
@@ -183,8 +172,8 @@ def ask_placements(artifact: SceneModel, encoded: EncodedScene, rng: Rng) -> Ans
 
 def collect_missing(
     artifact: SceneModel, scenes: SceneTensors, size: Size, seed: int = 0, *, stated: bool = False
-) -> Items:
-    """Ask for the missing classes of random parts of this size, and collect the answers.
+) -> tuple[Scored | None, int]:
+    """Ask for the missing classes of random parts of this size, as `collect` does.
 
     With `stated`, each request states the coverage: 1 if one class is hidden, otherwise the share.
     """
@@ -201,7 +190,7 @@ def collect_missing(
             index = artifact.vocabulary.index(entry["label"])
             if able[row, index]:
                 items.append((k, entry["probability"], bool(parts.hidden[row, index])))
-    return Items.of(items, len(scenes), parts.skipped)
+    return scored(items, len(scenes)), parts.skipped
 
 
 class PlaceQuestion(NamedTuple):
@@ -334,15 +323,16 @@ def calibration_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
         scenes = scenes_of.get(name, related) if name in QUESTIONS else listed
         for suffix, model in models.items():
             if name in QUESTIONS:
-                answers = collect(model, scenes, ask[name], seed)
+                answers, skips = collect(model, scenes, ask[name], seed)
             else:
                 size, stated = LISTED[name]
-                answers = collect_missing(model, scenes, size, seed, stated=stated)
-            skipped += 0 if suffix else answers.skipped
-            if not len(answers.scene):
+                answers, skips = collect_missing(model, scenes, size, seed, stated=stated)
+            skipped += 0 if suffix else skips
+            if answers is None:
                 break
             for figure in ("ECE", "Brier skill"):
-                metrics[f"{figure}, {name}{suffix}"] = answers.metric(figure).by(scenes.group_ids)
+                metric = replace(answers, statistic=figure).by(scenes.group_ids)
+                metrics[f"{figure}, {name}{suffix}"] = metric
     # Brier skill is undefined if all answers are true or all answers are false.
     metrics = {name: metric for name, metric in metrics.items() if np.isfinite(metric.value)}
     return Outcome(metrics, max(len(related), len(complete)), skipped) if metrics else None

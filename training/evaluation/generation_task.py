@@ -1,4 +1,4 @@
-"""Task T4: compare generated scenes with held-out scenes.
+"""Tasks T4: compare generated scenes with held-out scenes.
 
 The metrics use only annotated classes, without structure classes such as walls. For intervals, the
 held-out scenes are resampled and the generated scenes are fixed.
@@ -16,12 +16,23 @@ held-out scenes are resampled and the generated scenes are fixed.
     cycles      share of scenes with a cycle of on-top relations, among scenes with on-top
                 relations. A cycle of classes can be true if a class has several instances
 
+The task T4 rooms measures common room types of homes and offices:
+
+    refused     share of held-out rooms that do not reach the limits of a generated scene of their
+                room type (`app.questions.generate.is_within_limits`)
+    change of the number of classes
+                mean number of classes of generated scenes, divided by that of held-out whole
+                rooms, minus 1. The scenes are drawn as the service draws them, without evidence
+                ("free"), or with a room type. Only sources of whole rooms
+                (`training.datasets.sources`) have sizes: lists of camera frames are parts of rooms
+
 Sources: Gretton et al., "A kernel two-sample test" (2012), eq. 3.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 import torch
@@ -31,14 +42,14 @@ from torch import Tensor
 
 from app.inference.chains import Conditions, random_stream
 from app.model import SceneModel
-from app.questions.generate import STEPS, draw_plausible
-from app.scene import CANONICAL
+from app.questions.generate import STEPS, draw_plausible, is_within_limits
+from app.scene import CANONICAL, Scene
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.cases import some_scenes
-from training.evaluation.asking import of_classes
+from training.datasets.sources import source_of
 from training.evaluation.metrics import Metric, Ratio, Resampled, Statistic
-from training.evaluation.model import Drawn, Sampler, SamplerOf
-from training.evaluation.setting import Outcome, Setting
+from training.evaluation.parts import of_classes
+from training.evaluation.setting import Drawn, Evidence, Outcome, Sampler, Setting
 
 _RESAMPLES = 200
 _BANDWIDTH_SCENES = 1000  # maximum number of held-out scenes for the bandwidth
@@ -82,61 +93,48 @@ def transitive_closure(pairs: Bool[Tensor, "*B n n"]) -> Bool[Tensor, "*B n n"]:
         reach = longer
 
 
-def independent_sampler(train: SceneTensors) -> Sampler:
-    """Return a sampler that draws each class independently, with its frequency in training."""
-    frequency = train.v.mean(0)
-
-    def sample(given: Bool[Tensor, "B V"], room: Int[Tensor, " B"], seed: int) -> Drawn:  # noqa: ARG001
-        generator = torch.Generator().manual_seed(seed)
-        v = torch.rand(given.shape, generator=generator) < frequency
-        return Drawn((v | given).to(train.v.dtype), torch.zeros(len(v), 4))
-
-    return sample
+def independent_scenes(evidence: Evidence) -> Drawn:
+    """Draw each class independently, with its frequency in training. The room type is not used."""
+    generator, train = torch.Generator().manual_seed(evidence.seed), evidence.train
+    v = torch.rand(evidence.given.shape, generator=generator) < train.v.mean(0)
+    return Drawn((v | evidence.given).to(train.v.dtype), torch.zeros(len(v), 4))
 
 
-def scene_sampler(scenes: SceneTensors) -> Sampler:
-    """Return a sampler that returns real scenes, to estimate the best possible value of a metric.
+def held_out_scenes(evidence: Evidence) -> Drawn:
+    """Return real scenes, to estimate the best possible value of a metric.
 
     Without given classes, sample k is scene k, which has the given room type in `generation_task`.
     Otherwise it is a random scene with the given classes.
     """
+    scenes, given = evidence.held_out, evidence.given
     batches = map(scenes.batch, torch.arange(len(scenes)).split(64))
     contradictions = torch.cat([count_contradictions(batch.holds) for batch in batches])
-
-    def sample(given: Bool[Tensor, "B V"], room: Int[Tensor, " B"], seed: int) -> Drawn:  # noqa: ARG001
-        if not given.any():
-            return Drawn(scenes.v, contradictions)
-        rng = np.random.default_rng(seed)
-        fits = given.float() @ (scenes.v == 0).float().T == 0
-        index = torch.tensor([int(rng.choice(row.nonzero().squeeze(1).numpy())) for row in fits])
-        return Drawn(scenes.v[index], contradictions[index])
-
-    return sample
+    if not given.any():
+        return Drawn(scenes.v, contradictions)
+    rng = np.random.default_rng(evidence.seed)
+    fits = given.float() @ (scenes.v == 0).float().T == 0
+    index = torch.tensor([int(rng.choice(row.nonzero().squeeze(1).numpy())) for row in fits])
+    return Drawn(scenes.v[index], contradictions[index])
 
 
-def machine_sampler(artifact: SceneModel) -> Sampler:
-    """Return a sampler that draws scenes as the service does, and also samples relations.
+def machine_scenes(artifact: SceneModel, evidence: Evidence) -> Drawn:
+    """Draw scenes as the service does, and also sample relations.
 
-    The sampler keeps both of two contradictory relations; the service keeps only one.
+    Both of two contradictory relations are kept; the service keeps only one.
     """
-    chains = artifact.scene_chains
-
-    def sample(given: Bool[Tensor, "B V"], room: Int[Tensor, " B"], seed: int) -> Drawn:
-        """Draw a plausible scene for each row of given classes; room type -1 is unknown."""
-        objects, contradictions = torch.zeros(given.shape), []
-        for row, (classes, room_type) in enumerate(zip(given, room.tolist(), strict=True)):
-            index = classes.nonzero().squeeze(1)
-            stated = room_type if room_type >= 0 and artifact.spec.C else None
-            conditions = Conditions(index.numpy(), observed=None, room=stated)
-            evidence = replace(of_classes(index.tolist()), room_type=stated)
-            stream = random_stream(seed, row)
-            state = draw_plausible(artifact, chains.under(conditions), evidence, STEPS, stream)
-            objects[row, torch.from_numpy(state.classes)] = 1.0
-            holds = torch.from_numpy(state.r).float().unsqueeze(0)
-            contradictions.append(count_contradictions(holds))
-        return Drawn(objects, torch.cat(contradictions))
-
-    return sample
+    objects, contradictions = torch.zeros(evidence.given.shape), []
+    rows = zip(evidence.given, evidence.room.tolist(), strict=True)
+    for row, (classes, room_type) in enumerate(rows):
+        index = classes.nonzero().squeeze(1)
+        stated = room_type if room_type >= 0 and artifact.spec.C else None
+        chains = artifact.scene_chains.under(Conditions(index.numpy(), observed=None, room=stated))
+        listed = replace(of_classes(index.tolist()), room_type=stated)
+        stream = random_stream(evidence.seed, row)
+        state = draw_plausible(artifact, chains, listed, STEPS, stream)
+        objects[row, torch.from_numpy(state.classes)] = 1.0
+        holds = torch.from_numpy(state.r).float().unsqueeze(0)
+        contradictions.append(count_contradictions(holds))
+    return Drawn(objects, torch.cat(contradictions))
 
 
 def held_out_halves(setting: Setting) -> tuple[SceneTensors, SceneTensors]:
@@ -149,16 +147,9 @@ def held_out_halves(setting: Setting) -> tuple[SceneTensors, SceneTensors]:
     return first, second
 
 
-def hamming(x: Float[Tensor, "N V"], y: Float[Tensor, "M V"]) -> Float[Tensor, "N M"]:
-    """Return the Hamming distances between binary rows."""
-    return (x.sum(1, keepdim=True) + y.sum(1) - 2 * x @ y.T).clamp(min=0)
-
-
 def median_distance(v: Float[Tensor, "scenes V"]) -> float:
     """Return the median Hamming distance between two scenes, at least 1."""
-    v = v[:_BANDWIDTH_SCENES]
-    row, column = torch.triu_indices(len(v), len(v), 1)
-    return max(1.0, float(hamming(v, v)[row, column].median()))
+    return max(1.0, float(torch.pdist(v[:_BANDWIDTH_SCENES], p=0).median()))
 
 
 def discrepancy(
@@ -170,7 +161,7 @@ def discrepancy(
     """
 
     def kernel(x: Float[Tensor, "N V"], y: Float[Tensor, "M V"]) -> Float[NDArray, "N M"]:
-        return torch.exp(-hamming(x, y) / bandwidth).double().numpy()
+        return torch.exp(-torch.cdist(x, y, p=0) / bandwidth).double().numpy()
 
     # MMD² = E k(x, x') + E k(y, y') - 2 E k(x, y) for generated scenes x and held-out scenes y.
     xx, yy = kernel(drawn, drawn), kernel(held_out, held_out)
@@ -271,7 +262,7 @@ def generation_metrics(
     return metrics | contradiction_metrics(drawn.contradictions)
 
 
-def generation_task(sampler_of: SamplerOf, setting: Setting) -> Outcome | None:
+def generation_task(sample: Sampler, setting: Setting) -> Outcome | None:
     """Measure T4: compare generated scenes with the first half of the held-out scenes.
 
     As many scenes as the second half has are generated under three conditions: without evidence,
@@ -279,8 +270,7 @@ def generation_task(sampler_of: SamplerOf, setting: Setting) -> Outcome | None:
     from all (scene, class) pairs of the second half. With a given class, each scene of the first
     half is therefore weighted by its number of classes. A perfect sampler then has no discrepancy.
     """
-    sampler = sampler_of(setting)
-    if sampler is None or setting.train is None:
+    if setting.train is None:
         return None
     first, second = held_out_halves(setting)
     mask = first.annotated_classes[first.source].any(0) & ~setting.structure
@@ -301,7 +291,62 @@ def generation_task(sampler_of: SamplerOf, setting: Setting) -> Outcome | None:
     metrics: dict[str, Metric] = {}
     truth = first.v, first.group_ids, setting.train.v, mask, bandwidth
     for name, (given, room, emphasis) in conditions.items():
-        values = generation_metrics(sampler(given, room, setting.seed), *truth, emphasis)
+        drawn = sample(Evidence(given, room, setting.seed, setting.train, second))
+        values = generation_metrics(drawn, *truth, emphasis)
         metrics |= {f"{metric}, {name}": value for metric, value in values.items()}
     notes = {"bandwidth": bandwidth, "held-out scenes": len(first), "drawn scenes": len(second)}
     return Outcome(metrics, len(first), 0, notes)
+
+
+ROOMS: Final = ("bedroom", "kitchen", "bathroom", "living room", "office")
+FREE: Final = "free"
+REFUSED: Final = "refused"
+SIZE: Final = "change of the number of classes"
+
+_FEWEST = 10  # held-out scenes of a room type
+_DRAWS = 200  # generated scenes of each condition
+
+
+def generated_rooms_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
+    """Measure the task on held-out scenes. The figures of a room type need 10 scenes."""
+    names = artifact.vocabulary.room_types
+    types = {name: names.index(name) for name in ROOMS if artifact.spec.C and name in names}
+    scenes, things = setting.some(), ~setting.structure
+    room, present = scenes.room.numpy(), (scenes.v > 0) & things
+    metrics: dict[str, Metric] = {}
+    is_common = np.isin(room, list(types.values())) & present.any(1).numpy()
+    refused = np.zeros(len(scenes))
+    for k in np.flatnonzero(is_common):
+        classes = present[k].nonzero().squeeze(1).tolist()
+        refused[k] = not is_within_limits(artifact, classes, int(room[k]))
+    of_type = {name: is_common & (room == t) for name, t in types.items()}
+    of_name = {f"{REFUSED}, {name}": mask for name, mask in of_type.items()}
+    for name, mask in {REFUSED: is_common, **of_name}.items():
+        if mask.sum() >= _FEWEST:
+            metrics[name] = Ratio.of_scenes(refused * mask, mask)
+    whole = np.array([source_of(scene.source).whole_rooms for scene in scenes.scenes], np.bool_)
+    sizes = present.sum(1).double().numpy()
+    for name, mask in {FREE: whole, **{n: m & whole for n, m in of_type.items()}}.items():
+        if mask.sum() >= _FEWEST:
+            drawn = _drawn_size(artifact, types.get(name), things, setting.seed)
+            change, groups = _size_change(drawn, sizes[mask]), scenes.group_ids[mask]
+            metrics[f"{SIZE}, {name}"] = Resampled.of(change, groups, _DRAWS, _RESAMPLES)
+    return Outcome.over(scenes, metrics, int((~is_common).sum()))
+
+
+def _drawn_size(
+    artifact: SceneModel, room: int | None, things: Bool[Tensor, " V"], seed: int
+) -> float:
+    """Return the mean number of classes of generated scenes, without structure."""
+    chains = artifact.scene_chains.under(Conditions(np.zeros(0, np.int64), None, room))
+    evidence, is_thing = Scene((), room_type=room), things.numpy()
+    sizes = [
+        int(is_thing[draw_plausible(artifact, chains, evidence, STEPS, stream).classes].sum())
+        for stream in (random_stream(seed, k) for k in range(_DRAWS))
+    ]
+    return float(np.mean(sizes))
+
+
+def _size_change(drawn: float, sizes: Float[NDArray, " scenes"]) -> Statistic:
+    """Return the relative change of a mean size against held-out sizes, by scene weights."""
+    return lambda weight: float(drawn * weight.sum() / (weight @ sizes) - 1)

@@ -184,10 +184,8 @@ class Ratio(Metric):
 
     def by(self, groups: Int[NDArray, " G"]) -> Ratio:
         ids, index = np.unique(groups, return_inverse=True)
-        top, below = np.zeros((2, len(ids)))
-        np.add.at(top, index, self.numerators)
-        np.add.at(below, index, self.denominators)
-        return Ratio(top, below, ids)
+        top = np.bincount(index, self.numerators, len(ids))
+        return Ratio(top, np.bincount(index, self.denominators, len(ids)), ids)
 
     @cached_property
     def draws(self) -> Float[NDArray, " resamples"]:  # type: ignore[override]
@@ -365,3 +363,12 @@ class Resampled(Metric):
     @property
     def draws(self) -> Float[NDArray, " resamples"]:  # type: ignore[override]
         return self.drawn
+
+
+def evidence_changes(metric: str, kind: str, without: Ratio, informed: Ratio) -> dict[str, Metric]:
+    """Return a metric with and without one kind of evidence, and its change, which comes first."""
+    return {
+        f"change of {metric}, {kind}": informed - without,
+        f"{metric}, {kind}": informed,
+        f"{metric}, {kind} withheld": without,
+    }

@@ -17,7 +17,7 @@ Pairs with structure classes are excluded. Scenes without such a pair are skippe
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -29,12 +29,11 @@ from scipy.special import expit
 from app.model import SceneModel
 from app.scene.spatial_relations import INSIDE, LATERAL, VERTICAL
 from training.datasets import EncodedScene
-from training.datasets.batches import SceneTensors, seen_triples
+from training.datasets.batches import SceneTensors, seen_triples, subset
 from training.evaluation.asking import ask_every, labels_alone, relation_probabilities
 from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.model import Model, RelationScore
 from training.evaluation.relation_tasks import with_observed
-from training.evaluation.setting import Outcome, Setting, Structure
+from training.evaluation.setting import Model, Outcome, RelationScore, Setting, Structure
 
 RARE = 10  # A class is rare if training relates it to at most this many classes
 SHIFTS = (0.0, -0.4, -0.8, -1.2)  # tested changes of the log-odds of left and front
@@ -93,12 +92,6 @@ def baseline_log_odds(scenes: SceneTensors, relations: RelationScore) -> PairSco
         return both_ways(relations(with_observed(batch))[0].double().numpy(), question.pairs)
 
     return score
-
-
-def baseline_score(scenes: SceneTensors, relations: RelationScore, lateral: float) -> PairScore:
-    """Return the probabilities of a score of relations, after a `lateral_shift`."""
-    log_odds = baseline_log_odds(scenes, relations)
-    return lambda question: expit(_shifted(log_odds(question), lateral))
 
 
 def lateral_shift(log_odds: PairScore, questions: Sequence[ScenePairs]) -> float:
@@ -161,12 +154,11 @@ def pairs_task(model: Model, setting: Setting) -> Outcome | None:
     count = 0
     if answers := _ask(model, setting, VERTICAL):
         p, listed = without_inside(answers.p), without_inside(answers.listed)
-        hits, loss = accuracy(p, listed), log_loss(p, listed)
-        metrics = {"accuracy": answers.mean(hits), "log-loss": answers.mean(loss)}
-        for name, mask in _hard_pairs(answers.classes, setting).items():
+        values = {"accuracy": accuracy(p, listed), "log-loss": log_loss(p, listed)}
+        every = {"": np.ones(len(p), np.bool_)} | _hard_pairs(answers.classes, setting)
+        for kind, mask in every.items():
             if mask.any():
-                metrics[f"accuracy, {name}"] = answers.mean(hits, mask)
-                metrics[f"log-loss, {name}"] = answers.mean(loss, mask)
+                metrics |= {name + kind: answers.mean(x, mask) for name, x in values.items()}
         count = len(answers.scenes)
     if answers := _ask(model, setting, (INSIDE,)):
         hits = accuracy(answers.p, answers.listed)
@@ -185,10 +177,11 @@ class _Answers:
     p: Float[NDArray, "N 2*A"]
     listed: Bool[NDArray, "N 2*A"]
 
-    def mean(self, values: Float[NDArray, " N"], mask: Bool[NDArray, " N"] | None = None) -> Ratio:
+    def mean(
+        self, values: Float[NDArray, " N"], mask: Bool[NDArray, " N"] | slice = slice(None)
+    ) -> Ratio:
         """Return the mean of the values of pairs in `mask`, with one value for each group."""
-        chosen = np.ones(len(values), dtype=np.bool_) if mask is None else mask
-        ratio = Ratio.of_items(self.scene[chosen], values[chosen], len(self.scenes))
+        ratio = Ratio.of_items(self.scene[mask], values[mask], len(self.scenes))
         return ratio.by(self.scenes.group_ids)
 
 
@@ -197,12 +190,14 @@ def _ask(model: Model, setting: Setting, relations: Sequence[int]) -> _Answers |
     pairs = listed_pairs(setting.scenes, setting.structure, relations)
     if not pairs:
         return None
-    scenes = setting.at(torch.tensor([question.scene_index for question in pairs])).some()
+    index = torch.tensor([question.scene_index for question in pairs])
+    scenes = replace(setting, scenes=subset(setting.scenes, index)).some()
     questions = listed_pairs(scenes, setting.structure, relations)
     if model.scene_model is not None:
         score = service_score(model.scene_model)
     elif model.relations is not None:
-        score = baseline_score(scenes, model.relations, model.lateral)
+        log_odds = baseline_log_odds(scenes, model.relations)
+        score = lambda question: expit(_shifted(log_odds(question), model.lateral))  # noqa: E731
     else:
         return None
     return _Answers(
@@ -228,4 +223,5 @@ def _hard_pairs(classes: Int[NDArray, "N 2"], setting: Setting) -> dict[str, Boo
     related = np.unique(np.sort(triples.numpy()[:, 1:].astype(np.int64), axis=1), axis=0)
     partners = np.bincount(related.ravel(), minlength=V)
     is_unseen = ~np.isin(classes @ np.array([V, 1]), related @ np.array([V, 1]))
-    return {"unseen pairs": is_unseen, "rare classes": np.any(partners[classes] <= RARE, axis=1)}
+    is_rare = np.any(partners[classes] <= RARE, axis=1)
+    return {", unseen pairs": is_unseen, ", rare classes": is_rare}

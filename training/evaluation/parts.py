@@ -20,11 +20,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from app.inference.weights import SHARES
+from app.scene import Scene, SceneObject
 from training.datasets.array_types import Rng
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.cases import scene_rng, some_scenes
-from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.setting import Structure
+from training.evaluation.metrics import Ratio
+from training.evaluation.setting import Structure, by_source
 
 REAL_SOURCES: Final = ("sunrgbd", "3dssg", "sunrgbd_bedrooms_3d", "matterport_rooms")
 """Data sources of real rooms with nearly complete object lists."""
@@ -57,12 +58,6 @@ class Parts:
     def skipped(self) -> int:
         """Number of scenes without a part."""
         return self.scenes - len(self.scene.unique())
-
-    def of_listed_families(self) -> Ratio:
-        """Return the share of hidden classes of one family with a listed class."""
-        row, target = self.hidden.nonzero(as_tuple=True)
-        is_related = self.related[row, target].numpy()
-        return Ratio.of_items(self.scene[row].numpy(), is_related, self.scenes)
 
 
 def all_but_one(classes: int, _: Rng) -> int:
@@ -113,6 +108,11 @@ def draw_parts(
     return Parts(index, v, mask, scenes.relatives_of(v) & (v == 0), len(scenes))
 
 
+def of_classes(classes: Sequence[int]) -> Scene:
+    """Return a scene with one object for each entry of `classes`."""
+    return Scene(tuple(SceneObject(str(k), str(c), c) for k, c in enumerate(classes)))
+
+
 def share_bin(listed: Float[Tensor, " B"], classes: Float[Tensor, " B"]) -> Int[Tensor, " B"]:
     """Return the bin of the listed share of scenes of so many classes, by the limits `SHARES`."""
     bins = torch.bucketize(listed / classes, torch.tensor(SHARES[:-1]))
@@ -128,7 +128,6 @@ class Ranking:
     above: Int[NDArray, " N"]  # number of candidates with a higher score
     ties: Int[NDArray, " N"]  # number of other candidates with the same score
     scenes: int
-    skipped: int  # scenes with too few classes
 
     @classmethod
     def of(
@@ -137,7 +136,6 @@ class Ranking:
         target: Int[Tensor, " N"],
         values: Float[Tensor, "N V"],
         scenes: int,
-        skipped: int,
     ) -> Ranking:
         """Compute ranks from scores; classes that are not candidates have score -inf.
 
@@ -148,24 +146,21 @@ class Ranking:
             raise FloatingPointError("the score of a class is NaN")
         target_score = values.gather(1, target.unsqueeze(1))
         above, ties = (values > target_score).sum(1), (values == target_score).sum(1) - 1
-        return cls(scene.numpy(), target.numpy(), above.numpy(), ties.numpy(), scenes, skipped)
+        return cls(scene.numpy(), target.numpy(), above.numpy(), ties.numpy(), scenes)
 
-    def reciprocal_rank(self) -> Float[NDArray, " N"]:
-        """Return the expectation of 1 / rank under random order of ties."""
+    def mrr(self, selection: Bool[NDArray, " N"] | slice = slice(None)) -> Ratio:
+        """Return the mean of 1 / rank of the selected targets, expected over ties."""
         # Mean of 1/r over r = above + 1 .. above + ties + 1, by harmonic numbers.
         last = self.above + self.ties + 1
         ranks = np.arange(1, int(last.max(initial=1)) + 1)
         harmonic = np.concatenate([[0.0], np.cumsum(1.0 / ranks)])
-        return (harmonic[last] - harmonic[self.above]) / (self.ties + 1)
+        values = (harmonic[last] - harmonic[self.above]) / (self.ties + 1)
+        return Ratio.of_items(self.scene[selection], values[selection], self.scenes)
 
-    def top(self, k: int) -> Metric:
+    def top(self, k: int) -> Ratio:
         """Return the share of targets among the first k candidates."""
         share = np.clip((k - self.above) / (self.ties + 1), 0.0, 1.0)
         return Ratio.of_items(self.scene, share, self.scenes)
-
-    def mrr(self, selection: Bool[NDArray, " N"] | slice = slice(None)) -> Ratio:
-        """Return the mean reciprocal rank of the selected targets."""
-        return Ratio.of_items(self.scene[selection], self.reciprocal_rank()[selection], self.scenes)
 
 
 def rank_hidden(parts: Parts, structure: Structure, values: Float[Tensor, "N V"]) -> Ranking:
@@ -180,14 +175,14 @@ def rank_hidden(parts: Parts, structure: Structure, values: Float[Tensor, "N V"]
     row, target = (parts.hidden & ~parts.related).nonzero(as_tuple=True)
     others = parts.hidden[row].scatter(1, target.unsqueeze(1), False)
     competing = values[row].masked_fill(others, -torch.inf)
-    return Ranking.of(parts.scene[row], target, competing, parts.scenes, parts.skipped)
+    return Ranking.of(parts.scene[row], target, competing, parts.scenes)
 
 
 def real_sources(scenes: SceneTensors) -> Iterator[tuple[str, SceneTensors]]:
     """Generate `REAL_SOURCES` by name, with their scenes; all sources if there are no real ones."""
-    names = np.array([scene.source for scene in scenes.scenes], dtype=np.str_)
-    for name in [x for x in REAL_SOURCES if x in names] or np.unique(names).tolist():
-        yield name, subset(scenes, torch.from_numpy(names == name))
+    every = dict(by_source(scenes))
+    for name in [x for x in REAL_SOURCES if x in every] or every:
+        yield name, every[name]
 
 
 @torch.no_grad()

@@ -6,6 +6,12 @@
     T3b   one triple is false. The model scores each triple given the other triples. The false
           triple should rank as the least likely
 
+    T1 with evidence
+          the evidence is the relations or poses between the instances of half of the classes. Poses
+          also show which relations do not hold; only sources with positions have them. The
+          candidates are all other ordered pairs of instances. Each question is asked twice: with
+          labels only, and with the evidence. The result is the paired change of R-precision
+
 The metric of T1 is R-precision: the number of predictions is the number of annotated triples. The
 candidates are all ordered pairs i ≠ j of present classes × canonical relations. An unlisted triple
 counts as wrong, although annotators list only a few relations per scene. Structure classes are
@@ -23,6 +29,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -30,33 +37,29 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from app.scene import CANONICAL
-from training.datasets.array_types import Rng
+from app.model import SceneModel
+from app.scene import CANONICAL, RelationTable, Scene
+from training.datasets.array_types import Rng, Table
 from training.datasets.batches import Batch, SceneTensors
-from training.datasets.cases import Triple, scene_rng
-from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.model import RelationScore
-from training.evaluation.setting import Outcome, Setting, Structure
+from training.datasets.cases import Triple, scene_of, scene_rng
+from training.evaluation.asking import ask_every, relation_probabilities
+from training.evaluation.metrics import Metric, Ratio, evidence_changes
+from training.evaluation.setting import Outcome, RelationScore, Setting, Structure
 from training.machines.edges import triple_keys
 
+OF_RELATIONS = ("relations", "poses")  # kinds of evidence for relations (T1)
 FIRST = (20, 50, 100)  # numbers of predictions per scene for recall
 _TRIES = 50
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
+class Candidates(Table):
     """The ranked triples of one scene."""
 
-    scene: int  # index among the scored scenes
     relation: Int[NDArray, " k"]  # canonical
     key: Int[NDArray, " k"]  # number of the triple, see `triple_keys`
     score: Float[NDArray, " k"]
     truth: Bool[NDArray, " k"]  # True if the triple is annotated
-
-    def where(self, mask: Bool[NDArray, " k"]) -> Candidates:
-        """Select the triples with a True value in the mask."""
-        scene, *columns = vars(self).values()
-        return Candidates(scene, *(column[mask] for column in columns))
 
 
 def scorable(batch: Batch, structure: Structure) -> Bool[Tensor, "B A n n"]:
@@ -99,7 +102,7 @@ def _scored(
                 raise FloatingPointError(f"the score of a triple in scene {row} of a batch is NaN")
             key = triple_keys(relation, classes[x], classes[y], batch.v.shape[1]).numpy()
             truth = (batch.holds[row, relation, x, y] > 0).numpy()
-            candidates.append(Candidates(len(candidates), relation.numpy(), key, score, truth))
+            candidates.append(Candidates(relation.numpy(), key, score, truth))
     return candidates
 
 
@@ -120,28 +123,24 @@ def score_scenes(
 def complete_scenes(
     scenes: SceneTensors, structure: Structure, score: RelationScore, *, seed: int = 0
 ) -> list[Candidates]:
-    """Score the T1b candidates of scenes with at least two triples, given half of the triples."""
+    """Score the T1b candidates of scenes with at least two triples.
+
+    Half of the triples of each scene, rounded down, is given.
+    """
 
     def ask(batch: Batch, index: list[int]) -> tuple[Tensor, Tensor]:
         mask = scorable(batch, structure)
-        observed = random_half((batch.holds > 0) & mask, scenes, index, seed)
+        truth = (batch.holds > 0) & mask
+        observed = torch.zeros_like(truth)
+        for row, k in enumerate(index):
+            triples = truth[row].nonzero()
+            order = scene_rng(scenes.scenes[k], seed).permutation(len(triples))
+            observed[row][tuple(triples[torch.from_numpy(order[: len(triples) // 2])].T)] = True
         # With a single triple the observed half is empty: the scene is left out.
         has_evidence = observed.flatten(1).any(1)[:, None, None, None]
         return score(with_observed(batch, observed)), mask & ~observed & ~observed.mT & has_evidence
 
     return _scored(scenes, 2, ask)
-
-
-def random_half(
-    truth: Bool[Tensor, "B A n n"], scenes: SceneTensors, index: Sequence[int], seed: int
-) -> Bool[Tensor, "B A n n"]:
-    """Return half of each scene's triples, rounded down."""
-    half = torch.zeros_like(truth)
-    for row, k in enumerate(index):
-        triples = truth[row].nonzero()
-        order = scene_rng(scenes.scenes[k], seed).permutation(len(triples))
-        half[row][tuple(triples[torch.from_numpy(order[: len(triples) // 2])].T)] = True
-    return half
 
 
 def r_precision(
@@ -152,10 +151,10 @@ def r_precision(
     By default, `first` is the number of annotated triples. Without such triples, return None.
     """
     hits, annotated = np.zeros((2, scenes))
-    for scene in ranked:
+    for k, scene in enumerate(ranked):
         if count := int(scene.truth.sum()):
-            annotated[scene.scene] = count
-            hits[scene.scene] = expected_hits(scene.score, scene.truth, first or count)
+            annotated[k] = count
+            hits[k] = expected_hits(scene.score, scene.truth, first or count)
     return Ratio(hits, annotated) if annotated.any() else None
 
 
@@ -165,7 +164,7 @@ def unseen(
     """Select the candidates that are not among the training triples `seen` (zero-shot)."""
     relation, subject, object_ = seen.long().unbind(1)
     keys = triple_keys(relation, subject, object_, classes).numpy()
-    return [scene.where(~np.isin(scene.key, keys)) for scene in scored]
+    return [scene.rows(~np.isin(scene.key, keys)) for scene in scored]
 
 
 def expected_hits(score: Float[NDArray, " k"], truth: Bool[NDArray, " k"], count: int) -> float:
@@ -272,7 +271,7 @@ def _details(scored: list[Candidates], setting: Setting) -> dict[str, Metric]:
     count = len(setting.scenes)
     metrics: dict[str, Ratio | None] = {}
     for a, name in enumerate(CANONICAL):
-        candidates = [scene.where(scene.relation == a) for scene in scored]
+        candidates = [scene.rows(scene.relation == a) for scene in scored]
         metrics[f"R-precision, {name}"] = r_precision(candidates, count)
     for k in FIRST:
         recall = r_precision(scored, count, first=k)
@@ -288,3 +287,64 @@ def placement_task(score: RelationScore, setting: Setting) -> Outcome | None:
     scenes = setting.some(related=True)
     hits = false_hits(scenes, setting.structure, score, seed=setting.seed)
     return None if hits is None else Outcome.over(scenes, {"hit@1": hits}, hits.skipped)
+
+
+class Case(NamedTuple):
+    """One question of T1."""
+
+    scene_index: int
+    scene: Scene  # with the evidence
+    queried: Bool[NDArray, "A objects objects"]
+    truth: Bool[NDArray, "A objects objects"]  # queried relations that hold
+
+
+def evidence_cases(
+    scenes: SceneTensors, structure: Bool[NDArray, " V"], kind: str, seed: int = 0
+) -> Iterator[Case]:
+    """Generate the T1 questions: evidence about half of the classes, all other pairs queried."""
+    for index, encoded in enumerate(scenes.scenes):
+        instances, classes = encoded.instance_classes, encoded.evidence.classes
+        things = classes[~structure[classes]]
+        if len(things) < 3 or (kind == "poses" and encoded.instance_positions is None):
+            continue
+        half = scene_rng(encoded, seed).permutation(things)[: max(2, len(things) // 2)]
+        in_half, is_thing = np.isin(instances, half), ~structure[instances]
+        between = in_half[:, None] & in_half
+        pair = is_thing[:, None] & is_thing & ~between & ~np.eye(len(instances), dtype=np.bool_)
+        queried = np.broadcast_to(pair, encoded.instance_holds.shape)
+        truth, evidence = encoded.instance_holds & queried, encoded.instance_holds & between
+        if not truth.any() or not evidence.any():
+            continue
+        triples = [(int(a), int(i), int(j)) for a, i, j in np.argwhere(evidence)]
+        scene = replace(scene_of(encoded, range(len(instances)), triples), room_type=None)
+        if kind == "poses":
+            observed = encoded.instance_observed & between
+            table = RelationTable.shown_by_boxes(evidence, observed, np.zeros_like(observed))
+            scene = replace(scene, relations=table)
+        yield Case(index, scene, queried, truth)
+
+
+def relations_evidence_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
+    """Measure T1 of instances with labels only, and with relations or poses."""
+    scenes, structure = setting.some(related=True), setting.structure.numpy()
+    metrics: dict[str, Metric] = {}
+    skipped: list[int] = []
+
+    def ask(case: Case) -> Float[NDArray, " 2"]:
+        count, truth = int(case.truth.sum()), case.truth[case.queried]
+        bare = replace(case.scene, relations=None)
+        p = (relation_probabilities(artifact, scene) for scene in (bare, case.scene))
+        return np.array([expected_hits(x[case.queried], truth, count) for x in p])
+
+    for kind in OF_RELATIONS:
+        cases = list(evidence_cases(scenes, structure, kind, setting.seed))
+        if not cases:
+            continue
+        without, informed, items = np.zeros((3, len(scenes)))
+        for case, hits in zip(cases, ask_every(ask, cases), strict=True):
+            without[case.scene_index], informed[case.scene_index] = hits
+            items[case.scene_index] = case.truth.sum()
+        ratios = Ratio(without, items), Ratio(informed, items)
+        metrics |= evidence_changes("R-precision", kind, *ratios)
+        skipped.append(int((items == 0).sum()))
+    return Outcome.over(scenes, metrics, skipped[0] if skipped else 0)

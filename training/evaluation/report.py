@@ -2,31 +2,36 @@
 
 A `SourceReport` stores the values of each group of near-duplicate scenes. So reports can be pooled
 over data sources, and compared by paired resampling, without the models.
+
+A `RoomList` asks the questions of a file of the user, which no training read: scenes in any format
+of `read_scenes`, such as JSON lines. The vocabulary of the evaluated model reads the labels.
+Intervals come from resampled groups of scenes.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
-from jaxtyping import Int
-from torch import Tensor
 
 from app.model import SceneModel
+from app.registry import Artifact
 from app.registry import Metric as CardMetric
-from training.datasets.batches import SceneTensors, subset
+from app.scene import Vocabulary
+from training.datasets import AnnotatedScene, DatasetError, annotated_classes, encode, read_scenes
+from training.datasets.batches import SceneTensors, scene_tensors
 from training.datasets.files import write_whole
-from training.evaluation.artifact_model import artifact_model
+from training.datasets.records import digest_of
+from training.evaluation.asking import artifact_model
 from training.evaluation.everyday_task import SOURCE, facts_file
 from training.evaluation.metrics import Metric, Ratio, Resampled, Scored
-from training.evaluation.model import Model
-from training.evaluation.setting import Outcome, Setting, Structure
+from training.evaluation.setting import Model, Outcome, Setting, Structure
 from training.evaluation.tasks import EVERY_TASK, ONCE, TASKS, WHOLE_SET
 
 _LIMIT = 200  # maximum number of scenes per data source in slow tasks
@@ -50,46 +55,12 @@ class SourceReport:
 
     def write(self, path: Path) -> None:
         """Write the report into a JSON file."""
-        tasks = {
-            task: outcome
-            and vars(outcome)
-            | {"metrics": {name: metric_to_dict(m) for name, m in outcome.metrics.items()}}
-            for task, outcome in self.outcomes.items()
-        }
-        write_whole(path, json.dumps(vars(self) | {"outcomes": tasks}, allow_nan=False))
+        write_whole(path, json.dumps(self, default=to_json, allow_nan=False))
 
     @classmethod
     def read(cls, path: Path) -> SourceReport:
         """Read a report from a file."""
-        values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        outcomes: dict[str, Outcome | None] = {}
-        for task, outcome in values["outcomes"].items():
-            outcomes[task] = None
-            if outcome:
-                metrics = {name: metric_from_dict(m) for name, m in outcome["metrics"].items()}
-                outcomes[task] = Outcome(**outcome | {"metrics": metrics})
-        return cls(**values | {"outcomes": outcomes})
-
-
-def by_source(scenes: SceneTensors) -> Iterator[tuple[str, SceneTensors]]:
-    """Iterate over the data sources, by name, and their scenes."""
-    for source in sorted({scene.source for scene in scenes.scenes}):
-        index = [k for k, scene in enumerate(scenes.scenes) if scene.source == source]
-        yield source, subset(scenes, torch.tensor(index))
-
-
-def settings_by_source(
-    scenes: SceneTensors,
-    structure: Structure,
-    train: SceneTensors,
-    seen: Int[Tensor, "triples 3"] | None,
-    *,
-    limit: int | None = 600,
-) -> Iterator[tuple[str, Setting]]:
-    """Iterate over the data sources and the settings of their scenes and training scenes."""
-    training = dict(by_source(train))
-    for source, source_scenes in by_source(scenes):
-        yield source, Setting(source_scenes, structure, training.get(source), seen, limit)
+        return cls(**json.loads(path.read_text(encoding="utf-8"), object_hook=from_json))
 
 
 def digest(setting: Setting) -> str:
@@ -153,12 +124,13 @@ def evaluate(
     of_source = [task for task in selected if task not in WHOLE_SET]
     once = [task for task in selected if task in ONCE]
     whole = [task for task in selected if task in WHOLE_SET and task not in ONCE]
-    by_name = dict(settings_by_source(scenes, structure, train, None, limit=limit))
+    every = Setting(scenes, structure, train, limit=limit)
+    by_name = dict(every.by_source())
     together = next(iter(by_name)) if len(by_name) == 1 else "pooled"
     questions = [
         *((source, setting, of_source) for source, setting in by_name.items()),
-        (together, Setting(scenes, structure, train, limit=limit), whole),
-        (SOURCE, Setting(scenes, structure, limit=limit, everyday=everyday), once),
+        (together, every, whole),
+        (SOURCE, replace(every, train=None, everyday=everyday), once),
     ]
     return [
         row
@@ -194,30 +166,88 @@ _KINDS: dict[str, type[Any]] = {cls.__name__.lower(): cls for cls in (Ratio, Sco
 _TYPES: dict[str, type] = {"unit": np.int64, "groups": np.int64, "truth": np.bool_}
 
 
-def metric_to_dict(metric: Metric) -> dict[str, Any]:
-    """Return the values of a metric for JSON. Floats are rounded to nine significant digits."""
-    kind = type(metric).__name__.lower()
-    names = [field.name for field in fields(_KINDS[kind])]
-    return {"kind": kind} | {name: _plain(getattr(metric, name)) for name in names}
+def to_json(value: Any) -> Any:
+    """Return the entries of an array, a metric, an outcome or a report for JSON.
 
-
-def metric_from_dict(values: dict[str, Any]) -> Metric:
-    """Create a metric from the output of `metric_to_dict`."""
-    # JSON has no NaN, so null marks a resample in which the metric is undefined. numpy reads None
-    # as NaN.
-    entries = {
-        name: np.array(value, _TYPES.get(name, np.float64)) if isinstance(value, list) else value
-        for name, value in values.items()
-        if name != "kind"
-    }
-    metric: Metric = _KINDS[values["kind"]](**entries)
-    return metric
-
-
-def _plain(value: Any) -> Any:
-    """Return an array as a list for JSON, with null for values that are not finite."""
+    Floats of arrays are rounded to nine significant digits, with null for values that are not
+    finite, such as a resample in which the metric is undefined.
+    """
     if isinstance(value, np.ndarray) and value.dtype == np.float64:
         return [float(f"{x:.9g}") if np.isfinite(x) else None for x in value.tolist()]
     if isinstance(value, np.ndarray):
         return value.astype(np.int64).tolist()
-    return value
+    kind = {"kind": type(value).__name__.lower()} if isinstance(value, Metric) else {}
+    return kind | {entry.name: getattr(value, entry.name) for entry in fields(value)}
+
+
+def from_json(values: dict[str, Any]) -> Any:
+    """Create a metric or an outcome from the entries of `to_json`; return other entries."""
+    if "metrics" in values:
+        return Outcome(**values)
+    if "kind" not in values:
+        return values
+    entries = {
+        name: np.array(value, _TYPES.get(name, np.float64)) if isinstance(value, list) else value
+        for name, value in values.items()
+        if name != "kind"
+    }  # numpy reads None as NaN
+    return _KINDS[values["kind"]](**entries)
+
+
+ROOM_TASKS: Final = tuple(name for name in TASKS if name not in WHOLE_SET)
+"""Tasks that a room list is asked. The others compare the answers with training scenes."""
+
+
+def read_test(path: Path) -> RoomList:
+    """Read the scenes of a file.
+
+    Raises:
+        DatasetError: the file has no known format, is invalid or contains no scenes.
+    """
+    name = path.name.partition(".")[0]
+    scenes = [replace(scene, source=name) for scene in read_scenes(path)]
+    if not scenes:
+        raise DatasetError(path, "", "contains no scenes")
+    return RoomList(name, scenes)
+
+
+@dataclass(frozen=True, eq=False)
+class RoomList:
+    """The scenes of a file, with the name of the file as source."""
+
+    source: str
+    scenes: Sequence[AnnotatedScene]
+
+    def setting(self, vocabulary: Vocabulary, limit: int | None = None) -> Setting:
+        """Return the scenes in the classes of a vocabulary; a single group is split into rooms.
+
+        T3 intruders have the popularity of the file.
+        """
+        encoded = encode(self.scenes, vocabulary)
+        if len({scene.group for scene in encoded}) == 1:
+            encoded = [replace(scene, group=scene.scene_id) for scene in encoded]
+        scenes = scene_tensors(encoded, annotated_classes(encoded, vocabulary), vocabulary)
+        structure = torch.from_numpy(vocabulary.structure.copy())
+        return Setting(scenes, structure, train=scenes, limit=limit)
+
+    def measure(self, model: SceneModel, progress: Progress = silent) -> list[CardMetric]:
+        """Return the metrics of `ROOM_TASKS`."""
+        asked = artifact_model(model), self.setting(model.vocabulary), self.source
+        return card_figures(measure(*asked, tasks=ROOM_TASKS, progress=progress))
+
+    def trained(self, artifact: Artifact) -> list[str]:
+        """Return the source if the model learnt from exactly these scenes."""
+        is_trained = any(
+            entry.scenes == len(self.scenes)
+            and digest_of([replace(scene, source=entry.source) for scene in self.scenes])
+            == entry.digest
+            for entry in artifact.manifest.data
+        )
+        return [self.source] if is_trained else []
+
+    def remark(self, model: SceneModel) -> str:
+        """Return the number of objects with unknown labels."""
+        labels = [thing.label for scene in self.scenes for thing in scene.objects]
+        unknown = sum(model.vocabulary.index(label) is None for label in labels)
+        reason = "objects are left out, because their labels are unknown"
+        return f"{unknown:,} of {len(labels):,} {reason}" if unknown else ""

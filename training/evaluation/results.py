@@ -5,15 +5,12 @@ A row of a result table is a model: a machine, a baseline or a reference.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from training.datasets.files import write_whole
 from training.evaluation.metrics import Figure, Metric, Resampled, paired_difference
 from training.evaluation.report import SourceReport
 from training.evaluation.setting import Outcome
@@ -24,8 +21,6 @@ Shown = Mapping[str, tuple[str, ...]]
 
 SHOWN: Shown = {name: task.shown for name, task in TASKS.items()}
 """Names of the metrics in tables, by task."""
-
-UNLISTED = "An unlisted relation counts as wrong"  # annotators list only a part of the true ones
 
 _RELATION_TASKS = ("T1a", "T1b", "T1 with")
 
@@ -88,13 +83,8 @@ class Results:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-serialisable dictionary."""
-        return {
-            "ours": self.ours,
-            "parameters": dict(self.parameters),
-            "cells": [asdict(cell) for cell in self.cells],
-            "differences": [asdict(row) | {"verdict": row.verdict} for row in self.differences],
-            "asked": list(self.asked),
-        }
+        differences = [asdict(row) | {"verdict": row.verdict} for row in self.differences]
+        return asdict(self) | {"differences": differences}
 
     def markdown(self, shown: Shown = SHOWN) -> str:
         """Return one Markdown table per metric, and the number of skipped scenes of each task.
@@ -131,7 +121,8 @@ class Results:
             lines.append([name, weights, *(cells.get(source, "") for source in sources)])
         parts = [f"### {task}: {metric}"]
         if task.startswith(_RELATION_TASKS):
-            parts.append(f"{UNLISTED}.")
+            # Annotators list only a part of the true relations.
+            parts.append("An unlisted relation counts as wrong.")
         return "\n\n".join([*parts, grid(["", "weights", *sources], lines)])
 
     def _skipped(self, task: str) -> Iterator[str]:
@@ -150,12 +141,6 @@ def grid(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a Markdown table."""
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)])
-
-
-def write(folder: Path, values: Mapping[str, Any], text: str) -> None:
-    """Write `values` into results.json and `text` into results.md. Replace each file atomically."""
-    write_whole(folder / "results.md", text)
-    write_whole(folder / "results.json", json.dumps(values, indent=1) + "\n")
 
 
 def summarise(reports: Reports, ours: str) -> Results:
@@ -207,16 +192,16 @@ def summarise(reports: Reports, ours: str) -> Results:
     return Results(ours, cells, differences, parameters, tuple(asked))
 
 
+def _same_groups(a: Metric, b: Metric) -> bool:
+    return np.array_equal(a.groups, b.groups)
+
+
 def mean_over_seeds(members: Sequence[Metric]) -> Resampled:
     """Return the mean of a metric over training seeds; all seeds use the same resamples."""
     shortest = min(len(member.draws) for member in members)
     drawn = np.mean([member.draws[:shortest] for member in members], axis=0)
     value = float(np.mean([member.value for member in members]))
     return Resampled(value, drawn, members[0].groups, members[0].n)
-
-
-def _same_groups(a: Metric, b: Metric) -> bool:
-    return np.array_equal(a.groups, b.groups)
 
 
 def only(report: SourceReport, wanted: Mapping[str, Sequence[str]]) -> SourceReport:

@@ -9,31 +9,45 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from training.evaluation import evidence_tasks as evidence
 from training.evaluation.asking import SENSITIVITIES
 from training.evaluation.calibration_task import NAMES, calibration_task
-from training.evaluation.count_task import METRICS as COUNTS
-from training.evaluation.count_task import counts_task
 from training.evaluation.everyday_task import LINES, everyday_task
-from training.evaluation.generated_rooms_task import (
+from training.evaluation.generation_task import (
     FREE,
     REFUSED,
     ROOMS,
     SIZE,
     generated_rooms_task,
+    generation_task,
 )
-from training.evaluation.generation_task import generation_task
-from training.evaluation.intruders import LAWS
-from training.evaluation.missing_tasks import SIZES, missing_task, placed_task
-from training.evaluation.model import Model
-from training.evaluation.moved_task import METRICS, moved_task
-from training.evaluation.offset_task import METRICS as OFFSETS
-from training.evaluation.offset_task import offsets_task
-from training.evaluation.outlier_tasks import LENGTHS, alarms_task, outliers_task
+from training.evaluation.object_tasks import (
+    FIGURES,
+    LISTS,
+    OF_OBJECTS,
+    SIZES,
+    missing_evidence_task,
+    missing_task,
+    placed_task,
+    rooms_task,
+)
+from training.evaluation.outlier_tasks import (
+    LAWS,
+    LENGTHS,
+    MOVED,
+    alarms_task,
+    moved_task,
+    outliers_task,
+)
 from training.evaluation.pair_task import pairs_task
-from training.evaluation.relation_tasks import completion_task, placement_task, relations_task
-from training.evaluation.room_task import FIGURES, LISTS, rooms_task
-from training.evaluation.setting import Outcome, Setting
+from training.evaluation.relation_tasks import (
+    OF_RELATIONS,
+    completion_task,
+    placement_task,
+    relations_evidence_task,
+    relations_task,
+)
+from training.evaluation.setting import Model, Outcome, Setting
+from training.evaluation.statistics_tasks import COUNTS, OFFSETS, counts_task, offsets_task
 
 
 @dataclass(frozen=True)
@@ -88,9 +102,9 @@ TASKS: dict[str, Task] = {
     ),
     "T1 with evidence": Task(
         "relations, with more evidence",
-        evidence.relations_evidence_task,
+        relations_evidence_task,
         "scene_model",
-        card=_each(["change of R-precision"], evidence.OF_RELATIONS),
+        card=_each(["change of R-precision"], OF_RELATIONS),
         of_objects=False,
     ),
     "T1b completion": Task(
@@ -105,9 +119,9 @@ TASKS: dict[str, Task] = {
     ),
     "T2 with evidence": Task(
         "missing object, with the room type",
-        evidence.missing_evidence_task,
+        missing_evidence_task,
         "scene_model",
-        card=_each(["change of MRR"], evidence.OF_OBJECTS),
+        card=_each(["change of MRR"], OF_OBJECTS),
     ),
     "T2-at missing at a place": Task(
         "missing object at a place", placed_task, "at_place", ("MRR",), ("MRR", "MRR, on-top")
@@ -118,7 +132,7 @@ TASKS: dict[str, Task] = {
     "T3b placement": Task(
         "false relation", placement_task, "false_relations", ("hit@1",), of_objects=False
     ),
-    "T3c moved": Task("moved object", moved_task, "misplaced", METRICS, of_objects=False),
+    "T3c moved": Task("moved object", moved_task, "misplaced", MOVED, of_objects=False),
     "T4 generate": Task(
         "generated scenes",
         generation_task,

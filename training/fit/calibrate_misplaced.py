@@ -48,7 +48,7 @@ from training.datasets.cases import (
     scene_rng,
 )
 from training.datasets.moved import moved_scene, untouched_scene
-from training.evaluation.alarms import ALARMS
+from training.evaluation.outlier_tasks import ALARMS
 from training.fit.regression import LEAST_SCENES, RIDGE, at_most, logistic
 
 _SCENES: Final = 250  # maximum scenes of a source

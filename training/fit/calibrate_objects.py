@@ -35,8 +35,7 @@ from app.model.calibration import LEAST_COVERAGE, LONGEST_JUDGED
 from app.questions.posterior import calibrated
 from training.datasets.array_types import ClassMask
 from training.datasets.batches import SceneTensors, subset
-from training.evaluation.alarms import ALARMS
-from training.evaluation.intruders import draw_intruders, intruder_weights
+from training.evaluation.outlier_tasks import ALARMS, draw_intruders, intruder_weights
 from training.evaluation.parts import (
     Parts,
     Size,

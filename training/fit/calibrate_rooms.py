@@ -30,8 +30,7 @@ from app.questions.posterior import Posterior
 from training.datasets.array_types import Table
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.sources import source_of
-from training.evaluation.asking import of_classes
-from training.evaluation.parts import Parts, Size, draw_parts, exactly
+from training.evaluation.parts import Parts, Size, draw_parts, exactly, of_classes
 from training.fit.long_chains import conditions_of
 from training.fit.regression import LEAST_SCENES, quantile_of, recalibrated, structure_of
 

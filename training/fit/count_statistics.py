@@ -27,7 +27,7 @@ from training.datasets import EncodedScene
 from training.datasets.array_types import ClassMask, Table
 from training.datasets.cases import MOST, Part, counted_classes, listed_cases
 from training.datasets.sources import source_of
-from training.evaluation.count_task import class_mean
+from training.evaluation.statistics_tasks import class_mean
 from training.fit.offset_statistics import half_precision, source_weights
 from training.fit.regression import at_most
 

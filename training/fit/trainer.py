@@ -14,7 +14,7 @@ from torch import Tensor
 from app.inference.variants import VARIANTS
 from app.scene import CANONICAL
 from training.datasets.batches import TrainingData, seen_triples, subset
-from training.evaluation.artifact_model import score_relations
+from training.evaluation.asking import score_relations
 from training.evaluation.parts import validation_score
 from training.evaluation.relation_tasks import r_precision, score_scenes
 from training.fit.configuration import Config

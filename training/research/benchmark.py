@@ -1,39 +1,62 @@
-"""`python -m training benchmark`: compare machines and baselines on the same scenes.
+"""`python -m training benchmark` and `ablate`: compare models on the same scenes.
 
-Each machine or baseline is one row of the result tables. An interrupted run can be continued.
+Each machine or baseline is one row of the result tables. `ablate` compares a full model with
+ablations, its variants. An interrupted run can be continued. Reliability plots show the predicted
+probability against the observed frequency.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
+from pydantic import BaseModel, Field, ValidationError
 
 from training.datasets.batches import seen_triples
+from training.datasets.files import write_whole
+from training.domain.terminal import console
+from training.evaluation.calibration_task import NAMES
 from training.evaluation.everyday_task import EVERYDAY, facts_file
-from training.evaluation.report import settings_by_source
-from training.evaluation.results import SHOWN, Shown, grid, summarise, write
-from training.evaluation.setting import Setting
+from training.evaluation.metrics import Scored
+from training.evaluation.results import SHOWN, Reports, Shown, grid, summarise
+from training.evaluation.setting import Outcome, Setting
 from training.evaluation.tasks import TASKS
-from training.fit.configuration import Config, ConfigError
-from training.research.entries import Entry, baseline_entries, machine_entry, reference_entries
-from training.research.measure import POOLED, Plan, measure_entries, resumable
-from training.research.plots import write_plots
-from training.runs.config_files import data_folder, load_config, with_settings
-from training.runs.pipeline import SplitScenes, prepare
+from training.fit.configuration import Config, ConfigError, first_error
+from training.research.measure import (
+    POOLED,
+    Entry,
+    Plan,
+    baseline_entries,
+    machine_entry,
+    measure_entries,
+    reference_entries,
+    resumable,
+    slug,
+)
+from training.runs.config_files import (
+    data_folder,
+    load_config,
+    own_or_shipped,
+    read_toml,
+    with_settings,
+)
+from training.runs.pipeline import prepare
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 DEFAULT = ("places-triway", "places-gbm", "places-rbm")
 """Configurations that the command measures if it is called without configurations."""
 
+Folder = Annotated[Path, typer.Option("--folder", help="folder for the results")]
 Data = Annotated[Path | None, typer.Option("--data", help="folder with the scene files")]
 Limit = Annotated[int, typer.Option(min=1, help="maximum scenes per data source in slow tasks")]
 Workers = Annotated[int, typer.Option(min=1, help="processes with one thread each")]
 Fresh = Annotated[bool, typer.Option("--fresh", help="delete earlier runs and reports")]
-
-console = Console()
 
 
 def benchmark(
@@ -45,9 +68,7 @@ def benchmark(
         ),
     ] = None,
     data: Data = None,
-    folder: Annotated[Path, typer.Option("--folder", help="folder for the results")] = Path(
-        "runs/benchmark"
-    ),
+    folder: Folder = Path("runs/benchmark"),
     seeds: Annotated[
         int, typer.Option(min=1, help="training seeds, for models with random training")
     ] = 3,
@@ -66,7 +87,7 @@ def benchmark(
     The command writes results.json, results.md and plots into a folder with the first word of the
     first configuration. After Ctrl-C, run the same command again: it skips finished reports.
     """
-    with resumable(console):
+    with resumable():
         shown = {name: SHOWN[name] for name in chosen_tasks(task)}
         baselines = None if baseline is None else [name for name in baseline if name != "none"]
         names = machines or DEFAULT
@@ -137,32 +158,152 @@ def compare_machines(
     """
     with console.status("reading and encoding scenes"):
         scenes = prepare(configs[0], root)
-        plan = _plan(folder, scenes, limit, tuple(shown))
-    related, learning = plan.data.related, configs[0].objects
+        data = scenes.complete_data()
+        seen = seen_triples(data.train.scenes, data.train.v.shape[1])
+    every = Setting(data.test, data.structure, data.train, seen, limit)
+    pooled = replace(every, everyday=EVERYDAY if facts_file() else None)
+    plan = Plan(folder, data, {**dict(every.by_source()), POOLED: pooled}, tuple(shown))
+    related, learning = data.related, configs[0].objects
     entries: list[Entry] = []
     for seed in range(seeds):
         seeded = [with_settings(config, {"training.seed": seed}) for config in configs]
         entries += [machine_entry(config) for config in seeded]
         entries += baseline_entries(seed, baselines, related=related, learning=learning)
     entries += reference_entries()
-    reports, failures = measure_entries(plan, entries, console, workers=workers, fresh=fresh)
+    reports, failures = measure_entries(plan, entries, workers=workers, fresh=fresh)
     with console.status("resampling scenes"):
         results = summarise(reports, configs[0].name)
     contents = {"contents": dict(scenes.digests), "failures": failures}
     remarks = [f"{name} could not be measured: {reason}" for name, reason in failures.items()]
     table = grid(["", ""], ([config.name, config.description] for config in configs))
     text = "\n\n".join([f"# {folder.name}", table, *remarks, results.markdown(shown)])
-    write(folder, contents | results.to_dict(), text)
+    write_whole(folder / "results.md", text)
+    write_whole(folder / "results.json", json.dumps(contents | results.to_dict(), indent=1) + "\n")
     console.print(*remarks, sep="\n", markup=False, soft_wrap=True)
     write_plots(folder, [config.name for config in configs], reports)
     console.print(f"all results: results.md, results.json and plots in {folder}", soft_wrap=True)
 
 
-def _plan(folder: Path, scenes: SplitScenes, limit: int, tasks: tuple[str, ...]) -> Plan:
-    """Return the questions about the test scenes of each data source, and of all together."""
-    data = scenes.complete_data()
-    common = data.structure, data.train, seen_triples(data.train.scenes, data.train.v.shape[1])
-    settings = dict(settings_by_source(data.test, *common, limit=limit))
-    facts = EVERYDAY if facts_file() else None
-    settings[POOLED] = Setting(data.test, *common, limit, everyday=facts)
-    return Plan(folder, data, settings, tasks)
+PRIMARY: dict[str, tuple[str, ...]] = {
+    "T1a relations": ("R-precision, instance counts",),
+    "T1 pairs": ("accuracy", "accuracy, unseen pairs", "accuracy, rare classes"),
+    "T1b completion": ("R-precision",),
+    "T2 missing": ("MRR, one removed", "MRR, 25 % shown"),
+    "T2-at missing at a place": ("MRR",),
+    "T3 outliers": ("hit@1, uniform", "hit@1, by popularity", "hit@1, signature"),
+}
+"""Tasks of an ablation, and their metrics in the tables. JSON files hold all metrics."""
+
+
+def ablate(
+    configuration: Annotated[str, typer.Argument(help="configuration of the full model")],
+    rows: Annotated[
+        Path | None, typer.Option(help="TOML file of the ablations; by default the shipped file")
+    ] = None,
+    row: Annotated[
+        list[str] | None, typer.Option(help="train only these ablations and the full model")
+    ] = None,
+    data: Data = None,
+    folder: Annotated[Path, typer.Option("--folder", help="folder for runs and results")] = Path(
+        "runs/ablation"
+    ),
+    seeds: Annotated[int, typer.Option(min=1, help="number of training seeds per model")] = 1,
+    limit: Limit = 300,
+    workers: Workers = 2,
+    fresh: Fresh = False,
+) -> None:
+    """Train the full model and each of its ablations, and compare them on the same test scenes.
+
+    The command writes results.json and results.md into FOLDER/CONFIGURATION. If the training of
+    an ablation diverges, the results contain the error in place of its metrics. After Ctrl-C, run
+    the same command again: it skips finished models and tasks.
+    """
+    with resumable():
+        full = load_config(configuration)
+        ablations = load_rows(own_or_shipped(rows, full, "ablations", "--rows"), full)
+        names = [ablation.name for ablation in ablations]
+        if unknown := sorted(set(row or ()) - set(names)):
+            raise ConfigError(f"unknown rows {unknown}: choose from {', '.join(names)}")
+        configs = [full, *(one for one in ablations if not row or one.name in row)]
+        compare_machines(
+            configs, data_folder(configuration, full, data), folder / full.name,
+            PRIMARY, seeds=seeds, baselines=(), limit=limit, workers=workers, fresh=fresh,
+        )  # fmt: skip
+
+
+class _Change(BaseModel, extra="forbid", frozen=True):
+    name: str
+    what: str
+    start: str | None = Field(default=None, alias="from")
+    changes: dict[str, Any] = Field(default_factory=dict)
+
+
+class _File(BaseModel, extra="forbid", frozen=True):
+    row: tuple[_Change, ...] = Field(min_length=1)
+
+
+def load_rows(path: Path, full: Config) -> list[Config]:
+    """Read one configuration for each `[[row]]` of a TOML file, with the scenes of the full model.
+
+    Raises:
+        ConfigError: the file is missing or not TOML, a setting is unknown or invalid, two ablations
+            have the same name, or an ablation has the same settings as the full model.
+    """
+    try:
+        file = _File.model_validate(read_toml(path))
+    except ValidationError as error:
+        raise ConfigError(f"{path.name}: {first_error(error)}") from error
+    configs = [full]
+    for row in file.row:
+        if any(row.name == config.name for config in configs):
+            raise ConfigError(f"{path.name}: the name {row.name} occurs twice: rename one row")
+        configs.append(_config(row, full, path.name))
+    return configs[1:]
+
+
+def _config(row: _Change, full: Config, file: str) -> Config:
+    """Return the configuration of one ablation; see `load_rows` for the errors."""
+    try:
+        start = load_config(row.start) if row.start else full
+        changed = with_settings(start, row.changes).model_copy(update={"data": full.data})
+        if changed == full:
+            raise ConfigError(f"the row has the same settings as {full.name}: change a setting")
+        names = {"name": row.name, "description": row.what}
+        return Config.model_validate(changed.model_dump() | names)
+    except (ConfigError, ValidationError) as error:
+        reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
+        raise ConfigError(f"{file}: {row.name}: {reason}") from error
+
+
+def write_plots(folder: Path, machines: Sequence[str], reports: Reports) -> None:
+    """Write reliability-<machine>.png for each machine with measured calibration, of seed 0."""
+    for name in machines:
+        report = reports.get((name, 0), {}).get(POOLED)
+        outcome = None if report is None else report.outcomes.get("Calibration")
+        if outcome is not None:
+            figure = reliability_diagrams(outcome, f"{name}, {POOLED}")
+            figure.savefig(folder / f"reliability-{slug(name)}.png", dpi=110)
+
+
+def reliability_diagrams(outcome: Outcome, title: str) -> Figure:
+    """Plot reliability diagrams, one per question, with and without calibration."""
+    from matplotlib.figure import Figure  # slow to import
+
+    questions = [name for name in NAMES if f"ECE, {name}" in outcome.metrics]
+    figure = Figure(figsize=(3.2 * len(questions), 3.6), layout="constrained")
+    figure.suptitle(title)
+    axes = figure.subplots(1, len(questions), squeeze=False).flat
+    for axis, name in zip(axes, questions, strict=True):
+        axis.plot([1e-5, 1], [1e-5, 1], color="0.7", linewidth=1)
+        for suffix, marker in ((", uncalibrated", "x"), ("", "o")):
+            metric = outcome.metrics[f"ECE, {name}{suffix}"]
+            if not isinstance(metric, Scored):
+                raise TypeError(f"the metric ECE of {name} does not store its answers")
+            probability, frequency = metric.reliability()
+            label = f"{suffix[2:] or 'as published'}, ECE {metric.value:.3f}"
+            axis.plot(probability, frequency, marker=marker, linewidth=1, label=label)
+        axis.set_xscale("symlog", linthresh=1e-3)  # most probabilities are small
+        axis.set_yscale("symlog", linthresh=1e-3)
+        axis.set(xlim=(0, 1.1), ylim=(0, 1.1), xlabel="probability", title=name)
+        axis.legend(fontsize=7)
+    return figure

@@ -31,8 +31,8 @@ from app.registry import DEFAULT_STORE, Store
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import some_scenes
 from training.domain.terminal import StorePath
-from training.evaluation.outside import read_test
 from training.evaluation.parts import draw_parts, exactly, rank_hidden
+from training.evaluation.report import read_test
 from training.evaluation.setting import Structure, with_relations
 from training.machines import BoltzmannMachine
 from training.machines.arrays import machine_of
@@ -156,18 +156,12 @@ def main(
     """Print the differences between served log-odds and those of the joint."""
     models = Store(store)
     artifact = models.load(*models.resolve(model)).model
-    scenes = read_test(file).tensors(artifact.vocabulary)
-    structure = torch.from_numpy(artifact.vocabulary.structure.copy())
-    machine = machine_of(artifact.weights).double()
-    for length in _LENGTHS:
-        figures = compare_sources(machine, scenes, structure, length)
-        _show(f"unknown source, {length} classes", figures)
-    _show("observed relations", compare_relations(machine, scenes, structure))
-
-
-def _show(title: str, figures: dict[str, float]) -> None:
-    values = ", ".join(f"{name} {value:.4g}" for name, value in figures.items())
-    typer.echo(f"{title}: {values or 'no such scenes'}")
+    setting = read_test(file).setting(artifact.vocabulary)
+    asked = machine_of(artifact.weights).double(), setting.scenes, setting.structure
+    tables = {f"unknown source, {n} classes": compare_sources(*asked, n) for n in _LENGTHS}
+    for title, figures in {**tables, "observed relations": compare_relations(*asked)}.items():
+        values = ", ".join(f"{name} {value:.4g}" for name, value in figures.items())
+        typer.echo(f"{title}: {values or 'no such scenes'}")
 
 
 if __name__ == "__main__":

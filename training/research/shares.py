@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import torch
 import typer
 
 from app.inference.weights import Weights
@@ -28,18 +27,11 @@ from app.model import SceneModel
 from app.model.calibration import KINDS
 from app.registry import DEFAULT_STORE, Store
 from training.domain.terminal import StorePath
-from training.evaluation.artifact_model import artifact_model
-from training.evaluation.outside import read_test
-from training.evaluation.setting import Setting
+from training.evaluation.asking import artifact_model
+from training.evaluation.report import read_test
 from training.evaluation.tasks import TASKS
 
 _LIMIT = 600
-_SHOWN = {
-    "T1a relations": ("R-precision, distinct classes",),
-    "T1 pairs": ("accuracy",),
-    "T2-at missing at a place": ("MRR",),
-    "T3c moved": ("named first",),
-}
 
 
 def without_context(artifact: SceneModel) -> SceneModel:
@@ -80,21 +72,27 @@ def whole(artifact: SceneModel) -> SceneModel:
     return artifact
 
 
-VARIANTS: dict[str, dict[str, Callable[[SceneModel], SceneModel]]] = {
-    "T1a relations": {"whole": whole, "without hidden context": without_context},
-    "T1 pairs": {"whole": whole, "without hidden context": without_context},
-    "T2-at missing at a place": {
+_CONTEXT: dict[str, Callable[[SceneModel], SceneModel]] = {
+    "whole": whole,
+    "without hidden context": without_context,
+}
+
+VARIANTS: dict[tuple[str, str], dict[str, Callable[[SceneModel], SceneModel]]] = {
+    ("T1a relations", "R-precision, distinct classes"): _CONTEXT,
+    ("T1 pairs", "accuracy"): _CONTEXT,
+    ("T2-at missing at a place", "MRR"): {
         "whole": whole,
         "without relation score": at_a_place(relation=0.0),
         "without counts": at_a_place(counts=0.0),
         "without both": at_a_place(relation=0.0, counts=0.0),
     },
-    "T3c moved": {
+    ("T3c moved", "named first"): {
         "whole": whole,
         "without relation score": misplaced(relation=0.0, change=0.0),
         "without counts": misplaced(stand=0.0, supporter=0.0),
     },
 }
+"""Variants of a model by the task and the metric that show them."""
 
 
 def main(
@@ -105,17 +103,12 @@ def main(
     """Print the metrics of a model and of its variants on the scenes of a file."""
     models = Store(store)
     artifact = models.load(*models.resolve(model)).model
-    scenes = read_test(file).tensors(artifact.vocabulary)
-    structure = torch.from_numpy(artifact.vocabulary.structure.copy())
-    setting = Setting(scenes, structure, train=scenes, limit=_LIMIT)
-    for task, variants in VARIANTS.items():
+    setting = read_test(file).setting(artifact.vocabulary, limit=_LIMIT)
+    for (task, metric), variants in VARIANTS.items():
         for name, change in variants.items():
             outcome = TASKS[task](artifact_model(change(artifact)), setting)
-            metrics = outcome.metrics if outcome else {}
-            for metric in filter(metrics.__contains__, _SHOWN[task]):
-                figure = metrics[metric].figure()
-                bounds = f"[{figure.low:.3f}, {figure.high:.3f}]"
-                typer.echo(f"{task}, {metric}: {name} {figure.value:.3f} {bounds}")
+            if outcome and metric in outcome.metrics:
+                typer.echo(f"{task}, {metric}: {name} {outcome.metrics[metric].figure()}")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """`python -m training tune`: search for settings on validation scenes with optuna.
 
-<folder>/<configuration>/<digest>/  curve and reports of the settings of a trial
+<folder>/<configuration>/<digest>/  curve and report of the settings of a trial
                          best.toml  the best configuration
 
 The same seed draws the same settings. So the same command repeats its trials from these folders.
@@ -28,20 +28,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 from pydantic import BaseModel, ValidationError
-from rich.console import Console
 
 from training.datasets.batches import TrainingData
 from training.datasets.files import write_whole
-from training.evaluation.artifact_model import score_relations
-from training.evaluation.asking import score_missing
+from training.domain.terminal import console
+from training.evaluation.asking import score_missing, score_relations
 from training.evaluation.metrics import Metric, paired_difference
-from training.evaluation.model import Model
-from training.evaluation.report import SourceReport, measure, pooled, settings_by_source
+from training.evaluation.report import SourceReport, measure, pooled
+from training.evaluation.setting import Model, Setting
 from training.fit.configuration import Config, ConfigError, first_error
 from training.fit.curve import SCORES, CurvePoint
 from training.fit.draft import draft_artifact
 from training.fit.trainer import Trainer
-from training.machines import BoltzmannMachine
+from training.research.benchmark import Data, Folder
 from training.research.measure import resumable
 from training.runs.config_files import (
     config_toml,
@@ -69,8 +68,6 @@ _FIXED = ("data.", "training.seed", "training.threads")
 _RIVALS = 4  # finished trials before pruning starts
 _WARM_UP = 33  # percentage of the first phase before pruning starts
 
-console = Console()
-
 
 class _Interval(BaseModel, extra="forbid", frozen=True, strict=True):
     low: int | float
@@ -90,10 +87,8 @@ def tune(
     length: Annotated[
         float, typer.Option(min=0.001, max=1, help="share of the steps and epochs of a trial")
     ] = 1.0,
-    data: Annotated[Path | None, typer.Option("--data", help="folder with the scene files")] = None,
-    folder: Annotated[Path, typer.Option("--folder", help="folder for the results")] = Path(
-        "runs/tuning"
-    ),
+    data: Data = None,
+    folder: Folder = Path("runs/tuning"),
     fresh: Annotated[bool, typer.Option("--fresh", help="delete earlier trials")] = False,
 ) -> None:
     """Search for better settings on validation scenes only.
@@ -103,7 +98,7 @@ def tune(
     FOLDER/CONFIGURATION/best.toml. After Ctrl-C, run the same command again: it keeps finished
     trials.
     """
-    with resumable(console):
+    with resumable():
         original = load_config(configuration)
         distributions = load_space(own_or_shipped(space, original, "spaces", "--space"), original)
         results = folder / original.name
@@ -217,7 +212,7 @@ class Search:
     ) -> dict[str, Metric]:
         """Return `FIGURES` of a machine with changed settings, over all validation scenes.
 
-        A machine without finished reports is trained. `passed` gets the points of its curve.
+        A machine without a finished report is trained. `passed` gets the points of its curve.
 
         Raises:
             FloatingPointError: the training diverged.
@@ -225,31 +220,26 @@ class Search:
         config = with_settings(self.config, settings)
         digest = sha256(f"{config.digest} {self.data.digest}".encode()).hexdigest()
         folder = self.folder / digest[:12]
-        if (curve := folder / "curve.json").exists():
+        curve, path = folder / "curve.json", folder / "report.json"
+        if path.exists():
             for values in json.loads(curve.read_text(encoding="utf-8")):
                 passed(CurvePoint(**values))
         else:
             result = Trainer(config, self.data).run(passed=passed)
-            self._measure(result.machine, folder)
             write_whole(curve, json.dumps([asdict(point) for point in result.curve]))
-        sources = sorted({scene.source for scene in self.data.validation.scenes})
-        paths = [folder / f"{source}.json" for source in sources]
-        report = pooled([SourceReport.read(path) for path in paths])
+            artifact = draft_artifact(result.machine, self.data.vocabulary)
+            relations = partial(score_relations, artifact, given=False)
+            model = Model(missing=partial(score_missing, artifact), relations=relations)
+            every = Setting(self.data.validation, self.data.structure, self.data.train)
+            tasks = [task for task, _ in FIGURES.values()]
+            reports = [measure(model, s, name, tasks=tasks) for name, s in every.by_source()]
+            pooled(reports).write(path)
+        report = SourceReport.read(path)
         return {
             name: outcome.metrics[metric]
             for name, (task, metric) in FIGURES.items()
             if (outcome := report.outcomes.get(task))
         }
-
-    def _measure(self, machine: BoltzmannMachine, folder: Path) -> None:
-        """Write the reports of a machine on the validation scenes of each data source."""
-        data, artifact = self.data, draft_artifact(machine, self.data.vocabulary)
-        relations = partial(score_relations, artifact, given=False)
-        model = Model(missing=partial(score_missing, artifact), relations=relations)
-        tasks = [task for task, _ in FIGURES.values()]
-        settings = settings_by_source(data.validation, data.structure, data.train, seen=None)
-        for source, setting in settings:
-            measure(model, setting, source, tasks=tasks).write(folder / f"{source}.json")
 
 
 def shown(settings: Mapping[str, Any]) -> str:

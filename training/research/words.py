@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -45,12 +46,12 @@ from app.scene.words import word_vectors
 from training.datasets import EncodedScene
 from training.datasets.cases import scene_rng
 from training.datasets.files import DATA, write_whole
-from training.domain.terminal import StorePath
+from training.domain.terminal import StorePath, console
 from training.evaluation.metrics import Ratio, paired_difference
 from training.fit.configuration import Config, ConfigError
 from training.fit.draft import draft_artifact
 from training.fit.trainer import Trainer
-from training.research.benchmark import Data, console
+from training.research.benchmark import Data, Folder
 from training.research.measure import resumable
 from training.runs.config_files import load_config
 from training.runs.pipeline import prepare
@@ -140,15 +141,13 @@ def words(
     aliases: Annotated[
         bool, typer.Option("--aliases", help="words have the vectors of their aliases, too")
     ] = False,
-    folder: Annotated[Path, typer.Option("--folder", help="folder for the results")] = Path(
-        "runs/words"
-    ),
+    folder: Folder = Path("runs/words"),
 ) -> None:
     """Measure answers about words that a model has no class for.
 
     The command writes results.json into the folder.
     """
-    with resumable(console):
+    with resumable():
         models = Store(store)
         artifact = models.load(*models.resolve(model)).model
         settings, root = load_config(config), data or DATA
@@ -156,8 +155,7 @@ def words(
         scenes = [s for name in ("validation", "test") for s in parts[name] if s.source in REAL]
         lists = Lists.draw(scenes, artifact.vocabulary)
         labels: list[str] = []
-        auc: dict[str, list[float]] = {}
-        mrr: dict[str, list[float]] = {}
+        auc, mrr = defaultdict[str, list[float]](list), defaultdict[str, list[float]](list)
         for left_out in read_parts(LEFT_OUT, artifact.vocabulary):
             reader = _trained_without(left_out, artifact, settings, root) if train else artifact
             labels += [artifact.vocabulary.labels[index] for index in left_out.tolist()]
@@ -165,8 +163,7 @@ def words(
             tables = measure(artifact, reader, lists, left_out, vectors)
             for total, part in zip((auc, mrr), tables, strict=True):
                 for name, values in part.items():
-                    total.setdefault(name, []).extend(values)
-        folder.mkdir(parents=True, exist_ok=True)
+                    total[name] += values
         results = {"classes": labels, "auc": auc, "mrr": mrr}
         write_whole(folder / "results.json", json.dumps(results, indent=1))
         count = len(lists.listed)
@@ -193,13 +190,12 @@ def read_parts(path: Path, vocabulary: Vocabulary) -> list[Int[NDArray, " n"]]:
     Raises:
         ConfigError: the model does not have a class of the table.
     """
-    index_of = {label: index for index, label in enumerate(vocabulary.labels)}
-    parts: dict[str, list[int]] = {}
+    parts = defaultdict[str, list[int]](list)
     with path.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
-            if row["label"] not in index_of:
+            if row["label"] not in vocabulary.labels:
                 raise ConfigError(f"{path.name}: the model has no class {row['label']!r}")
-            parts.setdefault(row["part"], []).append(index_of[row["label"]])
+            parts[row["part"]].append(vocabulary.labels.index(row["label"]))
     return [np.array(classes) for classes in parts.values()]
 
 
@@ -274,17 +270,14 @@ def _word(
     return Word(label, vector, int(cosines.argmax()), float(cosines.max()))
 
 
-@lru_cache(maxsize=4)
-def scorer_of(weights: Weights) -> ObjectScorer:
-    """Return the log-odds of a machine, prepared once."""
-    return ObjectScorer(weights)
+_scorer_of = lru_cache(maxsize=4)(ObjectScorer)  # the log-odds of a machine, prepared once
 
 
 def log_odds(
     weights: Weights, listed: Sequence[Int[NDArray, " k"]], columns: Int[NDArray, " n"]
 ) -> Float[NDArray, "lists n"]:
     """Return the log-odds of some classes given each list."""
-    scorer, scores = scorer_of(weights), np.zeros((len(listed), len(columns)))
+    scorer, scores = _scorer_of(weights), np.zeros((len(listed), len(columns)))
     for row, classes in enumerate(listed):
         x = weights["c1"] + weights["W"][classes].sum(0)
         presence = np.ones(len(classes), np.float32)

@@ -14,8 +14,8 @@ from app.registry import Artifact, DataSource, Description, Metric, Store, Vocab
 from training.datasets.batches import TrainingData
 from training.datasets.sources import SOURCES, is_inventory
 from training.datasets.vocabulary import with_aliases, with_room_aliases
-from training.evaluation.alarms import untouched_alarms
 from training.evaluation.everyday_task import EVERYDAY
+from training.evaluation.outlier_tasks import untouched_alarms
 from training.evaluation.report import Progress, evaluate, silent
 from training.evaluation.tasks import STATISTICS
 from training.fit.calibrate import calibrate

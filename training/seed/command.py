@@ -27,8 +27,7 @@ from rich.console import Console
 
 from training.datasets import DatasetError
 from training.datasets.files import DATA, write_whole
-from training.seed.learning import EPOCHS, KINDS, LEARNING_RATE, train
-from training.seed.machines import VARIANTS
+from training.seed.machines import EPOCHS, KINDS, LEARNING_RATE, VARIANTS, train
 from training.seed.protocol import (
     ANNEALED,
     ONE_PASS,
@@ -83,10 +82,15 @@ def seed(
     except KeyboardInterrupt:
         console.print("stopped; run the same command again to continue")
         raise typer.Exit(130) from None
-    results = {
-        split: {"references": _references(materials[split], seeds), "machines": machines}
-        for split, machines in runs.items()
-    }
+    results: dict[str, Any] = {}
+    for split, machines in runs.items():
+        m = materials[split]
+        answers = {"frequency": frequency_answer(m.triples, m.train), "nothing": nothing_answer}
+        references = {
+            name: [measure(answer, m.triples, m.test, k) for k in range(seeds)]
+            for name, answer in answers.items()
+        }
+        results[split] = {"references": references, "machines": machines}
     page = markdown(source, materials, results)
     write_whole(folder / "results.json", json.dumps({"paper": PAPER, "splits": results}, indent=1))
     write_whole(folder / "results.md", page)
@@ -95,10 +99,7 @@ def seed(
     console.print(f"results: {folder}/results.md, results.json, errors.png", soft_wrap=True)
 
 
-@cache
-def _materials(source: str, data: Path) -> dict[str, Material]:
-    """Read the scenes once in each process."""
-    return read_material(source, data)
+_materials = cache(read_material)  # the scenes are read once in each process
 
 
 def _train_all(
@@ -160,18 +161,6 @@ def _run(job: Job, source: str, data: Path, folder: Path, settings: Mapping[str,
     }
     write_whole(path, json.dumps(run, indent=1))
     return run
-
-
-def _references(material: Material, seeds: int) -> dict[str, list[Row]]:
-    """Measure the reference rows, once for each seed."""
-    answers = {
-        "frequency": frequency_answer(material.triples, material.train),
-        "nothing": nothing_answer,
-    }
-    return {
-        name: [measure(answer, material.triples, material.test, k) for k in range(seeds)]
-        for name, answer in answers.items()
-    }
 
 
 _EPOCHS_SHOWN: Final = (1, 10, 50)

@@ -5,8 +5,8 @@ from app.scene import ObjectClass, Vocabulary
 from tests.enumeration.small_machines import random_weights
 from training.datasets.batches import Batch
 from training.domain.translation import BEYOND, Translation, same_classes
-from training.evaluation.artifact_model import artifact_model
-from training.evaluation.model import Places
+from training.evaluation.asking import artifact_model
+from training.evaluation.setting import Places
 from training.fit.draft import draft_artifact
 from training.machines import MachineSpec, build
 

@@ -1,7 +1,7 @@
 from dataclasses import replace
 
 from tests.training.evaluation.furnished_rooms import room_model, rooms
-from training.evaluation.alarms import ALARMS, EXCESS, Alarms, untouched_alarms
+from training.evaluation.outlier_tasks import ALARMS, EXCESS, Alarms, untouched_alarms
 from training.fit.regression import recalibrated
 
 

@@ -20,7 +20,7 @@ from training.evaluation.calibration_task import (
     collect_missing,
     uncalibrated,
 )
-from training.evaluation.intruders import draw_intruder_choices
+from training.evaluation.outlier_tasks import draw_intruder_choices
 from training.evaluation.parts import draw_parts, exactly
 
 ARTIFACT = larger_artifact("triway")
@@ -29,7 +29,7 @@ DATA = tensors(random_scenes(30, V - 1), V)
 
 
 def test_the_truth_of_a_relation_is_its_annotation():
-    found = collect(ARTIFACT, DATA, QUESTIONS["relations"])
+    found, _ = collect(ARTIFACT, DATA, QUESTIONS["relations"])
     entry = DATA.scenes[4]
     asked = replace(scene_of(entry, range(len(entry.instance_classes)), ()), room_type=None)
     answers = relations(ARTIFACT, asked)
@@ -37,7 +37,7 @@ def test_the_truth_of_a_relation_is_its_annotation():
         bool(entry.instance_holds[CANONICAL.index(a.relation), a.subject, a.object])
         for a in answers
     ]
-    ours = found.scene == 4
+    ours = found.unit == 4
     assert found.score[ours].tolist() == [answer.probability for answer in answers]
     assert found.truth[ours].tolist() == listed
 
@@ -48,25 +48,25 @@ def test_sentences_tell_the_sides_of_stacked_objects_alone():
         scene([0, 1], [triple], source="coco_captions") for triple in ((LEFT, 0, 1), (ON_TOP, 0, 1))
     )
     ask = QUESTIONS["relations"]
-    assert not len(collect(ARTIFACT, tensors([beside], V), ask).truth)
-    assert collect(ARTIFACT, tensors([stacked], V), ask).truth.tolist() == [False] * 4
+    assert collect(ARTIFACT, tensors([beside], V), ask)[0] is None
+    assert collect(ARTIFACT, tensors([stacked], V), ask)[0].truth.tolist() == [False] * 4
 
 
 def test_hidden_classes_are_true_and_nothing_else():
     """All unlisted classes are answered here; of n classes n - 2 are hidden."""
-    found = collect_missing(ARTIFACT, DATA, exactly(2))
+    found, skipped = collect_missing(ARTIFACT, DATA, exactly(2))
     sizes = np.array([(entry.evidence.classes < V - 1).sum() for entry in DATA.scenes])
-    hidden = np.bincount(found.scene, weights=found.truth, minlength=30)
+    hidden = np.bincount(found.unit, weights=found.truth, minlength=30)
     assert hidden.tolist() == np.where(sizes > 2, sizes - 2, 0).tolist()
-    answered = np.bincount(found.scene, minlength=30)
+    answered = np.bincount(found.unit, minlength=30)
     assert answered.tolist() == np.where(sizes > 2, V - 1 - 2, 0).tolist()
-    assert found.skipped == (sizes <= 2).sum()
+    assert skipped == (sizes <= 2).sum()
 
 
 def test_classes_that_a_source_cannot_show_are_left_out():
     able = torch.arange(V).expand(1, -1) != 3
     some = replace(DATA, annotated_classes=able)
-    every, found = (collect_missing(ARTIFACT, data, exactly(2)) for data in (DATA, some))
+    every, found = (collect_missing(ARTIFACT, data, exactly(2))[0] for data in (DATA, some))
     listed = draw_parts(DATA, torch.arange(V) == V - 1, exactly(2)).v[:, 3]
     assert len(every.score) - len(found.score) == int((listed == 0).sum())
 
@@ -83,8 +83,8 @@ def test_intruders_are_of_every_kind():
     assert max(map(len, found.values())) == 3
     alone = draw_intruder_choices(data, STRUCTURE, None)
     assert {len(drawn) for drawn in alone.values()} <= {0, 1}
-    answers = collect(room_model(), data, partial(ask_outliers, intruders=found))
-    intruders = np.bincount(answers.scene, weights=answers.truth)
+    answers, _ = collect(room_model(), data, partial(ask_outliers, intruders=found))
+    intruders = np.bincount(answers.unit, weights=answers.truth)
     assert set(intruders.tolist()) == {0.0, 1.0}
     assert 7 <= intruders.sum() <= 33
 

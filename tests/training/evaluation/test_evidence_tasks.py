@@ -4,10 +4,10 @@ import pytest
 
 from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, room_model, rooms
 from tests.training.evaluation.scenes import scene, tensors
-from training.evaluation import evidence_tasks as evidence
-from training.evaluation.evidence_tasks import (
+from training.evaluation.object_tasks import OF_OBJECTS, missing_evidence_task
+from training.evaluation.relation_tasks import (
+    OF_RELATIONS,
     evidence_cases,
-    missing_evidence_task,
     relations_evidence_task,
 )
 from training.evaluation.setting import Setting
@@ -34,7 +34,7 @@ def test_evidence_contains_no_queried_relation(kind):
 @pytest.mark.parametrize("metric", TASKS)
 def test_a_change_is_the_difference_of_both_sides(metric):
     outcome = TASKS[metric](room_model(), Setting(DATA, STRUCTURE, limit=8))
-    kinds = evidence.OF_RELATIONS if metric == "R-precision" else evidence.OF_OBJECTS
+    kinds = OF_RELATIONS if metric == "R-precision" else OF_OBJECTS
     for kind in kinds:
         names = (f"change of {metric}, {kind}", f"{metric}, {kind}", f"{metric}, {kind} withheld")
         change, given, without = (outcome.metrics[name] for name in names)

@@ -7,8 +7,8 @@ import torch
 from tests.questions.answers import generate
 from tests.questions.artifacts import LABELS, larger_artifact, scene_of
 from tests.training.evaluation.scenes import scene, tensors, values_of
-from training.evaluation import generated_rooms_task as task
-from training.evaluation.generated_rooms_task import generated_rooms_task
+from training.evaluation import generation_task as task
+from training.evaluation.generation_task import generated_rooms_task
 from training.evaluation.setting import Setting
 
 V = len(LABELS)

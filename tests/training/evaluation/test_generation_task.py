@@ -6,15 +6,13 @@ from tests.enumeration.small_machines import small_machine
 from tests.questions.artifacts import artifact_of
 from tests.training.evaluation.scenes import WIDE, random_scenes, scene, tensors
 from training.evaluation import generation_task
-from training.evaluation.model import Drawn
-from training.evaluation.setting import Setting
+from training.evaluation.setting import Drawn, Evidence, Setting
 
 X = torch.tensor([[1.0, 0, 0], [1, 1, 0]])
 Y = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, 1, 1]])
 
 
 def test_distances_and_copies_by_hand():
-    assert generation_task.hamming(X, Y).tolist() == [[0, 2, 3], [1, 3, 2]]
     # 2, 3 and 1 between the rows of Y.
     assert generation_task.median_distance(Y) == 2.0
     assert generation_task.copies(X, Y).tolist() == [1.0, 0.0]
@@ -76,10 +74,11 @@ def test_halves_keep_groups_together():
 
 def test_scenes_that_fit_are_their_own_sampler():
     scenes = tensors([scene([0, 1], room=0), scene([1, 2], room=1), scene([3], room=1)], WIDE)
-    sample, given = generation_task.scene_sampler(scenes), torch.zeros(3, WIDE, dtype=torch.bool)
-    assert bool((sample(given, scenes.room, 0).v == scenes.v).all())
+    given = torch.zeros(3, WIDE, dtype=torch.bool)
+    evidence = Evidence(given, scenes.room, 0, scenes, scenes)
+    assert bool((generation_task.held_out_scenes(evidence).v == scenes.v).all())
     given[:, 2] = True
-    assert bool((sample(given, torch.full((3,), -1), 0).v == scenes.v[1]).all())
+    assert bool((generation_task.held_out_scenes(evidence).v == scenes.v[1]).all())
 
 
 def test_given_one_class_scenes_count_by_their_size():
@@ -107,7 +106,8 @@ def test_independent_classes_have_the_frequencies_of_training():
     train = tensors(random_scenes(50), WIDE)
     given = torch.zeros(2000, WIDE, dtype=torch.bool)
     given[:, 3] = True
-    v = generation_task.independent_sampler(train)(given, torch.full((2000,), -1), 0).v
+    evidence = Evidence(given, torch.full((2000,), -1), 0, train, train)
+    v = generation_task.independent_scenes(evidence).v
     p = train.v.mean(0)
     error = (v.mean(0) - p).abs()
     error[3] = 0
@@ -118,6 +118,8 @@ def test_independent_classes_have_the_frequencies_of_training():
 def test_given_classes_stay():
     artifact = artifact_of(small_machine("triway").float())
     given = torch.tensor([[True, False]]).expand(50, -1)
-    drawn = generation_task.machine_sampler(artifact)(given, torch.full((50,), -1), 1)
+    none = tensors([scene([0])])
+    evidence = Evidence(given, torch.full((50,), -1), 1, none, none)
+    drawn = generation_task.machine_scenes(artifact, evidence)
     assert bool((drawn.v[:, 0] == 1).all())
     assert 0 < float(drawn.v[:, 1].mean()) < 1

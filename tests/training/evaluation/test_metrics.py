@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from training.evaluation import metrics
-from training.evaluation.report import metric_from_dict, metric_to_dict, pool
+from training.evaluation.report import from_json, pool, to_json
 from training.evaluation.results import mean_over_seeds
 
 
@@ -91,7 +91,8 @@ def test_metrics_that_are_undefined(compute, message):
 
 @pytest.mark.parametrize("metric", [*POOLABLE.values(), RESAMPLED], ids=[*POOLABLE, "resampled"])
 def test_metrics_survive_json(metric):
-    again = metric_from_dict(json.loads(json.dumps(metric_to_dict(metric), allow_nan=False)))
+    text = json.dumps(metric, default=to_json, allow_nan=False)
+    again = json.loads(text, object_hook=from_json)
     assert again.figure() == metric.figure()
 
 

@@ -15,18 +15,16 @@ from tests.training.evaluation.scenes import (
     tensors,
     values_of,
 )
-from training.evaluation.artifact_model import score_placed
-from training.evaluation.asking import LeakError
-from training.evaluation.missing_tasks import (
+from training.evaluation.asking import LeakError, score_placed
+from training.evaluation.object_tasks import (
     SEEDS,
     leave_one_out_at,
     missing_task,
     rank_missing,
     removed_places,
 )
-from training.evaluation.model import Places
 from training.evaluation.parts import all_but_one, draw_parts
-from training.evaluation.setting import Setting
+from training.evaluation.setting import Places, Setting
 
 
 def test_metrics_by_hand():

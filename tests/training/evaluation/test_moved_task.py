@@ -6,7 +6,7 @@ import pytest
 from tests.training.evaluation.furnished_rooms import STRUCTURE, rooms
 from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors, values_of
 from training.evaluation.asking import LeakError
-from training.evaluation.moved_task import flagged, moved_cases, moved_task
+from training.evaluation.outlier_tasks import flagged, moved_cases, moved_task
 from training.evaluation.setting import Setting
 
 LEFT, ON = 0, 2

@@ -7,8 +7,8 @@ from app.scene.spatial_relations import LEFT, ON_TOP
 from tests.questions.artifacts import LARGER, larger_artifact
 from tests.training.evaluation.scenes import scene, tensors, values_of
 from tests.training.fit.test_offset_statistics import MEAN, STD, apart, draws
-from training.evaluation.offset_task import offsets_task
 from training.evaluation.setting import Setting
+from training.evaluation.statistics_tasks import offsets_task
 from training.fit.offset_statistics import fit_offsets
 
 V = LARGER["triway"].V

@@ -4,14 +4,21 @@ import torch
 
 from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
 from tests.training.evaluation.scenes import FLOOR, NO_STRUCTURE, scene, tensors, values_of
-from training.evaluation import intruders
-from training.evaluation.artifact_model import artifact_model
-from training.evaluation.asking import SENSITIVITIES, judge, of_classes
-from training.evaluation.missing_tasks import SEEDS
-from training.evaluation.model import Model, suspicion_of
-from training.evaluation.outlier_tasks import alarms_task, hit_at_1, outliers_task, with_intruders
-from training.evaluation.parts import draw_parts, exactly
-from training.evaluation.setting import Setting
+from training.evaluation.asking import SENSITIVITIES, artifact_model, judge
+from training.evaluation.object_tasks import SEEDS
+from training.evaluation.outlier_tasks import (
+    LAWS,
+    alarms_task,
+    by_signature,
+    draw_intruders,
+    hit_at_1,
+    intruder_weights,
+    outliers_task,
+    signatures,
+    with_intruders,
+)
+from training.evaluation.parts import draw_parts, exactly, of_classes
+from training.evaluation.setting import Model, Setting, suspicion_of
 
 
 def only_intruders(v):
@@ -54,7 +61,7 @@ def test_a_request_lists_the_things_of_a_scene_and_an_absent_one():
     assert intruder.tolist() == [4] * len(SEEDS)
     assert v.tolist() == [[1, 0, 1, 1, 1]] * len(SEEDS)
     absent = torch.arange(len(FLOOR)) == 4
-    drawn = intruders.draw_intruders(tensors([scene([0, 1, 2]) for _ in range(20)]), absent)
+    drawn = draw_intruders(tensors([scene([0, 1, 2]) for _ in range(20)]), absent)
     assert set(drawn.tolist()) == {3}
 
 
@@ -63,7 +70,7 @@ def test_popular_intruders_follow_training():
     250 to 350 with probability below 1e-7."""
     train = tensors([scene([0, 3])] * 6 + [scene([3, 4])] * 3)
     data = tensors([scene([0, 1, 2]) for _ in range(400)])
-    added = intruders.draw_intruders(data, NO_STRUCTURE, intruders.by_popularity(data, train))
+    added = draw_intruders(data, NO_STRUCTURE, intruder_weights(data, train)["by popularity"])
     assert set(added.tolist()) == {3, 4}
     assert 250 <= int((added == 3).sum()) <= 350
 
@@ -80,12 +87,10 @@ TOY = tensors(
 
 def test_signature_classes_are_frequent_in_their_room_type_and_rare_elsewhere():
     """Lift of its own class 180 / 30 = 6; of class 4 in rooms 0 and 1 3; of class 3 1."""
-    typical, share = intruders.signatures(TOY)
+    typical, share = signatures(TOY)
     assert [np.flatnonzero(row).tolist() for row in typical] == [[0], [1], [2], [], [], []]
     assert share[0].tolist() == [1, 0, 0, 1, 1]
-    typical, share = intruders.signatures(
-        tensors([*TOY.scenes, *(scene([0, 3], room=6) for _ in range(10))])
-    )
+    typical, share = signatures(tensors([*TOY.scenes, *(scene([0, 3], room=6) for _ in range(10))]))
     assert np.isnan(share[6]).all()
     assert not typical[6].any()
 
@@ -94,22 +99,22 @@ def test_signature_classes_are_frequent_in_their_room_type_and_rare_elsewhere():
 def test_rare_classes_and_rooms_have_no_signature(scenes, times, typical):
     """Under 20 scenes of the room, or the class in under a fifth of them."""
     some = [scene([0, 3] if k < times else [3], room=0) for k in range(scenes)]
-    assert intruders.signatures(tensors([*some, *TOY.scenes[30:180]]))[0][0, 0] == typical
+    assert signatures(tensors([*some, *TOY.scenes[30:180]]))[0][0, 0] == typical
 
 
 def test_intruders_are_typical_of_another_room_and_foreign_to_this_one():
     """Rooms 1 and 2 have one suitable class each; in a hundredth of the scenes is not foreign."""
     asked = [scene([0, 3, 4], room=0), scene([3, 4], room=-1), scene([0, 1, 3], room=0)]
-    weights = intruders.by_signature(tensors(asked), TOY)
+    weights = by_signature(tensors(asked), TOY)
     assert weights.tolist() == [[0, 0.5, 0.5, 0, 0], [0] * 5, [0, 0, 1, 0, 0]]
     often = tensors([*TOY.scenes, scene([0, 2], room=0)])
-    assert intruders.by_signature(tensors(asked[:1]), often).tolist() == [[0, 1, 0, 0, 0]]
+    assert by_signature(tensors(asked[:1]), often).tolist() == [[0, 1, 0, 0, 0]]
 
 
 def test_a_published_model_is_judged_as_the_service_ranks():
     data = rooms(40, 2)
     outcome = outliers_task(artifact_model(room_model()), Setting(data, STRUCTURE, rooms(400, 1)))
-    names = {f"{name}, {law}" for name in ("hit@1", "flagged") for law in intruders.LAWS}
+    names = {f"{name}, {law}" for name in ("hit@1", "flagged") for law in LAWS}
     assert set(outcome.metrics) == names
     index, v, intruder = with_intruders(data, STRUCTURE, None)
     hits, flagged = np.zeros(len(data)), np.zeros(len(data))

@@ -8,9 +8,8 @@ from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, roo
 from training.datasets import DatasetError, annotated_classes, encode, generate_rooms
 from training.datasets.batches import scene_tensors
 from training.datasets.jsonl import write_jsonl
-from training.evaluation.artifact_model import artifact_model
-from training.evaluation.outside import ROOM_TASKS, read_test
-from training.evaluation.report import measure
+from training.evaluation.asking import artifact_model
+from training.evaluation.report import ROOM_TASKS, measure, read_test
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import TASKS
 

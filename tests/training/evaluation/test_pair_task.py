@@ -20,7 +20,6 @@ from tests.training.evaluation.scenes import (
 )
 from training.datasets.batches import seen_triples
 from training.evaluation.asking import labels_alone, relation_probabilities
-from training.evaluation.model import Model
 from training.evaluation.pair_task import (
     RARE,
     baseline_log_odds,
@@ -30,7 +29,7 @@ from training.evaluation.pair_task import (
     service_score,
     without_inside,
 )
-from training.evaluation.setting import Setting
+from training.evaluation.setting import Model, Setting
 
 LEFT, ON, ABOVE, A = 0, 2, 3, len(CANONICAL)
 DATA = tensors(random_scenes(20), WIDE)

@@ -74,7 +74,7 @@ def test_a_score_of_minus_infinity_ranks_last_and_nan_is_an_error():
     lowest = torch.zeros_like(parts.v).masked_fill(parts.hidden, -torch.inf)
     assert rank_hidden(parts, NO_STRUCTURE, lowest).above.tolist() == [3]
     with pytest.raises(FloatingPointError, match="NaN"):
-        Ranking.of(parts.scene, parts.scene, torch.full((1, V), torch.nan), 1, 0)
+        Ranking.of(parts.scene, parts.scene, torch.full((1, V), torch.nan), 1)
 
 
 def test_bins_of_the_listed_share():

@@ -19,7 +19,7 @@ from tests.training.evaluation.scenes import (
 )
 from training.datasets import AnnotatedObject, AnnotatedScene, encode
 from training.datasets.batches import seen_triples
-from training.evaluation.artifact_model import score_relations
+from training.evaluation.asking import score_relations
 from training.evaluation.relation_tasks import (
     complete_scenes,
     draw_false_triple,
@@ -69,7 +69,7 @@ def test_r_precision_by_hand():
     assert ratio.value == pytest.approx(2 / 3)
     assert ratio.mean_over_scenes().value == pytest.approx((1 / 2 + 1) / 2)
     first = scored[:1]
-    assert r_precision([first[0].where(first[0].relation == 0)], 1).value == 1.0
+    assert r_precision([first[0].rows(first[0].relation == 0)], 1).value == 1.0
     assert [r_precision(first, 1, first=k).value for k in (1, 3, 20)] == [0.5, 1.0, 1.0]
     # left(0, 1) was seen; of the others left(1, 0) comes first and front(1, 0) is the true one.
     new = r_precision(unseen(first, torch.tensor([[0, 0, 1]]), V), 1)

@@ -9,12 +9,11 @@ from tests.training.evaluation.scenes import flat, random_scenes, scene, tensors
 from training.datasets.batches import seen_triples
 from training.datasets.cases import some_scenes
 from training.evaluation import report as reports
-from training.evaluation.artifact_model import artifact_model, floor_model, independent_model
+from training.evaluation.asking import artifact_model
 from training.evaluation.calibration_task import QUESTIONS
-from training.evaluation.generation_task import held_out_halves
-from training.evaluation.model import Model
+from training.evaluation.generation_task import held_out_halves, held_out_scenes, independent_scenes
 from training.evaluation.relation_tasks import completion_task
-from training.evaluation.setting import Setting
+from training.evaluation.setting import Model, Setting
 from training.evaluation.tasks import EVERY_TASK, TASKS, WHOLE_SET
 
 V = LARGER["triway"].V
@@ -112,9 +111,9 @@ def test_tasks_about_objects_see_scenes_with_complete_object_lists_alone():
 def test_pooled_sources_are_their_union():
     union, train = two_sources(DATA), two_sources(TRAIN)
     tasks = ("T1a relations", "T2 missing", "T3 alarms")
-    settings = reports.settings_by_source(union, NO_STRUCTURE, train, SEEN)
-    together = reports.pooled([report_of(MODEL, setting, tasks) for _, setting in settings])
-    whole = report_of(MODEL, Setting(union, NO_STRUCTURE, train, SEEN), tasks)
+    every = Setting(union, NO_STRUCTURE, train, SEEN)
+    together = reports.pooled([report_of(MODEL, own, tasks) for _, own in every.by_source()])
+    whole = report_of(MODEL, every, tasks)
     assert values_of(together) == pytest.approx(values_of(whole))
 
 
@@ -122,9 +121,9 @@ def test_the_floor_is_the_other_half_of_the_scenes():
     """The samples of independent classes have the mean size of the training scenes."""
     tasks = ("T4 generate",)
     name = "T4 generate", "classes per scene, free"
-    independent = values_of(report_of(independent_model(V), SETTING, tasks))
+    independent = values_of(report_of(Model(generate=independent_scenes), SETTING, tasks))
     assert independent[name] == pytest.approx(float(TRAIN.v.sum(1).mean()), abs=0.3)
-    floor = values_of(report_of(floor_model(), SETTING, tasks))
+    floor = values_of(report_of(Model(generate=held_out_scenes), SETTING, tasks))
     assert floor[name] == pytest.approx(float(held_out_halves(SETTING)[1].v.sum(1).mean()))
 
 

@@ -8,8 +8,9 @@ import torch
 from app import questions
 from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, room_model, rooms
 from tests.training.evaluation.scenes import NO_STRUCTURE, V, scene, tensors
-from training.evaluation.asking import of_classes, score_rooms
-from training.evaluation.room_task import LEAST, LISTS, mean_log_p, rooms_task
+from training.evaluation.asking import score_rooms
+from training.evaluation.object_tasks import LEAST, LISTS, mean_log_p, rooms_task
+from training.evaluation.parts import of_classes
 from training.evaluation.setting import Setting
 
 DATA = tensors([scene([k % 2, 2, 3, 4], room=k % 3) for k in range(30)], V)

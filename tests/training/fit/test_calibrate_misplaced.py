@@ -13,7 +13,7 @@ from tests.training.evaluation.furnished_rooms import A
 from tests.training.evaluation.scenes import scene
 from training.datasets.cases import draw_true_relations, scene_of, scene_rng
 from training.datasets.moved import moved_by_triple
-from training.evaluation.alarms import ALARMS
+from training.evaluation.outlier_tasks import ALARMS
 from training.fit import calibrate_misplaced as module
 from training.fit.calibrate_misplaced import fit_misplaced, hardest_quantile
 from training.machines import MachineSpec, build

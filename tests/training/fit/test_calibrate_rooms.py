@@ -7,7 +7,7 @@ from app.questions import rooms
 from app.questions.generate import is_within_limits, room_fit
 from tests.questions.artifacts import LABELS, larger_artifact
 from tests.training.evaluation.scenes import scene, tensors
-from training.evaluation.asking import of_classes
+from training.evaluation.parts import of_classes
 from training.fit import calibrate_rooms
 from training.fit.regression import recalibrated
 

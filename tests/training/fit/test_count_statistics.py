@@ -12,8 +12,8 @@ from tests.training.evaluation.furnished_rooms import VOCABULARY, room_model, ro
 from tests.training.evaluation.scenes import scene
 from training.datasets.cases import MOST, counted_classes, scene_rng, some_instances
 from training.datasets.sources import SOURCES
-from training.evaluation.count_task import counts_task
 from training.evaluation.setting import Setting
+from training.evaluation.statistics_tasks import counts_task
 from training.fit.count_statistics import fit_counts
 
 CHAIR, DESK, TABLE, WALL = range(4)

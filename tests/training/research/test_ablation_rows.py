@@ -1,7 +1,7 @@
 import pytest
 
 from training.fit.configuration import ConfigError
-from training.research.ablate import load_rows
+from training.research.benchmark import load_rows
 from training.runs.config_files import load_config, shipped_files
 
 FULL = load_config("places-triway")

@@ -8,7 +8,7 @@ from training.fit.configuration import ConfigError
 from training.fit.relation_weights import RelationFit
 from training.fit.trainer import Trainer
 from training.research.benchmark import DEFAULT, chosen_tasks, read_configs
-from training.research.entries import baseline_entries
+from training.research.measure import baseline_entries
 from training.runs.folder import load_run
 
 pytestmark = pytest.mark.slow

@@ -1,16 +1,10 @@
-import io
 from types import SimpleNamespace
 
 import pytest
-from rich.console import Console
 
 from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
-from training.evaluation.model import Model
-from training.evaluation.setting import Setting
-from training.research.entries import Entry
-from training.research.measure import POOLED, Plan, measure_entries
-
-CONSOLE = Console(file=io.StringIO())
+from training.evaluation.setting import Model, Setting
+from training.research.measure import POOLED, Entry, Plan, measure_entries
 
 
 def answers(*_):
@@ -35,7 +29,7 @@ def plan(folder, material="these scenes"):
 def test_an_error_other_than_divergence_stops_all_processes(tmp_path):
     entries = [Entry(name, 0, name, make) for name, make in (("a", breaks), ("b", answers))]
     with pytest.raises(RuntimeError, match="broken"):
-        measure_entries(plan(tmp_path), entries, CONSOLE, workers=2)
+        measure_entries(plan(tmp_path), entries, workers=2)
 
 
 def test_another_row_or_other_scenes_have_other_folders(tmp_path):
@@ -43,5 +37,5 @@ def test_another_row_or_other_scenes_have_other_folders(tmp_path):
     others = (plan(tmp_path, "other scenes"), first[1]), (first[0], Entry("row", 0, "2", answers))
     for material, entry in (first, *others):
         assert not material.finished(entry)
-        measure_entries(material, [entry], CONSOLE)
-    measure_entries(first[0], [Entry("row", 0, "1", diverges)], CONSOLE)
+        measure_entries(material, [entry])
+    measure_entries(first[0], [Entry("row", 0, "1", diverges)])

@@ -5,8 +5,18 @@ import pytest
 import torch
 
 from tests.enumeration.small_machines import check_frequencies, code
-from training.seed.learning import PATIENCE, phases, train
-from training.seed.machines import GBM, RBM, Free, GatedRBM, Machine, State, Triway
+from training.seed.machines import (
+    GBM,
+    PATIENCE,
+    RBM,
+    Free,
+    GatedRBM,
+    Machine,
+    State,
+    Triway,
+    phases,
+    train,
+)
 from training.seed.scenes import Scenes
 
 V, H1 = 2, 2
@@ -203,7 +213,7 @@ def test_training_stops_early_and_keeps_the_best_weights(monkeypatch):
         weights.append(machine.b.clone())
         return next(scores), 0.0
 
-    monkeypatch.setattr("training.seed.learning.errors", keep)
+    monkeypatch.setattr("training.seed.machines.errors", keep)
     assert len(train(machine, Parts, torch.Generator().manual_seed(0))) == 2 + PATIENCE
     assert torch.equal(machine.b, weights[1])
 

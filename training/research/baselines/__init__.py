@@ -4,15 +4,9 @@ from __future__ import annotations
 
 from typing import Final
 
-from training.evaluation.baselines import EASE, FREQUENCY_TABLE, PLACED, POPULARITY, triples
-from training.evaluation.baselines.fitting import COMPLETION, MISPLACED, RELATIONS, ROOMS, Baseline
-from training.research.baselines import (
-    networks,
-    object_models,
-    relation_models,
-    room_models,
-    supporters,
-)
+from training.evaluation.baselines import EASE, FREQUENCY_TABLE, PLACED, POPULARITY
+from training.evaluation.selection import COMPLETION, MISPLACED, RELATIONS, ROOMS, Baseline
+from training.research.baselines import count_models, object_models
 
 _EVERY: tuple[Baseline, ...] = (
     POPULARITY,
@@ -21,20 +15,20 @@ _EVERY: tuple[Baseline, ...] = (
     EASE,
     Baseline("pairwise logistic", object_models.pairwise),
     Baseline("scikit-learn BernoulliRBM", object_models.bernoulli_rbm, stochastic=True),
-    Baseline("denoising autoencoder", networks.autoencoder, stochastic=True),
-    Baseline("most common room type", room_models.most_common, ROOMS),
-    Baseline("naive Bayes of rooms", room_models.naive_bayes, ROOMS),
-    Baseline("relation popularity", relation_models.relation_popularity, RELATIONS),
+    Baseline("denoising autoencoder", object_models.autoencoder, stochastic=True),
+    Baseline("most common room type", count_models.most_common_room, ROOMS),
+    Baseline("naive Bayes of rooms", count_models.room_naive_bayes, ROOMS),
+    Baseline("relation popularity", count_models.relation_popularity, RELATIONS),
     FREQUENCY_TABLE,
-    Baseline("ComplEx", relation_models.complex_embedding, RELATIONS, stochastic=True),
-    Baseline("frequency table, completing", triples.frequency_table, COMPLETION),
+    Baseline("ComplEx", count_models.complex_embedding, RELATIONS, stochastic=True),
+    Baseline("frequency table, completing", FREQUENCY_TABLE.propose, COMPLETION),
     Baseline(
         "frequency table + closure, completing",
-        relation_models.frequency_table_with_closure,
+        count_models.frequency_table_with_closure,
         COMPLETION,
     ),
     PLACED,
-    Baseline("frequency table of supporters", supporters.supporter_table, MISPLACED),
+    Baseline("frequency table of supporters", count_models.supporter_table, MISPLACED),
 )
 
 BASELINES: Final[dict[str, Baseline]] = {entry.name: entry for entry in _EVERY}

@@ -15,19 +15,19 @@ from tests.training.research.baselines.furnished import (
     scene,
     tensors,
 )
-from training.evaluation.baselines import triples
-from training.evaluation.baselines.classes import Lists, fit_ease, frequency, training_lists
+from training.evaluation import baselines
+from training.evaluation.baselines import Lists, fit_ease, frequency, training_lists
 from training.evaluation.generation_task import transitive_closure
-from training.evaluation.model import Places
 from training.evaluation.relation_tasks import with_observed
-from training.research.baselines.networks import hidden_loss
+from training.evaluation.setting import Places
+from training.research.baselines.count_models import closure_score, complex_logits
 from training.research.baselines.object_models import (
     bernoulli_rbm,
     evidence,
     fit_pairwise,
+    hidden_loss,
     nearest_score,
 )
-from training.research.baselines.relation_models import closure_score, complex_logits
 
 
 def lists_of(v):
@@ -168,7 +168,7 @@ def related():
 
 
 def test_triples_by_hand(related):
-    counts = triples.count_triples(related, STRUCTURE)
+    counts = baselines.count_triples(related, STRUCTURE)
     assert counts.holds.nonzero().tolist() == [[LEFT, 0, 2], [ON_TOP, 0, 1]]
     assert counts.holds[ON_TOP, 0, 1] == 2
     assert counts.together[0, 1] == counts.together[1, 0] == 3
@@ -178,8 +178,8 @@ def test_triples_by_hand(related):
 
 
 def test_the_frequency_table_by_hand(related):
-    counts = triples.count_triples(related, STRUCTURE)
-    p = triples.smoothed_log_odds(counts, of_pair=4.0, of_class=2.0).sigmoid()
+    counts = baselines.count_triples(related, STRUCTURE)
+    p = baselines.smoothed_log_odds(counts, of_pair=4.0, of_class=2.0).sigmoid()
     # Ordered pairs together: 3 + 3 of (0, 1), 1 + 1 each of (0, 2) and (1, 2).
     overall = (2 + 1) / (10 + 2)
     subject = (2 + 2 * overall) / (4 + 2)
@@ -193,10 +193,10 @@ def test_the_frequency_table_by_hand(related):
 def test_tables_are_looked_up_for_the_classes_of_a_scene(related):
     table = torch.randn(A, V, V, generator=torch.Generator().manual_seed(0))
     batch = related.batch(torch.tensor([1, 0]))
-    values = triples.table_score(table)(batch)
+    values = baselines.table_score(table)(batch)
     assert values[1, LEFT, 2, 0] == table[LEFT, 2, 0]
     assert values[0, ON_TOP, 0, 1] == table[ON_TOP, 0, 1]
-    more = triples.table_score(table, multiplicity=0.5)(batch) - values
+    more = baselines.table_score(table, multiplicity=0.5)(batch) - values
     assert float(more[0, LEFT, 0, 1]) == pytest.approx(0.5 * np.log(3), abs=1e-6)
     assert float(more[0, LEFT, 1, 1]) == pytest.approx(np.log(3), abs=1e-6)
     assert not more[1].any()
@@ -213,7 +213,9 @@ def test_closure_is_warshalls():
 def test_closure_changes_implied_relations_and_mirror_images_alone():
     batch = tensors([scene([0, 1, 2, 3], [(LEFT, 0, 1), (LEFT, 1, 2)])]).batch(torch.tensor([0]))
     given = with_observed(batch, batch.holds > 0)
-    moved = closure_score(triples.table_score(torch.zeros(A, V, V)), bonus=2.0, penalty=3.0)(given)
+    moved = closure_score(baselines.table_score(torch.zeros(A, V, V)), bonus=2.0, penalty=3.0)(
+        given
+    )
     expected = torch.zeros(1, A, 4, 4)
     expected[0, LEFT, 0, 2] = 2.0
     for i, j in ((1, 0), (2, 1), (2, 0)):
@@ -231,14 +233,14 @@ def test_complex_logits_by_einsum():
 
 
 def test_places_by_hand(related):
-    counts = triples.count_triples(related, STRUCTURE)
-    log_p = triples.smoothed_log_p(counts, torch.full((V,), 0.5), place=2.0, relation=1.0)
+    counts = baselines.count_triples(related, STRUCTURE)
+    log_p = baselines.smoothed_log_p(counts, torch.full((V,), 0.5), place=2.0, relation=1.0)
     assert log_p.exp().sum(-1) == pytest.approx(torch.ones(2, A, V), abs=1e-5)
     # Something on 1: 0 twice. Whatever is on something: 0 twice, and one case of 1/11 each.
     back_off = (2 + 1 / 11) / (2 + 1)
     # Second, something under 0: 1 twice.
     v, relation = torch.zeros(2, V), torch.tensor([ON_TOP, ON_TOP])
     places = Places(v, v, relation, torch.tensor([1, 0]), torch.tensor([True, False]))
-    first, second = triples.place_score(log_p)(places)
+    first, second = baselines.place_score(log_p)(places)
     assert float(first[0].exp()) == pytest.approx((2 + 2 * back_off) / (2 + 2), abs=1e-5)
     assert second.argmax() == 1

@@ -16,19 +16,21 @@ from tests.training.research.baselines.furnished import (
     scene,
     tensors,
 )
-from training.evaluation.baselines import PLACED, fitting, placed_product
-from training.evaluation.baselines.fitting import TRIALS, Baseline, drawn_settings, halving
-from training.evaluation.missing_tasks import removed_places
-from training.evaluation.moved_task import moved_cases
+from training.evaluation import selection
+from training.evaluation.baselines import PLACED, placed_product
+from training.evaluation.object_tasks import removed_places
+from training.evaluation.outlier_tasks import moved_cases
 from training.evaluation.relation_tasks import with_observed
-from training.research.baselines import BASELINES, networks
+from training.evaluation.selection import TRIALS, Baseline, drawn_settings, halving
+from training.research.baselines import BASELINES, object_models
 
 TRAIN, VALIDATION = furnished(300, seed=1), furnished(60, seed=2)
 EVERY = tuple(BASELINES.values())
 OBJECTS, OF_ROOMS, OF_RELATIONS, COMPLETIONS, (SUPPORTERS,) = (
     [one for one in EVERY if one.answer is answer]
     for answer in (
-        fitting.OBJECTS, fitting.ROOMS, fitting.RELATIONS, fitting.COMPLETION, fitting.MISPLACED,
+        selection.OBJECTS, selection.ROOMS, selection.RELATIONS, selection.COMPLETION,
+        selection.MISPLACED,
     )
 )  # fmt: skip
 
@@ -40,7 +42,7 @@ PROGRESS = defaultdict(list)
 def _short_courses():
     """A few steps suffice for two kinds of rooms."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(networks, "_STEPS", 60)
+        patch.setattr(object_models, "_STEPS", 60)
         yield
 
 
@@ -211,7 +213,7 @@ def test_nothing_to_learn_from_is_an_error(baseline):
 
 
 def test_a_score_that_is_no_number_is_an_error():
-    answer = fitting.Answer((), lambda *_: float("nan"))
+    answer = selection.Answer((), lambda *_: float("nan"))
     broken = Baseline("broken", lambda *_: iter([({}, None)]), answer)
     with pytest.raises(FloatingPointError, match="broken"):
         broken.fit(TRAIN, VALIDATION, STRUCTURE)

@@ -10,9 +10,9 @@ from training.datasets import annotated_classes, encode
 from training.datasets.batches import scene_tensors
 from training.datasets.cases import scene_of
 from training.datasets.moved import posed_scene
-from training.evaluation.baselines.fitting import named_moved
+from training.evaluation.selection import named_moved
 from training.research.baselines import BASELINES
-from training.research.baselines.supporters import supporter_score, supporter_table
+from training.research.baselines.count_models import supporter_score, supporter_table
 
 VOCABULARY = Vocabulary(
     [*map(ObjectClass, ("table", "cup", "bed")), ObjectClass("floor", structure=True)], []

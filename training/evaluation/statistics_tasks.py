@@ -1,19 +1,20 @@
-"""Test the expected numbers of instances of a model on held-out scenes.
+"""Test the statistics of a model, which training scenes give, on held-out scenes.
 
-A robot lists a part of each scene (`datasets.cases.some_instances`) and asks for the expected
-number of instances of each listed class. The task compares the mean absolute error of this number
-with the errors of two means:
+Offsets: an offset is the position of a relation's subject minus the position of its object, in
+metres. The model has a distribution of offsets for each relation and pair of classes. It gives an
+ellipse in the horizontal plane and an ellipsoid in space, which should contain 80 % of the offsets
+each. The task measures the shares of held-out offsets in them. It also measures the distance of
+offsets to the mean for the relation and classes, and to the mean for the relation alone.
 
-- the class mean: over the training scenes of the model with at least the listed number;
-- the mean of the source: over the training scenes of the same data source, and at least the listed
-  number.
-
-Classes without statistics, and classes whose instances the source does not count, are left out.
+Counts: a robot lists a part of each scene (`datasets.cases.some_instances`) and asks for the
+expected number of instances of each listed class. The task compares the mean absolute error of this
+number with the errors of two means over the training scenes with at least the listed number: those
+of the model, and those of the same data source. Classes without statistics, and classes whose
+instances the source does not count, are left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -21,18 +22,61 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from app.model import SceneModel
 from app.model.count_statistics import Counts
 from app.questions.missing import LIKELY, more
 from app.questions.posterior import present
+from app.scene import CANONICAL
 from training.datasets import EncodedScene
-from training.datasets.cases import MOST, counted_classes, listed_cases
-from training.evaluation.asking import of_classes
+from training.datasets.batches import subset
+from training.datasets.cases import MOST, counted_classes, listed_cases, observed_offsets
 from training.evaluation.metrics import Metric, Ratio
+from training.evaluation.parts import of_classes
 from training.evaluation.setting import Outcome, Setting
 
-METRICS: Final = (
+SHARE: Final = 0.8  # share of the offsets that each ellipse or ellipsoid should contain
+
+_REGIONS: Final = {"the ellipse": 2, "the ellipsoid": 3}
+"""Number of axes of each region: two axes are x and y, three axes are x, y and z."""
+
+OFFSETS: Final = (
+    *(f"in {region}, {name}" for name in CANONICAL for region in _REGIONS),
+    "distance (m)",
+    "distance (m), relation alone",
+)
+
+
+def offsets_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
+    """Measure the share of covered offsets for each relation, and the distances for all."""
+    if (offsets := artifact.offsets) is None:
+        return None
+    scenes = setting.scenes.scenes
+    all_offsets = observed_offsets(scenes)
+    has_statistics = offsets.relation_scenes[all_offsets.relation] > 0
+    if not has_statistics.any():
+        return None
+    observed = all_offsets.rows(has_statistics)
+    values, _ = offsets.find(observed.relation, observed.subject, observed.other)
+    deviation = observed.offset - values[:, :3]
+    squares = np.square(deviation / values[:, 3:])
+    metrics: dict[str, Metric] = {}
+    for a in np.unique(observed.relation):
+        in_relation = observed.relation == a
+        for region, axes in _REGIONS.items():
+            is_inside = squares[in_relation, :axes].sum(axis=1) <= chdtri(axes, 1 - SHARE)
+            metrics[f"in {region}, {CANONICAL[a]}"] = Ratio.of_items(
+                observed.scene[in_relation], is_inside.astype(np.float64), len(scenes)
+            )
+    residual = observed.offset - offsets.relation[observed.relation, :3]
+    for name, vectors in (("distance (m)", deviation), ("distance (m), relation alone", residual)):
+        distance = np.linalg.norm(vectors, axis=1)
+        metrics[name] = Ratio.of_items(observed.scene, distance, len(scenes))
+    return Outcome.over(setting.scenes, metrics, len(scenes) - len(np.unique(observed.scene)))
+
+
+COUNTS: Final = (
     "error of the expected count",
     "error of the class mean",
     "change of error, class mean",
@@ -49,7 +93,7 @@ def counts_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
         return None
     counted = counted_classes(train.scenes, artifact.vocabulary)
     is_counted = torch.tensor([scene.source in counted for scene in setting.scenes.scenes])
-    scenes = setting.at(is_counted.nonzero().squeeze(1)).scenes
+    scenes = subset(setting.scenes, is_counted)
     answers = [
         (k, *answer)
         for k, scene in enumerate(scenes.scenes)
@@ -65,7 +109,11 @@ def counts_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
 
     row = np.searchsorted(artifact.counts.classes, index)
     of_class = mean(np.abs(class_mean(artifact.counts, row, listed_number) - number))
-    source_mean = np.maximum(_mean_counts(train.scenes, artifact)[index], listed)
+    times, total = np.zeros((2, len(artifact.vocabulary)))
+    for evidence in (encoded.evidence for encoded in train.scenes):
+        times[evidence.classes] += 1
+        total[evidence.classes] += np.minimum(evidence.counts, MOST)
+    source_mean = np.maximum((total / np.maximum(times, 1))[index], listed)
     error = mean(np.abs(expected - number))
     metrics: dict[str, Metric] = {
         "error of the expected count": error,
@@ -95,15 +143,6 @@ def _ask_counts(
     entries = more(artifact, request, listing, top_k=len(candidates), candidates=candidates)
     fields = ("listed_count", "expected_count", "low", "high", "probability")
     return [(*number_of[entry["label"]], *(entry[name] for name in fields)) for entry in entries]
-
-
-def _mean_counts(scenes: Sequence[EncodedScene], artifact: SceneModel) -> Float[NDArray, " V"]:
-    """Return the mean number of instances of each class in the scenes with the class."""
-    times, total = np.zeros((2, len(artifact.vocabulary)))
-    for scene in scenes:
-        times[scene.evidence.classes] += 1
-        total[scene.evidence.classes] += np.minimum(scene.evidence.counts, MOST)
-    return total / np.maximum(times, 1)
 
 
 def class_mean(

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
@@ -19,16 +20,8 @@ from torch import Tensor
 
 from training.datasets.batches import SceneTensors, has_relations
 from training.datasets.cases import some_scenes
-from training.evaluation.missing_tasks import leave_one_out_at
-from training.evaluation.model import (
-    MisplacedScore,
-    Model,
-    ObjectScore,
-    Parameters,
-    PlacedScore,
-    RelationScore,
-)
-from training.evaluation.moved_task import ask_moved, moved_cases
+from training.evaluation.object_tasks import leave_one_out_at, mean_log_p
+from training.evaluation.outlier_tasks import ask_moved, moved_cases
 from training.evaluation.parts import validation_score
 from training.evaluation.relation_tasks import (
     Candidates,
@@ -36,8 +29,15 @@ from training.evaluation.relation_tasks import (
     r_precision,
     score_scenes,
 )
-from training.evaluation.room_task import mean_log_p
-from training.evaluation.setting import Structure
+from training.evaluation.setting import (
+    MisplacedScore,
+    Model,
+    ObjectScore,
+    Parameters,
+    PlacedScore,
+    RelationScore,
+    Structure,
+)
 
 _SCENES = 1000
 
@@ -89,18 +89,17 @@ def placed_mrr(scenes: SceneTensors, structure: Structure, score: PlacedScore) -
     return leave_one_out_at(some_scenes(scenes, _SCENES), structure, score)[0].mrr().value
 
 
-def relation_precision(scenes: SceneTensors, structure: Structure, score: RelationScore) -> float:
-    """Return the R-precision of relations, given the instance counts of classes (task T1a)."""
-    return _precision(score_scenes(scenes, structure, score), scenes)
+def relation_precision(
+    scenes: SceneTensors,
+    structure: Structure,
+    score: RelationScore,
+    ask: Callable[..., list[Candidates]] = score_scenes,
+) -> float:
+    """Return the R-precision of relations, given the instance counts of classes (task T1a).
 
-
-def completion_precision(scenes: SceneTensors, structure: Structure, score: RelationScore) -> float:
-    """Return the R-precision of half of the relations, given the other half (task T1b)."""
-    return _precision(complete_scenes(scenes, structure, score), scenes)
-
-
-def _precision(scored: list[Candidates], scenes: SceneTensors) -> float:
-    ratio = r_precision(scored, len(scenes))
+    With `ask=complete_scenes`, it is that of half of the relations, given the other half (T1b).
+    """
+    ratio = r_precision(ask(scenes, structure, score), len(scenes))
     if ratio is None:
         raise ValueError("no scene has an annotated relation between two things")
     return ratio.value
@@ -129,7 +128,7 @@ class Answer(NamedTuple):
 OBJECTS: Final = Answer(("missing",), missing_mrr, of_relations=False)
 ROOMS: Final = Answer(("rooms",), mean_log_p, of_relations=False)
 RELATIONS: Final = Answer(("relations", "false_relations"), relation_precision)
-COMPLETION: Final = Answer(("completion",), completion_precision)
+COMPLETION: Final = Answer(("completion",), partial(relation_precision, ask=complete_scenes))
 AT_PLACE: Final = Answer(("at_place",), placed_mrr)
 MISPLACED: Final = Answer(("misplaced",), named_moved)
 
