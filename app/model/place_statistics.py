@@ -3,13 +3,14 @@
 The counts serve two purposes. The roles decide between on, under and in for boxes that reach into
 each other (`app.scene.roles`). The triples tell which classes stand at a place, such as on a desk:
 
-    p(i at a, j) = (held(a, i, j) + s · p(i at a)) / (held(a, any class, j) + s)
-    p(i at a)    = (held(a, i, any class) + m · p(i)) / (held(a, any class, any class) + m)
+    p(i at a, j) = (N(a, i, j) + s · p(i at a)) / (N(a, any class, j) + s)
+    p(i at a)    = (N(a, i, any class) + m · p(i)) / (N(a, any class, any class) + m)
 
-held is the number of scenes with a relation a from class i to class j, or in the other direction.
+N is the number of scenes with a relation a from class i to class j, or in the other direction.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Final
@@ -42,9 +43,10 @@ class Places(TensorGroup):
 
     prefix: ClassVar[str] = "places."
     integers = ("triple", "role_pair")
+    stored_as: ClassVar[Mapping[str, str]] = {"triple_scenes": "held"}
 
     triple: Annotated[NDArray[np.int32], "N"]  # keys (a V + i) V + j of a(i, j), ascending
-    held: Annotated[NDArray[np.float32], "N"]  # number of training scenes with each triple
+    triple_scenes: Annotated[NDArray[np.float32], "N"]  # number of training scenes with each triple
     frequency: Annotated[NDArray[np.float32], "V"]  # share of the listed classes in training
     role_pair: Annotated[NDArray[np.int32], "P"]  # this and the next two: see `RoleCounts`
     role_counts: Annotated[NDArray[np.float32], "P", 3]
@@ -56,7 +58,7 @@ class Places(TensorGroup):
         self.require(len(self.triple), "there must be at least one triple")
         self.require_keys("triple", A * V * V)
         self.require_keys("role_pair", V * V)
-        counts = self.held, self.role_counts, self.role_anchor, self.stands
+        counts = self.triple_scenes, self.role_counts, self.role_anchor, self.stands
         is_right = all((array >= 0).all() for array in counts) and (self.frequency > 0).all()
         self.require(is_right, "counts must be at least 0, and frequencies must be above 0")
 
@@ -82,7 +84,9 @@ class Places(TensorGroup):
     ) -> Bool[NDArray[np.bool_], "N M"]:
         """Return whether training shows a relation of classes. A single scene may be an error."""
         V = len(self.frequency)
-        return _triple_counts(self.triple, self.held, V, relation, subject, other) >= _SHOWN
+        return (
+            _triple_counts(self.triple, self.triple_scenes, V, relation, subject, other) >= _SHOWN
+        )
 
     def supporters(
         self, subject: Int[Indices, "N"], other: Int[Indices, "M"]
@@ -91,7 +95,9 @@ class Places(TensorGroup):
         total, share = self._supporters
         V, of_pairs = len(self.frequency), _SUPPORTER * share[other]
         for a in SUPPORTS:
-            of_pairs = of_pairs + _triple_counts(self.triple, self.held, V, a, subject, other)
+            of_pairs = of_pairs + _triple_counts(
+                self.triple, self.triple_scenes, V, a, subject, other
+            )
         return of_pairs / (total[subject, None] + _SUPPORTER)
 
     @cached_property
@@ -100,8 +106,8 @@ class Places(TensorGroup):
         V = len(self.frequency)
         is_support = np.isin(self.triple // (V * V), SUPPORTS)
         subject, other = np.divmod(self.triple[is_support] % (V * V), V)
-        held = self.held[is_support]
-        total, count = (np.bincount(role, held, V).astype(float) for role in (subject, other))
+        scenes = self.triple_scenes[is_support]
+        total, count = (np.bincount(role, scenes, V).astype(float) for role in (subject, other))
         return total, (count + _SEEN) / (count + _SEEN).sum()
 
     @cached_property
@@ -151,10 +157,12 @@ class Places(TensorGroup):
             key = a.astype(np.int64) * V + anchor
             order = np.argsort(key, kind="stable")
             back_off = np.zeros((A, V)) + _RELATION * share
-            np.add.at(back_off, (a, other), self.held)
+            np.add.at(back_off, (a, other), self.triple_scenes)
             back_off /= back_off.sum(1, keepdims=True)
             start = np.searchsorted(key[order], np.arange(A * V + 1))
-            tables.append((start, other[order], self.held[order].astype(np.float64), back_off))
+            tables.append(
+                (start, other[order], self.triple_scenes[order].astype(np.float64), back_off)
+            )
         return tuple(tables)
 
 
@@ -181,7 +189,7 @@ def add_unseen(
 @compiled
 def _triple_counts(
     triple: Int[NDArray, " R"],
-    held: Float[NDArray, " R"],
+    triple_scenes: Float[NDArray, " R"],
     V: int,
     relation: int,
     subject: Int[NDArray, " N"],
@@ -193,5 +201,5 @@ def _triple_counts(
         for j in range(len(other)):
             row = find_row(triple, (relation * V + subject[i]) * V + other[j])
             if row >= 0:
-                counts[i, j] = held[row]
+                counts[i, j] = triple_scenes[row]
     return counts
