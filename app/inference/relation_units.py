@@ -8,7 +8,7 @@ module treats the logit as a normal variable with
     mean base_e + U_e·m   and variance   σ_e² = sum_u [sum_z U_euz² m_uz - (sum_z U_euz m_uz)²]
 
 where m_uz is the probability of state z of hidden unit u (its first state has the weight 0).
-`app.inference.quadrature` computes the mean of sigmoid(ℓ_e). The variant of the machine defines
+`app.inference.elementary` computes the mean of sigmoid(ℓ_e). The variant of the machine defines
 base and U. Each unit of `FreeUnits` has its own row of U. `SharedUnits` computes U from factors.
 """
 
@@ -24,8 +24,8 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled, compiled_in_any_order
+from app.inference.elementary import to_log_odds
 from app.inference.implications import implication_shifts
-from app.inference.quadrature import to_log_odds
 from app.inference.weights import Weights, state_means
 
 Means = Float[NDArray, "B H1"]

@@ -162,7 +162,7 @@ def staying(
     Relations of the evidence always stay. The function then tries the other relations one by one,
     likeliest first. A tried relation stays if all of these conditions are met:
 
-    - The relations kept so far contain no relation between its two classes. `app.scene.geometry`
+    - The relations kept so far contain no relation between its two classes. `app.scene.scene`
       also finds at most one relation between two objects.
     - The relation does not close a cycle, such as A left of B, B left of C, C left of A.
     - If the relation is *on-top*, no kept relation places its subject on top of another class.

@@ -3,7 +3,7 @@
 The answers are object classes that the scene does not list (candidates), and their placements
 (`app.questions.placements`). Structural classes (floor, wall) are neither candidates nor anchors of
 placements. `more` adds listed classes with probably more instances than listed, by the statistics
-of counts (`app.model.count_statistics`).
+of counts (`app.model.Counts`).
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence

@@ -13,10 +13,9 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled
-from app.inference.quadrature import NO_UNIT
-from app.model.offset_statistics import UNOBSERVED, rotated_offsets
-from app.model.place_statistics import add_unseen
+from app.inference.elementary import NO_UNIT
 from app.model.scene_model import SceneModel
+from app.model.statistics import UNOBSERVED, add_unseen, rotated_offsets
 from app.questions.answer import Fields, best, significant
 from app.questions.posterior import Posterior, exclusive, relation_probability
 from app.scene.scene import Scene, SceneObject, boxes_of

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from app.compiling import compiled, inlined
 from app.inference import MachineSpec
-from app.inference.elementary import logistic
-from app.inference.quadrature import to_log_odds
+from app.inference.elementary import logistic, to_log_odds
 from app.inference.relation_units import ObservedRelations, RelationLogits, encode
 from app.model.calibration import LEAST_COVERAGE, Calibration, CountSlope, CoverageFit
 from app.model.scene_model import SceneModel

@@ -11,10 +11,9 @@ from itertools import compress, count
 from app.errors import ContradictionError, InvalidRequestError, Location
 from app.questions.names import ErrorList, LookUps, Names, Unknown
 from app.questions.scene_warnings import scene_warnings
-from app.scene.geometry import Viewpoint
 from app.scene.relation_table import RelationTable, Triple
 from app.scene.roles import RoleCounts
-from app.scene.scene import Scene, SceneObject, observe
+from app.scene.scene import Scene, SceneObject, Viewpoint, observe
 from app.scene.spatial_relations import CANONICAL, canonicalise, support_cycle
 from app.scene.vocabulary import Vocabulary
 from scene_client.frames import body_pose, is_optical, is_world_fixed

@@ -10,8 +10,7 @@ from itertools import compress
 from statistics import median
 from typing import Final
 
-from app.scene.geometry import LARGEST, MOST_DISTANT, SMALLEST
-from app.scene.scene import Point, Scene, SceneObject
+from app.scene.scene import LARGEST, MOST_DISTANT, SMALLEST, Point, Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
 from scene_client.frames import is_optical, is_world_fixed
 from scene_client.schemas import Detection, SceneRequest, SceneWarning

@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 from safetensors import SafetensorError, deserialize
 from safetensors.numpy import save
 
-from app.model.count_statistics import ROOM
 from app.model.fields import TensorGroup
+from app.model.statistics import ROOM
 from app.registry.errors import ArtifactError
 from app.registry.manifest import WEIGHTS, TensorEntry
 

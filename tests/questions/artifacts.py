@@ -12,8 +12,8 @@ from app.model.calibration import (
     Judgement,
     Misplaced,
 )
-from app.model.place_statistics import Places
 from app.model.scene_model import SceneModel
+from app.model.statistics import Places
 from app.scene import ObjectClass, RelationTable, Scene, SceneObject, Vocabulary
 from tests.enumeration.small_machines import SMALL, random_weights
 from training.machines import BoltzmannMachine, MachineSpec, build

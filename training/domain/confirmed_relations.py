@@ -2,7 +2,7 @@
 
 The new model never reports a confirmed relation of two classes (`app.model.Misplaced.confirmed`).
 The relation also counts like `_SCENES` training scenes in the places of the model
-(`app.model.place_statistics`), so the place becomes a usual one for missing objects.
+(`app.model.Places`), so the place becomes a usual one for missing objects.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from app.model import SceneModel
-from app.model.count_statistics import Counts
+from app.model.statistics import Counts
 from app.questions.missing import LIKELY, more
 from app.questions.posterior import present
 from training.datasets import EncodedScene

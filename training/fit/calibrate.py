@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from app.inference.quadrature import NO_UNIT
+from app.inference.elementary import NO_UNIT
 from app.model import Calibration, CountSlope, SceneModel
 from app.questions.placements import PLACES
 from app.questions.posterior import Posterior
