@@ -115,13 +115,14 @@ class RelationUnits(ABC):
 
     def __init__(self, weights: Weights) -> None:
         self._W, self._A, self._V = weights["W"], weights.spec.A, weights.spec.V
+        self._all = slice(0, self._A)  # relations
         self._states = weights.spec.states
 
     @abstractmethod
     def moments(
-        self, means: Means, pairs: Pairs, only: int | None = None, *, sampled: bool = False
+        self, means: Means, pairs: Pairs, chosen: slice, *, sampled: bool = False
     ) -> Moments:
-        """Return the moments of `only`, or of all relations; the mean is `NEVER` without a unit."""
+        """Return the moments of the chosen relations; the mean is `NEVER` without a unit."""
 
     def logits(self, scene: EncodedScene) -> RelationLogits:
         """Return the logits of all relations between the classes of a scene."""
@@ -129,7 +130,7 @@ class RelationUnits(ABC):
         pairs = Pairs(scene.classes, scene.log_counts, scene.presence, *all_pairs(n))
         mean, spread = (
             part.reshape(self._A, n, n)
-            for part in self.moments(state_means(scene.x[None], self._states), pairs)
+            for part in self.moments(state_means(scene.x[None], self._states), pairs, self._all)
         )
         weight = None if observed is None else self.implication_weights(scene.x)
         if observed is None or weight is None:
@@ -183,7 +184,8 @@ class RelationUnits(ABC):
             *(i, j),
         )
         means = state_means(scene.x + self._W[candidates], self._states)
-        log_odds = to_log_odds(*self.moments(means, pairs, only))
+        chosen = self._all if only is None else slice(only, only + 1)
+        log_odds = to_log_odds(*self.moments(means, pairs, chosen))
         return log_odds[:, :, :m], log_odds[:, :, m:]
 
 
@@ -204,10 +206,9 @@ class FreeUnits(RelationUnits):
         self._index[index] = np.arange(len(self._U))
 
     def moments(
-        self, means: Means, pairs: Pairs, only: int | None = None, *, sampled: bool = False
+        self, means: Means, pairs: Pairs, chosen: slice, *, sampled: bool = False
     ) -> Moments:
         """Return means and √3 σ of logits by the formula, which gives samples the variance 0."""
-        chosen = _chosen_relations(self._A, only)
         shape = len(means), chosen.stop - chosen.start, pairs.i.shape[1]
         # Row b of the means, relation a and pair p of each entry of the result.
         b, a, p = (indices.reshape(-1) for indices in np.indices(shape))
@@ -278,10 +279,9 @@ class SharedUnits(RelationUnits):
             self._gamma = gamma.reshape(len(gamma), -1)
 
     def moments(
-        self, means: Means, pairs: Pairs, only: int | None = None, *, sampled: bool = False
+        self, means: Means, pairs: Pairs, chosen: slice, *, sampled: bool = False
     ) -> Moments:
         """Return means and √3 σ of logits from the factors of the classes."""
-        chosen = _chosen_relations(self._A, only)
         Y = self._Y[chosen, :0] if sampled else self._Y[chosen]
         U = self._products(chosen, means, self._GT) + self._g[chosen]
         # The covariance of h1 is diag(m) - m m' within each hidden unit, and 0 between units.
@@ -319,11 +319,11 @@ class StandIns(RelationUnits):
         self._units, self._stand_in = units, stand_in
 
     def moments(
-        self, means: Means, pairs: Pairs, only: int | None = None, *, sampled: bool = False
+        self, means: Means, pairs: Pairs, chosen: slice, *, sampled: bool = False
     ) -> Moments:
         """Return means and √3 σ of the logits of the stand-ins."""
         pairs = pairs._replace(classes=self._stand_in[pairs.classes])
-        return self._units.moments(means, pairs, only, sampled=sampled)
+        return self._units.moments(means, pairs, chosen, sampled=sampled)
 
     def implication_weights(
         self, x: Float[NDArray, " H1"], beta: float = 1.0
@@ -340,11 +340,6 @@ def relation_units(weights: Weights) -> RelationUnits:
 def _columns(matrices: Float[NDArray, "A n H1"]) -> Float[NDArray, "H1 A*n"]:
     """Convert the n rows of each relation to columns. Matrix products with columns are faster."""
     return np.ascontiguousarray(matrices.reshape(-1, matrices.shape[2]).T)
-
-
-def _chosen_relations(relations: int, only: int | None) -> slice:
-    """Return a slice of the relation `only`, or of all relations. A slice copies no array."""
-    return slice(0, relations) if only is None else slice(only, only + 1)
 
 
 def _directions(weights: Weights) -> tuple[Float[NDArray, "A r H1"], Float[NDArray, "A r K+1"]]:

@@ -30,7 +30,7 @@ from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, rounded_number
 from app.questions.names import ErrorList
 from app.questions.outliers import intruders
-from app.questions.posterior import Present, given_relations, present
+from app.questions.posterior import Present, present
 from app.questions.question import BEDROOM, POSES, REFUSED, Example, Options, Question
 from app.questions.reading import Reading
 from app.scene.relation_table import Triple
@@ -79,8 +79,7 @@ def generate(
         True
     """
     listing = present(scene, model.spec)
-    observed = given_relations(scene, listing, model.spec.A)
-    conditions = Conditions(listing.classes, observed, scene.room_type, scene.profile)
+    conditions = Conditions(listing.classes, listing.observed, scene.room_type, scene.profile)
     chains = model.scene_chains.under(conditions, temperature)
     shown = ~model.vocabulary.structure
     shown[conditions.classes] = True

@@ -53,7 +53,9 @@ def place_log_p(
 ) -> Float[NDArray[np.floating[Any]], "N"]:
     """Return log p(relation to the anchor | candidate is present), not calibrated."""
     anchor = posterior.present.row[[place.anchor]]
-    forward, backward = posterior.placement_log_odds(candidates, anchor, place.relation)
+    forward, backward = posterior.units.placement_log_odds(
+        posterior.context, candidates, anchor, place.relation
+    )
     log_odds = (forward if place.outgoing else backward)[:, 0, 0]
     return -np.logaddexp(np.float32(0.0), -log_odds)
 
@@ -79,7 +81,7 @@ def placements(
     anchors = (~model.vocabulary.structure[present.classes]).nonzero()[0]
     if not len(anchors):
         return [[] for _ in candidates]
-    forward, backward = posterior.placement_log_odds(candidates, anchors)
+    forward, backward = posterior.units.placement_log_odds(posterior.context, candidates, anchors)
     A, objects, stand_in = forward.shape[1], present.first[anchors], model.vocabulary.stand_in
     classes, candidates = stand_in[present.classes[anchors]], stand_in[candidates]
     first = -1  # number of the requested place in `_likeliest_places`; -1 without a request
