@@ -261,7 +261,6 @@ class SharedUnits(RelationUnits):
             table=table,
             residual=residual,
         )
-        self._G = np.concatenate([weights["M"], weights["P"][:, None]], 1)
         self._g = np.concatenate([weights["R"], weights["d"][:, None]], 1)
         F, self._Y = _directions(weights)
         # (units, states - 1, A r): a matrix product sums over the states of each unit.
@@ -270,7 +269,7 @@ class SharedUnits(RelationUnits):
         p, q = np.tril_indices(F.shape[1])
         twice = np.where(p == q, np.float32(1), np.float32(2))  # int64 would give float64 products
         self._FF = _columns(F[:, p] * F[:, q] * twice[:, None])
-        self._GT = _columns(self._G)
+        self._GT = _columns(np.concatenate([weights["M"], weights["P"][:, None]], 1))
         self._B = weights["B"] if weights.spec.G else None
         if self._B is not None:
             gamma = weights["gamma"].swapaxes(1, 2).copy()
@@ -283,21 +282,17 @@ class SharedUnits(RelationUnits):
     ) -> Moments:
         """Return means and √3 σ of logits from the factors of the classes."""
         Y = self._Y[chosen, :0] if sampled else self._Y[chosen]
-        U = self._products(chosen, means, self._GT) + self._g[chosen]
+        B, (R, r, _) = len(means), Y.shape
         # The covariance of h1 is diag(m) - m m' within each hidden unit, and 0 between units.
-        C, (R, r, _) = self._products(chosen, means, self._FF), Y.shape
-        by_unit = means.reshape(len(means), -1, self._states - 1).transpose(1, 0, 2)
+        U, C = (
+            (means @ columns[:, chosen].reshape(len(columns), -1)).reshape(B, R, -1)
+            for columns in (self._GT, self._FF)
+        )
+        U += self._g[chosen]
+        by_unit = means.reshape(B, -1, self._states - 1).transpose(1, 0, 2)
         f = by_unit @ self._F[:, :, chosen.start * r : chosen.stop * r]
-        f = f.reshape(len(f), len(means), R, r)
+        f = f.reshape(len(f), B, R, r)
         return _shared_moments(self._w, chosen.start, pairs, U, Y, C, f)
-
-    def _products(
-        self, chosen: slice, rows: Float[NDArray, "B H1"], columns: Float[NDArray, "H1 A*n"]
-    ) -> Float[NDArray, "B R n"]:
-        """Return the product of the rows with n columns of each chosen relation; see `_columns`."""
-        n = columns.shape[1] // self._A
-        products = rows @ columns[:, chosen.start * n : chosen.stop * n]
-        return products.reshape(len(rows), -1, n)
 
     def implication_weights(
         self, x: Float[NDArray, " H1"], beta: float = 1.0
@@ -337,9 +332,9 @@ def relation_units(weights: Weights) -> RelationUnits:
     return SharedUnits(weights) if weights.spec.kind.factorised else FreeUnits(weights)
 
 
-def _columns(matrices: Float[NDArray, "A n H1"]) -> Float[NDArray, "H1 A*n"]:
+def _columns(matrices: Float[NDArray, "A n H1"]) -> Float[NDArray, "H1 A n"]:
     """Convert the n rows of each relation to columns. Matrix products with columns are faster."""
-    return np.ascontiguousarray(matrices.reshape(-1, matrices.shape[2]).T)
+    return np.ascontiguousarray(matrices.transpose(2, 0, 1))
 
 
 def _directions(weights: Weights) -> tuple[Float[NDArray, "A r H1"], Float[NDArray, "A r K+1"]]:

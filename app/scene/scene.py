@@ -259,8 +259,9 @@ def to_viewer_frame(
     Raises:
         ValueError: a shape is wrong.
     """
-    points = _array("positions", positions, (len(positions), 3))
-    turns = np.zeros(len(points)) if yaws is None else _array("yaws", yaws, (len(points),))
+    points = np.asarray(positions, np.float64).reshape(len(positions), 3)
+    turns = np.zeros(len(points)) if yaws is None else np.asarray(yaws, np.float64)
+    turns = turns.reshape(len(points))
     cos, sin = math.cos(viewpoint.yaw), math.sin(viewpoint.yaw)
     dx, dy = points[:, 0] - viewpoint.x, points[:, 1] - viewpoint.y
     turned = np.stack([cos * dx + sin * dy, cos * dy - sin * dx, points[:, 2]], axis=1)
@@ -282,10 +283,11 @@ def derive_relations(
         ValueError: a shape is wrong, a value is infinite, a size is negative, or the counts lack a
             class.
     """
-    points = _array("positions", positions, (len(positions), 3))
-    n = len(points)
-    extents = _array("sizes", sizes, (n, 3))
-    turns = np.zeros(n) if yaws is None else _array("yaws", yaws, (n,))
+    n = len(positions)
+    points, extents = (
+        np.asarray(rows, np.float64, order="C").reshape(n, 3) for rows in (positions, sizes)
+    )
+    turns = np.zeros(n) if yaws is None else np.asarray(yaws, np.float64, order="C").reshape(n)
     if np.isinf(points).any() or np.isinf(extents).any() or not np.isfinite(turns).all():
         raise ValueError("positions, sizes and yaws must not be infinite, and yaws must not be NaN")
     if np.any(extents < 0):
@@ -321,16 +323,6 @@ def excluded_by_centres(
     radius[np.isnan(radius)] = UNKNOWN_REACH
     excluded[ON_TOP:] = np.hypot(dx, dy) > radius[:, None] + radius  # the stacked relations
     return excluded
-
-
-def _array(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Float[NDArray, "..."]:
-    """Return the values as an array of this shape, or raise ValueError with the argument's name."""
-    array = np.asarray(values, dtype=np.float64, order="C")
-    if array.size == 0 and 0 in shape:
-        return array.reshape(shape)
-    if array.shape != shape:
-        raise ValueError(f"{name} must have the shape {shape}, not {array.shape}")
-    return array
 
 
 @compiled
