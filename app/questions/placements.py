@@ -4,7 +4,7 @@ A placement is a relation between a candidate, a class that may be missing, and 
 called the anchor. An offset is the distance vector between the centres of both.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import repeat
 from typing import Any, Final, NamedTuple, Self
 
@@ -18,13 +18,12 @@ from app.model.scene_model import SceneModel
 from app.model.statistics import UNOBSERVED, add_unseen, rotated_offsets
 from app.questions.answer import Fields, best, significant
 from app.questions.posterior import Posterior, exclusive, relation_probability
-from app.scene.scene import Scene, SceneObject, boxes_of
+from app.scene.scene import Scene, boxes_of
 from app.scene.spatial_relations import INSIDE, ON_TOP, RELATIONS, SUPPORTS, canonicalise, opposite
 from app.scene.vocabulary import do_not_fit
 from scene_client.frames import Axes
 
 Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 PLACES: Final = 3  # maximum number of placements in the answer for one class
 
@@ -100,9 +99,14 @@ def placements(
     if A > ON_TOP and model.places is not None:
         add_unseen(*model.places.unseen, candidates, classes, forward, backward)
     if A > INSIDE:
-        candidates_too_large, things_too_large = _too_large(model, things, candidates, classes)
-        forward[:, INSIDE][candidates_too_large] = NO_UNIT
-        backward[:, INSIDE][things_too_large] = NO_UNIT
+        sizes = model.vocabulary.sizes
+        has_sizes = any(thing.size is not None for thing in things)
+        inner, outer = (
+            sizes[candidates],
+            boxes_of(things, sizes)[1] if has_sizes else sizes[classes],
+        )
+        forward[:, INSIDE][do_not_fit(inner, outer)] = NO_UNIT
+        backward[:, INSIDE][do_not_fit(outer, inner).T] = NO_UNIT
     slopes, log_counts = model.relation_slopes.placement, present.log_counts[anchors]
     rows, relations, outgoing, columns, p = _likeliest_places(
         slopes, forward, backward, log_counts, PLACES, first, LEAST_SHARE, LEAST_LIKELY
@@ -144,20 +148,6 @@ def supported_objects(model: SceneModel, posterior: Posterior, scene: Scene) -> 
         if a == INSIDE
         or (a == ON_TOP and not (places and places.means_under(classes[i], classes[j])))
     ]
-
-
-def _too_large(
-    model: SceneModel,
-    things: Sequence[SceneObject],
-    candidates: Int[Indices, "N"],
-    classes: Int[Indices, "m"],
-) -> tuple[Bool[Mask, "N m"], Bool[Mask, "N m"]]:
-    """Return which candidates do not fit into each object, and which objects into candidates."""
-    rows, vocabulary = candidates[:, None], model.vocabulary
-    if all(thing.size is None for thing in things):
-        return vocabulary.too_large[rows, classes], vocabulary.too_large[classes, rows]
-    inner, (_, outer) = vocabulary.sizes[candidates], boxes_of(things, vocabulary.sizes)
-    return do_not_fit(inner, outer), do_not_fit(outer, inner).T
 
 
 def _offset_fields(
