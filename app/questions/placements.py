@@ -101,10 +101,8 @@ def placements(
     if A > INSIDE:
         sizes = model.vocabulary.sizes
         has_sizes = any(thing.size is not None for thing in things)
-        inner, outer = (
-            sizes[candidates],
-            boxes_of(things, sizes)[1] if has_sizes else sizes[classes],
-        )
+        inner = sizes[candidates]
+        outer = boxes_of(things, sizes)[1] if has_sizes else sizes[classes]
         forward[:, INSIDE][do_not_fit(inner, outer)] = NO_UNIT
         backward[:, INSIDE][do_not_fit(outer, inner).T] = NO_UNIT
     slopes, log_counts = model.relation_slopes.placement, present.log_counts[anchors]
