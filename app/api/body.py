@@ -84,7 +84,12 @@ def parse(body: bytes, most: int) -> Any:
         InvalidRequestError: the body has too many arrays or objects, an object has more than
             `MAX_MEMBERS` members, or a list of a large body has more than `MAX_BATCH` entries.
     """
-    _check_density(body, most)
+    # A large body has at most one array or object, such as `[1,2],`, per 5 bytes.
+    for start in range(0, len(body), most) if len(body) > SMALL else ():
+        part = body[start : start + most]
+        if part.count(b"[") + part.count(b"{") > len(part) // 5:
+            fewer = f"more than {len(part) // 5} arrays and objects."
+            raise _invalid(f"{len(part)} bytes of the body have {fewer}")
     try:
         if len(body) > most:
             return _in_pieces(body.decode(), most)
@@ -101,15 +106,6 @@ def parse(body: bytes, most: int) -> Any:
                 "Comments, trailing commas, NaN, None and True are not JSON."
             )
         raise errors.NotJSONError(detail, errors=not_finite) from None
-
-
-def _check_density(body: bytes, most: int) -> None:
-    """Check that a large body has at most one array or object, such as `[1,2],`, per 5 bytes."""
-    for start in range(0, len(body), most) if len(body) > SMALL else ():
-        part = body[start : start + most]
-        if part.count(b"[") + part.count(b"{") > len(part) // 5:
-            fewer = f"more than {len(part) // 5} arrays and objects."
-            raise _invalid(f"{len(part)} bytes of the body have {fewer}")
 
 
 def _invalid(detail: str) -> errors.InvalidRequestError:
@@ -261,16 +257,14 @@ class JSONRoute(APIRoute):
         runtime: Runtime = scope["app"].state.runtime
         schema: Any = self.body_field.field_info.annotation  # type: ignore[union-attr]
         most = http.app.state.settings.max_scene_bytes
-
-        def read(_: object) -> tuple[Any, Any]:
-            value = parse(body, most)
-            return value, validated(value, schema)
-
         ticket = scope["state"]["ticket"]
         if len(body) <= SMALL:
-            value, data = read(None)
+            value = parse(body, most)
+            data = validated(value, schema)
         else:
-            value, data = await runtime.admission.in_worker(ticket, read)
+            in_worker = runtime.admission.in_worker
+            value = await in_worker(ticket, lambda _: parse(body, most))
+            data = await in_worker(ticket, lambda _: validated(value, schema))
         try:
             answer: bytes = await self.endpoint(data=data, http=http, **scope["path_params"])
         except errors.RequestError as error:

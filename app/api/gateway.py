@@ -7,9 +7,9 @@ import hmac
 import logging
 import re
 from asyncio import CancelledError
-from collections.abc import Sequence
+from dataclasses import dataclass, field
 from time import monotonic, perf_counter
-from typing import Any, Final
+from typing import Final
 from uuid import uuid4
 
 from pydantic import SecretStr
@@ -22,8 +22,7 @@ from app import errors
 from app.api.problems import answer, from_exception
 from app.questions import QUESTIONS
 from app.serving.admission import SMALL, Admission, Bodies, Ticket
-from app.serving.models import NO_MODELS
-from app.serving.request import SUCCESS, Record
+from app.serving.models import NO_MODELS, Key
 from app.serving.runtime import Runtime
 from app.settings import Settings
 
@@ -78,15 +77,36 @@ def gateway(app: ASGIApp, settings: Settings, runtime: Runtime) -> ASGIApp:
     return Recorded(steps, app, settings, runtime)
 
 
-def route_path(scope: Scope) -> str:
-    """Return the path of a request below the root path of the service."""
-    path: str = scope["path"]
-    return path.removeprefix(scope.get("root_path", ""))
+SUCCESS: Final = "success"
+
+
+@dataclass(slots=True)
+class Record:
+    """Values of a request for log and metrics. The gateway reads them after the response."""
+
+    outcome: str = SUCCESS  # or the slug of the problem type in the response
+    status: int = 0  # HTTP status; 0 before the response starts
+    models: set[Key] = field(default_factory=set)  # models that the request used
+    queue_seconds: float | None = None  # total time that scenes waited; None without a model
+    compute_seconds: float | None = None  # total time that models computed; None without a model
+
+    def log_fields(self) -> dict[str, str | float]:
+        """Return the fields for the access log line, and the model if the request used only one."""
+        entry: dict[str, str | float] = {"outcome": self.outcome}
+        if len(self.models) == 1:
+            ((entry["model"], entry["version"]),) = self.models
+        if self.queue_seconds is not None:
+            entry["queue_ms"] = round(self.queue_seconds * 1e3, 3)
+        if self.compute_seconds is not None:
+            entry["compute_ms"] = round(self.compute_seconds * 1e3, 3)
+        return entry
 
 
 class Recorded:
     """Complete the headers of each response, and record the request in metrics and access log.
 
+    Later steps find in ``scope["state"]`` the `Record`, the request id, and the path below the root
+    path of the service.
     The client may choose the request id: 1 to 128 unreserved URI characters or colons. The
     application ``other`` gets everything but requests, such as the start of the service.
     """
@@ -107,16 +127,26 @@ class Recorded:
             request_id = str(uuid4()).encode()
         upgrades = any(name == b"upgrade" for name, _ in headers)
         record = Record()
-        scope.setdefault("state", {}).update(request_id=request_id.decode(), record=record)
+        scope.setdefault("state", {}).update(
+            request_id=request_id.decode(),
+            record=record,
+            path=scope["path"].removeprefix(scope.get("root_path", "")),
+        )
 
         async def send_completed(message: Message) -> None:
             if message["type"] == "http.response.start":
                 record.status = message["status"]
-                message["headers"] = _with_defaults(message.get("headers", ()), request_id)
+                completed = [*message.get("headers", ()), *_ALWAYS, (b"x-request-id", request_id)]
+                names = {name for name, _ in completed}
+                if b"content-security-policy" not in names:
+                    completed.append(_POLICY)
+                if not names & {b"cache-control", b"etag"}:
+                    completed.append(_NOT_KEPT)
                 # While draining, the client's next request must go to another replica. After a
                 # request to upgrade, the parser would read its body as the next request.
                 if self._runtime.draining or upgrades:
-                    message["headers"].append((b"connection", b"close"))
+                    completed.append((b"connection", b"close"))
+                message["headers"] = completed
             await send(message)
 
         try:
@@ -152,16 +182,6 @@ class Recorded:
             _access.handle(line)
 
 
-def _with_defaults(headers: Sequence[tuple[bytes, bytes]], request_id: bytes) -> list[Any]:
-    names = {name for name, _ in headers}
-    completed = [*headers, *_ALWAYS, (b"x-request-id", request_id)]
-    if b"content-security-policy" not in names:
-        completed.append(_POLICY)
-    if b"cache-control" not in names and b"etag" not in names:
-        completed.append(_NOT_KEPT)
-    return completed
-
-
 class HostCheck:
     """Refuse requests whose Host header does not name this service.
 
@@ -178,7 +198,7 @@ class HostCheck:
         hosts = [value for name, value in scope["headers"] if name == b"host"]
         host = _HOST.fullmatch(hosts[0].lower()) if len(hosts) == 1 else None
         is_named = host is not None and (host[1] in self._names or _ADDRESS.fullmatch(host[1]))
-        if is_named or route_path(scope) in HEALTH:
+        if is_named or scope["state"]["path"] in HEALTH:
             await self._app(scope, receive, send)
             return
         detail = (
@@ -223,7 +243,7 @@ class KeyCheck:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or raise UnauthorizedError if it lacks the key."""
-        path, headers = route_path(scope), Headers(scope=scope)
+        path, headers = scope["state"]["path"], Headers(scope=scope)
         scheme, _, token = headers.get("authorization", "").partition(" ")
         key = headers.get(API_KEY) or (token.strip() if scheme.lower() == "bearer" else "")
         # The comparison takes constant time. Otherwise the response time would show how many
@@ -249,7 +269,7 @@ class Deadline:
             NotReadyError: the service is starting.
             BadRequestError: the time limit in the header of the request is invalid.
         """
-        if route_path(scope) in HEALTH:
+        if scope["state"]["path"] in HEALTH:
             await self._health(scope, receive, send)
             return
         if self._runtime.models is NO_MODELS:
@@ -284,14 +304,14 @@ class Size:
         """Pass a request on. The errors are those of `Bodies.read`."""
         client, body = scope["state"]["ticket"].client, b""
         if scope["method"] in _WITH_BODY:
-            limit = self._limit if route_path(scope) in _LARGE else self._limit_of_scene
+            limit = self._limit if scope["state"]["path"] in _LARGE else self._limit_of_scene
             length = next((v for name, v in scope["headers"] if name == b"content-length"), b"")
             body = await self._bodies.read(receive, client, limit, length)
         scope["state"]["body"] = body
         try:
             await self._app(scope, receive, send)
         finally:
-            self._bodies.release(client, len(body))
+            self._bodies.add(client, -len(body))
 
 
 class Turn:
@@ -316,13 +336,15 @@ class Turn:
         try:
             if len(scope["state"]["body"]) > SMALL:
                 await ticket.enter(self._slow, 1)
-            elif self._quick.is_full(ticket.client, 1):
-                # A refusal takes a turn, too. Otherwise refusals of one client would take the time
-                # of all others.
-                await ticket.enter(self._quick, 0)
-                raise errors.QueueFullError("Too many requests of this client are waiting.")
             else:
-                await ticket.enter(self._quick, 1)
+                try:
+                    await ticket.enter(self._quick, 1)
+                except errors.QueueFullError as error:
+                    # A refusal takes a turn, too. Otherwise refusals of one client would take the
+                    # time of all others.
+                    await ticket.enter(self._quick, 0)
+                    error.detail = "Too many requests of this client are waiting."
+                    raise
             await self._app(scope, receive, send_after_turn)
         finally:
             ticket.leave()

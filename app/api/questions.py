@@ -3,23 +3,38 @@
 The answer to a batch has one entry for each scene.
 """
 
-from typing import Any, TypeVar
+from collections.abc import Callable, Mapping
+from functools import partial
+from time import monotonic
+from typing import Any, Final, TypeAlias, TypeVar
 
 from fastapi import APIRouter
 from pydantic_core import to_json
 from starlette.requests import Request
 
 from app.api.body import JSONRoute, validated
+from app.api.gateway import SUCCESS, Record
 from app.api.openapi import error_responses, operation_id
 from app.api.problems import from_exception
 from app.errors import AnswerTooLargeError, LocatedError, RequestError
 from app.questions import QUESTIONS, Question
-from app.serving import request as serving
+from app.questions.answer import Fields, envelope, written_within
+from app.questions.generate import STEPS
+from app.questions.names import LookUps, new_labels
+from app.questions.reading import Limits, Reading, read_scene
+from app.registry import Artifact
+from app.scene.vocabulary import Vocabulary
+from app.serving.admission import Admission, Ticket, in_thread
+from app.serving.models import ServedModels
+from app.serving.runtime import Runtime
 from scene_client.schemas import MAX_BATCH, BatchAnswer, BatchRequest, SceneRequest
 
 RequestT = TypeVar("RequestT", bound=SceneRequest)
 
 _FULL = "the batch has reached SCENE_MAX_ANSWER_BYTES. Send this scene in another request"
+
+# Text and fields of an answer, and the seconds that its scene waited and that the model computed.
+_Computed: TypeAlias = tuple[bytes, Fields, float, float]
 
 router = APIRouter(route_class=JSONRoute, generate_unique_id_function=operation_id)
 
@@ -27,52 +42,165 @@ router = APIRouter(route_class=JSONRoute, generate_unique_id_function=operation_
 # The tests validate answers against the schemas of the routes.
 
 
-def serving_request(http: Request) -> serving.Request:
-    """Create the serving request of an HTTP request. It uses one snapshot of the models."""
-    state, runtime = http.scope["state"], http.scope["app"].state.runtime
-    return serving.Request(
-        state["request_id"], state["ticket"], state["record"], runtime, runtime.models
+async def _answer(
+    http: Request,
+    question: Question[RequestT],
+    scene: RequestT,
+    models: ServedModels,  # the snapshot of the request
+    look_ups: LookUps,  # shared by all scenes of the request
+    most_bytes: int | None = None,
+) -> bytes:
+    """Ask the model in the field `model` of a scene one question. Return the answer as JSON.
+
+    The answer has at most ``most_bytes`` bytes, by default the limit of the service.
+
+    Raises:
+        UnknownModelError: the model does not exist.
+        ModelUnavailableError: the service refused to load the model.
+        RequestError: the scene is invalid, or the answer would be too large.
+        QueueFullError, DeadlinePassedError, DisconnectedError: see `admission`.
+    """
+    state = http.scope["state"]
+    runtime: Runtime = http.scope["app"].state.runtime
+    ticket: Ticket = state["ticket"]
+    record: Record = state["record"]
+    artifact = models.resolve(scene.model)
+    record.models.add(artifact.key)
+    admission = runtime.admission
+    most = runtime.limits.answer_bytes if most_bytes is None else most_bytes
+    read = partial(_read, question, scene, artifact, runtime.limits, look_ups)
+
+    def compute(began: float, reading: Reading, ask: Callable[[], Fields]) -> _Computed:
+        fields = ask()
+        seconds, waited = monotonic() - began, ticket.waited - (record.queue_seconds or 0.0)
+        record.queue_seconds = ticket.waited
+        record.compute_seconds = (record.compute_seconds or 0.0) + seconds
+        answer = envelope(scene, state["request_id"], artifact.reference, reading) | fields
+        answer["warnings"] = [*reading.warnings, *fields.get("warnings", ())]
+        if (body := written_within(answer, most)) is None:
+            raise _too_large(question, most)
+        return body, answer, waited, seconds
+
+    is_fast = is_quick(scene, artifact.model.vocabulary)
+    if question.samples:
+        reading, ask = read() if is_fast else await admission.in_worker(ticket, lambda _: read())
+        weight = ask.keywords["count"] * (ask.keywords["steps"] or STEPS)
+        # The models of a client take turns, too.
+        await ticket.enter(admission.draws, weight, line=(ticket.client, artifact.key))
+        computed = await in_thread(
+            lambda stop: compute(monotonic(), reading, partial(ask, stop=stop)),
+            ticket,
+            admission.drawing,
+        )
+    elif is_fast:
+        ticket.check()
+        computed = compute(monotonic(), *read())
+        ticket.check()
+    else:
+        computed = await admission.in_worker(ticket, lambda _: compute(monotonic(), *read()))
+    body, answer, waited, seconds = computed
+    runtime.metrics.computed(
+        artifact.key, question.name, waited, seconds, len(scene.objects), answer
     )
+    return body
+
+
+def _read(
+    question: Question[RequestT],
+    scene: RequestT,
+    artifact: Artifact,
+    limits: Limits,
+    look_ups: LookUps,
+) -> tuple[Reading, partial[Fields]]:
+    """Return the scene as the model reads it, and the call that computes the answer."""
+    model = artifact.model
+    reading = read_scene(
+        scene,
+        model.vocabulary,
+        limits,
+        look_ups,
+        roles=None if model.places is None else model.places.roles,
+        profiles=artifact.manifest.vocabulary.profiles,
+        may_be_empty=question.samples,
+    )
+    options = question.read(scene, model, reading)
+    words = list(reading.unknown.words.values())
+    enlarged = model.with_words(words) if words else model
+    return reading, partial(question.answer, enlarged, reading.scene, **options)
+
+
+def _too_large(question: Question[Any], most: int) -> AnswerTooLargeError:
+    """Return the error for an answer of too many bytes. It names the parameter to lower."""
+    fields = question.request.model_fields
+    field = next(name for name in ("count", "top_k", "objects") if name in fields)
+    message = (
+        f"the answer would have more than {most} bytes, the limit of SCENE_MAX_ANSWER_BYTES here. "
+        f"Lower `{field}`, send fewer objects, relations or scenes, or use shorter ids"
+    )
+    return AnswerTooLargeError([LocatedError((field,), message)])
+
+
+QUICK_OBJECTS: Final = 32
+QUICK_ENTRIES: Final = 256
+QUICK_LABELS: Final = 2
+"""Largest scene, lists and number of new labels of a question that the event loop computes.
+
+Such a question takes about 2 ms.
+"""
+
+
+def is_quick(scene: SceneRequest, vocabulary: Vocabulary) -> bool:
+    """Return whether the event loop may compute a question about a scene."""
+    return is_small(vars(scene)) and new_labels(scene, vocabulary) <= QUICK_LABELS
+
+
+def is_small(scene: Mapping[str, Any]) -> bool:
+    """Return whether the event loop may validate a scene, given by its fields."""
+    for name, value in scene.items():
+        if isinstance(value, list):
+            if len(value) > (QUICK_OBJECTS if name == "objects" else QUICK_ENTRIES):
+                return False
+        elif name == "top_k" and isinstance(value, int) and value > QUICK_ENTRIES:
+            return False
+    return True
 
 
 async def _answer_each(
     http: Request, batch: BatchRequest[RequestT], question: Question[RequestT]
 ) -> bytes:
-    request = serving_request(http)
-    results: list[bytes] = []
-    admission = request.runtime.admission
+    state = http.scope["state"]
+    runtime: Runtime = http.scope["app"].state.runtime
+    ticket, request_id, admission = state["ticket"], state["request_id"], runtime.admission
+    models, look_ups, results = runtime.models, LookUps(), list[bytes]()
     # The rest is for the problems of the scenes that the batch does not answer.
-    left = request.runtime.limits.answer_bytes // 16 * 15
-    await request.ticket.enter(admission.slow, len(batch.scenes))
+    left = runtime.limits.answer_bytes // 16 * 15
+    await ticket.enter(admission.slow, len(batch.scenes))
     for number, scene in enumerate(batch.scenes):
         try:
             if left <= 0:
                 raise AnswerTooLargeError([LocatedError((), _FULL)])
-            request.ticket.check()
-            data = await _validated(scene, question, number, request)
-            answer = await request.answer(question, data, left)
-            outcome, result = serving.SUCCESS, b'{"status":200,"result":%b}' % answer
+            ticket.check()
+            data = await _validated(scene, question, number, admission, ticket)
+            answer = await _answer(http, question, data, models, look_ups, left)
+            outcome, result = SUCCESS, b'{"status":200,"result":%b}' % answer
         except Exception as error:  # noqa: BLE001 — any error fails only this scene
-            outcome, result = _failed(error, number, scene, request.id)
-        request.runtime.metrics.entry_answered(question.name, outcome)
+            outcome, result = _failed(error, number, scene, request_id)
+        runtime.metrics.entry_answered(question.name, outcome)
         results.append(result)
         # After the first answer that is too large, the batch stops.
         left = 0 if outcome == AnswerTooLargeError.slug else left - len(result)
         await admission.quick.let_pass()
-    return b'{"request_id":%b,"results":[%b]}' % (to_json(request.id), b",".join(results))
+    return b'{"request_id":%b,"results":[%b]}' % (to_json(request_id), b",".join(results))
 
 
 async def _validated(
-    scene: Any, question: Question[RequestT], number: int, request: serving.Request
+    scene: Any, question: Question[RequestT], number: int, admission: Admission, ticket: Ticket
 ) -> RequestT:
     """Validate a scene of a batch. The worker thread validates large scenes."""
-
-    def validate(_: object) -> RequestT:
-        return validated(scene, question.request, at=("scenes", number))
-
-    if not isinstance(scene, dict) or serving.is_small(scene):
-        return validate(None)
-    return await request.runtime.admission.in_worker(request.ticket, validate)
+    validate = partial(validated, scene, question.request, at=("scenes", number))
+    if not isinstance(scene, dict) or is_small(scene):
+        return validate()
+    return await admission.in_worker(ticket, lambda _: validate())
 
 
 def _failed(error: Exception, number: int, scene: Any, request_id: str) -> tuple[str, bytes]:
@@ -86,7 +214,8 @@ def _failed(error: Exception, number: int, scene: Any, request_id: str) -> tuple
 
 def _add_route(question: Question[Any]) -> None:
     async def answer(data: Any, http: Request) -> bytes:
-        return await serving_request(http).answer(question, data)
+        models = http.scope["app"].state.runtime.models
+        return await _answer(http, question, data, models, LookUps())
 
     # FastAPI reads the schema of the body from the annotations.
     answer.__annotations__["data"] = question.request

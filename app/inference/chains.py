@@ -221,7 +221,7 @@ class ConditionedChains:
         n, spec = len(classes), self._machine.spec
         pairs = Pairs(classes, np.zeros(n, np.float32), np.ones(n, np.float32), *all_pairs(n))
         entries = (h1[:, None] == np.arange(1, spec.states)).astype(np.float32).reshape(1, -1)
-        mean, _ = self._chains.units.moments(entries, pairs, sampled=True)
+        mean, _ = self._chains.units.moments(entries, pairs, slice(0, spec.A), sampled=True)
         return mean.reshape(spec.A, n, n)
 
     def _relations(

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from app.compiling import compiled, compiled_in_any_order
 from app.inference.elementary import LN2, exp, exponent, log, log_softmax, mantissa, sigmoid
 from app.inference.relation_units import EncodedScene
-from app.inference.weights import SHARES, Weights, all_states
+from app.inference.weights import LISTED_SHARES, Weights, all_states
 
 LARGEST_WEIGHT: Final = 40.0
 """Maximum |weight| between h1 and a class or room type that float32 products allow."""
@@ -130,7 +130,7 @@ class ObjectScorer:
     def kappa(self, coverage: float) -> Float[NDArray, " V"]:
         """Return the bias of each class for a listed share, interpolated between the bins."""
         kappa = self._weights["kappa"]
-        low = bisect(_MIDDLES, coverage, 1, len(SHARES)) - 1
+        low = bisect(_MIDDLES, coverage, 1, len(LISTED_SHARES)) - 1
         share = (coverage - _MIDDLES[low]) / (_MIDDLES[low + 1] - _MIDDLES[low])
         weight = np.float32(min(max(share, 0.0), 1.0))
         return (1 - weight) * kappa[low] + weight * kappa[low + 1]

@@ -8,7 +8,7 @@ module treats the logit as a normal variable with
     mean base_e + U_e·m   and variance   σ_e² = sum_u [sum_z U_euz² m_uz - (sum_z U_euz m_uz)²]
 
 where m_uz is the probability of state z of hidden unit u (its first state has the weight 0).
-`app.inference.quadrature` computes the mean of sigmoid(ℓ_e). The variant of the machine defines
+`app.inference.elementary` computes the mean of sigmoid(ℓ_e). The variant of the machine defines
 base and U. Each unit of `FreeUnits` has its own row of U. `SharedUnits` computes U from factors.
 """
 
@@ -24,8 +24,8 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled, compiled_in_any_order
+from app.inference.elementary import to_log_odds
 from app.inference.implications import implication_shifts
-from app.inference.quadrature import to_log_odds
 from app.inference.weights import Weights, state_means
 
 Means = Float[NDArray, "B H1"]
@@ -115,13 +115,14 @@ class RelationUnits(ABC):
 
     def __init__(self, weights: Weights) -> None:
         self._W, self._A, self._V = weights["W"], weights.spec.A, weights.spec.V
+        self._all = slice(0, self._A)  # relations
         self._states = weights.spec.states
 
     @abstractmethod
     def moments(
-        self, means: Means, pairs: Pairs, only: int | None = None, *, sampled: bool = False
+        self, means: Means, pairs: Pairs, chosen: slice, *, sampled: bool = False
     ) -> Moments:
-        """Return the moments of `only`, or of all relations; the mean is `NEVER` without a unit."""
+        """Return the moments of the chosen relations; the mean is `NEVER` without a unit."""
 
     def logits(self, scene: EncodedScene) -> RelationLogits:
         """Return the logits of all relations between the classes of a scene."""
@@ -129,7 +130,7 @@ class RelationUnits(ABC):
         pairs = Pairs(scene.classes, scene.log_counts, scene.presence, *all_pairs(n))
         mean, spread = (
             part.reshape(self._A, n, n)
-            for part in self.moments(state_means(scene.x[None], self._states), pairs)
+            for part in self.moments(state_means(scene.x[None], self._states), pairs, self._all)
         )
         weight = None if observed is None else self.implication_weights(scene.x)
         if observed is None or weight is None:
@@ -183,7 +184,8 @@ class RelationUnits(ABC):
             *(i, j),
         )
         means = state_means(scene.x + self._W[candidates], self._states)
-        log_odds = to_log_odds(*self.moments(means, pairs, only))
+        chosen = self._all if only is None else slice(only, only + 1)
+        log_odds = to_log_odds(*self.moments(means, pairs, chosen))
         return log_odds[:, :, :m], log_odds[:, :, m:]
 
 
@@ -204,10 +206,9 @@ class FreeUnits(RelationUnits):
         self._index[index] = np.arange(len(self._U))
 
     def moments(
-        self, means: Means, pairs: Pairs, only: int | None = None, *, sampled: bool = False
+        self, means: Means, pairs: Pairs, chosen: slice, *, sampled: bool = False
     ) -> Moments:
         """Return means and √3 σ of logits by the formula, which gives samples the variance 0."""
-        chosen = _chosen_relations(self._A, only)
         shape = len(means), chosen.stop - chosen.start, pairs.i.shape[1]
         # Row b of the means, relation a and pair p of each entry of the result.
         b, a, p = (indices.reshape(-1) for indices in np.indices(shape))
@@ -260,7 +261,6 @@ class SharedUnits(RelationUnits):
             table=table,
             residual=residual,
         )
-        self._G = np.concatenate([weights["M"], weights["P"][:, None]], 1)
         self._g = np.concatenate([weights["R"], weights["d"][:, None]], 1)
         F, self._Y = _directions(weights)
         # (units, states - 1, A r): a matrix product sums over the states of each unit.
@@ -269,7 +269,7 @@ class SharedUnits(RelationUnits):
         p, q = np.tril_indices(F.shape[1])
         twice = np.where(p == q, np.float32(1), np.float32(2))  # int64 would give float64 products
         self._FF = _columns(F[:, p] * F[:, q] * twice[:, None])
-        self._GT = _columns(self._G)
+        self._GT = _columns(np.concatenate([weights["M"], weights["P"][:, None]], 1))
         self._B = weights["B"] if weights.spec.G else None
         if self._B is not None:
             gamma = weights["gamma"].swapaxes(1, 2).copy()
@@ -278,26 +278,21 @@ class SharedUnits(RelationUnits):
             self._gamma = gamma.reshape(len(gamma), -1)
 
     def moments(
-        self, means: Means, pairs: Pairs, only: int | None = None, *, sampled: bool = False
+        self, means: Means, pairs: Pairs, chosen: slice, *, sampled: bool = False
     ) -> Moments:
         """Return means and √3 σ of logits from the factors of the classes."""
-        chosen = _chosen_relations(self._A, only)
         Y = self._Y[chosen, :0] if sampled else self._Y[chosen]
-        U = self._products(chosen, means, self._GT) + self._g[chosen]
+        B, (R, r, _) = len(means), Y.shape
         # The covariance of h1 is diag(m) - m m' within each hidden unit, and 0 between units.
-        C, (R, r, _) = self._products(chosen, means, self._FF), Y.shape
-        by_unit = means.reshape(len(means), -1, self._states - 1).transpose(1, 0, 2)
+        U, C = (
+            (means @ columns[:, chosen].reshape(len(columns), -1)).reshape(B, R, -1)
+            for columns in (self._GT, self._FF)
+        )
+        U += self._g[chosen]
+        by_unit = means.reshape(B, -1, self._states - 1).transpose(1, 0, 2)
         f = by_unit @ self._F[:, :, chosen.start * r : chosen.stop * r]
-        f = f.reshape(len(f), len(means), R, r)
+        f = f.reshape(len(f), B, R, r)
         return _shared_moments(self._w, chosen.start, pairs, U, Y, C, f)
-
-    def _products(
-        self, chosen: slice, rows: Float[NDArray, "B H1"], columns: Float[NDArray, "H1 A*n"]
-    ) -> Float[NDArray, "B R n"]:
-        """Return the product of the rows with n columns of each chosen relation; see `_columns`."""
-        n = columns.shape[1] // self._A
-        products = rows @ columns[:, chosen.start * n : chosen.stop * n]
-        return products.reshape(len(rows), -1, n)
 
     def implication_weights(
         self, x: Float[NDArray, " H1"], beta: float = 1.0
@@ -319,11 +314,11 @@ class StandIns(RelationUnits):
         self._units, self._stand_in = units, stand_in
 
     def moments(
-        self, means: Means, pairs: Pairs, only: int | None = None, *, sampled: bool = False
+        self, means: Means, pairs: Pairs, chosen: slice, *, sampled: bool = False
     ) -> Moments:
         """Return means and √3 σ of the logits of the stand-ins."""
         pairs = pairs._replace(classes=self._stand_in[pairs.classes])
-        return self._units.moments(means, pairs, only, sampled=sampled)
+        return self._units.moments(means, pairs, chosen, sampled=sampled)
 
     def implication_weights(
         self, x: Float[NDArray, " H1"], beta: float = 1.0
@@ -337,14 +332,9 @@ def relation_units(weights: Weights) -> RelationUnits:
     return SharedUnits(weights) if weights.spec.kind.factorised else FreeUnits(weights)
 
 
-def _columns(matrices: Float[NDArray, "A n H1"]) -> Float[NDArray, "H1 A*n"]:
+def _columns(matrices: Float[NDArray, "A n H1"]) -> Float[NDArray, "H1 A n"]:
     """Convert the n rows of each relation to columns. Matrix products with columns are faster."""
-    return np.ascontiguousarray(matrices.reshape(-1, matrices.shape[2]).T)
-
-
-def _chosen_relations(relations: int, only: int | None) -> slice:
-    """Return a slice of the relation `only`, or of all relations. A slice copies no array."""
-    return slice(0, relations) if only is None else slice(only, only + 1)
+    return np.ascontiguousarray(matrices.transpose(2, 0, 1))
 
 
 def _directions(weights: Weights) -> tuple[Float[NDArray, "A r H1"], Float[NDArray, "A r K+1"]]:

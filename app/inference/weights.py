@@ -27,7 +27,7 @@ from app.inference.variants import MachineSpec
 WORD: Final = 32
 """Number of bits in a word of the packed stored scenes."""
 
-SHARES: Final = (0.3, 0.6, 1.0)
+LISTED_SHARES: Final = (0.3, 0.6, 1.0)
 """Upper limits of the listed share of a scene in the bins of kappa. The last row of kappa is for
 lists of all classes but one."""
 
@@ -47,7 +47,8 @@ def layout(spec: MachineSpec) -> dict[str, tuple[type, tuple[int, ...]]]:
         y (profiles, C): change of e in scenes of a data source
         u (profiles + 1, V): change of b + a in whole scenes, which Gibbs chains draw. The last row
             is for the mix of data sources that the model serves
-        kappa (4, V): change of the log-odds of unlisted classes by the listed share; see `SHARES`
+        kappa (4, V): change of the log-odds of unlisted classes by the listed share; see
+            `LISTED_SHARES`
         triples (T, 3): sorted triples (relation a, subject class i, object class j) with an own
             weight
         fantasies (N, ceil(V / 32)): stored samples of Gibbs chains. Each bit is the presence of
@@ -58,7 +59,7 @@ def layout(spec: MachineSpec) -> dict[str, tuple[type, tuple[int, ...]]]:
     floats: dict[str, tuple[int, ...]] = {
         "b": (V,), "c1": (H1,), "e": (spec.C,), "W": (V, H1), "Q": (spec.C, H1),
         "f": (spec.profiles,), "a": (spec.profiles, V), "y": (spec.profiles, spec.C),
-        "u": (spec.profiles + 1, V), "kappa": (len(SHARES) + 1, V),
+        "u": (spec.profiles + 1, V), "kappa": (len(LISTED_SHARES) + 1, V),
     }  # fmt: skip
     if spec.coupled:
         floats |= {"L": (V, V), "Y": (spec.C, V)}

@@ -16,10 +16,8 @@ from app.model.calibration import (
     Sensitivity,
     Sharpness,
 )
-from app.model.count_statistics import Counts
-from app.model.offset_statistics import Offsets
-from app.model.place_statistics import Places
 from app.model.scene_model import SceneModel
+from app.model.statistics import Counts, Offsets, Places
 
 __all__ = [
     "AlarmLine", "AlarmLines", "Calibration", "CountSlope", "Counts", "CoverageFit", "FitLimit",

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final, NamedTuple, Self
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from app.model.fields import Count, Frozen, Many
 from app.scene.spatial_relations import CANONICAL
@@ -151,13 +151,15 @@ class Judgement(Frozen):
 class Misplaced(Frozen):
     """The judgement of each kind of entry. None: training had too few scenes for the fit."""
 
+    model_config = ConfigDict(validate_by_name=True, serialize_by_alias=True)
+
     lateral: Judgement | None = None
     support: Judgement | None = None
     above: Judgement | None = None
     under: Judgement | None = None
     stand: Judgement | None = None
     # Relations (relation, subject, object) between classes that a person has confirmed.
-    usual: Many[tuple[Count, Count, Count]] = ()
+    confirmed: Many[tuple[Count, Count, Count]] = Field(default=(), alias="usual")
 
     @property
     def judges_relations(self) -> bool:

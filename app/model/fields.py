@@ -2,7 +2,7 @@
 
 import json
 from abc import abstractmethod
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
 from datetime import UTC
 from typing import Annotated, Any, ClassVar, TypeVar
@@ -54,16 +54,23 @@ class TensorGroup:
     """Base class of groups of arrays that an artifact stores beside the tensors of the machine.
 
     A subclass is a dataclass of arrays. The annotation of a field contains the name or the number
-    of each size: `Annotated[Table, "V", 3]`. The names of the stored tensors begin with `prefix`.
-    The fields in `integers` have integers, all others floating-point numbers.
+    of each size: `Annotated[Table, "V", 3]`. The name of a stored tensor is `prefix` and the name
+    of the field, or its name in `stored_as`. The fields in `integers` have integers, all others
+    floating-point numbers.
     """
 
     prefix: ClassVar[str]
+    stored_as: ClassVar[Mapping[str, str]] = {}
     integers: ClassVar[Collection[str]]
 
     def tensors(self) -> dict[str, NDArray[Any]]:
         """Return a mapping of tensor names in an artifact to the arrays."""
-        return {f"{self.prefix}{field.name}": getattr(self, field.name) for field in fields(self)}
+        return {self.tensor(field.name): getattr(self, field.name) for field in fields(self)}
+
+    @classmethod
+    def tensor(cls, field: str) -> str:
+        """Return the name of the tensor of a field."""
+        return f"{cls.prefix}{cls.stored_as.get(field, field)}"
 
     @abstractmethod
     def check(self, A: int, V: int, C: int) -> None:

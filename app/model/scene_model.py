@@ -15,9 +15,7 @@ from app.inference.chains import SceneChains
 from app.inference.objects import ObjectScorer
 from app.inference.relation_units import RelationUnits, StandIns, relation_units
 from app.model.calibration import Calibration, RelationSlopes
-from app.model.count_statistics import Counts
-from app.model.offset_statistics import Offsets
-from app.model.place_statistics import Places
+from app.model.statistics import Counts, Offsets, Places
 from app.model.word_weights import RowMap
 from app.scene.vocabulary import Vocabulary, Word
 

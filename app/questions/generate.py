@@ -30,7 +30,7 @@ from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, rounded_number
 from app.questions.names import ErrorList
 from app.questions.outliers import intruders
-from app.questions.posterior import Present, given_relations, present
+from app.questions.posterior import Present, present
 from app.questions.question import BEDROOM, POSES, REFUSED, Example, Options, Question
 from app.questions.reading import Reading
 from app.scene.relation_table import Triple
@@ -79,8 +79,7 @@ def generate(
         True
     """
     listing = present(scene, model.spec)
-    observed = given_relations(scene, listing, model.spec.A)
-    conditions = Conditions(listing.classes, observed, scene.room_type, scene.profile)
+    conditions = Conditions(listing.classes, listing.observed, scene.room_type, scene.profile)
     chains = model.scene_chains.under(conditions, temperature)
     shown = ~model.vocabulary.structure
     shown[conditions.classes] = True
@@ -162,7 +161,7 @@ def staying(
     Relations of the evidence always stay. The function then tries the other relations one by one,
     likeliest first. A tried relation stays if all of these conditions are met:
 
-    - The relations kept so far contain no relation between its two classes. `app.scene.geometry`
+    - The relations kept so far contain no relation between its two classes. `app.scene.scene`
       also finds at most one relation between two objects.
     - The relation does not close a cycle, such as A left of B, B left of C, C left of A.
     - If the relation is *on-top*, no kept relation places its subject on top of another class.

@@ -30,7 +30,7 @@ The sum of the shares q is over the listed classes. Positions and sizes show the
 object; otherwise s = 0. Classes that belong everywhere, such as pets and bags, have s = q = 0, and
 only their supports are judged.
 
-A relation that a person has confirmed (`app.model.Misplaced.usual`) has z = `EXPLAINED` and
+A relation that a person has confirmed (`app.model.Misplaced.confirmed`) has z = `EXPLAINED` and
 d = s = q = 0, because its stand may be rare for the class.
 """
 
@@ -125,7 +125,7 @@ def entries_of(model: SceneModel, posterior: Posterior, scene: Scene) -> Entries
     of_relation, changes = (
         values[relation, *pairs].tolist() for values in (alone, posterior.relation_change())
     )
-    confirmed = {*model.calibration.misplaced.usual}
+    confirmed = {*model.calibration.misplaced.confirmed}
     entries: list[tuple[float, ...]] = []  # relation, subject, object, kind, terms, mover
     for (a, i, j), z, d in zip(stated, of_relation, changes, strict=True):
         mover = j if (a, i, j) in opposites and a != INSIDE else i

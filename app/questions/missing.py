@@ -3,7 +3,7 @@
 The answers are object classes that the scene does not list (candidates), and their placements
 (`app.questions.placements`). Structural classes (floor, wall) are neither candidates nor anchors of
 placements. `more` adds listed classes with probably more instances than listed, by the statistics
-of counts (`app.model.count_statistics`).
+of counts (`app.model.Counts`).
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -262,7 +262,7 @@ def _log_p_at(
 
 
 def _read(request: MissingRequest, model: SceneModel, reading: Reading) -> Options:
-    errors, size = ErrorList(), len(model.vocabulary)
+    errors, size = ErrorList(), model.spec.V
     # Only the default of `top_k` may exceed the size of the vocabulary.
     if request.top_k > size and "top_k" in request.model_fields_set:
         message = f"`top_k` must be at most {size}, the size of the vocabulary"

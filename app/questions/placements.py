@@ -4,7 +4,7 @@ A placement is a relation between a candidate, a class that may be missing, and 
 called the anchor. An offset is the distance vector between the centres of both.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import repeat
 from typing import Any, Final, NamedTuple, Self
 
@@ -13,19 +13,17 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled
-from app.inference.quadrature import NO_UNIT
-from app.model.offset_statistics import UNOBSERVED, rotated_offsets
-from app.model.place_statistics import add_unseen
+from app.inference.elementary import NO_UNIT
 from app.model.scene_model import SceneModel
+from app.model.statistics import UNOBSERVED, add_unseen, rotated_offsets
 from app.questions.answer import Fields, best, significant
 from app.questions.posterior import Posterior, exclusive, relation_probability
-from app.scene.scene import Scene, SceneObject, boxes_of
+from app.scene.scene import Scene, boxes_of
 from app.scene.spatial_relations import INSIDE, ON_TOP, RELATIONS, SUPPORTS, canonicalise, opposite
 from app.scene.vocabulary import do_not_fit
 from scene_client.frames import Axes
 
 Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 PLACES: Final = 3  # maximum number of placements in the answer for one class
 
@@ -54,7 +52,9 @@ def place_log_p(
 ) -> Float[NDArray[np.floating[Any]], "N"]:
     """Return log p(relation to the anchor | candidate is present), not calibrated."""
     anchor = posterior.present.row[[place.anchor]]
-    forward, backward = posterior.placement_log_odds(candidates, anchor, place.relation)
+    forward, backward = posterior.units.placement_log_odds(
+        posterior.context, candidates, anchor, place.relation
+    )
     log_odds = (forward if place.outgoing else backward)[:, 0, 0]
     return -np.logaddexp(np.float32(0.0), -log_odds)
 
@@ -80,7 +80,7 @@ def placements(
     anchors = (~model.vocabulary.structure[present.classes]).nonzero()[0]
     if not len(anchors):
         return [[] for _ in candidates]
-    forward, backward = posterior.placement_log_odds(candidates, anchors)
+    forward, backward = posterior.units.placement_log_odds(posterior.context, candidates, anchors)
     A, objects, stand_in = forward.shape[1], present.first[anchors], model.vocabulary.stand_in
     classes, candidates = stand_in[present.classes[anchors]], stand_in[candidates]
     first = -1  # number of the requested place in `_likeliest_places`; -1 without a request
@@ -99,9 +99,12 @@ def placements(
     if A > ON_TOP and model.places is not None:
         add_unseen(*model.places.unseen, candidates, classes, forward, backward)
     if A > INSIDE:
-        candidates_too_large, things_too_large = _too_large(model, things, candidates, classes)
-        forward[:, INSIDE][candidates_too_large] = NO_UNIT
-        backward[:, INSIDE][things_too_large] = NO_UNIT
+        sizes = model.vocabulary.sizes
+        has_sizes = any(thing.size is not None for thing in things)
+        inner = sizes[candidates]
+        outer = boxes_of(things, sizes)[1] if has_sizes else sizes[classes]
+        forward[:, INSIDE][do_not_fit(inner, outer)] = NO_UNIT
+        backward[:, INSIDE][do_not_fit(outer, inner).T] = NO_UNIT
     slopes, log_counts = model.relation_slopes.placement, present.log_counts[anchors]
     rows, relations, outgoing, columns, p = _likeliest_places(
         slopes, forward, backward, log_counts, PLACES, first, LEAST_SHARE, LEAST_LIKELY
@@ -143,20 +146,6 @@ def supported_objects(model: SceneModel, posterior: Posterior, scene: Scene) -> 
         if a == INSIDE
         or (a == ON_TOP and not (places and places.means_under(classes[i], classes[j])))
     ]
-
-
-def _too_large(
-    model: SceneModel,
-    things: Sequence[SceneObject],
-    candidates: Int[Indices, "N"],
-    classes: Int[Indices, "m"],
-) -> tuple[Bool[Mask, "N m"], Bool[Mask, "N m"]]:
-    """Return which candidates do not fit into each object, and which objects into candidates."""
-    rows, vocabulary = candidates[:, None], model.vocabulary
-    if all(thing.size is None for thing in things):
-        return vocabulary.too_large[rows, classes], vocabulary.too_large[classes, rows]
-    inner, (_, outer) = vocabulary.sizes[candidates], boxes_of(things, vocabulary.sizes)
-    return do_not_fit(inner, outer), do_not_fit(outer, inner).T
 
 
 def _offset_fields(

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from app.compiling import compiled, inlined
 from app.inference import MachineSpec
-from app.inference.elementary import logistic
-from app.inference.quadrature import to_log_odds
+from app.inference.elementary import logistic, to_log_odds
 from app.inference.relation_units import ObservedRelations, RelationLogits, encode
 from app.model.calibration import LEAST_COVERAGE, Calibration, CountSlope, CoverageFit
 from app.model.scene_model import SceneModel
@@ -47,10 +46,11 @@ class Present(NamedTuple):
     first: Int[Indices, "n"]  # first object of each class in `Scene.objects`
     presence: Float[Singles, "n"]  # probability that at least one instance is present
     log_counts: Float[Singles, "n"]
+    observed: ObservedRelations | None  # between the classes; None: without observations
 
 
 def present(scene: Scene, spec: MachineSpec) -> Present:
-    """Group the objects of a scene by class.
+    """Group the objects of a scene, and its observed relations, by class.
 
     Raises:
         ValueError: the machine does not know the class of an object, the room type or the profile.
@@ -70,15 +70,11 @@ def present(scene: Scene, spec: MachineSpec) -> Present:
         np.array(indices, dtype=np.int64), confidence
     )
     log_counts = np.log(counts).astype(np.float32)
-    return Present(classes, counts, row, first, presence.astype(np.float32), log_counts)
-
-
-def given_relations(scene: Scene, present: Present, A: int) -> ObservedRelations | None:
-    """Return the observed relations between the classes of a scene, or None without any."""
-    if scene.relations is None:
-        return None
-    columns = scene.relations.of_classes(present.row, len(present.classes), A)
-    return None if columns is None else ObservedRelations(*columns)
+    columns = None
+    if scene.relations is not None:
+        columns = scene.relations.of_classes(row, len(classes), spec.A)
+    observed = None if columns is None else ObservedRelations(*columns)
+    return Present(classes, counts, row, first, presence.astype(np.float32), log_counts, observed)
 
 
 class Posterior:
@@ -104,9 +100,9 @@ class Posterior:
             listing.presence,
             listing.log_counts,
             room=scene.room_type,
-            observed=given_relations(scene, listing, model.spec.A),
+            observed=listing.observed,
         )
-        self._objects, self._units = model.objects, model.relation_units
+        self._objects, self.units = model.objects, model.relation_units
         self._profile, self._room = scene.profile, scene.room_type
 
     def absent_log_odds(self, absent: Int[Indices, "N"], coverage: float) -> Float[Floats, "N"]:
@@ -147,7 +143,7 @@ class Posterior:
 
     def relation_log_odds(self) -> Float[Floats, "A n n"]:
         """Return the log-odds of every relation of the scene's classes, without its observation."""
-        return self._units.log_odds(self._between)
+        return self.units.log_odds(self._between)
 
     def alone_log_odds(self) -> Float[Floats, "A n n"]:
         """Return the log-odds of every relation given the objects alone."""
@@ -159,17 +155,11 @@ class Posterior:
 
     def pair_log_odds(self) -> Float[Floats, "A n n"]:
         """Return the log-odds of every relation without the evidence of its pair of classes."""
-        return self._units.log_odds(self._between, leave_out_pair=True)
-
-    def placement_log_odds(
-        self, candidates: Int[Indices, "N"], anchors: Int[Indices, "m"], only: int | None = None
-    ) -> tuple[Float[Floats, "N R m"], Float[Floats, "N R m"]]:
-        """Return the log-odds of R relations from the candidates to the anchors, and back."""
-        return self._units.placement_log_odds(self.context, candidates, anchors, only)
+        return self.units.log_odds(self._between, leave_out_pair=True)
 
     @cached_property
     def _between(self) -> RelationLogits:
-        return self._units.logits(self.context)
+        return self.units.logits(self.context)
 
 
 def log_odds_of(log_p: Float[Doubles, "..."]) -> Float[Doubles, "..."]:

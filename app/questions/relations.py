@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from app.compiling import compiled, inlined
 from app.errors import InvalidRequestError, Location
-from app.inference.quadrature import NO_UNIT
+from app.inference.elementary import NO_UNIT
 from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, best, significant
 from app.questions.names import ErrorList

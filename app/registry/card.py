@@ -7,8 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from math import prod
 
 from app.inference import MachineSpec
-from app.model.count_statistics import Counts
-from app.model.offset_statistics import Offsets
+from app.model.statistics import Counts, Offsets
 from app.registry.description import DataSource, Description
 from app.registry.manifest import TensorEntry, of_machine
 

@@ -13,10 +13,8 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import Field, ValidationError, field_validator
 
-from app.model.count_statistics import Counts
 from app.model.fields import Count, Frozen, Many, Sha256, first_error, to_json
-from app.model.offset_statistics import Offsets
-from app.model.place_statistics import Places
+from app.model.statistics import Counts, Offsets, Places
 from app.registry.description import Description
 from app.registry.errors import ArtifactError, Code
 

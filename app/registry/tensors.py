@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 from safetensors import SafetensorError, deserialize
 from safetensors.numpy import save
 
-from app.model.count_statistics import ROOM
 from app.model.fields import TensorGroup
+from app.model.statistics import ROOM
 from app.registry.errors import ArtifactError
 from app.registry.manifest import WEIGHTS, TensorEntry
 
@@ -94,23 +94,24 @@ def read_group(
     sizes, shapes = {"A": A, "V": V, "features": ROOM + C + V}, {}
     for name, hint in get_type_hints(group, include_extras=True).items():
         if axes := getattr(hint, "__metadata__", ()):
-            actual = np.shape(tensors.get(f"{group.prefix}{name}", ()))
+            actual = np.shape(tensors.get(group.tensor(name), ()))
             sizes = dict(zip(axes, actual, strict=False)) | sizes
             shapes[name] = tuple(
                 sizes.get(axis, 0) if isinstance(axis, str) else axis for axis in axes
             )
-    for name in sorted(tensors.keys() | {f"{group.prefix}{name}" for name in shapes}):
-        required = shapes.get(name.removeprefix(group.prefix))
-        shape = tensors[name].shape if name in tensors else None
-        if shape != required:
-            reason = f"tensor '{name}' has the shape {shape}, not {required} (None: no tensor)"
+    required = {group.tensor(name): shape for name, shape in shapes.items()}
+    for name in sorted(tensors.keys() | required):
+        shape, expected = tensors[name].shape if name in tensors else None, required.get(name)
+        if shape != expected:
+            reason = f"tensor '{name}' has the shape {shape}, not {expected} (None: no tensor)"
             raise ArtifactError("wrong_shape", reason)
-    tables = group(**{name: tensors[f"{group.prefix}{name}"] for name in shapes})
+    tables = group(**{name: tensors[group.tensor(name)] for name in shapes})
     try:
         for name in shapes:
             kind = np.integer if name in group.integers else np.floating
             is_right = np.issubdtype(getattr(tables, name).dtype, kind)
-            tables.require(is_right, f"{name} must have a dtype of {kind.__name__}")
+            stored = group.stored_as.get(name, name)
+            tables.require(is_right, f"{stored} must have a dtype of {kind.__name__}")
         tables.check(A, V, C)
     except ValueError as error:
         raise ArtifactError("invalid_tensor", str(error)) from None

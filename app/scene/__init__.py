@@ -1,10 +1,17 @@
 """Scenes, canonical relations, vocabularies and geometry, independent of any trained model."""
 
-from app.scene.geometry import PoseRelations, Viewpoint, derive_relations, to_viewer_frame
 from app.scene.labels import head_of, label_key
 from app.scene.relation_table import RelationTable
 from app.scene.roles import RoleCounts
-from app.scene.scene import Scene, SceneObject, observe
+from app.scene.scene import (
+    PoseRelations,
+    Scene,
+    SceneObject,
+    Viewpoint,
+    derive_relations,
+    observe,
+    to_viewer_frame,
+)
 from app.scene.spatial_relations import CANONICAL, OPPOSITES, RELATIONS, canonicalise, opposite
 from app.scene.vocabulary import ObjectClass, Vocabulary
 

@@ -1,7 +1,54 @@
-"""A scene as observed by one viewer: objects, and their relations.
+"""A scene as observed by one viewer: objects, and their relations, derived from poses by rules.
 
-`observe` derives the relations of a scene from the poses of its objects. Scenes contain instances
-(objects), but models only know classes: `app.questions.posterior` pools the instances of a class.
+Scenes contain instances (objects), but models only know classes: `app.questions.posterior` pools
+the instances of a class. `observe` derives the relations of a scene from the poses of its objects.
+Training and serving use the same rules.
+
+Viewer axes point away from the viewer (x), to the left (y) and up (z). Units are metres and
+radians. Boxes are upright. The footprint of a box is the rectangle of its horizontal extents,
+rotated by the yaw.
+
+1. *on-top*(i, j) holds if the footprints overlap by at least 30 % of the smaller footprint, and the
+   bottom of i is within 5 cm of the top of j. Box i must not surround box j. If two thin boxes meet
+   this rule in both directions, only the box with the higher centre is on top. If both centres have
+   the same height, neither box is on top. A box surrounds a smaller box if it is more than 10 cm
+   high, and if it reaches both lower and higher than the smaller box.
+2. *above*(i, j) holds if the footprints overlap by at least 30 % of the smaller footprint, and the
+   bottom of i is more than 5 cm above the top of j.
+3. Two boxes reach into each other if two conditions hold. The footprints overlap by at least 30 %
+   of the smaller footprint. The bottom of each box is more than 5 cm below the top of the other, or
+   one box surrounds the other. The smaller box is the box with the smaller footprint. If the
+   footprints differ by at most 1 %, it is the box with the smaller volume. The smaller box has one
+   of three roles:
+
+   - on the larger box: *on-top*(smaller, larger). The bottom of the smaller box must be at least
+     20 % of the larger height above the bottom of the larger box.
+   - under the larger box: *on-top*(larger, smaller). The bottom of the smaller box must be at
+     most 10 cm, or at most 20 % of the larger height, above the bottom of the larger box.
+   - in the larger box: *inside*(smaller, larger). The smaller box must have at most 1.2 times the
+     larger height.
+
+   The counts of `app.scene.roles` choose one of the possible roles, or leave the role undecided.
+   Without counts, without classes, or if the volumes also differ by at most 1 %, the role is
+   undecided.
+4. If rules 1 to 3 do not apply to two neighbours, their centres decide. dx and dy are the
+   differences of the centres. If |dy| is at least |dx|, the box with the larger y is *left* of the
+   other box. If |dx| is larger, the box with the smaller x, nearer to the viewer, is in *front* of
+   the other box. If both |dx| and |dy| are under 10 cm, neither relation holds.
+5. Two boxes are neighbours if their footprints are at most 1 m apart. If the size of a box is
+   unknown, the centres must be at most 1.5 m apart in the horizontal plane.
+6. All relations between two neighbours are observed, whether they hold or not. So if a stacked
+   relation (on-top, above, inside) holds, left and front are observed not to hold.
+7. If a role is undecided, the relations of the possible roles are unobserved. All other relations
+   of the two boxes are observed not to hold. For two boxes of the same size, *on-top* and *inside*
+   are unobserved in both directions.
+8. Boxes that are further apart than neighbours exclude stacked relations: on-top, above and inside
+   are observed not to hold. Left and front are unobserved.
+9. If the size of a box is unknown, its stacked relations are unobserved. A box without height or
+   depth is thin, and its size is known.
+
+`excluded_by_centres` excludes further relations at every distance: those with a direction that rule
+4 does not allow, and stacked relations of boxes too far apart to overlap.
 """
 
 from __future__ import annotations
@@ -9,21 +56,27 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
-from numpy.typing import NDArray
+from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike, NDArray
 
 from app.compiling import compiled
-from app.scene.geometry import (
-    SMALLEST,
-    Viewpoint,
-    derive_relations,
-    excluded_by_centres,
-    to_viewer_frame,
-)
+from app.scene.footprints import measure
 from app.scene.relation_table import EXCLUDED, RelationTable, Triple
-from app.scene.roles import RoleCounts
+from app.scene.roles import IN, ON, UNDER, RoleCounts, is_smaller, likely_role, possible_roles
+from app.scene.spatial_relations import ABOVE, CANONICAL, FRONT, INSIDE, LEFT, ON_TOP
+
+MIN_OVERLAP: Final = 0.30  # minimum overlap as a share of the smaller footprint
+CONTACT: Final = 0.05  # maximum distance in metres between bottom and top for *on-top*
+NEIGHBOUR_GAP: Final = 1.0  # maximum distance in metres between the footprints of neighbours
+NEIGHBOUR_DISTANCE: Final = 1.5  # maximum distance in metres between centres if a size is unknown
+MIN_OFFSET: Final = 0.10  # minimum |dx| or |dy| in metres for *front* or *left*
+UNKNOWN_REACH: Final = 1.5  # maximum reach in metres of a footprint of unknown size
+MOST_DISTANT: Final = 100.0  # longest plausible distance from the viewer in metres; detects mm
+SMALLEST: Final = 1e-3  # shortest plausible longest side of a box in metres
+LARGEST: Final = 20.0  # longest plausible side of a box in metres
 
 Point = tuple[float, float, float]
 
@@ -66,6 +119,40 @@ class Scene:
     def has_boxes(self) -> bool:
         """Whether the observed relations come from boxes."""
         return self.relations is not None and self.relations.of_boxes
+
+
+@compiled
+def pool_classes(
+    classes: Int[NDArray, " N"], confidence: Float[NDArray, " N"]
+) -> tuple[
+    Int[NDArray, " n"], Int[NDArray, " n"], Int[NDArray, " N"], Int[NDArray, " n"],
+    Float[NDArray, " n"],
+]:  # fmt: skip
+    """Return the n distinct classes of N instances, ascending.
+
+    The other results are the index of the first instance of each class, the row of each instance's
+    class, the number of instances of each class, and the probability that at least one exists.
+    """
+    N = len(classes)
+    distinct, first, counts = np.empty(N, np.int64), np.empty(N, np.int64), np.zeros(N, np.int64)
+    order, row, presence, n = np.empty(N, np.int64), np.empty(N, np.int64), np.empty(N), 0
+    for k in range(N):  # insertion sort
+        rank = k
+        while rank and classes[order[rank - 1]] > classes[k]:
+            order[rank] = order[rank - 1]
+            rank -= 1
+        order[rank] = k
+    absent = 1.0
+    for k in range(N):
+        instance = order[k]
+        if n == 0 or distinct[n - 1] != classes[instance]:
+            distinct[n], first[n], absent = classes[instance], instance, 1.0
+            n += 1
+        row[instance] = n - 1
+        counts[n - 1] += 1
+        absent *= 1.0 - confidence[instance]
+        presence[n - 1] = 1.0 - absent
+    return distinct[:n], first[:n], row, counts[:n], presence[:n]
 
 
 # ------------------------------------------------------------------------- relations from poses
@@ -142,35 +229,203 @@ def boxes_of(
     return centres, extents
 
 
-@compiled
-def pool_classes(
-    classes: Int[NDArray, " N"], confidence: Float[NDArray, " N"]
-) -> tuple[
-    Int[NDArray, " n"], Int[NDArray, " n"], Int[NDArray, " N"], Int[NDArray, " n"],
-    Float[NDArray, " n"],
-]:  # fmt: skip
-    """Return the n distinct classes of N instances, ascending.
+Rows = Float[NDArray, "n 3"] | Sequence[Sequence[float]]
 
-    The other results are the index of the first instance of each class, the row of each instance's
-    class, the number of instances of each class, and the probability that at least one exists.
+
+class Viewpoint(NamedTuple):
+    """Position and heading of the viewer: x and y in metres, yaw in radians."""
+
+    x: float
+    y: float
+    yaw: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseRelations:
+    """Relations a(i, j) between n objects, derived from poses, at [a, i, j]."""
+
+    holds: Bool[NDArray, "A n n"]
+    # Whether it was observed if a relation holds. Symmetric in i and j, except for undecided roles.
+    observed: Bool[NDArray, "A n n"]
+
+
+def to_viewer_frame(
+    positions: Rows, viewpoint: Viewpoint, yaws: ArrayLike | None = None
+) -> tuple[Float[NDArray, "n 3"], Float[NDArray, " n"]]:
+    """Convert positions (metres) and yaws (radians, 0 by default) of n boxes to viewer axes.
+
+    Heights do not change.
+
+    Raises:
+        ValueError: a shape is wrong.
     """
-    N = len(classes)
-    distinct, first, counts = np.empty(N, np.int64), np.empty(N, np.int64), np.zeros(N, np.int64)
-    order, row, presence, n = np.empty(N, np.int64), np.empty(N, np.int64), np.empty(N), 0
-    for k in range(N):  # insertion sort
-        rank = k
-        while rank and classes[order[rank - 1]] > classes[k]:
-            order[rank] = order[rank - 1]
-            rank -= 1
-        order[rank] = k
-    absent = 1.0
-    for k in range(N):
-        instance = order[k]
-        if n == 0 or distinct[n - 1] != classes[instance]:
-            distinct[n], first[n], absent = classes[instance], instance, 1.0
-            n += 1
-        row[instance] = n - 1
-        counts[n - 1] += 1
-        absent *= 1.0 - confidence[instance]
-        presence[n - 1] = 1.0 - absent
-    return distinct[:n], first[:n], row, counts[:n], presence[:n]
+    points = np.asarray(positions, np.float64).reshape(len(positions), 3)
+    turns = np.zeros(len(points)) if yaws is None else np.asarray(yaws, np.float64)
+    turns = turns.reshape(len(points))
+    cos, sin = math.cos(viewpoint.yaw), math.sin(viewpoint.yaw)
+    dx, dy = points[:, 0] - viewpoint.x, points[:, 1] - viewpoint.y
+    turned = np.stack([cos * dx + sin * dy, cos * dy - sin * dx, points[:, 2]], axis=1)
+    return turned, turns - viewpoint.yaw
+
+
+def derive_relations(
+    positions: Rows,  # centres in viewer axes, in metres; a row with NaN where unknown
+    sizes: Rows,  # extents before the rotation, in metres; 0 for flat boxes, NaN where unknown
+    yaws: ArrayLike | None = None,  # rotations about z in radians; all 0 by default
+    *,
+    horizontal: bool = True,  # whether the viewer is known; if not, left and front are unobserved
+    classes: Int[NDArray, " n"] | None = None,  # -1 where unknown
+    roles: RoleCounts | None = None,  # for rule 3; None leaves all roles undecided
+) -> PoseRelations:
+    """Derive the relations between n boxes by the rules of this module.
+
+    Raises:
+        ValueError: a shape is wrong, a value is infinite, a size is negative, or the counts lack a
+            class.
+    """
+    n = len(positions)
+    points, extents = (
+        np.asarray(rows, np.float64, order="C").reshape(n, 3) for rows in (positions, sizes)
+    )
+    turns = np.zeros(n) if yaws is None else np.asarray(yaws, np.float64, order="C").reshape(n)
+    if np.isinf(points).any() or np.isinf(extents).any() or not np.isfinite(turns).all():
+        raise ValueError("positions, sizes and yaws must not be infinite, and yaws must not be NaN")
+    if np.any(extents < 0):
+        raise ValueError("sizes must not be negative")
+    if classes is None or roles is None:
+        classes, roles = np.full(n, -1), _NO_ROLES
+    elif classes.shape != (n,) or classes.max(initial=-1) >= len(roles.anchor):
+        raise ValueError(f"classes must be {n} indices below {len(roles.anchor)}")
+    holds = np.zeros((len(CANONICAL), n, n), dtype=np.bool_)
+    observed = np.zeros_like(holds)
+    _relate_all(points, extents, turns, horizontal, classes, roles, holds, observed)
+    return PoseRelations(holds, observed)
+
+
+_NO_ROLES: Final = RoleCounts(
+    np.empty(0, np.int64), np.empty((0, 3), np.float32), np.empty((0, 3), np.float32)
+)
+
+
+def excluded_by_centres(
+    points: Float[NDArray, "n 3"], sizes: Float[NDArray, "n 3"], *, horizontal: bool
+) -> Bool[NDArray, "A n n"]:
+    """Return the relations that the centres exclude. Unknown footprints reach `UNKNOWN_REACH`."""
+    x, y = points[:, 0], points[:, 1]
+    dx, dy = x[:, None] - x, y[:, None] - y
+    excluded = np.zeros((len(CANONICAL), len(x), len(x)), np.bool_)
+    # A comparison with NaN is False.
+    if horizontal:
+        size_x, size_y = np.abs(dx), np.abs(dy)
+        excluded[LEFT] = (dy < MIN_OFFSET) | (size_y < size_x)
+        excluded[FRONT] = (dx > -MIN_OFFSET) | (size_x <= size_y)
+    radius = np.hypot(sizes[:, 0], sizes[:, 1]) / 2
+    radius[np.isnan(radius)] = UNKNOWN_REACH
+    excluded[ON_TOP:] = np.hypot(dx, dy) > radius[:, None] + radius  # the stacked relations
+    return excluded
+
+
+@compiled
+def _relate_all(
+    points: Float[NDArray, "n 3"],
+    extents: Float[NDArray, "n 3"],
+    turns: Float[NDArray, " n"],
+    horizontal: bool,
+    classes: Int[NDArray, " n"],
+    roles: RoleCounts,
+    holds: Bool[NDArray, "A n n"],
+    observed: Bool[NDArray, "A n n"],
+) -> None:
+    """Write the relations of all pairs of boxes to `holds` and `observed`."""
+    n = len(points)
+    has_position, has_size = np.empty(n, np.bool_), np.empty(n, np.bool_)
+    radius = np.empty(n)
+    for i in range(n):
+        radius[i] = math.hypot(extents[i, 0], extents[i, 1]) / 2
+        has_size[i] = not math.isnan(radius[i] + extents[i, 2])
+        has_position[i] = not math.isnan(points[i, 0] + points[i, 1] + points[i, 2])
+    for i in range(n):
+        for j in range(i + 1, n):
+            if not (has_position[i] and has_position[j]):
+                continue
+            distance = math.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1])
+            have_sizes, overlap = has_size[i] and has_size[j], False
+            if not have_sizes:
+                neighbours = distance <= NEIGHBOUR_DISTANCE
+            # The distance between the circles around the footprints is a fast first check, because
+            # `measure` is slower.
+            elif distance - radius[i] - radius[j] <= NEIGHBOUR_GAP:
+                share, gap = measure(
+                    points[i], extents[i], turns[i], points[j], extents[j], turns[j]
+                )
+                neighbours, overlap = gap <= NEIGHBOUR_GAP, share >= MIN_OVERLAP
+            else:
+                neighbours = False
+            # The order of relation indices is left, front, on-top, above, inside.
+            first = LEFT if neighbours and horizontal else ON_TOP
+            last = INSIDE if have_sizes else FRONT
+            for relation in range(first, last + 1):
+                observed[relation, i, j] = observed[relation, j, i] = True
+            if overlap and _stack(points, extents, i, j, classes, roles, holds, observed):
+                continue
+            if neighbours and horizontal:
+                for subject, anchor in ((i, j), (j, i)):
+                    to_front = points[anchor, 0] - points[subject, 0]
+                    to_left = points[subject, 1] - points[anchor, 1]
+                    if abs(to_left) >= abs(to_front):
+                        holds[LEFT, subject, anchor] = to_left >= MIN_OFFSET
+                    else:
+                        holds[FRONT, subject, anchor] = to_front >= MIN_OFFSET
+
+
+@compiled
+def _stack(
+    points: Float[NDArray, "n 3"],
+    extents: Float[NDArray, "n 3"],
+    i: int,
+    j: int,
+    classes: Int[NDArray, " n"],
+    roles: RoleCounts,
+    holds: Bool[NDArray, "A n n"],
+    observed: Bool[NDArray, "A n n"],
+) -> bool:
+    """Apply rules 1 to 3 to two boxes with overlapping footprints. Return whether one applies."""
+    smaller, larger, is_nested, is_deep = -1, -1, False, True
+    for one, other in ((i, j), (j, i)):
+        if is_smaller(extents[one], extents[other]):
+            smaller, larger = one, other
+    height, larger_height = extents[smaller, 2], extents[larger, 2]
+    rise = points[smaller, 2] - height / 2 - (points[larger, 2] - larger_height / 2)
+    if smaller >= 0:  # the larger box may surround the smaller box; see rule 1
+        tops = points[smaller, 2] + height / 2, points[larger, 2] + larger_height / 2
+        is_nested = rise > 0 and tops[1] > tops[0] and larger_height > 2 * CONTACT
+    for subject, anchor in ((i, j), (j, i)):
+        bottom = points[subject, 2] - extents[subject, 2] / 2
+        lift = bottom - (points[anchor, 2] + extents[anchor, 2] / 2)
+        is_deep = is_deep and lift < -CONTACT
+        is_higher = points[subject, 2] > points[anchor, 2]
+        if lift > CONTACT:
+            holds[ABOVE, subject, anchor] = True
+            return True
+        if lift >= -CONTACT and is_higher and not (is_nested and subject == larger):
+            holds[ON_TOP, subject, anchor] = True
+            return True
+    if not is_deep and not is_nested:
+        return False  # two thin boxes at the same height
+    if smaller < 0:
+        for relation in (ON_TOP, INSIDE):
+            observed[relation, i, j] = observed[relation, j, i] = False
+        return True
+    possible = possible_roles(rise, height, larger_height)
+    role = likely_role(roles, classes[smaller], classes[larger], possible)
+    if role == ON:
+        holds[ON_TOP, smaller, larger] = True
+    elif role == UNDER:
+        holds[ON_TOP, larger, smaller] = True
+    elif role == IN:
+        holds[INSIDE, smaller, larger] = True
+    else:  # the relations of the possible roles are unobserved
+        observed[ON_TOP, smaller, larger] = not possible[ON]
+        observed[ON_TOP, larger, smaller] = not possible[UNDER]
+        observed[INSIDE, smaller, larger] = not possible[IN]
+    return True

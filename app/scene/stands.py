@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from app.scene.geometry import CONTACT
+from app.scene.scene import CONTACT
 from app.scene.spatial_relations import ABOVE, INSIDE, ON_TOP
 
 UNKNOWN, FLOOR, HANGS, SUPPORTED = -1, 0, 1, 2

@@ -166,11 +166,6 @@ class Vocabulary:
         return _read_only([entry.size or (math.nan,) * 3 for entry in self.objects])
 
     @cached_property
-    def too_large(self) -> Bool[NDArray[np.bool_], "V V"]:
-        """True if a box of the size of class i does not fit into one of class j."""
-        return _read_only(do_not_fit(self.sizes, self.sizes))
-
-    @cached_property
     def broader(self) -> Bool[NDArray[np.bool_], "V V"]:
         """True if class j is the parent of class i, or a parent of its parent."""
         is_broader = np.zeros((len(self), len(self)), np.bool_)
@@ -338,10 +333,6 @@ class _WithWords(Vocabulary):
     @cached_property
     def sizes(self) -> NDArray[np.float64]:
         return np.pad(self._base.sizes, ((0, len(self._nearest)), (0, 0)), constant_values=math.nan)
-
-    @cached_property
-    def too_large(self) -> NDArray[np.bool_]:
-        return np.pad(self._base.too_large, (0, len(self._nearest)))
 
     @cached_property
     def broader(self) -> NDArray[np.bool_]:

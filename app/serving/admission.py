@@ -53,80 +53,36 @@ _NICE: Final = 5
 
 
 class Lane:
-    """A bounded queue in which clients take turns. At most ``slots`` requests run at a time."""
+    """A bounded queue in which clients take turns. At most ``slots`` requests run at a time.
+
+    `Ticket.enter` and `Ticket.leave` begin and end the turn of a request.
+    """
 
     def __init__(self, slots: int, limit: int) -> None:
         self.limit, self.weight = limit, 0  # total weight of the waiting and running requests
-        self._free_slots = slots
-        self._weights: dict[str, int] = {}  # by client
+        self.free_slots = slots
+        self.weights: dict[str, int] = {}  # by client
         # One queue of waiting requests for each key (`line`). The first queue has the next turn.
-        self._queues: dict[Hashable, deque[asyncio.Future[None]]] = {}
-
-    def is_full(self, client: str, weight: int) -> bool:
-        """Return whether the lane must refuse a request of this weight."""
-        of_client = self._weights.get(client, 0) + weight
-        return self.weight + weight > self.limit or of_client > self.limit // SHARE
+        self.queues: dict[Hashable, deque[asyncio.Future[None]]] = {}
 
     async def let_pass(self) -> None:
         """Let requests of this lane run before the next scene of a batch."""
         # A turn takes three iterations of the event loop: to end the turn before it, to start, and
         # to answer.
-        for _ in range(3 if self._queues else 1):
+        for _ in range(3 if self.queues else 1):
             await asyncio.sleep(0)
 
-    async def enter(self, client: str, weight: int, deadline: float, line: Hashable = None) -> None:
-        """Wait for the turn of a request, until a ``deadline`` of `time.monotonic`.
-
-        `leave` ends the turn. A weight of 0 is never refused. The keys ``line`` of the queues, by
-        default the clients, take turns.
-
-        Raises:
-            QueueFullError: the lane or the client's share of it is full.
-            DeadlinePassedError: the deadline passed while the request was waiting.
-        """
-        if weight and self.is_full(client, weight):
-            raise errors.QueueFullError("The queue, or the share of this client in it, is full.")
-        self.weight += weight
-        self._weights[client] = self._weights.get(client, 0) + weight
-        if self._free_slots and not self._queues:
-            self._free_slots -= 1
-            return
-        turn = asyncio.get_running_loop().create_future()
-        self._queues.setdefault(client if line is None else line, deque()).append(turn)
-        try:
-            async with asyncio.timeout(max(deadline - monotonic(), 0)):
-                await turn
-        except BaseException as error:
-            # `leave` frees a slot. Take one first, unless `_start_next` gave a slot to this request
-            # in the same moment.
-            has_slot = turn.done() and not turn.cancelled()
-            if not has_slot:
-                self._free_slots -= 1
-            self.leave(client, weight)
-            if isinstance(error, TimeoutError):
-                detail = "The deadline passed before the request started."
-                raise errors.DeadlinePassedError(detail) from None
-            raise
-
-    def leave(self, client: str, weight: int) -> None:
-        """End the turn of a request, and free its slot in the event loop's next iteration."""
-        self.weight -= weight
-        left = self._weights.pop(client, 0) - weight
-        if left:
-            self._weights[client] = left
-        asyncio.get_running_loop().call_soon(self._start_next)
-
-    def _start_next(self) -> None:
+    def start_next(self) -> None:
         """Free one slot, and start waiting requests while slots are free."""
-        self._free_slots += 1
-        while self._free_slots > 0 and self._queues:
-            key = next(iter(self._queues))
-            queue = self._queues.pop(key)
+        self.free_slots += 1
+        while self.free_slots > 0 and self.queues:
+            key = next(iter(self.queues))
+            queue = self.queues.pop(key)
             turn = queue.popleft()
             if queue:
-                self._queues[key] = queue  # a dictionary appends new keys, so the others go first
+                self.queues[key] = queue  # a dictionary appends new keys, so the others go first
             if not turn.done():  # the request has not ended by timeout or cancellation
-                self._free_slots -= 1
+                self.free_slots -= 1
                 turn.set_result(None)
 
 
@@ -138,23 +94,58 @@ class Ticket:
     client: str  # address
     deadline: float  # as a value of `time.monotonic`
     is_gone: Callable[[], Awaitable[bool]] | None = None  # whether the client has disconnected
-    lane: Lane | None = None  # in which the request has its turn
+    lane: Lane | None = None  # in which the request waits or has its turn
     weight: int = 0
     waited: float = 0.0  # total seconds so far
 
     async def enter(self, lane: Lane, weight: int, line: Hashable = None) -> None:
-        """Leave the lane of the request and wait for a turn in another; see `Lane.enter`."""
+        """Leave the lane of the request and wait for a turn in another, until the deadline.
+
+        A weight of 0 is never refused. The keys ``line`` of the queues, by default the clients,
+        take turns.
+
+        Raises:
+            QueueFullError: the lane or the client's share of it is full.
+            DeadlinePassedError: the deadline passed while the request was waiting.
+        """
         self.leave()
-        began = monotonic()
-        await lane.enter(self.client, weight, self.deadline, line)
-        self.waited += monotonic() - began
+        of_client = lane.weights.get(self.client, 0) + weight
+        if weight and (lane.weight + weight > lane.limit or of_client > lane.limit // SHARE):
+            raise errors.QueueFullError("The queue, or the share of this client in it, is full.")
+        lane.weight += weight
+        lane.weights[self.client] = of_client
         self.lane, self.weight = lane, weight
+        if lane.free_slots and not lane.queues:
+            lane.free_slots -= 1
+            return
+        began, turn = monotonic(), asyncio.get_running_loop().create_future()
+        lane.queues.setdefault(self.client if line is None else line, deque()).append(turn)
+        try:
+            async with asyncio.timeout(max(self.deadline - began, 0)):
+                await turn
+        except BaseException as error:
+            # `leave` frees a slot. Take one first, unless `start_next` gave a slot to this request
+            # in the same moment.
+            has_slot = turn.done() and not turn.cancelled()
+            if not has_slot:
+                lane.free_slots -= 1
+            self.leave()
+            if isinstance(error, TimeoutError):
+                detail = "The deadline passed before the request started."
+                raise errors.DeadlinePassedError(detail) from None
+            raise
+        self.waited += monotonic() - began
 
     def leave(self) -> None:
-        """End the turn, if the request has one."""
-        if self.lane is not None:
-            lane, self.lane = self.lane, None
-            lane.leave(self.client, self.weight)
+        """End the turn, if the request has one. The next iteration of the event loop frees it."""
+        if (lane := self.lane) is None:
+            return
+        self.lane = None
+        lane.weight -= self.weight
+        left = lane.weights.pop(self.client, 0) - self.weight
+        if left:
+            lane.weights[self.client] = left
+        asyncio.get_running_loop().call_soon(lane.start_next)
 
     def check(self) -> None:
         """Raise DeadlinePassedError if the deadline has passed."""
@@ -178,7 +169,7 @@ class Admission:
         self.drawing = ThreadPoolExecutor(1, "drawing", _lower_priority)
 
     async def in_worker(self, ticket: Ticket, call: Callable[[Callable[[], bool]], T]) -> T:
-        """Run a computation in a turn of the lane `slow`; see `Lane.enter` and `in_thread`."""
+        """Run a computation in a turn of the lane `slow`; see `Ticket.enter` and `in_thread`."""
         if ticket.lane is not self.slow:
             await ticket.enter(self.slow, 1)
         return await in_thread(call, ticket, self.worker)
@@ -249,19 +240,22 @@ class Bodies:
     @contextmanager
     def hold(self, client: str, size: int) -> Iterator[None]:
         """Count a large answer of a client in the ``with`` block, or raise BodiesFullError."""
-        self._add(client, size)
+        self.add(client, size)
         try:
             self._check(client, size)
             yield
         finally:
-            self.release(client, size)
+            self.add(client, -size)
 
-    def release(self, client: str, size: int) -> None:
-        """Stop counting a body of a client."""
-        self._add(client, -size)
+    def add(self, client: str, size: int) -> None:
+        """Count bytes of a client. A negative size stops counting them."""
+        self.total += size
+        of_client = self._of_clients.pop(client, 0) + size
+        if of_client:
+            self._of_clients[client] = of_client
 
     async def read(self, receive: Receive, client: str, limit: int, length: bytes) -> bytes:
-        """Read a whole body of at most ``limit`` bytes. The caller must `release` it.
+        """Read a whole body of at most ``limit`` bytes. The caller must stop counting it.
 
         ``length`` is the header Content-Length, or empty.
 
@@ -282,25 +276,19 @@ class Bodies:
                         raise errors.BadRequestError(detail)
                     part, more = message.get("body", b""), message.get("more_body", False)
                     is_whole = not (more or body)
-                    self._add(client, len(part))
+                    self.add(client, len(part))
                     body += part
                     if len(body) > limit:
                         raise _too_large(limit)
                     if not (is_whole and len(body) <= SMALL):
                         self._check(client, len(body))
         except BaseException as error:
-            self.release(client, len(body))
+            self.add(client, -len(body))
             if isinstance(error, TimeoutError):
                 detail = f"The body did not arrive within {self.patience:g} seconds."
                 raise errors.RequestTimeoutError(detail) from None
             raise
         return bytes(body)
-
-    def _add(self, client: str, size: int) -> None:
-        self.total += size
-        of_client = self._of_clients.pop(client, 0) + size
-        if of_client:
-            self._of_clients[client] = of_client
 
     def _check(self, client: str, size: int) -> None:
         share = max(self._budget // SHARE, size)

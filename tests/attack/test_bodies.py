@@ -156,7 +156,7 @@ async def test_large_scenes_leave_the_event_loop(
         return read_scene(*args, **options)
 
     async with serve(shared_store) as client:
-        monkeypatch.setattr("app.serving.request.read_scene", read)
+        monkeypatch.setattr("app.api.questions.read_scene", read)
         assert (await client.post(f"/{question}", json=scene)).status_code == 200
     assert (threads[0] is not threading.main_thread()) == is_large
 

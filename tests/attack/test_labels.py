@@ -18,12 +18,12 @@ from httpx import AsyncClient
 
 import app
 import scene_client
+from app.api.questions import QUICK_LABELS, is_quick
 from app.errors import RequestError
 from app.questions.reading import Limits, read_scene
 from app.scene.labels import label_key
 from app.scene.nearest import NameIndex
 from app.scene.vocabulary import Vocabulary
-from app.serving.request import QUICK_LABELS, is_quick
 from scene_client.schemas import MissingRequest, RoomsRequest
 from scene_client.schemas.requests import MAX_LABEL
 from tests.http.stores import VOCABULARY

@@ -12,8 +12,8 @@ from app.model.calibration import (
     Judgement,
     Misplaced,
 )
-from app.model.place_statistics import Places
 from app.model.scene_model import SceneModel
+from app.model.statistics import Places
 from app.scene import ObjectClass, RelationTable, Scene, SceneObject, Vocabulary
 from tests.enumeration.small_machines import SMALL, random_weights
 from training.machines import BoltzmannMachine, MachineSpec, build
@@ -61,10 +61,10 @@ def calibration(relations: int, **changes: object) -> Calibration:
 
 def places_of(V: int, triples: dict[tuple[int, int, int], float], **changes: np.ndarray) -> Places:
     """Places with these numbers of scenes. Every stand has the same share, and no role is known."""
-    keys = sorted(((a * V + i) * V + j, held) for (a, i, j), held in triples.items())
+    keys = sorted(((a * V + i) * V + j, scenes) for (a, i, j), scenes in triples.items())
     arrays = {
         "triple": np.array([key for key, _ in keys], np.int32),
-        "held": np.array([held for _, held in keys], np.float32),
+        "triple_scenes": np.array([scenes for _, scenes in keys], np.float32),
         "frequency": np.linspace(0.05, 0.45, V, dtype=np.float32),
         "role_pair": np.zeros(0, np.int32),
         "role_counts": np.zeros((0, 3), np.float32),

@@ -39,7 +39,7 @@ EVERY = list(range(V))
 def by_hand(
     counts: Counts, row: int, listed: dict[int, int], room: int | None, rho: float = 1.0
 ) -> list[float]:
-    """The formula of `app.model.count_statistics`, term by term."""
+    """The formula of `app.model.Counts`, term by term."""
     own = int(counts.classes[row])
     k, others = listed[own], [j for j in listed if j != own]
     exponents = []

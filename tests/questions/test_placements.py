@@ -15,7 +15,7 @@ from scipy.special import expit, logit
 
 from app.model import CountSlope, Offsets
 from app.model.calibration import PlaceFit
-from app.model.offset_statistics import UNOBSERVED, rotated_offsets
+from app.model.statistics import UNOBSERVED, rotated_offsets
 from app.questions.placements import Place, place_log_p, placements
 from app.questions.posterior import Posterior
 from app.scene import RELATIONS, ObjectClass, Scene, SceneObject, Vocabulary

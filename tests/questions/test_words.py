@@ -78,7 +78,10 @@ def test_relations_and_places_are_those_of_the_nearest_class(variant) -> None:
         # With the same effect on the hidden units, the word has the relations of a sofa.
         W[sofa] = W[word]
         units._W = W
-        both = [posterior.placement_log_odds(np.array([k]), anchors) for k in (word, sofa)]
+        both = [
+            units.placement_log_odds(posterior.context, np.array([k]), anchors)
+            for k in (word, sofa)
+        ]
         for a, b in zip(*both, strict=True):
             assert a == pytest.approx(b, abs=1e-4)
     scene = Scene(objects(artifact, "couch", "rug"), RelationTable.stated([(3, 0, 1)]))

@@ -57,7 +57,7 @@ def places(**changes: Any) -> Places:
     """Places of a lamp (1) on a bed (0) in nine scenes, and of three other triples."""
     values = {
         "triple": np.array([(a * V + i) * V + j for a, i, j in HELD], np.int32),
-        "held": np.array([*HELD.values()], np.float32),
+        "triple_scenes": np.array([*HELD.values()], np.float32),
         "frequency": np.array(FREQUENCY, np.float32),
         "role_pair": np.array([1 * V + 0, 2 * V + 0], np.int32),
         "role_counts": np.array([(7, 1, 0), (0, 3, 0)], np.float32),
@@ -129,15 +129,15 @@ INVALID: dict[tuple[Any, str], list[dict[str, Any]]] = {
     ],
     (offsets, "not_finite"): [{"relation": full(np.nan, A, 6)}],
     (places, "wrong_shape"): [
-        *({"held": full(0, 3)}, {"frequency": full(1, 2)}, {"role_counts": full(0, 2, 2)}),
+        *({"triple_scenes": full(0, 3)}, {"frequency": full(1, 2)}, {"role_counts": full(0, 2, 2)}),
         *({"role_anchor": full(0, 2, 3)}, {"stands": full(0, V, 2)}),
     ],
     (places, "invalid_tensor"): [
         *({"triple": np.array([1, *keys, 4], "i4")} for keys in ((3, 2), (2, 2))),
         *({"triple": np.array([key, 2, 3, last], "i4")} for key, last in ((-1, 4), (1, A * V * V))),
-        {"triple": EMPTY, "held": full(0, 0)},
+        {"triple": EMPTY, "triple_scenes": full(0, 0)},
         *({"role_pair": np.array([2, key], "i4")} for key in (V * V, 1)),
-        {"held": np.array([4, -1, 1, 2], "f4")},
+        {"triple_scenes": np.array([4, -1, 1, 2], "f4")},
         {"frequency": np.array([0.5, 0, 0.1], "f4")},
         {"role_counts": np.array([(7, 1, 0), (0, -3, 0)], "f4")},
         *({name: full(-1, V, 3)} for name in ("role_anchor", "stands")),
@@ -219,7 +219,7 @@ def test_supporters_are_smoothed_counts_of_on_top_and_inside() -> None:
     """A lamp (1) is on a bed (0) and on class 2, and class 2 is in a bed."""
     table = places(
         triple=np.array([(2 * V + 1) * V, (2 * V + 1) * V + 2, (4 * V + 2) * V], np.int32),
-        held=np.array([9, 2, 1], np.float32),
+        triple_scenes=np.array([9, 2, 1], np.float32),
     )
     prior = np.array([10.5, 0.5, 2.5]) / 13.5
     held = np.array([(0, 0, 0), (9, 0, 2), (1, 0, 0)])

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.scene.footprints import overlap_and_gap
-from app.scene.geometry import PoseRelations, derive_relations
 from app.scene.roles import IN, ON, UNDER, RoleCounts, is_smaller, likely_role, possible_roles
+from app.scene.scene import PoseRelations, derive_relations
 from app.scene.spatial_relations import CANONICAL, canonicalise
 
 LABELS = (

@@ -11,8 +11,7 @@ from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation
 
 from app.scene import RelationTable, Scene, SceneObject, observe
-from app.scene.geometry import Viewpoint, derive_relations, to_viewer_frame
-from app.scene.scene import pool_classes
+from app.scene.scene import Viewpoint, derive_relations, pool_classes, to_viewer_frame
 from app.scene.spatial_relations import (
     ABOVE,
     CANONICAL,

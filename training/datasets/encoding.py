@@ -26,9 +26,8 @@ from app.scene import (
     label_key,
     to_viewer_frame,
 )
-from app.scene.geometry import CONTACT
 from app.scene.roles import IN, ON, likely_role
-from app.scene.scene import pool_classes
+from app.scene.scene import CONTACT, pool_classes
 from app.scene.spatial_relations import INSIDE, ON_TOP, STACKED, SUPPORTS, pool_relations
 from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN, Heights, stands_of
 from scene_client.image_plane import are_neighbours, relation_between
@@ -116,7 +115,7 @@ def encode(
     in this list that a scene contains:
 
     - Listed relations. A relation that is listed in both directions is unobserved.
-    - Positions, by the rules of `app.scene.geometry`. If positions are not in viewer axes,
+    - Positions, by the rules of `app.scene.scene`. If positions are not in viewer axes,
       `room_viewpoint` chooses a viewpoint.
     - Boxes in an image, by the rule of `scene_client.image_plane`, for left and above only.
     - Support links. The object is on top of its support or inside it. All other relations of the

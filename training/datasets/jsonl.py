@@ -17,7 +17,7 @@ from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, StrictBool, StrictInt, ValidationError
 
-from app.scene.geometry import SMALLEST
+from app.scene.scene import SMALLEST
 from scene_client.schemas import Stamp
 from training.datasets.files import position_and_problem, read_lines
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError, Id, Text

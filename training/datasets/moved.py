@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from app.scene import Scene
 from app.scene.footprints import overlap_and_gap
-from app.scene.geometry import CONTACT
+from app.scene.scene import CONTACT
 from app.scene.spatial_relations import ON_TOP, SUPPORTS
 from training.datasets.array_types import ClassMask, Rng
 from training.datasets.cases import draw_true_relations, scene_of

@@ -6,7 +6,7 @@ unobserved. docs/decisions/relations.md gives the reason for each source.
 
 If on-top, inside or above is listed for a pair, all its unlisted relations are false in both
 directions. (1 to 10 % of such pairs also have a listed left or front.) A relation that an annotator
-marked as false is false. Neighbours are close by the rule of `app.scene.geometry`; without poses,
+marked as false is false. Neighbours are close by the rule of `app.scene.scene`; without poses,
 they have at least one listed relation.
 
 `vocabularies/sources.toml` describes the sources.

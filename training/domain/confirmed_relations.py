@@ -1,8 +1,8 @@
 """Relations that a person has confirmed, although the model reports them as misplaced.
 
-The new model never reports a confirmed relation of two classes (`app.registry.Misplaced.usual`).
+The new model never reports a confirmed relation of two classes (`app.model.Misplaced.confirmed`).
 The relation also counts like `_SCENES` training scenes in the places of the model
-(`app.model.place_statistics`), so the place becomes a usual one for missing objects.
+(`app.model.Places`), so the place becomes a usual one for missing objects.
 """
 
 from __future__ import annotations
@@ -68,10 +68,10 @@ def with_confirmed(artifact: SceneModel, triples: Iterable[Triple]) -> SceneMode
     places, V, triples = artifact.places, len(artifact.vocabulary), sorted(triples)
     if places is None:
         return artifact
-    misplaced = artifact.calibration.misplaced.model_copy(update={"usual": tuple(triples)})
+    misplaced = artifact.calibration.misplaced.model_copy(update={"confirmed": tuple(triples)})
     calibration = artifact.calibration.model_copy(update={"misplaced": misplaced})
     new = np.array([(a * V + i) * V + j for a, i, j in triples], places.triple.dtype)
     keys, index = np.unique(np.concatenate([places.triple, new]), return_inverse=True)
-    scenes = np.bincount(index, np.concatenate([places.held, np.full(len(new), _SCENES)]))
-    places = replace(places, triple=keys, held=scenes.astype(places.held.dtype))
+    scenes = np.bincount(index, np.concatenate([places.triple_scenes, np.full(len(new), _SCENES)]))
+    places = replace(places, triple=keys, triple_scenes=scenes.astype(places.triple_scenes.dtype))
     return replace(artifact, places=places, calibration=calibration)

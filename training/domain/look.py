@@ -12,7 +12,7 @@ from rapidfuzz import process
 from rapidfuzz.distance import OSA
 
 from app.scene import CANONICAL, canonicalise, label_key
-from app.scene.geometry import LARGEST, MOST_DISTANT
+from app.scene.scene import LARGEST, MOST_DISTANT
 from app.scene.spatial_relations import ABOVE, ON_TOP
 from training.datasets import AnnotatedScene, EncodedScene
 from training.datasets.sources import source_of

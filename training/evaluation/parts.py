@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from app.inference.weights import SHARES
+from app.inference.weights import LISTED_SHARES
 from app.scene import Scene, SceneObject
 from training.datasets.array_types import Rng
 from training.datasets.batches import SceneTensors, subset
@@ -30,7 +30,7 @@ from training.evaluation.setting import Structure, by_source
 REAL_SOURCES: Final = ("sunrgbd", "3dssg", "sunrgbd_bedrooms_3d", "matterport_rooms")
 """Data sources of real rooms with nearly complete object lists."""
 
-ALL_BUT_ONE: Final = len(SHARES)
+ALL_BUT_ONE: Final = len(LISTED_SHARES)
 """Bin of the listed share, and row of kappa, for lists of all classes but one."""
 
 LONGEST: Final = 12  # maximum number of listed classes of a random part in `validation_score`
@@ -114,8 +114,8 @@ def of_classes(classes: Sequence[int]) -> Scene:
 
 
 def share_bin(listed: Float[Tensor, " B"], classes: Float[Tensor, " B"]) -> Int[Tensor, " B"]:
-    """Return the bin of the listed share of scenes of so many classes, by the limits `SHARES`."""
-    bins = torch.bucketize(listed / classes, torch.tensor(SHARES[:-1]))
+    """Return the bin of `LISTED_SHARES` for lists of so many of the classes of a scene."""
+    bins = torch.bucketize(listed / classes, torch.tensor(LISTED_SHARES[:-1]))
     return torch.where(listed >= classes - 1, ALL_BUT_ONE, bins)
 
 

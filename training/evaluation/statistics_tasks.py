@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from app.model import SceneModel
-from app.model.count_statistics import Counts
+from app.model.statistics import Counts
 from app.questions.missing import LIKELY, more
 from app.questions.posterior import present
 from app.scene import CANONICAL

@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from app.inference.quadrature import NO_UNIT
+from app.inference.elementary import NO_UNIT
 from app.model import Calibration, CountSlope, SceneModel
 from app.questions.placements import PLACES
 from app.questions.posterior import Posterior
@@ -225,7 +225,7 @@ def fit_placements(
         posterior = _posterior(artifact, encoded, kept)
         present = posterior.present
         anchors = np.flatnonzero(~structure[present.classes])
-        tables = posterior.placement_log_odds(np.array([target]), anchors)
+        tables = posterior.units.placement_log_odds(posterior.context, np.array([target]), anchors)
         anchor_index = np.array(kept)[present.first[anchors]]
         removed_index = np.full_like(anchor_index, instance)
         holds, annotated = encoded.instance_holds, annotated_relations(encoded)

@@ -1,6 +1,6 @@
 """Fit statistics of the numbers of instances of a class, such as the chairs of a kitchen.
 
-`app.model.count_statistics` has the formula. s(n) is a weighted share of the training scenes with n
+`app.model.Counts` has the formula. s(n) is a weighted share of the training scenes with n
 instances, shrunk towards the shares over all classes. The weights maximise the penalised likelihood
 of the numbers in partly listed scenes (`some_instances`). A weight is the sum of a term of the
 class and a term that all classes share. `docs/decisions/counts.md` describes the alternatives.
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.optimize import minimize
 
-from app.model.count_statistics import EXPONENTS, INTERCEPT, ROOM, SEVERAL, SINGLE, Counts
+from app.model.statistics import EXPONENTS, INTERCEPT, ROOM, SEVERAL, SINGLE, Counts
 from app.scene import Vocabulary
 from training.datasets import EncodedScene
 from training.datasets.array_types import ClassMask, Table

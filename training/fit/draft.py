@@ -62,7 +62,7 @@ def fit_places(
         return None
     return Places(
         triple=keys.astype(np.int32),
-        held=scene_counts.astype(np.float32),
+        triple_scenes=scene_counts.astype(np.float32),
         frequency=(listed / listed.sum()).astype(np.float32),
         role_pair=roles.pair.astype(np.int32),
         role_counts=roles.counts,

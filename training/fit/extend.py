@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from app.inference import Weights
 from app.model import Calibration, Counts, Offsets, Places, SceneModel
 from app.model.calibration import NO_LIMIT
-from app.model.count_statistics import ROOM
+from app.model.statistics import ROOM
 from app.scene import CANONICAL, ObjectClass, Vocabulary
 
 _RARE: Final = 0.1  # quantile of the old biases that a new class or room type gets

@@ -38,7 +38,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from app.inference.variants import MachineSpec
-from app.inference.weights import SHARES
+from app.inference.weights import LISTED_SHARES
 from training.machines.edges import Edges, triple_keys
 
 OBJECT_WEIGHTS = ("b", "c1", "e", "W", "Q", "L", "Y", "f", "a", "y", "kappa")
@@ -67,7 +67,7 @@ class BoltzmannMachine(nn.Module, ABC):
         self.a = nn.Parameter(torch.zeros(spec.profiles, spec.V))
         self.y = nn.Parameter(torch.zeros(spec.profiles, spec.C))
         self.u = nn.Parameter(torch.zeros(spec.profiles + 1, spec.V), requires_grad=False)
-        self.kappa = nn.Parameter(torch.zeros(len(SHARES) + 1, spec.V))
+        self.kappa = nn.Parameter(torch.zeros(len(LISTED_SHARES) + 1, spec.V))
         if spec.coupled:
             self.L = nn.Parameter(torch.zeros(spec.V, spec.V))
             self.Y = nn.Parameter(torch.zeros(spec.C, spec.V))
@@ -185,7 +185,7 @@ class BoltzmannMachine(nn.Module, ABC):
         *,
         room: Int[Tensor, "B"] | None = None,  # -1: unknown
         source: Int[Tensor, "B"] | None = None,  # -1: unknown
-        share: Int[Tensor, "B"] | None = None,  # bin of the listed share (`SHARES`); adds kappa
+        share: Int[Tensor, "B"] | None = None,  # bin of `LISTED_SHARES`; adds kappa
     ) -> Float[Tensor, "B V"]:
         """Return the log-odds of each unlisted class given the listed classes v, in closed form."""
         bias = self.b + self.source_weights(v, source) @ self.a + self.room_bias(room)

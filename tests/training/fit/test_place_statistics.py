@@ -30,7 +30,7 @@ def test_each_scene_counts_once_for_each_triple():
     ]
     places = fit_places(scenes, ROLES, VOCABULARY)
     triples = {key(ON_TOP, LAMP, DESK): 2, key(LEFT, DESK, LAMP): 1, key(INSIDE, PICTURE, LAMP): 1}
-    assert dict(zip(places.triple.tolist(), places.held.tolist(), strict=True)) == triples
+    assert dict(zip(places.triple.tolist(), places.triple_scenes.tolist(), strict=True)) == triples
     assert places.triple.tolist() == sorted(triples)
     # One more for each class: three, three, one, none and none of the four scenes list it.
     assert places.frequency == pytest.approx(np.array([4, 4, 2, 1, 1]) / 12)

@@ -45,7 +45,7 @@ def test_every_variant_keeps_the_other_scores():
 def test_kinds_that_the_model_does_not_judge_stay_unjudged():
     artifact = larger_artifact("triway-states")
     judged = misplaced(relation=0.0)(artifact).calibration.misplaced
-    assert judged.usual == artifact.calibration.misplaced.usual
+    assert judged.confirmed == artifact.calibration.misplaced.confirmed
     for kind in ("lateral", "support", "above", "under", "stand"):
         before, after = (getattr(one, kind) for one in (artifact.calibration.misplaced, judged))
         assert (after is None) == (before is None)
