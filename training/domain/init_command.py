@@ -14,9 +14,8 @@ from app.scene import label_key
 from training.datasets import DatasetError, generate_rooms
 from training.datasets.files import write_whole
 from training.datasets.jsonl import write_jsonl
-from training.datasets.placeholders import left_out_line
 from training.datasets.rooms import DOMAINS
-from training.datasets.vocabulary import vocabulary_json
+from training.datasets.vocabulary import left_out_line, vocabulary_json
 from training.domain.look import Label
 from training.domain.material import read_material
 from training.domain.proposal import Proposal, propose

@@ -33,7 +33,7 @@ from training.evaluation.generation_task import (
 )
 from training.evaluation.model import Model, Places, Sampler
 from training.evaluation.setting import Setting
-from training.machines.arrays import machine_of
+from training.machines import machine_of
 
 
 def artifact_model(artifact: SceneModel, *, profiles: Sequence[str] = ()) -> Model:

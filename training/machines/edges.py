@@ -23,12 +23,6 @@ class Edges:
     object: Int[Tensor, "B E"]
     valid: Bool[Tensor, "B E"]  # False marks padding; padded units are 0
 
-    def both_present(self, v: Float[Tensor, "... B V"]) -> Float[Tensor, "... B E"]:
-        """Return 1 where both classes of a unit are present in v, else 0."""
-        lead = v.shape[:-1]
-        subject, object_ = (v.gather(-1, i.expand(*lead, -1)) for i in (self.subject, self.object))
-        return subject * object_ * self.valid
-
 
 @dataclass(frozen=True)
 class PairEdges(Edges):

@@ -95,7 +95,9 @@ class Triway(BoltzmannMachine):
         return self.edges(classes, counts), holds.flatten(1), observed.flatten(1)
 
     def gate(self, edges: Edges, v: Float[Tensor, "... B V"]) -> Float[Tensor, "... B E"]:
-        return edges.both_present(v)
+        ends = (index.expand(*v.shape[:-1], -1) for index in (edges.subject, edges.object))
+        subject, object_ = (v.gather(-1, index) for index in ends)
+        return subject * object_ * edges.valid
 
     def relation_logits(
         self, edges: Edges, v: Float[Tensor, "... B V"], h1: Float[Tensor, "... B H1"]

@@ -34,8 +34,7 @@ from training.domain.terminal import StorePath
 from training.evaluation.outside import read_test
 from training.evaluation.parts import draw_parts, exactly, rank_hidden
 from training.evaluation.setting import Structure, with_relations
-from training.machines import BoltzmannMachine
-from training.machines.arrays import machine_of
+from training.machines import BoltzmannMachine, machine_of
 from training.machines.edges import Edges
 
 _LENGTHS = (3, 8)

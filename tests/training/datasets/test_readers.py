@@ -22,8 +22,13 @@ from training.datasets import (
     jsonl,
     read_scenes,
 )
-from training.datasets.priors import COLUMNS, SOURCE, read_prior_scenes
-from training.datasets.readers import READERS, guess_format
+from training.datasets.readers import (
+    PRIOR_COLUMNS,
+    PRIORS,
+    READERS,
+    guess_format,
+    read_prior_scenes,
+)
 from training.datasets.tables import MAX_LINE
 from training.fit.configuration import ConfigError, DataConfig
 from training.runs.pipeline import read_sources
@@ -489,7 +494,7 @@ def test_huge_numbers_and_deep_lists_in_a_json_file_are_errors(tmp_path: Path, b
         read_scenes(path)
 
 
-HEAD = "\t".join(COLUMNS)
+HEAD = "\t".join(PRIOR_COLUMNS)
 
 
 def table(folder: Path, *rows: str, head: str = HEAD) -> Path:
@@ -509,7 +514,7 @@ def test_rows_become_scenes_of_two_objects(tmp_path: Path) -> None:
         "housekeep_votes\tcup\tinside\tcabinet\t3\tkitchen",  # votes of people are skipped
     )
     scenes = read_prior_scenes(path)
-    assert {scene.source for scene in scenes} == {SOURCE}
+    assert {scene.source for scene in scenes} == {PRIORS}
     assert [thing.label for thing in scenes[0].objects] == ["bread", "table"]
     assert [(scene.group, scene.relations) for scene in scenes] == [
         ("bread table", ((0, "on-top", 1),)),

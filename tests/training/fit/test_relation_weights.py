@@ -12,8 +12,15 @@ from tests.enumeration.small_machines import random_weights
 from tests.training.evaluation.scenes import V, scene, tensors, toy
 from training.datasets.batches import relation_units
 from training.fit.configuration import RelationsConfig
-from training.fit.relation_weights import SHARED, RelationFit, bake_shared_weights, share_weights
-from training.fit.residuals import lower_unseen_roles, means_of_parts, with_counted_residuals
+from training.fit.relation_weights import (
+    SHARED,
+    RelationFit,
+    bake_shared_weights,
+    lower_unseen_roles,
+    means_of_parts,
+    share_weights,
+    with_counted_residuals,
+)
 from training.machines import MachineSpec, build
 from training.machines.machine import OBJECT_WEIGHTS
 
@@ -269,7 +276,7 @@ LISTED = {(0, 1, 2): (18, 2), (0, 3, 4): (4, 8), (1, 0, 3): (0, 12)}
 @pytest.mark.parametrize("weights", [(1.0, 1.0), (0.5, 2.0)])
 def test_residuals_maximise_the_likelihood_of_triples_under_a_normal_prior(monkeypatch, weights):
     """At the mode the slope of the log-likelihood is τ δ, with one precision τ for all triples."""
-    monkeypatch.setattr("training.fit.residuals.means_of_parts", of_whole_scenes)
+    monkeypatch.setattr("training.fit.relation_weights.means_of_parts", of_whole_scenes)
     every = [
         annotated(triple, k < true, "captions" if k % 2 else "rooms")
         for triple, (true, false) in LISTED.items()
