@@ -52,25 +52,21 @@ class ClassEvidence:
     counts: Int[NDArray, "n"]  # number of instances of each class
     holds: Bool[NDArray, "A n n"]  # [a, x, y]: classes[x] has relation a to classes[y]
     observed: Bool[NDArray, "A n n"]  # also True where a relation holds
-    room_type: int | None  # index
 
     def only(self, rows: Int[NDArray, "m"]) -> ClassEvidence:
         """Return the evidence about some of the classes; `rows` are ascending indices of them."""
         pairs = np.ix_(np.arange(len(self.holds)), rows, rows)
         holds, observed = self.holds[pairs], self.observed[pairs]
-        return ClassEvidence(self.classes[rows], self.counts[rows], holds, observed, self.room_type)
+        return ClassEvidence(self.classes[rows], self.counts[rows], holds, observed)
 
 
 def pool_instances(
-    classes: Int[NDArray, "N"],
-    holds: Bool[NDArray, "A N N"],
-    observed: Bool[NDArray, "A N N"],
-    room_type: int | None = None,
+    classes: Int[NDArray, "N"], holds: Bool[NDArray, "A N N"], observed: Bool[NDArray, "A N N"]
 ) -> ClassEvidence:
     """Pool N instances by class, with a logical OR over the pairs of their instances."""
     distinct, _, row, counts, _ = pool_classes(classes, np.ones(len(classes)))
     holds, observed = pool_relations(row, len(distinct), holds, observed)
-    return ClassEvidence(distinct, counts, holds, observed, room_type)
+    return ClassEvidence(distinct, counts, holds, observed)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,13 +92,13 @@ class EncodedScene:
 
     def only(self, kept: Bool[NDArray, "N"]) -> EncodedScene:
         """Return the scene with only some of its instances."""
-        index, room = np.flatnonzero(kept), self.evidence.room_type
+        index = np.flatnonzero(kept)
         names = ("classes", "stands", "positions", "sizes", "yaws")
         arrays = {f"instance_{name}": getattr(self, f"instance_{name}") for name in names}
         arrays = {name: None if array is None else array[index] for name, array in arrays.items()}
         tables = (self.instance_holds, self.instance_observed)
         holds, observed = (table[:, index][:, :, index] for table in tables)
-        evidence = pool_instances(arrays["instance_classes"], holds, observed, room)
+        evidence = pool_instances(arrays["instance_classes"], holds, observed)
         arrays |= {"instance_holds": holds, "instance_observed": observed}
         return replace(self, evidence=evidence, **arrays)
 
@@ -177,20 +173,17 @@ def _encode(
     for array in (holds, observed):
         array[:, structure[kept]] = array[:, :, structure[kept]] = False
     room_type = curated_names().room_index(scene.room_type, vocabulary)
-    evidence = pool_instances(classes, holds, observed, room_type)
-    if any(thing.count > 1 for thing in scene.objects):
-        # One object entry can mean several instances.
-        counts = np.zeros_like(evidence.counts)
-        numbers = [scene.objects[i].count for i in kept]
-        np.add.at(counts, np.searchsorted(evidence.classes, classes), numbers)
-        evidence = replace(evidence, counts=counts)
+    evidence = pool_instances(classes, holds, observed)
+    # One object entry can mean several instances.
+    counts, numbers = np.zeros_like(evidence.counts), [scene.objects[i].count for i in kept]
+    np.add.at(counts, np.searchsorted(evidence.classes, classes), numbers)
     labels = [thing.label for thing, c in zip(scene.objects, matches, strict=True) if c is None]
     return EncodedScene(
         scene_id=scene.scene_id,
         source=scene.source,
         group=scene.group,
         room_type=-1 if room_type is None else room_type,
-        evidence=evidence,
+        evidence=replace(evidence, counts=counts),
         instance_classes=classes,
         instance_holds=holds,
         instance_observed=observed,

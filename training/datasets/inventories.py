@@ -85,7 +85,7 @@ def read_things(path: Path) -> dict[str, Thing]:
     keys: set[str] = set()
     errors = Errors(path)
     for row in read_table(path, THING_COLUMNS, errors):
-        with errors:
+        with errors.collected():
             thing = _thing(row)
             if (key := label_key(thing.label)) in keys:
                 raise row.error("label", f"{thing.label!r} has two rows")
@@ -93,7 +93,7 @@ def read_things(path: Path) -> dict[str, Thing]:
             things[thing.label], rows[thing.label] = thing, row
     errors.check()
     for label, row in rows.items():
-        with errors:
+        with errors.collected():
             _check_parents(label, things, row)
     errors.check()
     return things
@@ -207,13 +207,13 @@ def read_inventory(path: Path) -> Inventory:
     things: Mapping[str, Thing] = read_things(beside) if beside.is_file() else {}
     errors, table, left_out = Errors(path), _Places(), Counter[str]()
     for row in read_table(path, COLUMNS, errors, OPTIONAL):
-        with errors:
+        with errors.collected():
             if is_placeholder(label := row.text("label")):
                 left_out[label] += 1
             else:
                 table.add(row)
     for row, place, anchor in table.anchored:
-        with errors:
+        with errors.collected():
             if label_key(anchor) not in table.labels[place]:
                 problem = f"the place {place!r} has no row with the label {anchor!r}"
                 raise row.error("anchor", problem)

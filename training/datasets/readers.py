@@ -203,7 +203,7 @@ def read_prior_scenes(path: Path) -> list[AnnotatedScene]:
     """Read each row of a list of places as a scene of two objects. Rows of a pair are one group."""
     scenes, errors = [], Errors(path)
     for row in read_table(path, PRIOR_COLUMNS, errors):
-        with errors:
+        with errors.collected():
             source = row.one_of("source", (*_TRAINED, *_SKIPPED))
             relation = row.optional("relation")
             # One of the sources has prefixes, for example in "food bread" and "clothes skirt".

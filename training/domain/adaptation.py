@@ -113,20 +113,18 @@ def measure(home: Home, seed: int, progress: Callable[[str], None]) -> Measured:
     fold_of = rng.permutation(len(names))[group] % _FOLDS
     if len(np.unique(fold_of)) < _FOLDS:
         fold_of = rng.permutation(len(index)) % _FOLDS
-    loss, rank, alarms, change = [], [], [], []
+    rows = []
     for fold in range(_FOLDS):
         progress(f"comparing in folds: {fold + 1} of {_FOLDS}")
         test, seen = index[fold_of == fold], index[fold_of != fold]
         scenes = home.tensors.rows(torch.from_numpy(np.concatenate([seen, home.written])))
         weights = adapt(home.parent.weights, scenes, trained_on=home.trained_on, seed=seed)
         sides = home.parent, replace(home.parent, weights=weights)
-        loss.append(_losses(home, test, sides, seed))
-        rank.append(_ranks(home, test, sides, seed))
-        alarms.append(_alarms(home, test, sides))
-        change.append(_change(home, weights, scenes.v.sum(0) > 0, seed))
-    return Measured(
-        np.concatenate(loss), np.concatenate(rank), np.concatenate(alarms), float(np.mean(change))
-    )
+        losses, ranks = _losses(home, test, sides, seed), _ranks(home, test, sides, seed)
+        change = _change(home, weights, scenes.v.sum(0) > 0, seed)
+        rows.append((losses, ranks, _alarms(home, test, sides), change))
+    *tables, changes = zip(*rows, strict=True)
+    return Measured(*map(np.concatenate, tables), change=float(np.mean(changes)))
 
 
 Sides = tuple[SceneModel, SceneModel]  # the parent, and the model with adapted weights

@@ -34,17 +34,13 @@ from app.questions.outliers import intruders
 from app.scene import ObjectClass, Scene, Vocabulary, label_key
 from app.scene.spatial_relations import STACKED
 from training.datasets import AnnotatedScene, encode
-from training.datasets.cases import scene_of
+from training.datasets.cases import Triple, scene_of
 from training.datasets.inventories import SHARE, Place, complete_scene
 from training.datasets.moved import has_boxes, posed_scene
 from training.datasets.vocabulary import curated_names
-from training.evaluation.asking import (
-    canonical_triple,
-    index_of_ids,
-    of_classes,
-    score_misplaced,
-)
+from training.evaluation.asking import canonical_triple, index_of_ids, of_classes, score_misplaced
 from training.fit.adapt import HomeScenes, TrainedOn, extended
+from training.fit.regression import recalibrated
 
 JUDGED = 3  # number of scenes with a new class from which its objects are judged
 
@@ -233,8 +229,6 @@ def alarms_of(artifact: SceneModel, scene: Scene) -> Int[NDArray, "n"]:
 
 _SCENES: Final = 20.0
 
-Triple = tuple[int, int, int]
-
 
 def reported_relations(model: SceneModel, recorded: Sequence[AnnotatedScene]) -> set[Triple]:
     """Return the stacked relations (a, i, j) of classes that the model reports in confirmed scenes.
@@ -278,9 +272,8 @@ def with_confirmed(artifact: SceneModel, triples: Iterable[Triple]) -> SceneMode
     if places is None:
         return artifact
     misplaced = artifact.calibration.misplaced.model_copy(update={"usual": tuple(triples)})
-    calibration = artifact.calibration.model_copy(update={"misplaced": misplaced})
     new = np.array([(a * V + i) * V + j for a, i, j in triples], places.triple.dtype)
     keys, index = np.unique(np.concatenate([places.triple, new]), return_inverse=True)
     scenes = np.bincount(index, np.concatenate([places.held, np.full(len(new), _SCENES)]))
     places = replace(places, triple=keys, held=scenes.astype(places.held.dtype))
-    return replace(artifact, places=places, calibration=calibration)
+    return recalibrated(replace(artifact, places=places), misplaced=misplaced)

@@ -73,9 +73,6 @@ class HomeScenes(Table):
     observed: Bool[Tensor, "N V"]  # classes whose presence or absence the scene shows
     room: Int[Tensor, "N"]  # room type; -1 where unknown
 
-    def __len__(self) -> int:
-        return len(self.v)
-
 
 def adapt(
     parent: Weights, scenes: HomeScenes, *, trained_on: TrainedOn | None = None, seed: int = 0
@@ -160,7 +157,7 @@ class _Fit:
     def _batch_loss(self) -> Tensor:
         """Return the loss of parts of recorded scenes, followed by parts of stored samples."""
         drawn = self._draw(self.scenes, _BATCH), self._draw(self._samples, _DISTILLED)
-        columns = zip(*(vars(part).values() for part in drawn), strict=True)
+        columns = zip(*(part.columns for part in drawn), strict=True)
         scenes = HomeScenes(*map(torch.cat, columns))
         of_home = (torch.arange(len(scenes)) < _BATCH).unsqueeze(1)
         scale = torch.where(of_home.squeeze(1), 1 / _BATCH, _DISTILLATION / _DISTILLED)

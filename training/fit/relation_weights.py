@@ -46,7 +46,7 @@ from torch.nn.utils.parametrize import (
 )
 
 from app.scene.spatial_relations import STACKED
-from training.datasets.batches import Batch, SceneTensors, relation_units, subset
+from training.datasets.batches import Batch, SceneTensors, subset
 from training.datasets.encoding import ClassEvidence
 from training.fit.configuration import RelationsConfig
 from training.machines import BoltzmannMachine, build
@@ -97,7 +97,7 @@ class RelationFit:
         if self.config.count_dropout:
             hidden = torch.rand(len(batch), 1, generator=generator) < self.config.count_dropout
             batch = replace(batch, counts=batch.counts.masked_fill(hidden, 0))
-        edges, r, observed = relation_units(machine, batch)
+        edges, r, observed = machine.lay_out(batch)
         h1 = means_of_parts(machine, batch, generator)
         offsets = self.offsets[batch.source]
         logits = machine.relation_logits(edges, batch.v, h1)
@@ -334,7 +334,7 @@ def with_counted_residuals(
     generator = torch.Generator().manual_seed(0)
     for index in torch.arange(len(train)).split(_BATCH):
         batch = train.batch(index)
-        edges, r, observed = relation_units(machine, batch)
+        edges, r, observed = machine.lay_out(batch)
         h1 = means_of_parts(machine, batch, generator)
         logits = machine.relation_logits(edges, batch.v, h1)
         logits = logits + offsets[batch.source].gather(1, edges.relation)

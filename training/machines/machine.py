@@ -33,13 +33,13 @@ from abc import ABC, abstractmethod
 from typing import Self
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from app.inference.variants import MachineSpec
 from app.inference.weights import SHARES
-from training.machines.edges import Edges, triple_keys
+from training.machines.edges import Edges, LaidOut, SceneRelations, triple_keys
 
 OBJECT_WEIGHTS = ("b", "c1", "e", "W", "Q", "L", "Y", "f", "a", "y", "kappa")
 """Names of the weights without relations."""
@@ -251,14 +251,8 @@ class BoltzmannMachine(nn.Module, ABC):
         """Return the units between classes (-1: padding) with counts (0: unknown; default 1)."""
 
     @abstractmethod
-    def lay_out(
-        self,
-        classes: Int[Tensor, "B n"],
-        counts: Int[Tensor, "B n"],
-        holds: Float[Tensor, "B A n n"],
-        observed: Bool[Tensor, "B A n n"],
-    ) -> tuple[Edges, Float[Tensor, "B E"], Bool[Tensor, "B E"]]:
-        """Return the relations between classes as edges, r and observed flags of this machine."""
+    def lay_out(self, scenes: SceneRelations) -> LaidOut:
+        """Return the relations between classes as the relation units of this machine."""
 
     @abstractmethod
     def gate(self, edges: Edges, v: Float[Tensor, "... B V"]) -> Float[Tensor, "... B E"]:

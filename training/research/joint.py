@@ -129,9 +129,7 @@ def compare_relations(
     every, first = [], []
     for k in order[:_LISTS]:
         batch = related.batch(k.unsqueeze(0))
-        edges, r, observed = machine.lay_out(
-            batch.classes, batch.counts, batch.holds.double(), batch.observed
-        )
+        edges, r, observed = machine.lay_out(replace(batch, holds=batch.holds.double()))
         v = batch.v.double()
         change = change_by_relations(machine, v, edges, r, observed, generator).abs()
         absent = (v[0] == 0) & ~structure
