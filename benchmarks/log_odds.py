@@ -13,8 +13,7 @@ from app.inference.relation_units import encode
 from benchmarks.report import Result
 from benchmarks.timing import interleave
 from benchmarks.yardsticks import object_machine, presence, random_scenes, scikit_learn
-from training.machines import MachineSpec
-from training.machines.arrays import weights_of
+from training.machines import MachineSpec, weights_of
 
 OURS, UNPREPARED = "ours, exp(W) precomputed", "ours, from the weights alone"
 TWO_COPIES = "scikit-learn, 2 V copies"

@@ -26,7 +26,7 @@ from training.domain.evaluate_command import evaluate_command
 from training.domain.gate import MARGIN, NEW, losses, measure_usefulness, served_model
 from training.domain.init_command import example, init
 from training.domain.look import outside_vocabulary
-from training.domain.terminal import StorePath, console, fail, print_lines
+from training.domain.terminal import Display, StorePath, console, fail, next_steps, print_lines
 from training.evaluation.report import Progress
 from training.fit.configuration import Config, ConfigError
 from training.fit.trainer import Trainer
@@ -36,7 +36,6 @@ from training.research.words import words
 from training.runs.config_files import data_folder, load_config, with_settings
 from training.runs.example_scenes import accepted_examples, read_examples
 from training.runs.folder import FinishedRun, RunError, load_run, save_run
-from training.runs.live import Display, next_steps, summarise
 from training.runs.pipeline import SplitScenes, prepare
 from training.runs.publish import RefusedError, publish_run, refit
 from training.seed.command import seed as seed_command
@@ -108,12 +107,12 @@ def train(
         scenes = _prepare(config, root)
         trainer = Trainer(config, scenes.training_data())
         console.print(f"{config.name}: {trainer.machine.parameter_count:,} weights")
-        with Display(trainer, console) as display:
+        with Display(trainer) as display:
             result = trainer.run(display.progress)
         save_run(folder, config, result, data=root, scenes=scenes.digest)
-        summarise(result, folder, console)
+        display.summarise(result.seconds, folder)
         if publish is None and not final:
-            next_steps(folder, console)
+            next_steps(folder)
         if publish is not None:
             artifact = _publish(load_run(folder), scenes, Store(store), publish, measured=measured)
             _print_published(artifact, store)

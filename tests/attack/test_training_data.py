@@ -10,7 +10,7 @@ import pytest
 
 from training.datasets import DatasetError, files, read_scenes, sunrgbd_mat
 from training.datasets.jsonl import MAX_LINE
-from training.datasets.priors import read_prior_scenes
+from training.datasets.readers import read_prior_scenes
 
 SCENE = '{"scene_id": "a", "objects": []}\n'
 

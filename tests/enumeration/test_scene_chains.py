@@ -22,8 +22,7 @@ from tests.enumeration.small_machines import (
     small_machine,
     with_mean_rates,
 )
-from training.machines import MachineSpec, build
-from training.machines.arrays import weights_of
+from training.machines import MachineSpec, build, weights_of
 from training.machines.machine import OBJECT_WEIGHTS
 
 CHAINS, RELATION_DRAWS = 10_000, 4_000

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from app.inference.objects import LARGEST_WEIGHT, HiddenLogOdds, ObjectScorer
 from app.inference.relation_units import encode
 from tests.enumeration.small_machines import random_weights
-from training.machines import MachineSpec, build
-from training.machines.arrays import weights_of
+from training.machines import MachineSpec, build, weights_of
 
 SEEDS = st.integers(0, 2**32)
 # The largest |w| decides how many factors share a log.

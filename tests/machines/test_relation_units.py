@@ -16,8 +16,7 @@ from app.inference.relation_units import (
 )
 from tests.enumeration.small_machines import implied_by_hand, random_weights, unit_states
 from tests.questions.artifacts import random_machine
-from training.machines import MachineSpec, build
-from training.machines.arrays import weights_of
+from training.machines import MachineSpec, build, weights_of
 
 V, A = 6, 2
 

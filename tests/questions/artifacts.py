@@ -16,8 +16,7 @@ from app.model.scene_model import SceneModel
 from app.model.statistics import Places
 from app.scene import ObjectClass, RelationTable, Scene, SceneObject, Vocabulary
 from tests.enumeration.small_machines import SMALL, random_weights
-from training.machines import BoltzmannMachine, MachineSpec, build
-from training.machines.arrays import weights_of
+from training.machines import BoltzmannMachine, MachineSpec, build, weights_of
 
 # Few enough states to enumerate, with three classes.
 EXACT: dict[str, MachineSpec] = {name: spec for name, spec in SMALL.items() if spec.V == 3}

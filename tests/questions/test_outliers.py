@@ -11,7 +11,7 @@ from app.model.calibration import CountSlope
 from app.questions.posterior import Posterior
 from tests.questions.answers import misplaced, missing, outliers
 from tests.questions.artifacts import LABELS, STRUCTURE, judging, larger_artifact, lines, scene_of
-from training.machines.arrays import machine_of
+from training.machines import machine_of
 
 LINE = CountSlope(intercept=0.2, slope=-0.8, log_count=0.1)
 LEVELS = ("low", "medium", "high")

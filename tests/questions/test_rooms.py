@@ -9,7 +9,7 @@ import torch
 from app.model import Sharpness
 from tests.questions.answers import rooms
 from tests.questions.artifacts import LARGER, larger_artifact, scene_of
-from training.machines.arrays import machine_of
+from training.machines import machine_of
 
 pytestmark = pytest.mark.usefixtures("without_minimums")
 

@@ -118,9 +118,8 @@ def instances(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.n
 @given(instances())
 def test_classes_are_the_or_over_instance_pairs(drawn):
     classes, confidence, holds, observed = drawn
-    evidence = pool_instances(classes, holds, observed, room_type=3)
+    evidence = pool_instances(classes, holds, observed)
     *_, presence = pool_classes(classes, confidence)
-    assert evidence.room_type == 3
     assert evidence.classes.tolist() == sorted(set(classes.tolist()))
     assert evidence.counts.tolist() == [(classes == c).sum() for c in evidence.classes]
     for x, c in enumerate(evidence.classes):

@@ -8,8 +8,6 @@ from jaxtyping import Bool
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 Rng = np.random.Generator
 ClassMask = Bool[NDArray, "V"]  # True for some of the V classes
 
@@ -19,5 +17,12 @@ class Table:
 
     def rows(self, index: Any) -> Self:
         """Return the rows at the indices, or the rows where a mask is True."""
-        names = (field.name for field in fields(cast("Any", self)))
-        return type(self)(*(getattr(self, name)[index] for name in names))
+        return type(self)(*(column[index] for column in self.columns))
+
+    def __len__(self) -> int:
+        return len(self.columns[0])
+
+    @property
+    def columns(self) -> list[Any]:
+        """The values of the fields, in order."""
+        return [getattr(self, field.name) for field in fields(cast("Any", self))]

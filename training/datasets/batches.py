@@ -17,26 +17,18 @@ from app.scene import CANONICAL, RoleCounts, Vocabulary
 from training.datasets import EncodedScene
 from training.datasets.array_types import ClassMask, Table
 from training.datasets.encoding import ClassEvidence
-from training.machines import BoltzmannMachine
-from training.machines.edges import Edges
+from training.machines.edges import SceneRelations
 
 _BLOCK = 1024
 
 
 @dataclass(frozen=True)
-class Batch(Table):
+class Batch(SceneRelations, Table):
     """A batch of scenes as tensors. n is the largest number of classes of a scene."""
 
     v: Float[Tensor, "B V"]  # presence of each class
-    classes: Int[Tensor, "B n"]  # present classes; padding is -1
-    counts: Int[Tensor, "B n"]  # instances of each of `classes`; 0: the source gives none
-    holds: Float[Tensor, "B A n n"]  # value of each relation between two of `classes`
-    observed: Bool[Tensor, "B A n n"]  # True where a relation is annotated
     room: Int[Tensor, "B"]  # room type; -1 means unknown
     source: Int[Tensor, "B"]  # index in `SceneTensors.source_names`
-
-    def __len__(self) -> int:
-        return len(self.v)
 
 
 @dataclass(frozen=True)
@@ -90,7 +82,7 @@ class SceneTensors:
             classes[row, :m], counts[row, :m] = e.classes, e.counts
             holds[row, :, :m, :m], observed[row, :, :m, :m] = e.holds, e.observed
         tables = map(torch.from_numpy, (classes, counts, holds, observed))
-        return Batch(*(self.v[index], *tables, self.room[index], self.source[index]))
+        return Batch(*tables, self.v[index], self.room[index], self.source[index])
 
 
 def scene_tensors(
@@ -123,13 +115,6 @@ def subset(scenes: SceneTensors, index: Tensor) -> SceneTensors:
         room=scenes.room[index],
         source=scenes.source[index],
     )
-
-
-def relation_units(
-    machine: BoltzmannMachine, batch: Batch
-) -> tuple[Edges, Float[Tensor, "B E"], Bool[Tensor, "B E"]]:
-    """Return the layout, values and observed flags of the relation units of a batch."""
-    return machine.lay_out(batch.classes, batch.counts, batch.holds, batch.observed)
 
 
 def seen_triples(scenes: Sequence[EncodedScene], V: int, minimum: int = 1) -> Int[Tensor, "T 3"]:

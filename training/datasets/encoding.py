@@ -51,25 +51,21 @@ class ClassEvidence:
     counts: Int[NDArray, "n"]  # number of instances of each class
     holds: Bool[NDArray, "A n n"]  # [a, x, y]: classes[x] has relation a to classes[y]
     observed: Bool[NDArray, "A n n"]  # also True where a relation holds
-    room_type: int | None  # index
 
     def only(self, rows: Int[NDArray, "m"]) -> ClassEvidence:
         """Return the evidence about some of the classes; `rows` are ascending indices of them."""
         pairs = np.ix_(np.arange(len(self.holds)), rows, rows)
         holds, observed = self.holds[pairs], self.observed[pairs]
-        return ClassEvidence(self.classes[rows], self.counts[rows], holds, observed, self.room_type)
+        return ClassEvidence(self.classes[rows], self.counts[rows], holds, observed)
 
 
 def pool_instances(
-    classes: Int[NDArray, "N"],
-    holds: Bool[NDArray, "A N N"],
-    observed: Bool[NDArray, "A N N"],
-    room_type: int | None = None,
+    classes: Int[NDArray, "N"], holds: Bool[NDArray, "A N N"], observed: Bool[NDArray, "A N N"]
 ) -> ClassEvidence:
     """Pool N instances by class, with a logical OR over the pairs of their instances."""
     distinct, _, row, counts, _ = pool_classes(classes, np.ones(len(classes)))
     holds, observed = pool_relations(row, len(distinct), holds, observed)
-    return ClassEvidence(distinct, counts, holds, observed, room_type)
+    return ClassEvidence(distinct, counts, holds, observed)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,13 +91,13 @@ class EncodedScene:
 
     def only(self, kept: Bool[NDArray, "N"]) -> EncodedScene:
         """Return the scene with only some of its instances."""
-        index, room = np.flatnonzero(kept), self.evidence.room_type
+        index = np.flatnonzero(kept)
         names = ("classes", "stands", "positions", "sizes", "yaws")
         arrays = {f"instance_{name}": getattr(self, f"instance_{name}") for name in names}
         arrays = {name: None if array is None else array[index] for name, array in arrays.items()}
         tables = (self.instance_holds, self.instance_observed)
         holds, observed = (table[:, index][:, :, index] for table in tables)
-        evidence = pool_instances(arrays["instance_classes"], holds, observed, room)
+        evidence = pool_instances(arrays["instance_classes"], holds, observed)
         arrays |= {"instance_holds": holds, "instance_observed": observed}
         return replace(self, evidence=evidence, **arrays)
 
@@ -124,9 +120,13 @@ def encode(
     `training.datasets.sources` defines which unlisted relations of a data source are false, and
     which labels are ignored. Relations of structure classes are unobserved.
     """
-    encoder, scenes = _Encoder(vocabulary, roles), list(scenes)
+    scenes, index_of = list(scenes), cache(vocabulary.index)
     groups = Counter(scene.group for scene in scenes)
-    return [encoder(scene, groups[scene.group]) for scene in scenes]
+    encoded = []
+    for scene in scenes:
+        indices = [index_of(thing.label) for thing in scene.objects]
+        encoded.append(_encode(scene, groups[scene.group], indices, vocabulary, roles))
+    return encoded
 
 
 def annotated_classes(
@@ -150,54 +150,51 @@ def _classes_named(labels: Iterable[str], vocabulary: Vocabulary) -> list[int]:
     return [vocabulary.labels.index(label) for label in labels if label in vocabulary.labels]
 
 
-class _Encoder:
-    def __init__(self, vocabulary: Vocabulary, roles: RoleCounts | None) -> None:
-        self.vocabulary, self.roles = vocabulary, roles
-        self.index = cache(vocabulary.index)
-
-    def __call__(self, scene: AnnotatedScene, group_size: int) -> EncodedScene:
-        """Encode one scene of a group of `group_size` near-duplicates."""
-        meaning = meaning_of(scene.source, listed=scene.relations is not None)
-        left_out = _classes_named(source_of(scene.source).left_out, self.vocabulary)
-        matches = [self.index(thing.label) for thing in scene.objects]
-        kept = [i for i, c in enumerate(matches) if c is not None and c not in left_out]
-        indices = np.array([-1 if c is None else c for c in matches], dtype=np.int64)
-        relations, boxes = _relations(scene, meaning, indices, self.roles)
-        structure = (indices >= 0) & self.vocabulary.structure[indices]
-        stands = _stands(scene, relations, boxes, structure)[kept]
-        holds = relations.holds[:, kept][:, :, kept]
-        observed = relations.observed[:, kept][:, :, kept]
-        classes = indices[kept]
-        # Relations of structure classes are uninformative: every room has walls on all sides.
-        for array in (holds, observed):
-            array[:, structure[kept]] = array[:, :, structure[kept]] = False
-        room_type = curated_names().room_index(scene.room_type, self.vocabulary)
-        evidence = pool_instances(classes, holds, observed, room_type)
-        if any(thing.count > 1 for thing in scene.objects):
-            # One object entry can mean several instances.
-            counts = np.zeros_like(evidence.counts)
-            numbers = [scene.objects[i].count for i in kept]
-            np.add.at(counts, np.searchsorted(evidence.classes, classes), numbers)
-            evidence = replace(evidence, counts=counts)
-        labels = [thing.label for thing, c in zip(scene.objects, matches, strict=True) if c is None]
-        return EncodedScene(
-            scene_id=scene.scene_id,
-            source=scene.source,
-            group=scene.group,
-            room_type=-1 if room_type is None else room_type,
-            evidence=evidence,
-            instance_classes=classes,
-            instance_holds=holds,
-            instance_observed=observed,
-            instance_stands=stands,
-            # One spelling of each label without a class.
-            unknown=tuple(sorted({label_key(label): label for label in labels}.values())),
-            instance_positions=None if boxes is None else boxes[kept, :3],
-            instance_sizes=None if boxes is None else boxes[kept, 3:6],
-            instance_yaws=None if boxes is None else boxes[kept, 6],
-            weight=min(1.0, (meaning.scenes_per_group or group_size) / group_size),
-            complete=meaning.complete_objects,
-        )
+def _encode(
+    scene: AnnotatedScene,
+    group_size: int,
+    matches: Sequence[int | None],
+    vocabulary: Vocabulary,
+    roles: RoleCounts | None,
+) -> EncodedScene:
+    """Encode one scene of a group of `group_size` scenes; `matches` are classes of its objects."""
+    meaning = meaning_of(scene.source, listed=scene.relations is not None)
+    left_out = _classes_named(source_of(scene.source).left_out, vocabulary)
+    kept = [i for i, c in enumerate(matches) if c is not None and c not in left_out]
+    indices = np.array([-1 if c is None else c for c in matches], dtype=np.int64)
+    relations, boxes = _relations(scene, meaning, indices, roles)
+    structure = (indices >= 0) & vocabulary.structure[indices]
+    stands = _stands(scene, relations, boxes, structure)[kept]
+    holds = relations.holds[:, kept][:, :, kept]
+    observed = relations.observed[:, kept][:, :, kept]
+    classes = indices[kept]
+    # Relations of structure classes are uninformative: every room has walls on all sides.
+    for array in (holds, observed):
+        array[:, structure[kept]] = array[:, :, structure[kept]] = False
+    room_type = curated_names().room_index(scene.room_type, vocabulary)
+    evidence = pool_instances(classes, holds, observed)
+    # One object entry can mean several instances.
+    counts, numbers = np.zeros_like(evidence.counts), [scene.objects[i].count for i in kept]
+    np.add.at(counts, np.searchsorted(evidence.classes, classes), numbers)
+    labels = [thing.label for thing, c in zip(scene.objects, matches, strict=True) if c is None]
+    return EncodedScene(
+        scene_id=scene.scene_id,
+        source=scene.source,
+        group=scene.group,
+        room_type=-1 if room_type is None else room_type,
+        evidence=replace(evidence, counts=counts),
+        instance_classes=classes,
+        instance_holds=holds,
+        instance_observed=observed,
+        instance_stands=stands,
+        # One spelling of each label without a class.
+        unknown=tuple(sorted({label_key(label): label for label in labels}.values())),
+        instance_positions=None if boxes is None else boxes[kept, :3],
+        instance_sizes=None if boxes is None else boxes[kept, 3:6],
+        instance_yaws=None if boxes is None else boxes[kept, 6],
+        weight=min(1.0, (meaning.scenes_per_group or group_size) / group_size),
+        complete=meaning.complete_objects,
+    )
 
 
 def _stands(

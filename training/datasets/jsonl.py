@@ -60,7 +60,7 @@ class _Line(BaseModel):
     false_relations: list[_Triple] | None = None
     counts: dict[str, StrictInt] | None = None
     viewer_frame: StrictBool | None = None
-    stamp: Stamp | None = None
+    stamp: Stamp | None = None  # checked, but not used
     confirmed: StrictBool = False
 
 
@@ -116,8 +116,6 @@ def _fields_of(scene: AnnotatedScene) -> dict[str, Any]:
             values[name] = [[ids[s], r, ids[o]] for s, r, o in triples]
     if counts := {thing.label: thing.count for thing in scene.objects if thing.count > 1}:
         values["counts"] = counts
-    if scene.stamp is not None:
-        values["stamp"] = dict(zip(("sec", "nanosec"), scene.stamp, strict=True))
     flags = ("viewer_frame", "confirmed")
     return values | {name: True for name in flags if getattr(scene, name)}
 
@@ -141,7 +139,6 @@ def _parse_scene(line: bytes, default_id: str) -> AnnotatedScene:
         viewer_frame=source in _VIEWER_SOURCES if frame is None else frame,
         false_relations=relations_of(source, denied),
         supported=supported_subjects(source, stated),
-        stamp=None if values.stamp is None else (values.stamp.sec, values.stamp.nanosec),
         confirmed=values.confirmed,
     )
 

@@ -1,4 +1,4 @@
-"""The readers of scene files by the name of the format, and the readers of 3DSSG and COCO.
+"""The readers of scene files by the name of the format; readers of 3DSSG, COCO and placing priors.
 
 3DSSG scene graphs (Wald et al., CVPR 2020): the whole data set consists of ``relationships.json``
 and of ``objects.json``, which contains the labels. The subset consists of
@@ -7,6 +7,8 @@ the labels and divide scans into splits of at most nine objects. ``3RScan.json``
 lists the scans of each room.
 
 COCO instance annotations (Lin et al., ECCV 2014): ``instances*.json``.
+
+Placing priors: tables of the usual relations between pairs of objects, without scenes.
 
 A reader raises a DatasetError if a file is missing or does not have the official format.
 """
@@ -20,6 +22,7 @@ from typing import Any, Final
 
 from pydantic import BaseModel
 
+from app.scene import RELATIONS, label_key
 from training.datasets.files import read_json
 from training.datasets.jsonl import read_jsonl
 from training.datasets.records import (
@@ -33,6 +36,7 @@ from training.datasets.records import (
 )
 from training.datasets.sources import relations_of, supported_subjects
 from training.datasets.sunrgbd_mat import read_sunrgbd_mat
+from training.datasets.tables import Errors, read_table
 
 
 class _Scan(BaseModel):
@@ -182,3 +186,37 @@ def guess_format(path: Path) -> str:
 def read_scenes(path: Path) -> list[AnnotatedScene]:
     """Read the scenes of a file in the format that `guess_format` returns, or raise its error."""
     return READERS[guess_format(path)](path)
+
+
+PRIOR_COLUMNS: Final = ("source", "subject", "relation", "object", "count", "room")
+
+PRIORS: Final = "placing_priors"
+"""Source name of all scenes that the reader makes from rows of the table."""
+
+# Sources whose rows become training scenes: the places of VirtualHome and AI2-THOR.
+_TRAINED: Final = ("virtualhome_placing", "ithor_receptacles")
+# Other values of the column ``source``, such as tables of votes and of part counts.
+_SKIPPED: Final = ("tidybot", "conceptnet_atlocation", "housekeep_votes", "vg80k_partof_counts")
+
+
+def read_prior_scenes(path: Path) -> list[AnnotatedScene]:
+    """Read each row of a list of places as a scene of two objects. Rows of a pair are one group."""
+    scenes, errors = [], Errors(path)
+    for row in read_table(path, PRIOR_COLUMNS, errors):
+        with errors.collected():
+            source = row.one_of("source", (*_TRAINED, *_SKIPPED))
+            relation = row.optional("relation")
+            # One of the sources has prefixes, for example in "food bread" and "clothes skirt".
+            names = [
+                row.optional(column).removeprefix("food ").removeprefix("clothes ").strip()
+                for column in ("subject", "object")
+            ]
+            keys = set(map(label_key, names)) - {""}
+            if source in _TRAINED and relation in RELATIONS and len(keys) == 2:
+                things = tuple(AnnotatedObject(str(k), name) for k, name in enumerate(names))
+                group, listed = " ".join(names), ((0, relation, 1),)
+                scenes.append(
+                    AnnotatedScene(row.position, PRIORS, group, None, things, relations=listed)
+                )
+    errors.check()
+    return scenes

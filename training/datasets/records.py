@@ -106,9 +106,8 @@ class AnnotatedScene:
     false_relations: tuple[tuple[int, str, int], ...] = ()  # marked as false by an annotator
     # Indices of objects with a listed support, also by other relations such as "attached to".
     supported: tuple[int, ...] = ()
-    # Of scenes recorded by a robot: seconds and nanoseconds since 1970, and whether a person has
-    # confirmed the scene. The digest of a data source does not depend on them.
-    stamp: tuple[int, int] | None = field(default=None, repr=False)
+    # True for a recorded scene that a person has confirmed. The digest of a data source does not
+    # depend on it.
     confirmed: bool = field(default=False, repr=False)
 
     def __post_init__(self) -> None:

@@ -36,20 +36,14 @@ def count_roles(scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary) -> Rol
     stated: set[tuple[str, str, Role]] = set()
     for scene in scenes:
         classes = [index(thing.label) for thing in scene.objects]
-        for role, i, j in _stated_roles(scene):
-            k, m = classes[i], classes[j]
-            if k is None or m is None or k == m or vocabulary.structure[[k, m]].any():
-                continue
-            stated.add((scene.source, scene.group, (role, k, m)))
-    return _table(Counter(role for _, _, role in stated), vocabulary)
-
-
-def _stated_roles(scene: AnnotatedScene) -> Iterable[Role]:
-    """Yield role, index of the object in this role and index of the larger object."""
-    for subject, relation, anchor in scene.relations or ():
-        if relation in _ROLES:
+        for subject, relation, anchor in scene.relations or ():
             small, large = (anchor, subject) if relation == "contains" else (subject, anchor)
-            yield _ROLES[relation], small, large
+            role, i, j = _ROLES.get(relation), classes[small], classes[large]
+            if role is None or i is None or j is None or i == j:
+                continue
+            if not vocabulary.structure[[i, j]].any():
+                stated.add((scene.source, scene.group, (role, i, j)))
+    return _table(Counter(role for _, _, role in stated), vocabulary)
 
 
 def lift_of(thing: AnnotatedObject, support: AnnotatedObject) -> float | None:

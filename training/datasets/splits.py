@@ -51,7 +51,7 @@ def split(
     units = [_unit(scene, protocol) for scene in scenes]
     part_of: dict[str, Part] = {}
     if protocol == "stable":
-        part_of = {unit: _stable_part(unit, seed) for unit in units}
+        part_of = {_unit(scene, protocol): stable_part(scene, seed) for scene in scenes}
     else:
         for family in _families(scenes, units):
             part_of |= _assign(family, FRACTIONS[protocol], seed)
@@ -69,11 +69,7 @@ def _unit(scene: AnnotatedScene, protocol: Protocol) -> str:
 
 def stable_part(scene: AnnotatedScene, seed: int) -> Part:
     """Return the part of a scene in the ``stable`` protocol. It depends on no other scenes."""
-    return _stable_part(_unit(scene, "stable"), seed)
-
-
-def _stable_part(unit: str, seed: int) -> Part:
-    fraction = int.from_bytes(_rank(seed, unit)[:8], "big") / 2**64
+    fraction = int.from_bytes(_rank(seed, _unit(scene, "stable"))[:8], "big") / 2**64
     for part, share in FRACTIONS["stable"].items():
         if fraction < share:
             return part

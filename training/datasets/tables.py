@@ -7,8 +7,8 @@ decimal comma, because spreadsheets of many countries write semicolons and decim
 import csv
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Final
 
 from training.datasets.files import read_lines
@@ -20,7 +20,7 @@ _SEPARATORS: Final = (",", ";", "\t")
 
 
 class Errors:
-    """Errors of the rows of a table. A `with` block collects the `DatasetError` that ends it."""
+    """Errors of the rows of a table."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -40,20 +40,13 @@ class Errors:
         if self._count:
             raise InvalidLinesError(self._path, self._listed, self._count)
 
-    def __enter__(self) -> None:
-        """Begin a block."""
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> bool:
-        """Collect a DatasetError. Other exceptions leave the block."""
-        if isinstance(error, DatasetError):
+    @contextmanager
+    def collected(self) -> Iterator[None]:
+        """Collect the `DatasetError` that ends the block. Other exceptions leave the block."""
+        try:
+            yield
+        except DatasetError as error:
             self.add(error)
-            return True
-        return False
 
 
 class Row:

@@ -9,8 +9,7 @@ from typing import Final
 
 from app.scene import ObjectClass, Vocabulary, label_key
 from training.datasets.files import KNOWLEDGE
-from training.datasets.inventories import read_inventory
-from training.datasets.things import Thing
+from training.datasets.inventories import Thing, read_inventory
 from training.datasets.vocabulary import (
     INDOOR_FILE,
     curated_names,

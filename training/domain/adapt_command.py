@@ -27,8 +27,8 @@ from app.registry import (
 )
 from app.registry.references import AliasTarget
 from training.datasets import AnnotatedScene, DatasetError
-from training.datasets.placeholders import left_out_line
 from training.datasets.records import digest_of
+from training.datasets.vocabulary import left_out_line
 from training.domain.adaptation import FEWEST, Adapted, Measured, adapted
 from training.domain.home import JUDGED, Home, confirmed_scene
 from training.domain.material import read_material

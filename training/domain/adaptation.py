@@ -7,8 +7,7 @@
 - With fewer scenes, or if the gate refuses, the weights stay.
 - Classes of confirmed scenes that the model still reports as outliers become exceptions: the new
   version never reports them.
-- Confirmed relations that the model reports as misplaced count as usual ones
-  (`training.domain.confirmed_relations`).
+- Confirmed relations that the model reports as misplaced count as usual ones.
 """
 
 from __future__ import annotations
@@ -26,11 +25,10 @@ from numpy.typing import NDArray
 from app.inference import Weights
 from app.model import SceneModel
 from app.scene import CANONICAL
-from training.domain.confirmed_relations import with_confirmed
-from training.domain.home import Home, alarms_of, with_exceptions
+from training.domain.home import Home, alarms_of, with_confirmed, with_exceptions
 from training.fit.adapt import adapt, part_loss
 from training.fit.objects import random_parts
-from training.machines.arrays import machine_of
+from training.machines import machine_of
 
 FEWEST = 20  # number of distinct recorded scenes from which the weights adapt
 
@@ -115,20 +113,18 @@ def measure(home: Home, seed: int, progress: Callable[[str], None]) -> Measured:
     fold_of = rng.permutation(len(names))[group] % _FOLDS
     if len(np.unique(fold_of)) < _FOLDS:
         fold_of = rng.permutation(len(index)) % _FOLDS
-    loss, rank, alarms, change = [], [], [], []
+    rows = []
     for fold in range(_FOLDS):
         progress(f"comparing in folds: {fold + 1} of {_FOLDS}")
         test, seen = index[fold_of == fold], index[fold_of != fold]
         scenes = home.tensors.rows(torch.from_numpy(np.concatenate([seen, home.written])))
         weights = adapt(home.parent.weights, scenes, trained_on=home.trained_on, seed=seed)
         sides = home.parent, replace(home.parent, weights=weights)
-        loss.append(_losses(home, test, sides, seed))
-        rank.append(_ranks(home, test, sides, seed))
-        alarms.append(_alarms(home, test, sides))
-        change.append(_change(home, weights, scenes.v.sum(0) > 0, seed))
-    return Measured(
-        np.concatenate(loss), np.concatenate(rank), np.concatenate(alarms), float(np.mean(change))
-    )
+        losses, ranks = _losses(home, test, sides, seed), _ranks(home, test, sides, seed)
+        change = _change(home, weights, scenes.v.sum(0) > 0, seed)
+        rows.append((losses, ranks, _alarms(home, test, sides), change))
+    *tables, changes = zip(*rows, strict=True)
+    return Measured(*map(np.concatenate, tables), change=float(np.mean(changes)))
 
 
 Sides = tuple[SceneModel, SceneModel]  # the parent, and the model with adapted weights
@@ -166,11 +162,8 @@ def _ranks(home: Home, index: Int[NDArray, "N"], sides: Sides, seed: int) -> Flo
 
 def _alarms(home: Home, index: Int[NDArray, "N"], sides: Sides) -> Bool[NDArray, "N 2"]:
     """Return whether each scene has an alarm about an object."""
-    table = np.zeros((len(index), 2), bool)
-    for row, number in enumerate(index.tolist()):
-        scene = home.scenes[number]
-        table[row] = [len(alarms_of(side, scene.question(side))) > 0 for side in sides]
-    return table
+    questions = (home.scenes[k].question for k in index.tolist())
+    return np.array([[len(alarms_of(side, x)) > 0 for side in sides] for x in questions])
 
 
 @torch.no_grad()

@@ -7,6 +7,11 @@ scene teaches all its objects.
 Each written place (`training.datasets.inventories`) is one confirmed scene. A thing that most such
 places lack teaches nothing there, but the model never reports it.
 
+Confirmed relations that the model reports as misplaced count as usual ones: the new model never
+reports them (`app.model.Misplaced.confirmed`). Such a relation of two classes also counts like
+`_SCENES` training scenes in the places of the model (`app.model.Places`), so the place
+becomes a usual one for missing objects.
+
 A label that the model cannot read becomes a new class. It is judged once `JUDGED` scenes show it.
 """
 
@@ -16,6 +21,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Final
 
 import numpy as np
 import torch
@@ -23,14 +29,18 @@ from jaxtyping import Int
 from numpy.typing import NDArray
 
 from app.model import SceneModel
+from app.questions.misplaced import THE_FLOOR
 from app.questions.outliers import intruders
-from app.scene import ObjectClass, Scene, SceneObject, label_key
-from training.datasets import AnnotatedScene
+from app.scene import ObjectClass, Scene, Vocabulary, label_key
+from app.scene.spatial_relations import STACKED
+from training.datasets import AnnotatedScene, encode
+from training.datasets.cases import Triple, scene_of
 from training.datasets.inventories import SHARE, Place, complete_scene
+from training.datasets.moved import has_boxes, posed_scene
 from training.datasets.vocabulary import curated_names
-from training.domain.confirmed_relations import Triple, reported_relations
-from training.fit.adapt import HomeScenes, TrainedOn
-from training.fit.extend import extended
+from training.evaluation.asking import canonical_triple, index_of_ids, of_classes, score_misplaced
+from training.fit.adapt import HomeScenes, TrainedOn, extended
+from training.fit.regression import recalibrated
 
 JUDGED = 3  # number of scenes with a new class from which its objects are judged
 
@@ -46,9 +56,10 @@ class HomeScene:
     confirmed: bool  # by a person
     written: bool = False  # by a person; other scenes were recorded
 
-    def question(self, artifact: SceneModel) -> Scene:
-        """Return the scene as a request of labels."""
-        return of_classes(artifact, self.classes, self.room)
+    @property
+    def question(self) -> Scene:
+        """The scene as a request without poses and relations."""
+        return replace(of_classes(self.classes.tolist()), room_type=self.room)
 
 
 @dataclass(frozen=True)
@@ -146,7 +157,7 @@ class Home:
         labels, counts = artifact.vocabulary.labels, Counter[str]()
         for scene in self.scenes:
             if scene.confirmed and len(scene.classes):
-                alarms = alarms_of(artifact, scene.question(artifact))
+                alarms = alarms_of(artifact, scene.question)
                 counts.update(labels[c] for c in alarms.tolist())
         return counts
 
@@ -188,10 +199,10 @@ def _read(parent: SceneModel, scene: AnnotatedScene) -> HomeScene:
     classes = np.unique([match.entry for match in matches if match is not None]).astype(np.int64)
     classes = classes[~vocabulary.structure[classes]]
     room = names.room_index(scene.room_type, vocabulary) if parent.spec.C else None
-    left_out = classes[:0]
-    if not scene.confirmed and len(classes):
-        left_out = alarms_of(parent, of_classes(parent, classes, room))
-    return HomeScene(classes, left_out, room, scene.group, scene.confirmed)
+    read = HomeScene(classes, classes[:0], room, scene.group, scene.confirmed)
+    if scene.confirmed or not len(classes):
+        return read
+    return replace(read, left_out=alarms_of(parent, read.question))
 
 
 def confirmed_scene(place: Place) -> AnnotatedScene:
@@ -216,8 +227,53 @@ def alarms_of(artifact: SceneModel, scene: Scene) -> Int[NDArray, "n"]:
     return classes[~artifact.rarely_shown[classes]]
 
 
-def of_classes(artifact: SceneModel, classes: Int[NDArray, "n"], room: int | None) -> Scene:
-    """Return a request with one object of each class, and the index of a room type or None."""
-    labels = artifact.vocabulary.labels
-    things = tuple(SceneObject(labels[c], labels[c], c) for c in classes.tolist())
-    return Scene(things, room_type=room)
+_SCENES: Final = 20.0
+
+
+def reported_relations(model: SceneModel, recorded: Sequence[AnnotatedScene]) -> set[Triple]:
+    """Return the stacked relations (a, i, j) of classes that the model reports in confirmed scenes.
+
+    The model judges each scene as stated and with its boxes, which also show where objects stand.
+    """
+    if model.places is None:
+        return set()
+    reported: set[Triple] = set()
+    confirmed = [scene for scene in recorded if scene.confirmed]
+    words = [_canonical(scene, model.vocabulary) for scene in confirmed]
+    for encoded in encode(words, model.vocabulary, model.places.roles):
+        holds = encoded.instance_holds
+        triples = [(a, i, j) for a in STACKED for i, j in np.argwhere(holds[a]).tolist()]
+        scenes = [scene_of(encoded, range(len(encoded.instance_classes)), triples)]
+        if has_boxes(encoded):
+            scenes.append(posed_scene(encoded))
+        for scene in scenes if triples else ():
+            index = index_of_ids(scene)
+            for entry in score_misplaced(model, scene):
+                if entry["is_misplaced"] and entry["object"] != THE_FLOOR:
+                    a, i, j = canonical_triple(index, entry)
+                    subject, other = encoded.instance_classes[[i, j]].tolist()
+                    reported |= {(a, subject, other)} if a in STACKED else set()
+    return reported
+
+
+def _canonical(scene: AnnotatedScene, vocabulary: Vocabulary) -> AnnotatedScene:
+    """Return the scene with the label of the class in place of each name of it."""
+    matches = (vocabulary.look_up(thing.label) for thing in scene.objects)
+    objects = tuple(
+        thing if match is None else replace(thing, label=vocabulary.labels[match.entry])
+        for thing, match in zip(scene.objects, matches, strict=True)
+    )
+    return replace(scene, objects=objects)
+
+
+def with_confirmed(artifact: SceneModel, triples: Iterable[Triple]) -> SceneModel:
+    """Return the model, which never reports these relations of classes."""
+    places, V, triples = artifact.places, len(artifact.vocabulary), sorted(triples)
+    if places is None:
+        return artifact
+    misplaced = artifact.calibration.misplaced.model_copy(update={"confirmed": tuple(triples)})
+    new = np.array([(a * V + i) * V + j for a, i, j in triples], places.triple.dtype)
+    keys, index = np.unique(np.concatenate([places.triple, new]), return_inverse=True)
+    scenes = np.bincount(index, np.concatenate([places.triple_scenes, np.full(len(new), _SCENES)]))
+    places = replace(places, triple=keys, triple_scenes=scenes.astype(places.triple_scenes.dtype))
+    return recalibrated(replace(artifact, places=places), misplaced=misplaced)

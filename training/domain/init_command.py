@@ -14,9 +14,8 @@ from app.scene import label_key
 from training.datasets import DatasetError, generate_rooms
 from training.datasets.files import write_whole
 from training.datasets.jsonl import write_jsonl
-from training.datasets.placeholders import left_out_line
 from training.datasets.rooms import DOMAINS
-from training.datasets.vocabulary import vocabulary_json
+from training.datasets.vocabulary import left_out_line, vocabulary_json
 from training.domain.look import Label
 from training.domain.material import read_material
 from training.domain.proposal import Proposal, propose
@@ -93,9 +92,9 @@ def init(
     )
     for path, text in zip(targets, texts, strict=True):
         write_whole(path, text)
-    written = "of written things or " if proposal.places else ""
+    written = "of written things or " if material.places else ""
     _show(proposal, f"classes {written}with at least {proposal.minimum} mentions")
-    lines = _next(name, folder, promoted=not proposal.places)
+    lines = _next(name, folder, promoted=not material.places)
     print_lines(f"\nwritten: {', '.join(map(str, targets))}", *lines)
 
 
@@ -116,7 +115,7 @@ def _update(name: str, folder: Path, files: Sequence[Path]) -> None:
         *lines,
         f"\nwritten: {', '.join(map(str, result.files)) or 'nothing'}",
         f"kept as they are: the earlier classes, {kept} and the examples",
-        *_next(name, folder, promoted=not result.proposal.places),
+        *_next(name, folder, promoted=not result.proposal.material.places),
     )
 
 
@@ -164,7 +163,7 @@ def _show(proposal: Proposal, classes: str) -> None:
         [f"{label.spellings[0]} = {label.name}" for label in joined],
     )
     lines += listing("labels without a class:", _mentions(proposal.dropped))
-    lines += filter(None, [left_out_line(proposal.left_out, ROWS)])
+    lines += filter(None, [left_out_line(proposal.material.left_out, ROWS)])
     print_lines(*lines)
     console.print("Please check:" if facts.findings else "no contradictions found")
     for finding in facts.findings:

@@ -8,13 +8,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from training.datasets import AnnotatedScene, DatasetError
-from training.datasets.inventories import Inventory, Place, read_inventory, shipped_things
+from training.datasets.inventories import Inventory, Place, Thing, read_inventory, shipped_things
 from training.datasets.jsonl import scan_jsonl
-from training.datasets.placeholders import plain_scenes
 from training.datasets.readers import guess_format, read_scenes
 from training.datasets.records import InvalidLinesError
 from training.datasets.sources import is_inventory
-from training.datasets.things import Thing
+from training.datasets.vocabulary import plain_scenes
 from training.fit.configuration import ConfigError, source_name
 
 

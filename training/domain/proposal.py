@@ -43,7 +43,7 @@ _DRAWN, _OF_PLACE = 800, 30  # least scenes drawn of all written places together
 class Proposal:
     """The files and the report that `init` writes."""
 
-    name: str
+    material: Material
     facts: Facts
     labels: tuple[Label, ...]
     minimum: int  # number of objects of a class
@@ -56,24 +56,21 @@ class Proposal:
     parts: dict[str, int]  # number of scenes of each part of the split
     test_groups: int  # number of groups of near-duplicates in the test part
     examples: tuple[Example, ...]
-    seen: int  # number of seen scenes
-    places: int  # number of written places
-    left_out: Counter[str]  # labels that name no kind of object
 
     def written_lines(self) -> list[str]:
         """Return a line about the written places, if there are any."""
-        if not self.places:
+        if not (places := self.material.places):
             return []
-        each = self.config.data.written
+        each, seen = self.config.data.written, self.material.scenes
         return [
-            f"{self.places} written places, of which training draws {each} scenes each; "
-            f"{self.seen} seen scenes. The lines below count a written place as one complete scene"
+            f"{len(places)} written places, of which training draws {each} scenes each; "
+            f"{len(seen)} seen scenes. The lines below count a written place as one complete scene"
         ]
 
     @property
     def warning(self) -> str:
         """A warning if the scenes are few, or ""."""
-        if self.places:
+        if self.material.places:
             return ""  # written scenes are drawn in sufficient number
         if self.facts.scenes >= FEW_SCENES and self.test_groups >= FEWEST_GROUPS:
             return ""
@@ -86,8 +83,9 @@ class Proposal:
 
     def toml(self) -> str:
         """Return the configuration as TOML text. A comment above each entry gives the reason."""
+        name = self.config.name
         return (
-            f"# Proposed by `python -m training init {self.name}`; you can change every entry.\n"
+            f"# Proposed by `python -m training init {name}`; you can change every entry.\n"
             "# `python -m training tune` searches for better values on the validation scenes.\n"
             "# The published model contains the scenes of examples.json, for the visual page.\n\n"
             f"{sections_toml(self.values, self.reasons)}"
@@ -143,7 +141,7 @@ def propose(name: str, material: Material, sources: Sequence[str], *, terms: str
     values = {"name": name, "description": f"{variant} machine over {name} scenes."}
     values |= {"examples": "examples.json", "data": data} | settings
     return Proposal(
-        name=name,
+        material=material,
         facts=facts,
         labels=tuple(labels),
         minimum=minimum,
@@ -156,9 +154,6 @@ def propose(name: str, material: Material, sources: Sequence[str], *, terms: str
         parts=parts,
         test_groups=test_groups,
         examples=choose_examples(scenes, vocabulary),
-        seen=len(seen),
-        places=len(places),
-        left_out=material.left_out,
     )
 
 
@@ -203,7 +198,7 @@ def _split(scenes: Sequence[AnnotatedScene]) -> tuple[int, dict[str, int], int]:
         scenes_of = split(scenes, seed=seed, protocol="stable")
         sizes: dict[str, int] = {name: len(part) for name, part in scenes_of.items()}
         deviation = max(abs(sizes[p] / (x * len(scenes)) - 1) for p, x in fractions.items())
-        if deviation < smallest and all(map(_is_informative, scenes_of.values())):
+        if deviation < smallest and all(any(map(_is_informative, x)) for x in scenes_of.values()):
             smallest = deviation
             best = seed, sizes, len({scene.group for scene in scenes_of["test"]})
         if smallest <= _TOLERANCE:
@@ -217,8 +212,8 @@ def _split(scenes: Sequence[AnnotatedScene]) -> tuple[int, dict[str, int], int]:
     return best
 
 
-def _is_informative(scenes: Sequence[AnnotatedScene]) -> bool:
-    return any(len({label_key(thing.label) for thing in scene.objects}) >= 3 for scene in scenes)
+def _is_informative(scene: AnnotatedScene) -> bool:
+    return len({label_key(thing.label) for thing in scene.objects}) >= 3
 
 
 def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, Any], dict[str, str]]:

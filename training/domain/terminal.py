@@ -1,16 +1,20 @@
-"""What the commands of training share: the console, errors, lists and the option of the store."""
+"""What the commands of training share: console, errors, lists, progress, option of the store."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Final, NoReturn
 
 import typer
 from rich.console import Console
 from rich.markup import escape
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from app.registry import RegistryError
 from training.datasets.records import InvalidLinesError
+from training.fit.trainer import SCORES, CurvePoint, Trainer
 
 ROWS: Final = 12  # maximum number of entries of a printed list
 
@@ -45,3 +49,49 @@ def fail(error: Exception) -> NoReturn:
     console.print(f"[red]error:[/red] {escape(reason)}", soft_wrap=True)
     print_lines(*further)
     raise typer.Exit(1) from None
+
+
+class Display(Progress):
+    """A progress bar with phase, scores and remaining time."""
+
+    def __init__(self, trainer: Trainer) -> None:
+        super().__init__(
+            "[progress.description]{task.description}",
+            BarColumn(bar_width=12),
+            TextColumn("{task.fields[note]}"),
+            TimeElapsedColumn(),
+            "/",
+            TimeRemainingColumn(),
+            console=console,
+        )
+        self._trainer = trainer
+        self._task = self.add_task(trainer.config.name, total=1.0, note="")
+
+    def progress(self, phase: str, done: float, loss: float) -> None:
+        """Show the progress after an update of the weights."""
+        points = [point for point in self._trainer.curve if point.phase == phase]
+        state = score_of(points[-1]) if points else f"loss {loss:.3f}"
+        whole = (done + (phase == "relations")) / 2  # both phases take about as long
+        self.update(self._task, completed=whole, note=f"{phase} {done:.0%}, {state}")
+
+    def summarise(self, seconds: float, folder: Path) -> None:
+        """Print the last score of each phase, and the duration of a run in its folder."""
+        last = {point.phase: point for point in self._trainer.curve}
+        scores = ", ".join(f"{phase}: {score_of(point)}" for phase, point in last.items())
+        curve = f"curve in {folder / 'curve.png'}"
+        console.print(f"trained in {seconds:.0f} s; {scores}; {curve}", soft_wrap=True)
+
+
+def score_of(point: CurvePoint) -> str:
+    """Return the validation score of a point of the curve as text, or its loss without a score."""
+    if math.isnan(point.score):
+        return f"loss {point.loss:.3f}"
+    return f"{SCORES[point.phase]} {point.score:.3f}"
+
+
+def next_steps(folder: Path) -> None:
+    """Print the commands that compare a run and publish it."""
+    print_lines(
+        f"next: python -m training compare {folder} --store my-store",
+        f"      python -m training publish {folder} 1.0.0 --store my-store --promote",
+    )

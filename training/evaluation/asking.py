@@ -31,7 +31,7 @@ from training.datasets.cases import scene_of
 from training.evaluation.generation_task import machine_scenes
 from training.evaluation.parts import of_classes
 from training.evaluation.setting import Model, Places
-from training.machines.arrays import machine_of
+from training.machines import machine_of
 
 Case = TypeVar("Case")
 

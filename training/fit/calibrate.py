@@ -154,8 +154,8 @@ class _Examples(Table):
 
     @classmethod
     def joined(cls, blocks: Sequence[_Examples]) -> _Examples:
-        """Join blocks, without pairs that have no relation unit. A column may be one value."""
-        arrays = (np.broadcast_arrays(*vars(block).values()) for block in blocks)
+        """Join blocks, whose columns are broadcast, without pairs that have no relation unit."""
+        arrays = ([*map(np.ravel, np.broadcast_arrays(*block.columns))] for block in blocks)
         columns = zip(*arrays, strict=True)
         joined = map(np.concatenate, columns) if blocks else np.zeros((6, 0), dtype=np.int64)
         examples = cls(*joined)
@@ -232,13 +232,12 @@ def fit_placements(
         directions = (removed_index, anchor_index), (anchor_index, removed_index)
         for values, (subject, object_) in zip(tables, directions, strict=True):
             truth = np.where(annotated[:, subject, object_], holds[:, subject, object_], _UNKNOWN)
-            relation, anchor = map(np.ravel, np.indices(truth.shape))
             block = _Examples(
                 scene=np.array(number),
-                relation=relation,
-                log_odds=values[0].ravel().astype(np.float64),
-                log_count=np.log(present.counts[anchors])[anchor],
-                truth=truth.ravel(),
+                relation=np.arange(len(truth))[:, None],
+                log_odds=values[0].astype(np.float64),
+                log_count=np.log(present.counts[anchors]),
+                truth=truth,
                 source=np.array(sources.index(encoded.source)),
             )
             blocks.append(block)
@@ -257,7 +256,7 @@ def _fit_listed(examples: _Examples, listed: int) -> tuple[CountSlope, ...]:
     """Fit the slopes, mainly to the `listed` likeliest examples of a scene, as an answer does."""
     annotated = examples.annotated
     fitted = examples.rows(annotated)
-    slopes = _fit_by_kind(fitted, np.ones(len(fitted.truth)))
+    slopes = _fit_by_kind(fitted, np.ones(len(fitted)))
     # Selection by log-odds also selects errors, so the ranking changes the fit.
     for _ in range(_ROUNDS):
         is_listed = _is_listed(examples, slopes, listed)[annotated]

@@ -138,10 +138,8 @@ def _questions(
         yield _stating(scene, scene.triples, unders), false
         if false[0] == ON_TOP:
             yield _stating(scene, scene.triples, [*unders, false]), false
-    state = scene_rng(encoded, seed + 1), scene_rng(encoded, seed + 1)
-    untouched, moved = untouched_scene(encoded, structure, state[0]), None
-    if untouched is not None:
-        moved = moved_scene(encoded, structure, state[1])
+    untouched = untouched_scene(encoded, structure, scene_rng(encoded, seed + 1))
+    moved = moved_scene(encoded, structure, scene_rng(encoded, seed + 1))
     if untouched is not None and moved is not None:
         sizes = artifact.vocabulary.sizes
         roles = None if places is None else places.roles

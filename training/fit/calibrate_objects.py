@@ -34,7 +34,7 @@ from app.model import AlarmLine, AlarmLines, Calibration, CountSlope, CoverageFi
 from app.model.calibration import LEAST_COVERAGE, LONGEST_JUDGED
 from app.questions.posterior import calibrated
 from training.datasets.array_types import ClassMask
-from training.datasets.batches import SceneTensors, subset
+from training.datasets.batches import SceneTensors, TrainingData, subset
 from training.evaluation.outlier_tasks import ALARMS, draw_intruders, intruder_weights
 from training.evaluation.parts import (
     Parts,
@@ -45,7 +45,7 @@ from training.evaluation.parts import (
     share_of,
     up_to_longest,
 )
-from training.fit.calibrate_rooms import calibrate_rooms, of_sources, posterior_of
+from training.fit.calibrate_rooms import calibrate_rooms, limits, of_sources, posterior_of
 from training.fit.configuration import ObjectsConfig
 from training.fit.regression import (
     LEAST_SCENES,
@@ -259,15 +259,13 @@ def fit_outliers(
     return {"popularity_weight": alpha, "outlier": entry, **lines}
 
 
-def refitted_lines(
-    artifact: SceneModel, validation: SceneTensors, config: ObjectsConfig
-) -> SceneModel:
-    """Return the model with alarm lines that are fitted again; a model without lines as it is."""
-    scenes = calibration_scenes(validation, config.calibrated_sources)
+def refitted(artifact: SceneModel, data: TrainingData, config: ObjectsConfig) -> SceneModel:
+    """Return the model with new limits of generated scenes, and new alarm lines if it has any."""
+    scenes = calibration_scenes(data.validation, config.calibrated_sources)
     entry, alpha = artifact.calibration.outlier, artifact.calibration.popularity_weight
-    if entry is None:
-        return artifact
-    return recalibrated(artifact, **fit_lines(artifact, scenes, entry, alpha))
+    if entry is not None:
+        artifact = recalibrated(artifact, **fit_lines(artifact, scenes, entry, alpha))
+    return recalibrated(artifact, **limits(artifact, complete_scenes(data.train)))
 
 
 def judged_classes(artifact: SceneModel) -> ClassMask:
@@ -367,7 +365,7 @@ def fit_lines(
     for name, in_room in (("outlier_lines", False), ("room_lines", True)):
         untouched = score_untouched(artifact, scenes, in_room=in_room)
         worst = worst_log_odds(untouched, entry, alpha)
-        lines = {level: fit_line(worst, share) for level, share in ALARMS.items()} if worst else {}
+        lines = {level: fit_line(worst, share) for level, share in ALARMS.items() if worst}
         fields[name] = AlarmLines(**lines) if lines else None
     return fields
 

@@ -32,7 +32,7 @@ from training.datasets.batches import SceneTensors, subset
 from training.datasets.sources import source_of
 from training.evaluation.parts import Parts, Size, draw_parts, exactly, of_classes
 from training.fit.long_chains import conditions_of
-from training.fit.regression import LEAST_SCENES, quantile_of, recalibrated, structure_of
+from training.fit.regression import LEAST_SCENES, quantile_of, structure_of
 
 _LENGTHS = (1, 2, 3, 5, 8)  # numbers of listed classes in the fit of `rooms`
 # A room type of at least `_ENOUGH_SCENES` scenes is never rare; one of fewer than `_FEW_SCENES` is.
@@ -130,19 +130,16 @@ def _resemblance(first: Bool[NDArray, "N V"], second: Bool[NDArray, "M V"]) -> f
     return float(np.minimum(p, q).sum() / max(np.maximum(p, q).sum(), 1e-9))
 
 
-def refitted_limits(artifact: SceneModel, train: SceneTensors) -> SceneModel:
-    """Return the model with newly fitted `limits` of generated scenes."""
-    return recalibrated(artifact, **limits(artifact, train))
-
-
 def limits(artifact: SceneModel, train: SceneTensors) -> dict[str, Any]:
     """Return the entries `smallest` and `room_fit`: limits of a generated scene by room type.
 
-    A limit is a 5 % quantile over parts of whole rooms. All sources have equal weight. `smallest`
-    has parts of 30 % of the classes, as a robot lists a room. The limit of the fit grows with the
-    log of the number of classes. A room type of few scenes has the smallest number of all rooms.
+    A limit is a 5 % quantile over parts of whole rooms, or of all scenes without sources of these.
+    All sources have equal weight. `smallest` has parts of 30 % of the classes, as a robot lists a
+    room. The limit of the fit grows with the log of the number of classes. A room type of few
+    scenes has the smallest number of all rooms.
     """
-    rooms = whole_rooms(train)
+    of_whole_rooms = of_sources(train, "whole_rooms")
+    rooms = subset(train, of_whole_rooms) if of_whole_rooms.any() else train
     parts = [draw_parts(rooms, structure_of(artifact), _part_of(share)) for share in _PARTS]
     lists = [_ListedRooms.of(rooms, part) for part in parts]
     least = lists[0].smallest() if len(lists[0].size) else 0
@@ -189,12 +186,6 @@ def _fit_limit(artifact: SceneModel, lists: Sequence[_ListedRooms], room: int) -
     sizes = np.log([parts.size.mean() for parts in lists])
     slope, intercept = np.polyfit(sizes, quantiles, 1) if np.ptp(sizes) else (0.0, quantiles[0])
     return FitLimit(intercept=round(float(intercept), 4), log_count=round(float(slope), 4))
-
-
-def whole_rooms(scenes: SceneTensors) -> SceneTensors:
-    """Return the scenes of sources of whole rooms, or all scenes if there are none."""
-    mask = of_sources(scenes, "whole_rooms")
-    return subset(scenes, mask) if mask.any() else scenes
 
 
 def _part_of(share: float) -> Size:

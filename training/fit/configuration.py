@@ -43,22 +43,16 @@ class DataConfig(_Section):
     """
 
     sources: tuple[str, ...] = Field(min_length=1)
-    vocabulary: str = Field(
-        default="written", description="written, source, rooms, or a file that ends in .json"
-    )
+    vocabulary: str = "written"  # written, source, rooms, or a file that ends in .json
     split: Literal["group", "stable", "final"] = "group"
     split_seed: int = 0
-    rooms: int = Field(default=0, ge=0, description="scenes to generate where `rooms` is a source")
-    written: int = Field(
-        default=0,
-        ge=0,
-        exclude_if=not_,
-        description="scenes to draw of each place of a written inventory",
-    )
-    limit: int | None = Field(default=None, ge=10, description="maximum scenes of each source")
-    words: bool = Field(default=False, description="whether word vectors tell similar classes")
-    # A value that `exclude_if` leaves out of the dump preserves the digests of earlier runs.
-    terms: str = Field(default="", exclude_if=not_, description="terms of use of own files")
+    rooms: int = Field(default=0, ge=0)  # scenes to generate where `rooms` is a source
+    # Scenes to draw of each place of a written inventory. A value that `exclude_if` leaves out of
+    # the dump preserves the digests of earlier runs.
+    written: int = Field(default=0, ge=0, exclude_if=not_)
+    limit: int | None = Field(default=None, ge=10)  # maximum scenes of each source
+    words: bool = False  # whether word vectors tell similar classes
+    terms: str = Field(default="", exclude_if=not_)  # terms of use of own files
     research_only: bool = Field(default=False, exclude_if=not_)
 
     @model_validator(mode="after")
@@ -78,17 +72,15 @@ class MachineConfig(_Section):
     """The variant and the sizes of the machine. The data determine V, A, C and T."""
 
     variant: Variant
-    units: int = Field(default=8, ge=1, description="hidden units")
-    states: int = Field(default=32, ge=2, description="states of a hidden unit; 2: binary")
-    coupled: bool = Field(default=False, description="couplings between classes")
+    units: int = Field(default=8, ge=1)  # hidden units
+    states: int = Field(default=32, ge=2)  # states of a hidden unit; 2: binary
+    coupled: bool = False  # couplings between classes
     K: int = Field(default=32, ge=0)
-    G: int = Field(default=0, ge=0, description="rank of the implication factors (Triway)")
-    N: int = Field(default=1024, ge=0, description="number of stored chain samples")
+    G: int = Field(default=0, ge=0)  # rank of the implication factors (Triway)
+    N: int = Field(default=1024, ge=0)  # number of stored chain samples
     min_triple_count: int = Field(default=1, ge=1)
     initial_scale: float = Field(default=0.05, gt=0)
-    without: tuple[str, ...] = Field(
-        default=(), exclude_if=not_, description="names of weights held at zero"
-    )
+    without: tuple[str, ...] = Field(default=(), exclude_if=not_)  # weights held at zero
 
 
 class ObjectsConfig(_Section):
@@ -97,45 +89,28 @@ class ObjectsConfig(_Section):
     steps: int = Field(default=800, ge=1)
     batch_size: int = Field(default=256, ge=1)
     learning_rate: float = Field(default=0.01, gt=0)
-    warm_up: int = Field(default=50, ge=1, description="steps in which the rate rises")
-    leave_one_out: float = Field(default=0.3, ge=0, le=1, description="share of such parts")
-    room_share: float = Field(default=0.15, ge=0, le=1, description="share of listed room types")
-    weight_prior: float = Field(
-        default=1.5, ge=0, description="precision of W and Q, in numbers of scenes"
-    )
-    coupling_prior: float = Field(default=5.0, ge=0, description="precision of L and Y")
-    rate_prior: float = Field(default=7.5, ge=0, description="precision of a, y and kappa")
-    room_loss: float = Field(
-        default=12.0, ge=0, description="weight of the log-likelihood of the room type"
-    )
-    source_loss: float = Field(
-        default=3.0, ge=0, description="weight of the log-likelihood of the data source"
-    )
-    generative_weight: float = Field(default=0.2, ge=0, description="weight of PCD")
-    chains: int = Field(default=256, ge=1, description="number of persistent chains (PCD)")
-    served_sweeps: int = Field(
-        default=20, ge=1, description="sweeps of a round of chains that fits u of the served mix"
-    )
-    classes_per_sweep: int = Field(
-        default=250, ge=1, description="random classes that a sweep of coupled classes draws"
-    )
-    word_weight: float = Field(default=1.0, ge=0, description="scale of the word-vector term")
-    source_weights: dict[str, float] = Field(
-        default={}, description="weight of the scenes of a source; default 1, 0: not used"
-    )
-    served_sources: dict[str, float] = Field(
-        default={},
-        description="weights of the sources in the base rates that are served; empty: all equal",
-    )
-    calibrated_sources: tuple[str, ...] = Field(
-        default=(),
-        description="sources whose validation scenes calibrate the answers about objects; empty: "
-        "all scenes with complete object lists",
-    )
-    open_sources: tuple[str, ...] = Field(
-        default=(),
-        description="sources that show every class; empty: those with an open vocabulary",
-    )
+    warm_up: int = Field(default=50, ge=1)  # steps in which the rate rises
+    leave_one_out: float = Field(default=0.3, ge=0, le=1)  # share of such parts
+    room_share: float = Field(default=0.15, ge=0, le=1)  # share of listed room types
+    weight_prior: float = Field(default=1.5, ge=0)  # precision of W and Q, in numbers of scenes
+    coupling_prior: float = Field(default=5.0, ge=0)  # precision of L and Y
+    rate_prior: float = Field(default=7.5, ge=0)  # precision of a, y and kappa
+    room_loss: float = Field(default=12.0, ge=0)  # weight of the log-likelihood of the room type
+    source_loss: float = Field(default=3.0, ge=0)  # weight of the log-likelihood of the data source
+    generative_weight: float = Field(default=0.2, ge=0)  # weight of PCD
+    chains: int = Field(default=256, ge=1)  # number of persistent chains (PCD)
+    # Sweeps of a round of chains that fits u of the served mix.
+    served_sweeps: int = Field(default=20, ge=1)
+    # Random classes that a sweep of coupled classes draws.
+    classes_per_sweep: int = Field(default=250, ge=1)
+    word_weight: float = Field(default=1.0, ge=0)  # scale of the word-vector term
+    source_weights: dict[str, float] = {}  # of the scenes of a source; default 1, 0: not used
+    # Weights of the sources in the base rates that are served; empty: all equal.
+    served_sources: dict[str, float] = {}
+    # Sources whose validation scenes calibrate the answers about objects; empty: all scenes with
+    # complete object lists.
+    calibrated_sources: tuple[str, ...] = ()
+    open_sources: tuple[str, ...] = ()  # that show every class; empty: those with open vocabulary
 
     def precision_of(self, name: str) -> float:
         """Return the precision of the normal prior of an object weight, by the name of it."""
@@ -148,21 +123,16 @@ class ObjectsConfig(_Section):
 class RelationsConfig(_Section):
     """The fit of the relation weights (`training.fit.relation_weights`)."""
 
-    epochs: int = Field(default=8, ge=0, description="passes over the scenes; 0: no relations")
+    epochs: int = Field(default=8, ge=0)  # passes over the scenes; 0: no relations
     learning_rate: float = Field(default=0.01, gt=0)
     batch_size: int = Field(default=64, ge=1)
-    averaging: float = Field(default=0.99, ge=0, lt=1, description="decay of average weights")
-    count_dropout: float = Field(
-        default=0.3, ge=0, le=1, description="share of scenes with hidden counts"
-    )
-    offset_prior: float = Field(default=8.0, ge=0, description="precision of source offsets")
-    weight_prior: float = Field(default=16.0, ge=0, description="precision of the weights")
-    word_weight: float = Field(default=1.0, ge=0, description="scale of the word-vector term")
-    source_weights: dict[str, float] = Field(
-        default={},
-        description="weight of relations by source, default 1; below 1: share of the scenes that "
-        "an epoch draws",
-    )
+    averaging: float = Field(default=0.99, ge=0, lt=1)  # decay of average weights
+    count_dropout: float = Field(default=0.3, ge=0, le=1)  # share of scenes with hidden counts
+    offset_prior: float = Field(default=8.0, ge=0)  # precision of source offsets
+    weight_prior: float = Field(default=16.0, ge=0)  # precision of the weights
+    word_weight: float = Field(default=1.0, ge=0)  # scale of the word-vector term
+    # Weight of relations by source, default 1; below 1: share of the scenes that an epoch draws.
+    source_weights: dict[str, float] = {}
 
 
 class TrainingConfig(_Section):
@@ -177,12 +147,8 @@ class Config(_Section):
 
     name: str = Field(pattern=r"^[a-z0-9]+(-[a-z0-9]+)*$")
     description: str = ""
-    examples: str = Field(
-        default="",
-        exclude_if=not_,
-        description="example scenes for the visual page: indoor, or a file in the data folder that "
-        "ends in .json; empty: none",
-    )
+    # Example scenes for the visual page: indoor, or a file in the data folder that ends in .json.
+    examples: str = Field(default="", exclude_if=not_)  # empty: none
     data: DataConfig
     machine: MachineConfig
     objects: ObjectsConfig = ObjectsConfig()

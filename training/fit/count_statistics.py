@@ -69,14 +69,6 @@ def fit_counts(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> Counts
     return _fit(cases, most, vocabulary) if (most > 1).any() else None
 
 
-def _folds(scenes: Sequence[EncodedScene]) -> Int[NDArray, "scenes"]:
-    """Return the number of the fold, of five, that tests each scene. A group is in one fold."""
-    groups = sorted({scene.group for scene in scenes})
-    order = np.random.default_rng(0).permutation(len(groups)) % _FOLDS
-    fold = dict(zip(groups, order.tolist(), strict=True))
-    return np.array([fold[scene.group] for scene in scenes])
-
-
 def _fit(cases: _Cases, most: Int[NDArray, "V"], vocabulary: Vocabulary) -> Counts:
     """Fit the statistics of the classes whose maximum listed number `most` is above 0."""
     log_frequency = _log_frequencies(cases, len(vocabulary))
@@ -224,7 +216,10 @@ def _is_better_than_mean(
     vocabulary: Vocabulary,
 ) -> ClassMask:
     """Return the classes whose expected number is closer to the truth than the class mean."""
-    V, fold = len(vocabulary), _folds(scenes)
+    V, groups = len(vocabulary), sorted({scene.group for scene in scenes})
+    order = np.random.default_rng(0).permutation(len(groups)) % _FOLDS
+    fold_of = dict(zip(groups, order.tolist(), strict=True))  # a group is in one fold
+    fold = np.array([fold_of[scene.group] for scene in scenes])
     improvement = np.zeros(V)
     for number in range(_FOLDS):
         counts = _fit(cases.rows(fold[cases.scene] != number), most, vocabulary)

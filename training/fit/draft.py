@@ -13,8 +13,7 @@ from app.model import Calibration, Places, SceneModel
 from app.scene import RoleCounts, Vocabulary
 from training.datasets import EncodedScene
 from training.datasets.batches import TrainingData
-from training.machines import BoltzmannMachine
-from training.machines.arrays import weights_of
+from training.machines import BoltzmannMachine, weights_of
 
 
 @torch.no_grad()

@@ -43,7 +43,7 @@ _RESOLUTION: Final = 0.005
 def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
     """Fit the distribution of offsets, with equal weights of sources; None without poses."""
     observed = observed_offsets(scenes)
-    if not len(observed.offset):
+    if not len(observed):
         return None
     A = len(CANONICAL)
     relation, scenes_of = np.zeros((A, 6)), np.zeros(A, dtype=np.int32)
@@ -51,7 +51,7 @@ def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
     pair, moments, counts = [], [], []
     for a in range(A):
         offsets = observed.rows(observed.relation == a)
-        if not len(offsets.offset):
+        if not len(offsets):
             continue
         pairs = _pool_pairs(offsets)
         fit = _fit(pairs, V)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
+from typing import Final
 
 import numpy as np
 import torch
@@ -18,17 +20,40 @@ from training.evaluation.asking import score_relations
 from training.evaluation.parts import validation_score
 from training.evaluation.relation_tasks import r_precision, score_scenes
 from training.fit.configuration import Config
-from training.fit.curve import CurvePoint, TrainingResult
 from training.fit.draft import draft_artifact
+from training.fit.long_chains import fit_scene_rates, store_samples
 from training.fit.objects import ObjectFit, ObjectScenes, start_objects
 from training.fit.relation_weights import SHARED, RelationFit, bake_shared_weights, share_weights
-from training.fit.samples import fit_scene_rates, store_samples
 from training.machines import BoltzmannMachine, MachineSpec, build
 from training.machines.edges import find_triples, triple_keys
 from training.machines.machine import OBJECT_WEIGHTS
 
 _STEPS = 100  # steps of the first phase between two points of the curve
 _SCORED = 200  # minimum number of scenes with relations of a validation score
+
+SCORES: Final = {"objects": "MRR", "relations": "R-precision"}
+"""Name of the validation score of each phase."""
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """One point of the training curve."""
+
+    phase: str  # "objects" or "relations"
+    done: float  # finished share of the phase, from 0 to 1
+    loss: float  # mean since the previous point of the phase
+    score: float  # on validation scenes; NaN means that no scene can be scored
+    seconds: float  # since the previous point
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """The trained machine, the training curve and the duration in seconds."""
+
+    machine: BoltzmannMachine
+    curve: list[CurvePoint]
+    seconds: float
+
 
 Progress = Callable[[str, float, float], None]
 """Function that is called with the phase, its finished share, and its mean loss."""

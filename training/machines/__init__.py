@@ -2,12 +2,30 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
+import numpy as np
+import torch
+
 from app.inference.variants import MachineSpec
+from app.inference.weights import Weights, layout
 from training.machines.machine import BoltzmannMachine
 from training.machines.rbm import GBM, RBM
 from training.machines.triway import Triway
 
 VARIANTS: dict[str, type[BoltzmannMachine]] = {"rbm": RBM, "gbm": GBM, "triway": Triway}
+
+__all__ = [
+    "GBM",
+    "RBM",
+    "VARIANTS",
+    "BoltzmannMachine",
+    "MachineSpec",
+    "Triway",
+    "build",
+    "machine_of",
+    "weights_of",
+]
 
 
 def build(spec: MachineSpec) -> BoltzmannMachine:
@@ -15,4 +33,20 @@ def build(spec: MachineSpec) -> BoltzmannMachine:
     return VARIANTS[spec.variant](spec)
 
 
-__all__ = ["GBM", "RBM", "VARIANTS", "BoltzmannMachine", "MachineSpec", "Triway", "build"]
+def weights_of(machine: BoltzmannMachine) -> Weights:
+    """Return copies of the machine's tensors, with shared weights summed."""
+    arrays = {
+        name: np.array(getattr(machine, name).detach().numpy(), order="C")
+        for name in layout(machine.spec)
+    }
+    return Weights(machine.spec, arrays)
+
+
+@lru_cache(maxsize=16)
+def machine_of(weights: Weights) -> BoltzmannMachine:
+    """Return the machine with these weights. Both share memory, so do not change the machine."""
+    with torch.device("meta"):
+        machine = build(weights.spec)
+    state = {name: torch.from_numpy(array) for name, array in weights.arrays.items()}
+    machine.load_state_dict(state, assign=True)
+    return machine.eval().requires_grad_(False)

@@ -15,6 +15,16 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
+class SceneRelations:
+    """The relations between the n present classes of each of B scenes."""
+
+    classes: Int[Tensor, "B n"]  # present classes; padding is -1
+    counts: Int[Tensor, "B n"]  # instances of each of `classes`; 0: the source gives none
+    holds: Float[Tensor, "B A n n"]  # value of each relation between two of `classes`
+    observed: Bool[Tensor, "B A n n"]  # True where a relation is annotated
+
+
+@dataclass(frozen=True)
 class Edges:
     """The relation units (a, i, j) of B scenes. A single row applies to all scenes."""
 
@@ -22,12 +32,6 @@ class Edges:
     subject: Int[Tensor, "B E"]
     object: Int[Tensor, "B E"]
     valid: Bool[Tensor, "B E"]  # False marks padding; padded units are 0
-
-    def both_present(self, v: Float[Tensor, "... B V"]) -> Float[Tensor, "... B E"]:
-        """Return 1 where both classes of a unit are present in v, else 0."""
-        lead = v.shape[:-1]
-        subject, object_ = (v.gather(-1, i.expand(*lead, -1)) for i in (self.subject, self.object))
-        return subject * object_ * self.valid
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,10 @@ def pair_edges(
     )
     log_counts = torch.zeros(B, n) if log_counts is None else log_counts
     return PairEdges(relation, subject, object_, valid, classes, log_counts)
+
+
+LaidOut = tuple[Edges, Float[Tensor, "B E"], Bool[Tensor, "B E"]]
+"""The relation units of B scenes, their values r, and which of these are observed."""
 
 
 def triple_edges(triples: Int[Tensor, "T 3"]) -> Edges:

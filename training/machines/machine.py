@@ -33,13 +33,13 @@ from abc import ABC, abstractmethod
 from typing import Self
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from app.inference.variants import MachineSpec
 from app.inference.weights import LISTED_SHARES
-from training.machines.edges import Edges, triple_keys
+from training.machines.edges import Edges, LaidOut, SceneRelations, triple_keys
 
 OBJECT_WEIGHTS = ("b", "c1", "e", "W", "Q", "L", "Y", "f", "a", "y", "kappa")
 """Names of the weights without relations."""
@@ -251,14 +251,8 @@ class BoltzmannMachine(nn.Module, ABC):
         """Return the units between classes (-1: padding) with counts (0: unknown; default 1)."""
 
     @abstractmethod
-    def lay_out(
-        self,
-        classes: Int[Tensor, "B n"],
-        counts: Int[Tensor, "B n"],
-        holds: Float[Tensor, "B A n n"],
-        observed: Bool[Tensor, "B A n n"],
-    ) -> tuple[Edges, Float[Tensor, "B E"], Bool[Tensor, "B E"]]:
-        """Return the relations between classes as edges, r and observed flags of this machine."""
+    def lay_out(self, scenes: SceneRelations) -> LaidOut:
+        """Return the relations between classes as the relation units of this machine."""
 
     @abstractmethod
     def gate(self, edges: Edges, v: Float[Tensor, "... B V"]) -> Float[Tensor, "... B E"]:
@@ -277,17 +271,6 @@ class BoltzmannMachine(nn.Module, ABC):
         del edges, h1
         return torch.zeros_like(observed)
 
-    def relation_term(
-        self,
-        edges: Edges,
-        v: Float[Tensor, "... B V"],
-        r: Float[Tensor, "... B E"],
-        h1: Float[Tensor, "... B H1"],
-    ) -> Float[Tensor, "... B"]:
-        """Return sum_e g_e (r_e ℓ_e - log(1 + exp ℓ_e)) = log p(r | v, h1)."""
-        logits = self.relation_logits(edges, v, h1)
-        return ((r * logits - softplus(logits)) * self.gate(edges, v)).sum(-1)
-
     def energy(
         self,
         v: Float[Tensor, "B V"],
@@ -304,8 +287,10 @@ class BoltzmannMachine(nn.Module, ABC):
             log_weight = log_weight + 0.5 * ((v @ couplings) * v).sum(-1)
             log_weight = log_weight + (v * self.room_bias(room)).sum(-1)
         log_weight = log_weight + self.room_rate(room, source)
-        energy = -log_weight - self.relation_term(edges, v, r, h1)
-        return torch.where((r > self.gate(edges, v)).any(-1), torch.inf, energy)
+        logits, gate = self.relation_logits(edges, v, h1), self.gate(edges, v)
+        # sum_e g_e (r_e ℓ_e - log(1 + exp ℓ_e)) = log p(r | v, h1)
+        energy = -log_weight - ((r * logits - softplus(logits)) * gate).sum(-1)
+        return torch.where((r > gate).any(-1), torch.inf, energy)
 
 
 def sparse_product(v: Float[Tensor, "B V"], weights: Float[Tensor, "V k"]) -> Float[Tensor, "B k"]:

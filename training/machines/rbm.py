@@ -9,11 +9,19 @@ hidden layer, which `training.seed` keeps.
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from app.inference.variants import MachineSpec
-from training.machines.edges import Edges, find_triples, pair_edges, triple_edges, triple_keys
+from training.machines.edges import (
+    Edges,
+    LaidOut,
+    SceneRelations,
+    find_triples,
+    pair_edges,
+    triple_edges,
+    triple_keys,
+)
 from training.machines.machine import BoltzmannMachine
 
 
@@ -38,25 +46,20 @@ class RBM(BoltzmannMachine):
         """Return all relation units of the machine, whatever the classes are."""
         return triple_edges(self.triples)
 
-    def lay_out(
-        self,
-        classes: Int[Tensor, "B n"],
-        counts: Int[Tensor, "B n"],
-        holds: Float[Tensor, "B A n n"],
-        observed: Bool[Tensor, "B A n n"],
-    ) -> tuple[Edges, Float[Tensor, "B E"], Bool[Tensor, "B E"]]:
+    def lay_out(self, scenes: SceneRelations) -> LaidOut:
         # Relations without a unit are left out. Units of absent classes are 0, and observed if any
         # relation of the scene is.
-        pairs = pair_edges(classes, holds.shape[1])
+        pairs = pair_edges(scenes.classes, scenes.holds.shape[1])
         keys = triple_keys(pairs.relation, pairs.subject, pairs.object, self.spec.V)
         position, exists = find_triples(self.triple_keys, keys)
         row, slot = (exists & pairs.valid).nonzero(as_tuple=True)
         unit = position[row, slot]
-        r = torch.zeros(len(classes), self.spec.T)
-        r[row, unit] = holds.flatten(1)[row, slot]
-        unit_observed = observed.flatten(1).any(1, keepdim=True).repeat(1, self.spec.T)
-        unit_observed[row, unit] = observed.flatten(1)[row, slot]
-        return triple_edges(self.triples), r, unit_observed
+        holds, annotated = scenes.holds.flatten(1), scenes.observed.flatten(1)
+        r = torch.zeros(len(holds), self.spec.T)
+        r[row, unit] = holds[row, slot]
+        observed = annotated.any(1, keepdim=True).repeat(1, self.spec.T)
+        observed[row, unit] = annotated[row, slot]
+        return triple_edges(self.triples), r, observed
 
     def gate(self, edges: Edges, v: Float[Tensor, "... B V"]) -> Float[Tensor, "... B E"]:
         # The units have no gate.

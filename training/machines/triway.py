@@ -31,12 +31,20 @@ output prediction" (2011), for models that are conditioned on observed units.
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import embedding
 
 from app.inference.variants import MachineSpec, feature_count
-from training.machines.edges import Edges, PairEdges, find_triples, pair_edges, triple_keys
+from training.machines.edges import (
+    Edges,
+    LaidOut,
+    PairEdges,
+    SceneRelations,
+    find_triples,
+    pair_edges,
+    triple_keys,
+)
 from training.machines.machine import BoltzmannMachine
 
 # Maximum of a degree feature. Degrees are capped, because more neighbours add little information.
@@ -84,18 +92,15 @@ class Triway(BoltzmannMachine):
         logs = torch.where(counts > 0, counts.clamp(min=1).to(self.b.dtype).log(), mean_log_counts)
         return pair_edges(classes, self.spec.A, logs)
 
-    def lay_out(
-        self,
-        classes: Int[Tensor, "B n"],
-        counts: Int[Tensor, "B n"],
-        holds: Float[Tensor, "B A n n"],
-        observed: Bool[Tensor, "B A n n"],
-    ) -> tuple[Edges, Float[Tensor, "B E"], Bool[Tensor, "B E"]]:
+    def lay_out(self, scenes: SceneRelations) -> LaidOut:
         # A flattened table has the layout of this machine.
-        return self.edges(classes, counts), holds.flatten(1), observed.flatten(1)
+        edges = self.edges(scenes.classes, scenes.counts)
+        return edges, scenes.holds.flatten(1), scenes.observed.flatten(1)
 
     def gate(self, edges: Edges, v: Float[Tensor, "... B V"]) -> Float[Tensor, "... B E"]:
-        return edges.both_present(v)
+        ends = (index.expand(*v.shape[:-1], -1) for index in (edges.subject, edges.object))
+        subject, object_ = (v.gather(-1, index) for index in ends)
+        return subject * object_ * edges.valid
 
     def relation_logits(
         self, edges: Edges, v: Float[Tensor, "... B V"], h1: Float[Tensor, "... B H1"]

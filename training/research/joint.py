@@ -34,8 +34,7 @@ from training.domain.terminal import StorePath
 from training.evaluation.parts import draw_parts, exactly, rank_hidden
 from training.evaluation.report import read_test
 from training.evaluation.setting import Structure, with_relations
-from training.machines import BoltzmannMachine
-from training.machines.arrays import machine_of
+from training.machines import BoltzmannMachine, machine_of
 from training.machines.edges import Edges
 
 _LENGTHS = (3, 8)
@@ -130,9 +129,7 @@ def compare_relations(
     every, first = [], []
     for k in order[:_LISTS]:
         batch = related.batch(k.unsqueeze(0))
-        edges, r, observed = machine.lay_out(
-            batch.classes, batch.counts, batch.holds.double(), batch.observed
-        )
+        edges, r, observed = machine.lay_out(replace(batch, holds=batch.holds.double()))
         v = batch.v.double()
         change = change_by_relations(machine, v, edges, r, observed, generator).abs()
         absent = (v[0] == 0) & ~structure

@@ -37,9 +37,8 @@ from training.evaluation.metrics import Metric, paired_difference
 from training.evaluation.report import SourceReport, measure, pooled
 from training.evaluation.setting import Model, Setting
 from training.fit.configuration import Config, ConfigError, first_error
-from training.fit.curve import SCORES, CurvePoint
 from training.fit.draft import draft_artifact
-from training.fit.trainer import Trainer
+from training.fit.trainer import SCORES, CurvePoint, Trainer
 from training.research.benchmark import Data, Folder
 from training.research.measure import resumable
 from training.runs.config_files import (

@@ -23,7 +23,6 @@ from training.datasets import (
     encode,
     generate_rooms,
     inventories,
-    priors,
     read_scenes,
     rooms_vocabulary,
     source_vocabulary,
@@ -31,11 +30,11 @@ from training.datasets import (
 )
 from training.datasets.batches import TrainingData, scene_tensors
 from training.datasets.files import KNOWLEDGE
-from training.datasets.placeholders import plain_scenes
+from training.datasets.readers import PRIORS, read_prior_scenes
 from training.datasets.records import digest_of
 from training.datasets.roles import count_roles
 from training.datasets.sources import is_inventory
-from training.datasets.vocabulary import read_vocabulary, with_typical_sizes
+from training.datasets.vocabulary import plain_scenes, read_vocabulary, with_typical_sizes
 from training.datasets.written import written_vocabulary
 from training.fit.configuration import Config, ConfigError, DataConfig, is_file, source_name
 
@@ -103,8 +102,8 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
             own = generate_rooms(data.rooms, seed=data.split_seed)
         elif is_inventory(source):
             own = inventories.read_inventory(path).scenes(data.written, seed=data.split_seed)
-        elif source == priors.SOURCE:
-            own = priors.read_prior_scenes(path)
+        elif source == PRIORS:
+            own = read_prior_scenes(path)
         else:
             own = read_scenes(path)
             if is_file(source):
@@ -118,7 +117,7 @@ def _path(source: str, root: Path) -> Path:
         return KNOWLEDGE / "inventories.csv"
     if is_file(source):
         return root / source
-    file = f"{source}.tsv.gz" if source == priors.SOURCE else f"{source}.jsonl.gz"
+    file = f"{source}.tsv.gz" if source == PRIORS else f"{source}.jsonl.gz"
     extra = root / "extra" / file
     return extra if extra.is_file() else root / file
 

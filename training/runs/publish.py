@@ -19,8 +19,7 @@ from training.evaluation.outlier_tasks import untouched_alarms
 from training.evaluation.report import Progress, evaluate, silent
 from training.evaluation.tasks import STATISTICS
 from training.fit.calibrate import calibrate
-from training.fit.calibrate_objects import complete_scenes, refitted_lines
-from training.fit.calibrate_rooms import refitted_limits
+from training.fit.calibrate_objects import refitted
 from training.fit.configuration import DataConfig, source_name
 from training.fit.count_statistics import fit_counts
 from training.fit.draft import placed_draft
@@ -150,12 +149,11 @@ def refit(
         evaluated_scenes = split_and_encode(other, annotated, root, model.vocabulary)
     progress("fitting statistics")
     test, own = evaluated_scenes.training_data(), scenes.training_data()
-    refitted = refitted_lines(with_statistics(model, scenes), own.validation, config.objects)
-    refitted = refitted_limits(refitted, complete_scenes(own.train))
+    refitted_model = refitted(with_statistics(model, scenes), own, config.objects)
     evaluated = with_statistics(model, evaluated_scenes)
     rows = _measure(evaluated, test, progress, tuple(STATISTICS))
     if not split:
-        rows += _measure(refitted, test, progress, _OF_LIMITS)
+        rows += _measure(refitted_model, test, progress, _OF_LIMITS)
     again = {metric.task for metric in rows} | {*STATISTICS, "T4 rooms"}
     kept = [m for m in manifest.metrics if m.task not in again and not _ALARM.search(m.metric)]
     vocabulary = VocabularyEntry.of(
@@ -164,8 +162,8 @@ def refit(
     fields = {name: getattr(manifest, name) for name in Description.model_fields}
     fields |= {"version": version, "created": _now(), "examples": examples}
     fields |= {"metrics": (*kept, *rows), "vocabulary": vocabulary}
-    description = Description(**fields | {"calibration": refitted.calibration})
-    return publish_rounded(store, description, refitted)
+    description = Description(**fields | {"calibration": refitted_model.calibration})
+    return publish_rounded(store, description, refitted_model)
 
 
 def with_statistics(model: SceneModel, scenes: SplitScenes) -> SceneModel:

@@ -122,7 +122,7 @@ const ROWS = {
   ],
 };
 
-/** Whether adapt learns a confirmed relation (training/domain/confirmed_relations.py). */
+/** Whether adapt learns a confirmed relation (training/domain/home.py). */
 const isLearnt = ({ relation, object }) => object !== 'floor' && !['left', 'right', 'front', 'behind'].includes(relation);
 const NOT_LEARNT = 'An adapted model reports this again: adapt learns which objects support others, not places on the floor or beside objects.';
 

@@ -13,6 +13,7 @@ from training.datasets.inventories import (
     COLUMNS,
     LISTED,
     OPTIONAL,
+    THING_COLUMNS,
     Group,
     Item,
     Place,
@@ -20,12 +21,11 @@ from training.datasets.inventories import (
     detection_rates,
     draw_scene,
     read_inventory,
+    read_things,
     shipped_things,
     written_scenes,
 )
 from training.datasets.records import MAX_LISTED, InvalidLinesError
-from training.datasets.things import COLUMNS as THING_COLUMNS
-from training.datasets.things import read_things
 from training.datasets.written import with_things
 from training.fit.configuration import Config, DataConfig, MachineConfig
 from training.runs.pipeline import prepare

@@ -7,8 +7,13 @@ from hypothesis import strategies as st
 from tests.training.scenes import scene
 from training.datasets import AnnotatedObject, AnnotatedScene
 from training.datasets.inventories import shipped_things
-from training.datasets.placeholders import is_placeholder, left_out_line, plain_label, plain_scenes
-from training.datasets.vocabulary import curated_names
+from training.datasets.vocabulary import (
+    curated_names,
+    is_placeholder,
+    left_out_line,
+    plain_label,
+    plain_scenes,
+)
 
 PLACEHOLDERS = (
     *("REMOVE", "SPLIT", "unknown", "Undefined", "BACKGROUND", "ground_plane", "N/A", "none"),

@@ -22,8 +22,13 @@ from training.datasets import (
     jsonl,
     read_scenes,
 )
-from training.datasets.priors import COLUMNS, SOURCE, read_prior_scenes
-from training.datasets.readers import READERS, guess_format
+from training.datasets.readers import (
+    PRIOR_COLUMNS,
+    PRIORS,
+    READERS,
+    guess_format,
+    read_prior_scenes,
+)
 from training.fit.configuration import ConfigError, DataConfig
 from training.runs.pipeline import read_sources
 
@@ -490,7 +495,7 @@ def test_huge_numbers_and_deep_lists_in_a_json_file_are_errors(tmp_path: Path, b
 
 def test_rows_become_scenes_of_two_objects(tmp_path: Path) -> None:
     rows = [
-        "\t".join(COLUMNS),
+        "\t".join(PRIOR_COLUMNS),
         "virtualhome_placing\tfood bread\ton-top\ttable\t1\tattic",
         "virtualhome_placing\tcup\tat\ttable\t1\t",
         "virtualhome_placing\tcup\tinside\tcabinet\t1\t",
@@ -501,7 +506,7 @@ def test_rows_become_scenes_of_two_objects(tmp_path: Path) -> None:
     path = tmp_path / "pairs.tsv"
     path.write_text("\n".join(rows))
     scenes = read_prior_scenes(path)
-    assert {scene.source for scene in scenes} == {SOURCE}
+    assert {scene.source for scene in scenes} == {PRIORS}
     assert [thing.label for thing in scenes[0].objects] == ["bread", "table"]
     assert [(scene.group, scene.relations) for scene in scenes] == [
         ("bread table", ((0, "on-top", 1),)),

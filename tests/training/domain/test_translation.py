@@ -34,8 +34,8 @@ def batch(classes: list[int], size: int, told: tuple[int, int, int] | None = Non
     v = torch.zeros(1, size)
     v[0, classes] = 1.0
     return Batch(
-        v, torch.tensor([classes]), torch.ones(1, n, dtype=torch.int64), holds, observed,
-        torch.tensor([-1]), torch.tensor([0]),
+        torch.tensor([classes]), torch.ones(1, n, dtype=torch.int64), holds, observed,
+        v, torch.tensor([-1]), torch.tensor([0]),
     )  # fmt: skip
 
 

@@ -10,10 +10,8 @@ from app.model import SceneModel
 from app.registry import Store
 from app.scene import ObjectClass
 from tests.training.scenes import request
-from training.fit.adapt import HomeScenes, TrainedOn, adapt
-from training.fit.extend import extended
-from training.machines import build
-from training.machines.arrays import machine_of, weights_of
+from training.fit.adapt import HomeScenes, TrainedOn, adapt, extended
+from training.machines import build, machine_of, weights_of
 
 V, C = 12, 3
 

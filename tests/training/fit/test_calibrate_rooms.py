@@ -116,7 +116,7 @@ def test_the_fit_of_a_room_type_is_the_low_quantile(model):
     scenes = [scene([high], room=1)] * 18 + [scene([low], room=1)] * 2
     limit = limits_of(model, scenes)["room_fit"][1]
     assert (limit.intercept, limit.log_count) == (pytest.approx(fits[low], abs=1e-4), 0.0)
-    limited = calibrate_rooms.refitted_limits(model, tensors([scene([high], room=1)] * 20, V))
+    limited = recalibrated(model, **limits_of(model, [scene([high], room=1)] * 20))
     assert is_within_limits(limited, [high], 1)
     assert not is_within_limits(limited, [low], 1)
     assert limited.calibration.rare_rooms == model.calibration.rare_rooms

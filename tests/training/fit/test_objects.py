@@ -14,10 +14,9 @@ from tests.training.evaluation.scenes import scene, tensors
 from training.evaluation.parts import ALL_BUT_ONE
 from training.fit import long_chains, objects
 from training.fit.configuration import ObjectsConfig
+from training.fit.long_chains import fit_scene_rates, store_samples
 from training.fit.objects import ObjectFit, ObjectScenes, random_parts, start_objects
-from training.fit.samples import fit_scene_rates, store_samples
-from training.machines import MachineSpec, build
-from training.machines.arrays import weights_of
+from training.machines import MachineSpec, build, weights_of
 from training.machines.gibbs import Chains
 
 V = 4

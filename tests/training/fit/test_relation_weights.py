@@ -10,11 +10,18 @@ from hypothesis import strategies as st
 from app.scene.spatial_relations import ABOVE, CANONICAL, INSIDE, LEFT, ON_TOP, STACKED
 from tests.enumeration.small_machines import random_weights
 from tests.training.evaluation.scenes import V, scene, tensors, toy
-from training.datasets.batches import relation_units
 from training.fit.configuration import RelationsConfig
-from training.fit.relation_weights import SHARED, RelationFit, bake_shared_weights, share_weights
-from training.fit.residuals import lower_unseen_roles, means_of_parts, with_counted_residuals
+from training.fit.relation_weights import (
+    SHARED,
+    RelationFit,
+    bake_shared_weights,
+    lower_unseen_roles,
+    means_of_parts,
+    share_weights,
+    with_counted_residuals,
+)
 from training.machines import MachineSpec, build
+from training.machines.edges import SceneRelations
 from training.machines.machine import OBJECT_WEIGHTS
 
 CONFIG = RelationsConfig(
@@ -79,7 +86,7 @@ def of_whole_scenes(machine, batch, generator):
 def logit_of(machine, a, i, j):
     """Of a relation between two classes of a scene with 0, with the hidden units at their mean."""
     batch = whole(tensors([toy(sorted({0, i, j}), [(a, i, j)])]))
-    edges, r, _ = relation_units(machine, batch)
+    edges, r, _ = machine.lay_out(batch)
     with torch.no_grad():
         logits = machine.relation_logits(edges, batch.v, of_whole_scenes(machine, batch, None))
     return float(logits[r > 0])
@@ -140,7 +147,8 @@ def test_relations_have_the_layout_of_their_machine(machine):
         (classes >= 0).view(2, 1, 3, 1) & (classes >= 0).view(2, 1, 1, 3)
     )
     holds = observed & (torch.rand(2, 2, 3, 3, generator=generator) < 0.5)
-    edges, r, seen = machine.lay_out(classes, classes.clamp(max=1), holds.float(), observed)
+    relations = SceneRelations(classes, classes.clamp(max=1), holds.float(), observed)
+    edges, r, seen = machine.lay_out(relations)
     for row in range(2):
         table = {
             (a, int(classes[row, x]), int(classes[row, y])): holds[row, a, x, y].item()
@@ -188,7 +196,7 @@ def test_the_loss_is_the_mean_over_scenes_and_the_prior_of_one(monkeypatch):
         for name in ("s", "o", "S", "O", "R", "M", "P", "n", "residual")
     )
     assert prior == pytest.approx(0.5 * CONFIG.weight_prior * squares / len(scenes), rel=1e-4)
-    edges, r, observed = relation_units(machine, batch)
+    edges, r, observed = machine.lay_out(batch)
     h1 = of_whole_scenes(machine, batch, None)
     logits = machine.relation_logits(edges, batch.v, h1).detach()
     log_p = torch.distributions.Bernoulli(logits=logits).log_prob(r)
@@ -269,7 +277,7 @@ LISTED = {(0, 1, 2): (18, 2), (0, 3, 4): (4, 8), (1, 0, 3): (0, 12)}
 @pytest.mark.parametrize("weights", [(1.0, 1.0), (0.5, 2.0)])
 def test_residuals_maximise_the_likelihood_of_triples_under_a_normal_prior(monkeypatch, weights):
     """At the mode the slope of the log-likelihood is τ δ, with one precision τ for all triples."""
-    monkeypatch.setattr("training.fit.residuals.means_of_parts", of_whole_scenes)
+    monkeypatch.setattr("training.fit.relation_weights.means_of_parts", of_whole_scenes)
     every = [
         annotated(triple, k < true, "captions" if k % 2 else "rooms")
         for triple, (true, false) in LISTED.items()
@@ -287,7 +295,7 @@ def test_residuals_maximise_the_likelihood_of_triples_under_a_normal_prior(monke
     assert set(after) == set(before) | {(1, 0, 3)}
     assert all(after[key] == before[key] for key in set(before) - set(LISTED))
     batch = whole(scenes)
-    edges, r, observed = relation_units(found, batch)
+    edges, r, observed = found.lay_out(batch)
     with torch.no_grad():
         h1 = of_whole_scenes(found, batch, None)
         logits = found.relation_logits(edges, batch.v, h1)

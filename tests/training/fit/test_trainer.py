@@ -5,10 +5,9 @@ import pytest
 import torch
 
 from tests.training import commands
-from training.fit import samples, trainer
+from training.fit import long_chains, trainer
 from training.fit.configuration import Config
-from training.fit.curve import CurvePoint
-from training.fit.trainer import Trainer
+from training.fit.trainer import CurvePoint, Trainer
 from training.machines.machine import OBJECT_WEIGHTS
 from training.runs.config_files import with_settings
 from training.runs.pipeline import prepare
@@ -25,7 +24,7 @@ def _few_steps():
     """A point of the curve after 4 steps, and a short fit of the base rates of whole scenes."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(trainer, "_STEPS", 4)
-        patch.setattr(samples, "_ROUNDS", 3)
+        patch.setattr(long_chains, "_ROUNDS", 3)
         yield
 
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from tests.training.commands import invoke, small_config, write_config
-from training.fit.curve import CurvePoint, TrainingResult
 from training.fit.relation_weights import RelationFit
+from training.fit.trainer import CurvePoint, TrainingResult
 from training.machines import MachineSpec, Triway, build
 from training.runs import folder as folders
 from training.runs.folder import RunError, load_run, save_run
