@@ -82,7 +82,7 @@ class SceneTensors:
             classes[row, :m], counts[row, :m] = e.classes, e.counts
             holds[row, :, :m, :m], observed[row, :, :m, :m] = e.holds, e.observed
         tables = map(torch.from_numpy, (classes, counts, holds, observed))
-        return Batch(*tables, self.v[index], self.room[index], self.source[index])
+        return Batch(*(*tables, self.v[index], self.room[index], self.source[index]))
 
 
 def scene_tensors(

@@ -124,7 +124,8 @@ def measure(home: Home, seed: int, progress: Callable[[str], None]) -> Measured:
         change = _change(home, weights, scenes.v.sum(0) > 0, seed)
         rows.append((losses, ranks, _alarms(home, test, sides), change))
     *tables, changes = zip(*rows, strict=True)
-    return Measured(*map(np.concatenate, tables), change=float(np.mean(changes)))
+    loss, rank, alarms = map(np.concatenate, tables)
+    return Measured(loss, rank, alarms, float(np.mean(changes)))
 
 
 Sides = tuple[SceneModel, SceneModel]  # the parent, and the model with adapted weights

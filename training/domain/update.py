@@ -30,7 +30,6 @@ from training.fit.configuration import ConfigError, DataConfig, is_file
 from training.runs.config_files import load_config, read_toml
 
 PROPOSED: Final = "proposed.json"  # the file with the names of all proposals
-_NOTHING: Final[Mapping[str, set[str]]] = {}
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ def _data_of(config_file: Path) -> DataConfig:
 
 
 def proposed_json(
-    classes: Iterable[ObjectClass], rooms: Iterable[str], earlier: Mapping[str, set[str]] = _NOTHING
+    classes: Iterable[ObjectClass], rooms: Iterable[str], earlier: Mapping[str, set[str]] = {}
 ) -> str:
     """Return the text of `proposed.json`: the keys of the names of this and earlier proposals."""
     names = {

@@ -18,6 +18,7 @@ kappa take no part: they belong to sampling and to the questions.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
