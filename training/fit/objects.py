@@ -195,10 +195,14 @@ class ObjectFit:
         self._add_to_average()
 
     def _batch_loss(self) -> Tensor:
-        index = self.scenes.draw(self.config.batch_size, self._generator)
+        scenes = self.scenes
+        index = scenes.draw(self.config.batch_size, self._generator)
         loss = self._conditional_loss(index)
         if self._chains is not None:
-            difference = self._generative_loss(self._chains, index)
+            room = self._some_rooms(scenes.room[index])
+            difference = self._generative_loss(
+                self._chains, scenes.v[index], room, scenes.source[index]
+            )
             loss = loss + self.config.generative_weight * difference
         return loss
 
@@ -229,15 +233,22 @@ class ObjectFit:
         is_listed = torch.rand(len(room), generator=self._generator) < self.config.room_share
         return torch.where(is_listed, room, -1)
 
-    def _generative_loss(self, chains: Chains, index: Int[Tensor, "B"]) -> Float[Tensor, ""]:
+    def _generative_loss(
+        self,
+        chains: Chains,
+        v: Float[Tensor, "B V"],
+        room: Int[Tensor, "B"],
+        source: Int[Tensor, "B"],
+    ) -> Float[Tensor, ""]:
         """Return F(scenes) - F(chains) given the room types, which the chains keep."""
-        room = self._some_rooms(self.scenes.room[index])
         sweep(self.machine, chains, self._generator, classes=self.config.classes_per_sweep)
-        v = torch.cat([self.scenes.v[index], chains.v])
-        room = torch.cat([room, chains.room])
-        source = torch.cat([self.scenes.source[index], chains.source])
+        n = len(v)
+        v, room, source = (
+            torch.cat(pair)
+            for pair in ((v, chains.v), (room, chains.room), (source, chains.source))
+        )
         free = self.machine.free_energy(v, room, source) + self.machine.room_rate(room, source)
-        return free[: len(index)].mean() - free[len(index) :].mean()
+        return free[:n].mean() - free[n:].mean()
 
     def _schedule(self) -> float:
         """Return the factor of the learning rate: it rises, stays, and falls along a cosine."""
