@@ -38,7 +38,8 @@ from training.datasets.cases import Triple, scene_of
 from training.datasets.inventories import SHARE, Place, complete_scene
 from training.datasets.moved import has_boxes, posed_scene
 from training.datasets.vocabulary import curated_names
-from training.evaluation.asking import canonical_triple, index_of_ids, of_classes, score_misplaced
+from training.evaluation.asking import canonical_triple, index_of_ids, score_misplaced
+from training.evaluation.parts import of_classes
 from training.fit.adapt import HomeScenes, TrainedOn, extended
 from training.fit.regression import recalibrated
 
