@@ -95,6 +95,7 @@ if FOLDER is not None:
 
 
 def _kernel(function: Callable[..., Any], **options: Any) -> Any:
+    """Return a function compiled by numba, and list it in `KERNELS`."""
     options |= {"cache": FOLDER is not None, "nogil": True, "error_model": "numpy"}
     # Only Python calls the loops, so they need no wrapper for C.
     options["no_cfunc_wrapper"] = True

@@ -73,6 +73,7 @@ class ServiceError(HTTPException):
     def __init_subclass__(
         cls, *, slug: str = "", status: int = 500, steps: tuple[Step, ...] = ()
     ) -> None:
+        """Derive title and page of a subclass with a slug from its docstring, and register it."""
         super().__init_subclass__()
         if slug:
             title, _, explanation = (cls.__doc__ or slug).partition("\n")

@@ -27,6 +27,7 @@ class InProcess(httpx.BaseTransport):
     """
 
     def __init__(self, store: Path) -> None:
+        """Start the application with the models of a store."""
         try:
             settings = _FixedSettings(
                 store=store, metrics=False, access_log=False, docs=False, allowed_hosts=("*",)

@@ -57,6 +57,7 @@ def create_app(settings: Settings) -> FastAPI:
 
 
 def _add_routes(app: FastAPI, settings: Settings) -> None:
+    """Add all routes, and keep the set of their paths in `app.state.paths`."""
     app.router.routes += questions.router.routes + scenes.router.routes
     routers = [models.router, health.router, *([health.monitoring] if settings.metrics else [])]
     for router in routers:

@@ -95,6 +95,7 @@ class Server(uvicorn.Server):
             self._runtime.request_check()
 
     def _log_addresses(self, sockets: list[socket.socket]) -> None:
+        """Log the URLs of the service, whether its models are ready, and whether it needs a key."""
         port = sockets[0].getsockname()[1]
         hosts = dict.fromkeys(listener.getsockname()[0] for listener in sockets)
         others = [host for host in hosts if host not in _ANY]

@@ -151,6 +151,7 @@ def _in_pieces(text: str, most: int) -> dict[str, Any]:
             last = mark("," + closing)
 
     def value() -> Any:
+        """Parse the value at the current position, and move the position to its end."""
         nonlocal at
         # The parsers would read the rest of the body, so the slice bounds the step.
         part, start = (text, at) if text.startswith('"', at) else (text[at : at + most], 0)
@@ -164,6 +165,7 @@ def _in_pieces(text: str, most: int) -> dict[str, Any]:
         return parsed
 
     def entries(name: str) -> list[Any]:
+        """Parse the array at the current position, the value of the member ``name``."""
         items: list[Any] = []
         for _ in parts("[", "]"):
             if len(items) == MAX_BATCH:
@@ -197,6 +199,7 @@ def _constants(value: Any, at: errors.Location = ()) -> Iterator[tuple[str, erro
 
 
 def _members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the members of a JSON object. Refuse too many members and duplicate names."""
     if len(pairs) > MAX_MEMBERS:
         raise _invalid(f"A JSON object has more than {MAX_MEMBERS} members.")
     members = dict(pairs)

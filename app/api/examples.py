@@ -36,6 +36,7 @@ _SUMMARY: Final = {"name": "home", "versions": [_REFUSED, _VERSION]}
 
 
 def _batch(result: dict[str, Any]) -> dict[str, Any]:
+    """Return the answer to a batch of two scenes: a result, and an unknown label."""
     (unknown,) = UnknownLabelsError.example
     error = unknown.model_copy(update={"pointer": f"#/scenes/1{unknown.pointer[1:]}"})
     problem = UnknownLabelsError(errors=[error]).describe(REQUEST_ID)

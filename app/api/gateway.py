@@ -134,6 +134,7 @@ class Recorded:
         )
 
         async def send_completed(message: Message) -> None:
+            """Send a message to the client. The start of a response gets further headers."""
             if message["type"] == "http.response.start":
                 record.status = message["status"]
                 completed = [*message.get("headers", ()), *_ALWAYS, (b"x-request-id", request_id)]

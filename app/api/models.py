@@ -121,6 +121,7 @@ async def show_word(
     vocabulary = served.model.vocabulary
 
     def look_up(_: object) -> schemas.WordAnswer:
+        """Return the class of the label, or the nearest classes if no rule finds one."""
         answer = partial(schemas.WordAnswer, model=served.reference, word=word)
         reading = vocabulary.look_up(word)
         if reading is None:
@@ -173,6 +174,7 @@ def _summary(models: ServedModels, name: str) -> schemas.ModelSummary:
 
 
 def _version_summary(models: ServedModels, name: str, number: str) -> schemas.VersionSummary:
+    """Return aliases, variant and digest of a version, or why the service refused it."""
     served = models.served.get((name, number))
     if served is None:
         failure = models.failures[f"{name}@{number}"]

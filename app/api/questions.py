@@ -71,6 +71,7 @@ async def _answer(
     read = partial(_read, question, scene, artifact, runtime.limits, look_ups)
 
     def compute(began: float, reading: Reading, ask: Callable[[], Fields]) -> _Computed:
+        """Compute the answer and write it as JSON. Count the seconds that its scene waited."""
         fields = ask()
         seconds, waited = monotonic() - began, ticket.waited - (record.queue_seconds or 0.0)
         record.queue_seconds = ticket.waited
@@ -168,27 +169,28 @@ def is_small(scene: Mapping[str, Any]) -> bool:
 async def _answer_each(
     http: Request, batch: BatchRequest[RequestT], question: Question[RequestT]
 ) -> bytes:
+    """Answer the scenes of a batch one by one. Return the JSON list of results and problems."""
     state = http.scope["state"]
     runtime: Runtime = http.scope["app"].state.runtime
     ticket, request_id, admission = state["ticket"], state["request_id"], runtime.admission
     models, look_ups, results = runtime.models, LookUps(), list[bytes]()
     # The rest is for the problems of the scenes that the batch does not answer.
-    left = runtime.limits.answer_bytes // 16 * 15
+    left_bytes = runtime.limits.answer_bytes // 16 * 15
     await ticket.enter(admission.slow, len(batch.scenes))
     for number, scene in enumerate(batch.scenes):
         try:
-            if left <= 0:
+            if left_bytes <= 0:
                 raise AnswerTooLargeError([LocatedError((), _FULL)])
             ticket.check()
             data = await _validated(scene, question, number, admission, ticket)
-            answer = await _answer(http, question, data, models, look_ups, left)
+            answer = await _answer(http, question, data, models, look_ups, left_bytes)
             outcome, result = SUCCESS, b'{"status":200,"result":%b}' % answer
         except Exception as error:  # noqa: BLE001 — any error fails only this scene
             outcome, result = _failed(error, number, scene, request_id)
         runtime.metrics.entry_answered(question.name, outcome)
         results.append(result)
         # After the first answer that is too large, the batch stops.
-        left = 0 if outcome == AnswerTooLargeError.slug else left - len(result)
+        left_bytes = 0 if outcome == AnswerTooLargeError.slug else left_bytes - len(result)
         await admission.quick.let_pass()
     return b'{"request_id":%b,"results":[%b]}' % (to_json(request_id), b",".join(results))
 
@@ -213,6 +215,7 @@ def _failed(error: Exception, number: int, scene: Any, request_id: str) -> tuple
 
 
 def _add_route(question: Question[Any]) -> None:
+    """Add the route `POST /NAME` of a question, which answers one scene."""
     async def answer(data: Any, http: Request) -> bytes:
         models = http.scope["app"].state.runtime.models
         return await _answer(http, question, data, models, LookUps())
@@ -233,6 +236,7 @@ def _add_route(question: Question[Any]) -> None:
 
 
 def _add_batch_route(question: Question[Any]) -> None:
+    """Add the route `POST /NAME/batch` of a question, which answers a list of scenes."""
     async def answer(data: Any, http: Request) -> bytes:
         return await _answer_each(http, data, question)
 

@@ -99,6 +99,7 @@ def _read(data: ScenesRequest, request_id: str, limit: int, stop: Callable[[], b
 
 
 def _content(data: ScenesRequest) -> bytes:
+    """Return the bytes of the file in a request, which are sent as text or as Base64."""
     if data.text is not None:
         return data.text.encode()
     try:

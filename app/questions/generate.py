@@ -266,6 +266,7 @@ def room_fit(model: SceneModel, classes: list[int], room: int) -> float:
 
 
 def _read(request: GenerateRequest, model: SceneModel, reading: Reading) -> Options:
+    """Return the keyword arguments of `generate` for a request."""
     if (name := request.room_type) is not None and reading.scene.room_type is None:
         errors = ErrorList()
         reading.unknown.refuse(name, ("room_type",), errors, is_room=True)

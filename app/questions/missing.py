@@ -262,6 +262,7 @@ def _log_p_at(
 
 
 def _read(request: MissingRequest, model: SceneModel, reading: Reading) -> Options:
+    """Return the keyword arguments of `missing` for a request."""
     errors, size = ErrorList(), model.spec.V
     # Only the default of `top_k` may exceed the size of the vocabulary.
     if request.top_k > size and "top_k" in request.model_fields_set:
@@ -303,6 +304,7 @@ def _at(
 
 
 def _ask_all(model: SceneModel, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
+    """Yield answers for the warm-up, which together run every loop of the question."""
     related, bare, _ = scenes
     for scene in scenes:
         yield missing(model, scene)

@@ -228,7 +228,10 @@ class Unknown:
 
 
 class Names:
-    """Look-up of the objects of a scene by id, or by label if only one object has the label."""
+    """Look-up of the objects of a scene by id, or by label if only one object has the label.
+
+    `left_out` has the (id, label) of each ignored object.
+    """
 
     def __init__(
         self, objects: Sequence[SceneObject], unknown: Unknown, left_out: Sequence[tuple[str, str]]

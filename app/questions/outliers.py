@@ -238,6 +238,7 @@ def _unjudged(model: SceneModel, scene: Scene) -> list[SceneWarning]:
 
 
 def _read(request: OutliersRequest, _: SceneModel, __: Reading) -> Options:
+    """Return the keyword arguments of `outliers` for a request."""
     return {
         "sensitivity": request.sensitivity,
         "threshold": request.threshold,

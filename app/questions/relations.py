@@ -227,6 +227,7 @@ def _names(
 
 
 def _read(request: RelationsRequest, _: SceneModel, reading: Reading) -> Options:
+    """Return the keyword arguments of `relations` for a request."""
     return {
         "top_k": request.top_k,
         "min_probability": request.min_probability,

@@ -65,6 +65,7 @@ def rooms(
 
 
 def _read(request: RoomsRequest, _: SceneModel, reading: Reading) -> Options:
+    """Return the keyword arguments of `rooms` for a request."""
     candidates = None
     if request.candidates is not None:
         errors = ErrorList()

@@ -123,6 +123,7 @@ def _is_upgrade(old: AliasTarget, new: AliasTarget, added: set[tuple[str, str]])
 
 
 def _list(store: Store) -> None:
+    """Print each version with its error, and the aliases. Raise an error of the store itself."""
     models = load_model_set(store, release=Store(DEFAULT_STORE))
     for name, version in models.entries:
         failure = models.failures.get((name, version))

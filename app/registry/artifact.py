@@ -125,6 +125,7 @@ def load_artifact(
 
 
 def _model(manifest: Manifest, tensors: dict[str, NDArray[Any]]) -> SceneModel:
+    """Return the model of the tensors by name: its weights and its tables of statistics."""
     offsets, counts, places = (
         {name: tensors.pop(name) for name in list(tensors) if name.startswith(group.prefix)}
         for group in (Offsets, Counts, Places)
@@ -154,6 +155,7 @@ def _digest(data: bytes) -> str:
 
 
 def _weights(manifest: Manifest, tensors: Mapping[str, NDArray[Any]]) -> Weights:
+    """Return the weights of a machine, or raise ArtifactError if they do not fit the spec."""
     try:
         spec = MachineSpec.from_dict(dict(manifest.spec))
         expected = layout(spec)
@@ -208,6 +210,7 @@ def _require_size(name: str, size: int, limit: int) -> None:
 
 
 def _read(path: Path, limit: int) -> bytes:
+    """Return at most ``limit`` + 1 bytes of a file, or raise ArtifactError if it is unreadable."""
     try:
         return read_file(path, limit)
     except FileNotFoundError:
@@ -221,6 +224,7 @@ def _unreadable(what: str, error: OSError) -> ArtifactError:
 
 
 def _read_checked(path: Path, manifest: Manifest, limit: int) -> bytes:
+    """Return a file whose size and SHA-256 are those of the manifest, or raise ArtifactError."""
     name, entry = path.name, manifest.files[path.name]
     _require_size(name, entry.bytes, limit)
     data = _read(path, entry.bytes)

@@ -161,14 +161,15 @@ def _machine(spec: MachineSpec) -> list[tuple[str, str]]:
 
 
 def _metrics(description: Description) -> str:
+    """Return the section about metrics: a table of tasks by data sources, and its notes."""
     if not description.metrics:
         return "No metrics are recorded, so the quality of the answers is unknown."
-    sources = list(dict.fromkeys(m.source for m in description.metrics))
+    sources = list(dict.fromkeys(entry.source for entry in description.metrics))
     rows: dict[tuple[str, str], dict[str, str]] = {}
-    for m in description.metrics:
-        cell = f"{m.value:.3f} [{m.low:.3f}, {m.high:.3f}]"
-        rows.setdefault((m.task, m.metric), dict.fromkeys(sources, ""))[m.source] = cell
-    table = [(*name, *cells.values()) for name, cells in rows.items()]
+    for entry in description.metrics:
+        cells = rows.setdefault((entry.task, entry.metric), dict.fromkeys(sources, ""))
+        cells[entry.source] = f"{entry.value:.3f} [{entry.low:.3f}, {entry.high:.3f}]"
+    table = [(*name, *row.values()) for name, row in rows.items()]
     calibration = description.calibration
     judged = {"objects": calibration.outlier, "relations": calibration.misplaced.judges_relations}
     unjudged = [
@@ -176,7 +177,7 @@ def _metrics(description: Description) -> str:
         for part, is_judged in judged.items()
         if not is_judged
     ]
-    note = [_OFFSETS] if any(m.task == "Offsets" for m in description.metrics) else []
+    note = [_OFFSETS] if any(entry.task == "Offsets" for entry in description.metrics) else []
     parts = [_MEASURED, _table(("Task", "Metric", *sources), table), _PROBABILITIES]
     return "\n\n".join([*parts, *unjudged, *note])
 

@@ -153,6 +153,7 @@ class Description(Frozen):
 
     @model_validator(mode="after")
     def _check_spec(self) -> Self:
+        """Check that the sizes in the spec are the lengths of the lists in the other fields."""
         words = self.vocabulary
         for name, what, length in (
             ("V", "vocabulary objects", len(words.objects)),

@@ -153,6 +153,7 @@ def _load(
     check: Callable[[Artifact], None],
     shipped: Shipped,
 ) -> Artifact | ArtifactError:
+    """Return a verified version of the store, or the error that makes it unusable."""
     try:
         artifact = store.load(name, version, previous)
         if artifact is not previous:

@@ -165,6 +165,7 @@ def resolve_reference(
 def _pick(
     target: AliasTarget, versions: Callable[[str], Sequence[str]], replaced: Mapping[str, str]
 ) -> tuple[str, str]:
+    """Return the (name, version) of a target, without a version the newest one."""
     if not (published := versions(target.name)):
         if (new := replaced.get(target.name)) is not None:
             raise StoreError("replaced_model", f"'{new}' replaces the model '{target.name}'")

@@ -283,6 +283,7 @@ class Store:
             raise StoreError("not_writable", reason) from error
 
     def _clear_leftovers(self) -> None:
+        """Remove the temporary files and folders of writers that crashed."""
         folders = (self.root / name for name in self.names())
         for folder in (self.root, *filter(_is_directory, folders)):
             for entry in folder.glob(f"{TEMPORARY}*"):

@@ -119,6 +119,7 @@ def read_group(
 
 
 def _stored(name: str, value: ArrayLike, storage_dtype: StorageDtype) -> NDArray[Any]:
+    """Return an array for the file. Floats get the storage dtype, but vectors get float32."""
     # ascontiguousarray() turns shape () into (1,). reshape() restores it.
     array = np.ascontiguousarray(value).reshape(np.shape(value))
     if np.issubdtype(array.dtype, np.floating):
@@ -132,6 +133,7 @@ def _stored(name: str, value: ArrayLike, storage_dtype: StorageDtype) -> NDArray
 
 
 def _loaded(name: str, data: bytes, entry: TensorEntry) -> NDArray[Any]:
+    """Return a tensor of the file as a writable array. Floats become float32."""
     array = np.frombuffer(data, dtype=entry.dtype).reshape(entry.shape)
     if not entry.dtype.startswith("float"):
         return array.copy()

@@ -139,6 +139,7 @@ def split_words(label: str) -> tuple[str, ...]:
 
 
 def _fold_unicode(label: str) -> str:
+    """Fold case, compatibility variants, separators and plural of a label once; see `label_key`."""
     composed = unicodedata.normalize("NFKC", label)
     if len(composed) > LONGEST:
         return label
@@ -181,6 +182,7 @@ def readings(label: str) -> Iterator[tuple[Rule, str]]:
 
 
 def _readings(label: str) -> Iterator[tuple[Rule, str]]:
+    """Yield the readings by one rule, then those by a second rule on the first readings."""
     pairs = _by_one_rule(label)
     yield from pairs
     parts = [pair for pair in pairs if pair[1] in label]  # without combinations of parts

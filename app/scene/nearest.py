@@ -76,6 +76,7 @@ class NameIndex:
     """Search for entries by similar names, from pairs (name, index). An entry may have several."""
 
     def __init__(self, names: Sequence[tuple[str, int]]) -> None:
+        """Split the names into words. Index them by key (joined words), last word and length."""
         self._entries = [index for _, index in names]
         self._words = [split_words(name) for name, _ in names]
         self._keys = ["".join(words) for words in self._words]

@@ -202,6 +202,7 @@ def observe(
 def _in_viewer_frame(
     objects: tuple[SceneObject, ...], viewpoint: Viewpoint
 ) -> tuple[SceneObject, ...]:
+    """Return the objects with their poses in the axes of the viewer."""
     positions, yaws = to_viewer_frame(
         [thing.position or _UNKNOWN for thing in objects], viewpoint, [one.yaw for one in objects]
     )

@@ -40,6 +40,7 @@ def _remembered(search: SearchT) -> SearchT:
 
     @wraps(search)
     def recall(self: "Vocabulary", label: str, *, is_room: bool = False) -> Any:
+        """Return the remembered result for a label, or search and remember the result."""
         memory, key = self._memory, (search.__name__, label, is_room)
         result = memory.get(key, memory)  # a result may be None
         if result is memory:
@@ -100,6 +101,7 @@ class Vocabulary:
     room_aliases: Mapping[str, Sequence[str]] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
+        """Validate the names, and build the tables for look-ups by spelling and by `label_key`."""
         if not self.objects:
             raise ValueError("a vocabulary needs at least one object class")
         self.objects = tuple(self.objects)
@@ -120,6 +122,7 @@ class Vocabulary:
         self._memory: dict[tuple[str, str, bool], Any] = {}
 
     def _parent_indices(self) -> NDArray[np.int64]:
+        """Return the index of the parent of each class, or -1. Refuse circles of parents."""
         index_of = {entry.label: index for index, entry in enumerate(self.objects)}
         parents = np.full(len(self.objects), -1, dtype=np.int64)
         for index, entry in enumerate(self.objects):
@@ -128,6 +131,8 @@ class Vocabulary:
                     text = f"the parent {entry.parent!r} of {entry.label!r}"
                     raise ValueError(f"{text} is not the label of a class")
                 parents[index] = parent
+        # Each pass replaces the ancestors by their parents. A class that is its own ancestor would
+        # never reach -1.
         ancestors = parents.copy()
         while (ancestors >= 0).any():
             if (own := np.flatnonzero(ancestors == np.arange(len(ancestors)))).size:
@@ -316,6 +321,7 @@ class _WithWords(Vocabulary):
     """A vocabulary and the classes of some words, faster than a new one; see `with_words`."""
 
     def __init__(self, base: Vocabulary, words: Sequence[Word]) -> None:
+        """Append a class for each word. The tables in `_SHARED` stay those of the base."""
         vars(self).update({name: vars(base)[name] for name in _SHARED})
         self._base, self._nearest = base, [word.nearest for word in words]
         self.trained = len(base)
@@ -373,7 +379,10 @@ def do_not_fit(
 def _tables(
     names: Sequence[tuple[str, ...]], kind: str, clash: str
 ) -> tuple[dict[str, int], dict[str, int]]:
-    """Return the index of each entry by its names, and by their keys. The label comes first."""
+    """Return the index of each entry by its names, and by their keys (`label_key`).
+
+    Each entry of ``names`` is a label and its aliases. ``kind`` and ``clash`` are texts of errors.
+    """
     by_spelling: dict[str, int] = {}
     by_key: dict[str, int] = {}
     for index, spellings in enumerate(names):

@@ -164,6 +164,7 @@ class Admission:
     def __init__(self, requests: int, rows: int) -> None:
         self.quick = Lane(8, requests)
         self.slow = Lane(2, rows)
+        # So the share of one client has room for the largest `/generate`.
         self.draws = Lane(1, SHARE * MAX_SWEEPS)
         self.worker = ThreadPoolExecutor(1, "slow", _lower_priority)
         self.drawing = ThreadPoolExecutor(1, "drawing", _lower_priority)
@@ -204,6 +205,7 @@ async def in_thread(
     has_ended, called_at = False, monotonic()
 
     def compute() -> T:
+        """Run the computation on the thread, and count the seconds in its queue as waiting."""
         # The computation of an ended request is still in the executor's queue, so skip it here.
         if has_ended:
             raise errors.DeadlinePassedError("The request ended before the computation started.")
@@ -291,6 +293,10 @@ class Bodies:
         return bytes(body)
 
     def _check(self, client: str, size: int) -> None:
+        """Raise BodiesFullError if the bodies of all clients, or of this client, are too large.
+
+        ``size`` is the size of the current body, which may exceed the client's share on its own.
+        """
         share = max(self._budget // SHARE, size)
         if self.total > self._budget or self._of_clients.get(client, 0) > share:
             detail = (

@@ -73,6 +73,7 @@ class ServedModels:
         return model
 
     def _find(self, reference: str) -> Artifact:
+        """Return the model of a reference, or the substitute for an unusable target of an alias."""
         try:
             return self.store.resolve(reference)
         except (StoreError, ArtifactError):

@@ -104,10 +104,11 @@ class Runtime:
             await self.check_store(always=is_requested)
 
     def _serve(self, models: ServedModels) -> None:
+        """Answer from a new snapshot of the models. Log new failures and moved aliases."""
         previous, self.models = self.models, models
         is_first = previous is NO_MODELS
         old = {} if is_first else previous.failures
-        new = [one for name, one in models.failures.items() if old.get(name) != one]
+        new = [failure for name, failure in models.failures.items() if old.get(name) != failure]
         _log_failures("", new)
         if not is_first:
             _logger.info("the service has loaded the store: %d usable versions", len(models.served))
@@ -119,6 +120,7 @@ class Runtime:
             _freeze_memory()
 
     def _load(self) -> ServedModels:
+        """Load, verify and warm up the models in the store. Unchanged models are reused."""
         # Read the state first. So the next check finds changes that are made during the load.
         self._loaded_state = self._store.state()
         with progress():
