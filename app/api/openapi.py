@@ -126,7 +126,7 @@ def _complete_operation(operation: dict[str, Any], path: str, settings: Settings
     ok["example"] = examples.ANSWERS[name]
     if "requestBody" in operation:
         (body,) = operation["requestBody"]["content"].values()
-        body["examples"] = {case: described(one) for case, one in examples.REQUESTS[name].items()}
+        body["examples"] = {key: described(case) for key, case in examples.REQUESTS[name].items()}
     if "504" in responses:
         most = settings.max_request_timeout_ms
         timeout = {

@@ -216,6 +216,7 @@ def _failed(error: Exception, number: int, scene: Any, request_id: str) -> tuple
 
 def _add_route(question: Question[Any]) -> None:
     """Add the route `POST /NAME` of a question, which answers one scene."""
+
     async def answer(data: Any, http: Request) -> bytes:
         models = http.scope["app"].state.runtime.models
         return await _answer(http, question, data, models, LookUps())
@@ -237,6 +238,7 @@ def _add_route(question: Question[Any]) -> None:
 
 def _add_batch_route(question: Question[Any]) -> None:
     """Add the route `POST /NAME/batch` of a question, which answers a list of scenes."""
+
     async def answer(data: Any, http: Request) -> bytes:
         return await _answer_each(http, data, question)
 

@@ -158,8 +158,8 @@ class ConditionedChains:
     def __init__(self, chains: SceneChains, conditions: Conditions, temperature: float) -> None:
         self._chains, self._machine = chains, chains.machine
         self._conditions, self._temperature = conditions, temperature
-        of = conditions.classes, conditions.profile, conditions.room
-        bias, self._room_bias = chains.machine.scene_bias(*of)
+        evidence = conditions.classes, conditions.profile, conditions.room
+        bias, self._room_bias = chains.machine.scene_bias(*evidence)
         self._w = chains.arrays._replace(b=bias)
         self._beta = np.float32(1.0 / temperature)
         self._room, self._bias = conditions.room, chains.machine.room_bias(conditions.room)
@@ -220,6 +220,7 @@ class ConditionedChains:
         """Return the logits of the relations between classes with one instance each."""
         n, spec = len(classes), self._machine.spec
         pairs = Pairs(classes, np.zeros(n, np.float32), np.ones(n, np.float32), *all_pairs(n))
+        # 1 for the state of each unit, without an entry for the first state.
         entries = (h1[:, None] == np.arange(1, spec.states)).astype(np.float32).reshape(1, -1)
         mean, _ = self._chains.units.moments(entries, pairs, slice(0, spec.A), sampled=True)
         return mean.reshape(spec.A, n, n)
@@ -266,9 +267,8 @@ class ConditionedChains:
         if state.room != self._room:
             return self._in_room(state.room).log_score(state, shown, kept)
         listed, machine = state.classes[shown], self._machine
-        by_unit = (
-            self._hidden_logits(listed).astype(np.float64).reshape(-1, machine.spec.states - 1)
-        )
+        hidden_logits = self._hidden_logits(listed).astype(np.float64)
+        by_unit = hidden_logits.reshape(-1, machine.spec.states - 1)
         # The first state of each unit has the logit 0.
         log_sums = np.logaddexp.reduce(by_unit, axis=1, initial=0.0)
         logits = state.logits[:, shown][:, :, shown].astype(np.float64)
@@ -293,6 +293,7 @@ def sweeps(
 
     A sweep draws h1 given the classes, and then the classes. Coupled classes are drawn one after
     another, each given all others. `required` classes stay present. beta is 1 / temperature.
+    `uniform` has a random number in [0, 1) for each draw: of units m, then of classes i and j.
     """
     (V, H1), units, coupled = w.W.shape, len(h1), len(w.L) > 0
     others = H1 // units  # states of a unit but the first, whose logit is 0

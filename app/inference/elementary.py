@@ -81,7 +81,7 @@ def _bits_of_float(_, value):  # noqa: ARG001
 
 @inlined
 def exp(x):
-    """Compute e^x for float32, with x clipped to [-87, 88]."""
+    """Compute e^x = 2^n e^r for float32, with x clipped to [-87, 88]; p approximates e^r."""
     x = min(max(x, _LEAST), _LARGEST)
     n = np.floor(x * _f(1.44269504) + _f(0.5))
     r = x - n * _LN2_HIGH
@@ -93,14 +93,15 @@ def exp(x):
     p = p * r + _f(1.6666665459e-1)
     p = p * r + _f(5.0000001201e-1)
     p = p * r * r + r + _f(1.0)
-    return p * _float_of_bits((_i(n) + _i(127)) << _i(23))
+    return p * _float_of_bits((_i(n) + _i(127)) << _i(23))  # 2^n
 
 
 @inlined
 def log(x):
-    """Compute ln x for positive, normal float32."""
+    """Compute ln x = exponent · ln 2 + ln(1 + m) for positive, normal float32; 1 + m >= √½."""
     bits = _bits_of_float(x) - _SQRT_HALF_BITS
     exponent = _f(bits >> _i(23))
+    # m + p is the polynomial for ln(1 + m).
     m = _float_of_bits((bits & _MANTISSA_BITS) + _SQRT_HALF_BITS) - _f(1.0)
     p = _f(7.0376836292e-2)
     p = p * m + _f(-1.1514610310e-1)
@@ -163,31 +164,38 @@ def to_log_odds(mean: Float[NDArray, "*E"], spread: Float[NDArray, "*E"]) -> Flo
 
 @compiled
 def _to_log_odds(means: Float[NDArray, " E"], spreads: Float[NDArray, " E"]) -> None:
-    """Replace the means of logits by log-odds, given √3 σ, by both rules of `to_log_odds`."""
+    """Replace the means of normal logits ℓ by the log-odds of E[sigmoid(ℓ)], given √3 σ.
+
+    The loops compute the log-odds for |mean|, and give them the sign of the mean. `wide` are the W
+    logits of the trapezoidal rule; all others have three nodes.
+    """
     one, four, wide, W = np.float32(1.0), np.float32(4.0), np.empty(len(means), np.int64), 0
     for e in range(len(means)):
         if spreads[e] >= _WIDE:
             wide[W] = e
             W += 1
+    # With u = e^-|mean| and q = e^(distance of a node), plus sums sigmoid(ℓ) over the nodes, and
+    # minus sums sigmoid(-ℓ) / u. Short loops let the compiler use vector instructions.
     u, q, step = np.empty(W, np.float32), np.ones(W, np.float32), np.empty(W, np.float32)
-    on, off = np.empty(W, np.float32), np.empty(W, np.float32)
+    minus, plus = np.empty(W, np.float32), np.empty(W, np.float32)
     for k in range(W):
         u[k], step[k] = -abs(means[wide[k]]), _STEP / _ROOT_3 * spreads[wide[k]]
     for k in range(W):
         u[k], step[k] = exp(u[k]), exp(step[k])
-        on[k] = off[k] = one / (one + u[k])
+        minus[k] = plus[k] = one / (one + u[k])
     for weight in _TAIL:
         for k in range(W):
             q[k] = min(q[k] * step[k], np.float32(1e30))
             up, down = one / (one + u[k] * q[k]), one / (q[k] + u[k])
-            on[k] += weight * (q[k] * up + down)
-            off[k] += weight * (up + q[k] * down)
+            minus[k] += weight * (q[k] * up + down)
+            plus[k] += weight * (up + q[k] * down)
     for k in range(W):
-        step[k] = log(on[k] / off[k])
+        step[k] = log(minus[k] / plus[k])
     for k in range(W):
         log_odds = abs(means[wide[k]]) - step[k]
-        on[k] = log_odds if means[wide[k]] >= 0.0 else -log_odds
-    # The sums over the three nodes have the common denominator a b c.
+        plus[k] = log_odds if means[wide[k]] >= 0.0 else -log_odds
+    # sigmoid(ℓ) is 1/a, 1/b and root/c at the three nodes, and sigmoid(-ℓ) is ratio times 1/a,
+    # root/b and 1/c. The sums have the common denominator a b c.
     for e in range(len(means)):
         size, root = abs(means[e]), exp(spreads[e])
         ratio = exp(-size)
@@ -196,4 +204,4 @@ def _to_log_odds(means: Float[NDArray, " E"], spreads: Float[NDArray, " E"]) -> 
         log_odds = size - log((middle + a * (root * c + b)) / (middle + a * (c + root * b)))
         means[e] = max(log_odds if means[e] >= 0.0 else -log_odds, NO_UNIT)
     for k in range(W):
-        means[wide[k]] = max(on[k], NO_UNIT)
+        means[wide[k]] = max(plus[k], NO_UNIT)

@@ -30,7 +30,9 @@ def implication_shifts(
 
     A step leads from one class to another class along a relation that holds. A step of kind a leads
     from the subject to the object of relation a. A step of kind A + a leads from the object to the
-    subject. A path consists of two steps. The first 2A features are the steps from i to j.
+    subject. A path consists of two steps. The rows of `weight` are the kinds of a step from x to y,
+    the pairs of kinds of a path, the kinds of steps from x, and the kinds of steps to y. x, y and z
+    are classes, c and d are kinds, and b is the relation whose logit changes.
     """
     # The loops use plain indices, because a slice would cost more time.
     A, n, _ = r.shape
@@ -92,9 +94,9 @@ def draw_in_groups(
 ) -> None:
     """Sample the free relations of r, which are off before, group after group.
 
-    Each group is sampled given the relations of all earlier groups. `group_numbers`, random numbers
-    in [0, 1), select the groups. a(i, j) and a(j, i) are always in different groups. `logits` lack
-    the changes by other relations.
+    Each group is sampled given the relations of all earlier groups. a(i, j) and a(j, i) are always
+    in different groups. `uniform` and `group_numbers` are random numbers in [0, 1): the first draw
+    the relations, and the second select the groups. `logits` lack the changes by other relations.
     """
     A, n, _ = r.shape
     group = np.empty(r.shape, np.int64)

@@ -69,6 +69,7 @@ class HiddenLogOdds:
             raise ValueError(f"weights must be between -{LARGEST_WEIGHT} and {LARGEST_WEIGHT}")
         self._rows, self._states = len(weights), states
         self._group = min(_LARGEST_GROUP, max(1, int(_LOG_RANGE / max(largest, 1.0))))
+        # -(-a // b) rounds a / b up. Tiles have equal widths of whole vector registers.
         tiles = max(1, -(-self._rows // _TILE))
         width = -(-self._rows // (tiles * _LANES)) * _LANES
         # The padding of the last tile is 1, which leaves the products near 1.
@@ -92,9 +93,8 @@ class ObjectScorer:
 
     def __init__(self, weights: Weights) -> None:
         self._weights, self._states = weights, weights.spec.states
-        self._biases: dict[
-            tuple[float, int | None], Float[NDArray, " V"]
-        ] = {}  # by coverage and room type
+        # By coverage and room type.
+        self._biases: dict[tuple[float, int | None], Float[NDArray, " V"]] = {}
         self._increases: dict[int, tuple[Float[NDArray, " V"], Float[NDArray, " V"]]] = {}
         self.hidden = HiddenLogOdds(weights["W"], self._states)
         self.hidden_of_rooms = HiddenLogOdds(weights["Q"], self._states)
@@ -131,6 +131,7 @@ class ObjectScorer:
         """Return the bias of each class for a listed share, interpolated between the bins."""
         kappa = self._weights["kappa"]
         low = bisect(_MIDDLES, coverage, 1, len(LISTED_SHARES)) - 1
+        # Beyond the first and the last middle, the value is that of the nearest bin.
         share = (coverage - _MIDDLES[low]) / (_MIDDLES[low + 1] - _MIDDLES[low])
         weight = np.float32(min(max(share, 0.0), 1.0))
         return (1 - weight) * kappa[low] + weight * kappa[low + 1]
@@ -251,11 +252,11 @@ def _hidden_log_odds(
     group: int,
     rows: int,
 ) -> Float[NDArray, "B rows"]:
-    """Return the result of `HiddenLogOdds`.
+    """Return hidden(w), defined in the module, for each row w of weights at B probabilities p.
 
     After each `group` of sums, the function splits the product into mantissa and exponent, and adds
     the exponent to an integer. So one log at the end is enough. `factors` are exponentials of the
-    weights, in tiles of `width` rows.
+    weights, in tiles of `width` rows. t is a tile, i is a row in it, and z is a state of unit m.
     """
     tiles, units, others, width = factors.shape
     log_odds = np.empty((len(p), rows), np.float32)
@@ -294,9 +295,10 @@ def _hidden_changes(
     raised: Float[NDArray, "N units states-1"],
     removed: Float[NDArray, "n units states-1"],
 ) -> tuple[Float[NDArray, " N"], Float[NDArray, "N n"]]:
-    """Return hidden(W_i) of N classes i, and its changes by n listed classes.
+    """Return hidden(W_c) of N classes c, and its changes by n listed classes j.
 
-    `raised` is exp(W_i). `removed` is exp(-contribution) of each listed class.
+    p is one row for all classes, or one for each. `raised` is exp(W_c). `removed` is
+    exp(-contribution) of each listed class: this factor removes class j from the probabilities p.
     """
     (N, units, others), n = raised.shape, len(removed)
     total, change = np.zeros(N, np.float32), np.zeros((N, n), np.float32)
@@ -311,6 +313,7 @@ def _hidden_changes(
             total[c] += log(hidden[m])
         for j in range(n):
             for m in range(units):
+                # Without class j, the sum of the unit is after / before.
                 row, factors, without = states[m], raised[c, m], removed[j, m]
                 before, after = row[0], row[0]
                 for z in range(others):
@@ -339,7 +342,11 @@ def _explained_log_odds(
     states: int,
     explained: bool,
 ) -> tuple[Float[NDArray, " N"], Float[NDArray, "N n"]]:
-    """Return the result of `ObjectScorer._explained`."""
+    """Return the log-odds of N target classes i, and their changes by each listed class j.
+
+    `rows` are the indices of listed targets among the listed classes, empty for unlisted targets.
+    The logits x of a listed target leave out its own contribution.
+    """
     N, n, others = len(targets), len(classes) if explained else 0, states - 1
     without = np.empty((max(len(rows), 1), len(x)), np.float32)
     without[0] = x
@@ -358,10 +365,10 @@ def _explained_log_odds(
     for i in range(N):
         coupled = np.float32(0.0)
         for j in range(len(classes) if len(L) else 0):
-            part = L[targets[i], classes[j]] * presence[j]
-            coupled += part
+            coupling = L[targets[i], classes[j]] * presence[j]
+            coupled += coupling
             if j < n:
-                change[i, j] += part
+                change[i, j] += coupling
         log_odds[i] += bias[targets[i]] + mean[i] + coupled
         for j in range(n):
             change[i, j] += of_source[i, j]
@@ -384,6 +391,8 @@ def _source_effects(
 
     The effect on a class i is the mean base rate sum_q p_q a_qi over the Q data sources. p_q is the
     probability of source q given the listed classes. The changes are those by the first n classes.
+    `rows` are the indices of listed targets among the listed classes: a class has no effect on p_q
+    of itself.
     """
     Q = len(f)
     # Part of each listed class in the logit of each source, and e^-part.

@@ -122,7 +122,7 @@ class RelationUnits(ABC):
     def moments(
         self, means: Means, pairs: Pairs, chosen: slice, *, sampled: bool = False
     ) -> Moments:
-        """Return the moments of the chosen relations; the mean is `NEVER` without a unit."""
+        """Return moments of the chosen relations: `NEVER` without a unit, σ = 0 if `sampled`."""
 
     def logits(self, scene: EncodedScene) -> RelationLogits:
         """Return the logits of all relations between the classes of a scene."""
@@ -149,8 +149,9 @@ class RelationUnits(ABC):
     ) -> Float[NDArray, "F A"] | None:
         """Return how much each of F features of the relations that hold changes a logit.
 
-        `training/machines/triway.py` defines the features. The result is None for machines in which
-        relations do not change each other's logits directly. beta is 1 / temperature.
+        The features of a pair are its relations, paths over a third class, and how many relations
+        each class has. The result is None for machines in which relations do not change each
+        other's logits directly. beta is 1 / temperature.
         """
         return None
 
@@ -174,6 +175,7 @@ class RelationUnits(ABC):
         counts as present. `anchors` are positions among the classes of the scene.
         """
         N, m = len(candidates), len(anchors)
+        # Classes 0 to N - 1 of the pairs are the candidates, and the next m are the anchors.
         i, j = np.empty((N, 2 * m), np.int64), np.empty((N, 2 * m), np.int64)
         i[:, :m] = j[:, m:] = np.arange(N)[:, None]
         j[:, :m] = i[:, m:] = np.arange(N, N + m)
@@ -208,18 +210,18 @@ class FreeUnits(RelationUnits):
     def moments(
         self, means: Means, pairs: Pairs, chosen: slice, *, sampled: bool = False
     ) -> Moments:
-        """Return means and √3 σ of logits by the formula, which gives samples the variance 0."""
+        """Return means and √3 σ of logits by the module's formulas; for states of h1, σ is 0."""
         shape = len(means), chosen.stop - chosen.start, pairs.i.shape[1]
         # Row b of the means, relation a and pair p of each entry of the result.
         b, a, p = (indices.reshape(-1) for indices in np.indices(shape))
         i, j = pairs.i[b, p], pairs.j[b, p]
         rows = _pair_rows(self._table, pairs.classes[i] * self._V + pairs.classes[j])
         units = self._index[rows, chosen.start + a].astype(np.int64)
-        kept = np.flatnonzero(units >= 0)
-        units, b = units[kept], b[kept]
+        existing = np.flatnonzero(units >= 0)
+        units, b = units[existing], b[existing]
         base = self._d[units]
         if self._g is not None:
-            v_i, v_j = pairs.presence[i[kept]], pairs.presence[j[kept]]
+            v_i, v_j = pairs.presence[i[existing]], pairs.presence[j[existing]]
             base = base + self._g[units, 0] * v_i + self._g[units, 1] * v_j
         terms = self._by_unit(self._U[units])
         m = self._by_unit(means)[b if len(means) > 1 else np.zeros(1, np.int64)]
@@ -227,8 +229,8 @@ class FreeUnits(RelationUnits):
         by_unit = weighted.sum(2)
         variance = ((weighted * terms).sum(2) - by_unit * by_unit).sum(1)
         mean, spread = np.full(shape, NEVER), np.zeros(shape, np.float32)
-        mean.reshape(-1)[kept] = base + by_unit.sum(1)
-        spread.reshape(-1)[kept] = np.sqrt(3 * np.maximum(variance, 0))
+        mean.reshape(-1)[existing] = base + by_unit.sum(1)
+        spread.reshape(-1)[existing] = np.sqrt(3 * np.maximum(variance, 0))
         return mean, spread
 
     def _by_unit(self, rows: Float[NDArray, "N H1"]) -> Float[NDArray, "N units states-1"]:
@@ -261,6 +263,7 @@ class SharedUnits(RelationUnits):
             table=table,
             residual=residual,
         )
+        # Weights of the factors z in base, as U_e = G[a]'z for h1.
         self._g = np.concatenate([weights["R"], weights["d"][:, None]], 1)
         F, self._Y = _directions(weights)
         # (units, states - 1, A r): a matrix product sums over the states of each unit.
@@ -280,7 +283,8 @@ class SharedUnits(RelationUnits):
     def moments(
         self, means: Means, pairs: Pairs, chosen: slice, *, sampled: bool = False
     ) -> Moments:
-        """Return means and √3 σ of logits from the factors of the classes."""
+        """Return means and √3 σ of logits from factors, for B means, R relations, r directions."""
+        # States of h1 have no variance, and σ is 0 without directions.
         Y = self._Y[chosen, :0] if sampled else self._Y[chosen]
         B, (R, r, _) = len(means), Y.shape
         # The covariance of h1 is diag(m) - m m' within each hidden unit, and 0 between units.
@@ -362,11 +366,13 @@ def _directions(weights: Weights) -> tuple[Float[NDArray, "A r H1"], Float[NDArr
     of_h1 = _mean_covariance(means.astype(np.float64), spec.states)
     covariance = root.T @ (rows @ of_h1 @ rows.transpose(0, 2, 1)) @ root
     values, vectors = np.linalg.eigh(covariance)
+    # The values ascend, so left_out is the variance that a cut behind each direction neglects.
     left_out = np.cumsum(values.clip(min=0), axis=1)
     kept = max(1, int((left_out > _LEFT_OUT).sum(1).max()))
     vectors = vectors[:, :, -kept:]
     Y = np.linalg.solve(root.T, vectors).transpose(0, 2, 1)
     F = vectors.transpose(0, 2, 1) @ root.T @ rows
+    # The factor 1 is the first one above, but the last one in z.
     Y = np.ascontiguousarray(np.roll(Y, -1, axis=2), np.float32)
     return F.astype(np.float32), Y
 
@@ -393,7 +399,7 @@ def _pair_table(
     # A triple (a, i, j) has the key (a V + i) V + j. The key of its pair is i V + j.
     relation, pair_of_triple = np.divmod(weights.triple_keys, weights.spec.V**2)
     pairs, pair_index = np.unique(pair_of_triple, return_inverse=True)
-    buckets = 1 << (2 * len(pairs)).bit_length()
+    buckets = 1 << (2 * len(pairs)).bit_length()  # a power of 2, more than twice the pairs
     bucket = (pairs * _SPREAD >> _SHIFT) & (buckets - 1)
     order = np.argsort(bucket, kind="stable")
     row_of_pair = np.empty_like(order)
@@ -446,7 +452,8 @@ def _shared_moments(
     The mean of a logit is base + U z, and its variance σ² is q'C q - sum_u (f_u'q)² with q = Y z.
     base are the terms that do not depend on the hidden units; see `SharedUnits`. σ is 0 if r is 0.
     `first` is the first of the R consecutive relations. C has the lower half of each symmetric
-    r x r matrix, with doubled entries off the diagonal. It changes in place.
+    r x r matrix, with doubled entries off the diagonal. It changes in place. The loops take the
+    entries b of a batch, pairs p, relations c, directions d and e, and hidden units u.
     """
     # Local names are faster: each access through the tuple would change a reference count.
     S, O, s, o, n, residual = w.S, w.O, w.s, w.o, w.n, w.residual  # noqa: E741
@@ -455,11 +462,8 @@ def _shared_moments(
     width = -(-P // _VECTOR) * _VECTOR
     z, q = np.zeros((K, B * width), np.float32), np.empty((r, B * width), np.float32)
     mean, spread = np.empty((B, R, P), np.float32), np.empty((B, R, P), np.float32)
-    row, variance, keys = (
-        np.empty(width, np.float32),
-        np.empty(width, np.float32),
-        np.empty(P, np.int64),
-    )
+    row, variance = np.empty(width, np.float32), np.empty(width, np.float32)
+    keys = np.empty(P, np.int64)
     for b in range(B):
         subjects, objects = pairs.i[b], pairs.j[b]
         for p in range(P):

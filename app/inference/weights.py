@@ -198,7 +198,7 @@ def pack_scenes(presence: NDArray[Any]) -> Int[NDArray, "N words"]:
 
 @compiled
 def all_states(x: Float[NDArray, "B H1"], states: int) -> Float[NDArray, "B units states"]:
-    """Return the probabilities of all states of the hidden units, the first state included."""
+    """Return the softmax over the states of each hidden unit; the first state has the logit 0."""
     others, half, one = states - 1, np.float32(0.5), np.float32(1.0)
     p = np.zeros((len(x), x.shape[1] // others, states), np.float32)
     for b in range(len(p)):
@@ -225,9 +225,10 @@ def _source_weights(
     classes: Int[NDArray, " n"],
     presence: Float[NDArray, "N n"],
 ) -> Float[NDArray, "N profiles"]:
-    """Return softmax(f + a v); see `Weights.source_weights`.
+    """Return p(q | classes) = softmax_q(f_q + sum_j a_qj v_j) of each data source q in N scenes s.
 
-    The sums have float64 digits, so that listed structure, whose terms are 0, changes none.
+    v is the presence of the listed classes j. The sums have float64 digits, so that listed
+    structure, whose terms are 0, changes none.
     """
     p = np.empty((len(presence), len(f)), np.float64)
     for s in range(len(presence)):

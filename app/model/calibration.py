@@ -243,6 +243,6 @@ class RelationSlopes(NamedTuple):
     @classmethod
     def of(cls, calibration: Calibration) -> Self:
         """Build the tables of a calibration."""
-        entries = (getattr(calibration, name) for name in PAIR_CALIBRATIONS)
-        rows = ([(e.intercept, e.slope, e.log_count) for e in part] for part in entries)
-        return cls(*(np.array(part, np.float32).reshape(-1, 3) for part in rows))
+        fields = (getattr(calibration, name) for name in PAIR_CALIBRATIONS)
+        tables = ([(fit.intercept, fit.slope, fit.log_count) for fit in field] for field in fields)
+        return cls(*(np.array(table, np.float32).reshape(-1, 3) for table in tables))

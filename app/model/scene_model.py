@@ -59,12 +59,12 @@ class SceneModel:
     @cached_property
     def intruder_prior(self) -> Float[NDArray[np.float64], "V"]:
         """Log prior alpha · popularity of an intruder of each class; unseen ones as the rarest."""
-        calibration, none = self.calibration, np.zeros(0, np.int64)
+        calibration, no_classes = self.calibration, np.zeros(0, np.int64)
         if not calibration.popularity:
             return np.zeros(self.spec.V)
         popularity = np.array(calibration.popularity, dtype=np.float64)
-        nothing = self.weights["c1"], none, none.astype(np.float32)
-        alone = self.objects.absent(*nothing, profile=None, coverage=1.0)
+        empty_scene = self.weights["c1"], no_classes, no_classes.astype(np.float32)
+        alone = self.objects.absent(*empty_scene, profile=None, coverage=1.0)
         rarest, alpha = np.nanmin(popularity), calibration.popularity_weight
         return np.where(np.isnan(popularity), alone - (1 - alpha) * rarest, alpha * popularity)
 

@@ -112,7 +112,11 @@ def _distributions(
     first: int,  # column of class 0 in `weights`
     log_unlisted: float,  # log ρ of the formula
 ) -> tuple[Int[NDArray, " k"], Float[NDArray, "k M"]]:
-    """Return the rows and distributions of `Counts.distribution`."""
+    """Return indices of classes with statistics, and the distributions of their numbers m.
+
+    The formula of `Counts` is p(m) ∝ share(m) exp(η log m + ζ log m log(M/m)) ρ^(m - listed), from
+    m = listed to M. `exponents` are η and ζ: sums of the weights that apply to the scene.
+    """
     n, M = len(classes), log_share.shape[1]
     p, rows, k = np.empty((n, M), np.float64), np.empty(n, np.int64), 0
     exponents, several, entry = np.empty(2), 0, np.empty(n, np.int64)
@@ -264,7 +268,7 @@ def _look_up_offsets(
     subject: Int[NDArray, " n"],
     other: Int[NDArray, " n"],
 ) -> tuple[Float[NDArray, "n 6"], Int[NDArray, " n"]]:
-    """Return the offsets and the numbers of scenes of `Offsets.find`."""
+    """Return means and standard deviations (metres) of offsets, and numbers of training scenes."""
     relation_offset, relation_scenes, subjects, objects, pair, pair_offset, pair_scenes = tables
     n, V = len(relation), subjects.shape[1]
     offset, scenes = np.empty((n, 6)), np.empty(n, np.int64)
@@ -276,6 +280,7 @@ def _look_up_offsets(
                 offset[k, axis] = pair_offset[row, axis]
             scenes[k] = pair_scenes[row]
             continue
+        # Without an own offset, a pair has the sum of the terms of a, i and j, with variances.
         scenes[k] = 0 if relation_scenes[a] > 0 else UNOBSERVED
         for axis in range(6):
             value = np.float64(relation_offset[a, axis])
@@ -352,9 +357,8 @@ class Places(TensorGroup):
     ) -> Bool[NDArray[np.bool_], "N M"]:
         """Return whether training shows a relation of classes. A single scene may be an error."""
         V = len(self.frequency)
-        return (
-            _triple_counts(self.triple, self.triple_scenes, V, relation, subject, other) >= _SHOWN
-        )
+        counts = _triple_counts(self.triple, self.triple_scenes, V, relation, subject, other)
+        return counts >= _SHOWN
 
     def supporters(
         self, subject: Int[Indices, "N"], other: Int[Indices, "M"]
@@ -362,10 +366,9 @@ class Places(TensorGroup):
         """Return the share of each class among the objects on or in which each subject class is."""
         total, share = self._supporters
         V, of_pairs = len(self.frequency), _SUPPORTER * share[other]
-        for a in SUPPORTS:
-            of_pairs = of_pairs + _triple_counts(
-                self.triple, self.triple_scenes, V, a, subject, other
-            )
+        triples = self.triple, self.triple_scenes, V
+        for relation in SUPPORTS:
+            of_pairs = of_pairs + _triple_counts(*triples, relation, subject, other)
         return of_pairs / (total[subject, None] + _SUPPORTER)
 
     @cached_property
@@ -444,6 +447,7 @@ def add_unseen(
     backward: Float[NDArray, "N A m"],  # log-odds with the other class as subject
 ) -> None:
     """Add the changes of stacked relations that training never shows to log-odds, in place."""
+    # a is an index in `STACKED`, which are the last canonical relations, from `ON_TOP`.
     for c in range(len(candidates)):
         for a in range(forward.shape[1] - ON_TOP):
             for k in range(len(classes)):

@@ -137,16 +137,16 @@ def _strongest(
     `rows` has the index of each explained class in the scene; it is empty if they are absent.
     """
     N, n = change.shape
-    kept = min(count, n - (len(rows) > 0))
-    columns, values = np.empty((N, kept), np.int64), np.empty((N, kept), np.float64)
+    most = min(count, n - (len(rows) > 0))
+    columns, values = np.empty((N, most), np.int64), np.empty((N, most), np.float64)
     usable = np.ones(n, np.bool_)
     for c in range(N):
         if len(rows):
             usable[rows[c]] = False
-        indices = best(np.abs(change[c]), usable, kept)
+        indices = best(np.abs(change[c]), usable, most)
         if len(rows):
             usable[rows[c]] = True
-        for k in range(kept):
+        for k in range(most):
             columns[c, k], values[c, k] = indices[k], change[c, indices[k]]
     return columns, values
 
@@ -178,11 +178,11 @@ def best(
 
     Of equal values, the value with the lower index comes first. The time is O(N log count).
     """
-    size, rest, kept = 0, 0, min(count, len(values))
+    size, rest, capacity = 0, 0, min(count, len(values))
     # A heap of the best indices so far. Its root is the worst: the smallest value, and of equal
     # values the largest index.
-    heap = np.empty(kept, np.int64)
-    while size < kept and rest < len(values):
+    heap = np.empty(capacity, np.int64)
+    while size < capacity and rest < len(values):
         if usable[rest]:
             heap[size] = rest
             size += 1
@@ -208,8 +208,8 @@ def _sink(
     while 2 * node + 1 < size:
         child = 2 * node + 1
         if child + 1 < size:
-            one, other = heap[child], heap[child + 1]
-            if values[other] < values[one] or (values[other] == values[one] and other > one):
+            left, right = heap[child], heap[child + 1]
+            if values[right] < values[left] or (values[right] == values[left] and right > left):
                 child += 1
         worse = heap[child]
         if not (values[worse] < value or (values[worse] == value and worse > index)):

@@ -132,11 +132,11 @@ def _scene(
     labels, room_types = model.vocabulary.labels, model.vocabulary.room_types
     units = np.nonzero(state.r & shown[:, None] & shown)
     a, i, j = units
-    named = np.stack([a, state.classes[i], state.classes[j]], axis=1)
-    stay = staying(named, state.logits[units], evidence, model.vocabulary.structure)
+    by_class = np.stack([a, state.classes[i], state.classes[j]], axis=1)
+    stay = staying(by_class, state.logits[units], evidence, model.vocabulary.structure)
     kept = np.zeros_like(state.r)
     kept[units] = stay
-    triples = sorted({*map(tuple, named[stay].tolist()), *evidence})
+    triples = sorted({*map(tuple, by_class[stay].tolist()), *evidence})
     room = {} if state.room is None else {"room_type": room_types[state.room]}
     return room | {
         "objects": [labels[index] for index in state.classes[shown].tolist()],
@@ -149,9 +149,8 @@ def _scene(
 
 
 def staying(
-    units: Int[
-        NDArray[np.int64], "m 3"
-    ],  # distinct triples (relation, subject class, object class)
+    # Distinct triples (relation, subject class, object class).
+    units: Int[NDArray[np.int64], "m 3"],
     logits: Float[NDArray[np.floating[Any]], "m"],  # if equal, the smallest triple is tried first
     evidence: Collection[Triple],
     structure: Bool[NDArray[np.bool_], "V"],

@@ -126,7 +126,8 @@ def entries_of(model: SceneModel, posterior: Posterior, scene: Scene) -> Entries
         values[relation, *pairs].tolist() for values in (alone, posterior.relation_change())
     )
     confirmed = {*model.calibration.misplaced.confirmed}
-    entries: list[tuple[float, ...]] = []  # relation, subject, object, kind, terms, mover
+    # An entry has relation a, subject i, object j, kind, the terms z, d, s and q, and the mover.
+    entries: list[tuple[float, ...]] = []
     for (a, i, j), z, d in zip(stated, of_relation, changes, strict=True):
         mover = j if (a, i, j) in opposites and a != INSIDE else i
         s = q = 0.0

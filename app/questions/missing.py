@@ -142,9 +142,9 @@ def more(
     size = model.vocabulary.trained
     plain = ~model.vocabulary.structure[listing.classes] & (listing.classes < size)
     classes, listed = listing.classes[plain], listing.counts[plain]
-    own, unlisted = model.calibration.coverage, 1.0
-    if coverage is not None and coverage > own:
-        unlisted = (1 - coverage) / (1 - own)
+    assumed, unlisted = model.calibration.coverage, 1.0
+    if coverage is not None and coverage > assumed:
+        unlisted = (1 - coverage) / (1 - assumed)
     rows, p = model.counts.distribution(size, classes, listed, scene.room_type, unlisted)
     classes, listed = classes[rows], listed[rows]
     numbers, cumulative = np.arange(1, p.shape[1] + 1), p.cumsum(axis=1)

@@ -228,16 +228,13 @@ class Unknown:
 
 
 class Names:
-    """Look-up of the objects of a scene by id, or by label if only one object has the label.
-
-    `left_out` has the (id, label) of each ignored object.
-    """
+    """Look-up of the objects of a scene by id, or by label if only one object has the label."""
 
     def __init__(
         self, objects: Sequence[SceneObject], unknown: Unknown, left_out: Sequence[tuple[str, str]]
     ) -> None:
         self._objects, self._unknown = objects, unknown
-        self._ignored_ids = {name for name, _ in left_out}
+        self._ignored_ids = {ignored_id for ignored_id, _ in left_out}
         self._ignored_labels = {label_key(label) for _, label in left_out}
 
     # The first access builds each table, because most requests do not refer to objects by name.

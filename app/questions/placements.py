@@ -191,22 +191,22 @@ def _likeliest_places(
     to = relation_probability(slopes, forward, log_counts)
     back = relation_probability(slopes, backward, log_counts)
     p, usable = np.empty(2 * size, forward.dtype), np.ones(2 * size, np.bool_)
-    kept, begin, at = min(count, 2 * size), 0, 0
+    most, begin, end = min(count, 2 * size), 0, 0
     if first >= 0:
         usable[first], begin = False, 1
-    candidate, relation = np.empty(N * kept, np.int64), np.empty(N * kept, np.int64)
-    outgoing, anchor = np.empty(N * kept, np.bool_), np.empty(N * kept, np.int64)
-    probabilities = np.empty(N * kept, np.float64)
+    candidate, relation = np.empty(N * most, np.int64), np.empty(N * most, np.int64)
+    outgoing, anchor = np.empty(N * most, np.bool_), np.empty(N * most, np.int64)
+    probabilities = np.empty(N * most, np.float64)
     for c in range(N):
         p_to, p_back = to[c].reshape(-1), back[c].reshape(-1)
         for e in range(size):
             p[e], p[size + e] = exclusive(p_to[e], p_back[e])
-        indices = best(p, usable, kept - begin)
+        indices = best(p, usable, most - begin)
         enough = max(share * p[first if begin else indices[0]], least)
-        for k in range(kept):
+        for k in range(most):
             place = first if k < begin else indices[k - begin]
             if k < begin or p[place] >= enough:
-                candidate[at], relation[at], anchor[at] = c, place // m % A, place % m
-                outgoing[at], probabilities[at] = place < size, p[place]
-                at += 1
-    return candidate[:at], relation[:at], outgoing[:at], anchor[:at], probabilities[:at]
+                candidate[end], relation[end], anchor[end] = c, place // m % A, place % m
+                outgoing[end], probabilities[end] = place < size, p[place]
+                end += 1
+    return candidate[:end], relation[:end], outgoing[:end], anchor[:end], probabilities[:end]

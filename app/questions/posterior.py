@@ -66,9 +66,8 @@ def present(scene: Scene, spec: MachineSpec) -> Present:
     if scene.profile is not None and not 0 <= scene.profile < spec.profiles:
         raise ValueError(f"profile is {scene.profile}, but must be below {spec.profiles}")
     confidence = np.array([thing.confidence for thing in scene.objects], dtype=np.float64)
-    classes, first, row, counts, presence = pool_classes(
-        np.array(indices, dtype=np.int64), confidence
-    )
+    class_indices = np.array(indices, dtype=np.int64)
+    classes, first, row, counts, presence = pool_classes(class_indices, confidence)
     log_counts = np.log(counts).astype(np.float32)
     columns = None
     if scene.relations is not None:

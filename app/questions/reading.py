@@ -104,8 +104,8 @@ def read_scene(
         vocabulary = vocabulary.with_words(list(unknown.words.values()))
     reading = Reading(Scene(objects, None, room, profile), unknown, left_out, vocabulary)
     entries = [entry for entry in request.objects if not isinstance(entry, str)]
-    has_positions = len(entries) == len(ids) and all(one.position is not None for one in entries)
-    has_supports = any(one.supported_by is not None for one in entries)
+    has_positions = len(entries) == len(ids) and all(item.position is not None for item in entries)
+    has_supports = any(item.supported_by is not None for item in entries)
     if request.relations is not None or (detections and has_supports and not has_positions):
         is_opposite = _triples(_stated(request, ids), reading, errors)
         errors.raise_any()
@@ -214,9 +214,8 @@ def _ids(entries: Sequence[str | Detection], errors: ErrorList) -> list[str]:
         if is_stated[index]:
             continue
         if labels[label] > 1 or label in used:
-            names[index] = next(
-                name for k in numbers[label] if (name := f"{label}_{k}") not in used
-            )
+            numbered = (f"{label}_{number}" for number in numbers[label])
+            names[index] = next(name for name in numbered if name not in used)
         used.add(names[index])
     return names
 
@@ -226,8 +225,8 @@ def _stated(
 ) -> list[tuple[Location, str, RelationName, str]]:
     """Return (location, subject, relation, object) of the relations that the request states."""
     stated: list[tuple[Location, str, RelationName, str]] = [
-        (("relations", n), one.subject, one.relation, one.object)
-        for n, one in enumerate(request.relations or ())
+        (("relations", number), triple.subject, triple.relation, triple.object)
+        for number, triple in enumerate(request.relations or ())
     ]
     for index, (name, entry) in enumerate(zip(ids, request.objects, strict=True)):
         if not isinstance(entry, str) and entry.supported_by is not None:
@@ -436,4 +435,4 @@ def _y_up(fits: Sequence[_Fit]) -> list[SceneObject]:
     agree = total >= _MOST * sum(map(abs, advantages))
     if len(advantages) < _LEAST or not agree or total < _BETTER * len(advantages):
         return []
-    return [fit[0] for fit, advantage in zip(fits, advantages, strict=True) if advantage > 0]
+    return [thing for (thing, *_), better in zip(fits, advantages, strict=True) if better > 0]

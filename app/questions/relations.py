@@ -276,6 +276,7 @@ def _likeliest_relations(
     """Return the likeliest relations between N objects, likeliest first.
 
     The results are subjects, objects, relations, probabilities, and probabilities without evidence.
+    x and y are objects, and i and j are their classes.
     """
     A, size, p = len(log_odds), len(row), _between_classes(slopes, log_odds, log_counts)
     names = 2 * A if opposites else A
@@ -335,7 +336,8 @@ def _expected_relations(
 
     The results are subject, object, expected relation, its probability, that of the likeliest
     observed relation, and the observed relations. A + a is the opposite of relation a. The subject
-    is that of the first observed relation.
+    is that of the first observed relation. x and y are objects, i and j their classes, and of the
+    pair (x, y), s is the subject and o the object.
     """
     (A, n), size, p = log_odds.shape[:2], len(row), _between_classes(slopes, log_odds, log_counts)
     holds, of_classes = np.zeros((size, size, 2 * A), np.bool_), np.zeros((n, n, 2 * A), np.bool_)
@@ -369,10 +371,8 @@ def _expected_relations(
             subject[x, y] = s
     chosen = best((likely / observed).reshape(-1), usable.reshape(-1), count)
     subjects = subject.reshape(-1)[chosen]
-    objects, kinds = (
-        chosen // size + chosen % size - subjects,
-        np.empty((len(chosen), 2 * A), np.bool_),
-    )
+    objects = chosen // size + chosen % size - subjects  # the other object of the pair
+    kinds = np.empty((len(chosen), 2 * A), np.bool_)
     for k in range(len(chosen)):
         kinds[k] = holds[subjects[k], objects[k]]
     grids = expected.reshape(-1)[chosen], likely.reshape(-1)[chosen], observed.reshape(-1)[chosen]

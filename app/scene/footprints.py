@@ -28,9 +28,9 @@ def overlap_and_gap(
     size_b: Float[NDArray, "P 2"],
     yaw_b: Float[NDArray, " P"],
 ) -> tuple[Float[NDArray, " P"], Float[NDArray, " P"]]:
-    """Return overlap and gap of P pairs of rectangles a and b; see `measure`."""
-    rectangles = (centre_a, size_a, yaw_a, centre_b, size_b, yaw_b)
-    rows = zip(*(np.asarray(part, np.float64, order="C") for part in rectangles), strict=True)
+    """Return overlap (share of the smaller area) and gap (metres) of P pairs of rectangles."""
+    columns = (centre_a, size_a, yaw_a, centre_b, size_b, yaw_b)
+    rows = zip(*(np.asarray(column, np.float64, order="C") for column in columns), strict=True)
     overlap, gap = np.array([measure(*row) for row in rows]).reshape(-1, 2).T
     return overlap, gap
 
@@ -79,6 +79,7 @@ def measure(
 @compiled
 def _skew(offset: Pair, half_a: Pair, cos: float, sin: float, half_b: Pair) -> Pair:
     """Return the area of the intersection and the gap of two rectangles that are not parallel."""
+    # In the axes of b, a has the centre `offset` and a yaw with these values of cos and sin.
     # Corners of a in the axes of b, and corners of b in the axes of a, counter-clockwise.
     corners_a, corners_b = np.empty((4, 2)), np.empty((4, 2))
     gap = math.inf

@@ -199,7 +199,7 @@ def _by_one_rule(label: str) -> list[tuple[Rule, str]]:
         name, qualifier = label[: match.end(1)], match[2]
         # The vocabulary can have a class for name and qualifier together.
         names = (f"{qualifier} {name}", f"{name} {qualifier}", name)
-        pairs += [("qualifier", one) for one in names]
+        pairs += [("qualifier", reading) for reading in names]
     pairs += [("alternative", part) for part in _alternatives(label)]
     prompt, article = _PROMPT.match(label), _ARTICLE.match(label)
     if prompt is None and article is not None:
@@ -213,7 +213,7 @@ def _by_one_rule(label: str) -> list[tuple[Rule, str]]:
 
 def _alternatives(label: str) -> list[str]:
     """Return the alternatives. In "coffee/side table", the alternatives share the last word."""
-    parts = [p for p in map(str.strip, _OR.split(_in_folder(label), _MOST_READINGS)) if p]
+    parts = [part for part in map(str.strip, _OR.split(_in_folder(label), _MOST_READINGS)) if part]
     if len(parts) < 2:
         return []
     last_words = parts[-1].split()

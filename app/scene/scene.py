@@ -180,7 +180,8 @@ def observe(
         return scene
     objects = scene.objects if viewpoint is None else _in_viewer_frame(scene.objects, viewpoint)
     points, sizes = boxes_of(objects, typical_sizes)
-    classes = np.array([-1 if one.class_index is None else one.class_index for one in objects])
+    indices = [-1 if thing.class_index is None else thing.class_index for thing in objects]
+    classes = np.array(indices)
     if stand_in is not None:
         classes = np.where(classes >= 0, stand_in[classes], classes)
     poses = derive_relations(
@@ -203,9 +204,8 @@ def _in_viewer_frame(
     objects: tuple[SceneObject, ...], viewpoint: Viewpoint
 ) -> tuple[SceneObject, ...]:
     """Return the objects with their poses in the axes of the viewer."""
-    positions, yaws = to_viewer_frame(
-        [thing.position or _UNKNOWN for thing in objects], viewpoint, [one.yaw for one in objects]
-    )
+    centres = [thing.position or _UNKNOWN for thing in objects]
+    positions, yaws = to_viewer_frame(centres, viewpoint, [thing.yaw for thing in objects])
     poses = zip(objects, map(tuple, positions.tolist()), yaws.tolist(), strict=True)
     return tuple(
         thing if thing.position is None else replace(thing, position=position, yaw=yaw)
@@ -337,7 +337,7 @@ def _relate_all(
     holds: Bool[NDArray, "A n n"],
     observed: Bool[NDArray, "A n n"],
 ) -> None:
-    """Write the relations of all pairs of boxes to `holds` and `observed`."""
+    """Write the relations of all pairs of boxes. Left and front need `horizontal`, a viewer."""
     n = len(points)
     has_position, has_size = np.empty(n, np.bool_), np.empty(n, np.bool_)
     radius = np.empty(n)

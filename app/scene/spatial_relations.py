@@ -92,7 +92,7 @@ def support_cycle(triples: Iterable[tuple[int, End, End]]) -> list[End] | None:
 def pool_relations(
     row: Int[NDArray, " N"], n: int, holds: Bool[NDArray, "A N N"], observed: Bool[NDArray, "A N N"]
 ) -> tuple[Bool[NDArray, "A n n"], Bool[NDArray, "A n n"]]:
-    """Pool the relations of N instances into relations of n classes; see `app.scene.scene`."""
+    """Return which relations hold, and are observed, between any instances of n classes, `row`."""
     A, size, _ = holds.shape
     class_holds, class_observed = np.zeros((A, n, n), np.bool_), np.zeros((A, n, n), np.bool_)
     for a in range(A):

@@ -74,6 +74,7 @@ def stands_of(
     is_closed = observed[ON_TOP] & observed[INSIDE]
     np.fill_diagonal(is_closed, True)
     carried = holds[ON_TOP] & ~heights.around & ~(tops <= floor + CLEARANCE)
+    # A later line overrules the earlier lines.
     stands = np.where(is_close, UNKNOWN, HANGS)
     stands[bottoms <= floor + CLEARANCE] = FLOOR
     stands[(~is_closed & is_known).any(1)] = UNKNOWN

@@ -371,18 +371,15 @@ def do_not_fit(
     A box fits into another box if each of its extents, in order of size, is at most `_TIGHT` times
     that of the other. A box of unknown size (NaN) fits everywhere.
     """
-    a, b = np.sort(inner, axis=1), _TIGHT * np.sort(outer, axis=1)
+    sides, limits = np.sort(inner, axis=1), _TIGHT * np.sort(outer, axis=1)
     # A comparison with NaN is False.
-    return np.logical_or.reduce([a[:, None, k] > b[:, k] for k in range(3)])
+    return np.logical_or.reduce([sides[:, None, k] > limits[:, k] for k in range(3)])
 
 
 def _tables(
     names: Sequence[tuple[str, ...]], kind: str, clash: str
 ) -> tuple[dict[str, int], dict[str, int]]:
-    """Return the index of each entry by its names, and by their keys (`label_key`).
-
-    Each entry of ``names`` is a label and its aliases. ``kind`` and ``clash`` are texts of errors.
-    """
+    """Return the index of each entry, a label and its aliases, by these names and by their keys."""
     by_spelling: dict[str, int] = {}
     by_key: dict[str, int] = {}
     for index, spellings in enumerate(names):

@@ -82,7 +82,7 @@ def class_vectors(
     """
     vectors = np.zeros((len(names), words.dimensions), dtype=np.float32)
     for index, (label, *aliases) in enumerate(names):
-        of_aliases = [vector for x in aliases if (vector := words.of(x)) is not None]
+        of_aliases = [vector for alias in aliases if (vector := words.of(alias)) is not None]
         parts = [words.of(label), _mean(of_aliases)]
         vector = _mean([vector for vector in parts if vector is not None])
         if vector is not None:

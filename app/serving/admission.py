@@ -293,11 +293,8 @@ class Bodies:
         return bytes(body)
 
     def _check(self, client: str, size: int) -> None:
-        """Raise BodiesFullError if the bodies of all clients, or of this client, are too large.
-
-        ``size`` is the size of the current body, which may exceed the client's share on its own.
-        """
-        share = max(self._budget // SHARE, size)
+        """Raise BodiesFullError if the bodies of all clients, or of this client, are too large."""
+        share = max(self._budget // SHARE, size)  # a single body of this size is accepted
         if self.total > self._budget or self._of_clients.get(client, 0) > share:
             detail = (
                 f"All bodies in progress exceed {self._budget} bytes together, or those of this "
