@@ -105,7 +105,7 @@ class SceneChains:
             L=weights["L"] if spec.coupled else np.zeros((0, spec.V), np.float32),
             b=weights["b"],
         )
-        self.mean: Float[NDArray, "N H1"] = np.zeros((0, spec.H1), np.float32)
+        self.mean: Float[NDArray, "N H1"] = np.zeros((0, spec.H1), np.float32)  # of h1
         if spec.N:
             self.mean = weights.sample_means
 
@@ -160,12 +160,12 @@ class ConditionedChains:
         self._conditions, self._temperature = conditions, temperature
         evidence = conditions.classes, conditions.profile, conditions.room
         bias, self._room_bias = chains.machine.scene_bias(*evidence)
-        self._w = chains.arrays._replace(b=bias)
+        self._w = chains.arrays._replace(b=bias)  # weights of the sweeps
         self._beta = np.float32(1.0 / temperature)
         self._room, self._bias = conditions.room, chains.machine.room_bias(conditions.room)
         self._required_classes = np.zeros(chains.machine.spec.V, np.uint8)
         self._required_classes[conditions.classes] = 1
-        self._others: dict[int | None, ConditionedChains] = {}
+        self._others: dict[int | None, ConditionedChains] = {}  # by room type
 
     @cached_property
     def _start_cdf(self) -> Float[NDArray, " N"]:
@@ -238,13 +238,13 @@ class ConditionedChains:
         if observed is not None:
             # The observed classes are always present, so ``classes`` contains each of them.
             rows = np.searchsorted(classes, self._conditions.classes)
-            a, i, j = observed.a, rows[observed.i], rows[observed.j]
+            a, i, j = observed.a, rows[observed.i], rows[observed.j]  # relation, subject, object
             has_unit = logits[a, i, j] > NEVER / 2
             units = a[has_unit], i[has_unit], j[has_unit]
             r[units], free[units] = observed.r[has_unit] > 0, False
         uniform, group_numbers = stream.random((2, *r.shape), np.float32)
-        x = self._hidden_logits(classes)
-        weight = self._chains.units.implication_weights(x, float(self._beta))
+        hidden_logits = self._hidden_logits(classes)
+        weight = self._chains.units.implication_weights(hidden_logits, float(self._beta))
         if weight is not None:
             draw_in_groups(weight, self._beta * logits, free, uniform, group_numbers, r)
         else:

@@ -391,8 +391,7 @@ def _source_effects(
 
     The effect on a class i is the mean base rate sum_q p_q a_qi over the Q data sources. p_q is the
     probability of source q given the listed classes. The changes are those by the first n classes.
-    `rows` are the indices of listed targets among the listed classes: a class has no effect on p_q
-    of itself.
+    `rows` are the indices of listed targets among the listed classes; no class affects itself.
     """
     Q = len(f)
     # Part of each listed class in the logit of each source, and e^-part.

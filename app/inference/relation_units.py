@@ -287,7 +287,8 @@ class SharedUnits(RelationUnits):
         # States of h1 have no variance, and σ is 0 without directions.
         Y = self._Y[chosen, :0] if sampled else self._Y[chosen]
         B, (R, r, _) = len(means), Y.shape
-        # The covariance of h1 is diag(m) - m m' within each hidden unit, and 0 between units.
+        # cov(h1) is diag(m) - m m' within each hidden unit, and 0 between units. C is the lower
+        # half of F diag(m) F', and f is F m of each unit. `_shared_moments` subtracts f f' from C.
         U, C = (
             (means @ columns[:, chosen].reshape(len(columns), -1)).reshape(B, R, -1)
             for columns in (self._GT, self._FF)
@@ -354,13 +355,14 @@ def _directions(weights: Weights) -> tuple[Float[NDArray, "A r H1"], Float[NDArr
     if spec.N:
         frequency = weights.chain_samples.mean(0).astype(np.float64) + 1e-6
         means = weights.sample_means
-    p = (frequency / frequency.sum())[:, None]
+    share = (frequency / frequency.sum())[:, None]
     ones = np.ones((spec.V, 1))
     S, O = (  # noqa: E741
         np.concatenate([ones, weights[name].astype(np.float64)], 1) for name in ("S", "O")
     )
     # moment is E[z z'] of z = (1, S_i * O_j) for independent i and j. root is its Cholesky factor.
-    moment = (S.T @ (p * S)) * (O.T @ (p * O))
+    # As U_e = rows[a]'z, the eigenvalues of root' rows[a] cov(h1) rows[a]' root are variances.
+    moment = (S.T @ (share * S)) * (O.T @ (share * O))
     scale = np.trace(moment) / len(moment)
     root = np.linalg.cholesky(moment + 1e-9 * scale * np.eye(len(moment)))
     of_h1 = _mean_covariance(means.astype(np.float64), spec.states)
@@ -368,8 +370,8 @@ def _directions(weights: Weights) -> tuple[Float[NDArray, "A r H1"], Float[NDArr
     values, vectors = np.linalg.eigh(covariance)
     # The values ascend, so left_out is the variance that a cut behind each direction neglects.
     left_out = np.cumsum(values.clip(min=0), axis=1)
-    kept = max(1, int((left_out > _LEFT_OUT).sum(1).max()))
-    vectors = vectors[:, :, -kept:]
+    r = max(1, int((left_out > _LEFT_OUT).sum(1).max()))
+    vectors = vectors[:, :, -r:]
     Y = np.linalg.solve(root.T, vectors).transpose(0, 2, 1)
     F = vectors.transpose(0, 2, 1) @ root.T @ rows
     # The factor 1 is the first one above, but the last one in z.
@@ -462,8 +464,11 @@ def _shared_moments(
     width = -(-P // _VECTOR) * _VECTOR
     z, q = np.zeros((K, B * width), np.float32), np.empty((r, B * width), np.float32)
     mean, spread = np.empty((B, R, P), np.float32), np.empty((B, R, P), np.float32)
-    row, variance = np.empty(width, np.float32), np.empty(width, np.float32)
-    keys = np.empty(P, np.int64)
+    row, variance, keys = (
+        np.empty(width, np.float32),
+        np.empty(width, np.float32),
+        np.empty(P, np.int64),
+    )
     for b in range(B):
         subjects, objects = pairs.i[b], pairs.j[b]
         for p in range(P):
@@ -486,7 +491,7 @@ def _shared_moments(
             for p in range(P):
                 mean[b, c, p] += row[p]
             variance[:] = np.float32(0.0)
-            lower, t = C[b, c], 0
+            lower, t = C[b, c], 0  # t is the start of row d in the half matrix
             for d in range(r):
                 for u in range(len(f)):
                     f_d = f[u, b, c, d]

@@ -91,8 +91,8 @@ class Weights:
                     f"array {name} has the shape {shapes.get(name)}, but the spec needs the shape "
                     f"{expected.get(name)} (None means that the array does not exist)"
                 )
-        table = self["triples"].astype(np.int64)
-        if (table < 0).any() or (table >= [self.spec.A, self.spec.V, self.spec.V]).any():
+        triples = self["triples"].astype(np.int64)
+        if (triples < 0).any() or (triples >= [self.spec.A, self.spec.V, self.spec.V]).any():
             raise ValueError(
                 "a triple (a, i, j) has an invalid index: a must be from 0 to A - 1, and i and j "
                 "must be from 0 to V - 1"
@@ -207,7 +207,7 @@ def all_states(x: Float[NDArray, "B H1"], states: int) -> Float[NDArray, "B unit
             for z in range(others):
                 row[z + 1] = x[b, m * others + z]
                 top = max(top, row[z + 1])
-            # The square of e^(x/2) covers subnormal numbers.
+            # exp() clips below e^-87. The square of e^(x/2) also covers smaller numbers.
             for z in range(states):
                 row[z] = exp((row[z] - top) * half)
                 row[z] *= row[z]
@@ -227,8 +227,7 @@ def _source_weights(
 ) -> Float[NDArray, "N profiles"]:
     """Return p(q | classes) = softmax_q(f_q + sum_j a_qj v_j) of each data source q in N scenes s.
 
-    v is the presence of the listed classes j. The sums have float64 digits, so that listed
-    structure, whose terms are 0, changes none.
+    v is the presence of the listed classes j. In float64, terms of 0 (structure) change no sum.
     """
     p = np.empty((len(presence), len(f)), np.float64)
     for s in range(len(presence)):

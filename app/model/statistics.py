@@ -127,8 +127,8 @@ def _distributions(
             rows[k] = i
             k += 1
     for row in range(k):
-        e, number = entry[rows[row]], listed[rows[row]]
-        for x in range(2):
+        e, number = entry[rows[row]], listed[rows[row]]  # e is the row of the class in the tables
+        for x in range(2):  # η and ζ
             exponents[x] = 0.0
             # The effect of a class on itself is 0, so the sum over all listed classes is correct.
             for j in range(n):

@@ -131,7 +131,7 @@ def _scene(
     """Return the `GeneratedScene` of a drawn scene, with the ``shown`` classes of its state."""
     labels, room_types = model.vocabulary.labels, model.vocabulary.room_types
     units = np.nonzero(state.r & shown[:, None] & shown)
-    a, i, j = units
+    a, i, j = units  # relation, and rows of subject and object in `state.classes`
     by_class = np.stack([a, state.classes[i], state.classes[j]], axis=1)
     stay = staying(by_class, state.logits[units], evidence, model.vocabulary.structure)
     kept = np.zeros_like(state.r)

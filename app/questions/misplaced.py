@@ -226,10 +226,10 @@ def wrong_relations(model: SceneModel, scene: Scene) -> dict[Triple, float]:
     """Return the log-odds that each judged relation of a scene is wrong."""
     entries = entries_of(model, Posterior(model, scene), scene)
     return {
-        (a, i, j): z
+        (a, i, j): log_odds
         for _, rows, values in _judged(model, entries)
-        for (a, i, j), z in zip(entries.triple[rows].tolist(), values.tolist(), strict=True)
-        if j >= 0
+        for (a, i, j), log_odds in zip(entries.triple[rows].tolist(), values.tolist(), strict=True)
+        if j >= 0  # other entries are about the floor
     }
 
 

@@ -186,11 +186,12 @@ def _ranked(
     usable = ~vocabulary.structure
     usable[listed] = False
     if candidates is None:
+        # A listed chair may be the office chair, so only named candidates are kinds of it.
         usable &= ~vocabulary.related[listed].any(0)
     else:
-        named = np.zeros_like(usable)
-        named[list(candidates)] = True
-        usable &= named & ~vocabulary.broader[listed].any(0)
+        requested = np.zeros_like(usable)
+        requested[list(candidates)] = True
+        usable &= requested & ~vocabulary.broader[listed].any(0)
     if not usable.any():
         return np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
     calibration = model.calibration

@@ -136,7 +136,7 @@ def placements(
 
 
 def supported_objects(model: SceneModel, posterior: Posterior, scene: Scene) -> list[int]:
-    """Return the indices of the objects that stand on or in an object, without desks over bins."""
+    """Return indices of objects on or in an object. A desk "on top of" a bin is on the floor."""
     places = model.places
     present = posterior.present
     classes = model.vocabulary.stand_in[present.classes][present.row].tolist()

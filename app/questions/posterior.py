@@ -181,7 +181,7 @@ def calibrated(
 def calibrated_missing(
     calibration: Calibration, z: Float[Floats, "N"], n: int, coverage: float | None
 ) -> Float[Floats, "N"]:
-    """Return the calibrated log-odds that classes are present, beside n listed ones."""
+    """Return the calibrated log-odds of presence from logits z, for a list of n classes."""
     n = max(1, n)
     if coverage is None:
         return calibrated(calibration.missing, z, n)
@@ -194,7 +194,7 @@ def calibrated_at_coverage(
     n: int | Int[NDArray[np.integer[Any]], "N"],
     coverage: float | Float[Floats, "N"],
 ) -> Float[Floats, "N"]:
-    """Return the calibrated log-odds of logits z by the formula of `CoverageFit`."""
+    """Return calibrated log-odds from logits z, for n listed classes with this share (coverage)."""
     log_n, log_s = np.log(n), np.log(np.maximum(coverage, LEAST_COVERAGE))
     change = entry.log_share * log_s + entry.both * log_n * log_s
     last = entry.last * (np.asarray(coverage) == 1)

@@ -313,7 +313,7 @@ def _between_classes(slopes, log_odds, log_counts):
     counts = np.empty((n, n), log_counts.dtype)
     for i in range(n):
         for j in range(n):
-            counts[i, j] = log_counts[i] + log_counts[j]
+            counts[i, j] = log_counts[i] + log_counts[j]  # log of the number of object pairs
     flat = log_odds.reshape(1, A, n * n)
     return relation_probability(slopes, flat, counts.reshape(-1)).reshape(A, n, n)
 
@@ -361,8 +361,8 @@ def _expected_relations(
             for kind in range(2 * A):
                 a = kind % A
                 to, back = exclusive(p[a, i, j], p[a, j, i])
-                value, z = (to, log_odds[a, i, j]) if kind < A else (back, log_odds[a, j, i])
-                if z > NO_UNIT and value > likely[x, y]:
+                value, logit = (to, log_odds[a, i, j]) if kind < A else (back, log_odds[a, j, i])
+                if logit > NO_UNIT and value > likely[x, y]:
                     likely[x, y], expected[x, y] = value, kind
                 if holds[s, o, kind]:
                     observed[x, y] = max(observed[x, y], value)

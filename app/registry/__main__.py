@@ -95,7 +95,7 @@ def _copy(
 def _replacement(
     old: AliasTarget, new: AliasTarget, source: Store, target: Store, added: set[tuple[str, str]]
 ) -> AliasTarget | None:
-    """Return the target that replaces a shipped model of an earlier release, if an alias moves."""
+    """Return the new target of an alias to a replaced shipped model, or None if it stays."""
     versions = target.versions(old.name) if old.version is None else (old.version,)
     shipped = source.shipped()
     names = {shipped.replacement(old.name, v, target.digest(old.name, v)) for v in versions}

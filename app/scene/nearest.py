@@ -139,7 +139,6 @@ class NameIndex:
         second_cost = min((other_cost for _, (other_cost, _) in others), default=math.inf)
         if cost > max_cost or second_cost - cost <= _MARGIN:
             return None
-        # A wrong letter costs 2, so cost / 2 is the number of wrong letters.
         return LookUp(entry, round(1 - cost / 2 / len("".join(words)), 3), "spelling")
 
     def _corrections(self, word: str) -> list[tuple[str, int]]:

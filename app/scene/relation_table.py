@@ -74,11 +74,11 @@ class RelationTable:
 
     def excluding(self, grid: Bool[Array, "A N N"], origin: int) -> "RelationTable":
         """Return the table with relations that do not hold: those of a grid, unless they hold."""
-        others, holding = grid.copy(), self.holding
+        others, holding = grid.copy(), self.holding  # others: relations that do not hold
         others[holding.relation, holding.subject, holding.object] = False
         a, i, j = _between_two(others)
-        off = np.zeros(len(a), np.float32)
-        new = a, i, j, off, np.full(len(a), origin), off.astype(np.bool_)
+        probability = np.zeros(len(a), np.float32)
+        new = a, i, j, probability, np.full(len(a), origin), np.zeros(len(a), np.bool_)
         columns = zip(_COLUMNS, new, strict=True)
         joined: dict[str, Any] = {
             name: np.concatenate([getattr(self, name), more]) for name, more in columns

@@ -131,8 +131,7 @@ class Vocabulary:
                     text = f"the parent {entry.parent!r} of {entry.label!r}"
                     raise ValueError(f"{text} is not the label of a class")
                 parents[index] = parent
-        # Each pass replaces the ancestors by their parents. A class that is its own ancestor would
-        # never reach -1.
+        # Each pass goes one parent up. In a circle, a class becomes its own ancestor.
         ancestors = parents.copy()
         while (ancestors >= 0).any():
             if (own := np.flatnonzero(ancestors == np.arange(len(ancestors)))).size:
@@ -296,6 +295,7 @@ class Vocabulary:
         if label in (self._room_by_spelling if is_room else self._by_spelling):
             return True
         keys = [(search, label, is_room) for search in searches]
+        # The first search with a result is the last one, or all searches were without a result.
         return keys[-1] in self._memory or any(map(self._memory.get, keys))
 
     def to_dict(self) -> dict[str, Any]:
