@@ -139,7 +139,7 @@ def _complete_operation(operation: dict[str, Any], path: str, settings: Settings
         }
         operation.setdefault("parameters", []).append(timeout)
     if "application/json" in responses.get("422", {}).get("content", {}):
-        del responses["422"]
+        del responses["422"]  # the default of FastAPI, which the service does not answer
     if settings.api_key is not None and path not in OPEN_ROUTES:
         operation["security"] = [{scheme: []} for scheme in _KEY_SCHEMES]
         responses["401"] = error_responses("key")[401]

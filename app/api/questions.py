@@ -206,7 +206,7 @@ async def _validated(
 
 
 def _failed(error: Exception, number: int, scene: Any, request_id: str) -> tuple[str, bytes]:
-    """Return outcome and answer entry of a failed scene, without a cycle; see `gateway._fail`."""
+    """Return the outcome of a failed scene, and its entry in the answer: status and problem."""
     if isinstance(error, RequestError):
         error.locate(scene, ("scenes", number))
     failure = from_exception(error, request_id)

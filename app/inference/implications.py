@@ -30,9 +30,9 @@ def implication_shifts(
 
     A step leads from one class to another class along a relation that holds. A step of kind a leads
     from the subject to the object of relation a. A step of kind A + a leads from the object to the
-    subject. A path consists of two steps. The rows of `weight` are the kinds of a step from x to y,
-    the pairs of kinds of a path, the kinds of steps from x, and the kinds of steps to y. x, y and z
-    are classes, c and d are kinds, and b is the relation whose logit changes.
+    subject. A path consists of two steps. `weight` has a row for each kind of a step from x to y.
+    Then follow the pairs of kinds of a path, the kinds of steps from x, and those of steps to y. x,
+    y and z are classes, c and d are kinds, and b is the relation whose logit changes.
     """
     # The loops use plain indices, because a slice would cost more time.
     A, n, _ = r.shape

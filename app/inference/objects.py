@@ -235,7 +235,7 @@ class ObjectScorer:
         presence: Float[NDArray, "N n"],
         profile: int | None,
     ) -> Float[NDArray, "N C"]:
-        """Return log p(t | listed classes) of each room type t; see `absent`."""
+        """Return log p(t | listed classes) of each room type t, for a data source or for all."""
         weights = self._weights
         logits = weights["e"] + self.room_evidence(x, classes, presence)
         if not weights.spec.profiles:

@@ -141,7 +141,7 @@ def _strongest(
     columns, values = np.empty((N, most), np.int64), np.empty((N, most), np.float64)
     usable = np.ones(n, np.bool_)
     for c in range(N):
-        if len(rows):  # a class is no reason for itself
+        if len(rows):  # without the class itself
             usable[rows[c]] = False
         indices = best(np.abs(change[c]), usable, most)
         if len(rows):

@@ -97,7 +97,7 @@ def missing(
             entry["placements"], entry["because"] = class_places, []
         if place is not None:
             for entry, p in zip(entries, significant(placed), strict=True):
-                for requested in entry["placements"][:1]:
+                for requested in entry["placements"][:1]:  # the requested place is the first
                     requested["probability"] = p
         if len(posterior.present.classes):
             explained = classes[:EXPLAINED]

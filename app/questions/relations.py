@@ -121,7 +121,7 @@ def relations(
 def _evidence(
     model: SceneModel, posterior: Posterior, scene: Scene
 ) -> Float[NDArray[np.float32], "A N N"]:
-    """Return the evidence about the relations of a scene; see `_likeliest_relations`.
+    """Return p of observed relations, `_EXCLUDED` for impossible ones, and NaN for all others.
 
     The probability of an observed relation is multiplied by the confidences of its objects. An
     object on or in one object is not on or in another object.

@@ -48,7 +48,7 @@ def _existing(root: str) -> Store:
 
 
 def _point(store: Store, alias: str, target: AliasTarget, expected: str | None) -> None:
-    """Point an alias at a usable version; see `Store.set_alias`."""
+    """Point an alias at a usable version. With ``expected``, it must have this target before."""
     load_model_set(store, release=Store(DEFAULT_STORE)).resolve(str(target))
     before = store.aliases().get(alias)
     store.set_alias(alias, target, expected=before if expected is None else _target(expected))

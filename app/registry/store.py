@@ -117,7 +117,7 @@ class Store:
         return resolve_reference(reference, self.aliases(), self.versions, replaced)
 
     def load(self, name: str, version: str, previous: Artifact | None = None) -> Artifact:
-        """Load and verify one version; see `load_artifact`.
+        """Load and verify one version. Return ``previous`` if its digest is unchanged.
 
         Raises:
             ArtifactError: the artifact is not valid, or has another name or version.
@@ -167,7 +167,7 @@ class Store:
         *,
         storage_dtype: StorageDtype = "float32",
     ) -> Artifact:
-        """Publish a version permanently, and return the artifact; see `write_artifact`.
+        """Publish a version permanently from its tensors, ``state``. Return the artifact.
 
         Raises:
             ArtifactError: the artifact is not valid.
@@ -254,7 +254,7 @@ class Store:
             if expected not in ("any", current):
                 targets = f"{current or 'nothing'}, not at {expected or 'nothing'}"
                 raise StoreError("alias_conflict", f"alias '{alias}' points at {targets}")
-            resolve_reference(str(target), {}, self.versions)
+            resolve_reference(str(target), {}, self.versions)  # raises without such a target
             self._write_table({**self.aliases(), alias: target})
 
     def remove_alias(self, alias: str) -> None:

@@ -139,7 +139,7 @@ def split_words(label: str) -> tuple[str, ...]:
 
 
 def _fold_unicode(label: str) -> str:
-    """Fold case, compatibility variants, separators and plural of a label once; see `label_key`."""
+    """Fold case, compatibility variants, separators and plural of a label; keep a long label."""
     composed = unicodedata.normalize("NFKC", label)
     if len(composed) > LONGEST:
         return label

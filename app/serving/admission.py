@@ -170,7 +170,7 @@ class Admission:
         self.drawing = ThreadPoolExecutor(1, "drawing", _lower_priority)
 
     async def in_worker(self, ticket: Ticket, call: Callable[[Callable[[], bool]], T]) -> T:
-        """Run a computation in a turn of the lane `slow`; see `Ticket.enter` and `in_thread`."""
+        """Run a computation in the worker thread, in a turn of the lane `slow`; see `in_thread`."""
         if ticket.lane is not self.slow:
             await ticket.enter(self.slow, 1)
         return await in_thread(call, ticket, self.worker)

@@ -36,12 +36,12 @@ class Runtime:
         self.draining = False
         self.metrics = Metrics(self.admission)
         self._store = Store(settings.store, max_weights_bytes=settings.max_weights_bytes)
-        self._release = Store(DEFAULT_STORE)
+        self._release = Store(DEFAULT_STORE)  # models of this release
         self.limits = Limits(
             settings.max_objects, settings.max_relations, settings.max_answer_bytes
         )
-        self._poll = settings.store_poll
-        self._requested = asyncio.Event()
+        self._poll = settings.store_poll  # seconds between two checks of the store; 0: none
+        self._requested = asyncio.Event()  # set to check the store at once
         self._following: asyncio.Task[None] | None = None
         self.models = NO_MODELS  # until the start
         self._loaded_state: StoreState | None = None
