@@ -140,6 +140,7 @@ def moved_by_pose(
 
 
 def _shifted(scene: Scene, group: Bool[NDArray, "N"], step: Float[NDArray, "3"]) -> Scene:
+    """Return the scene with the objects of a group moved by a step in metres."""
     objects = tuple(
         replace(thing, position=_point(np.add(thing.position, step)))
         if moves and thing.position is not None

@@ -63,6 +63,7 @@ def _read_tables(path: Path) -> dict[str, Rooms]:
     named: dict[str, Piece] = {}
 
     def piece(entry: Any) -> Piece:
+        """Return the piece of a table, or the earlier piece of a name."""
         if isinstance(entry, str):
             return named[entry]
         beside = tuple((piece(e["piece"]), e["side"]) for e in entry.get("beside", ()))
@@ -132,6 +133,7 @@ class _Layout:
     """One furnished room. The origin is a corner of the room, and the walls run along x and y."""
 
     def __init__(self, rng: Rng, room_type: str, pieces: tuple[Piece, ...]) -> None:
+        """Draw the extents of the room in metres, and furnish it."""
         self.rng = rng
         self.room_type = room_type
         self.width, self.depth = rng.uniform(3.2, 5.5), rng.uniform(3.0, 5.0)

@@ -143,6 +143,7 @@ def _check_sizes(path: Path) -> None:
     size = 0
 
     def check(data: memoryview) -> None:
+        """Add up the sizes of all elements in data, and of those within them."""
         nonlocal size
         for kind, body in _elements(data, order):
             if kind == _COMPRESSED:

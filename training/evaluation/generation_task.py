@@ -168,9 +168,10 @@ def discrepancy(
     xy = kernel(drawn, held_out).mean(0)
     n = len(xx)
     mean_xx = float((xx.sum() - np.trace(xx)) / (n * (n - 1)))
-    np.fill_diagonal(yy, 0.0)
+    np.fill_diagonal(yy, 0.0)  # pairs of a scene with itself
 
     def squared_mmd(weight: Float[NDArray, " scenes"]) -> float:
+        """Return MMD² with these weights of the held-out scenes."""
         pairs_weight = weight.sum() ** 2 - (weight**2).sum()
         if not pairs_weight > 0:
             return float("nan")
@@ -207,6 +208,7 @@ def pair_correlation(
     def covariances(
         v: Float[NDArray, "scenes common"], weight: Float[NDArray, " scenes"]
     ) -> Float[NDArray, " pairs"]:
+        """Return the weighted covariance of the presence of each pair of common classes."""
         total = weight.sum()
         mean = weight @ v / total
         return ((v.T * weight) @ v / total - np.outer(mean, mean))[pairs]
@@ -243,18 +245,19 @@ def generation_metrics(
     emphasis: Float[Tensor, " scenes"] | None = None,
 ) -> dict[str, Metric]:
     """Compute all metrics of T4 over the classes in the mask; `emphasis` weighs held-out scenes."""
-    x, y, training = drawn.v[:, mask], held_out[:, mask], train[:, mask]
-    drawn_v, held_out_v = x.double().numpy(), y.double().numpy()
-    base = np.ones(len(y)) if emphasis is None else emphasis.double().numpy()
+    generated, reference, training = drawn.v[:, mask], held_out[:, mask], train[:, mask]
+    drawn_v, held_out_v = generated.double().numpy(), reference.double().numpy()
+    base = np.ones(len(reference)) if emphasis is None else emphasis.double().numpy()
+    count = len(generated)
 
     def resampled(statistic: Statistic) -> Resampled:
-        return Resampled.of(lambda weight: statistic(weight * base), groups, len(x), _RESAMPLES)
+        return Resampled.of(lambda weight: statistic(weight * base), groups, count, _RESAMPLES)
 
     metrics: dict[str, Metric] = {
-        "MMD²": resampled(discrepancy(y, x, bandwidth)),
+        "MMD²": resampled(discrepancy(reference, generated, bandwidth)),
         "marginal error": resampled(marginal_error(held_out_v, drawn_v)),
         "classes per scene": Ratio.of_scenes(drawn_v.sum(1)),
-        "copies of training scenes": Ratio.of_scenes(copies(x, training)),
+        "copies of training scenes": Ratio.of_scenes(copies(generated, training)),
     }
     pairs = resampled(pair_correlation(held_out_v, drawn_v))
     if np.isfinite(pairs.value):

@@ -248,6 +248,7 @@ class Scored(Metric):
 
     @classmethod
     def join(cls, parts: Sequence[Self]) -> Scored:
+        """Return the statistic over the items of all parts. Equal groups become one group."""
         groups = np.concatenate([part.groups for part in parts])
         starts = np.cumsum([0, *(len(part.groups) for part in parts)])[:-1]
         unit = np.concatenate([p.unit + start for p, start in zip(parts, starts, strict=True)])

@@ -129,6 +129,7 @@ def complete_scenes(
     """
 
     def ask(batch: Batch, index: list[int]) -> tuple[Tensor, Tensor]:
+        """Observe half of the triples; score the others without mirror images of observed ones."""
         mask = scorable(batch, structure)
         truth = (batch.holds > 0) & mask
         observed = torch.zeros_like(truth)
